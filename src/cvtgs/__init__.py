@@ -1,0 +1,1 @@
+"""Make trained 3D Gaussian Splatting scenes smaller."""

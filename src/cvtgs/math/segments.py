@@ -1,0 +1,91 @@
+"""Reductions over consecutive runs of rows (CSR segments), deterministic on every device."""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+def segment_sum(
+    values: Float[Tensor, "n *k"], offsets: Int[Tensor, "m_plus_1"]
+) -> Float[Tensor, "m *k"]:
+    """Sum runs of rows.
+
+    Args:
+        values: Rows, those of one segment next to one another.
+        offsets: Where each segment starts, and the end of the last one.
+
+    Returns:
+        One row per segment; an empty segment gives 0.
+
+    Example:
+        >>> segment_sum(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0, 2, 3])).tolist()
+        [3.0, 3.0]
+    """
+    return _reduce(values, offsets, "sum")
+
+
+def segment_max(
+    values: Float[Tensor, "n *k"], offsets: Int[Tensor, "m_plus_1"]
+) -> Float[Tensor, "m *k"]:
+    """Take the largest row entry of each run of rows.
+
+    Args:
+        values: Rows, those of one segment next to one another.
+        offsets: Where each segment starts, and the end of the last one.
+
+    Returns:
+        One row per segment; an empty segment gives minus infinity.
+
+    Example:
+        >>> segment_max(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0, 2, 3])).tolist()
+        [2.0, 3.0]
+    """
+    return _reduce(values, offsets, "max")
+
+
+def segment_ids(offsets: Int[Tensor, "m_plus_1"]) -> Int[Tensor, "n"]:
+    """Give the segment of every row.
+
+    Args:
+        offsets: Where each segment starts, and the end of the last one.
+
+    Returns:
+        Segment numbers, ascending.
+
+    Example:
+        >>> segment_ids(torch.tensor([0, 2, 3])).tolist()
+        [0, 0, 1]
+    """
+    counts = offsets.diff()
+    return torch.repeat_interleave(torch.arange(len(counts), device=offsets.device), counts)
+
+
+def segment_argmax(
+    values: Float[Tensor, "n"], offsets: Int[Tensor, "m_plus_1"]
+) -> Int[Tensor, "m"]:
+    """Find the first row with the largest value of each segment.
+
+    Args:
+        values: One number per row, none of them NaN.
+        offsets: Where each segment starts, and the end of the last one; no segment is empty.
+
+    Returns:
+        Row numbers.
+
+    Example:
+        >>> segment_argmax(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0, 2, 3])).tolist()
+        [1, 2]
+    """
+    ids = segment_ids(offsets)
+    is_top = values == segment_max(values, offsets)[ids]
+    rows = torch.arange(len(values), device=values.device)
+    candidates = torch.where(is_top, rows, len(values))
+    first = torch.full((len(offsets) - 1,), len(values), device=values.device)
+    return first.scatter_reduce(0, ids, candidates, "amin")
+
+
+def _reduce(values: Tensor, offsets: Tensor, how: Literal["sum", "max"]) -> Tensor:
+    result: Tensor = torch.segment_reduce(values, how, lengths=offsets.diff(), axis=0)
+    return result

@@ -1,0 +1,34 @@
+"""Progress events: what a long call tells whoever listens."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProgressEvent:
+    """One step of one stage.
+
+    Attributes:
+        stage: Name of the stage, for example ``"tessellate"``.
+        done: Steps finished so far, 0 when the stage starts.
+        total: Steps of the whole stage; ``done == total`` when it has ended.
+    """
+
+    stage: str
+    done: int
+    total: int
+
+
+ProgressListener = Callable[[ProgressEvent], None]
+"""Anything that takes a :class:`ProgressEvent`. An exception that it raises ends the call."""
+
+
+def silent(event: ProgressEvent) -> None:
+    """Ignore a progress event; the default listener.
+
+    Args:
+        event: The event to ignore.
+
+    Example:
+        >>> silent(ProgressEvent(stage="read", done=0, total=1))
+    """

@@ -1,0 +1,213 @@
+"""GaussianScene: the only thing that travels between the stages."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any, Self
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from cvtgs.errors import InvalidSceneError
+from cvtgs.math import activations, spherical_harmonics
+
+ANTIALIASED_TAG = "SplatRenderMode: mip"
+"""The comment of scenes that were trained with anti-aliasing (Mip-Splatting)."""
+
+_SHAPES: dict[str, tuple[int | None, ...]] = {
+    "means": (3,),
+    "quats": (4,),
+    "log_scales": (3,),
+    "logit_opacities": (),
+    "sh0": (1, 3),
+    "shN": (None, 3),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GaussianScene:
+    """A 3D Gaussian Splatting scene of ``n`` Gaussians, as files and optimisers store it.
+
+    Values are not checked, only shapes, dtypes and devices: a scene may hold the NaN rows of the
+    file that it came from. :func:`cvtgs.filters.valid_rows` tells which rows are usable.
+
+    Attributes:
+        means: ``(n, 3)`` centres, scene units.
+        quats: ``(n, 4)`` rotations, w first, not necessarily of unit length.
+        log_scales: ``(n, 3)`` natural logarithms of the standard deviations, scene units.
+        logit_opacities: ``(n,)`` logits of the opacities; infinities are valid.
+        sh0: ``(n, 1, 3)`` constant SH band of red, green, blue.
+        shN: ``(n, k, 3)`` view-dependent SH bands, k in {0, 3, 8, 15}.
+        extras: Further columns ``(n,)`` by name, of any dtype; they are carried along.
+        comments: Comment lines of the file, such as ``SplatRenderMode: mip``.
+        layout: Property names and types of the file, in order; empty if there was none. Only
+            ``cvtgs.io`` reads it, to write the scene back the way it came.
+
+    Raises:
+        InvalidSceneError: Shapes, dtypes or devices do not fit together.
+
+    Example:
+        >>> scene = GaussianScene(
+        ...     means=torch.zeros(2, 3), quats=torch.tensor([[1.0, 0, 0, 0]] * 2),
+        ...     log_scales=torch.zeros(2, 3), logit_opacities=torch.zeros(2),
+        ...     sh0=torch.zeros(2, 1, 3), shN=torch.zeros(2, 0, 3),
+        ... )
+        >>> len(scene), scene.sh_degree
+        (2, 0)
+    """
+
+    means: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]
+    log_scales: Float[Tensor, "n 3"]
+    logit_opacities: Float[Tensor, "n"]
+    sh0: Float[Tensor, "n 1 3"]
+    shN: Float[Tensor, "n k 3"]  # noqa: N815 (the name that gsplat gives it)
+    extras: Mapping[str, Tensor] = field(default_factory=dict)
+    comments: tuple[str, ...] = ()
+    layout: tuple[tuple[str, str], ...] = ()
+
+    def __post_init__(self) -> None:
+        _check(self)
+        object.__setattr__(self, "extras", MappingProxyType(dict(self.extras)))
+
+    def __len__(self) -> int:
+        """Give the number of Gaussians."""
+        return int(self.means.shape[0])
+
+    @property
+    def scales(self) -> Float[Tensor, "n 3"]:
+        """Standard deviations along the own axes, scene units."""
+        return torch.exp(self.log_scales)
+
+    @property
+    def opacities(self) -> Float[Tensor, "n"]:
+        """Opacities in [1e-6, 1 - 1e-6]."""
+        return activations.opacity_from_logit(self.logit_opacities)
+
+    @property
+    def sh(self) -> Float[Tensor, "n k_plus_1 3"]:
+        """All SH coefficients, the constant band first."""
+        return torch.cat([self.sh0, self.shN], dim=1)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return spherical_harmonics.degree_of(self.shN.shape[1])
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether the scene was trained with anti-aliasing and must be shown so."""
+        return any(ANTIALIASED_TAG.lower() in comment.lower() for comment in self.comments)
+
+    @property
+    def device(self) -> torch.device:
+        """The device that holds every tensor."""
+        return self.means.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """float32 or float64."""
+        return self.means.dtype
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Give the six standard tensors by name.
+
+        Returns:
+            A new dictionary: means, quats, log_scales, logit_opacities, sh0, shN.
+        """
+        return {name: getattr(self, name) for name in _SHAPES}
+
+    def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> Self:
+        """Take some Gaussians, with all that belongs to them.
+
+        Args:
+            rows: Row numbers, or a mask.
+
+        Returns:
+            A scene with those rows, copied.
+        """
+        if rows.dtype == torch.bool:
+            rows = rows.nonzero()[:, 0]
+        return self.with_tensors(
+            {name: tensor.index_select(0, rows) for name, tensor in self.tensors().items()},
+            {name: column.index_select(0, rows) for name, column in self.extras.items()},
+        )
+
+    def with_tensors(self, tensors: Mapping[str, Tensor], extras: Mapping[str, Tensor]) -> Self:
+        """Give a scene of other Gaussians with the comments and the layout of this one.
+
+        Args:
+            tensors: Some or all of the six standard tensors by name.
+            extras: All further columns.
+
+        Returns:
+            The new scene.
+
+        Raises:
+            InvalidSceneError: The tensors do not fit together.
+        """
+        changes: dict[str, Any] = {**tensors, "extras": extras}
+        return replace(self, **changes)
+
+    def to(self, device: torch.device | str) -> Self:
+        """Move the scene to a device.
+
+        Args:
+            device: Where to.
+
+        Returns:
+            This scene if it is there already, else a copy.
+        """
+        target = torch.device(device)
+        if target == self.device:
+            return self
+        return self.with_tensors(
+            {name: tensor.to(target) for name, tensor in self.tensors().items()},
+            {name: column.to(target) for name, column in self.extras.items()},
+        )
+
+    def __repr__(self) -> str:
+        """Say count, degree, dtype and device, not the values."""
+        return (
+            f"GaussianScene({len(self):,} Gaussians, SH degree {self.sh_degree}, "
+            f"{str(self.dtype).removeprefix('torch.')}, {self.device})"
+        )
+
+
+def _check(scene: GaussianScene) -> None:
+    for name, tensor in scene.tensors().items():
+        if not isinstance(tensor, Tensor):
+            raise InvalidSceneError(
+                f"{name} must be a torch.Tensor, found {type(tensor).__name__}; "
+                f"use cvtgs.from_dict for numpy arrays."
+            )
+    n, dtype, device = len(scene.means), scene.means.dtype, scene.means.device
+    if dtype not in (torch.float32, torch.float64):
+        raise InvalidSceneError(f"means must be float32 or float64, found {dtype}.")
+    for name, tensor in scene.tensors().items():
+        wanted = (n, *_SHAPES[name])
+        fits = tensor.ndim == len(wanted) and all(
+            want is None or have == want for have, want in zip(tensor.shape, wanted, strict=True)
+        )
+        if not fits:
+            shape = ", ".join("k" if want is None else str(want) for want in wanted)
+            raise InvalidSceneError(
+                f"{name} must have shape ({shape}), found {tuple(tensor.shape)}."
+            )
+        if tensor.dtype != dtype or tensor.device != device:
+            raise InvalidSceneError(
+                f"{name} must be {dtype} on {device} like means, "
+                f"found {tensor.dtype} on {tensor.device}."
+            )
+    if scene.shN.shape[1] not in spherical_harmonics.REST_COUNTS:
+        raise InvalidSceneError(
+            f"shN must hold 0, 3, 8 or 15 coefficients per channel, found {scene.shN.shape[1]}."
+        )
+    for name, column in scene.extras.items():
+        if column.shape != (n,) or column.device != device:
+            raise InvalidSceneError(
+                f"extra column {name!r} must have shape ({n},) on {device}, "
+                f"found {tuple(column.shape)} on {column.device}."
+            )
+
