@@ -25,6 +25,10 @@ class InputNotFoundError(CvtgsError, FileNotFoundError):
     """The file to read does not exist."""
 
 
+class InputError(CvtgsError, OSError):
+    """The file to read exists but cannot be read (a directory, no permission, a failing disk)."""
+
+
 class OutputExistsError(CvtgsError, FileExistsError):
     """The file to write exists already and overwriting was not asked for."""
 

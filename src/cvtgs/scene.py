@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.errors import InvalidSceneError
-from cvtgs.math import activations, spherical_harmonics
+from cvtgs.math import activations, covariances, spherical_harmonics
 
 ANTIALIASED_TAG = "SplatRenderMode: mip"
 """The comment of scenes that were trained with anti-aliasing (Mip-Splatting)."""
@@ -84,6 +84,12 @@ class GaussianScene:
     def opacities(self) -> Float[Tensor, "n"]:
         """Opacities in [1e-6, 1 - 1e-6]."""
         return activations.opacity_from_logit(self.logit_opacities)
+
+    @property
+    def masses(self) -> Float[Tensor, "n"]:
+        """Opacity times mean projected area, squared scene units, float64."""
+        areas = covariances.mean_projected_area(torch.exp(self.log_scales.double()))
+        return activations.opacity_from_logit(self.logit_opacities.double()) * areas
 
     @property
     def sh(self) -> Float[Tensor, "n k_plus_1 3"]:
@@ -210,4 +216,3 @@ def _check(scene: GaussianScene) -> None:
                 f"extra column {name!r} must have shape ({n},) on {device}, "
                 f"found {tuple(column.shape)} on {column.device}."
             )
-

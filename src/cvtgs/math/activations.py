@@ -126,3 +126,21 @@ def divide(numerator: Float[Tensor, "*n"], denominator: Float[Tensor, "*n"]) -> 
         [0.0, 0.5]
     """
     return numerator / denominator.clamp_min(torch.finfo(denominator.dtype).tiny)
+
+
+def logit_from_optical_depth(depths: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Give the opacity logit of an optical depth, the inverse of :func:`optical_depth_from_logit`.
+
+    ``logit(1 - exp(-tau))`` is ``tau + log(1 - exp(-tau))``, which loses no digits at either end.
+
+    Args:
+        depths: Optical depths, at least 0.
+
+    Returns:
+        Logits in [-13.8, 13.8].
+
+    Example:
+        >>> round(logit_from_optical_depth(torch.tensor([0.6931472])).item(), 4)
+        0.0
+    """
+    return clamp_logits(depths + positive_log(opacity_from_optical_depth(depths)))

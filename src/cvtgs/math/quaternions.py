@@ -22,7 +22,8 @@ def normalize(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
     """
     largest = quats.abs().amax(dim=-1, keepdim=True)
     scaled = quats / largest
-    return scaled / torch.linalg.vector_norm(scaled, dim=-1, keepdim=True)
+    norms: Tensor = torch.linalg.vector_norm(scaled, dim=-1, keepdim=True)
+    return scaled / norms
 
 
 def to_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:

@@ -7,6 +7,28 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 
+def sort_by_label(
+    labels: Int[Tensor, "n"], count: int
+) -> tuple[Int[Tensor, "n"], Int[Tensor, "m_plus_1"]]:
+    """Bring rows of one label next to one another.
+
+    Args:
+        labels: Label of every row, 0 to ``count - 1``.
+        count: Number of labels.
+
+    Returns:
+        Row numbers, by label and then as they were, and where each label starts.
+
+    Example:
+        >>> order, offsets = sort_by_label(torch.tensor([1, 0, 1]), 2)
+        >>> order.tolist(), offsets.tolist()
+        ([1, 0, 2], [0, 1, 3])
+    """
+    order = torch.sort(labels.to(torch.int32), stable=True).indices
+    ends = torch.bincount(labels, minlength=count).cumsum(0)
+    return order, torch.nn.functional.pad(ends, (1, 0))
+
+
 def segment_sum(
     values: Float[Tensor, "n *k"], offsets: Int[Tensor, "m_plus_1"]
 ) -> Float[Tensor, "m *k"]:

@@ -1,0 +1,18 @@
+"""From cells to Gaussians: members, moments and the reference; blind to how cells were made."""
+
+from cvtgs.cells.moments import Members, mean_and_covariance, normalized_weights, weighted_mean
+from cvtgs.cells.partition import Partition
+from cvtgs.cells.reference import gather_members, merge_cells, merged_depth
+from cvtgs.cells.widening import widening_factors
+
+__all__ = [
+    "Members",
+    "Partition",
+    "gather_members",
+    "mean_and_covariance",
+    "merge_cells",
+    "merged_depth",
+    "normalized_weights",
+    "weighted_mean",
+    "widening_factors",
+]

@@ -1,0 +1,105 @@
+"""Weighted moments of the members of every cell, in float64."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cvtgs.math import covariances
+from cvtgs.math.segments import segment_ids, segment_sum
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Members:
+    """The members of some cells, those of one cell next to one another, in float64.
+
+    Attributes:
+        means: ``(n, 3)`` positions.
+        quats: ``(n, 4)`` unit quaternions.
+        scales: ``(n, 3)`` standard deviations.
+        depths: ``(n,)`` optical depths ``-log(1 - a)``.
+        areas: ``(n,)`` mean projected areas.
+        weights: ``(n,)`` weights; those of one cell sum to 1.
+        offsets: ``(m + 1,)`` where each cell starts, and the end of the last one.
+    """
+
+    means: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]
+    scales: Float[Tensor, "n 3"]
+    depths: Float[Tensor, "n"]
+    areas: Float[Tensor, "n"]
+    weights: Float[Tensor, "n"]
+    offsets: Int[Tensor, "m_plus_1"]
+
+
+def normalized_weights(
+    weights: Float[Tensor, "n"], offsets: Int[Tensor, "m_plus_1"]
+) -> Float[Tensor, "n"]:
+    """Scale weights so that those of each cell sum to 1.
+
+    Args:
+        weights: Positive weights, members of one cell next to one another.
+        offsets: Where each cell starts, and the end of the last one.
+
+    Returns:
+        Weights in float64.
+
+    Example:
+        >>> import torch
+        >>> normalized_weights(torch.tensor([1.0, 3.0]), torch.tensor([0, 2])).tolist()
+        [0.25, 0.75]
+    """
+    weights = weights.double()
+    return weights / segment_sum(weights, offsets)[segment_ids(offsets)]
+
+
+def weighted_mean(
+    values: Float[Tensor, "n *k"],
+    weights: Float[Tensor, "n"],
+    offsets: Int[Tensor, "m_plus_1"],
+) -> Float[Tensor, "m *k"]:
+    """Average the rows of every cell.
+
+    Args:
+        values: One row per member.
+        weights: Weights that sum to 1 in each cell.
+        offsets: Where each cell starts, and the end of the last one.
+
+    Returns:
+        One row per cell, float64.
+
+    Example:
+        >>> import torch
+        >>> weighted_mean(
+        ...     torch.tensor([0.0, 4.0]), torch.tensor([0.25, 0.75]), torch.tensor([0, 2])
+        ... ).tolist()
+        [3.0]
+    """
+    spread = weights.double().reshape(-1, *[1] * (values.ndim - 1))
+    return segment_sum(values.double() * spread, offsets)
+
+
+def mean_and_covariance(
+    members: Members,
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3 3"]]:
+    """Match the first two moments of the mixture that each cell is.
+
+    The covariance is the weighted mean of the members' covariances plus the weighted spread of
+    their means; the spread is taken about the mean, in two passes, so that no digits are lost
+    far from the origin.
+
+    Args:
+        members: Members of the cells.
+
+    Returns:
+        Means and covariances of the cells, float64.
+    """
+    offsets, weights = members.offsets, members.weights
+    ids = segment_ids(offsets)
+    first_rows = members.means[offsets[:-1]]
+    local = members.means - first_rows[ids]
+    shift = weighted_mean(local, weights, offsets)
+    local = local - shift[ids]
+    inner = covariances.from_scales_and_quats(members.scales, members.quats)
+    outer = local[:, :, None] * local[:, None, :]
+    return first_rows + shift, weighted_mean(inner + outer, weights, offsets)

@@ -1,0 +1,98 @@
+"""Partition: which Gaussians make up which cell, as consecutive runs of row numbers."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.math.segments import sort_by_label
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Partition:
+    """Members of every cell in compressed (CSR) form.
+
+    Attributes:
+        order: ``(n,)`` row numbers, those of one cell next to one another.
+        offsets: ``(m + 1,)`` where each cell starts in ``order``, and the end of the last one.
+    """
+
+    order: Int[Tensor, "n"]
+    offsets: Int[Tensor, "m_plus_1"]
+
+    @classmethod
+    def from_labels(cls, labels: Int[Tensor, "n"], count: int) -> Self:
+        """Collect the members of every cell.
+
+        Args:
+            labels: Cell of every row, 0 to ``count - 1``.
+            count: Number of cells.
+
+        Returns:
+            The partition; the members of a cell keep their order.
+
+        Raises:
+            InvalidArgumentError: A label is out of range, or a cell has no member.
+
+        Example:
+            >>> Partition.from_labels(torch.tensor([1, 0, 1]), 2).order.tolist()
+            [1, 0, 2]
+        """
+        if len(labels) and (int(labels.amin()) < 0 or int(labels.amax()) >= count):
+            raise InvalidArgumentError(
+                f"labels must be between 0 and {count - 1}, "
+                f"found {int(labels.amin())} to {int(labels.amax())}."
+            )
+        order, offsets = sort_by_label(labels, count)
+        empty = (offsets.diff() == 0).nonzero()[:, 0]
+        if len(empty):
+            raise InvalidArgumentError(
+                f"every cell needs a member; {len(empty)} have none, the first is {int(empty[0])}."
+            )
+        return cls(order=order, offsets=offsets)
+
+    def __len__(self) -> int:
+        """Give the number of cells."""
+        return len(self.offsets) - 1
+
+    @property
+    def counts(self) -> Int[Tensor, "m"]:
+        """Members of every cell."""
+        return self.offsets.diff()
+
+    def select(self, cells: Bool[Tensor, "m"]) -> Self:
+        """Keep some cells.
+
+        Args:
+            cells: Mask of the cells to keep.
+
+        Returns:
+            Their partition, in the same order.
+        """
+        counts = self.counts
+        members = torch.repeat_interleave(cells, counts)
+        offsets = torch.nn.functional.pad(counts[cells].cumsum(0), (1, 0))
+        return type(self)(order=self.order[members], offsets=offsets)
+
+    def chunks(self, max_members: int) -> Iterator[tuple[slice, Self]]:
+        """Cut the partition into runs of cells, to bound memory.
+
+        Args:
+            max_members: Members of one run at most; a larger cell is a run of its own.
+
+        Yields:
+            The cells of the run, and their partition.
+        """
+        first = 0
+        while first < len(self):
+            start = int(self.offsets[first])
+            fitting = torch.searchsorted(self.offsets, start + max_members, right=True)
+            last = max(first + 1, int(fitting) - 1)
+            members = self.order[start : int(self.offsets[last])]
+            offsets = self.offsets[first : last + 1] - start
+            yield slice(first, last), type(self)(order=members, offsets=offsets)
+            first = last

@@ -1,0 +1,98 @@
+"""What the commands share when they show something: sizes, seconds, progress bars."""
+
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cvtgs.progress import ProgressEvent, ProgressListener, silent
+
+if TYPE_CHECKING:
+    from cvtgs.report import StageCost
+
+
+def size_text(count: int) -> str:
+    """Give a number of bytes in decimal units.
+
+    Args:
+        count: Bytes.
+
+    Returns:
+        For example ``68.0 MB``.
+
+    Example:
+        >>> size_text(68_000_000)
+        '68.0 MB'
+    """
+    if count < 1000:
+        return f"{count} B"
+    value = count / 1000
+    for unit in ("kB", "MB"):
+        if value < 1000:
+            return f"{value:.1f} {unit}"
+        value /= 1000
+    return f"{value:.1f} GB"
+
+
+def file_size(path: Path) -> str:
+    """Give the size of a file.
+
+    Args:
+        path: An existing file.
+
+    Returns:
+        For example ``68.0 MB``.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.NamedTemporaryFile() as file:
+        ...     file_size(Path(file.name))
+        '0 B'
+    """
+    return size_text(path.stat().st_size)
+
+
+def stage_seconds(stages: Sequence["StageCost"]) -> str:
+    """Give the time of all stages, and of each.
+
+    Args:
+        stages: What each stage cost.
+
+    Returns:
+        For example ``1.2 s (tessellate 1.0, merge 0.2)``.
+
+    Example:
+        >>> stage_seconds([])
+        '0.00 s'
+    """
+    total = f"{sum(stage.seconds for stage in stages):.2f} s"
+    parts = ", ".join(f"{stage.stage} {stage.seconds:.2f}" for stage in stages)
+    return f"{total} ({parts})" if parts else total
+
+
+@contextmanager
+def progress_bars(*, quiet: bool) -> Iterator[ProgressListener]:
+    """Show a bar per stage on stderr, if that is a terminal.
+
+    Args:
+        quiet: Show nothing.
+
+    Yields:
+        The listener that moves the bars.
+    """
+    if quiet or not sys.stderr.isatty():
+        yield silent
+        return
+    from rich.console import Console  # noqa: PLC0415 (only for terminals)
+    from rich.progress import Progress, TaskID  # noqa: PLC0415
+
+    with Progress(console=Console(stderr=True)) as progress:
+        bars: dict[str, TaskID] = {}
+
+        def listen(event: ProgressEvent) -> None:
+            if event.done == 0 or event.stage not in bars:
+                bars[event.stage] = progress.add_task(event.stage, total=event.total)
+            progress.update(bars[event.stage], completed=event.done, total=event.total)
+
+        yield listen

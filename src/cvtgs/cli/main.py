@@ -1,0 +1,84 @@
+"""``cvtgs``: reads the command, runs it, and turns errors into exit codes."""
+
+import argparse
+import signal
+import sys
+import warnings
+from collections.abc import Sequence
+from types import FrameType
+from typing import TextIO
+
+import cvtgs
+from cvtgs.cli import demo, info, simplify
+from cvtgs.errors import CvtgsError
+
+INTERRUPTED = 130
+TERMINATED = 143
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: The words after ``cvtgs``; those of the process if None.
+
+    Returns:
+        0 when all went well, 1 after an error (one sentence on stderr), 130 when interrupted.
+        Wrong usage exits with 2.
+
+    Example:
+        >>> main(["info", "missing.ply"])
+        1
+    """
+    options = build_parser().parse_args(arguments)
+    signal.signal(signal.SIGTERM, _terminate)
+    with warnings.catch_warnings():
+        warnings.showwarning = _show_warning
+        warnings.simplefilter("always", UserWarning)
+        try:
+            options.run(options)
+        except CvtgsError as error:
+            print(f"cvtgs: error: {error}", file=sys.stderr)
+            return 1
+        except KeyboardInterrupt:
+            print("cvtgs: interrupted; nothing was half-written.", file=sys.stderr)
+            return INTERRUPTED
+    return 0
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Describe every command and option.
+
+    Returns:
+        The parser.
+
+    Example:
+        >>> build_parser().prog
+        'cvtgs'
+    """
+    parser = argparse.ArgumentParser(
+        prog="cvtgs",
+        description="Make trained 3D Gaussian Splatting scenes 10 to 1000 times smaller.",
+        epilog="Start with: cvtgs demo",
+    )
+    parser.add_argument("--version", action="version", version=f"cvtgs {cvtgs.__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for command in (simplify, info, demo):
+        command.add_parser(commands)
+    return parser
+
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    print(f"cvtgs: warning: {message}", file=sys.stderr)
+
+
+def _terminate(signum: int, frame: FrameType | None) -> None:
+    """Leave in an orderly way, so that temporary files are removed."""
+    sys.exit(TERMINATED)

@@ -1,0 +1,90 @@
+"""``cvtgs simplify``: a scene in, a smaller scene out."""
+
+import argparse
+from pathlib import Path
+
+from cvtgs.cli.display import file_size, progress_bars, stage_seconds
+from cvtgs.errors import ConfigError
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Describe the command.
+
+    Args:
+        commands: Where to add it.
+    """
+    parser = commands.add_parser(
+        "simplify",
+        help="make a scene smaller",
+        description="Write a scene with exactly ceil(rho * N) of the N Gaussians of IN.",
+    )
+    parser.add_argument("input", metavar="IN", type=Path, help="scene to read (.ply)")
+    parser.add_argument("output", metavar="OUT", type=Path, help="scene to write (.ply)")
+    size = parser.add_mutually_exclusive_group(required=True)
+    size.add_argument("--rho", type=float, metavar="R", help="ratio of Gaussians to keep, (0, 1]")
+    size.add_argument("--count", type=int, metavar="M", help="number of Gaussians to keep")
+    parser.add_argument("--preset", metavar="NAME", help="standard (default) or paper")
+    parser.add_argument("--config", type=Path, metavar="F.toml", help="configuration file")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="settings",
+        help="change one setting, for example cvt.iterations=10; may be repeated",
+    )
+    parser.add_argument("--report", type=Path, metavar="R.json", help="write what was done as JSON")
+    parser.add_argument(
+        "--device", default="auto", metavar="DEVICE", help="auto (default), cpu or cuda"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace existing output files")
+    parser.add_argument("--quiet", action="store_true", help="print errors and warnings only")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the command.
+
+    Args:
+        options: The parsed options.
+    """
+    from cvtgs.config import SimplifyConfig  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.io import atomic_output, check_output, check_save, load, save  # noqa: PLC0415
+    from cvtgs.simplify import Simplifier, target_count  # noqa: PLC0415
+
+    config = SimplifyConfig.compose(
+        file=options.config, preset=options.preset, settings=_settings(options.settings)
+    )
+    if options.rho is not None:
+        target_count(1, options.rho)
+    check_save(options.output, overwrite=options.overwrite)
+    if options.report is not None:
+        check_output(options.report, overwrite=options.overwrite)
+    with progress_bars(quiet=options.quiet) as listener:
+        simplifier = Simplifier(config=config, device=options.device, listener=listener)
+        scene = load(options.input)
+        small, report = simplifier.run(scene, options.rho, count=options.count)
+        save(small, options.output, overwrite=options.overwrite)
+    if options.report is not None:
+        with atomic_output(options.report, overwrite=options.overwrite) as file:
+            file.write(report.to_json().encode())
+    if not options.quiet:
+        print(
+            f"{report.input_count:,} -> {report.output_count:,} Gaussians, "
+            f"{file_size(options.input)} -> {file_size(options.output)}, "
+            f"{stage_seconds(report.stages)}"
+        )
+        if report.shortfall:
+            print(f"Fewer than the {report.target_count:,} asked for: {report.shortfall}.")
+
+
+def _settings(words: list[str]) -> dict[str, str]:
+    settings = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not (key and equals):
+            raise ConfigError(
+                f"--set needs KEY=VALUE, for example cvt.iterations=10; found {word!r}."
+            )
+        settings[key.strip()] = value.strip()
+    return settings

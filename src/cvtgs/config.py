@@ -1,0 +1,240 @@
+"""SimplifyConfig: every choice that a simplification makes, with named presets."""
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import pydantic
+
+from cvtgs.errors import ConfigError
+
+Share = Annotated[float, pydantic.Field(ge=0.0, le=1.0)]
+
+
+class _Section(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+class FilterConfig(_Section):
+    """Which faint Gaussians are left out before the tessellation.
+
+    Attributes:
+        min_opacity: Only Gaussians fainter than this may be left out.
+        max_mass_share: They are left out, faintest first, while they hold at most this share of
+            the scene's mass; 1 leaves all of them out.
+    """
+
+    min_opacity: Share = 0.1
+    max_mass_share: Share = 0.01
+
+
+class TessellationConfig(_Section):
+    """How Gaussians are grouped into cells.
+
+    Attributes:
+        weight: What a Gaussian weighs: its mass (opacity times mean projected area) or its
+            opacity alone.
+        weight_floor: No Gaussian weighs less than this share of the mean weight.
+        color: Length of one unit of colour, in robust radii; 0 groups by position alone.
+        unbounded: Whether far Gaussians weigh less and lie closer; ``auto`` decides by the scene.
+        seeding: Deterministic strata of equal weight, or weighted random draws.
+        iterations: Lloyd iterations, at most.
+        tolerance: Lloyd stops when an iteration lowers the energy by less than this share.
+        samples_per_site: Lloyd looks at this many Gaussians per cell at most; 0 looks at all.
+        backend: What searches the nearest site; ``auto`` takes scipy on a CPU, else torch.
+    """
+
+    weight: Literal["mass", "opacity"] = "mass"
+    weight_floor: float = pydantic.Field(default=1e-3, ge=0.0)
+    color: float = pydantic.Field(default=0.05, ge=0.0)
+    unbounded: Literal["auto", "on", "off"] = "auto"
+    seeding: Literal["stratified", "weighted"] = "stratified"
+    iterations: int = pydantic.Field(default=5, ge=0)
+    tolerance: float = pydantic.Field(default=1e-3, ge=0.0)
+    samples_per_site: int = pydantic.Field(default=24, ge=0)
+    backend: Literal["auto", "scipy", "torch"] = "auto"
+
+
+class MergeConfig(_Section):
+    """How a cell becomes one Gaussian.
+
+    Attributes:
+        weight: What a member weighs in the means of position, covariance and colour.
+        opacity: ``saturating`` conserves mass, ``1 - exp(-tau)``; ``union`` is the opacity of
+            members that lie exactly behind one another, ``1 - prod(1 - a)``.
+        widening: How much wider than its moments an opaque cell of many members becomes.
+    """
+
+    weight: Literal["mass", "opacity"] = "mass"
+    opacity: Literal["saturating", "union"] = "saturating"
+    widening: float = pydantic.Field(default=0.3, ge=0.0, le=2.0)
+
+
+class SimplifyConfig(_Section):
+    """Every choice of a simplification; frozen, unknown keys are errors.
+
+    Attributes:
+        preset: Name of the preset that the values started from.
+        seed: Seed of whatever is drawn at random.
+        filter: Which Gaussians are left out.
+        cvt: How Gaussians are grouped.
+        merge: How a group becomes one Gaussian.
+
+    Example:
+        >>> SimplifyConfig.from_preset("paper").filter.max_mass_share
+        1.0
+    """
+
+    preset: str = "standard"
+    seed: int = pydantic.Field(default=0, ge=0)
+    filter: FilterConfig = FilterConfig()
+    cvt: TessellationConfig = TessellationConfig()
+    merge: MergeConfig = MergeConfig()
+
+    @classmethod
+    def from_preset(cls, name: str) -> Self:
+        """Give a preset.
+
+        Args:
+            name: One of :data:`PRESETS`.
+
+        Returns:
+            The configuration.
+
+        Raises:
+            ConfigError: There is no such preset.
+        """
+        if name not in PRESETS:
+            raise ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {name!r}.")
+        return cls.from_mapping({"preset": name})
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
+        """Build a configuration from nested values on top of the preset that they name.
+
+        Args:
+            values: For example ``{"preset": "paper", "cvt": {"iterations": 10}}``.
+
+        Returns:
+            The configuration.
+
+        Raises:
+            ConfigError: A key is unknown or a value out of range; the text names it.
+        """
+        name = values.get("preset", "standard")
+        if name not in PRESETS:
+            raise ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {name!r}.")
+        try:
+            return cls.model_validate(_merged(PRESETS[name], values))
+        except pydantic.ValidationError as error:
+            raise ConfigError(_explain(error)) from None
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """Read a configuration file.
+
+        Args:
+            path: A TOML file with the keys of this class; missing keys come from its preset.
+
+        Returns:
+            The configuration.
+
+        Raises:
+            ConfigError: The file cannot be read, is not TOML, or holds a bad key or value.
+        """
+        return cls.compose(file=path)
+
+    @classmethod
+    def compose(
+        cls,
+        *,
+        file: str | Path | None = None,
+        preset: str | None = None,
+        settings: Mapping[str, str] | None = None,
+    ) -> Self:
+        """Put a configuration together, as the command line does.
+
+        Args:
+            file: A TOML file; what it leaves open comes from the preset.
+            preset: Name of the preset, instead of the one that the file names.
+            settings: Texts by dotted key, for example ``{"cvt.iterations": "10"}``; they win.
+
+        Returns:
+            The configuration.
+
+        Raises:
+            ConfigError: The file cannot be read, or a key is unknown or a value out of range.
+        """
+        values = {} if file is None else _read_toml(Path(file))
+        if preset is not None:
+            values["preset"] = preset
+        for key, text in (settings or {}).items():
+            section, _, name = key.rpartition(".")
+            target = values.setdefault(section, {}) if section else values
+            if not isinstance(target, dict):
+                raise ConfigError(f"{key}: is not a known setting.")
+            target[name] = text
+        try:
+            return cls.from_mapping(values)
+        except ConfigError as error:
+            raise ConfigError(str(error) if file is None else f"{file}: {error}") from None
+
+    def to_toml(self) -> str:
+        """Write the configuration as TOML text that :meth:`from_toml` reads back.
+
+        Returns:
+            TOML text, all keys included.
+        """
+        import tomli_w  # noqa: PLC0415 (only those who write a file need it)
+
+        return tomli_w.dumps(self.model_dump())
+
+
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "standard": {},
+    "paper": {
+        "filter": {"max_mass_share": 1.0},
+        "cvt": {
+            "weight": "opacity",
+            "weight_floor": 0.0,
+            "color": 0.0,
+            "unbounded": "off",
+            "seeding": "weighted",
+            "iterations": 5,
+            "tolerance": 0.0,
+            "samples_per_site": 0,
+        },
+        "merge": {"weight": "opacity", "opacity": "union", "widening": 0.0},
+    },
+}
+"""What each preset changes of the defaults: ``standard`` nothing, ``paper`` is CVT-GS."""
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: is not a TOML file: {error}.") from None
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    result = dict(base)
+    for key, value in changes.items():
+        old = result.get(key)
+        both = isinstance(old, Mapping) and isinstance(value, Mapping)
+        result[key] = _merged(old, value) if both else value  # type: ignore[arg-type]
+    return result
+
+
+def _explain(error: pydantic.ValidationError) -> str:
+    problems = []
+    for problem in error.errors():
+        key = ".".join(str(part) for part in problem["loc"])
+        if problem["type"] == "extra_forbidden":
+            problems.append(f"{key}: is not a known setting")
+        else:
+            problems.append(f"{key}: {problem['msg'].lower()}, found {problem['input']!r}")
+    return "; ".join(problems) + "."

@@ -1,0 +1,60 @@
+"""What a Gaussian weighs in the tessellation."""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs.math.frames import RobustFrame
+
+
+def tessellation_weights(
+    opacities: Float[Tensor, "n"],
+    masses: Float[Tensor, "n"],
+    *,
+    weight: Literal["mass", "opacity"],
+    floor: float,
+) -> Float[Tensor, "n"]:
+    """Give the weight of every Gaussian.
+
+    Args:
+        opacities: Opacities.
+        masses: Opacity times mean projected area, as seen from where people stand.
+        weight: ``opacity`` as in CVT-GS, or ``mass``.
+        floor: No weight is below this share of the mean weight.
+
+    Returns:
+        Weights in float64 with mean 1 (before the floor); all 1 if all would be 0.
+
+    Example:
+        >>> tessellation_weights(
+        ...     torch.tensor([0.5, 0.5]), torch.tensor([1.0, 3.0]), weight="mass", floor=0.0
+        ... ).tolist()
+        [0.5, 1.5]
+    """
+    raw = (masses if weight == "mass" else opacities).double()
+    largest = raw.amax()
+    if not bool(largest > 0):
+        return torch.ones_like(raw)
+    scaled = raw / largest
+    return (scaled / scaled.mean()).clamp_min(floor)
+
+
+def falloff(means: Float[Tensor, "n 3"], frame: RobustFrame) -> Float[Tensor, "n"]:
+    """Give how much smaller a far Gaussian looks from the middle of the scene.
+
+    Args:
+        means: Positions, scene units.
+        frame: Centre and radius of the scene.
+
+    Returns:
+        ``1 / max(1, d / R)^2`` in float64, with d the distance to the centre.
+
+    Example:
+        >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
+        >>> falloff(torch.tensor([[2.0, 0, 0]]), frame).tolist()
+        [0.25]
+    """
+    distance: Tensor = torch.linalg.vector_norm(frame.normalize(means), dim=1)
+    return distance.clamp_min(1.0).pow(-2)

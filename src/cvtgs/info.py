@@ -1,0 +1,123 @@
+"""SceneInfo: what is known of a scene before anything is done to it."""
+
+import pydantic
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs.effects import EffectPlan, plan_effects
+from cvtgs.errors import InvalidSceneError
+from cvtgs.filters import invalid_rows
+from cvtgs.math.frames import robust_frame
+from cvtgs.scene import GaussianScene
+
+FAINT = 0.1
+"""Opacities below this are counted as faint: the filter of CVT-GS would drop them."""
+
+QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
+
+
+class SceneInfo(pydantic.BaseModel):
+    """Facts about a scene. Those about values are taken over its valid rows.
+
+    Attributes:
+        count: Gaussians, N.
+        sh_degree: Degree of the spherical harmonics.
+        dtype: float32 or float64.
+        bounds: Smallest and largest x, y, z of the centres, scene units.
+        robust_center: Median of each coordinate.
+        robust_radius: The 70 % quantile of the distance to it.
+        opacity_quantiles: Opacities at 0, 5, 25, 50, 75, 95 and 100 %.
+        mass: Sum of opacity times mean projected area, squared scene units.
+        mass_shares: Share of the mass that the heaviest 0.1, 1, 10 and 50 % of Gaussians hold.
+        faint_share: Share of Gaussians with opacity below 0.1.
+        faint_mass_share: Their share of the mass.
+        invalid_rows: Rows with NaN, infinite or zero values, by attribute.
+        invalid_count: Rows that are invalid.
+        antialiased: Whether the scene is tagged as trained with anti-aliasing.
+        comments: Comment lines of the file.
+        extra_columns: Names of the columns beyond the standard ones.
+        plan: The effects that the scene calls for.
+    """
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
+
+    count: int
+    sh_degree: int
+    dtype: str
+    bounds: tuple[tuple[float, ...], tuple[float, ...]]
+    robust_center: tuple[float, ...]
+    robust_radius: float
+    opacity_quantiles: tuple[float, ...]
+    mass: float
+    mass_shares: tuple[float, ...]
+    faint_share: float
+    faint_mass_share: float
+    invalid_rows: dict[str, int]
+    invalid_count: int
+    antialiased: bool
+    comments: tuple[str, ...]
+    extra_columns: tuple[str, ...]
+    plan: EffectPlan
+
+
+HEAVIEST = (0.001, 0.01, 0.1, 0.5)
+
+
+def describe(scene: GaussianScene) -> SceneInfo:
+    """Collect facts about a scene.
+
+    Args:
+        scene: Any scene.
+
+    Returns:
+        The facts.
+
+    Raises:
+        InvalidSceneError: The scene has no valid row.
+
+    Example:
+        >>> from cvtgs.synthetic import scene
+        >>> describe(scene("object", 100, sh_degree=2, seed=0)).sh_degree
+        2
+    """
+    invalid = invalid_rows(scene)
+    bad = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
+    for mask in invalid.values():
+        bad |= mask
+    if len(scene) == int(bad.sum()):
+        raise InvalidSceneError(f"none of the {len(scene)} Gaussians is valid.")
+    valid = scene.select(~bad) if invalid else scene
+    frame, masses, opacities = robust_frame(valid.means), valid.masses, valid.opacities
+    faint = opacities < FAINT
+    total = masses.sum()
+    return SceneInfo(
+        count=len(scene),
+        sh_degree=scene.sh_degree,
+        dtype=str(scene.dtype).removeprefix("torch."),
+        bounds=(tuple(valid.means.amin(dim=0).tolist()), tuple(valid.means.amax(dim=0).tolist())),
+        robust_center=tuple(frame.center.tolist()),
+        robust_radius=frame.radius,
+        opacity_quantiles=_quantiles(opacities),
+        mass=float(total),
+        mass_shares=_heaviest_shares(masses),
+        faint_share=float(faint.double().mean()),
+        faint_mass_share=float(masses[faint].sum() / total),
+        invalid_rows={name: int(mask.sum()) for name, mask in invalid.items()},
+        invalid_count=int(bad.sum()),
+        antialiased=scene.antialiased,
+        comments=scene.comments,
+        extra_columns=tuple(scene.extras),
+        plan=plan_effects(valid, masses, frame),
+    )
+
+
+def _quantiles(values: Float[Tensor, "n"]) -> tuple[float, ...]:
+    ascending = torch.sort(values).values
+    return tuple(float(ascending[round(q * (len(values) - 1))]) for q in QUANTILES)
+
+
+def _heaviest_shares(masses: Float[Tensor, "n"]) -> tuple[float, ...]:
+    running = torch.sort(masses, descending=True).values.cumsum(0)
+    counts = (max(1, round(share * len(masses))) for share in HEAVIEST)
+    return tuple(float(running[count - 1] / running[-1]) for count in counts)

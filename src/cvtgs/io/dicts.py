@@ -1,0 +1,179 @@
+"""Scenes in and out of the dictionaries that gsplat and nerfstudio users hold."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cvtgs.errors import InvalidSceneError
+from cvtgs.math import activations
+from cvtgs.scene import GaussianScene
+
+_TENSORS = {
+    "means": "means",
+    "quats": "quats",
+    "scales": "log_scales",
+    "opacities": "logit_opacities",
+    "sh0": "sh0",
+    "features_dc": "sh0",
+    "shN": "shN",
+    "features_rest": "shN",
+}
+
+
+def from_dict(
+    mapping: Mapping[str, Tensor | NDArray[Any]], *, activated: bool = False
+) -> GaussianScene:
+    """Make a scene of the dictionary of a gsplat or nerfstudio (Splatfacto) model.
+
+    Tensors are detached and share memory with the mapping's, numpy arrays are copied. Half
+    precision becomes float32; where dtypes differ, the widest is taken.
+
+    Args:
+        mapping: ``means (n, 3)``, ``quats (n, 4)`` w first, ``scales (n, 3)``, ``opacities (n,)``
+            or ``(n, 1)``, ``sh0 (n, 1, 3)`` or ``features_dc (n, 3)``, and ``shN (n, k, 3)`` or
+            ``features_rest (n, k, 3)``, which may be missing. A common prefix such as
+            ``_model.gauss_params.`` is fine; names without it are then not looked at.
+        activated: Whether scales and opacities are what one sees (above 0; from 0 to 1) rather
+            than logarithms and logits, which both models hold.
+
+    Returns:
+        The scene, on the device of the tensors.
+
+    Raises:
+        InvalidSceneError: A name is missing, unknown or double, or a value does not fit.
+
+    Example:
+        >>> scene = from_dict({
+        ...     "means": torch.zeros(2, 3), "quats": torch.ones(2, 4), "scales": torch.ones(2, 3),
+        ...     "opacities": torch.tensor([0.5, 0.5]), "sh0": torch.zeros(2, 1, 3),
+        ... }, activated=True)
+        >>> scene.log_scales[0].tolist(), scene.logit_opacities.tolist()
+        ([0.0, 0.0, 0.0], [0.0, 0.0])
+    """
+    tensors = {name: _as_tensor(key, mapping[key]) for name, key in _keys(mapping).items()}
+    dtype = _common_dtype(tensors)
+    tensors = {name: tensor.to(dtype) for name, tensor in tensors.items()}
+    if tensors["sh0"].ndim == 2:
+        tensors["sh0"] = tensors["sh0"][:, None, :]
+    if tensors["logit_opacities"].ndim == 2 and tensors["logit_opacities"].shape[1] == 1:
+        tensors["logit_opacities"] = tensors["logit_opacities"][:, 0]
+    if "shN" not in tensors:
+        tensors["shN"] = tensors["means"].new_zeros(len(tensors["means"]), 0, 3)
+    if activated:
+        tensors["log_scales"] = _stored_scales(tensors["log_scales"])
+        tensors["logit_opacities"] = _stored_opacities(tensors["logit_opacities"])
+    return GaussianScene(**tensors, extras={}, comments=(), layout=())
+
+
+def to_dict(scene: GaussianScene) -> dict[str, Tensor]:
+    """Give a scene as the dictionary that gsplat trains.
+
+    Args:
+        scene: The scene.
+
+    Returns:
+        ``means (n, 3)``, ``quats (n, 4)`` w first, ``scales (n, 3)`` as logarithms, ``opacities
+        (n,)`` as logits, ``sh0 (n, 1, 3)``, ``shN (n, k, 3)``; they share memory with the scene.
+        Extra columns, comments and layout are not in it.
+
+    Example:
+        >>> scene = from_dict({
+        ...     "means": torch.zeros(2, 3), "quats": torch.ones(2, 4), "scales": torch.ones(2, 3),
+        ...     "opacities": torch.zeros(2), "sh0": torch.zeros(2, 1, 3),
+        ... })
+        >>> list(to_dict(scene))
+        ['means', 'quats', 'scales', 'opacities', 'sh0', 'shN']
+    """
+    return {
+        "means": scene.means,
+        "quats": scene.quats,
+        "scales": scene.log_scales,
+        "opacities": scene.logit_opacities,
+        "sh0": scene.sh0,
+        "shN": scene.shN,
+    }
+
+
+def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
+    """Find the key of each scene tensor."""
+    prefix = _prefix(mapping)
+    keys: dict[str, str] = {}
+    for key in mapping:
+        if not key.startswith(prefix):
+            continue
+        name = _TENSORS.get(key.removeprefix(prefix))
+        if name is None:
+            raise InvalidSceneError(f"the names must be {_known()}, found {key!r}.")
+        if name in keys:
+            raise InvalidSceneError(
+                f"a dictionary must give {name} once, found {keys[name]!r} and {key!r}."
+            )
+        keys[name] = key
+    missing = [
+        known
+        for known in ("means", "quats", "scales", "opacities", "sh0")
+        if _TENSORS[known] not in keys
+    ]
+    if missing:
+        raise InvalidSceneError(
+            f"a dictionary must hold {_known()}, found none named {', '.join(missing)}."
+        )
+    return keys
+
+
+def _prefix(mapping: Mapping[str, Any]) -> str:
+    """Give what stands before ``means``, up to a dot."""
+    found = [key for key in mapping if key == "means" or key.endswith(".means")]
+    if len(found) > 1:
+        raise InvalidSceneError(
+            f"a dictionary must give means once, found {' and '.join(map(repr, found))}."
+        )
+    return found[0].removesuffix("means") if found else ""
+
+
+def _known() -> str:
+    return (
+        "means, quats, scales, opacities, sh0 (or features_dc) and, above SH degree 0, "
+        "shN (or features_rest)"
+    )
+
+
+def _as_tensor(key: str, value: Tensor | NDArray[Any]) -> Tensor:
+    if isinstance(value, np.ndarray):
+        native = value.dtype.newbyteorder("=")
+        value = torch.from_numpy(value.astype(native)) if native.kind == "f" else value
+    if not isinstance(value, Tensor) or not value.is_floating_point():
+        raise InvalidSceneError(
+            f"{key} must be a torch.Tensor or numpy array of floats, "
+            f"found {getattr(value, 'dtype', type(value).__name__)}."
+        )
+    return value.detach()
+
+
+def _common_dtype(tensors: Mapping[str, Tensor]) -> torch.dtype:
+    double = any(tensor.dtype == torch.float64 for tensor in tensors.values())
+    return torch.float64 if double else torch.float32
+
+
+def _stored_scales(scales: Tensor) -> Tensor:
+    _check_values("scales", scales < 0, required="at least 0")
+    return activations.positive_log(scales)
+
+
+def _stored_opacities(opacities: Tensor) -> Tensor:
+    _check_values("opacities", (opacities < 0) | (opacities > 1), required="from 0 to 1")
+    return activations.logit_from_opacity(opacities)
+
+
+def _check_values(name: str, wrong: Tensor, *, required: str) -> None:
+    rows = wrong.reshape(len(wrong), -1).any(dim=1)
+    count = int(rows.sum())
+    if count:
+        raise InvalidSceneError(
+            f"activated {name} must be {required}, found {count:,} rows that are not, "
+            f"the first is row {int(rows.nonzero()[0])}; pass activated=False for stored values."
+        )

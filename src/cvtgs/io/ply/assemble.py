@@ -1,0 +1,94 @@
+"""Columns of a file become the tensors of a scene."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cvtgs.io.ply.properties import (
+    FLAT_LOG_SCALE,
+    NORMALS,
+    SCALARS,
+    Layout,
+    dtype_of,
+    is_standard,
+    rest_count_of,
+    standard_slots,
+)
+from cvtgs.scene import GaussianScene
+
+
+def assemble(
+    chunks: Iterable[NDArray[Any]], *, count: int, layout: Layout, comments: tuple[str, ...]
+) -> GaussianScene:
+    """Copy rows into a new scene, chunk by chunk.
+
+    Memory is the scene plus what ``chunks`` holds.
+
+    Args:
+        chunks: Structured arrays that together have ``count`` rows, a field per property.
+        count: Number of Gaussians, n.
+        layout: Names and types of the scalar properties, all standard ones of an SH degree
+            among them (``scale_2`` may be missing).
+        comments: Comment lines of the file.
+
+    Returns:
+        The scene; all-zero normals are in its layout only, other unknown columns are extras.
+    """
+    types = dict(layout)
+    tensors = _empty_tensors(count, rest_count_of(types) or 0, dtype_of(layout))
+    extras = {
+        name: torch.empty(count, dtype=SCALARS[kind].dtype)
+        for name, kind in layout
+        if not is_standard(name) and name not in NORMALS
+    }
+    columns = {**_standard_columns(tensors, types), **{k: v.numpy() for k, v in extras.items()}}
+    if "scale_2" not in types:
+        tensors["log_scales"][:, 2] = FLAT_LOG_SCALE
+    normals: dict[str, Tensor] = {}
+    start = 0
+    for rows in chunks:
+        stop = start + len(rows)
+        if not normals and any(rows[name].any() for name in NORMALS if name in types):
+            normals = {
+                name: torch.zeros(count, dtype=SCALARS[types[name]].dtype)
+                for name in NORMALS
+                if name in types
+            }
+            columns.update({name: normal.numpy() for name, normal in normals.items()})
+        with np.errstate(over="ignore", invalid="ignore"):
+            for name, column in columns.items():
+                column[start:stop] = rows[name]
+        start = stop
+    carried = {**extras, **normals}
+    return GaussianScene(
+        **tensors,
+        extras={name: carried[name] for name in types if name in carried},
+        comments=comments,
+        layout=layout,
+    )
+
+
+def _empty_tensors(count: int, rest_count: int, dtype: torch.dtype) -> dict[str, Tensor]:
+    shapes = {
+        "means": (count, 3),
+        "quats": (count, 4),
+        "log_scales": (count, 3),
+        "logit_opacities": (count,),
+        "sh0": (count, 1, 3),
+        "shN": (count, rest_count, 3),
+    }
+    return {name: torch.empty(shape, dtype=dtype) for name, shape in shapes.items()}
+
+
+def _standard_columns(tensors: dict[str, Tensor], types: dict[str, str]) -> dict[str, NDArray[Any]]:
+    """Give a writable view of every standard column that the file has, in file order."""
+    slots = standard_slots(tensors["shN"].shape[1])
+    return {
+        name: tensors[slots[name].tensor].numpy()[slots[name].rows]
+        for name in types
+        if name in slots
+    }

@@ -1,0 +1,210 @@
+"""The header of a PLY file, parsed to a small typed object."""
+
+import re
+from dataclasses import dataclass
+from typing import BinaryIO, Literal, NoReturn, get_args
+
+import numpy as np
+
+from cvtgs.errors import FileFormatError
+from cvtgs.io.ply.properties import FLOAT_TYPES, SCALARS, TYPE_NAMES
+
+Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
+
+MAX_HEADER_BYTES = 1 << 20
+"""Longer headers are refused; a 3DGS header has about two thousand bytes."""
+
+_MAX_COUNT_DIGITS = 18
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Property:
+    """One property line.
+
+    Attributes:
+        name: Its name.
+        type: Canonical name of the number type (of the items, for a list).
+        count_type: Number type of the length of a list; None for a plain number.
+    """
+
+    name: str
+    type: str
+    count_type: str | None = None
+
+    @property
+    def least_bytes(self) -> int:
+        """Bytes in a binary row; for a list, those of an empty one."""
+        return np.dtype(SCALARS[self.count_type or self.type].code).itemsize
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Element:
+    """One element: a table of rows.
+
+    Attributes:
+        name: Its name.
+        count: The number of rows that the header promises.
+        properties: What each row holds, in order.
+    """
+
+    name: str
+    count: int
+    properties: tuple[Property, ...]
+
+    @property
+    def has_lists(self) -> bool:
+        """Whether rows differ in length."""
+        return any(prop.count_type for prop in self.properties)
+
+    def row_bytes(self, encoding: Encoding) -> int:
+        """Give the least size of a row.
+
+        Args:
+            encoding: How the file stores numbers.
+
+        Returns:
+            Bytes; exact for binary rows without lists.
+        """
+        if encoding == "ascii":
+            return 2 * len(self.properties)
+        return sum(prop.least_bytes for prop in self.properties)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Header:
+    """What a PLY header says.
+
+    Attributes:
+        encoding: How the file stores numbers.
+        elements: The tables, in file order.
+        comments: Comment lines, wherever they stood, in order.
+        data_offset: Where the first row starts, in bytes.
+    """
+
+    encoding: Encoding
+    elements: tuple[Element, ...]
+    comments: tuple[str, ...]
+    data_offset: int
+
+
+def read_header(file: BinaryIO, path: str) -> Header:
+    r"""Parse the header of a PLY file.
+
+    Lines may end in LF, CRLF or CR and have trailing blanks; blank lines are skipped.
+
+    Args:
+        file: The file, at its start.
+        path: Its name, for error texts.
+
+    Returns:
+        The header.
+
+    Raises:
+        FileFormatError: This is no PLY header.
+
+    Example:
+        >>> import io
+        >>> text = b"ply\nformat ascii 1.0\nelement vertex 1\nend_header\n"
+        >>> header = read_header(io.BytesIO(text), "point.ply")
+        >>> header.elements[0].count, header.data_offset
+        (1, 49)
+    """
+    lines, data_offset = _header_lines(file.read(MAX_HEADER_BYTES), path)
+    encoding: Encoding | None = None
+    tables: list[tuple[str, int, list[Property]]] = []
+    comments: list[str] = []
+    for number, line in enumerate(lines, start=2):
+        match line.split():
+            case [] | ["obj_info", *_]:
+                pass
+            case ["comment", *_]:
+                comments.append(line.lstrip()[len("comment ") :].rstrip())
+            case ["format", kind, "1.0"] if encoding is None and kind in get_args(Encoding):
+                encoding = kind  # type: ignore[assignment]
+            case ["element", name, count] if _is_count(count):
+                tables.append((name, int(count), []))
+            case ["property", "list", length, kind, name] if tables and _is_list(length, kind):
+                tables[-1][2].append(
+                    Property(name=name, type=TYPE_NAMES[kind], count_type=TYPE_NAMES[length])
+                )
+            case ["property", kind, name] if tables and kind in TYPE_NAMES:
+                tables[-1][2].append(Property(name=name, type=TYPE_NAMES[kind]))
+            case _:
+                _refuse(path, number, line)
+    if encoding is None:
+        raise FileFormatError(f"{path}: the PLY header must have a format line, found none.")
+    elements = tuple(
+        Element(name=name, count=count, properties=tuple(properties))
+        for name, count, properties in tables
+    )
+    _check_unique(elements, path)
+    return Header(
+        encoding=encoding,
+        elements=elements,
+        comments=tuple(comments),
+        data_offset=data_offset,
+    )
+
+
+def _header_lines(block: bytes, path: str) -> tuple[list[str], int]:
+    """Give the lines between ``ply`` and ``end_header``, and where the data starts."""
+    if not block:
+        raise FileFormatError(f"{path}: must be a PLY file, found an empty file.")
+    first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", block)
+    if not first:
+        raise FileFormatError(
+            f"{path}: a PLY file must start with the line 'ply', found {block[:8]!r}."
+        )
+    old_mac = first[1] == b"\r"
+    newline, blanks = (b"\r", rb"[ \t]*") if old_mac else (b"\n", rb"[ \t]*\r?")
+    end = re.compile(newline + rb"[ \t]*end_header" + blanks + newline).search(
+        block, first.end() - 1
+    )
+    if not end:
+        whole = len(block) < MAX_HEADER_BYTES
+        where = "the file" if whole else f"the first {MAX_HEADER_BYTES:,} bytes"
+        raise FileFormatError(
+            f"{path}: the PLY header must end with a line 'end_header', found none in {where}."
+        )
+    lines = block[first.end() : max(first.end(), end.start())].split(newline)
+    return [_decode(line).replace("\n", " ") for line in lines], end.end()
+
+
+def _decode(line: bytes) -> str:
+    try:
+        return line.decode("utf-8")
+    except UnicodeDecodeError:
+        return line.decode("latin-1")
+
+
+def _is_count(text: str) -> bool:
+    return text.isascii() and text.isdecimal() and len(text) <= _MAX_COUNT_DIGITS
+
+
+def _is_list(length: str, kind: str) -> bool:
+    return kind in TYPE_NAMES and TYPE_NAMES.get(length, "float") not in FLOAT_TYPES
+
+
+def _refuse(path: str, number: int, line: str) -> NoReturn:
+    raise FileFormatError(
+        f"{path}: line {number} of the PLY header must be a valid format, element, property or "
+        f"comment line, found {line.strip()[:80]!r}."
+    )
+
+
+def _check_unique(elements: tuple[Element, ...], path: str) -> None:
+    tables: set[str] = set()
+    for element in elements:
+        if element.name in tables:
+            raise FileFormatError(
+                f"{path}: elements must have different names, found {element.name!r} twice."
+            )
+        tables.add(element.name)
+        columns: set[str] = set()
+        for prop in element.properties:
+            if prop.name in columns:
+                raise FileFormatError(
+                    f"{path}: properties of element {element.name!r} must have different names, "
+                    f"found {prop.name!r} twice."
+                )
+            columns.add(prop.name)

@@ -1,0 +1,81 @@
+"""Read a 3DGS scene from a PLY file."""
+
+import os
+import stat
+import warnings
+from pathlib import Path
+from typing import BinaryIO
+
+from cvtgs.errors import DroppedDataWarning, InputError, InputNotFoundError
+from cvtgs.io.ply import fast, generic
+from cvtgs.io.ply.assemble import assemble
+from cvtgs.io.ply.header import Element, Header, read_header
+from cvtgs.io.ply.vertices import check_size, find_vertices, layout_of
+from cvtgs.scene import GaussianScene
+
+
+def read_ply(path: Path) -> GaussianScene:
+    """Read a scene from a PLY file of any encoding, property order and number type.
+
+    The common layout (binary little endian, vertices first) is memory-mapped, the rest goes
+    through plyfile; both give the same scene.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The scene, on the CPU. Values are returned as they are, NaN and infinity too.
+
+    Raises:
+        InputNotFoundError: There is no such file.
+        InputError: It cannot be opened or read.
+        FileFormatError: It is not a PLY file of a 3DGS scene, or damaged.
+    """
+    try:
+        with path.open("rb") as file:
+            return _read(file, str(path))
+    except FileNotFoundError as error:
+        raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
+    except IsADirectoryError as error:
+        raise InputError(f"{path}: must be a file, found a directory.") from error
+    except OSError as error:
+        if isinstance(error, InputError):
+            raise
+        reason = (error.strerror or str(error)).lower()
+        raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
+
+
+def _read(file: BinaryIO, path: str) -> GaussianScene:
+    status = os.fstat(file.fileno())
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path}: must be a regular file, found a device or a pipe.")
+    header = read_header(file, path)
+    vertex = find_vertices(header, path)
+    check_size(header, vertex, path=path, size=status.st_size)
+    if fast.can_read(header):
+        chunks = fast.read_chunks(file, header)
+    else:
+        chunks = generic.read_chunks(file, header, vertex=vertex, path=path)
+    scene = assemble(chunks, count=vertex.count, layout=layout_of(vertex), comments=header.comments)
+    _warn_of_dropped(header, vertex, path)
+    return scene
+
+
+def _warn_of_dropped(header: Header, vertex: Element, path: str) -> None:
+    dropped = [
+        f"element {element.name!r} ({element.count:,} rows)"
+        for element in header.elements
+        if element is not vertex and element.count > 0
+    ]
+    dropped += [
+        f"list property {prop.name!r} of 'vertex' ({vertex.count:,} rows)"
+        for prop in vertex.properties
+        if prop.count_type
+    ]
+    if dropped:
+        warnings.warn(
+            f"{path}: left out {', '.join(dropped)}, since a scene holds one number per Gaussian "
+            f"and property.",
+            DroppedDataWarning,
+            stacklevel=5,
+        )

@@ -1,0 +1,73 @@
+"""A robust frame of reference: where the bulk of a scene is, and how large."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+RADIUS_QUANTILE = 0.7
+"""The share of points within the radius of a frame."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RobustFrame:
+    """A centre and a radius that a minority of outliers cannot move.
+
+    Attributes:
+        center: ``(3,)`` median of each coordinate, float64.
+        radius: The 70 % quantile of the distance to the centre; positive.
+    """
+
+    center: Float[Tensor, "3"]
+    radius: float
+
+    def normalize(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Express points relative to the centre, in radii.
+
+        Args:
+            points: Finite positions, scene units.
+
+        Returns:
+            Positions in float64.
+        """
+        return (points.double() - self.center) / self.radius
+
+    def contract(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Express points in radii and pull those beyond the first radius into the second.
+
+        A point at distance d > 1 goes to distance ``2 - 1/d`` in the same direction, the map of
+        mip-NeRF 360 (Barron et al. 2022, equation 10).
+
+        Args:
+            points: Finite positions, scene units.
+
+        Returns:
+            Positions in float64, all within a ball of radius 2.
+        """
+        local = self.normalize(points)
+        distance: Tensor = torch.linalg.vector_norm(local, dim=1, keepdim=True).clamp_min(1.0)
+        return local * ((2.0 - 1.0 / distance) / distance)
+
+
+def robust_frame(points: Float[Tensor, "n 3"]) -> RobustFrame:
+    """Find the robust frame of points.
+
+    Args:
+        points: Finite positions, at least one.
+
+    Returns:
+        The frame. If more than 70 % of the points coincide, the radius is the largest distance,
+        and 1 if all do.
+
+    Example:
+        >>> frame = robust_frame(torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
+        >>> frame.center.tolist(), frame.radius
+        ([1.0, 0.0, 0.0], 1.0)
+    """
+    center = torch.stack([column.median() for column in points.unbind(1)]).double()
+    distances = torch.linalg.vector_norm(points.double() - center, dim=1)
+    rank = max(1, math.ceil(RADIUS_QUANTILE * len(points)))
+    radius = float(distances.kthvalue(rank).values) or float(distances.amax()) or 1.0
+    return RobustFrame(center=center, radius=radius)

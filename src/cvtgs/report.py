@@ -1,0 +1,167 @@
+"""SimplifyReport: what was done, what was left out, and what it cost."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pydantic
+import torch
+
+from cvtgs.config import SimplifyConfig
+from cvtgs.effects import EffectPlan
+from cvtgs.progress import ProgressEvent, ProgressListener
+
+
+class _Record(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
+
+
+class StageCost(_Record):
+    """What one stage cost.
+
+    Attributes:
+        stage: Name of the stage.
+        seconds: Wall-clock seconds.
+        cpu_seconds: Processor seconds of the whole process.
+        peak_memory_bytes: Largest resident size of the process up to the end of the stage, or 0
+            where the system does not tell; it never falls from stage to stage.
+        peak_device_memory_bytes: The same for tensors on a CUDA device, 0 elsewhere.
+    """
+
+    stage: str
+    seconds: float
+    cpu_seconds: float
+    peak_memory_bytes: int
+    peak_device_memory_bytes: int = 0
+
+
+class SimplifyReport(_Record):
+    """What a simplification did.
+
+    Attributes:
+        input_count: Gaussians in, N.
+        output_count: Gaussians out.
+        target_count: ``ceil(rho * N)``, or the count that was asked for.
+        rho: ``target_count / input_count``.
+        invalid_rows: Rows that were dropped, by the attribute that is NaN, infinite or zero. A
+            row with several bad attributes counts once for each.
+        invalid_count: Rows that were dropped.
+        shortfall: Why ``output_count`` is below ``target_count``, else empty.
+        filtered_count: Faint Gaussians that were left out of the tessellation.
+        filtered_mass_share: Their share of the mass.
+        single_member_cells: Cells of one Gaussian, which was kept as it is.
+        largest_cell: Members of the largest cell.
+        refilled_cells: Cells that were empty after Lloyd and took a Gaussian from another.
+        mass_in: Opacity times mean projected area of the input, squared scene units.
+        mass_out: The same of the output.
+        energies: Energy of the tessellation before every move of Lloyd, over the Gaussians that
+            Lloyd looked at, in squared robust radii.
+        energy: The same of the final cells, over all Gaussians.
+        backend: What searched the nearest site.
+        device: Where it ran.
+        plan: The effects that the scene called for.
+        stages: What each stage cost.
+        config: The configuration.
+    """
+
+    input_count: int
+    output_count: int
+    target_count: int
+    rho: float
+    invalid_rows: dict[str, int] = {}
+    invalid_count: int = 0
+    shortfall: str = ""
+    filtered_count: int = 0
+    filtered_mass_share: float = 0.0
+    single_member_cells: int = 0
+    largest_cell: int = 0
+    refilled_cells: int = 0
+    mass_in: float = 0.0
+    mass_out: float = 0.0
+    energies: tuple[float, ...] = ()
+    energy: float = 0.0
+    backend: str = "none"
+    device: str = "cpu"
+    plan: EffectPlan | None = None
+    stages: tuple[StageCost, ...] = ()
+    config: SimplifyConfig
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock seconds of all stages."""
+        return sum(stage.seconds for stage in self.stages)
+
+    def to_json(self) -> str:
+        """Give the report as indented JSON.
+
+        Returns:
+            JSON text that ends with a line break.
+        """
+        return self.model_dump_json(indent=2) + "\n"
+
+
+class StageClock:
+    """Measures stages one after the other and tells a listener about them.
+
+    Args:
+        listener: Told when a stage starts, advances and ends.
+        device: Where the stages compute; CUDA work is waited for.
+    """
+
+    def __init__(self, listener: ProgressListener, device: torch.device) -> None:
+        self._listener = listener
+        self._device = device
+        self.costs: list[StageCost] = []
+
+    @contextmanager
+    def stage(self, name: str, total: int = 1) -> Iterator[Callable[[int], None]]:
+        """Measure what happens inside.
+
+        Args:
+            name: Name of the stage.
+            total: Steps of the stage.
+
+        Yields:
+            A function to call with the number of steps that are done.
+        """
+
+        def advance(done: int) -> None:
+            self._listener(ProgressEvent(stage=name, done=done, total=total))
+
+        advance(0)
+        wall, cpu = time.perf_counter(), time.process_time()
+        yield advance
+        on_cuda = self._device.type == "cuda"
+        if on_cuda:
+            torch.cuda.synchronize(self._device)
+        self.costs.append(
+            StageCost(
+                stage=name,
+                seconds=time.perf_counter() - wall,
+                cpu_seconds=time.process_time() - cpu,
+                peak_memory_bytes=peak_memory_bytes(),
+                peak_device_memory_bytes=(
+                    torch.cuda.max_memory_allocated(self._device) if on_cuda else 0
+                ),
+            )
+        )
+        advance(total)
+
+
+def peak_memory_bytes() -> int:
+    """Give the largest resident size of this process so far.
+
+    Returns:
+        Bytes; 0 where the system does not tell (Windows).
+
+    Example:
+        >>> peak_memory_bytes() >= 0
+        True
+    """
+    try:
+        import resource  # noqa: PLC0415 (not on Windows)
+    except ImportError:
+        return 0
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak

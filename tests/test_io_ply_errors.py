@@ -1,0 +1,300 @@
+"""What damaged and foreign files get: one sentence, word for word."""
+
+import os
+import struct
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+
+from cvtgs.errors import FileFormatError, InputError, InputNotFoundError
+from cvtgs.io import load
+from cvtgs.io.ply.header import MAX_HEADER_BYTES
+from ply_files import gaussian_properties, gaussian_rows, ply_bytes
+
+PROPERTIES = gaussian_properties()
+ROWS = gaussian_rows(PROPERTIES, 3)
+GOOD = ply_bytes(PROPERTIES, ROWS)
+ASCII = ply_bytes(PROPERTIES, ROWS, encoding="ascii")
+ROW_BYTES = 17 * 4
+
+NEEDED = (
+    "a 3DGS scene must have the 'vertex' properties x, y, z, f_dc_0..2, opacity, scale_0..1 and "
+    "rot_0..3, found none named "
+)
+SHORT = "the file is cut short: its header promises"
+
+
+def without(*names: str) -> bytes:
+    properties = [p for p in PROPERTIES if p[0] not in names]
+    return ply_bytes(properties, gaussian_rows(properties, 1))
+
+
+def with_rest(*numbers: int) -> bytes:
+    properties = [*PROPERTIES, *((f"f_rest_{i}", "float") for i in numbers)]
+    return ply_bytes(properties, gaussian_rows(properties, 1))
+
+
+def with_list(name: str) -> bytes:
+    properties = [(p, "list uchar float" if p == name else kind) for p, kind in PROPERTIES]
+    row = [[1.0] if p == name else 0.0 for p, _ in PROPERTIES]
+    return ply_bytes(properties, [row])
+
+
+def ascii_row(number: int, change: Callable[[list[str]], None]) -> bytes:
+    lines = ASCII.decode().splitlines()
+    at = lines.index("end_header") + 1 + number
+    words = lines[at].split()
+    change(words)
+    lines[at] = " ".join(words)
+    return ("\n".join(lines) + "\n").encode()
+
+
+def put(index: int, word: str) -> Callable[[list[str]], None]:
+    return lambda words: words.__setitem__(index, word)
+
+
+HEADER_CASES: Mapping[str, tuple[bytes, str]] = {
+    "empty": (b"", "must be a PLY file, found an empty file."),
+    "not a ply": (
+        b"\x89PNG\r\n\x1a\n....",
+        "a PLY file must start with the line 'ply', found b'\\x89PNG\\r\\n\\x1a\\n'.",
+    ),
+    "plywood": (b"plywood", "a PLY file must start with the line 'ply', found b'plywood'."),
+    "no end": (
+        GOOD[:200],
+        "the PLY header must end with a line 'end_header', found none in the file.",
+    ),
+    "endless": (
+        b"ply\n" + b"comment no end_header here\n" * (MAX_HEADER_BYTES // 20),
+        "the PLY header must end with a line 'end_header', found none in the first "
+        "1,048,576 bytes.",
+    ),
+    "nothing": (
+        b"ply\nend_header\n",
+        "the PLY header must have a format line, found none.",
+    ),
+    "version": (
+        GOOD.replace(b"endian 1.0", b"endian 2.0"),
+        "line 2 of the PLY header must be a valid format, element, property or comment line, "
+        "found 'format binary_little_endian 2.0'.",
+    ),
+    "negative count": (
+        GOOD.replace(b"vertex 3", b"vertex -3"),
+        "line 3 of the PLY header must be a valid format, element, property or comment line, "
+        "found 'element vertex -3'.",
+    ),
+    "absurd count": (
+        GOOD.replace(b"vertex 3", b"vertex " + b"9" * 5000),
+        "line 3 of the PLY header must be a valid format, element, property or comment line, "
+        "found 'element vertex " + "9" * 65 + "'.",
+    ),
+    "unknown type": (
+        GOOD.replace(b"property float opacity", b"property half opacity"),
+        "line 13 of the PLY header must be a valid format, element, property or comment line, "
+        "found 'property half opacity'.",
+    ),
+    "list of odd length type": (
+        GOOD.replace(b"property float nx", b"property list float int nx"),
+        "line 7 of the PLY header must be a valid format, element, property or comment line, "
+        "found 'property list float int nx'.",
+    ),
+    "property first": (
+        b"ply\nformat ascii 1.0\nproperty float x\nend_header\n",
+        "line 3 of the PLY header must be a valid format, element, property or comment line, "
+        "found 'property float x'.",
+    ),
+    "element twice": (
+        ply_bytes(PROPERTIES, ROWS, after={"vertex2": ([("q", "int")], [[1]])}).replace(
+            b"vertex2", b"vertex"
+        ),
+        "elements must have different names, found 'vertex' twice.",
+    ),
+    "property twice": (
+        GOOD.replace(b"float rot_3", b"float rot_2"),
+        "properties of element 'vertex' must have different names, found 'rot_2' twice.",
+    ),
+}
+
+VERTEX_CASES: Mapping[str, tuple[bytes, str]] = {
+    "no vertex": (
+        GOOD.replace(b"element vertex", b"element splat"),
+        "must have an element 'vertex', found 'splat'.",
+    ),
+    "no element": (
+        b"ply\nformat ascii 1.0\nend_header\n",
+        "must have an element 'vertex', found no element.",
+    ),
+    "no rows": (
+        ply_bytes(PROPERTIES, []),
+        "must hold at least one Gaussian, found 'element vertex 0'.",
+    ),
+    "one missing": (without("opacity"), NEEDED + "opacity."),
+    "many missing": (without("y", "rot_0", "f_dc_2"), NEEDED + "y, f_dc_2, rot_0."),
+    "list": (
+        with_list("scale_1"),
+        "property 'scale_1' of 'vertex' must be a number, found a list.",
+    ),
+    "odd f_rest": (
+        with_rest(*range(10)),
+        "'vertex' must have 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3), found 10.",
+    ),
+    "f_rest gap": (
+        with_rest(0, 1, 2, 4, 5, 6, 7, 8, 9),
+        "the 9 f_rest properties of 'vertex' must be numbered from 0 without gaps, "
+        "found no f_rest_3.",
+    ),
+    "compressed": (
+        ply_bytes(
+            [("packed_position", "uint"), ("packed_rotation", "uint")],
+            [[1, 2]],
+            before={"chunk": ([("min_x", "float")], [[0.0]])},
+        ),
+        "must be an uncompressed PLY, found a compressed one (PlayCanvas: 'packed_position'), "
+        "which cvtgs does not read yet; convert it to a plain PLY first, for example with "
+        "splat-transform.",
+    ),
+}
+
+FACES = {"face": ([("corners", "list char int")], [[[0, 1, 2]], [[2, 1, 0]]])}
+WITH_FACES = ply_bytes(PROPERTIES, ROWS, before=FACES)
+FACE_START = WITH_FACES.index(b"end_header\n") + 11
+
+DATA_CASES: Mapping[str, tuple[bytes, str]] = {
+    "cut": (GOOD[: -ROW_BYTES - 1], f"{SHORT} 3 rows of 'vertex', found 1."),
+    "header only": (
+        GOOD[: -3 * ROW_BYTES],
+        f"{SHORT} 3 rows of 'vertex', found 0.",
+    ),
+    "lying": (
+        GOOD.replace(b"vertex 3", b"vertex 99999999999999"),
+        f"{SHORT} 99,999,999,999,999 rows of 'vertex', found 3.",
+    ),
+    "big endian cut": (
+        ply_bytes(PROPERTIES, ROWS, encoding="binary_big_endian")[:-1],
+        f"{SHORT} 3 rows of 'vertex', found 2.",
+    ),
+    "lying ascii": (
+        ASCII.replace(b"vertex 3", b"vertex 99999999999999"),
+        f"{SHORT} 99,999,999,999,999 rows of 'vertex', found room for at most 6.",
+    ),
+    "cut ascii": (
+        ASCII.replace(b"vertex 3", b"vertex 5"),
+        f"{SHORT} 5 rows of 'vertex', found 3.",
+    ),
+    "cut behind faces": (
+        WITH_FACES[:-1],
+        f"{SHORT} 3 rows of 'vertex', found 2.",
+    ),
+    "list longer than the file": (
+        WITH_FACES[:FACE_START] + b"\x7f" + WITH_FACES[FACE_START + 1 :],
+        f"{SHORT} 3 rows of 'vertex', found 1.",
+    ),
+    "list of negative length": (
+        WITH_FACES[:FACE_START] + b"\xff" + WITH_FACES[FACE_START + 1 :],
+        f"{SHORT} 2 rows of 'face', found 0.",
+    ),
+    "word": (
+        ascii_row(1, put(9, "opaque")),
+        "row 1 of 'vertex': property 'opacity' must be a float, found something unreadable.",
+    ),
+    "not ascii": (
+        ascii_row(2, put(0, "１")),
+        "row 2 of 'vertex': property 'x' must be a float, found something unreadable.",
+    ),
+    "number too few": (
+        ascii_row(0, lambda words: words.pop(-1) and None),
+        "row 0 of 'vertex' must have a value for property 'rot_3', found the end of the line.",
+    ),
+    "number too many": (
+        ascii_row(2, lambda words: words.append("1")),
+        "row 2 of 'vertex' must hold 17 values, found more.",
+    ),
+}
+
+
+@pytest.mark.parametrize("cases", [HEADER_CASES, VERTEX_CASES, DATA_CASES])
+def test_each_damage_has_its_sentence(
+    tmp_path: Path, subtests: pytest.Subtests, cases: Mapping[str, tuple[bytes, str]]
+) -> None:
+    path = tmp_path / "damaged.ply"
+    for name, (data, text) in cases.items():
+        with subtests.test(name):
+            path.write_bytes(data)
+            with pytest.raises(FileFormatError) as caught:
+                load(path)
+            assert str(caught.value) == f"{path}: {text}"
+
+
+def test_integers_out_of_range_are_an_error(tmp_path: Path) -> None:
+    properties = [("label", "uchar"), *PROPERTIES]
+    rows = [[7, *row] for row in ROWS]
+    data = ply_bytes(properties, rows, encoding="ascii").replace(
+        b"end_header\n7", b"end_header\n300"
+    )
+    (tmp_path / "s.ply").write_bytes(data)
+    with pytest.raises(FileFormatError, match=r"^\S*s\.ply: .*must be a"):
+        load(tmp_path / "s.ply")
+
+
+def test_no_cut_of_a_file_leaks_a_foreign_error(tmp_path: Path) -> None:
+    path = tmp_path / "s.ply"
+    for data in (GOOD, ASCII, WITH_FACES):
+        for length in range(0, len(data) - 1, 7):
+            path.write_bytes(data[:length])
+            with pytest.raises(FileFormatError):
+                load(path)
+
+
+def test_file_not_found(tmp_path: Path) -> None:
+    path = tmp_path / "none.ply"
+    with pytest.raises(InputNotFoundError) as caught:
+        load(path)
+    assert str(caught.value) == f"{path}: the file to read must exist, found none."
+    assert isinstance(caught.value, FileNotFoundError)
+
+
+@pytest.mark.parametrize("name", ["folder", "folder.ply"])
+def test_a_directory_is_no_file(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.mkdir()
+    with pytest.raises(InputError) as caught:
+        load(path)
+    assert str(caught.value) == f"{path}: must be a file, found a directory."
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs /dev/null")
+def test_a_device_is_no_file() -> None:
+    with pytest.raises(InputError) as caught:
+        load("/dev/null")
+    assert str(caught.value) == "/dev/null: must be a regular file, found a device or a pipe."
+
+
+def test_no_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "s.ply"
+    path.write_bytes(GOOD)
+
+    def refuse(*args: object) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(InputError) as caught:
+        load(path)
+    assert str(caught.value) == f"{path}: the file must be readable, found: permission denied."
+
+
+@pytest.mark.parametrize(
+    ("name", "found"), [("s.splat", "the suffix '.splat'"), ("s", "no suffix")]
+)
+def test_unknown_suffix(tmp_path: Path, name: str, found: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(struct.pack("<f", 0.0))
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    assert str(caught.value) == f"{path}: the file name must end in .ply, found {found}."
+
+
+def test_suffixes_ignore_case(tmp_path: Path) -> None:
+    path = tmp_path / "S.PLY"
+    path.write_bytes(GOOD)
+    assert len(load(path)) == 3
