@@ -1,13 +1,14 @@
 """What damaged and foreign files get: one sentence, word for word."""
 
-import os
-import struct
+import contextlib
+import random
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
 
-from cvtgs.errors import FileFormatError, InputError, InputNotFoundError
+from cvtgs.errors import DroppedDataWarning, FileFormatError
 from cvtgs.io import load
 from cvtgs.io.ply.header import MAX_HEADER_BYTES
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
@@ -176,7 +177,7 @@ DATA_CASES: Mapping[str, tuple[bytes, str]] = {
     ),
     "lying ascii": (
         ASCII.replace(b"vertex 3", b"vertex 99999999999999"),
-        f"{SHORT} 99,999,999,999,999 rows of 'vertex', found room for at most 6.",
+        f"{SHORT} 99,999,999,999,999 rows of 'vertex', found room for at most 7.",
     ),
     "cut ascii": (
         ASCII.replace(b"vertex 3", b"vertex 5"),
@@ -188,7 +189,7 @@ DATA_CASES: Mapping[str, tuple[bytes, str]] = {
     ),
     "list longer than the file": (
         WITH_FACES[:FACE_START] + b"\x7f" + WITH_FACES[FACE_START + 1 :],
-        f"{SHORT} 3 rows of 'vertex', found 1.",
+        f"{SHORT} 2 rows of 'face', found 0.",
     ),
     "list of negative length": (
         WITH_FACES[:FACE_START] + b"\xff" + WITH_FACES[FACE_START + 1 :],
@@ -199,7 +200,7 @@ DATA_CASES: Mapping[str, tuple[bytes, str]] = {
         "row 1 of 'vertex': property 'opacity' must be a float, found something unreadable.",
     ),
     "not ascii": (
-        ascii_row(2, put(0, "１")),
+        ascii_row(2, put(0, "\uff11")),
         "row 2 of 'vertex': property 'x' must be a float, found something unreadable.",
     ),
     "number too few": (
@@ -213,17 +214,16 @@ DATA_CASES: Mapping[str, tuple[bytes, str]] = {
 }
 
 
-@pytest.mark.parametrize("cases", [HEADER_CASES, VERTEX_CASES, DATA_CASES])
-def test_each_damage_has_its_sentence(
-    tmp_path: Path, subtests: pytest.Subtests, cases: Mapping[str, tuple[bytes, str]]
-) -> None:
+CASES = {**HEADER_CASES, **VERTEX_CASES, **DATA_CASES}
+
+
+@pytest.mark.parametrize(("data", "text"), CASES.values(), ids=CASES.keys())
+def test_each_damage_has_its_sentence(tmp_path: Path, data: bytes, text: str) -> None:
     path = tmp_path / "damaged.ply"
-    for name, (data, text) in cases.items():
-        with subtests.test(name):
-            path.write_bytes(data)
-            with pytest.raises(FileFormatError) as caught:
-                load(path)
-            assert str(caught.value) == f"{path}: {text}"
+    path.write_bytes(data)
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    assert str(caught.value) == f"{path}: {text}"
 
 
 def test_integers_out_of_range_are_an_error(tmp_path: Path) -> None:
@@ -233,8 +233,12 @@ def test_integers_out_of_range_are_an_error(tmp_path: Path) -> None:
         b"end_header\n7", b"end_header\n300"
     )
     (tmp_path / "s.ply").write_bytes(data)
-    with pytest.raises(FileFormatError, match=r"^\S*s\.ply: .*must be a"):
+    with pytest.raises(FileFormatError) as caught:
         load(tmp_path / "s.ply")
+    assert str(caught.value).startswith(
+        f"{tmp_path}/s.ply: every value must be a number of the type its property states, found "
+        f"one that is not: "
+    )
 
 
 def test_no_cut_of_a_file_leaks_a_foreign_error(tmp_path: Path) -> None:
@@ -246,55 +250,27 @@ def test_no_cut_of_a_file_leaks_a_foreign_error(tmp_path: Path) -> None:
                 load(path)
 
 
-def test_file_not_found(tmp_path: Path) -> None:
-    path = tmp_path / "none.ply"
-    with pytest.raises(InputNotFoundError) as caught:
-        load(path)
-    assert str(caught.value) == f"{path}: the file to read must exist, found none."
-    assert isinstance(caught.value, FileNotFoundError)
-
-
-@pytest.mark.parametrize("name", ["folder", "folder.ply"])
-def test_a_directory_is_no_file(tmp_path: Path, name: str) -> None:
-    path = tmp_path / name
-    path.mkdir()
-    with pytest.raises(InputError) as caught:
-        load(path)
-    assert str(caught.value) == f"{path}: must be a file, found a directory."
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs /dev/null")
-def test_a_device_is_no_file() -> None:
-    with pytest.raises(InputError) as caught:
-        load("/dev/null")
-    assert str(caught.value) == "/dev/null: must be a regular file, found a device or a pipe."
-
-
-def test_no_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_random_damage_leaks_a_foreign_error(tmp_path: Path) -> None:
+    draw = random.Random(0)
     path = tmp_path / "s.ply"
-    path.write_bytes(GOOD)
-
-    def refuse(*args: object) -> None:
-        raise PermissionError(13, "Permission denied", str(path))
-
-    monkeypatch.setattr(Path, "open", refuse)
-    with pytest.raises(InputError) as caught:
-        load(path)
-    assert str(caught.value) == f"{path}: the file must be readable, found: permission denied."
-
-
-@pytest.mark.parametrize(
-    ("name", "found"), [("s.splat", "the suffix '.splat'"), ("s", "no suffix")]
-)
-def test_unknown_suffix(tmp_path: Path, name: str, found: str) -> None:
-    path = tmp_path / name
-    path.write_bytes(struct.pack("<f", 0.0))
-    with pytest.raises(FileFormatError) as caught:
-        load(path)
-    assert str(caught.value) == f"{path}: the file name must end in .ply, found {found}."
-
-
-def test_suffixes_ignore_case(tmp_path: Path) -> None:
-    path = tmp_path / "S.PLY"
-    path.write_bytes(GOOD)
-    assert len(load(path)) == 3
+    words = [
+        b"list ",
+        b"-1",
+        b"99999999",
+        b"\n",
+        b"\x00",
+        b"\xff",
+        b"uint",
+        b"end_header",
+        b"1e999",
+    ]
+    for _ in range(600):
+        data = bytearray(draw.choice([GOOD, ASCII, WITH_FACES]))
+        at = draw.randrange(len(data))
+        data[at : at + draw.randrange(9)] = draw.choice(words)
+        path.write_bytes(data)
+        with (
+            warnings.catch_warnings(),
+            contextlib.suppress(FileFormatError, DroppedDataWarning),
+        ):
+            load(path)

@@ -3,7 +3,6 @@
 from typing import Literal
 
 import pydantic
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -114,9 +113,10 @@ def far_share(means: Float[Tensor, "n 3"], masses: Float[Tensor, "n"], frame: Ro
         A number in [0, 1].
 
     Example:
+        >>> import torch
         >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
         >>> far_share(torch.tensor([[0.0, 0, 0], [9, 0, 0]]), torch.tensor([1.0, 3.0]), frame)
         0.75
     """
-    far = torch.linalg.vector_norm(frame.normalize(means), dim=1) > UNBOUNDED_DISTANCE
+    far = frame.distances(means) > UNBOUNDED_DISTANCE
     return float((masses * far).sum() / masses.sum())

@@ -15,6 +15,8 @@ from cvtgs.math import activations, covariances, spherical_harmonics
 ANTIALIASED_TAG = "SplatRenderMode: mip"
 """The comment of scenes that were trained with anti-aliasing (Mip-Splatting)."""
 
+_CHUNK = 1 << 16
+
 _SHAPES: dict[str, tuple[int | None, ...]] = {
     "means": (3,),
     "quats": (4,),
@@ -88,8 +90,11 @@ class GaussianScene:
     @property
     def masses(self) -> Float[Tensor, "n"]:
         """Opacity times mean projected area, squared scene units, float64."""
-        areas = covariances.mean_projected_area(torch.exp(self.log_scales.double()))
-        return activations.opacity_from_logit(self.logit_opacities.double()) * areas
+        areas = [
+            covariances.mean_projected_area(torch.exp(part.double()))
+            for part in self.log_scales.split(_CHUNK)
+        ]
+        return torch.cat(areas).mul_(self.opacities)
 
     @property
     def sh(self) -> Float[Tensor, "n k_plus_1 3"]:

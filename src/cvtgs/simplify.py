@@ -2,8 +2,8 @@
 
 import math
 import warnings
-from collections.abc import Callable
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ from cvtgs.errors import (
     InvalidSceneError,
 )
 from cvtgs.math.frames import RobustFrame, robust_frame
+from cvtgs.math.morton import morton_order
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport, StageClock
 from cvtgs.scene import GaussianScene
@@ -220,7 +221,16 @@ def _simplify(
     with clock.stage("filter"):
         rows, filter_facts = _filter(valid, outlook, target, config)
     with clock.stage("tessellate", config.cvt.iterations + 1) as advance:
-        tessellation = _tessellate(valid, rows, outlook, target, config, advance)
+        rows, points = _place(valid, rows, outlook, config)
+        weights = cvt.tessellation_weights(
+            valid.opacities[rows],
+            outlook.seen_masses[rows],
+            weight=config.cvt.weight,
+            floor=config.cvt.weight_floor,
+        )
+        tessellation = cvt.tessellate(
+            points, weights, target, config=config.cvt, seed=config.seed, on_iteration=advance
+        )
     with clock.stage("merge", target) as advance:
         local = cells.Partition.from_labels(tessellation.labels, target)
         partition = cells.Partition(order=rows[local.order], offsets=local.offsets)
@@ -288,27 +298,11 @@ def _filter(
     return keep.nonzero()[:, 0], facts
 
 
-def _tessellate(
-    scene: GaussianScene,
-    rows: Tensor,
-    outlook: _Outlook,
-    target: int,
-    config: SimplifyConfig,
-    advance: Callable[[int], None],
-) -> cvt.Tessellation:
-    weights = cvt.tessellation_weights(
-        scene.opacities[rows],
-        outlook.seen_masses[rows],
-        weight=config.cvt.weight,
-        floor=config.cvt.weight_floor,
-    )
-    points = cvt.embed(
-        scene.means[rows],
-        scene.sh0[rows],
-        outlook.frame,
-        color=config.cvt.color,
-        contracted=outlook.plan.unbounded.active,
-    )
-    return cvt.tessellate(
-        points, weights, target, config=config.cvt, seed=config.seed, on_iteration=advance
-    )
+def _place(
+    scene: GaussianScene, rows: Tensor, outlook: _Outlook, config: SimplifyConfig
+) -> tuple[Tensor, Tensor]:
+    """Place Gaussians in the space of the tessellation; rows and points along a Morton curve."""
+    place = partial(cvt.embed, frame=outlook.frame, contracted=outlook.plan.unbounded.active)
+    means, colors = scene.means[rows], scene.sh0[rows]
+    order = morton_order(place(means, colors, color=0.0))
+    return rows[order], place(means[order], colors[order], color=config.cvt.color)

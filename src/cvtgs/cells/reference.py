@@ -15,7 +15,7 @@ from cvtgs.math import activations, covariances, quaternions
 from cvtgs.math.segments import segment_argmax, segment_sum
 from cvtgs.scene import GaussianScene
 
-CHUNK_MEMBERS = 1 << 16
+CHUNK_MEMBERS = 1 << 15
 """Members gathered at one time; a chunk takes about ``(60 + 6 k) * 8`` bytes for each."""
 
 

@@ -1,6 +1,7 @@
 """``cvtgs``: reads the command, runs it, and turns errors into exit codes."""
 
 import argparse
+import os
 import signal
 import sys
 import warnings
@@ -30,6 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         >>> main(["info", "missing.ply"])
         1
     """
+    # Idle OpenMP threads that spin burn several times the useful work; read when torch starts.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     options = build_parser().parse_args(arguments)
     signal.signal(signal.SIGTERM, _terminate)
     with warnings.catch_warnings():

@@ -56,5 +56,4 @@ def falloff(means: Float[Tensor, "n 3"], frame: RobustFrame) -> Float[Tensor, "n
         >>> falloff(torch.tensor([[2.0, 0, 0]]), frame).tolist()
         [0.25]
     """
-    distance: Tensor = torch.linalg.vector_norm(frame.normalize(means), dim=1)
-    return distance.clamp_min(1.0).pow(-2)
+    return frame.distances(means).clamp_min_(1.0).pow_(-2)

@@ -1,6 +1,5 @@
 """The space in which Gaussians are near or far: position, and a little colour."""
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -26,7 +25,7 @@ def embed(
         contracted: Whether positions beyond the robust radius are pulled in.
 
     Returns:
-        float64 coordinates in robust radii; d = 3, or 6 with colour.
+        Coordinates in robust radii, in the dtype of ``means``; d = 3, or 6 with colour.
 
     Example:
         >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=2.0)
@@ -35,12 +34,19 @@ def embed(
         ... ).tolist()
         [[0.5, 0.5, 0.5]]
     """
-    position = frame.contract(means) if contracted else frame.normalize(means)
-    if color == 0.0:
-        return position
-    rgb = (SH_C0 * sh0[:, 0].double()).clamp(-0.5, 0.5 + COLOR_HEADROOM)
-    return torch.cat([position, color * rgb], dim=1)
+    points = means.new_empty(len(means), 6 if color else 3)
+    for start in range(0, len(means), CHUNK):
+        part = slice(start, start + CHUNK)
+        local = means[part]
+        points[part, :3] = frame.contract(local) if contracted else frame.normalize(local)
+        if color:
+            rgb = (SH_C0 * sh0[part, 0].double()).clamp(-0.5, 0.5 + COLOR_HEADROOM)
+            points[part, 3:] = color * rgb
+    return points
 
+
+CHUNK = 1 << 16
+"""Gaussians that are placed together, to bound memory."""
 
 COLOR_HEADROOM = 0.5
 """Colours brighter than 1 plus this are treated as equally bright."""

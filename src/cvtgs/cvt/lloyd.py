@@ -60,6 +60,7 @@ def lloyd(
         [[0.5], [8.0]]
     """
     energies: list[float] = []
+    sites = sites.double()
     for done in range(iterations):
         labels, squared = nearest(points, sites)
         energies.append(float((weights * squared).sum()))
@@ -85,7 +86,7 @@ def weighted_centroids(
         fallback: Result for labels without points or without weight.
 
     Returns:
-        Weighted means.
+        Weighted means in float64.
 
     Example:
         >>> weighted_centroids(
@@ -95,8 +96,14 @@ def weighted_centroids(
         [[0.75], [7.0]]
     """
     order, offsets = sort_by_label(labels, len(fallback))
-    weights = weights[order]
+    weights = weights[order].double()
     totals = segment_sum(weights, offsets)
-    sums = segment_sum(points[order] * weights[:, None], offsets)
-    filled = (totals > 0)[:, None]
-    return torch.where(filled, sums / totals.where(totals > 0, 1.0)[:, None], fallback)
+    filled = totals > 0
+    divisors = totals.where(filled, 1.0)
+    axes = [
+        torch.where(
+            filled, segment_sum(column[order].double() * weights, offsets) / divisors, other
+        )
+        for column, other in zip(points.unbind(1), fallback.unbind(1), strict=True)
+    ]
+    return torch.stack(axes, dim=1)

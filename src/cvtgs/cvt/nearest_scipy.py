@@ -5,14 +5,17 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+CHUNK = 1 << 17
+"""Points that are searched together, to bound memory."""
+
 
 def nearest_scipy(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"]
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
     """Find the nearest site of every point with a k-d tree (Maneewongvatana and Mount 1999).
 
-    Points along a space-filling curve take half the time of shuffled ones. Memory is
-    ``16 n`` bytes for the result beside a copy of float32 points in float64.
+    Distances are computed in float64. Points along a space-filling curve take half the time of
+    shuffled ones. Memory is ``16 n`` bytes for the result, and a chunk of points in float64.
 
     Args:
         points: Positions on the CPU.
@@ -29,7 +32,10 @@ def nearest_scipy(
     from scipy.spatial import cKDTree  # noqa: PLC0415 (heavy; `import cvtgs` stays light)
 
     tree = cKDTree(np.asarray(sites, dtype=np.float64))
-    distances, labels = tree.query(np.asarray(points, dtype=np.float64), workers=-1)
-    return torch.from_numpy(labels.astype(np.int64, copy=False)), torch.from_numpy(
-        np.square(distances, out=distances)
-    )
+    labels = np.empty(len(points), dtype=np.int64)
+    squared = np.empty(len(points), dtype=np.float64)
+    for start in range(0, len(points), CHUNK):
+        part = slice(start, start + CHUNK)
+        distances, labels[part] = tree.query(np.asarray(points[part], np.float64), workers=-1)
+        np.square(distances, out=squared[part])
+    return torch.from_numpy(labels), torch.from_numpy(squared)

@@ -21,16 +21,16 @@ def nearest_torch(
 
     Points and sites are cut into blocks along a Morton curve. The nearest block of sites gives
     an upper bound for all points of a block; every other block whose bounding box is farther is
-    skipped. Distances are summed as squared differences, so the result equals brute force, and
-    of equally near sites the first one is named. Memory beside input and result is
+    skipped. Distances are sums of squared differences in float64, so the result equals brute
+    force, and of equally near sites the first one is named. Memory beside input and result is
     ``3 * MAX_ENTRIES`` numbers.
 
     Args:
         points: Positions; consecutive points should be neighbours, or hardly a block is skipped.
-        sites: Positions, at least one, on the same device and of the same dtype.
+        sites: Positions, at least one, on the same device.
 
     Returns:
-        Labels and squared distances in the dtype of ``points``.
+        Labels and squared distances in float64.
 
     Example:
         >>> labels, squared = nearest_torch(torch.tensor([[0.9]]), torch.tensor([[0.0], [1.0]]))
@@ -38,12 +38,15 @@ def nearest_torch(
         [1]
     """
     site_rows = _curve_order(sites)
-    site_blocks, site_ids = _blocks(sites[site_rows], SITE_BLOCK), _blocks(site_rows, SITE_BLOCK)
+    site_blocks, site_ids = (
+        _blocks(sites[site_rows].double(), SITE_BLOCK),
+        _blocks(site_rows, SITE_BLOCK),
+    )
     boxes = site_blocks.amin(dim=1), site_blocks.amax(dim=1)
     point_blocks = _blocks(points, POINT_BLOCK)
     step = max(1, MAX_ENTRIES // (len(site_blocks) + POINT_BLOCK * SITE_BLOCK))
     parts = [
-        _nearest_of_blocks(chunk, site_blocks, site_ids, boxes)
+        _nearest_of_blocks(chunk.double(), site_blocks, site_ids, boxes)
         for chunk in point_blocks.split(step)
     ]
     labels = torch.cat([part[0] for part in parts]).flatten()[: len(points)]

@@ -12,7 +12,6 @@ from cvtgs.cvt.lloyd import lloyd
 from cvtgs.cvt.nearest import nearest_backend
 from cvtgs.cvt.seeding import stratified_seeds, weighted_seeds
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.math.morton import morton_order
 from cvtgs.math.segments import segment_argmax, sort_by_label
 
 
@@ -49,7 +48,8 @@ def tessellate(
     """Group points into a weighted centroidal Voronoi tessellation (Du et al. 1999).
 
     Args:
-        points: Positions; the first three coordinates are spatial.
+        points: Positions in the order of :func:`cvtgs.math.morton.morton_order`, which the
+            stratified seeds follow and which halves the time of the search.
         weights: Weights, at least 0.
         count: Number of cells, 1 to n.
         config: Seeding, iterations and backend.
@@ -73,8 +73,6 @@ def tessellate(
             f"count must be between 1 and the number of points, {len(points)}; found {count}."
         )
     backend, nearest = nearest_backend(config.backend, points.device)
-    order = morton_order(points[:, :3])
-    points, weights = points[order], weights[order]
     if config.seeding == "weighted":
         seeds = weighted_seeds(weights, count, torch.Generator().manual_seed(seed))
     else:
@@ -92,10 +90,8 @@ def tessellate(
     sites = settled.sites
     labels, squared = nearest(points, sites)
     labels, squared, refilled = fill_empty_cells(labels, weights, squared, count)
-    unsorted = torch.empty_like(labels)
-    unsorted[order] = labels
     return Tessellation(
-        labels=unsorted,
+        labels=labels,
         sites=sites,
         energies=settled.energies,
         energy=float((weights * squared).sum()),

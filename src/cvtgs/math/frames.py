@@ -10,6 +10,9 @@ from torch import Tensor
 RADIUS_QUANTILE = 0.7
 """The share of points within the radius of a frame."""
 
+CHUNK = 1 << 16
+"""Points that are looked at together, to bound memory."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RobustFrame:
@@ -33,6 +36,20 @@ class RobustFrame:
             Positions in float64.
         """
         return (points.double() - self.center) / self.radius
+
+    def distances(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Give distances to the centre, in radii.
+
+        Args:
+            points: Finite positions, scene units.
+
+        Returns:
+            Distances in float64.
+        """
+        parts = [
+            torch.linalg.vector_norm(self.normalize(part), dim=1) for part in points.split(CHUNK)
+        ]
+        return torch.cat(parts)
 
     def contract(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Express points in radii and pull those beyond the first radius into the second.
@@ -67,7 +84,7 @@ def robust_frame(points: Float[Tensor, "n 3"]) -> RobustFrame:
         ([1.0, 0.0, 0.0], 1.0)
     """
     center = torch.stack([column.median() for column in points.unbind(1)]).double()
-    distances = torch.linalg.vector_norm(points.double() - center, dim=1)
+    distances = RobustFrame(center=center, radius=1.0).distances(points)
     rank = max(1, math.ceil(RADIUS_QUANTILE * len(points)))
     radius = float(distances.kthvalue(rank).values) or float(distances.amax()) or 1.0
     return RobustFrame(center=center, radius=radius)

@@ -10,8 +10,8 @@ from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 from cvtgs.synthetic.chunks import Chunk, Draw
 
-CHUNK = 1 << 15
-"""Rows that are drawn together: few enough to stay in the cache."""
+CHUNK = 1 << 13
+"""Rows that are drawn together: few enough to stay in the cache of one core."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +78,7 @@ def assemble(
         A scene of exactly ``count`` Gaussians.
     """
     rest = REST_COUNTS[sh_degree]
-    shapes = {
+    shapes: dict[str, tuple[int, ...]] = {
         "means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (),
         "sh0": (1, 3), "shN": (rest, 3),
     }  # fmt: skip
@@ -97,4 +97,8 @@ def assemble(
             for name, values in piece.tensors().items():
                 tensors[name][row + start : row + stop] = values
         row += total
-    return GaussianScene(**tensors, comments=(comment,))
+    return GaussianScene(
+        means=tensors["means"], quats=tensors["quats"], log_scales=tensors["log_scales"],
+        logit_opacities=tensors["logit_opacities"], sh0=tensors["sh0"], shN=tensors["shN"],
+        comments=(comment,),
+    )  # fmt: skip

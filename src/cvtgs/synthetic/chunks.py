@@ -79,9 +79,7 @@ Draw = Callable[[Chunk], GaussianScene]
 """Makes the Gaussians of one chunk of a part."""
 
 
-def frames_of(
-    first: Float[Tensor, "n 3"], second: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n 3 3"]:
+def frames_of(first: Float[Tensor, "n 3"], second: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
     """Build rotations whose first column is ``first`` and whose second is near ``second``.
 
     Args:

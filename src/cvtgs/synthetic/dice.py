@@ -1,7 +1,6 @@
 """Dice: the chances of a layout, such as places, sizes, colours and textures."""
 
 import colorsys
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -48,7 +47,8 @@ class Dice:
     def near(self, color: Color) -> Color:
         """Vary a colour a little."""
         shift = self.between(-0.06, 0.06)
-        red, green, blue = (min(1.0, max(0.0, c + shift + self.between(-0.04, 0.04))) for c in color)
+        moved = [c + shift + self.between(-0.04, 0.04) for c in color]
+        red, green, blue = (min(1.0, max(0.0, value)) for value in moved)
         return red, green, blue
 
     def clouds(self, low: Color, high: Color, size: float) -> Texture:
@@ -92,7 +92,7 @@ class Dice:
         """Draw several colours."""
         return torch.tensor([self.hue(saturation, value) for _ in range(count)])
 
-    def spots(self, count: int, ring: tuple[float, float]) -> Sequence[tuple[float, float]]:
+    def spots(self, count: int, ring: tuple[float, float]) -> list[tuple[float, float]]:
         """Spread places in a ring around the origin, no two in the same sector.
 
         Args:

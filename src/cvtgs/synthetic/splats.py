@@ -103,7 +103,7 @@ def light(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """
     sun = (normals @ _toward_sun()).clamp_min(0.0)[:, None] * torch.tensor(_SUN_COLOR)
     sky = (0.5 - 0.5 * normals[:, 1:2]) * torch.tensor(_SKY_COLOR)
-    return 0.18 + 0.72 * sun + 0.42 * sky
+    return 0.24 + 0.72 * sun + 0.42 * sky
 
 
 def shine(
@@ -149,7 +149,7 @@ def _along_edges(
     colors = texture(at.coords)
     slopes = torch.stack([texture(at.coords + step[k]) - colors for k in range(2)])
     steep = slopes.square().sum(2).sqrt() + 0.02 * chunk.uniforms(2).T
-    steep = torch.where(at.rims.T < spacing, 1.0, steep)
+    steep = torch.where(spacing > at.rims.T, 1.0, steep)
     same_sign = (slopes[0] * slopes[1]).sum(1) >= 0
     across = torch.atan2(torch.where(same_sign, steep[1], -steep[1]), steep[0])
     angle = across + 0.5 * math.pi + 0.15 * chunk.normals()
@@ -168,7 +168,7 @@ def _scales(
     chunk: Chunk,
 ) -> Float[Tensor, "n 3"]:
     """Draw the lengths of the axes; the third is across the surface."""
-    length = overlap * torch.exp(0.5 * chunk.normals() - 0.5 * busy)
+    length = overlap * torch.exp(0.5 * chunk.normals() - 0.2 * busy)
     width = length * torch.exp(-(0.5 + 1.0 * busy) - 0.45 * chunk.normals().abs())
     depth = torch.minimum(chunk.lognormals(0.05, 1.0), 0.7 * width)
     seen = torch.stack([length, width, depth], dim=1)

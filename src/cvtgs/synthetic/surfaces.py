@@ -148,6 +148,8 @@ def revolution(profile: Float[Tensor, "k 2"]) -> Surface:
     directions = steps / lengths[:, None]
     starts = lengths.cumsum(0) - lengths
     length = float(lengths.sum())
+    bends = (directions[1:] * directions[:-1]).sum(1) < 0.8
+    creases = torch.cat([lengths.cumsum(0)[:-1][bends], torch.tensor([math.inf])])
     girth = float(profile[:, 0].mean())
     total = float(ends[-1])
 
@@ -159,15 +161,16 @@ def revolution(profile: Float[Tensor, "k 2"]) -> Surface:
         angle = 2 * math.pi * square[:, 0]
         cos, sin, flat = torch.cos(angle), torch.sin(angle), torch.zeros_like(angle)
         out, up = directions[band].unbind(1)
-        down = length - starts[band] - share * lengths[band]
+        along = starts[band] + share * lengths[band]
+        rim = (along[:, None] - creases).abs().amin(1)
         return SurfacePoints(
             points=torch.stack([radius * cos, -height, radius * sin], dim=1),
             normals=torch.stack([up * cos, out, up * sin], dim=1),
             tangents=torch.stack([-sin, flat, cos], dim=1),
             bitangents=torch.stack([-out * cos, up, -out * sin], dim=1),
-            coords=torch.stack([angle * girth, down], dim=1),
+            coords=torch.stack([angle * girth, length - along], dim=1),
             areas=torch.full_like(angle, total),
-            rims=torch.full((len(angle), 2), math.inf),
+            rims=torch.stack([torch.full_like(rim, math.inf), rim], dim=1),
         )
 
     return sample

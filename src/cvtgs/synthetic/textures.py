@@ -30,7 +30,7 @@ _FONT = {
 
 def plain(color: Color) -> Texture:
     """Give one colour everywhere."""
-    rgb = torch.tensor(color)
+    rgb = torch.tensor(color, dtype=torch.float32)
     return lambda coords: rgb.expand(len(coords), 3)
 
 
@@ -110,7 +110,7 @@ def cloud_tile(generator: torch.Generator) -> Float[Tensor, "k k"]:
     wave = torch.fft.fftfreq(n) * n
     fall = (wave[:, None] ** 2 + wave[None, :] ** 2).sqrt().clamp_min(1.0) ** 1.5
     spectrum = torch.fft.fft2(torch.randn(n, n, generator=generator)) / fall
-    tile = torch.fft.ifft2(spectrum).real
+    tile: Tensor = torch.fft.ifft2(spectrum).real
     return (tile - tile.mean()) / tile.std()
 
 

@@ -150,9 +150,7 @@ def rods(strands: Strands, texture: Texture, gloss: float) -> Draw:
     return draw
 
 
-def grass(
-    roots: Float[Tensor, "k 3"], height: float, colors: tuple[Texture, Texture]
-) -> Draw:
+def grass(roots: Float[Tensor, "k 3"], height: float, colors: tuple[Texture, Texture]) -> Draw:
     """Plant blades of grass: one needle each, leaning any way.
 
     Args:

@@ -30,7 +30,7 @@ def haze(
     Returns:
         What draws it.
     """
-    rgb = torch.tensor(color)
+    rgb = torch.tensor(color, dtype=torch.float32)
     shadow = 2 * math.pi * float(extent.prod()) ** (2 / 3)
 
     def draw(chunk: Chunk) -> GaussianScene:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from cvtgs.errors import FileFormatError
 from cvtgs.io.ply.header import Element, Header
 
-CHUNK_ROWS = 1 << 16
+CHUNK_ROWS = 1 << 12
+"""How many rows are handed on at a time; a cache holds them."""
 
 _NOT_ASCII = bytes.maketrans(bytes(range(128, 256)), b"?" * 128)
 

@@ -32,26 +32,31 @@ def read_ply(path: Path) -> GaussianScene:
         FileFormatError: It is not a PLY file of a 3DGS scene, or damaged.
     """
     try:
+        _check_regular(path)
         with path.open("rb") as file:
             return _read(file, str(path))
     except FileNotFoundError as error:
         raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
-    except IsADirectoryError as error:
-        raise InputError(f"{path}: must be a file, found a directory.") from error
+    except InputError:
+        raise
     except OSError as error:
-        if isinstance(error, InputError):
-            raise
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
 
 
-def _read(file: BinaryIO, path: str) -> GaussianScene:
-    status = os.fstat(file.fileno())
-    if not stat.S_ISREG(status.st_mode):
+def _check_regular(path: Path) -> None:
+    """Refuse what cannot be mapped, before it is opened: opening a pipe would wait for ever."""
+    mode = path.stat().st_mode
+    if stat.S_ISDIR(mode):
+        raise InputError(f"{path}: must be a file, found a directory.")
+    if not stat.S_ISREG(mode):
         raise InputError(f"{path}: must be a regular file, found a device or a pipe.")
+
+
+def _read(file: BinaryIO, path: str) -> GaussianScene:
     header = read_header(file, path)
     vertex = find_vertices(header, path)
-    check_size(header, vertex, path=path, size=status.st_size)
+    check_size(header, vertex, path=path, size=os.fstat(file.fileno()).st_size)
     if fast.can_read(header):
         chunks = fast.read_chunks(file, header)
     else:

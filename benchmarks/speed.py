@@ -1,0 +1,118 @@
+"""Time and memory of ``cvtgs simplify``: whole process, per stage, and against the floor.
+
+The floor is what no method on cells can avoid: read the file, search the nearest site of every
+Gaussian once, write the result. ``python -m benchmarks.speed`` prints Markdown tables.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+
+import cvtgs
+from benchmarks.processes import machine, run_python, spread
+from cvtgs.math.frames import robust_frame
+from cvtgs.math.morton import morton_order
+
+SCENES = (("courtyard", 1_000_000, 0), ("courtyard", 250_000, 2), ("courtyard", 400_000, 3))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("files", nargs="*", type=Path, help="PLYs; generated scenes if none")
+    parser.add_argument("--rho", type=float, default=0.01)
+    parser.add_argument("--preset", default="standard")
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--child", choices=("stages",), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        print(json.dumps(stage_costs(options.files[0], options.rho, options.preset)))
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        files = options.files or generated_scenes(Path(folder))
+        print(f"{machine()}, torch {torch.__version__}; rho {options.rho:g}, {options.runs} runs\n")
+        measure_processes(files, Path(folder), options)
+        measure_stages(files, options)
+
+
+def generated_scenes(folder: Path) -> list[Path]:
+    files = []
+    for kind, count, degree in SCENES:
+        path = folder / f"{kind}_{count // 1000}k_sh{degree}.ply"
+        cvtgs.save(cvtgs.synthetic.scene(kind, count, sh_degree=degree, seed=0), path)
+        files.append(path)
+    return files
+
+
+def measure_processes(files: list[Path], folder: Path, options: argparse.Namespace) -> None:
+    """Whole processes: interpreter and torch start, reading and writing included."""
+    bare = [run_python("-c", "import torch") for _ in range(options.runs)]
+    bare_peak = max(cost.peak_bytes for cost in bare)
+    print("| process | user CPU s | wall s | peak MB | above bare torch / file |")
+    print("|---|---|---|---|---|")
+    print(
+        f"| python -c 'import torch' | {spread([cost.user_seconds for cost in bare])} "
+        f"| {spread([cost.wall_seconds for cost in bare])} | {bare_peak / 1e6:.0f} | |"
+    )
+    for file in files:
+        command = ["-m", "cvtgs", "simplify", str(file), str(folder / "small.ply"), "--overwrite"]
+        command += ["--rho", str(options.rho), "--preset", options.preset, "--quiet"]
+        costs = [run_python(*command) for _ in range(options.runs)]
+        peak = max(cost.peak_bytes for cost in costs)
+        print(
+            f"| {file.stem} | {spread([cost.user_seconds for cost in costs])} "
+            f"| {spread([cost.wall_seconds for cost in costs])} | {peak / 1e6:.0f} "
+            f"| {(peak - bare_peak) / file.stat().st_size:.2f} |"
+        )
+
+
+def measure_stages(files: list[Path], options: argparse.Namespace) -> None:
+    """CPU seconds of the stages, and the ratio of their sum to the floor, in fresh processes."""
+    print("\n| CPU s per stage | " + " | ".join(file.stem for file in files) + " |")
+    print("|---|" + "---|" * len(files))
+    columns = []
+    for file in files:
+        arguments = [str(file), "--rho", str(options.rho), "--preset", options.preset]
+        costs = [
+            json.loads(run_python("-m", "benchmarks.speed", "--child", "stages", *arguments).output)
+            for _ in range(options.runs)
+        ]
+        columns.append({name: [cost[name] for cost in costs] for name in costs[0]})
+    for name in columns[0]:
+        print(f"| {name} | " + " | ".join(spread(column[name]) for column in columns) + " |")
+
+
+def stage_costs(file: Path, rho: float, preset: str) -> dict[str, float]:
+    """Measure the stages and the floor once, in this process."""
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder) / "small.ply"
+        start = time.process_time()
+        scene = cvtgs.load(file)
+        read = time.process_time() - start
+        small, report = cvtgs.Simplifier(config=preset, device="cpu").run(scene, rho)
+        start = time.process_time()
+        cvtgs.save(small, output)
+        write = time.process_time() - start
+    stages = {cost.stage: cost.cpu_seconds for cost in report.stages}
+    floor = read + one_pass(scene, len(small)) + write
+    total = read + sum(stages.values()) + write
+    return {"read": read, **stages, "write": write, "all": total, "floor": floor} | {
+        "all / floor": total / floor
+    }
+
+
+def one_pass(scene: cvtgs.GaussianScene, count: int) -> float:
+    """Search the nearest of ``count`` sites for every Gaussian, by position only."""
+    points = robust_frame(scene.means).contract(scene.means)
+    points = points[morton_order(points)]
+    sites = points[:: len(points) // count][:count]
+    start = time.process_time()
+    cvtgs.cvt.nearest_scipy(points, sites)
+    return time.process_time() - start
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""What a Gaussian weighs, and where it lies, in the tessellation."""
+
+import pytest
+import torch
+
+from cvtgs.cvt import embed, falloff, tessellation_weights
+from cvtgs.math.frames import RobustFrame, robust_frame
+
+FRAME = RobustFrame(center=torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), radius=2.0)
+
+
+def test_falloff_beyond_the_radius_is_the_inverse_square():
+    means = torch.tensor([[1.0, 0, 0], [2.9, 0, 0], [1, 4, 0], [1, 0, -20]])
+    assert falloff(means, FRAME).tolist() == pytest.approx([1.0, 1.0, 0.25, 0.01])
+
+
+def test_weights_have_mean_one():
+    opacities, masses = torch.tensor([0.2, 0.6]), torch.tensor([1.0, 3.0])
+    by_mass = tessellation_weights(opacities, masses, weight="mass", floor=0.0)
+    by_opacity = tessellation_weights(opacities, masses * 7, weight="opacity", floor=0.0)
+    assert by_mass.tolist() == [0.5, 1.5]
+    assert by_opacity.tolist() == pytest.approx([0.5, 1.5])
+
+
+def test_embedding_of_known_points():
+    means, sh0 = torch.tensor([[3.0, 0, 0], [1, 8, 0]]), torch.zeros(2, 1, 3)
+    plain = embed(means, sh0, FRAME, color=0.0, contracted=False)
+    assert plain.tolist() == [[1.0, 0, 0], [0, 4, 0]]
+    pulled = embed(means, sh0, FRAME, color=0.0, contracted=True)
+    assert pulled.tolist() == [[1.0, 0, 0], [0, 1.75, 0]]
+
+
+@pytest.mark.parametrize(("color", "d"), [(0.0, 3), (0.05, 6)])
+def test_embedding_has_six_coordinates_with_colour(color, d):
+    points = embed(torch.zeros(4, 3), torch.ones(4, 1, 3), FRAME, color=color, contracted=True)
+    assert points.shape == (4, d)
+    assert points.dtype == torch.float64
+
+
+def test_colour_is_scaled():
+    sh0 = torch.zeros(2, 1, 3)
+    sh0[1, 0] = torch.tensor([1.0, -1.0, 0.5])
+    points = embed(torch.zeros(2, 3), sh0, FRAME, color=0.1, contracted=False)
+    wanted = 0.1 * 0.28209479177387814 * torch.tensor([1.0, -1.0, 0.5], dtype=torch.float64)
+    torch.testing.assert_close(points[1, 3:] - points[0, 3:], wanted)
+
+
+def test_extreme_colours_do_not_tear_points_apart():
+    sh0 = torch.tensor([[[1e4, -1e4, 0.0]], [[-1e30, 1e30, 0.0]]])
+    points = embed(torch.zeros(2, 3), sh0, FRAME, color=0.05, contracted=False)
+    assert float((points[0] - points[1]).abs().amax()) < 0.2
+
+
+@pytest.mark.parametrize("size", [1e-300, 1.0, 1e300])
+def test_the_unit_of_mass_does_not_matter(size):
+    masses = torch.rand(100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    plain = tessellation_weights(masses, masses, weight="mass", floor=1e-3)
+    scaled = tessellation_weights(masses, size * masses, weight="mass", floor=1e-3)
+    torch.testing.assert_close(scaled, plain, rtol=1e-12, atol=0)
+
+
+def test_no_weight_is_below_the_floor():
+    masses = torch.tensor([0.0, 1e-12, 1.0, 3.0], dtype=torch.float64)
+    weights = tessellation_weights(masses, masses, weight="mass", floor=0.01)
+    assert weights.tolist() == pytest.approx([0.01, 0.01, 1.0, 3.0])
+
+
+def test_masses_of_zero_weigh_the_same():
+    zero = torch.zeros(3)
+    assert tessellation_weights(zero, zero, weight="mass", floor=0.0).tolist() == [1.0, 1.0, 1.0]
+
+
+def test_flyaways_weigh_nothing_from_the_middle():
+    means = torch.randn(100, 3, generator=torch.Generator().manual_seed(0))
+    means[0] = 1e30
+    factors = falloff(means, robust_frame(means))
+    assert 0 <= float(factors[0]) < 1e-50
+    assert bool(factors.isfinite().all())

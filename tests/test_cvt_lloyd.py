@@ -1,0 +1,100 @@
+"""Lloyd's algorithm: centroids, energies and when it stops."""
+
+import pytest
+import torch
+
+from cvtgs.cvt import lloyd, nearest_scipy, nearest_torch, weighted_centroids, weighted_seeds
+from cvtgs.cvt.seeding import stratified_seeds
+from cvtgs.math.morton import morton_order
+
+BACKENDS = {"scipy": nearest_scipy, "torch": nearest_torch}
+
+
+def weighted_cloud(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    points = torch.randn(count, 3, generator=g, dtype=torch.float64).pow(3)
+    points = points[morton_order(points)]
+    return points, torch.exp(torch.randn(count, generator=g, dtype=torch.float64))
+
+
+def start(points: torch.Tensor, weights: torch.Tensor, count: int, seeding: str) -> torch.Tensor:
+    if seeding == "weighted":
+        return points[weighted_seeds(weights, count, torch.Generator().manual_seed(0))]
+    return points[stratified_seeds(weights, count)[0]]
+
+
+def test_centroid_of_weighted_points():
+    points = torch.tensor([[0.0, 0.0], [4.0, 8.0], [1.0, 1.0]])
+    fallback = torch.tensor([[9.0, 9.0], [5.0, 6.0], [7.0, 7.0]])
+    centroids = weighted_centroids(
+        points, torch.tensor([3.0, 1.0, 0.0]), torch.tensor([2, 2, 0]), fallback
+    )
+    assert centroids.tolist() == [[9.0, 9.0], [5.0, 6.0], [1.0, 2.0]]
+
+
+def test_energies_of_three_points_on_a_line():
+    points = torch.tensor([[0.0], [2.0], [10.0]])
+    result = lloyd(
+        points, torch.tensor([1.0, 3.0, 1.0]), torch.tensor([[0.0], [10.0]]),
+        nearest=nearest_torch, iterations=5, tolerance=0.0,
+    )  # fmt: skip
+    assert result.sites.tolist() == [[1.5], [10.0]]
+    assert result.energies == (12.0, 3.0, 3.0)
+
+
+def test_no_iterations_leave_the_sites():
+    points, weights = weighted_cloud(50)
+    result = lloyd(
+        points, weights, points[:5], nearest=nearest_scipy, iterations=0, tolerance=0.0
+    )
+    assert torch.equal(result.sites, points[:5])
+    assert result.energies == ()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("seeding", ["stratified", "weighted"])
+@pytest.mark.parametrize(("count", "sites"), [(300, 7), (1000, 100), (1000, 900), (50, 1)])
+def test_energy_never_rises(backend, seeding, count, sites):
+    points, weights = weighted_cloud(count, seed=sites)
+    result = lloyd(
+        points, weights, start(points, weights, sites, seeding),
+        nearest=BACKENDS[backend], iterations=15, tolerance=0.0,
+    )  # fmt: skip
+    energies = torch.tensor(result.energies, dtype=torch.float64)
+    assert len(energies) >= 2
+    assert bool((energies.diff() <= 1e-12 * energies[0]).all())
+    assert float(energies[-1]) < float(energies[0])
+
+
+def test_sites_without_points_stay():
+    points = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
+    sites = torch.tensor([[0.0], [100.0]], dtype=torch.float64)
+    result = lloyd(
+        points, torch.ones(2).double(), sites, nearest=nearest_scipy, iterations=3, tolerance=0.0
+    )
+    assert result.sites.tolist() == [[0.5], [100.0]]
+
+
+def test_stops_when_the_energy_stalls():
+    points, weights = weighted_cloud(2000)
+    sites = start(points, weights, 50, "stratified")
+    counts = []
+    for tolerance in (0.5, 0.02, 0.0):
+        told: list[int] = []
+        result = lloyd(
+            points, weights, sites, nearest=nearest_scipy, iterations=40, tolerance=tolerance,
+            on_iteration=told.append,
+        )  # fmt: skip
+        assert told == list(range(1, len(told) + 1))
+        assert len(told) <= len(result.energies)
+        counts.append(len(told))
+    assert counts[0] < counts[1] < counts[2]
+
+
+def test_weight_draws_the_site():
+    points = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
+    result = lloyd(
+        points, torch.tensor([1.0, 1e6], dtype=torch.float64), points[:1],
+        nearest=nearest_scipy, iterations=2, tolerance=0.0,
+    )  # fmt: skip
+    assert result.sites.item() == pytest.approx(1.0, abs=2e-6)

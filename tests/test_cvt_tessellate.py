@@ -1,0 +1,188 @@
+"""The whole tessellation."""
+
+import pytest
+import torch
+
+from cvtgs.config import SimplifyConfig, TessellationConfig
+from cvtgs.cvt import Tessellation, tessellate
+from cvtgs.errors import InvalidArgumentError
+
+CONFIGS = {name: SimplifyConfig.from_preset(name).cvt for name in ("standard", "paper")}
+each_config = pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
+
+
+def weighted_cloud(count: int, d: int = 3, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    points = torch.randn(count, d, generator=g, dtype=torch.float64)
+    return points, torch.exp(torch.randn(count, generator=g, dtype=torch.float64))
+
+
+def cells_of(labels: torch.Tensor) -> set[frozenset[int]]:
+    groups: dict[int, list[int]] = {}
+    for row, label in enumerate(labels.tolist()):
+        groups.setdefault(label, []).append(row)
+    return {frozenset(rows) for rows in groups.values()}
+
+
+def assert_complete(result: Tessellation, total: int, count: int) -> None:
+    assert result.labels.shape == (total,)
+    assert torch.equal(torch.unique(result.labels), torch.arange(count))
+    assert len(result.sites) == count
+
+
+def test_three_clusters_are_found():
+    points = torch.tensor([[0.0, 0, 0], [9, 0, 0], [0.1, 0, 0], [0, 9, 0], [9.1, 0, 0]])
+    result = tessellate(points.double(), torch.ones(5).double(), 3, config=TessellationConfig())
+    assert cells_of(result.labels) == {frozenset({0, 2}), frozenset({1, 4}), frozenset({3})}
+    assert result.energy == pytest.approx(2 * 2 * 0.05**2)
+    assert result.refilled == 0
+
+
+@each_config
+@pytest.mark.parametrize("d", [3, 6])
+@pytest.mark.parametrize(
+    ("total", "count"), [(1, 1), (2, 1), (2, 2), (50, 49), (50, 50), (1000, 10), (2000, 333)]
+)
+def test_partition_is_complete_and_no_cell_is_empty(total, count, d, config):
+    points, weights = weighted_cloud(total, d)
+    result = tessellate(points, weights, count, config=config)
+    assert_complete(result, total, count)
+    assert result.energy >= 0
+
+
+@each_config
+@pytest.mark.parametrize("count", [1, 7, 99, 100])
+def test_coincident_points(count, config):
+    result = tessellate(
+        torch.ones(100, 3).double(), torch.ones(100).double(), count, config=config
+    )
+    assert_complete(result, 100, count)
+    assert result.energy == 0.0
+    assert result.refilled == count - 1
+
+
+@each_config
+def test_duplicates_and_weights_of_zero(config):
+    points, _ = weighted_cloud(100)
+    weights = torch.zeros(300, dtype=torch.float64)
+    assert_complete(tessellate(points.repeat(3, 1), weights, 250, config=config), 300, 250)
+
+
+def test_labels_name_the_nearest_site():
+    points, weights = weighted_cloud(1000)
+    result = tessellate(points, weights, 40, config=CONFIGS["standard"])
+    assert result.refilled == 0
+    distances = torch.cdist(points, result.sites)
+    torch.testing.assert_close(
+        distances.gather(1, result.labels[:, None])[:, 0], distances.amin(dim=1)
+    )
+    wanted = float((weights * distances.amin(dim=1).square()).sum())
+    assert result.energy == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize("seeding", ["stratified", "weighted"])
+def test_more_iterations_lower_the_energy(seeding):
+    points, weights = weighted_cloud(3000)
+    energies = [
+        tessellate(
+            points, weights, 100,
+            config=TessellationConfig(
+                iterations=iterations, seeding=seeding, tolerance=0.0, samples_per_site=0
+            ),
+        ).energy
+        for iterations in (0, 1, 4, 12)
+    ]  # fmt: skip
+    assert energies == sorted(energies, reverse=True)
+    assert energies[-1] < 0.8 * energies[0]
+
+
+def test_a_sample_is_nearly_as_good_as_all_points():
+    points, weights = weighted_cloud(20_000)
+    of_sample, of_all, unmoved = (
+        tessellate(
+            points, weights, 100,
+            config=TessellationConfig(iterations=iterations, samples_per_site=samples),
+        )
+        for iterations, samples in ((5, 24), (5, 0), (0, 0))
+    )  # fmt: skip
+    assert_complete(of_sample, 20_000, 100)
+    assert not torch.equal(of_sample.labels, of_all.labels)
+    assert of_sample.energy < 1.05 * of_all.energy < 0.95 * unmoved.energy
+
+
+def test_a_sample_that_saves_little_is_not_taken():
+    points, weights = weighted_cloud(1000)
+    few, all_points = (
+        tessellate(points, weights, 100, config=TessellationConfig(samples_per_site=samples))
+        for samples in (6, 0)
+    )
+    assert torch.equal(few.labels, all_points.labels)
+
+
+@each_config
+def test_permuted_points_give_the_same_cells(config):
+    points, weights = weighted_cloud(800)
+    shuffle = torch.randperm(800, generator=torch.Generator().manual_seed(5))
+    plain = tessellate(points, weights, 60, config=config)
+    shuffled = tessellate(points[shuffle], weights[shuffle], 60, config=config)
+    unshuffled = torch.empty_like(shuffled.labels)
+    unshuffled[shuffle] = shuffled.labels
+    assert cells_of(unshuffled) == cells_of(plain.labels)
+    assert shuffled.energy == pytest.approx(plain.energy, rel=1e-12)
+
+
+@each_config
+def test_same_bits_twice(config):
+    points, weights = weighted_cloud(700)
+    first, second = (tessellate(points, weights, 50, config=config, seed=3) for _ in range(2))
+    assert torch.equal(first.labels, second.labels)
+    assert torch.equal(first.sites, second.sites)
+    assert first.energies == second.energies
+
+
+def test_the_seed_is_for_weighted_seeding_only():
+    points, weights = weighted_cloud(700)
+    for name, equal in (("standard", True), ("paper", False)):
+        first, second = (
+            tessellate(points, weights, 50, config=CONFIGS[name], seed=seed) for seed in (0, 1)
+        )
+        assert torch.equal(first.labels, second.labels) is equal
+
+
+@each_config
+@pytest.mark.parametrize("d", [3, 6])
+def test_backends_give_the_same_labels(config, d):
+    points, weights = weighted_cloud(2500, d)
+    by_name = {
+        name: tessellate(points, weights, 200, config=config.model_copy(update={"backend": name}))
+        for name in ("scipy", "torch")
+    }
+    assert torch.equal(by_name["scipy"].labels, by_name["torch"].labels)
+    assert by_name["scipy"].energy == pytest.approx(by_name["torch"].energy, rel=1e-12)
+    assert [by_name[name].backend for name in by_name] == ["scipy", "torch"]
+
+
+def test_input_is_not_changed():
+    points, weights = weighted_cloud(300)
+    before = points.clone(), weights.clone()
+    tessellate(points, weights, 200, config=CONFIGS["standard"])
+    assert torch.equal(points, before[0])
+    assert torch.equal(weights, before[1])
+
+
+def test_steps_are_told():
+    told: list[int] = []
+    points, weights = weighted_cloud(300)
+    config = TessellationConfig(iterations=4, tolerance=0.0)
+    tessellate(points, weights, 20, config=config, on_iteration=told.append)
+    assert told == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("count", [0, -1, 6])
+def test_counts_out_of_range_are_errors(count):
+    points, weights = weighted_cloud(5)
+    with pytest.raises(InvalidArgumentError) as caught:
+        tessellate(points, weights, count, config=TessellationConfig())
+    assert str(caught.value) == (
+        f"count must be between 1 and the number of points, 5; found {count}."
+    )

@@ -1,0 +1,228 @@
+"""Files appear complete or not at all, and an old one is replaced only when asked."""
+
+import errno
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+from typing import NoReturn
+
+import pytest
+
+from cvtgs.errors import FileFormatError, OutputError, OutputExistsError
+from cvtgs.io import atomic_output, check_output, check_save
+
+
+def write(path: Path, data: bytes = b"new", *, overwrite: bool = False) -> None:
+    with atomic_output(path, overwrite=overwrite) as file:
+        file.write(data)
+
+
+def write_while_another_does(path: Path) -> None:
+    with atomic_output(path) as file:
+        file.write(b"mine")
+        path.write_bytes(b"theirs")
+
+
+def write_half(path: Path, error: type[BaseException]) -> None:
+    with atomic_output(path, overwrite=True) as file:
+        file.write(b"half")
+        raise error("stop")
+
+
+def mode_of(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def test_a_new_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    with atomic_output(path) as file:
+        file.write(b"new")
+        assert not path.exists()
+    assert path.read_bytes() == b"new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_old_file_stays_until_the_new_one_is_complete(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+    with atomic_output(path, overwrite=True) as file:
+        file.write(b"new")
+        file.flush()
+        assert path.read_bytes() == b"old"
+    assert path.read_bytes() == b"new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="permissions are those of POSIX")
+def test_permissions(tmp_path: Path) -> None:
+    old, new = tmp_path / "old", tmp_path / "new"
+    old.write_bytes(b"old")
+    old.chmod(0o640)
+    before = os.umask(0o027)
+    try:
+        write(old, overwrite=True)
+        write(new)
+    finally:
+        os.umask(before)
+    assert (mode_of(old), mode_of(new)) == (0o640, 0o640)
+    old.chmod(0o604)
+    write(old, overwrite=True)
+    assert mode_of(old) == 0o604
+
+
+def test_symbolic_links_stay_links(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    target, link = tmp_path / "real" / "a.bin", tmp_path / "link.bin"
+    link.symlink_to(target)
+    write(link, b"one")
+    write(link, b"two", overwrite=True)
+    assert link.is_symlink()
+    assert target.read_bytes() == b"two"
+    assert list((tmp_path / "real").iterdir()) == [target]
+
+
+def test_without_hard_links_the_result_is_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*args: object) -> NoReturn:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(Path, "hardlink_to", refuse)
+    path = tmp_path / "a.bin"
+    write(path)
+    assert path.read_bytes() == b"new"
+    with pytest.raises(OutputExistsError):
+        write_while_another_does(tmp_path / "b.bin")
+    assert (tmp_path / "b.bin").read_bytes() == b"theirs"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.bin", "b.bin"]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit, OutputError])
+@pytest.mark.parametrize("old", [None, b"old"])
+def test_nothing_is_left_behind(
+    tmp_path: Path, error: type[BaseException], old: bytes | None
+) -> None:
+    path = tmp_path / "a.bin"
+    if old:
+        path.write_bytes(old)
+    with pytest.raises(error):
+        write_half(path, error)
+    assert [p.read_bytes() for p in tmp_path.iterdir()] == ([old] if old else [])
+
+
+def test_a_file_that_appeared_meanwhile_is_not_destroyed(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    with pytest.raises(OutputExistsError) as caught:
+        write_while_another_does(path)
+    assert str(caught.value) == (
+        f"{path}: the output must not exist yet, found a file; pass overwrite=True (--overwrite) "
+        f"to replace it."
+    )
+    assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"theirs"]
+
+
+def test_errors_of_other_files_are_not_relabelled(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError) as caught, atomic_output(tmp_path / "a.bin"):
+        (tmp_path / "elsewhere" / "b.bin").open()
+    assert type(caught.value) is FileNotFoundError
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "text"),
+    [
+        (errno.ENOSPC, "needs more space than the disk has left; nothing was written."),
+        (errno.EIO, "must be writable, found: input/output error."),
+    ],
+)
+def test_a_failing_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, text: str
+) -> None:
+    def fail(descriptor: int) -> NoReturn:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", fail)
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+    with pytest.raises(OutputError) as caught:
+        write(path, overwrite=True)
+    assert str(caught.value) == f"{path}: the output {text}"
+    assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"old"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits the file size as Linux does")
+def test_a_write_that_really_fails(tmp_path: Path) -> None:
+    program = (
+        "import resource, sys\n"
+        "from cvtgs.errors import OutputError\n"
+        "from cvtgs.io.atomic import atomic_output\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
+        "try:\n"
+        "    with atomic_output(sys.argv[1]) as file:\n"
+        "        for _ in range(9): file.write(bytes(50_000))\n"
+        "except OutputError as error: print(error)\n"
+    )
+    path = tmp_path / "a.bin"
+    result = subprocess.run(
+        [sys.executable, "-c", program, str(path)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+    )
+    assert result.stdout == f"{path}: the output must be writable, found: file too large.\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_early_check_of_what_cannot_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, old = tmp_path / "folder.ply", tmp_path / "old.ply"
+    folder.mkdir()
+    old.write_bytes(b"old")
+    missing = tmp_path / "no" / "a.ply"
+    cases: list[tuple[Path, type[Exception], str]] = [
+        (folder, OutputError, "the output must be a file, found a directory."),
+        (
+            old,
+            OutputExistsError,
+            "the output must not exist yet, found a file; pass overwrite=True (--overwrite) to "
+            "replace it.",
+        ),
+        (
+            missing,
+            OutputError,
+            f"the output must be in an existing directory, found no directory {missing.parent}.",
+        ),
+    ]
+    for path, kind, text in cases:
+        for check in (check_output, check_save, write):
+            with pytest.raises(kind) as caught:
+                check(path)
+            assert str(caught.value) == f"{path}: {text}"
+    check_save(old, overwrite=True)
+    monkeypatch.setattr(os, "access", lambda *args: False)
+    with pytest.raises(OutputError) as caught:
+        check_output(old, overwrite=True)
+    assert str(caught.value) == (
+        f"{old}: the output must be in a writable directory, found no permission to write in "
+        f"{tmp_path}."
+    )
+
+
+def test_early_check_of_the_suffix(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"the file name must end in \.ply, found no suffix"):
+        check_save(tmp_path / "scene")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /dev/full")
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_devices_are_never_replaced(tmp_path: Path, overwrite: bool) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for path in (pipe, Path("/dev/full")):
+        with pytest.raises(OutputError) as caught:
+            write(path, overwrite=overwrite)
+        assert str(caught.value) == (
+            f"{path}: the output must be a regular file, found a device or a pipe."
+        )

@@ -1,0 +1,167 @@
+"""Dictionaries of gsplat and nerfstudio in and out."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from cvtgs.errors import InvalidSceneError
+from cvtgs.io import from_dict, to_dict
+
+KNOWN = (
+    "means, quats, scales, opacities, sh0 (or features_dc) and, above SH degree 0, "
+    "shN (or features_rest)"
+)
+
+
+def gsplat(n: int = 2, k: int = 3) -> dict[str, Any]:
+    return {
+        "means": torch.arange(3.0 * n).reshape(n, 3),
+        "quats": torch.ones(n, 4),
+        "scales": torch.full((n, 3), -2.0),
+        "opacities": torch.full((n,), 0.25),
+        "sh0": torch.full((n, 1, 3), 0.5),
+        "shN": torch.full((n, k, 3), 0.125),
+    }
+
+
+def splatfacto(prefix: str = "") -> dict[str, Any]:
+    d = gsplat()
+    d["opacities"] = d["opacities"][:, None]
+    d["features_dc"], d["features_rest"] = d.pop("sh0")[:, 0], d.pop("shN")
+    return {prefix + name: torch.nn.Parameter(value) for name, value in d.items()}
+
+
+def test_gsplat_values_are_stored_values() -> None:
+    scene = from_dict(gsplat())
+    assert scene.means.tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert scene.log_scales.tolist() == [[-2] * 3] * 2
+    assert scene.logit_opacities.tolist() == [0.25] * 2
+    assert scene.sh_degree == 1
+
+
+def test_activated_values() -> None:
+    values = {
+        **gsplat(),
+        "scales": torch.full((2, 3), math.e),
+        "opacities": torch.tensor([[0.5], [1]]),
+    }
+    scene = from_dict(values, activated=True)
+    assert scene.log_scales.tolist() == [[1] * 3] * 2
+    assert scene.logit_opacities[0] == 0
+    assert scene.logit_opacities.isfinite().all()
+
+
+@pytest.mark.parametrize("prefix", ["", "gauss_params.", "_model.gauss_params."])
+def test_nerfstudio_is_the_same_scene(prefix: str) -> None:
+    other = {f"{prefix}x.y".replace("gauss_params.", "camera."): torch.zeros(1)} if prefix else {}
+    scene = from_dict({**splatfacto(prefix), **other})
+    for name, tensor in from_dict(gsplat()).tensors().items():
+        assert torch.equal(scene.tensors()[name], tensor)
+    assert not any(tensor.requires_grad for tensor in scene.tensors().values())
+
+
+@pytest.mark.parametrize("kind", ["<f4", ">f4", "<f2"])
+def test_numpy_arrays_are_copied(kind: str) -> None:
+    arrays = {name: value.numpy().astype(kind) for name, value in gsplat().items()}
+    arrays["means"].flags.writeable = False
+    scene = from_dict(arrays)
+    arrays["quats"][:] = 7
+    assert scene.dtype == torch.float32
+    assert scene.quats.tolist() == [[1] * 4] * 2
+    assert scene.means.tolist() == [[0, 1, 2], [3, 4, 5]]
+
+
+@pytest.mark.parametrize(
+    ("dtype", "wanted"),
+    [
+        (torch.float16, torch.float32),
+        (torch.bfloat16, torch.float32),
+        (torch.float64, torch.float64),
+    ],
+)
+def test_dtypes(dtype: torch.dtype, wanted: torch.dtype) -> None:
+    values = gsplat()
+    scene = from_dict({**values, "means": values["means"].to(dtype)})
+    assert {tensor.dtype for tensor in scene.tensors().values()} == {wanted}
+
+
+def test_without_view_dependent_colour() -> None:
+    values = gsplat()
+    del values["shN"]
+    assert from_dict(values).sh_degree == 0
+
+
+def test_there_and_back() -> None:
+    values = gsplat()
+    again = to_dict(from_dict(values))
+    assert list(again) == ["means", "quats", "scales", "opacities", "sh0", "shN"]
+    assert all(torch.equal(again[name], value) for name, value in values.items())
+
+
+def test_the_mapping_is_not_changed() -> None:
+    values = gsplat()
+    before = {name: value.clone() for name, value in values.items()}
+    from_dict({**values, "scales": values["scales"].exp()}, activated=True)
+    assert all(torch.equal(values[name], value) for name, value in before.items())
+
+
+@pytest.mark.parametrize(
+    ("changes", "activated", "text"),
+    [
+        (
+            {"quats": None, "sh0": None},
+            False,
+            f"a dictionary must hold {KNOWN}, found none named quats, sh0.",
+        ),
+        (
+            {"colors": torch.zeros(2, 3)},
+            False,
+            f"the names must be {KNOWN}, found 'colors'.",
+        ),
+        (
+            {"features_dc": torch.zeros(2, 3)},
+            False,
+            "a dictionary must give sh0 once, found 'sh0' and 'features_dc'.",
+        ),
+        (
+            {"a.means": torch.zeros(2, 3)},
+            False,
+            "a dictionary must give means once, found 'means' and 'a.means'.",
+        ),
+        (
+            {"means": [[0.0, 0.0, 0.0]] * 2},
+            False,
+            "means must be a torch.Tensor or numpy array of floats, found list.",
+        ),
+        (
+            {"means": np.zeros((2, 3), dtype=np.int64)},
+            False,
+            "means must be a torch.Tensor or numpy array of floats, found int64.",
+        ),
+        (
+            {"scales": torch.tensor([[1.0, 1, 1], [1, -1, 1]])},
+            True,
+            "activated scales must be at least 0, found 1 rows that are not, the first is row 1; "
+            "pass activated=False for stored values.",
+        ),
+        (
+            {"scales": torch.ones(2, 3), "opacities": torch.tensor([-3.0, 2.0])},
+            True,
+            "activated opacities must be from 0 to 1, found 2 rows that are not, the first is row "
+            "0; pass activated=False for stored values.",
+        ),
+        (
+            {"quats": torch.zeros(2, 3)},
+            False,
+            "quats must have shape (2, 4), found (2, 3).",
+        ),
+    ],
+)
+def test_what_is_no_scene(changes: dict[str, Any], activated: bool, text: str) -> None:
+    values = {name: v for name, v in {**gsplat(), **changes}.items() if v is not None}
+    with pytest.raises(InvalidSceneError) as caught:
+        from_dict(values, activated=activated)
+    assert str(caught.value) == text

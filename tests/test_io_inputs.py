@@ -1,0 +1,68 @@
+"""Paths that cannot be opened as a scene, whatever they hold."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from cvtgs.errors import FileFormatError, InputError, InputNotFoundError
+from cvtgs.io import load
+from ply_files import gaussian_properties, gaussian_rows, ply_bytes
+
+GOOD = ply_bytes(gaussian_properties(), gaussian_rows(gaussian_properties(), 3))
+
+
+def test_file_not_found(tmp_path: Path) -> None:
+    path = tmp_path / "none.ply"
+    with pytest.raises(InputNotFoundError) as caught:
+        load(path)
+    assert str(caught.value) == f"{path}: the file to read must exist, found none."
+    assert isinstance(caught.value, FileNotFoundError)
+
+
+@pytest.mark.parametrize("name", ["folder", "folder.ply"])
+def test_a_directory_is_no_file(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.mkdir()
+    with pytest.raises(InputError) as caught:
+        load(path)
+    assert str(caught.value) == f"{path}: must be a file, found a directory."
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_is_no_file(tmp_path: Path) -> None:
+    path = tmp_path / "pipe.ply"
+    os.mkfifo(path)
+    with pytest.raises(InputError) as caught:
+        load(path)
+    assert str(caught.value) == f"{path}: must be a regular file, found a device or a pipe."
+
+
+def test_no_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "s.ply"
+    path.write_bytes(GOOD)
+
+    def refuse(*args: object) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(InputError) as caught:
+        load(path)
+    assert str(caught.value) == f"{path}: the file must be readable, found: permission denied."
+
+
+@pytest.mark.parametrize(
+    ("name", "found"), [("s.splat", "the suffix '.splat'"), ("s", "no suffix")]
+)
+def test_unknown_suffix(tmp_path: Path, name: str, found: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(GOOD)
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    assert str(caught.value) == f"{path}: the file name must end in .ply, found {found}."
+
+
+def test_suffixes_ignore_case(tmp_path: Path) -> None:
+    path = tmp_path / "S.PLY"
+    path.write_bytes(GOOD)
+    assert len(load(path)) == 3

@@ -1,0 +1,79 @@
+"""The robust frame: a minority of outliers cannot move it."""
+
+import pytest
+import torch
+
+from cvtgs.math.frames import RobustFrame, robust_frame
+
+UNIT = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
+
+
+def test_frame_of_five_points_on_a_line():
+    points = torch.tensor([[float(x), 0.0, 0.0] for x in (0, 1, 2, 3, 10)])
+    frame = robust_frame(points)
+    assert frame.center.tolist() == [2.0, 0.0, 0.0]
+    assert frame.radius == 2.0  # distances 0 1 1 2 8; the fourth of five
+
+
+def test_contraction_of_known_points():
+    points = torch.tensor([[0.5, 0, 0], [0, 2, 0], [0, 0, -4.0]])
+    assert UNIT.contract(points).tolist() == [[0.5, 0, 0], [0, 1.5, 0], [0, 0, -1.75]]
+
+
+def test_one_point_and_coincident_points():
+    for count in (1, 7):
+        frame = robust_frame(torch.full((count, 3), 3.0))
+        assert frame.center.tolist() == [3.0, 3.0, 3.0]
+        assert frame.radius == 1.0
+
+
+def test_mostly_coincident_points_take_the_largest_distance():
+    points = torch.zeros(10, 3)
+    points[9, 0] = 4.0
+    assert robust_frame(points).radius == 4.0
+
+
+@pytest.mark.parametrize("far", [1e6, 1e30])
+def test_flyaways_do_not_move_the_frame(far):
+    points = torch.randn(1000, 3, generator=torch.Generator().manual_seed(0))
+    clean = robust_frame(points)
+    flown = points.clone()
+    flown[:5] = far
+    frame = robust_frame(flown)
+    assert float((frame.center - clean.center).abs().amax()) < 0.02
+    assert frame.radius == pytest.approx(clean.radius, rel=0.02)
+
+
+def test_permutation_does_not_change_the_frame():
+    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(1))
+    shuffled = points[torch.randperm(500, generator=torch.Generator().manual_seed(2))]
+    first, second = robust_frame(points), robust_frame(shuffled)
+    assert torch.equal(first.center, second.center)
+    assert first.radius == second.radius
+
+
+def test_geo_referenced_points_keep_their_detail():
+    local = torch.randn(200, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    offset = torch.tensor([6e6, -6e6, 6e6], dtype=torch.float64)
+    near = robust_frame(local).normalize(local)
+    far = robust_frame(1e-2 * local + offset).normalize(1e-2 * local + offset)
+    torch.testing.assert_close(near, far, rtol=0, atol=1e-5)
+
+
+def test_contraction_keeps_directions_order_and_stays_within_two():
+    g = torch.Generator().manual_seed(4)
+    directions = torch.nn.functional.normalize(
+        torch.randn(300, 3, generator=g, dtype=torch.float64), dim=1
+    )
+    distances = torch.logspace(-3, 9, 300, dtype=torch.float64)
+    contracted = UNIT.contract(distances[:, None] * directions)
+    lengths = torch.linalg.vector_norm(contracted, dim=1)
+    assert bool((lengths.diff() > 0).all())
+    assert bool((lengths <= 2).all())
+    torch.testing.assert_close(contracted / lengths[:, None], directions)
+
+
+def test_contraction_is_finite_for_float32_flyaways():
+    points = torch.tensor([[1e30, -1e30, 0.0], [3e38, 0.0, 0.0]])
+    lengths = torch.linalg.vector_norm(UNIT.contract(points), dim=1)
+    torch.testing.assert_close(lengths, torch.full((2,), 2.0, dtype=torch.float64))

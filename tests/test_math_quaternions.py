@@ -1,0 +1,89 @@
+"""Unit quaternions and rotation matrices."""
+
+import math
+
+import numpy as np
+import oracles
+import pytest
+import torch
+
+from cvtgs.math import quaternions
+
+HALF = math.sqrt(0.5)
+
+
+def random_quats(count: int, seed: int = 0) -> torch.Tensor:
+    g = torch.Generator().manual_seed(seed)
+    return quaternions.normalize(torch.randn(count, 4, generator=g, dtype=torch.float64))
+
+
+def test_quarter_turn_about_z_sends_x_to_y():
+    matrix = quaternions.to_matrices(torch.tensor([[HALF, 0.0, 0.0, HALF]], dtype=torch.float64))
+    wanted = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+    torch.testing.assert_close(matrix[0], wanted, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_half_turns_have_their_axis_as_quaternion(axis):
+    matrix = -torch.eye(3, dtype=torch.float64)
+    matrix[axis, axis] = 1.0
+    wanted = [0.0] * 4
+    wanted[axis + 1] = 1.0
+    assert quaternions.from_matrices(matrix[None])[0].abs().tolist() == wanted
+
+
+def test_no_rows():
+    assert quaternions.normalize(torch.zeros(0, 4)).shape == (0, 4)
+    assert quaternions.to_matrices(torch.zeros(0, 4)).shape == (0, 3, 3)
+    assert quaternions.from_matrices(torch.zeros(0, 3, 3)).shape == (0, 4)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("power", [-37, -20, 0, 20, 37])
+def test_normalize_survives_tiny_and_huge(dtype, power):
+    quats = torch.tensor([[3.0, -4.0, 0.0, 0.0]], dtype=dtype) * 10.0**power
+    torch.testing.assert_close(
+        quaternions.normalize(quats), torch.tensor([[0.6, -0.8, 0.0, 0.0]], dtype=dtype)
+    )
+
+
+def test_matrices_equal_the_oracle():
+    quats = random_quats(50)
+    wanted = torch.from_numpy(np.stack([oracles.rotation(q) for q in quats.tolist()]))
+    torch.testing.assert_close(quaternions.to_matrices(quats), wanted, rtol=0, atol=1e-14)
+
+
+def test_matrices_are_rotations():
+    matrices = quaternions.to_matrices(random_quats(100))
+    identity = torch.eye(3, dtype=torch.float64).expand(100, 3, 3)
+    torch.testing.assert_close(matrices @ matrices.transpose(1, 2), identity, rtol=0, atol=1e-14)
+    torch.testing.assert_close(torch.linalg.det(matrices), torch.ones(100, dtype=torch.float64))
+
+
+def test_negated_quaternion_is_the_same_rotation():
+    quats = random_quats(20)
+    assert torch.equal(quaternions.to_matrices(quats), quaternions.to_matrices(-quats))
+
+
+def test_round_trip_near_half_turns():
+    turn = math.pi - 1e-7
+    axes = torch.nn.functional.normalize(random_quats(60)[:, 1:], dim=1)
+    cosines = torch.full((60, 1), math.cos(turn / 2), dtype=torch.float64)
+    quats = torch.cat([cosines, math.sin(turn / 2) * axes], dim=1)
+    back = quaternions.from_matrices(quaternions.to_matrices(quats))
+    torch.testing.assert_close(back, quats, rtol=0, atol=1e-13)
+
+
+def test_round_trip_has_positive_w():
+    quats = random_quats(200, seed=3)
+    back = quaternions.from_matrices(quaternions.to_matrices(quats))
+    assert bool((back[:, 0] >= 0).all())
+    aligned = torch.where(quats[:, :1] < 0, -quats, quats)
+    torch.testing.assert_close(back, aligned, rtol=0, atol=1e-13)
+
+
+def test_gradients():
+    quats = random_quats(4).requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda q: quaternions.to_matrices(quaternions.normalize(q)), (quats,)
+    )
