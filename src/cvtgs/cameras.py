@@ -1,0 +1,143 @@
+"""Cameras: from where pictures of a scene are taken."""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cvtgs.errors import InvalidArgumentError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Cameras:
+    """Pinhole cameras of one image size.
+
+    Attributes:
+        viewmats: ``(c, 4, 4)`` from world to camera; OpenCV axes: x right, y down, z forward.
+        Ks: ``(c, 3, 3)`` intrinsics in pixels; pixel centres are at half-integers.
+        width: Pixels per row.
+        height: Rows.
+        names: Name of each camera, such as its photograph's file name; empty if they have none.
+
+    Raises:
+        InvalidArgumentError: Shapes, dtypes, devices or sizes do not fit together.
+
+    Example:
+        >>> cameras = Cameras(
+        ...     viewmats=torch.eye(4)[None], Ks=torch.eye(3)[None], width=64, height=48
+        ... )
+        >>> len(cameras)
+        1
+    """
+
+    viewmats: Float[Tensor, "c 4 4"]
+    Ks: Float[Tensor, "c 3 3"]
+    width: int
+    height: int
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        count = len(self.viewmats)
+        for name, tensor, shape in (
+            ("viewmats", self.viewmats, (count, 4, 4)),
+            ("Ks", self.Ks, (count, 3, 3)),
+        ):
+            if tuple(tensor.shape) != shape or not tensor.is_floating_point():
+                raise InvalidArgumentError(
+                    f"{name} must be floats of shape {shape}, "
+                    f"found {tensor.dtype} of shape {tuple(tensor.shape)}."
+                )
+        if self.viewmats.device != self.Ks.device or self.viewmats.dtype != self.Ks.dtype:
+            raise InvalidArgumentError(
+                f"viewmats and Ks must share device and dtype, found {self.viewmats.dtype} on "
+                f"{self.viewmats.device} and {self.Ks.dtype} on {self.Ks.device}."
+            )
+        if self.width < 1 or self.height < 1:
+            raise InvalidArgumentError(
+                f"width and height must be at least 1 pixel, found {self.width} x {self.height}."
+            )
+        if self.names and len(self.names) != count:
+            raise InvalidArgumentError(
+                f"names must hold one name per camera, {count}; found {len(self.names)}."
+            )
+
+    def __len__(self) -> int:
+        """Give the number of cameras."""
+        return len(self.viewmats)
+
+    @property
+    def centers(self) -> Float[Tensor, "c 3"]:
+        """Positions of the cameras in the world."""
+        rotations, shifts = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3:]
+        return -(rotations.transpose(1, 2) @ shifts)[:, :, 0]
+
+    def select(self, rows: Int[Tensor, "m"]) -> Self:
+        """Take some cameras.
+
+        Args:
+            rows: Their numbers.
+
+        Returns:
+            Those cameras.
+        """
+        names = tuple(self.names[row] for row in rows.tolist()) if self.names else ()
+        return replace(self, viewmats=self.viewmats[rows], Ks=self.Ks[rows], names=names)
+
+    def to(self, device: torch.device | str) -> Self:
+        """Move the cameras to a device.
+
+        Args:
+            device: Where to.
+
+        Returns:
+            The cameras there.
+        """
+        return replace(self, viewmats=self.viewmats.to(device), Ks=self.Ks.to(device))
+
+    def resized(self, width: int, height: int) -> Self:
+        """Give cameras that see the same in pictures of another size.
+
+        Args:
+            width: Pixels per row.
+            height: Rows.
+
+        Returns:
+            Cameras with scaled intrinsics.
+        """
+        factors = self.Ks.new_tensor([width / self.width, height / self.height, 1.0])
+        return replace(self, Ks=self.Ks * factors[:, None], width=width, height=height)
+
+
+def look_at(
+    eyes: Float[Tensor, "c 3"], targets: Float[Tensor, "c 3"], up: Float[Tensor, "3"]
+) -> Float[Tensor, "c 4 4"]:
+    """Build view matrices of cameras that look at points.
+
+    Args:
+        eyes: Positions of the cameras.
+        targets: What each camera has in the middle of its picture; not its own position.
+        up: Direction that is up in the pictures; need not be of unit length.
+
+    Returns:
+        World-to-camera matrices with OpenCV axes. A camera that looks along ``up`` gets some
+        upright direction at right angles to it.
+
+    Example:
+        >>> up = torch.tensor([0.0, -1.0, 0.0])
+        >>> look_at(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 5.0]]), up)[0, 2, :3].tolist()
+        [0.0, 0.0, 1.0]
+    """
+    forward = torch.nn.functional.normalize(targets - eyes, dim=1)
+    upright = torch.nn.functional.normalize(up, dim=0).expand_as(forward)
+    parallel = (forward * upright).sum(dim=1, keepdim=True).abs() > 1 - 1e-6
+    other = torch.eye(3, dtype=eyes.dtype, device=eyes.device)[upright.abs().argmin(dim=1)]
+    upright = torch.where(parallel, other, upright)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, upright), dim=1)
+    down = torch.linalg.cross(forward, right)
+    rotations = torch.stack([right, down, forward], dim=1)
+    viewmats = torch.eye(4, dtype=eyes.dtype, device=eyes.device).repeat(len(eyes), 1, 1)
+    viewmats[:, :3, :3] = rotations
+    viewmats[:, :3, 3] = -(rotations @ eyes[:, :, None])[:, :, 0]
+    return viewmats
