@@ -30,17 +30,39 @@ def test_embedding_of_known_points():
     assert pulled.tolist() == [[1.0, 0, 0], [0, 1.75, 0]]
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(("color", "d"), [(0.0, 3), (0.05, 6)])
-def test_embedding_has_six_coordinates_with_colour(color, d):
-    points = embed(torch.zeros(4, 3), torch.ones(4, 1, 3), FRAME, color=color, contracted=True)
+def test_embedding_has_six_coordinates_with_colour(color, d, dtype):
+    means, sh0 = torch.zeros(4, 3, dtype=dtype), torch.ones(4, 1, 3, dtype=dtype)
+    points = embed(means, sh0, FRAME, color=color, contracted=True)
     assert points.shape == (4, d)
-    assert points.dtype == torch.float64
+    assert points.dtype == dtype
+
+
+@pytest.mark.parametrize("contracted", [True, False])
+def test_embedding_in_chunks_gives_the_same(monkeypatch, contracted):
+    g = torch.Generator().manual_seed(0)
+    means, sh0 = torch.randn(100, 3, generator=g), torch.randn(100, 1, 3, generator=g)
+    whole = embed(means, sh0, FRAME, color=0.1, contracted=contracted)
+    monkeypatch.setitem(embed.__globals__, "CHUNK", 7)
+    assert torch.equal(embed(means, sh0, FRAME, color=0.1, contracted=contracted), whole)
+
+
+def test_detail_far_from_the_origin_survives():
+    g = torch.Generator().manual_seed(0)
+    local = 1e-2 * torch.randn(50, 3, generator=g, dtype=torch.float64)
+    sh0 = torch.zeros(50, 1, 3, dtype=torch.float64)
+    near, far = (
+        embed(means, sh0, robust_frame(means), color=0.0, contracted=True)
+        for means in (local, local + 6e6)
+    )
+    torch.testing.assert_close(near, far, rtol=0, atol=1e-6)
 
 
 def test_colour_is_scaled():
-    sh0 = torch.zeros(2, 1, 3)
+    sh0 = torch.zeros(2, 1, 3, dtype=torch.float64)
     sh0[1, 0] = torch.tensor([1.0, -1.0, 0.5])
-    points = embed(torch.zeros(2, 3), sh0, FRAME, color=0.1, contracted=False)
+    points = embed(torch.zeros(2, 3).double(), sh0, FRAME, color=0.1, contracted=False)
     wanted = 0.1 * 0.28209479177387814 * torch.tensor([1.0, -1.0, 0.5], dtype=torch.float64)
     torch.testing.assert_close(points[1, 3:] - points[0, 3:], wanted)
 

@@ -1,10 +1,15 @@
 """``cvtgs demo``: the main job on a scene that the library makes itself."""
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cvtgs.cli.display import file_size, progress_bars
 from cvtgs.errors import OutputError
+
+if TYPE_CHECKING:
+    from cvtgs.report import StageCost
 
 RATIOS = (0.1, 0.01, 0.001)
 
@@ -54,35 +59,39 @@ def run(options: argparse.Namespace) -> None:
         options.output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{options.output}: cannot be made: {error.strerror}.") from None
-    rows = []
     with progress_bars(quiet=options.quiet) as listener:
         simplifier = Simplifier(config=options.preset, device=options.device, listener=listener)
         scene = demo_scene(options.count, seed=options.seed)
         path = options.output / "full.ply"
         save(scene, path, overwrite=True)
-        rows.append([path.name, f"{len(scene):,}", file_size(path)])
+        columns = [_column(path, len(scene), ())]
         for rho in RATIOS:
             small, report = simplifier.run(scene, rho)
             path = options.output / f"small_{rho:g}.ply"
             save(small, path, overwrite=True)
-            seconds = [f"{cost.seconds:.2f}" for cost in report.stages]
-            rows.append(
-                [path.name, f"{len(small):,}", file_size(path), *seconds, f"{report.seconds:.2f}"]
-            )
+            columns.append(_column(path, len(small), report.stages))
     if not options.quiet:
-        _print_table(rows, [cost.stage for cost in report.stages])
+        _print_table(columns)
         _print_next_steps(options.output)
 
 
-def _print_table(rows: list[list[str]], stages: list[str]) -> None:
-    from rich.console import Console  # noqa: PLC0415 (keeps --help fast)
+def _column(path: Path, count: int, stages: "Sequence[StageCost]") -> dict[str, str]:
+    seconds = {f"{cost.stage}, s": f"{cost.seconds:.2f}" for cost in stages}
+    total = {"all stages, s": f"{sum(cost.seconds for cost in stages):.2f}"} if stages else {}
+    return {"file": path.name, "Gaussians": f"{count:,}", "size": file_size(path)} | seconds | total
+
+
+def _print_table(columns: list[dict[str, str]]) -> None:
+    from rich.box import SIMPLE_HEAD  # noqa: PLC0415 (keeps --help fast)
+    from rich.console import Console  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
 
-    table = Table(title="seconds per stage", title_justify="right")
-    for heading in ("file", "Gaussians", "size", *stages, "all"):
-        table.add_column(heading, justify="left" if heading == "file" else "right")
-    for row in rows:
-        table.add_row(*row)
+    first, *other_rows = columns[-1]
+    table = Table(first, *(column[first] for column in columns), box=SIMPLE_HEAD)
+    for name in other_rows:
+        table.add_row(name, *(column.get(name, "") for column in columns))
+    for column in table.columns[1:]:
+        column.justify = "right"
     Console().print(table)
 
 

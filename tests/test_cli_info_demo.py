@@ -1,0 +1,57 @@
+"""``cvtgs info`` and ``cvtgs demo``."""
+
+import cvtgs
+from cvtgs.cli.display import size_text
+from cvtgs.cli.main import main
+
+
+def test_info_shows_what_the_file_holds(tmp_path, capsys):
+    path = tmp_path / "in.ply"
+    scene = cvtgs.synthetic.scene("landscape", 2000, sh_degree=2, seed=0)
+    cvtgs.save(scene, path)
+    assert main(["info", str(path)]) == 0
+    printed = capsys.readouterr().out
+    for text in ("Gaussians        2,000", "SH degree        2", "robust radius", "opacity < 0.1"):
+        assert text in printed
+
+
+def test_info_as_json_is_the_scene_info(tmp_path, capsys):
+    path = tmp_path / "in.ply"
+    scene = cvtgs.synthetic.scene("room", 300, sh_degree=0, seed=0)
+    cvtgs.save(scene, path)
+    assert main(["info", str(path), "--json"]) == 0
+    facts = cvtgs.SceneInfo.model_validate_json(capsys.readouterr().out)
+    assert facts == cvtgs.describe(cvtgs.load(path))
+
+
+def test_demo_writes_four_scenes_and_says_what_is_next(tmp_path, capsys):
+    folder = tmp_path / "demo"
+    words = ["demo", "-o", str(folder), "--count", "3000"]
+    assert main(words) == 0
+    counts = {path.name: len(cvtgs.load(path)) for path in folder.iterdir()}
+    assert counts == {
+        "full.ply": 3000,
+        "small_0.1.ply": 300,
+        "small_0.01.ply": 30,
+        "small_0.001.ply": 3,
+    }
+    printed = capsys.readouterr().out
+    for text in ("small_0.001.ply", "tessellate", "cvtgs simplify scene.ply"):
+        assert text in printed
+    assert main([*words, "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_demo_names_the_folder_it_cannot_make(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main(["demo", "-o", str(tmp_path / "file" / "demo"), "--count", "10"]) == 1
+    assert "cannot be made" in capsys.readouterr().err
+
+
+def test_size_text():
+    assert [size_text(n) for n in (999, 1500, 68_000_000, 2_000_000_000)] == [
+        "999 B",
+        "1.5 kB",
+        "68.0 MB",
+        "2.0 GB",
+    ]

@@ -1,0 +1,115 @@
+"""The command line as a whole: help, usage, errors, exit codes, interruption."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import cvtgs
+from cvtgs.cli.main import build_parser, main
+
+
+def run_cvtgs(*arguments: str | Path, **options) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "cvtgs", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+
+def test_help_names_every_command(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--help"])
+    assert stopped.value.code == 0
+    printed = capsys.readouterr().out
+    for command in ("simplify", "info", "demo"):
+        assert command in printed
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert capsys.readouterr().out == f"cvtgs {cvtgs.__version__}\n"
+
+
+def test_help_loads_neither_torch_nor_numpy():
+    code = (
+        "import sys; from cvtgs.cli.main import build_parser; build_parser().format_help();"
+        "print([name for name in ('torch', 'numpy', 'scipy', 'rich') if name in sys.modules])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout == "[]\n"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["unknown"],
+        ["simplify", "in.ply", "out.ply"],
+        ["simplify", "in.ply", "out.ply", "--rho", "0.1", "--count", "5"],
+        ["simplify", "in.ply", "out.ply", "--rho", "many"],
+        ["simplify", "in.ply", "out.ply", "--count", "1.5"],
+    ],
+)
+def test_wrong_usage_exits_with_2(words, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(words)
+    assert stopped.value.code == 2
+    assert "usage: cvtgs" in capsys.readouterr().err
+
+
+def test_an_error_is_one_sentence_on_stderr(tmp_path, capsys):
+    missing = tmp_path / "missing.ply"
+    assert main(["info", str(missing)]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith(f"cvtgs: error: {missing}: ")
+    assert captured.err.count("\n") == 1
+
+
+def test_the_parser_is_made_anew():
+    assert build_parser() is not build_parser()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_leaves_no_output_behind(tmp_path, number, code):
+    source = tmp_path / "in.ply"
+    cvtgs.save(cvtgs.synthetic.scene("object", 200_000, sh_degree=0, seed=0), source)
+    output = tmp_path / "out.ply"
+    command = [sys.executable, "-m", "cvtgs", "simplify", source, output, "--rho", "0.3"]
+    settings = ["--set", "cvt.iterations=1000", "--set", "cvt.tolerance=0"]
+    with subprocess.Popen([*command, *settings], stderr=subprocess.PIPE, text=True) as process:
+        wait_for_handler(process.pid, number)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert "Traceback" not in errors
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in.ply"]
+
+
+def wait_for_handler(pid: int, number: int) -> None:
+    """Wait until the process catches the signal, and then until it computes."""
+    status = Path(f"/proc/{pid}/status")
+    if not status.exists():
+        pytest.skip("needs /proc to see when a process catches signals")
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        lines = status.read_text().splitlines()
+        caught = int(next(line for line in lines if line.startswith("SigCgt")).split()[1], 16)
+        threads = int(next(line for line in lines if line.startswith("Threads")).split()[1])
+        if caught >> (number - 1) & 1 and threads > 1:
+            time.sleep(1.0)
+            return
+        time.sleep(0.05)
+    raise TimeoutError("the process never caught the signal")
+
+
+def test_python_m_cvtgs_and_broken_pipe_do_not_trace_back():
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    result = run_cvtgs("info", "missing.ply", env=environment)
+    assert result.returncode == 1
+    assert "Traceback" not in result.stderr
