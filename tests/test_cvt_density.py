@@ -98,3 +98,13 @@ def test_flyaways_weigh_nothing_from_the_middle():
     factors = falloff(means, robust_frame(means))
     assert 0 <= float(factors[0]) < 1e-50
     assert bool(factors.isfinite().all())
+
+
+@pytest.mark.parametrize("contracted", [True, False])
+def test_flyaways_do_not_overflow(contracted):
+    means = torch.tensor([[3e38, -3e38, 0.0], [1e-10, 0, 0], [0, 0, 0]])
+    frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1e-10)
+    points = embed(means, torch.zeros(3, 1, 3), frame, color=0.0, contracted=contracted)
+    assert bool(points.isfinite().all())
+    assert points[1:].tolist() == [[1.0, 0, 0], [0, 0, 0]]
+    assert float(points[0, 0]) > 1.4

@@ -1,5 +1,7 @@
 """Which Gaussians enter the tessellation, and the mass that is left out."""
 
+import math
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -11,8 +13,9 @@ from cvtgs.scene import GaussianScene
 def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
     """Find the rows that no renderer can draw.
 
-    NaN or infinite means, log-scales and SH coefficients, NaN opacities, and quaternions that
-    are zero, NaN or infinite are invalid. Infinite opacity logits are valid.
+    NaN or infinite means, scales and SH coefficients, NaN opacities, and quaternions that are
+    zero, NaN or infinite are invalid. Scales beyond float32 count as infinite, and those of
+    minus infinity, which are 0, are invalid too. Infinite opacity logits are valid.
 
     Args:
         scene: Any scene.
@@ -28,7 +31,7 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
     masks = {
         "means": ~_finite(scene.means),
         "quats": ~_finite(scene.quats) | (scene.quats == 0).all(dim=1),
-        "log_scales": ~_finite(scene.log_scales),
+        "log_scales": ~_finite(scene.log_scales) | (scene.log_scales > MAX_LOG_SCALE).any(dim=1),
         "logit_opacities": scene.logit_opacities.isnan(),
         "sh0": ~_finite(scene.sh0),
         "shN": ~_finite(scene.shN),
@@ -129,10 +132,14 @@ UNIT_TOLERANCE = 1e-5
 """Quaternions whose squared length is this near 1 count as unit quaternions."""
 
 
+MAX_LOG_SCALE = math.log(torch.finfo(torch.float32).max)
+"""The logarithm of the largest scale that files and renderers, which hold float32, can express."""
+
+
 def _finite(values: Tensor) -> Tensor:
     """Tell the rows without NaN or infinity, without an array of booleans per value.
 
     A finite number times 0 is 0, any other is NaN, and a sum with a NaN is NaN.
     """
-    flat = values.reshape(len(values), -1)
+    flat = values.flatten(start_dim=1)
     return torch.cat([(part * 0).sum(dim=1) == 0 for part in flat.split(1 << 16)])

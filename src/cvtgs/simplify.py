@@ -253,6 +253,8 @@ def _simplify(
 
 
 def _valid_scene(scene: GaussianScene, target: int) -> tuple[GaussianScene, dict[str, Any]]:
+    if len(scene) == 0:
+        raise InvalidSceneError("a scene needs at least one Gaussian to be simplified; found none.")
     invalid = filters.invalid_rows(scene)
     if not invalid:
         return scene, {}

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -38,19 +39,21 @@ def normalized_weights(
     """Scale weights so that those of each cell sum to 1.
 
     Args:
-        weights: Positive weights, members of one cell next to one another.
+        weights: Weights, at least 0, members of one cell next to one another.
         offsets: Where each cell starts, and the end of the last one.
 
     Returns:
-        Weights in float64.
+        Weights in float64; equal ones in cells where all are 0 or denormal.
 
     Example:
-        >>> import torch
         >>> normalized_weights(torch.tensor([1.0, 3.0]), torch.tensor([0, 2])).tolist()
         [0.25, 0.75]
     """
-    weights = weights.double()
-    return weights / segment_sum(weights, offsets)[segment_ids(offsets)]
+    weights, ids = weights.double(), segment_ids(offsets)
+    totals = segment_sum(weights, offsets)[ids]
+    shares = weights / totals.clamp_min(torch.finfo(weights.dtype).tiny)
+    equal = offsets.diff().double().reciprocal()[ids]
+    return torch.where(totals < torch.finfo(weights.dtype).tiny, equal, shares)
 
 
 def weighted_mean(
@@ -69,7 +72,6 @@ def weighted_mean(
         One row per cell, float64.
 
     Example:
-        >>> import torch
         >>> weighted_mean(
         ...     torch.tensor([0.0, 4.0]), torch.tensor([0.25, 0.75]), torch.tensor([0, 2])
         ... ).tolist()

@@ -38,7 +38,8 @@ def embed(
     for start in range(0, len(means), CHUNK):
         part = slice(start, start + CHUNK)
         local = means[part]
-        points[part, :3] = frame.contract(local) if contracted else frame.normalize(local)
+        place = frame.contract(local) if contracted else frame.normalize(local)
+        points[part, :3] = place.clamp_(-FARTHEST, FARTHEST)
         if color:
             rgb = (SH_C0 * sh0[part, 0].double()).clamp(-0.5, 0.5 + COLOR_HEADROOM)
             points[part, 3:] = color * rgb
@@ -47,6 +48,9 @@ def embed(
 
 CHUNK = 1 << 16
 """Gaussians that are placed together, to bound memory."""
+
+FARTHEST = 1e30
+"""In robust radii: flyaways beyond are placed here, so that no float32 overflows."""
 
 COLOR_HEADROOM = 0.5
 """Colours brighter than 1 plus this are treated as equally bright."""

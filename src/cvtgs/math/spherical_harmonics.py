@@ -1,11 +1,31 @@
-"""Real spherical harmonics in the order and scale that 3DGS files use."""
+"""Real spherical harmonics in the order, scale and signs that 3DGS files use."""
 
 import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError
 
 SH_C0 = 0.5 / math.sqrt(math.pi)
 """The constant band: the colour of degree 0 is ``0.5 + SH_C0 * sh0``."""
+
+SH_C1 = math.sqrt(3 / (4 * math.pi))
+"""The factor of the three linear functions."""
+
+SH_C2 = (math.sqrt(15 / (4 * math.pi)), math.sqrt(5 / (16 * math.pi)))
+"""The factors of the quadratic functions: of ``xy``, ``yz``, ``xz`` (half of it of
+``xx - yy``), and of ``2zz - xx - yy``."""
+
+SH_C3 = (
+    math.sqrt(35 / (32 * math.pi)),
+    math.sqrt(105 / (4 * math.pi)),
+    math.sqrt(21 / (32 * math.pi)),
+    math.sqrt(7 / (16 * math.pi)),
+)
+"""The factors of the cubic functions, by rising rotational symmetry: of ``y (3xx - yy)``, ``xyz``
+(half of it of ``z (xx - yy)``), ``y (4zz - xx - yy)`` and ``z (2zz - 3xx - 3yy)``."""
 
 REST_COUNTS = (0, 3, 8, 15)
 """Coefficients per colour channel above the constant band, by degree."""
@@ -33,3 +53,84 @@ def degree_of(rest_count: int) -> int:
             f"(degree 0 to 3), found {rest_count}."
         )
     return REST_COUNTS.index(rest_count)
+
+
+def rest_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:
+    """Evaluate the view-dependent basis functions, those above the constant one.
+
+    They are the real spherical harmonics with the Condon-Shortley phase, within a degree by
+    order ``m`` from ``-l`` to ``l``, as 3DGS (Kerbl et al. 2023) and PlenOctrees (Yu et al. 2021)
+    have them.
+
+    Args:
+        directions: Unit vectors, from the camera to the Gaussian.
+        degree: 0 to 3.
+
+    Returns:
+        Values, k in {0, 3, 8, 15}.
+
+    Example:
+        >>> rest_basis(torch.tensor([[0.0, 0.0, 1.0]]), 1).round(decimals=4).tolist()
+        [[-0.0, 0.4886, -0.0]]
+    """
+    x, y, z = directions.unbind(1)
+    columns: list[Tensor] = []
+    if degree > 0:
+        columns += [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
+    if degree > 1:
+        columns += _quadratic(x, y, z)
+    if degree > 2:
+        columns += _cubic(x, y, z)
+    return torch.stack(columns, dim=1) if columns else directions[:, :0]
+
+
+def evaluate(
+    sh0: Float[Tensor, "n 1 3"], shN: Float[Tensor, "n k 3"], directions: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    """Evaluate colours: ``0.5`` and the spherical harmonics in the directions, not below 0.
+
+    Args:
+        sh0: Constant band.
+        shN: View-dependent bands; without any, directions are not looked at.
+        directions: Unit vectors, from the camera to the Gaussian.
+
+    Returns:
+        Red, green and blue, at least 0; above 1 is possible.
+
+    Raises:
+        InvalidArgumentError: ``shN`` has a number of coefficients that belongs to no degree.
+
+    Example:
+        >>> evaluate(torch.zeros(1, 1, 3), torch.zeros(1, 0, 3), torch.zeros(1, 3)).tolist()
+        [[0.5, 0.5, 0.5]]
+    """
+    colors = 0.5 + SH_C0 * sh0[:, 0]
+    degree = degree_of(shN.shape[1])
+    if degree > 0:
+        colors = colors + (rest_basis(directions, degree)[:, :, None] * shN).sum(dim=1)
+    return colors.clamp_min(0)
+
+
+def _quadratic(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
+    wide, round_ = SH_C2
+    return [
+        wide * x * y,
+        -wide * y * z,
+        round_ * (2 * z * z - x * x - y * y),
+        -wide * x * z,
+        0.5 * wide * (x * x - y * y),
+    ]
+
+
+def _cubic(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
+    xx, yy, zz = x * x, y * y, z * z
+    three, two, one, zero = SH_C3
+    return [
+        -three * y * (3 * xx - yy),
+        two * x * y * z,
+        -one * y * (4 * zz - xx - yy),
+        zero * z * (2 * zz - 3 * xx - 3 * yy),
+        -one * x * (4 * zz - xx - yy),
+        0.5 * two * z * (xx - yy),
+        -three * x * (xx - 3 * yy),
+    ]

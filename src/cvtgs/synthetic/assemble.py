@@ -1,6 +1,6 @@
 """From parts with shares to one scene of an exact count, chunk by chunk."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,7 +10,7 @@ from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 from cvtgs.synthetic.chunks import Chunk, Draw
 
-CHUNK = 1 << 13
+CHUNK = 1 << 15
 """Rows that are drawn together: few enough to stay in the cache of one core."""
 
 
@@ -85,20 +85,30 @@ def assemble(
     tensors = {name: torch.empty(count, *shape) for name, shape in shapes.items()}
     row = 0
     for part, total in zip(parts, allocate(count, [p.share for p in parts]), strict=True):
-        shift = torch.rand(2, generator=generator)
-        for start in range(0, total, CHUNK):
-            stop = min(start + CHUNK, total)
-            piece = part.draw(
-                Chunk(
-                    start=start, stop=stop, total=total, rest_count=rest,
-                    shift=shift, generator=generator,
-                )
-            )  # fmt: skip
+        for piece in _pieces(part, total, rest, generator):
             for name, values in piece.tensors().items():
-                tensors[name][row + start : row + stop] = values
-        row += total
+                tensors[name][row : row + len(piece)] = values
+            row += len(piece)
     return GaussianScene(
         means=tensors["means"], quats=tensors["quats"], log_scales=tensors["log_scales"],
         logit_opacities=tensors["logit_opacities"], sh0=tensors["sh0"], shN=tensors["shN"],
         comments=(comment,),
     )  # fmt: skip
+
+
+def _pieces(
+    part: Part, total: int, rest: int, generator: torch.Generator
+) -> Iterator[GaussianScene]:
+    """Draw a part of ``total`` Gaussians chunk by chunk."""
+    shift = torch.rand(2, generator=generator)
+    for start in range(0, total, CHUNK):
+        yield part.draw(
+            Chunk(
+                start=start,
+                stop=min(start + CHUNK, total),
+                total=total,
+                rest_count=rest,
+                shift=shift,
+                generator=generator,
+            )
+        )

@@ -44,8 +44,8 @@ def single_object(dice: Dice) -> list[Part]:
 
 
 def hazy(dice: Dice) -> list[Part]:
-    """Lay out a scene of which nine tenths are faint, as some trained scenes are."""
-    faint = Finish(overlap=2.3, faintness=4.2, gloss=0.1)
+    """Lay out a scene that is faint for the most part, as some trained scenes are."""
+    faint = Finish(overlap=2.6, faintness=3.2, gloss=0.1)
     columns = [
         covered(
             standing(revolution(column_profile(0.3, dice.between(1.0, 3.0))), place),

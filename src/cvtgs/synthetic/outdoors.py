@@ -142,6 +142,6 @@ def _mist(dice: Dice) -> Part:
     """Let a bank of mist hang in the corner of the walls."""
     turn = dice.between(0, 1)
     center = torch.tensor([-2.0 + 1.5 * turn, -0.4, -0.5 - 1.5 * turn])
-    extent = torch.tensor([1.3, 0.35, 1.1])
+    extent = torch.tensor([1.8, 0.45, 1.5])
     color = dice.near((0.8, 0.82, 0.86))
-    return Part(share=5, draw=haze(center, extent, dice.between(0.4, 0.7), color))
+    return Part(share=5, draw=haze(center, extent, dice.between(0.5, 0.8), color))

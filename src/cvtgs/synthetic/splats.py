@@ -2,7 +2,7 @@
 
 The shapes follow what trained scenes have in common: the longest axis about as long as the
 spacing, the second a third of it, the third a twentieth; elongated along edges of the texture
-and small where it is busy; a third nearly opaque, the rest of every opacity; larger ones hidden
+and small where it is busy; a quarter nearly opaque, the rest of every opacity; larger ones hidden
 behind the surface.
 """
 
@@ -31,13 +31,13 @@ class Finish:
 
     Attributes:
         overlap: Median length of the Gaussians, in spacings.
-        faintness: Subtracted from the logits of the opacities.
+        faintness: How much fainter than usual; see :func:`opacities`.
         gloss: Brightness of the highlights.
         thickness: Deviation from the surface, in spacings.
         lit: Whether sun and sky light it; else it shines by itself.
     """
 
-    overlap: float = 1.15
+    overlap: float = 1.25
     faintness: float = 0.0
     gloss: float = 0.0
     thickness: float = 0.04
@@ -64,12 +64,13 @@ def coated(surface: Surface, texture: Texture, finish: Finish) -> Draw:
         scales = _scales(spacing, busy, hidden, finish.overlap, chunk)
         depth = torch.where(hidden, 2.0 + chunk.uniforms(), finish.thickness * chunk.normals())
         average, rest = shine(at.normals, finish.gloss, chunk)
+        cover = 1 / (1 + math.exp(finish.faintness - 3.0))
         shade = light(at.normals) if finish.lit else 1.0
         return gaussians(
             means=at.points - (depth * spacing)[:, None] * at.normals,
             frames=frames,
             scales=scales,
-            opacities=torch.where(hidden, 0.95, opacities(chunk, finish.faintness)),
+            opacities=torch.where(hidden, cover, opacities(chunk, finish.faintness)),
             colors=colors * shade + average + 0.02 * chunk.normals(3),
             rest=rest,
         )
@@ -78,18 +79,19 @@ def coated(surface: Surface, texture: Texture, finish: Finish) -> Draw:
 
 
 def opacities(chunk: Chunk, faintness: float) -> Float[Tensor, "n"]:
-    """Draw opacities: a third nearly opaque, the others anywhere.
+    """Draw opacities: some nearly opaque, the others anywhere.
 
     Args:
         chunk: The rows.
-        faintness: Subtracted from the logits.
+        faintness: Subtracted from the logits of the others, which are then more alike and more.
 
     Returns:
         Opacities.
     """
-    opaque = chunk.uniforms() < 0.3
-    logits = torch.where(opaque, 4.5, 0.3) + torch.where(opaque, 1.0, 1.6) * chunk.normals()
-    return torch.sigmoid(logits - faintness)
+    opaque = chunk.uniforms() < 0.22 * math.exp(-0.5 * faintness)
+    spread = 1.6 / (1 + 0.2 * faintness)
+    others = spread * chunk.normals() - 0.1 - faintness
+    return torch.sigmoid(torch.where(opaque, 4.5 + chunk.normals(), others))
 
 
 def light(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -169,8 +171,8 @@ def _scales(
 ) -> Float[Tensor, "n 3"]:
     """Draw the lengths of the axes; the third is across the surface."""
     length = overlap * torch.exp(0.5 * chunk.normals() - 0.2 * busy)
-    width = length * torch.exp(-(0.5 + 1.0 * busy) - 0.45 * chunk.normals().abs())
+    width = length * torch.exp(-(0.65 + 1.0 * busy) - 0.45 * chunk.normals().abs())
     depth = torch.minimum(chunk.lognormals(0.05, 1.0), 0.7 * width)
     seen = torch.stack([length, width, depth], dim=1)
-    backing = torch.tensor([2.2, 1.8, 0.3])
+    backing = torch.tensor([2.3, 1.7, 0.3]) * torch.exp(0.2 * chunk.normals(3))
     return spacing[:, None] * torch.where(hidden[:, None], backing, seen)

@@ -12,6 +12,8 @@ from cvtgs.synthetic.chunks import Chunk, Draw, frames_of, gaussians
 from cvtgs.synthetic.splats import light, opacities, shine
 from cvtgs.synthetic.textures import Texture
 
+_MANY_BLADES = 12_000  # more blades than these are slimmer, so that the ground still shows
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Strands:
@@ -170,7 +172,8 @@ def grass(roots: Float[Tensor, "k 3"], height: float, colors: tuple[Texture, Tex
         spread = 0.22 * chunk.normals(3) * torch.tensor([1.0, 0.0, 1.0])
         means = roots[tuft] + spread + (0.5 * length)[:, None] * axis
         along = 0.27 * length
-        across = along * chunk.lognormals(0.07, 0.3)
+        slimness = math.sqrt(min(1.0, _MANY_BLADES / chunk.total))
+        across = along * chunk.lognormals(0.07 * slimness, 0.3)
         side = chunk.directions()
         frames = frames_of(axis, side)
         flat = means[:, [0, 2]]

@@ -11,6 +11,7 @@ from cvtgs.synthetic.chunks import Chunk, Draw, gaussians
 from cvtgs.synthetic.textures import Color
 
 _HAZE_OPACITY = 0.022
+_MANY_FLOATERS = 1000  # more than these are smaller, so that they hide no more of the scene
 
 
 def haze(
@@ -64,7 +65,8 @@ def floaters(center: Float[Tensor, "3"], radius: float) -> Draw:
         distance = radius * (0.4 + 2.6 * chunk.uniforms().square())
         offset = distance[:, None] * chunk.directions() * torch.tensor([1.0, 0.35, 1.0])
         lift = torch.tensor([0.0, -0.3 * radius, 0.0])
-        longest = chunk.lognormals(0.012 * radius, 0.8)
+        size = 0.012 * radius * math.sqrt(min(1.0, _MANY_FLOATERS / chunk.total))
+        longest = chunk.lognormals(size, 0.8)
         shape = torch.stack(
             [
                 torch.ones(len(chunk)),
@@ -79,7 +81,7 @@ def floaters(center: Float[Tensor, "3"], radius: float) -> Draw:
             scales=longest[:, None] * shape,
             opacities=0.02 + 0.5 * chunk.uniforms() ** 3,
             colors=0.55 + 0.15 * chunk.normals(1) + 0.05 * chunk.normals(3),
-            rest=0.1 * chunk.normals(chunk.rest_count, 3),
+            rest=0.05 * chunk.normals(chunk.rest_count, 3),
         )
 
     return draw

@@ -1,0 +1,187 @@
+"""Merged cells against the scalar oracle, and what a merge conserves."""
+
+import math
+
+import oracles
+import pytest
+import torch
+from scenes import assert_same_gaussians, covariances_of, moved, oracle_rows, random_scene
+
+from cvtgs import GaussianScene
+from cvtgs.cells import (
+    Partition,
+    gather_members,
+    mean_and_covariance,
+    merge_cells,
+    merged_depth,
+    widening_factors,
+)
+from cvtgs.config import MergeConfig, SimplifyConfig
+from cvtgs.math import covariances
+
+RULES = {
+    "paper": MergeConfig(weight="opacity", opacity="union", widening=0.0),
+    "standard": MergeConfig(weight="mass", opacity="saturating", widening=0.0),
+}
+each_rule = pytest.mark.parametrize("config", RULES.values(), ids=RULES)
+WIDENED = SimplifyConfig.from_preset("standard").merge
+
+
+def random_cells(total: int, count: int, seed: int = 0) -> Partition:
+    labels = torch.randint(0, count, (total,), generator=torch.Generator().manual_seed(seed))
+    labels[: 2 * count] = torch.arange(2 * count) % count
+    return Partition.from_labels(labels, count)
+
+
+def merged(scene: GaussianScene, cells: Partition, config: MergeConfig) -> GaussianScene:
+    return merge_cells(scene, cells, scene.masses, config=config)
+
+
+def assert_equals_oracle(scene, cells, config, *, tolerance: float) -> None:
+    small = merged(scene, cells, config)
+    matrices = covariances_of(small)
+    offsets, order = cells.offsets.tolist(), cells.order.tolist()
+    for cell in range(len(cells)):
+        rows = order[offsets[cell] : offsets[cell + 1]]
+        wanted = oracles.merge(
+            oracle_rows(scene, rows), weight=config.weight, opacity=config.opacity
+        )
+        size = math.sqrt(float(wanted.covariance.max()))
+        assert small.means[cell].tolist() == pytest.approx(wanted.mean, abs=tolerance * size)
+        difference = (matrices[cell] - torch.from_numpy(wanted.covariance)).abs().amax()
+        assert float(difference) < tolerance * size * size
+        assert small.opacities[cell].item() == pytest.approx(wanted.opacity, abs=tolerance)
+        torch.testing.assert_close(
+            small.sh[cell].double(), torch.from_numpy(wanted.sh), rtol=tolerance, atol=tolerance
+        )
+
+
+@each_rule
+@pytest.mark.parametrize(("total", "count"), [(2, 1), (50, 1), (200, 20), (300, 150)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 3e-5), (torch.float64, 1e-9)])
+def test_cells_equal_the_oracle(total, count, dtype, tolerance, config):
+    scene = random_scene(total, seed=count, degree=2, dtype=dtype)
+    assert_equals_oracle(scene, random_cells(total, count), config, tolerance=tolerance)
+
+
+@each_rule
+def test_thin_and_faint_and_opaque_members_equal_the_oracle(config):
+    scene = random_scene(60, dtype=torch.float64)
+    log_scales, logits = scene.log_scales.clone(), scene.logit_opacities.clone()
+    log_scales[::3, 2] -= 12.0
+    logits[::4], logits[1::4] = -30.0, 30.0
+    scene = scene.with_tensors({"log_scales": log_scales, "logit_opacities": logits}, {})
+    assert_equals_oracle(scene, random_cells(60, 9), config, tolerance=1e-8)
+
+
+@each_rule
+def test_moments_of_the_mixture_are_conserved(config):
+    """First and second raw moments of each cell, summed over the whole scene by weight."""
+    scene, cells = random_scene(400, dtype=torch.float64), random_cells(400, 30)
+    members = gather_members(scene, cells, scene.masses, weight=config.weight)
+    means, matrices = mean_and_covariance(members)
+    second = covariances.from_scales_and_quats(members.scales, members.quats)
+    second = second + members.means[:, :, None] * members.means[:, None, :]
+    for cell in range(30):
+        rows = slice(int(cells.offsets[cell]), int(cells.offsets[cell + 1]))
+        weights = members.weights[rows]
+        assert float(weights.sum()) == pytest.approx(1.0)
+        torch.testing.assert_close(means[cell], (weights[:, None] * members.means[rows]).sum(0))
+        torch.testing.assert_close(
+            matrices[cell] + means[cell][:, None] * means[cell],
+            (weights[:, None, None] * second[rows]).sum(0),
+        )
+
+
+def test_saturating_conserves_depth_times_area():
+    """The mass of transparent cells; an opaque cell can paint its own area only once."""
+    scene, cells = random_scene(400, dtype=torch.float64), random_cells(400, 150)
+    scene = scene.with_tensors({"logit_opacities": 0.3 * scene.logit_opacities - 7.0}, {})
+    small = merged(scene, cells, RULES["standard"])
+    members = gather_members(scene, cells, scene.masses, weight="mass")
+    wanted = torch.stack(
+        [
+            (members.depths * members.areas)[int(a) : int(b)].sum()
+            for a, b in zip(cells.offsets, cells.offsets[1:], strict=False)
+        ]
+    )
+    depths = -torch.log1p(-small.opacities)
+    inside = (depths > 1.1e-6) & (depths < 13.8)
+    assert bool(inside.all())
+    areas = covariances.mean_projected_area(small.scales)
+    torch.testing.assert_close(depths * areas, wanted, rtol=1e-8, atol=0)
+    assert float(small.masses.sum()) == pytest.approx(float(scene.masses.sum()), rel=0.01)
+
+
+def test_saturating_never_gains_mass_and_never_exceeds_one():
+    scene, cells = random_scene(500, dtype=torch.float64, spread=0.02), random_cells(500, 10)
+    small = merged(scene, cells, RULES["standard"])
+    assert bool((small.opacities < 1).all())
+    areas = covariances.mean_projected_area(small.scales)
+    assert bool((small.masses <= areas).all())
+
+
+def test_union_adds_depths():
+    scene, cells = random_scene(100, dtype=torch.float64), random_cells(100, 40)
+    members = gather_members(scene, cells, scene.masses, weight="opacity")
+    depths = merged_depth(members, torch.ones(40).double(), rule="union")
+    for cell in range(40):
+        rows = cells.order[int(cells.offsets[cell]) : int(cells.offsets[cell + 1])]
+        through = (1 - scene.opacities[rows]).prod()
+        assert float(torch.exp(-depths[cell])) == pytest.approx(float(through))
+
+
+def test_widening_widens_scales_only_and_only_cells_of_several():
+    scene = random_scene(300, dtype=torch.float64)
+    labels = torch.cat([torch.arange(40), torch.randint(20, 40, (260,))])
+    cells = Partition.from_labels(labels, 40)
+    plain, wide = merged(scene, cells, RULES["standard"]), merged(scene, cells, WIDENED)
+    ratios = wide.scales / plain.scales
+    assert bool((ratios[:20] == 1).all())
+    assert bool((ratios >= 1 - 1e-12).all())
+    assert float(ratios.amax()) > 1.01
+    torch.testing.assert_close(wide.means, plain.means)
+    torch.testing.assert_close(wide.quats, plain.quats)
+
+
+def test_widening_leaves_haze_alone():
+    scene, cells = random_scene(300, dtype=torch.float64), random_cells(300, 20)
+    hazy = scene.with_tensors({"logit_opacities": scene.logit_opacities * 0 - 9.0}, {})
+    members = gather_members(hazy, cells, hazy.masses, weight="mass")
+    faint = torch.full((20,), 1e-3, dtype=torch.float64)
+    factors = widening_factors(members, faint, strength=0.3)
+    assert bool(((factors >= 1) & (factors < 1.001)).all())
+    assert bool((widening_factors(members, faint, strength=0.0) == 1).all())
+
+
+@pytest.mark.parametrize("config", [*RULES.values(), WIDENED], ids=[*RULES, "widened"])
+@pytest.mark.parametrize(
+    "motion",
+    [
+        {"quat": (0.3, -0.5, 0.8, 0.1), "shift": (3.0, -2.0, 5.0)},
+        {"scale": 1e3},
+        {"scale": 1e-3, "quat": (0.0, 1.0, 0.0, 0.0)},
+    ],
+    ids=["rigid", "kilo", "milli"],
+)
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_merge_moves_with_the_scene(degree, motion, config):
+    """With given cells, a merge is equivariant under every rigid motion and change of unit."""
+    scene, cells = random_scene(80, degree=degree, dtype=torch.float64), random_cells(80, 12)
+    assert_same_gaussians(
+        merged(moved(scene, **motion), cells, config),
+        moved(merged(scene, cells, config), **motion),
+        tolerance=1e-7,
+    )
+
+
+@each_rule
+def test_order_of_members_does_not_matter(config):
+    scene, cells = random_scene(200, dtype=torch.float64), random_cells(200, 12)
+    shuffle = torch.randperm(200, generator=torch.Generator().manual_seed(1))
+    labels = torch.empty(200, dtype=torch.int64)
+    labels[cells.order] = torch.repeat_interleave(torch.arange(12), cells.counts)
+    other = Partition.from_labels(labels[shuffle], 12)
+    assert_same_gaussians(
+        merged(scene, cells, config), merged(scene.select(shuffle), other, config), tolerance=1e-9
+    )

@@ -1,0 +1,78 @@
+"""Partition: members of every cell as runs of row numbers."""
+
+import pytest
+import torch
+
+from cvtgs.cells import Partition
+from cvtgs.errors import InvalidArgumentError
+
+
+def lists_of(partition: Partition) -> list[list[int]]:
+    ends = partition.offsets.tolist()
+    rows = partition.order.tolist()
+    return [rows[first:last] for first, last in zip(ends, ends[1:], strict=False)]
+
+
+def partition_of(counts: list[int]) -> Partition:
+    labels = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
+    shuffle = torch.randperm(len(labels), generator=torch.Generator().manual_seed(0))
+    return Partition.from_labels(labels[shuffle], len(counts))
+
+
+def test_known_labels():
+    partition = Partition.from_labels(torch.tensor([2, 0, 2, 1, 0]), 3)
+    assert lists_of(partition) == [[1, 4], [3], [0, 2]]
+    assert partition.counts.tolist() == [2, 1, 2]
+    assert len(partition) == 3
+
+
+def test_select_keeps_order():
+    partition = Partition.from_labels(torch.tensor([2, 0, 2, 1, 0]), 3)
+    kept = partition.select(torch.tensor([True, False, True]))
+    assert lists_of(kept) == [[1, 4], [0, 2]]
+    none = partition.select(torch.tensor([False, False, False]))
+    assert len(none) == 0
+    assert lists_of(none) == []
+    assert list(none.chunks(5)) == []
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
+def test_labels_of_other_integers(dtype):
+    assert lists_of(Partition.from_labels(torch.tensor([1, 0], dtype=dtype), 2)) == [[1], [0]]
+
+
+@pytest.mark.parametrize("limit", [1, 2, 3, 7, 1000])
+def test_chunks_hold_every_cell_once_and_whole(limit):
+    partition = partition_of([1, 2, 3, 1, 1, 9, 1, 2])
+    wanted, found, next_cell = lists_of(partition), [], 0
+    for run, part in partition.chunks(limit):
+        assert run.start == next_cell
+        assert run.stop - run.start == len(part)
+        assert int(part.offsets[0]) == 0
+        assert len(part.order) <= limit or len(part) == 1
+        found += lists_of(part)
+        next_cell = run.stop
+    assert found == wanted
+
+
+def test_chunks_are_as_large_as_they_may_be():
+    runs = [part.counts.tolist() for _, part in partition_of([2, 2, 1, 5, 1, 1]).chunks(5)]
+    assert runs == [[2, 2, 1], [5], [1, 1]]
+
+
+def test_a_cell_larger_than_a_chunk_is_a_run_of_its_own():
+    runs = [part.counts.tolist() for _, part in partition_of([1, 50, 1, 1]).chunks(10)]
+    assert runs == [[1], [50], [1, 1]]
+
+
+def test_a_label_out_of_range_is_an_error():
+    for labels, found in (([0, 3], "0 to 3"), ([-1, 2], "-1 to 2")):
+        with pytest.raises(InvalidArgumentError) as caught:
+            Partition.from_labels(torch.tensor(labels), 3)
+        assert str(caught.value) == f"labels must be between 0 and 2, found {found}."
+
+
+def test_an_empty_cell_is_an_error():
+    with pytest.raises(InvalidArgumentError) as caught:
+        Partition.from_labels(torch.tensor([0, 3, 0]), 5)
+    assert str(caught.value) == "every cell needs a member; 3 have none, the first is 1."

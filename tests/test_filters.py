@@ -1,0 +1,133 @@
+"""Which Gaussians enter the tessellation."""
+
+import pytest
+import torch
+from scenes import random_scene, same_bits
+
+from cvtgs.filters import invalid_rows, standardized, visible_rows, with_finite_opacities
+
+NAN, INF = float("nan"), float("inf")
+
+
+def changed(name: str, row: int, value: float, *, degree: int = 1):
+    scene = random_scene(5, degree=degree)
+    tensor = getattr(scene, name).clone()
+    tensor[row].view(-1)[-1] = value
+    return scene.with_tensors({name: tensor}, {})
+
+
+def test_the_faintest_go_while_they_hold_little_mass():
+    opacities = torch.tensor([0.05, 0.5, 0.01, 0.09, 0.02])
+    masses = torch.tensor([3.0, 90.0, 1.0, 5.0, 1.0])
+    for share, kept in (
+        (0.0, [0, 1, 2, 3, 4]),
+        (0.01, [0, 1, 3, 4]),
+        (0.02, [0, 1, 3]),
+        (0.05, [1, 3]),
+        (1.0, [1]),
+    ):
+        keep = visible_rows(
+            opacities, masses, min_opacity=0.1, max_mass_share=share, at_least=1
+        )
+        assert keep.nonzero()[:, 0].tolist() == kept
+
+
+def test_the_heaviest_come_back_where_too_few_stay():
+    opacities = torch.tensor([0.05, 0.5, 0.01, 0.09, 0.02])
+    masses = torch.tensor([3.0, 90.0, 4.0, 5.0, 1.0])
+    keep = visible_rows(opacities, masses, min_opacity=0.1, max_mass_share=1.0, at_least=3)
+    assert keep.nonzero()[:, 0].tolist() == [1, 2, 3]
+
+
+def test_opacities_at_the_threshold_stay():
+    opacities = torch.tensor([0.1, 0.0999])
+    keep = visible_rows(opacities, opacities, min_opacity=0.1, max_mass_share=1.0, at_least=1)
+    assert keep.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("at_least", [1, 2, 500, 1000])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_all_faint(at_least, dtype):
+    """With share 1 all may go, whatever the rounding of their summed mass."""
+    for seed in range(20):
+        g = torch.Generator().manual_seed(seed)
+        opacities = 0.09 * torch.rand(1000, generator=g, dtype=dtype)
+        masses = torch.rand(1000, generator=g, dtype=dtype)
+        keep = visible_rows(
+            opacities, masses, min_opacity=0.1, max_mass_share=1.0, at_least=at_least
+        )
+        heaviest = torch.sort(masses, stable=True, descending=True).indices[:at_least]
+        assert set(keep.nonzero()[:, 0].tolist()) == set(heaviest.tolist())
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.01, 0.1, 0.5])
+def test_the_mass_that_is_left_out_is_bounded(share):
+    scene = random_scene(2000)
+    keep = visible_rows(
+        scene.opacities, scene.masses, min_opacity=0.5, max_mass_share=share, at_least=1
+    )
+    assert float(scene.masses[~keep].sum()) <= share * float(scene.masses.sum()) * (1 + 1e-12)
+    assert bool(keep[scene.opacities >= 0.5].all())
+
+
+def test_a_clean_scene_has_no_invalid_rows():
+    assert invalid_rows(random_scene(20, degree=3)) == {}
+    assert invalid_rows(random_scene(0)) == {}
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+@pytest.mark.parametrize("name", ["means", "quats", "log_scales", "sh0", "shN"])
+def test_values_that_are_not_finite_are_invalid(name, value):
+    found = invalid_rows(changed(name, 3, value))
+    assert {key: mask.tolist() for key, mask in found.items()} == {
+        name: [False, False, False, True, False]
+    }
+
+
+def test_nan_opacities_are_invalid_and_infinite_ones_are_not():
+    assert list(invalid_rows(changed("logit_opacities", 0, NAN))) == ["logit_opacities"]
+    for value in (INF, -INF):
+        assert invalid_rows(changed("logit_opacities", 0, value)) == {}
+
+
+@pytest.mark.parametrize(("value", "bad"), [(88.0, False), (89.0, True), (400.0, True)])
+def test_scales_beyond_float32_are_infinite(value, bad):
+    assert bool(invalid_rows(changed("log_scales", 1, value))) is bad
+
+
+def test_zero_quaternions_are_invalid_and_tiny_ones_are_not():
+    scene = random_scene(4)
+    quats = scene.quats.clone()
+    quats[0], quats[1] = 0.0, 1e-40
+    found = invalid_rows(scene.with_tensors({"quats": quats}, {}))
+    assert found["quats"].tolist() == [True, False, False, False]
+
+
+def test_huge_finite_values_are_valid():
+    for name in ("means", "sh0", "shN", "quats"):
+        assert invalid_rows(changed(name, 2, 3e38, degree=3)) == {}
+
+
+def test_finite_opacities_are_left_alone():
+    scene = random_scene(4)
+    assert with_finite_opacities(scene) is scene
+    logits = torch.tensor([INF, -INF, 700.0, 1.0])
+    replaced = with_finite_opacities(scene.with_tensors({"logit_opacities": logits}, {}))
+    assert replaced.logit_opacities.tolist() == pytest.approx([13.81551, -13.81551, 700.0, 1.0])
+
+
+def test_standard_rows_stay_bit_for_bit():
+    scene = random_scene(50, degree=2)
+    once = standardized(scene)
+    assert same_bits(standardized(once), once)
+    norms = torch.linalg.vector_norm(once.quats, dim=1)
+    torch.testing.assert_close(norms, torch.ones(50))
+    assert torch.equal(once.means, scene.means)
+
+
+def test_standard_rows_have_opacities_inside():
+    scene = random_scene(3)
+    logits = torch.tensor([INF, -700.0, 2.0])
+    small = standardized(scene.with_tensors({"logit_opacities": logits}, {}))
+    assert bool(((small.opacities > 0) & (small.opacities < 1)).all())
+    assert small.logit_opacities[2].item() == 2.0

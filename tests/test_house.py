@@ -1,0 +1,184 @@
+"""The house rules, read from the source: who may import what, and how files look."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+SOURCE = ROOT / "src" / "cvtgs"
+FILES = sorted(SOURCE.rglob("*.py"))
+
+# A file imports only from lower levels, or from inside its own package. As in docs and design,
+# with three refinements: `math` raises the errors of `errors` and `report` shows the plan of
+# `effects`, so each stands above what it needs; and `info` combines stages as `simplify` does.
+LEVELS = [
+    {"errors", "progress"},
+    {"math"},
+    {"config", "scene", "cameras"},
+    {"effects"},
+    {"report", "io", "filters", "cvt", "cells", "synthetic", "render", "losses"},
+    {"mergenet"},
+    {"simplify", "info", "evaluate"},
+    {"train"},
+    {"cli"},
+    {"__main__"},
+]
+RANKS = {name: rank for rank, level in enumerate(LEVELS) for name in level}
+
+# Packages that `import cvtgs` must not load, and the only places that may import them.
+OWNERS = {
+    "scipy": {"cvt/nearest_scipy.py"},
+    "plyfile": {"io/ply/generic.py"},
+    "tomli_w": {"config.py"},
+    "rich": {"cli"},
+    "gsplat": {"render/gsplat_backend.py"},
+}
+HEAVY = ("scipy", "kornia", "plyfile", "rich", "matplotlib")
+
+
+def relative(path: Path) -> str:
+    return path.relative_to(SOURCE).as_posix()
+
+
+def package_of(path: Path) -> str:
+    return path.relative_to(SOURCE).parts[0].removesuffix(".py")
+
+
+def is_for_types(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+
+
+def imports_in(node: ast.AST) -> Iterator[str]:
+    """Give the dotted names that run-time imports name, wherever in the file they are."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Import):
+            yield from (alias.name for alias in child.names)
+        elif isinstance(child, ast.ImportFrom):
+            assert child.level == 0, "imports are absolute"
+            yield from (f"{child.module}.{alias.name}" for alias in child.names)
+        elif not is_for_types(child):
+            yield from imports_in(child)
+
+
+def broken_ranks(path: Path, text: str) -> list[str]:
+    own, broken = package_of(path), []
+    for name in imports_in(ast.parse(text)):
+        parts = name.split(".")
+        if parts[0] == "cvtgs" and len(parts) > 1 and parts[1] != own:
+            known = own in RANKS and parts[1] in RANKS
+            if not known or RANKS[parts[1]] >= RANKS[own]:
+                broken.append(f"{relative(path)} imports {name}")
+    return broken
+
+
+def owners_of(package: str) -> set[str]:
+    return {
+        relative(path)
+        for path in FILES
+        if any(
+            name.split(".")[0] == package
+            for name in imports_in(ast.parse(path.read_text(encoding="utf-8")))
+        )
+    }
+
+
+def in_fresh_process(code: str) -> list[str]:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
+    return done.stdout.split()
+
+
+def test_rank_test_can_fail():
+    """A sideways import, an upward one, an unknown module and a downward one."""
+    path = SOURCE / "cvt" / "new.py"
+    text = """
+from cvtgs import cells, math
+from cvtgs.simplify import Simplifier
+def late():
+    import cvtgs.elsewhere
+from cvtgs.cvt.lloyd import lloyd
+if TYPE_CHECKING:
+    from cvtgs.train import anything
+"""
+    assert broken_ranks(path, text) == [
+        "cvt/new.py imports cvtgs.cells",
+        "cvt/new.py imports cvtgs.simplify.Simplifier",
+        "cvt/new.py imports cvtgs.elsewhere",
+    ]
+
+
+def test_imports_go_down_the_ranks():
+    assert len(FILES) > 20
+    broken = [
+        problem
+        for path in FILES
+        if path != SOURCE / "__init__.py"
+        for problem in broken_ranks(path, path.read_text(encoding="utf-8"))
+    ]
+    assert broken == []
+
+
+def test_the_front_page_imports_nothing_of_the_house():
+    text = (SOURCE / "__init__.py").read_text(encoding="utf-8")
+    assert not [name for name in imports_in(ast.parse(text)) if name.startswith("cvtgs")]
+
+
+@pytest.mark.parametrize(("package", "allowed"), OWNERS.items(), ids=OWNERS)
+def test_packages_are_imported_only_where_they_belong(package, allowed):
+    found = owners_of(package)
+    if allowed == {"cli"}:
+        assert found
+        assert all(name.startswith("cli/") for name in found)
+    elif package == "gsplat":
+        assert found <= allowed
+    else:
+        assert found == allowed
+
+
+@pytest.mark.parametrize(
+    "path",
+    [*FILES, *sorted((ROOT / "tests").rglob("*.py"))],
+    ids=lambda path: path.relative_to(ROOT).as_posix(),
+)
+def test_files_are_short(path):
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 300
+
+
+@pytest.mark.parametrize("path", FILES, ids=relative)
+def test_no_print_outside_cli_and_no_assert(path):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    asserts = [node.lineno for node in ast.walk(tree) if isinstance(node, ast.Assert)]
+    prints = [
+        node.lineno
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id in ("print", "input")
+    ]
+    assert asserts == []
+    assert prints == [] or package_of(path) == "cli"
+
+
+def test_no_name_that_means_everything():
+    vague = {"utils", "util", "helpers", "common", "misc"}
+    assert not [path for path in FILES if vague & set(path.with_suffix("").parts)]
+
+
+@pytest.mark.parametrize(
+    "statement",
+    ["import cvtgs", "import cvtgs.simplify", "import cvtgs; cvtgs.Simplifier; cvtgs.load"],
+)
+def test_imports_are_light(statement):
+    heavy = f"print(*sorted({set(HEAVY)!r} & set(sys.modules)))"
+    assert in_fresh_process(f"import sys; {statement}; {heavy}") == []
+
+
+def test_the_front_page_does_not_even_load_torch():
+    assert in_fresh_process("import sys, cvtgs; print('torch' in sys.modules)") == ["False"]
+
+
+def test_the_package_says_that_it_is_typed():
+    assert (SOURCE / "py.typed").is_file()

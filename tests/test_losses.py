@@ -1,0 +1,187 @@
+"""Losses between images."""
+
+import math
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.losses import gradient_loss, image_loss, l1_loss, ssim_loss
+
+LOSSES = [l1_loss, ssim_loss, gradient_loss, image_loss]
+
+
+def pair(height: int = 12, width: int = 13, count: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(3)
+    shape = (count, height, width, 3)
+    first = torch.rand(shape, generator=g, dtype=torch.float64)
+    return first, torch.rand(shape, generator=g, dtype=torch.float64)
+
+
+def from_rows(rows: list[list[float]]) -> torch.Tensor:
+    return torch.tensor(rows, dtype=torch.float64)[None, :, :, None].expand(1, -1, -1, 3)
+
+
+def test_l1_by_hand() -> None:
+    loss = l1_loss(from_rows([[0.0, 1.0], [0.5, 0.0]]), from_rows([[0.5, 0.0], [0.5, 0.25]]))
+    assert loss.item() == (0.5 + 1.0 + 0.0 + 0.25) / 4
+
+
+def test_gradient_by_hand() -> None:
+    difference = from_rows([[0.0, 1.0, 1.0], [2.0, 0.0, 1.0]])
+    loss = gradient_loss(difference + 0.25, torch.full_like(difference, 0.25))
+    dx = (1 + 0 + 2 + 1) / 4
+    dy = (2 + 1 + 0) / 3
+    assert loss.item() == pytest.approx(dx + dy, rel=1e-15)
+
+
+def test_gradient_does_not_see_an_offset() -> None:
+    first, _ = pair()
+    assert gradient_loss(first, first + 0.125).item() == pytest.approx(0.0, abs=1e-15)
+
+
+def test_ssim_of_flat_images_by_hand() -> None:
+    """Without variance only the luminance term is left."""
+    first, second = 0.5, 0.25
+    luminance = (2 * first * second + 1e-4) / (first**2 + second**2 + 1e-4)
+    flat = torch.ones(1, 11, 14, 3, dtype=torch.float64)
+    assert ssim_loss(first * flat, second * flat).item() == pytest.approx(1 - luminance, abs=1e-12)
+
+
+def test_ssim_of_one_bright_pixel_by_hand() -> None:
+    """One window, and one pixel of it at the centre: the moments are the weight of that pixel."""
+    taps = [math.exp(-0.5 * (i / 1.5) ** 2) for i in range(-5, 6)]
+    weight = (1 / sum(taps)) ** 2
+    image = torch.zeros(1, 11, 11, 3, dtype=torch.float64)
+    image[:, 5, 5] = 1.0
+    mean, variance = weight, weight - weight**2
+    similarity = (1e-4 / (mean**2 + 1e-4)) * (9e-4 / (variance + 9e-4))
+    loss = ssim_loss(image, torch.zeros_like(image)).item()
+    assert loss == pytest.approx(1 - similarity, abs=1e-12)
+
+
+def test_image_loss_is_the_sum_of_its_terms() -> None:
+    first, second = pair(count=2)
+    wanted = (
+        0.7 * l1_loss(first, second)
+        + 0.3 * ssim_loss(first, second)
+        + 0.5 * gradient_loss(first, second)
+    )
+    loss = image_loss(first, second, ssim_weight=0.3, gradient_weight=0.5)
+    torch.testing.assert_close(loss, wanted)
+    default = 0.8 * l1_loss(first, second) + 0.2 * ssim_loss(first, second)
+    default = default + 0.2 * gradient_loss(first, second)
+    torch.testing.assert_close(image_loss(first, second), default)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("loss", LOSSES)
+def test_a_scalar_of_the_dtype_that_is_zero_for_equal_images(loss, dtype) -> None:
+    first, second = (images.to(dtype) for images in pair(count=3))
+    value = loss(first, second)
+    assert value.shape == ()
+    assert value.dtype == dtype
+    assert value.item() > 0.05
+    assert abs(loss(first, first).item()) < 1e-6
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (7, 1), (10, 40)])
+def test_images_smaller_than_the_window(size) -> None:
+    first, second = pair(*size)
+    assert l1_loss(first, second).item() > 0
+    assert gradient_loss(first, second).item() >= 0
+    without = image_loss(first, second, ssim_weight=0.0)
+    torch.testing.assert_close(without, l1_loss(first, second) + 0.2 * gradient_loss(first, second))
+    for loss in (ssim_loss, image_loss):
+        with pytest.raises(InvalidArgumentError) as error:
+            loss(first, second)
+        assert str(error.value) == (
+            f"images must have at least 11 x 11 pixels here, found {size[1]} x {size[0]}."
+        )
+
+
+def test_one_column_has_no_dx() -> None:
+    first, second = pair(5, 1)
+    wanted = (first - second).diff(dim=1).abs().mean()
+    torch.testing.assert_close(gradient_loss(first, second), wanted)
+
+
+def test_nothing_is_mutated() -> None:
+    first, second = pair()
+    copies = first.clone(), second.clone()
+    image_loss(first, second)
+    assert torch.equal(first, copies[0])
+    assert torch.equal(second, copies[1])
+
+
+ZEROS = torch.zeros(1, 12, 12, 3)
+WRONG = {
+    "no floats": (
+        (ZEROS.int(), ZEROS),
+        "images must be tensors of floats, found torch.int32.",
+    ),
+    "no tensor": (([0.0], ZEROS), "images must be tensors of floats, found list."),
+    "one image": (
+        (ZEROS[0], ZEROS[0]),
+        "images must have shape (c, h, w, 3) with nothing empty, found (12, 12, 3).",
+    ),
+    "channels first": (
+        (ZEROS, ZEROS.permute(0, 3, 1, 2)),
+        "images must have shape (c, h, w, 3) with nothing empty, found (1, 3, 12, 12).",
+    ),
+    "empty": (
+        (ZEROS[:0], ZEROS[:0]),
+        "images must have shape (c, h, w, 3) with nothing empty, found (0, 12, 12, 3).",
+    ),
+    "two shapes": (
+        (ZEROS, ZEROS[:, :11]),
+        "both stacks of images must have one shape, found (1, 12, 12, 3) and (1, 11, 12, 3).",
+    ),
+    "two dtypes": (
+        (ZEROS, ZEROS.double()),
+        "both stacks of images must share dtype and device, "
+        "found torch.float32 on cpu and torch.float64 on cpu.",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+@pytest.mark.parametrize("loss", LOSSES)
+def test_error_texts(loss, case) -> None:
+    images, text = WRONG[case]
+    with pytest.raises(InvalidArgumentError) as error:
+        loss(*images)
+    assert str(error.value) == text
+
+
+def test_weights_out_of_range() -> None:
+    for weight in (-0.1, 1.5, math.nan):
+        with pytest.raises(InvalidArgumentError, match="ssim_weight must be from 0 to 1, found"):
+            image_loss(ZEROS, ZEROS, ssim_weight=weight)
+    for weight in (-0.1, math.inf, math.nan):
+        with pytest.raises(InvalidArgumentError, match="gradient_weight must be a finite number"):
+            image_loss(ZEROS, ZEROS, gradient_weight=weight)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_gradients_against_finite_differences(loss) -> None:
+    first, second = (images.requires_grad_() for images in pair(11, 12))
+    assert torch.autograd.gradcheck(loss, (first, second), fast_mode=True)
+
+
+def test_importing_losses_is_light() -> None:
+    program = (
+        "import sys, cvtgs, cvtgs.losses, cvtgs.evaluate, cvtgs.io\n"
+        "print(sorted({'kornia', 'scipy', 'lpips', 'torchvision'} & set(sys.modules)))\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+    )
+    assert result.stdout == "[]\n"

@@ -1,0 +1,149 @@
+"""The public names are a contract."""
+
+import ast
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+import cvtgs
+
+NAMES = {
+    "PRESETS",
+    "CvtgsError",
+    "EffectPlan",
+    "GaussianScene",
+    "ProgressEvent",
+    "ProgressListener",
+    "SceneInfo",
+    "Simplified",
+    "Simplifier",
+    "SimplifyConfig",
+    "SimplifyReport",
+    "cells",
+    "cvt",
+    "describe",
+    "effects",
+    "errors",
+    "filters",
+    "from_dict",
+    "io",
+    "load",
+    "math",
+    "save",
+    "synthetic",
+    "target_count",
+    "to_dict",
+}
+
+STAGES = {
+    "cvt": {
+        "LloydResult",
+        "Tessellation",
+        "embed",
+        "falloff",
+        "fill_empty_cells",
+        "lloyd",
+        "nearest_backend",
+        "nearest_scipy",
+        "nearest_torch",
+        "stratified_seeds",
+        "tessellate",
+        "tessellation_weights",
+        "weighted_centroids",
+        "weighted_seeds",
+    },
+    "cells": {
+        "Members",
+        "Partition",
+        "gather_members",
+        "mean_and_covariance",
+        "merge_cells",
+        "merged_depth",
+        "normalized_weights",
+        "weighted_mean",
+        "widening_factors",
+    },
+    "synthetic": {"KINDS", "demo_scene", "scene"},
+}
+
+ERRORS = {
+    "InvalidArgumentError": ValueError,
+    "InvalidSceneError": ValueError,
+    "ConfigError": ValueError,
+    "FileFormatError": ValueError,
+    "InputNotFoundError": FileNotFoundError,
+    "InputError": OSError,
+    "OutputExistsError": FileExistsError,
+    "OutputError": OSError,
+    "DeviceError": RuntimeError,
+    "CheckpointError": ValueError,
+    "MissingDependencyError": ImportError,
+}
+
+
+def names_for_type_checkers() -> dict[str, str]:
+    """Read what the TYPE_CHECKING block of the front page imports: name to module."""
+    tree = ast.parse(Path(cvtgs.__file__).read_text(encoding="utf-8"))
+    block = next(
+        node
+        for node in tree.body
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    )
+    return {
+        alias.asname or alias.name: str(node.module)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+
+
+def test_public_names():
+    assert set(cvtgs.__all__) == NAMES
+    assert len(cvtgs.__all__) == len(NAMES)
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_every_name_resolves_and_is_listed(name):
+    assert getattr(cvtgs, name) is not None
+    assert name in dir(cvtgs)
+
+
+def test_tables_agree_with_what_type_checkers_see():
+    wanted = dict(cvtgs._HOME) | dict.fromkeys(cvtgs._MODULES, "cvtgs")
+    assert names_for_type_checkers() == wanted
+    assert set(wanted) == NAMES
+
+
+def test_names_live_where_the_table_says():
+    for name, home in cvtgs._HOME.items():
+        assert getattr(cvtgs, name) is getattr(import_module(home), name)
+
+
+@pytest.mark.parametrize(("module", "names"), STAGES.items(), ids=STAGES)
+def test_names_of_the_stages(module, names):
+    stage = getattr(cvtgs, module)
+    assert set(stage.__all__) == names
+    assert all(hasattr(stage, name) for name in names)
+
+
+def test_every_error_is_also_the_builtin_it_specialises():
+    classes = {
+        name: value
+        for name, value in vars(cvtgs.errors).items()
+        if isinstance(value, type) and issubclass(value, cvtgs.CvtgsError)
+    }
+    assert set(classes) == {"CvtgsError", *ERRORS}
+    for name, builtin in ERRORS.items():
+        assert issubclass(classes[name], builtin)
+    assert issubclass(cvtgs.errors.DroppedDataWarning, UserWarning)
+
+
+def test_an_unknown_name_is_an_error():
+    with pytest.raises(AttributeError) as caught:
+        cvtgs.simplifier  # noqa: B018
+    assert str(caught.value) == "module 'cvtgs' has no attribute 'simplifier'"
+
+
+def test_version():
+    assert cvtgs.__version__.count(".") == 2

@@ -1,0 +1,186 @@
+"""GaussianScene: the only thing that travels between stages."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from scenes import random_scene, same_bits
+
+from cvtgs import GaussianScene
+from cvtgs.errors import InvalidSceneError
+
+INF = float("inf")
+
+
+def tensors_of(count: int = 4, rest: int = 3) -> dict[str, torch.Tensor]:
+    return {
+        "means": torch.zeros(count, 3),
+        "quats": torch.ones(count, 4),
+        "log_scales": torch.zeros(count, 3),
+        "logit_opacities": torch.zeros(count),
+        "sh0": torch.zeros(count, 1, 3),
+        "shN": torch.zeros(count, rest, 3),
+    }
+
+
+def error_of(**changes: object) -> str:
+    with pytest.raises(InvalidSceneError) as caught:
+        GaussianScene(**{**tensors_of(), **changes})
+    return str(caught.value)
+
+
+def test_activated_properties():
+    scene = GaussianScene(**tensors_of(2))
+    assert scene.scales.tolist() == [[1.0] * 3] * 2
+    assert scene.opacities.tolist() == [0.5, 0.5]
+    assert scene.masses.tolist() == pytest.approx([math.pi / 2] * 2)
+    assert scene.masses.dtype == torch.float64
+
+
+def test_sh_puts_the_constant_band_first():
+    scene = random_scene(3, degree=2)
+    assert scene.sh.shape == (3, 9, 3)
+    assert torch.equal(scene.sh[:, :1], scene.sh0)
+    assert torch.equal(scene.sh[:, 1:], scene.shN)
+
+
+@pytest.mark.parametrize(("rest", "degree"), [(0, 0), (3, 1), (8, 2), (15, 3)])
+def test_degree(rest, degree):
+    assert GaussianScene(**tensors_of(rest=rest)).sh_degree == degree
+
+
+def test_an_empty_scene_is_a_scene():
+    scene = GaussianScene(**tensors_of(0, 0))
+    assert len(scene) == 0
+    assert scene.masses.shape == (0,)
+
+
+def test_masses_in_chunks(monkeypatch):
+    scene = random_scene(50)
+    whole = scene.masses
+    monkeypatch.setattr("cvtgs.scene._CHUNK", 7)
+    assert torch.equal(scene.masses, whole)
+
+
+def test_select_by_rows_and_by_mask():
+    scene = random_scene(5).with_tensors({}, {"label": torch.arange(5)})
+    rows = scene.select(torch.tensor([4, 0, 0]))
+    assert rows.extras["label"].tolist() == [4, 0, 0]
+    assert torch.equal(rows.means, scene.means[[4, 0, 0]])
+    mask = torch.tensor([True, False, False, True, False])
+    assert same_bits(scene.select(mask), scene.select(torch.tensor([0, 3])))
+
+
+def test_select_copies():
+    scene = random_scene(3)
+    copy = scene.select(torch.arange(3))
+    copy.means.zero_()
+    assert bool(scene.means.any())
+
+
+def test_with_tensors_keeps_comments_and_layout():
+    scene = GaussianScene(**tensors_of(), comments=("a",), layout=(("x", "float"),))
+    changed = scene.with_tensors({"means": torch.ones(4, 3)}, {"b": torch.zeros(4)})
+    assert changed.comments == ("a",)
+    assert changed.layout == (("x", "float"),)
+    assert changed.means.tolist() == [[1.0] * 3] * 4
+    assert changed.quats is scene.quats
+    assert set(changed.extras) == {"b"}
+
+
+def test_to_the_same_device_is_the_same_scene():
+    scene = random_scene(3)
+    assert scene.to("cpu") is scene
+
+
+@pytest.mark.cuda
+def test_to_another_device_and_back():
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    scene = random_scene(3).with_tensors({}, {"label": torch.arange(3)})
+    there = scene.to("cuda")
+    assert there.extras["label"].device.type == "cuda"
+    assert same_bits(there.to("cpu"), scene)
+
+
+def test_frozen():
+    scene = random_scene(3)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        scene.means = torch.zeros(3, 3)
+    with pytest.raises(TypeError):
+        scene.extras["a"] = torch.zeros(3)
+
+
+def test_extras_are_not_shared_with_the_caller():
+    extras = {"a": torch.zeros(4)}
+    scene = GaussianScene(**tensors_of(), extras=extras)
+    extras["b"] = torch.zeros(7)
+    assert set(scene.extras) == {"a"}
+
+
+@pytest.mark.parametrize(
+    ("comment", "tagged"),
+    [("SplatRenderMode: mip", True), ("splatrendermode: MIP", True), ("SplatRenderMode: rgb", False)],
+)
+def test_antialiased_tag(comment, tagged):
+    assert GaussianScene(**tensors_of(), comments=("x", comment)).antialiased is tagged
+
+
+def test_values_are_not_checked():
+    tensors = tensors_of()
+    tensors["means"][0, 0], tensors["logit_opacities"][0] = float("nan"), INF
+    assert len(GaussianScene(**tensors)) == 4
+
+
+def test_repr_tells_no_values():
+    scene = random_scene(1234, degree=3)
+    assert repr(scene) == "GaussianScene(1,234 Gaussians, SH degree 3, float32, cpu)"
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "wanted"),
+    [
+        ("means", (4, 2), "(4, 3)"),
+        ("means", (4,), "(4, 3)"),
+        ("quats", (4, 3), "(4, 4)"),
+        ("quats", (3, 4), "(4, 4)"),
+        ("log_scales", (4, 1), "(4, 3)"),
+        ("logit_opacities", (4, 1), "(4)"),
+        ("sh0", (4, 3), "(4, 1, 3)"),
+        ("shN", (4, 9), "(4, k, 3)"),
+    ],
+)
+def test_wrong_shapes_are_errors(name, shape, wanted):
+    message = error_of(**{name: torch.zeros(*shape)})
+    assert message == f"{name} must have shape {wanted}, found {shape}."
+
+
+def test_a_number_of_coefficients_of_no_degree_is_an_error():
+    assert error_of(shN=torch.zeros(4, 5, 3)) == (
+        "shN must hold 0, 3, 8 or 15 coefficients per channel, found 5."
+    )
+
+
+def test_other_dtypes_are_errors():
+    assert error_of(means=torch.zeros(4, 3, dtype=torch.float16)) == (
+        "means must be float32 or float64, found torch.float16."
+    )
+    assert error_of(sh0=torch.zeros(4, 1, 3).double()) == (
+        "sh0 must be torch.float32 on cpu like means, found torch.float64 on cpu."
+    )
+    assert error_of(quats=torch.zeros(4, 4, device="meta")) == (
+        "quats must be torch.float32 on cpu like means, found torch.float32 on meta."
+    )
+
+
+def test_what_is_no_tensor_is_an_error():
+    assert error_of(quats=torch.zeros(4, 4).numpy()) == (
+        "quats must be a torch.Tensor, found ndarray; use cvtgs.from_dict for numpy arrays."
+    )
+
+
+def test_extra_columns_of_other_shapes_are_errors():
+    assert error_of(extras={"heat": torch.zeros(4, 1)}) == (
+        "extra column 'heat' must have shape (4,) on cpu, found (4, 1) on cpu."
+    )

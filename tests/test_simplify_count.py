@@ -1,0 +1,187 @@
+"""How many Gaussians come out: exactly as many as asked for."""
+
+import math
+from fractions import Fraction
+
+import pytest
+import torch
+from scenes import random_scene, same_bits
+
+from cvtgs import GaussianScene, Simplifier, target_count
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
+
+PRESETS = ["standard", "paper"]
+each_preset = pytest.mark.parametrize("preset", PRESETS)
+NAN, INF = float("nan"), float("inf")
+
+
+def simplifier(preset: str) -> Simplifier:
+    return Simplifier(config=preset, device="cpu")
+
+
+def with_bad_rows(scene: GaussianScene, rows: list[int]) -> GaussianScene:
+    means = scene.means.clone()
+    means[rows, 0] = NAN
+    return scene.with_tensors({"means": means}, scene.extras)
+
+
+@pytest.mark.parametrize(
+    ("total", "rho", "wanted"),
+    [
+        (100, 0.07, 7),  # 0.07 * 100 is 7.000000000000001
+        (100, 0.29, 29),  # 0.29 * 100 is 28.999999999999996
+        (100, 0.57, 57),
+        (1000, 0.001, 1),
+        (1001, 0.001, 2),
+        (10, 1e-9, 1),
+        (10, 1e-300, 1),
+        (1, 0.5, 1),
+        (2, 0.5, 1),
+        (3, 0.5, 2),
+        (3, 0.9999999, 3),
+        (7, 1.0, 7),
+        (7, 1, 7),
+        (6_000_000, 0.01, 60_000),
+    ],
+)
+def test_count_of_known_ratios(total, rho, wanted):
+    assert target_count(total, rho) == wanted
+
+
+@pytest.mark.parametrize("total", [1, 2, 3, 10, 99, 100, 1000, 123_457, 10**8])
+def test_count_is_the_ceiling_of_the_decimal_that_was_written(total):
+    for hundredths in range(1, 101):
+        wanted = math.ceil(Fraction(hundredths, 100) * total)
+        assert target_count(total, float(f"{hundredths / 100:.2f}")) == wanted
+
+
+@each_preset
+@pytest.mark.parametrize("total", [1, 2, 3, 5, 100, 101])
+@pytest.mark.parametrize("rho", [1e-6, 0.01, 0.07, 0.29, 1 / 3, 0.5, 0.99, 1.0])
+def test_exact_count_by_ratio(total, rho, preset):
+    scene = random_scene(total, seed=total)
+    result = simplifier(preset).run(scene, rho)
+    wanted = target_count(total, rho)
+    assert len(result.scene) == wanted
+    assert result.report.output_count == result.report.target_count == wanted
+    assert result.report.input_count == total
+    assert result.report.rho == pytest.approx(wanted / total)
+
+
+@each_preset
+@pytest.mark.parametrize(
+    ("total", "count"), [(2, 1), (3, 2), (50, 49), (50, 1), (400, 399), (3000, 17)]
+)
+def test_exact_count_by_number(total, count, preset):
+    assert len(simplifier(preset).simplify(random_scene(total), count=count)) == count
+
+
+@each_preset
+def test_ratio_of_one_is_the_identity(preset):
+    scene = random_scene(50, degree=3)
+    small = simplifier(preset).simplify(scene, 1.0)
+    assert same_bits(small, scene)
+    assert same_bits(simplifier(preset).simplify(scene, count=50), scene)
+
+
+@each_preset
+def test_more_than_the_survivors_of_the_filter(preset):
+    """All but ten are faint; a count of 60 lets the heaviest of the faint back in."""
+    scene = random_scene(100)
+    logits = torch.full((100,), -6.0)
+    logits[:10] = 6.0
+    scene = scene.with_tensors({"logit_opacities": logits}, {})
+    result = simplifier(preset).run(scene, count=60)
+    assert len(result.scene) == 60
+    assert result.report.filtered_count <= 40
+    if preset == "paper":
+        assert result.report.filtered_count == 40
+        means = {tuple(mean) for mean in result.scene.means.tolist()}
+        masses = scene.masses
+        masses[:10] = INF
+        heaviest = torch.sort(masses, descending=True).indices[:60]
+        assert means == {tuple(mean) for mean in scene.means[heaviest].tolist()}
+
+
+@each_preset
+def test_invalid_rows_are_dropped_counted_and_warned_about(preset):
+    scene = with_bad_rows(random_scene(100), [3, 50])
+    quats = scene.quats.clone()
+    quats[50], quats[70] = 0.0, 0.0
+    scene = scene.with_tensors({"quats": quats}, {})
+    with pytest.warns(DroppedDataWarning) as caught:
+        result = simplifier(preset).run(scene, 0.1)
+    assert [str(warning.message) for warning in caught] == [
+        "dropped 3 of 100 Gaussians with NaN, infinite or zero values (means 2, quats 2)."
+    ]
+    assert len(result.scene) == 10
+    assert result.report.invalid_count == 3
+    assert result.report.invalid_rows == {"means": 2, "quats": 2}
+    assert result.report.shortfall == ""
+
+
+def test_ratio_of_one_drops_invalid_rows():
+    scene = random_scene(20)
+    with pytest.warns(DroppedDataWarning):
+        result = simplifier("standard").run(with_bad_rows(scene, [4]), 1.0)
+    kept = torch.arange(20) != 4
+    assert same_bits(result.scene, scene.select(kept))
+    assert result.report.invalid_count == 1
+    assert result.report.shortfall == "only 19 of 20 Gaussians are valid"
+
+
+@each_preset
+@pytest.mark.parametrize("count", [8, 7, 6])
+def test_only_invalid_rows_can_lower_the_count(count, preset):
+    scene = with_bad_rows(random_scene(10), [0, 1, 2])
+    with pytest.warns(DroppedDataWarning):
+        result = simplifier(preset).run(scene, count=count)
+    assert len(result.scene) == min(count, 7)
+    wanted = "only 7 of 10 Gaussians are valid" if count > 7 else ""
+    assert result.report.shortfall == wanted
+
+
+def test_one_valid_row_is_enough():
+    scene = random_scene(5)
+    with pytest.warns(DroppedDataWarning):
+        small = simplifier("standard").simplify(with_bad_rows(scene, [0, 1, 2, 4]), count=1)
+    assert small.means.tolist() == scene.means[3:4].tolist()
+
+
+def test_no_valid_row_is_an_error():
+    with pytest.raises(InvalidSceneError) as caught:
+        simplifier("standard").simplify(with_bad_rows(random_scene(3), [0, 1, 2]), 0.5)
+    assert str(caught.value) == (
+        "none of the 3 Gaussians is valid; found NaN, infinite or zero values in means 3."
+    )
+
+
+@pytest.mark.parametrize("wish", [{"rho": 0.5}, {"rho": 1.0}])
+def test_an_empty_scene_is_an_error(wish):
+    with pytest.raises(InvalidSceneError) as caught:
+        simplifier("standard").simplify(random_scene(0), **wish)
+    assert str(caught.value) == "a scene needs at least one Gaussian to be simplified; found none."
+
+
+@pytest.mark.parametrize("rho", [0.0, -0.1, 1.0000001, 2, NAN, INF, -INF])
+def test_ratios_out_of_range_are_errors(rho):
+    with pytest.raises(InvalidArgumentError) as caught:
+        simplifier("standard").simplify(random_scene(5), rho)
+    assert str(caught.value) == f"rho must be above 0 and at most 1; found {rho!r}."
+
+
+@pytest.mark.parametrize("count", [0, -1, 6, 2.0, True, "3"])
+def test_counts_out_of_range_are_errors(count):
+    with pytest.raises(InvalidArgumentError) as caught:
+        simplifier("standard").simplify(random_scene(5), count=count)
+    assert str(caught.value) == (
+        "count must be a whole number between 1 and the 5 Gaussians of the scene; "
+        f"found {count!r}."
+    )
+
+
+@pytest.mark.parametrize("wish", [{}, {"rho": 0.5, "count": 2}])
+def test_both_or_neither_are_errors(wish):
+    with pytest.raises(InvalidArgumentError) as caught:
+        simplifier("standard").simplify(random_scene(5), **wish)
+    assert str(caught.value) == "give either rho or count, not both and not neither."
