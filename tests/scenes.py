@@ -58,7 +58,9 @@ def moved(
         "sh0": sh[:, :1],
         "shN": oracles.rotated_sh(sh, matrix)[:, 1:],
     }
-    tensors = {name: torch.from_numpy(array.copy()).to(scene.dtype) for name, array in turned.items()}
+    tensors = {
+        name: torch.from_numpy(array.copy()).to(scene.dtype) for name, array in turned.items()
+    }
     return scene.with_tensors(tensors, scene.extras)
 
 
@@ -101,7 +103,10 @@ def assert_same_gaussians(
     first: GaussianScene, second: GaussianScene, *, tolerance: float = 1e-4
 ) -> None:
     """Compare scenes as sets of Gaussians: in the order of their means along x, then y and z."""
-    a, b = (s.select(torch.from_numpy(np.lexsort(s.means.double().numpy().T[::-1]))) for s in (first, second))
+    a, b = (
+        s.select(torch.from_numpy(np.lexsort(s.means.double().numpy().T[::-1])))
+        for s in (first, second)
+    )
     extent = float((a.means.amax(dim=0) - a.means.amin(dim=0)).amax())
     torch.testing.assert_close(a.means, b.means, rtol=tolerance, atol=tolerance * extent)
     ours, theirs = covariances_of(a), covariances_of(b)

@@ -74,9 +74,7 @@ def test_a_cell_of_one_is_returned_bit_for_bit(config):
     scene = scene.with_tensors({"quats": quats, "logit_opacities": logits}, {"a": logits})
     assert same_bits(merged(scene, [0, 1, 2, 3, 4, 5], config), scene)
     some = merged(scene, [2, 0, 1, 3, 3, 3], config)
-    assert same_bits(
-        some.select(torch.tensor([0, 1, 2])), scene.select(torch.tensor([1, 2, 0]))
-    )
+    assert same_bits(some.select(torch.tensor([0, 1, 2])), scene.select(torch.tensor([1, 2, 0])))
 
 
 @each_config

@@ -44,9 +44,7 @@ def test_energies_of_three_points_on_a_line():
 
 def test_no_iterations_leave_the_sites():
     points, weights = weighted_cloud(50)
-    result = lloyd(
-        points, weights, points[:5], nearest=nearest_scipy, iterations=0, tolerance=0.0
-    )
+    result = lloyd(points, weights, points[:5], nearest=nearest_scipy, iterations=0, tolerance=0.0)
     assert torch.equal(result.sites, points[:5])
     assert result.energies == ()
 

@@ -49,9 +49,7 @@ def test_partition_is_complete_and_no_cell_is_empty(total, count, d, config):
 @each_config
 @pytest.mark.parametrize("count", [1, 7, 99, 100])
 def test_coincident_points(count, config):
-    result = tessellate(
-        torch.ones(100, 3).double(), torch.ones(100).double(), count, config=config
-    )
+    result = tessellate(torch.ones(100, 3).double(), torch.ones(100).double(), count, config=config)
     assert_complete(result, 100, count)
     assert result.energy == 0.0
     assert result.refilled == count - 1

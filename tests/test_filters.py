@@ -26,9 +26,7 @@ def test_the_faintest_go_while_they_hold_little_mass():
         (0.05, [1, 3]),
         (1.0, [1]),
     ):
-        keep = visible_rows(
-            opacities, masses, min_opacity=0.1, max_mass_share=share, at_least=1
-        )
+        keep = visible_rows(opacities, masses, min_opacity=0.1, max_mass_share=share, at_least=1)
         assert keep.nonzero()[:, 0].tolist() == kept
 
 

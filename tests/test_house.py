@@ -12,12 +12,13 @@ ROOT = Path(__file__).parent.parent
 SOURCE = ROOT / "src" / "cvtgs"
 FILES = sorted(SOURCE.rglob("*.py"))
 
-# A file imports only from lower levels, or from inside its own package. As in docs and design,
-# with three refinements: `math` raises the errors of `errors` and `report` shows the plan of
-# `effects`, so each stands above what it needs; and `info` combines stages as `simplify` does.
+# A file imports only from lower levels, or from inside its own package: the ranks of the design,
+# refined where one of a rank needs another. `math` raises the errors of `errors`, `report` shows
+# the plan of `effects`, so each stands above what it needs; `info` combines stages as `simplify`
+# does; `devices` (names of devices) and `cameras` (data) stand as low as their imports allow.
 LEVELS = [
     {"errors", "progress"},
-    {"math"},
+    {"math", "devices"},
     {"config", "scene", "cameras"},
     {"effects"},
     {"report", "io", "filters", "cvt", "cells", "synthetic", "render", "losses"},

@@ -16,9 +16,7 @@ def oracle_order(points: torch.Tensor) -> list[int]:
 
 
 def test_corners_of_a_cube():
-    corners = torch.tensor(
-        [[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)]
-    )
+    corners = torch.tensor([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
     walked = corners[morton_order(corners)].tolist()
     assert walked == [[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)]
 

@@ -121,7 +121,11 @@ def test_extras_are_not_shared_with_the_caller():
 
 @pytest.mark.parametrize(
     ("comment", "tagged"),
-    [("SplatRenderMode: mip", True), ("splatrendermode: MIP", True), ("SplatRenderMode: rgb", False)],
+    [
+        ("SplatRenderMode: mip", True),
+        ("splatrendermode: MIP", True),
+        ("SplatRenderMode: rgb", False),
+    ],
 )
 def test_antialiased_tag(comment, tagged):
     assert GaussianScene(**tensors_of(), comments=("x", comment)).antialiased is tagged

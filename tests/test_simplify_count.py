@@ -175,8 +175,7 @@ def test_counts_out_of_range_are_errors(count):
     with pytest.raises(InvalidArgumentError) as caught:
         simplifier("standard").simplify(random_scene(5), count=count)
     assert str(caught.value) == (
-        "count must be a whole number between 1 and the 5 Gaussians of the scene; "
-        f"found {count!r}."
+        f"count must be a whole number between 1 and the 5 Gaussians of the scene; found {count!r}."
     )
 
 

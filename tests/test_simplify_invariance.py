@@ -130,9 +130,7 @@ def test_same_bits_twice(preset):
 def test_the_seed_matters_where_seeds_are_drawn():
     scene = random_scene(800)
     for preset, equal in (("standard", True), ("paper", False)):
-        configs = (
-            SimplifyConfig.from_mapping({"preset": preset, "seed": seed}) for seed in (0, 1)
-        )
+        configs = (SimplifyConfig.from_mapping({"preset": preset, "seed": seed}) for seed in (0, 1))
         first, second = (simplified(scene, config, 0.05) for config in configs)
         assert same_bits(first, second) is equal
 

@@ -103,9 +103,7 @@ def test_report_is_sane(preset, rho):
 @each_preset
 def test_the_listener_hears_every_stage_from_start_to_end(preset):
     events: list[ProgressEvent] = []
-    Simplifier(config=preset, device="cpu", listener=events.append).simplify(
-        random_scene(200), 0.1
-    )
+    Simplifier(config=preset, device="cpu", listener=events.append).simplify(random_scene(200), 0.1)
     assert list(dict.fromkeys(event.stage for event in events)) == STAGES
     for name in STAGES:
         of_stage = [event for event in events if event.stage == name]

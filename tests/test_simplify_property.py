@@ -124,9 +124,11 @@ def test_flyaways_neither_crash_nor_become_a_giant_blob(far, size, dtype, preset
 def test_extreme_scales(exponent, preset):
     scene = random_scene(100)
     scene = scene.with_tensors({"log_scales": scene.log_scales.clamp(-0.1, 0.1) + exponent}, {})
-    small = Simplifier(config=preset, device="cpu").simplify(scene, 0.2)
+    small, report = Simplifier(config=preset, device="cpu").run(scene, 0.2)
     assert len(small) == 20
     assert_standard(small)
+    assert 0 <= report.filtered_mass_share <= 1
+    assert 0 <= report.plan.unbounded.figure <= 1
 
 
 @each_preset

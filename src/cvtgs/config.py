@@ -13,7 +13,9 @@ Share = Annotated[float, pydantic.Field(ge=0.0, le=1.0)]
 
 
 class _Section(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    model_config = pydantic.ConfigDict(
+        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
+    )
 
 
 class FilterConfig(_Section):
@@ -123,7 +125,7 @@ class SimplifyConfig(_Section):
             ConfigError: A key is unknown or a value out of range; the text names it.
         """
         name = values.get("preset", "standard")
-        if name not in PRESETS:
+        if not isinstance(name, str) or name not in PRESETS:
             raise ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {name!r}.")
         try:
             return cls.model_validate(_merged(PRESETS[name], values))

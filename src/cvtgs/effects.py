@@ -6,6 +6,7 @@ import pydantic
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.math import activations
 from cvtgs.math.frames import RobustFrame
 from cvtgs.scene import GaussianScene
 
@@ -119,4 +120,4 @@ def far_share(means: Float[Tensor, "n 3"], masses: Float[Tensor, "n"], frame: Ro
         0.75
     """
     far = frame.distances(means) > UNBOUNDED_DISTANCE
-    return float((masses * far).sum() / masses.sum())
+    return float(activations.divide((masses * far).sum(), masses.sum()))

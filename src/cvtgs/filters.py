@@ -73,7 +73,8 @@ def visible_rows(
     faint = (opacities < min_opacity).nonzero()[:, 0]
     faint = faint[torch.sort(opacities[faint], stable=True).indices]
     lost = masses[faint].double().cumsum(0)
-    dropped = faint[lost <= max_mass_share * masses.double().sum()]
+    limit = max_mass_share * float(masses.double().sum()) if max_mass_share < 1 else math.inf
+    dropped = faint[lost <= limit]
     missing = at_least - (len(opacities) - len(dropped))
     if missing > 0:
         heaviest_first = torch.sort(masses[dropped], stable=True, descending=True).indices

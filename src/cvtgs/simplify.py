@@ -12,14 +12,15 @@ from torch import Tensor
 
 from cvtgs import cells, cvt, filters
 from cvtgs.config import SimplifyConfig
+from cvtgs.devices import resolve_device
 from cvtgs.effects import EffectPlan, plan_effects
 from cvtgs.errors import (
     CheckpointError,
-    DeviceError,
     DroppedDataWarning,
     InvalidArgumentError,
     InvalidSceneError,
 )
+from cvtgs.math.activations import divide
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.morton import morton_order
 from cvtgs.progress import ProgressListener, silent
@@ -172,33 +173,6 @@ def target_count(total: int, rho: float | None, *, count: int | None = None) -> 
     return math.ceil(Fraction(str(float(rho or 0.0))) * total)
 
 
-def resolve_device(device: str | torch.device) -> torch.device | None:
-    """Turn the name of a device into a device that is there.
-
-    Args:
-        device: ``auto``, ``cpu``, ``cuda``, or any torch device.
-
-    Returns:
-        The device; None for ``auto``.
-
-    Raises:
-        DeviceError: There is no such device.
-
-    Example:
-        >>> resolve_device("cpu")
-        device(type='cpu')
-    """
-    if device == "auto":
-        return None
-    try:
-        resolved = torch.device(device)
-        torch.empty(0, device=resolved)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).split("\n")[0].rstrip(".")
-        raise DeviceError(f"device {str(device)!r} cannot be used here: {reason}.") from None
-    return resolved
-
-
 class _Outlook(NamedTuple):
     """What one look at the scene tells: where it is, and what each Gaussian paints."""
 
@@ -295,7 +269,7 @@ def _filter(
         max_mass_share=config.filter.max_mass_share,
         at_least=target,
     )
-    left_out = float(outlook.masses[~keep].sum() / outlook.masses.sum())
+    left_out = float(divide(outlook.masses[~keep].sum(), outlook.masses.sum()))
     facts = {"filtered_count": int((~keep).sum()), "filtered_mass_share": left_out}
     return keep.nonzero()[:, 0], facts
 

@@ -28,6 +28,7 @@ def embed(
         Coordinates in robust radii, in the dtype of ``means``; d = 3, or 6 with colour.
 
     Example:
+        >>> import torch
         >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=2.0)
         >>> embed(
         ...     torch.ones(1, 3), torch.zeros(1, 1, 3), frame, color=0.0, contracted=False

@@ -8,10 +8,15 @@ from torch import Tensor
 
 from cvtgs.math.morton import morton_order
 
-POINT_BLOCK = 128
-SITE_BLOCK = 32
+POINT_BLOCK = 32
+SITE_BLOCK = 16
+FIRST_BLOCKS = 4
+"""Blocks of sites that every block of points looks at before others are ruled out."""
+
 MAX_ENTRIES = 1 << 23
 """Largest number of distances held at one time (64 MiB in float64)."""
+
+UNKNOWN = torch.iinfo(torch.int64).max
 
 
 def nearest_torch(
@@ -19,9 +24,9 @@ def nearest_torch(
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
     """Find the nearest site of every point by comparing blocks that may be near one another.
 
-    Points and sites are cut into blocks along a Morton curve. The nearest block of sites gives
-    an upper bound for all points of a block; every other block whose bounding box is farther is
-    skipped. Distances are sums of squared differences in float64, so the result equals brute
+    Points and sites are cut into blocks along a Morton curve. The few nearest blocks of sites
+    give an upper bound for all points of a block; every other block whose bounding box is farther
+    is skipped. Distances are sums of squared differences in float64, so the result equals brute
     force, and of equally near sites the first one is named. Memory beside input and result is
     ``3 * MAX_ENTRIES`` numbers.
 
@@ -61,19 +66,20 @@ def _nearest_of_blocks(
     boxes: tuple[Float[Tensor, "c d"], Float[Tensor, "c d"]],
 ) -> tuple[Int[Tensor, "b p"], Float[Tensor, "b p"]]:
     gaps = _box_gaps((points.amin(dim=1), points.amax(dim=1)), boxes)
-    first = gaps.argmin(dim=1)
-    squared, labels = _nearest_in_pairs(points, site_blocks[first], site_ids[first])
-    near = gaps <= squared.amax(dim=1, keepdim=True)
-    near[torch.arange(len(points), device=points.device), first] = False
-    pairs = near.nonzero()
-    for block, other in (pair.unbind(1) for pair in pairs.split(_pairs_per_step())):
+    first = gaps.topk(min(FIRST_BLOCKS, len(site_blocks)), dim=1, largest=False).indices
+    squared, labels = _nearest_in_pairs(points, site_blocks[first[:, 0]], site_ids[first[:, 0]])
+    for other in first[:, 1:].unbind(1):
+        found, names = _nearest_in_pairs(points, site_blocks[other], site_ids[other])
+        wins = (found < squared) | ((found == squared) & (names < labels))
+        squared, labels = torch.where(wins, found, squared), torch.where(wins, names, labels)
+    near = (gaps <= squared.amax(dim=1, keepdim=True)).scatter_(1, first, False)
+    pairs = near.nonzero().split(max(1, MAX_ENTRIES // (POINT_BLOCK * SITE_BLOCK)))
+    for block, other in (pair.unbind(1) for pair in pairs):
         found, names = _nearest_in_pairs(points[block], site_blocks[other], site_ids[other])
-        rows = block[:, None].expand_as(found)
-        best = squared.scatter_reduce(0, rows, found, "amin")
-        unknown = torch.iinfo(labels.dtype).max
-        labels = torch.where(squared == best, labels, unknown)
-        names = torch.where(found == best[block], names, unknown)
-        labels = labels.scatter_reduce(0, rows, names, "amin")
+        best = squared.scatter_reduce(0, block[:, None].expand_as(found), found, "amin")
+        labels = torch.where(squared == best, labels, UNKNOWN)
+        names = torch.where(found == best[block], names, UNKNOWN)
+        labels = labels.scatter_reduce(0, block[:, None].expand_as(names), names, "amin")
         squared = best
     return labels, squared
 
@@ -87,7 +93,7 @@ def _nearest_in_pairs(
         total = total + (points[:, :, None, axis] - sites[:, None, :, axis]).square()
     squared = total.amin(dim=2)
     is_best = total == squared[:, :, None]
-    names = torch.where(is_best, ids[:, None, :], torch.iinfo(ids.dtype).max).amin(dim=2)
+    names = torch.where(is_best, ids[:, None, :], UNKNOWN).amin(dim=2)
     return squared, names
 
 
@@ -116,7 +122,3 @@ def _curve_order(sites: Float[Tensor, "m d"]) -> Int[Tensor, "m"]:
     spatial = sites[:, :3]
     missing = 3 - spatial.shape[1]
     return morton_order(torch.nn.functional.pad(spatial, (0, missing)))
-
-
-def _pairs_per_step() -> int:
-    return max(1, MAX_ENTRIES // (POINT_BLOCK * SITE_BLOCK))

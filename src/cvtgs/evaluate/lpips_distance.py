@@ -30,7 +30,7 @@ def lpips(
     Zhang, Isola, Efros, Shechtman, Wang 2018, equation 1: activations after five ReLUs, scaled to
     unit length over the channels, squared differences weighted by the trained heads, mean over
     places, sum over layers. Images go in as they are, in [0, 1] mapped to [-1, 1]. Memory: one
-    pair of images at a time; at ``h x w`` about ``1.5 kB * h * w`` (vgg), a tenth (alex).
+    pair of images at a time, in float32 about ``2 kB * h * w`` (vgg) or ``0.2 kB * h * w`` (alex).
 
     Args:
         a: ``(c, h, w, 3)`` images, clipped to [0, 1].

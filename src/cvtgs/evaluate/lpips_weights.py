@@ -5,9 +5,8 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from pickle import UnpicklingError
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
@@ -129,22 +128,29 @@ def _installed(network: LpipsNetwork) -> tuple[Path, ...]:
 def _read(path: Path) -> dict[str, Tensor]:
     """Read a state dict and give its tensors torchvision's names."""
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        with path.open("rb") as file:
+            state = _unpickled(file, path)
     except FileNotFoundError as error:
         raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
-    except (UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
-        raise FileFormatError(
-            f"{path}: must be a state dict that torch.load(weights_only=True) reads, "
-            f"found none; the file may be damaged."
-        ) from error
     if not isinstance(state, Mapping):
         raise FileFormatError(
             f"{path}: must hold a state dict, found an object of type {type(state).__name__}."
         )
-    return {_renamed(key): value for key, value in cast("Mapping[Any, Any]", state).items()}
+    return {_renamed(key): value for key, value in state.items()}
+
+
+def _unpickled(file: BinaryIO, path: Path) -> Any:
+    """Unpickle tensors and containers, and nothing that runs code."""
+    try:
+        return torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged file makes torch.load raise nearly anything
+        raise FileFormatError(
+            f"{path}: must be a state dict that torch.load(weights_only=True) reads, "
+            f"found none; the file may be damaged."
+        ) from error
 
 
 def _renamed(key: Any) -> str:

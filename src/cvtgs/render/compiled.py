@@ -1,0 +1,57 @@
+"""The door to numba, the only file that imports it; loading this file loads it.
+
+Compiled code is kept on disk beside the source (or in ``NUMBA_CACHE_DIR``), so only the first
+call ever waits for the compiler. A kernel's cache notices changes of its own file only: after
+changing a function that a kernel of another file calls, clear the cache.
+"""
+
+from collections.abc import Callable
+from typing import cast
+
+from cvtgs.errors import MissingDependencyError
+
+try:
+    import numba
+except ImportError as error:
+    raise MissingDependencyError(
+        f"backend 'numba' needs the package numba, which cannot be imported ({error}); "
+        f"install it with: pip install 'cvtgs[numba]', or use backend='torch'."
+    ) from error
+
+prange = numba.prange
+"""A range whose steps run in parallel, in a function made by :func:`parallel`."""
+
+_SETTINGS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+
+
+def serial[F: Callable[..., object]](function: F) -> F:
+    """Compile a function when it is first called.
+
+    Args:
+        function: Loops over numpy arrays and numbers.
+
+    Returns:
+        The compiled function, which takes the same arguments.
+    """
+    return cast("F", numba.njit(**_SETTINGS)(function))
+
+
+def parallel[F: Callable[..., object]](function: F) -> F:
+    """Compile a function whose outer loop runs over :data:`prange`.
+
+    Args:
+        function: Loops over numpy arrays; no two steps of the outer loop write the same place.
+
+    Returns:
+        The compiled function, which takes the same arguments.
+    """
+    return cast("F", numba.njit(parallel=True, **_SETTINGS)(function))
+
+
+def use_threads(count: int) -> None:
+    """Limit the threads of compiled functions that are called from this thread.
+
+    Args:
+        count: How many, at least 1; at most as many as numba was started with are used.
+    """
+    numba.set_num_threads(max(1, min(count, numba.config.NUMBA_NUM_THREADS)))

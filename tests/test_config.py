@@ -1,0 +1,195 @@
+"""SimplifyConfig: frozen, with presets; what is unknown is an error."""
+
+import pydantic
+import pytest
+
+from cvtgs import PRESETS, SimplifyConfig
+from cvtgs.config import FilterConfig, MergeConfig, TessellationConfig
+from cvtgs.errors import ConfigError
+
+
+def error_of(values: dict[str, object]) -> str:
+    with pytest.raises(ConfigError) as caught:
+        SimplifyConfig.from_mapping(values)
+    return str(caught.value)
+
+
+def compose_error(**arguments: object) -> str:
+    with pytest.raises(ConfigError) as caught:
+        SimplifyConfig.compose(**arguments)
+    return str(caught.value)
+
+
+def test_standard_is_what_no_choice_gives():
+    assert SimplifyConfig.from_preset("standard") == SimplifyConfig()
+    assert SimplifyConfig.from_mapping({}) == SimplifyConfig()
+
+
+def test_paper_is_cvt_gs():
+    paper = SimplifyConfig.from_preset("paper")
+    assert paper.preset == "paper"
+    assert paper.filter == FilterConfig(min_opacity=0.1, max_mass_share=1.0)
+    assert paper.cvt.weight == paper.merge.weight == "opacity"
+    assert (paper.cvt.color, paper.cvt.unbounded, paper.cvt.iterations) == (0.0, "off", 5)
+    assert (paper.cvt.seeding, paper.cvt.samples_per_site) == ("weighted", 0)
+    assert (paper.merge.opacity, paper.merge.widening) == ("union", 0.0)
+
+
+def test_standard_is_mass_everywhere():
+    standard = SimplifyConfig()
+    assert standard.filter.max_mass_share == 0.01
+    assert standard.cvt.weight == standard.merge.weight == "mass"
+    assert standard.cvt.seeding == "stratified"
+    assert standard.merge.opacity == "saturating"
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_is_valid_and_keeps_its_name(name):
+    assert SimplifyConfig.from_preset(name).preset == name
+
+
+def test_values_win_over_their_preset():
+    config = SimplifyConfig.from_mapping({"preset": "paper", "cvt": {"iterations": 9}})
+    assert config.cvt.iterations == 9
+    assert config.cvt.weight == "opacity"
+    assert SimplifyConfig.from_preset("paper").cvt.iterations == 5
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_toml_round_trip(name, tmp_path):
+    config = SimplifyConfig.from_mapping(
+        {"preset": name, "seed": 7, "merge": {"widening": 0.125}, "cvt": {"backend": "torch"}}
+    )
+    path = tmp_path / "config.toml"
+    path.write_text(config.to_toml(), encoding="utf-8")
+    assert SimplifyConfig.from_toml(path) == config
+
+
+def test_a_partial_file_takes_the_rest_from_its_preset(tmp_path):
+    path = tmp_path / "config.toml"
+    path.write_text('preset = "paper"\n[merge]\nwidening = 0.5\n', encoding="utf-8")
+    config = SimplifyConfig.from_toml(path)
+    assert config.merge == MergeConfig(weight="opacity", opacity="union", widening=0.5)
+    assert config.cvt == SimplifyConfig.from_preset("paper").cvt
+
+
+def test_settings_win_over_preset_and_preset_over_file(tmp_path):
+    path = tmp_path / "config.toml"
+    path.write_text('preset = "standard"\n[cvt]\niterations = 3\ncolor = 0.5\n', encoding="utf-8")
+    config = SimplifyConfig.compose(
+        file=path, preset="paper", settings={"cvt.iterations": "10", "seed": "4"}
+    )
+    assert config.preset == "paper"
+    assert config.seed == 4
+    assert (config.cvt.iterations, config.cvt.color, config.cvt.weight) == (10, 0.5, "opacity")
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "value"),
+    [
+        ("cvt.color", "0.25", 0.25),
+        ("cvt.weight", "opacity", "opacity"),
+        ("cvt.unbounded", "on", "on"),
+        ("merge.widening", "0", 0.0),
+        ("filter.max_mass_share", "1e-3", 1e-3),
+    ],
+)
+def test_settings_are_texts(key, text, value):
+    config = SimplifyConfig.compose(settings={key: text})
+    section, name = key.split(".")
+    assert getattr(getattr(config, section), name) == value
+
+
+def test_frozen():
+    config = SimplifyConfig()
+    with pytest.raises(pydantic.ValidationError):
+        config.seed = 1
+    with pytest.raises(pydantic.ValidationError):
+        config.cvt.iterations = 1
+
+
+def test_sections_stand_alone():
+    assert TessellationConfig(iterations=0).iterations == 0
+    with pytest.raises(pydantic.ValidationError):
+        TessellationConfig(iteration=0)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"rho": 0.1}, "rho: is not a known setting."),
+        ({"cvt": {"itertions": 3}}, "cvt.itertions: is not a known setting."),
+        (
+            {"cvt": {"iterations": -1}},
+            "cvt.iterations: input should be greater than or equal to 0, found -1.",
+        ),
+        (
+            {"filter": {"min_opacity": 1.5}},
+            "filter.min_opacity: input should be less than or equal to 1, found 1.5.",
+        ),
+        (
+            {"cvt": {"weight": "area"}},
+            "cvt.weight: input should be 'mass' or 'opacity', found 'area'.",
+        ),
+        (
+            {"merge": {"x": 1}, "y": 2},
+            "merge.x: is not a known setting; y: is not a known setting.",
+        ),
+    ],
+)
+def test_unknown_keys_and_values_are_errors(values, message):
+    assert error_of(values) == message
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("key", ["color", "weight_floor", "tolerance"])
+def test_numbers_that_are_not_finite_are_errors(key, value):
+    message = f"cvt.{key}: input should be a finite number, found {value!r}."
+    assert error_of({"cvt": {key: value}}) == message
+
+
+@pytest.mark.parametrize("name", ["fast", "", None, 3, ["paper"]])
+def test_unknown_presets_are_errors(name):
+    wanted = f"preset must be one of {', '.join(PRESETS)}; found {name!r}."
+    assert error_of({"preset": name}) == wanted
+
+
+def test_an_unknown_preset_by_name_is_an_error():
+    with pytest.raises(ConfigError) as caught:
+        SimplifyConfig.from_preset("fast")
+    assert str(caught.value) == f"preset must be one of {', '.join(PRESETS)}; found 'fast'."
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"cvt.speed": "1"}, "cvt.speed: is not a known setting."),
+        ({"speed": "1"}, "speed: is not a known setting."),
+        ({"a.b.c": "1"}, "a.b: is not a known setting."),
+        ({"seed": "2", "seed.x": "1"}, "seed.x: is not a known setting."),
+    ],
+)
+def test_unknown_settings_are_errors(settings, message):
+    assert compose_error(settings=settings) == message
+
+
+def test_a_setting_of_another_kind_is_an_error():
+    assert compose_error(settings={"cvt.iterations": "many"}) == (
+        "cvt.iterations: input should be a valid integer, unable to parse string as an integer, "
+        "found 'many'."
+    )
+
+
+def test_errors_in_a_file_name_the_file(tmp_path):
+    path = tmp_path / "config.toml"
+    path.write_text("[cvt]\nspeed = 1\n", encoding="utf-8")
+    assert compose_error(file=path) == f"{path}: cvt.speed: is not a known setting."
+
+
+def test_a_file_that_is_not_there_or_not_toml_is_an_error(tmp_path):
+    missing, broken, binary = (tmp_path / name for name in ("a.toml", "b.toml", "c.toml"))
+    broken.write_text("cvt = [", encoding="utf-8")
+    binary.write_bytes(b"\xff\xfe\x00")
+    assert compose_error(file=missing) == f"{missing}: cannot be read: No such file or directory."
+    for path in (broken, binary):
+        assert compose_error(file=path).startswith(f"{path}: is not a TOML file: ")

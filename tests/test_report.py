@@ -1,0 +1,87 @@
+"""The report and the clock that measures stages."""
+
+import json
+
+import pydantic
+import pytest
+import torch
+from scenes import random_scene
+
+from cvtgs import ProgressEvent, Simplifier, SimplifyConfig, SimplifyReport
+from cvtgs.progress import silent
+from cvtgs.report import StageClock, StageCost, peak_memory_bytes
+
+CPU = torch.device("cpu")
+
+
+def report_of(**changes: object) -> SimplifyReport:
+    values = {"input_count": 10, "output_count": 1, "target_count": 1, "rho": 0.1}
+    return SimplifyReport(**{**values, "config": SimplifyConfig(), **changes})
+
+
+def test_seconds_are_those_of_all_stages():
+    stages = tuple(
+        StageCost(stage=name, seconds=seconds, cpu_seconds=0.0, peak_memory_bytes=0)
+        for name, seconds in (("plan", 0.5), ("merge", 1.25))
+    )
+    assert report_of(stages=stages).seconds == 1.75
+    assert report_of().seconds == 0
+
+
+def test_the_clock_tells_start_steps_and_end():
+    events: list[ProgressEvent] = []
+    clock = StageClock(events.append, CPU)
+    with clock.stage("merge", 3) as advance:
+        advance(2)
+    assert [(event.stage, event.done, event.total) for event in events] == [
+        ("merge", 0, 3),
+        ("merge", 2, 3),
+        ("merge", 3, 3),
+    ]
+    assert [cost.stage for cost in clock.costs] == ["merge"]
+    assert clock.costs[0].seconds >= 0
+    assert clock.costs[0].peak_device_memory_bytes == 0
+
+
+def test_a_stage_that_fails_has_no_cost_and_no_end():
+    events: list[ProgressEvent] = []
+    clock = StageClock(events.append, CPU)
+    with pytest.raises(ZeroDivisionError), clock.stage("plan"):
+        1 / 0  # noqa: B018
+    assert clock.costs == []
+    assert [event.done for event in events] == [0]
+
+
+def test_memory_only_rises():
+    first = peak_memory_bytes()
+    ballast = torch.ones(1_000_000)
+    assert peak_memory_bytes() >= first
+    assert len(ballast) == 1_000_000
+
+
+def test_json_holds_everything():
+    report = Simplifier(device="cpu").run(random_scene(200), 0.1).report
+    values = json.loads(report.to_json())
+    assert set(values) == set(SimplifyReport.model_fields)
+    assert values["output_count"] == 20
+    assert values["plan"]["unbounded"]["active"] in (True, False)
+    assert [stage["stage"] for stage in values["stages"]][-1] == "merge"
+    assert report.to_json().endswith("}\n")
+
+
+def test_json_reads_back():
+    report = Simplifier(device="cpu", config="paper").run(random_scene(200), 0.1).report
+    assert SimplifyReport.model_validate_json(report.to_json()) == report
+
+
+def test_frozen_and_closed():
+    report = report_of()
+    with pytest.raises(pydantic.ValidationError):
+        report.rho = 0.5
+    with pytest.raises(pydantic.ValidationError):
+        report_of(colour="red")
+
+
+def test_the_silent_listener_is_silent(capsys):
+    assert silent(ProgressEvent(stage="plan", done=0, total=1)) is None
+    assert capsys.readouterr().out == ""
