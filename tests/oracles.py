@@ -148,6 +148,12 @@ def merge(cell: Sequence[Gaussian], *, weight: str, opacity: str) -> Gaussian:
     return Gaussian(mean=np.asarray(mean), covariance=matrix, depth=min(depth, limit), sh=sh)
 
 
+def widening(depth: float, members: int, *, strength: float) -> float:
+    """Factor on the scales of a merged Gaussian: ``1 + c (1 - exp(-tau))^2 min(log10(n)/2, 1)``."""
+    opaque = 1.0 - math.exp(-depth)
+    return 1.0 + strength * opaque**2 * min(math.log10(members) / 2.0, 1.0)
+
+
 def nearest(points: Array, sites: Array) -> tuple[list[int], list[float]]:
     """First nearest site of every point, and the squared distance, one by one."""
     labels, squared = [], []

@@ -4,10 +4,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import oracles
 import torch
 from torch import Tensor
 
+import oracles
 from cvtgs import GaussianScene
 
 REST_COUNTS = (0, 3, 8, 15)

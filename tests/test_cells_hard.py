@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from scenes import covariances_of, moved, random_scene
 
 from cvtgs import GaussianScene
 from cvtgs.cells import Partition, merge_cells, normalized_weights
 from cvtgs.config import SimplifyConfig
+from scenes import covariances_of, moved, random_scene
 
 CONFIGS = {name: SimplifyConfig.from_preset(name).merge for name in ("standard", "paper")}
 each_config = pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)

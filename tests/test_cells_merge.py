@@ -4,11 +4,11 @@ import math
 
 import pytest
 import torch
-from scenes import random_scene, same_bits
 
 from cvtgs import GaussianScene
 from cvtgs.cells import Partition, merge_cells
 from cvtgs.config import MergeConfig, SimplifyConfig
+from scenes import random_scene, same_bits
 
 PAPER = SimplifyConfig.from_preset("paper").merge
 STANDARD = SimplifyConfig.from_preset("standard").merge

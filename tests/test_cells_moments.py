@@ -2,11 +2,10 @@
 
 import math
 
-import oracles
 import pytest
 import torch
-from scenes import assert_same_gaussians, covariances_of, moved, oracle_rows, random_scene
 
+import oracles
 from cvtgs import GaussianScene
 from cvtgs.cells import (
     Partition,
@@ -18,6 +17,7 @@ from cvtgs.cells import (
 )
 from cvtgs.config import MergeConfig, SimplifyConfig
 from cvtgs.math import covariances
+from scenes import assert_same_gaussians, covariances_of, moved, oracle_rows, random_scene
 
 RULES = {
     "paper": MergeConfig(weight="opacity", opacity="union", widening=0.0),
@@ -142,6 +142,17 @@ def test_widening_widens_scales_only_and_only_cells_of_several():
     assert float(ratios.amax()) > 1.01
     torch.testing.assert_close(wide.means, plain.means)
     torch.testing.assert_close(wide.quats, plain.quats)
+
+
+def test_widening_equals_the_oracle():
+    scene = random_scene(300, dtype=torch.float64)
+    labels = torch.cat([torch.arange(6), torch.full((2,), 3), torch.full((292,), 4)])
+    cells = Partition.from_labels(labels, 6)
+    members = gather_members(scene, cells, scene.masses, weight="mass")
+    for depth in (1e-6, 0.3, 2.0, 13.8):
+        factors = widening_factors(members, torch.full((6,), depth).double(), strength=0.3)
+        wanted = [oracles.widening(depth, n, strength=0.3) for n in cells.counts.tolist()]
+        assert factors.tolist() == pytest.approx(wanted, rel=1e-6)
 
 
 def test_widening_leaves_haze_alone():

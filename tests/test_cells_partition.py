@@ -1,5 +1,7 @@
 """Partition: members of every cell as runs of row numbers."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 
@@ -10,7 +12,7 @@ from cvtgs.errors import InvalidArgumentError
 def lists_of(partition: Partition) -> list[list[int]]:
     ends = partition.offsets.tolist()
     rows = partition.order.tolist()
-    return [rows[first:last] for first, last in zip(ends, ends[1:], strict=False)]
+    return [rows[first:last] for first, last in pairwise(ends)]
 
 
 def partition_of(counts: list[int]) -> Partition:

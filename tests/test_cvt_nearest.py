@@ -1,10 +1,10 @@
 """Nearest site: both backends equal brute force."""
 
 import numpy as np
-import oracles
 import pytest
 import torch
 
+import oracles
 from cvtgs.cvt import nearest_backend, nearest_scipy, nearest_torch
 from cvtgs.errors import DeviceError
 from cvtgs.math.morton import morton_order

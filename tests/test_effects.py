@@ -3,11 +3,11 @@
 import pydantic
 import pytest
 import torch
-from scenes import random_scene
 
 from cvtgs import EffectPlan, GaussianScene
 from cvtgs.effects import UNBOUNDED_DISTANCE, UNBOUNDED_SHARE, far_share, plan_effects
 from cvtgs.math.frames import RobustFrame, robust_frame
+from scenes import random_scene
 
 FRAME = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=2.0)
 

@@ -116,7 +116,8 @@ def test_against_numpy(network, size) -> None:
 
 @pytest.mark.parametrize("network", ["alex", "vgg"])
 def test_equal_images_noise_and_symmetry(network) -> None:
-    first, noise = random_images(32, 33, count=2)
+    side = {"alex": 31, "vgg": 16}[network]
+    first, noise = (images.float() for images in random_images(side, side, count=2))
     weights = random_weights(network)
     assert lpips(first, first, network=network, weights=weights).tolist() == [0.0, 0.0]
     values = []
@@ -127,6 +128,18 @@ def test_equal_images_noise_and_symmetry(network) -> None:
         values.append(value)
     assert (values[0] < values[1]).all()
     assert (values[1] < values[2]).all()
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("network", ["alex", "vgg"])
+def test_cuda_gives_the_same_values(network) -> None:
+    first, second = (images.float() for images in random_images(50, 37))
+    weights = random_weights(network)
+    wanted = lpips(first, second, network=network, weights=weights)
+    found = lpips(first.cuda(), second.cuda(), network=network, weights=weights)
+    assert found.is_cuda
+    torch.testing.assert_close(found.cpu(), wanted, rtol=1e-2, atol=1e-4)  # TF32 convolutions
 
 
 def test_images_are_clipped_and_not_mutated() -> None:

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from scenes import random_scene, same_bits
 
 from cvtgs.filters import invalid_rows, standardized, visible_rows, with_finite_opacities
+from scenes import random_scene, same_bits
 
 NAN, INF = float("nan"), float("inf")
 
@@ -38,9 +38,9 @@ def test_the_heaviest_come_back_where_too_few_stay():
 
 
 def test_opacities_at_the_threshold_stay():
-    opacities = torch.tensor([0.1, 0.0999])
+    opacities = torch.tensor([0.1, 0.0999, 0.9])
     keep = visible_rows(opacities, opacities, min_opacity=0.1, max_mass_share=1.0, at_least=1)
-    assert keep.tolist() == [True, False]
+    assert keep.tolist() == [True, False, True]
 
 
 @pytest.mark.parametrize("at_least", [1, 2, 500, 1000])

@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
-from scenes import random_scene
 
 from cvtgs import GaussianScene, describe
 from cvtgs.errors import InvalidSceneError
+from scenes import random_scene
 
 NAN = float("nan")
 

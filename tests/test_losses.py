@@ -172,6 +172,22 @@ def test_gradients_against_finite_differences(loss) -> None:
     assert torch.autograd.gradcheck(loss, (first, second), fast_mode=True)
 
 
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("loss", LOSSES)
+def test_cuda_gives_the_same_values_and_gradients(loss) -> None:
+    first, second = (images.float() for images in pair(30, 41))
+    values, gradients = [], []
+    for device in ("cpu", "cuda"):
+        prediction = first.to(device).requires_grad_()
+        value = loss(prediction, second.to(device))
+        (gradient,) = torch.autograd.grad(value, prediction)
+        values.append(value.detach().cpu())
+        gradients.append(gradient.cpu())
+    torch.testing.assert_close(values[1], values[0], rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-3, atol=1e-6)
+
+
 def test_importing_losses_is_light() -> None:
     program = (
         "import sys, cvtgs, cvtgs.losses, cvtgs.evaluate, cvtgs.io\n"

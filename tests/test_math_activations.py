@@ -2,10 +2,10 @@
 
 import math
 
-import oracles
 import pytest
 import torch
 
+import oracles
 from cvtgs.math import activations
 
 DTYPES = [torch.float32, torch.float64]

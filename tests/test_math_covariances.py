@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-import oracles
 import pytest
 import torch
 
+import oracles
 from cvtgs.math import covariances, quaternions
 
 

@@ -1,9 +1,9 @@
 """The Morton curve against interleaved bits."""
 
-import oracles
 import pytest
 import torch
 
+import oracles
 from cvtgs.math.morton import BITS, morton_order
 
 

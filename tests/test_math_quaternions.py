@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-import oracles
 import pytest
 import torch
 
+import oracles
 from cvtgs.math import quaternions
 
 HALF = math.sqrt(0.5)

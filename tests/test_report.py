@@ -5,11 +5,11 @@ import json
 import pydantic
 import pytest
 import torch
-from scenes import random_scene
 
 from cvtgs import ProgressEvent, Simplifier, SimplifyConfig, SimplifyReport
 from cvtgs.progress import silent
 from cvtgs.report import StageClock, StageCost, peak_memory_bytes
+from scenes import random_scene
 
 CPU = torch.device("cpu")
 

@@ -5,10 +5,10 @@ import math
 
 import pytest
 import torch
-from scenes import random_scene, same_bits
 
 from cvtgs import GaussianScene
 from cvtgs.errors import InvalidSceneError
+from scenes import random_scene, same_bits
 
 INF = float("inf")
 

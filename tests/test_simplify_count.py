@@ -5,10 +5,10 @@ from fractions import Fraction
 
 import pytest
 import torch
-from scenes import random_scene, same_bits
 
 from cvtgs import GaussianScene, Simplifier, target_count
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
+from scenes import random_scene, same_bits
 
 PRESETS = ["standard", "paper"]
 each_preset = pytest.mark.parametrize("preset", PRESETS)

@@ -16,9 +16,9 @@ import sys
 
 import pytest
 import torch
-from scenes import assert_same_gaussians, moved, random_scene, same_bits
 
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
+from scenes import assert_same_gaussians, moved, random_scene, same_bits
 
 each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])
 HALF = math.sqrt(0.5)

@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
-from scenes import random_scene, same_bits
 
 from cvtgs import GaussianScene, ProgressEvent, Simplifier, SimplifyConfig
 from cvtgs.errors import CheckpointError, CvtgsError, DeviceError
+from scenes import random_scene, same_bits
 
 each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])
 STAGES = ["check", "plan", "filter", "tessellate", "merge"]

@@ -6,10 +6,10 @@ import hypothesis
 import pytest
 import torch
 from hypothesis import strategies as st
-from scenes import REST_COUNTS, random_scene
 
 from cvtgs import GaussianScene, Simplifier
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError
+from scenes import REST_COUNTS, random_scene
 
 NAN, INF = float("nan"), float("inf")
 PLACES = [0.0, 1.0, 1.0, -1.0, 1e-30, 1e-3, 1e6, -1e6, 6e6 + 0.01, 1e30, -3e38, 3e38, NAN, INF]

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.evaluate.lpips_network import NETWORKS, TAPS, LpipsNetwork, Network, activations
+from cvtgs.evaluate.lpips_network import NETWORKS, LpipsNetwork, Network, activations
 from cvtgs.evaluate.lpips_weights import LpipsWeights, load_lpips
 from cvtgs.losses.pairs import check_pair
 
@@ -31,6 +31,7 @@ def lpips(
     unit length over the channels, squared differences weighted by the trained heads, mean over
     places, sum over layers. Images go in as they are, in [0, 1] mapped to [-1, 1]. Memory: one
     pair of images at a time, in float32 about ``2 kB * h * w`` (vgg) or ``0.2 kB * h * w`` (alex).
+    On CUDA the convolutions obey ``torch.backends.cudnn.allow_tf32``, on by default.
 
     Args:
         a: ``(c, h, w, 3)`` images, clipped to [0, 1].
@@ -72,20 +73,32 @@ def lpips(
     check_pair(a, b, least=layers.least)
     tensors = {name: tensor.to(a) for name, tensor in weights.tensors.items()}
     pairs = zip(a.split(1), b.split(1), strict=True)
-    return torch.stack([_distance(torch.cat(pair), layers, tensors) for pair in pairs])
+    return torch.stack([_distance(pair, layers, tensors) for pair in pairs])
 
 
 def _distance(
-    pair: Float[Tensor, "2 h w 3"], network: Network, tensors: Mapping[str, Tensor]
+    pair: tuple[Float[Tensor, "1 h w 3"], Float[Tensor, "1 h w 3"]],
+    network: Network,
+    tensors: Mapping[str, Tensor],
 ) -> Float[Tensor, ""]:
-    """Compare two images layer by layer, holding one layer at a time."""
-    centred = pair.clamp(0, 1) * 2 - 1
-    normalised = (centred - centred.new_tensor(_SHIFT)) / centred.new_tensor(_SCALE)
-    layers = activations(normalised.permute(0, 3, 1, 2), network, tensors)
-    total = pair.new_zeros(())
-    for number, activation in zip(range(TAPS), layers, strict=True):
-        lengths = activation.square().sum(dim=1, keepdim=True).sqrt()
-        one, other = activation / (lengths + _EPSILON)
-        head = tensors[f"lin{number}.weight"].reshape(-1, 1, 1)
-        total = total + (head * (one - other).square()).sum(dim=0).mean()
+    """Compare two images layer by layer, holding one layer of each at a time.
+
+    They are not batched, so that equal images go through the same sums and differ by exactly 0.
+    """
+    stacks = [activations(_normalised(image), network, tensors) for image in pair]
+    total = pair[0].new_zeros(())
+    for number, (one, other) in enumerate(zip(*stacks, strict=True)):
+        head = tensors[f"lin{number}.weight"]
+        total = total + (head * (_unit(one) - _unit(other)).square()).sum(dim=1).mean()
     return total
+
+
+def _normalised(image: Float[Tensor, "1 h w 3"]) -> Float[Tensor, "1 3 h w"]:
+    centred = image.clamp(0, 1) * 2 - 1
+    scaled = (centred - centred.new_tensor(_SHIFT)) / centred.new_tensor(_SCALE)
+    return scaled.permute(0, 3, 1, 2)
+
+
+def _unit(activation: Float[Tensor, "1 k y x"]) -> Float[Tensor, "1 k y x"]:
+    lengths = activation.square().sum(dim=1, keepdim=True).sqrt()
+    return activation / (lengths + _EPSILON)

@@ -14,9 +14,6 @@ LpipsNetwork = Literal["alex", "vgg"]
 
 LPIPS_NETWORKS: tuple[LpipsNetwork, ...] = get_args(LpipsNetwork)
 
-TAPS = 5
-"""Layers whose activations are compared."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Convolution:

@@ -38,7 +38,8 @@ def ssim(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tens
     :func:`cvtgs.losses.ssim.mean_ssim` of clipped images: Gaussian window of 11 x 11 pixels and
     1.5 pixels, border "valid" (only windows inside the image count), mean over places and
     channels; what scikit-image gives with ``gaussian_weights=True, sigma=1.5,
-    use_sample_covariance=False``. Memory: about 12 copies of one image.
+    use_sample_covariance=False``. In float32 it is within 1e-4 of float64, mostly within 1e-5.
+    Memory: about 12 copies of one image.
 
     Args:
         a: ``(c, h, w, 3)`` images, clipped to [0, 1].

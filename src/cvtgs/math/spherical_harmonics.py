@@ -85,7 +85,9 @@ def rest_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "
 
 
 def evaluate(
-    sh0: Float[Tensor, "n 1 3"], shN: Float[Tensor, "n k 3"], directions: Float[Tensor, "n 3"]
+    sh0: Float[Tensor, "n 1 3"],
+    shN: Float[Tensor, "n k 3"],  # noqa: N803 (the name that gsplat gives it)
+    directions: Float[Tensor, "n 3"],
 ) -> Float[Tensor, "n 3"]:
     """Evaluate colours: ``0.5`` and the spherical harmonics in the directions, not below 0.
 

@@ -1,1 +1,10 @@
-"""x."""
+"""Pictures of scenes by the rules of 3DGS, differentiable, on every device.
+
+``torch`` is the reference backend; ``numba`` on CPUs and ``gsplat`` on CUDA are fast ones, and are
+imported only when they are chosen.
+"""
+
+from cvtgs.render.backends import BackendName, choose_backend
+from cvtgs.render.render import Rendering, render
+
+__all__ = ["BackendName", "Rendering", "choose_backend", "render"]

@@ -1,9 +1,7 @@
 """Choose, once and by name, what renders."""
 
-from collections.abc import Callable
 from importlib import import_module
-from importlib.util import find_spec
-from typing import Literal, Protocol, get_args
+from typing import Literal, Protocol, cast, get_args
 
 import torch
 
@@ -17,10 +15,14 @@ BackendName = Literal["auto", "torch", "numba", "gsplat"]
 """The names that :func:`choose_backend` takes."""
 
 
-class Rasterizer(Protocol):
-    """What every backend module offers under the name ``rasterize``."""
+class Backend(Protocol):
+    """What every backend's module offers."""
 
-    def __call__(
+    def require(self, device: torch.device) -> None:
+        """Raise a DeviceError or MissingDependencyError unless it works on that device."""
+        ...
+
+    def rasterize(
         self,
         scene: GaussianScene,
         cameras: Cameras,
@@ -28,20 +30,20 @@ class Rasterizer(Protocol):
         sh_degree: int,
         listener: ProgressListener,
     ) -> Painting:
-        """Render pictures on black."""
+        """Render pictures on black; scene and cameras share a device."""
         ...
 
 
-def choose_backend(name: BackendName, device: torch.device) -> tuple[str, Rasterizer]:
+def choose_backend(name: BackendName, device: torch.device) -> tuple[str, Backend]:
     """Resolve the name of a backend for a device.
 
     Args:
-        name: ``torch``, ``numba`` (CPU), ``gsplat`` (CUDA), or ``auto``: gsplat on CUDA when it
-            works there, numba on the CPU when it is installed, else torch.
+        name: ``torch``, ``numba`` (CPU), ``gsplat`` (CUDA), or ``auto``: gsplat on CUDA if it
+            works there, numba on the CPU if it is installed, else torch.
         device: Where the scene is.
 
     Returns:
-        The resolved name and the function.
+        The resolved name and the backend.
 
     Raises:
         InvalidArgumentError: There is no backend of that name.
@@ -55,22 +57,17 @@ def choose_backend(name: BackendName, device: torch.device) -> tuple[str, Raster
     if name not in get_args(BackendName):
         names = ", ".join(get_args(BackendName))
         raise InvalidArgumentError(f"backend must be one of {names}, found {name!r}.")
-    if name == "auto":
-        name = _best(device)
-    wanted = {"numba": "cpu", "gsplat": "cuda"}.get(name, device.type)
-    if device.type != wanted:
-        raise DeviceError(
-            f"backend {name!r} works on {wanted} only, found a scene on {device}; "
-            f"use 'torch' or 'auto', or move the scene."
-        )
-    if name == "gsplat":
-        _gsplat_probe()()
-    return name, _module(name).rasterize
+    if name != "auto":
+        return name, _backend(name, device)
+    for fast in ("gsplat", "numba"):
+        try:
+            return fast, _backend(fast, device)
+        except (DeviceError, MissingDependencyError):
+            continue
+    return "torch", _backend("torch", device)
 
 
-def _best(device: torch.device) -> BackendName:
-    if device.type == "cpu":
-        return "numba" if find_spec("numba") else "torch"
-    if device.type == "cuda":
-        return "gsplat"
-    return "torch"
+def _backend(name: str, device: torch.device) -> Backend:
+    backend = cast("Backend", import_module(f"cvtgs.render.{name}_backend"))
+    backend.require(device)
+    return backend

@@ -6,7 +6,7 @@ changing a function that a kernel of another file calls, clear the cache.
 """
 
 from collections.abc import Callable
-from typing import cast
+from typing import TypeVar, cast
 
 from cvtgs.errors import MissingDependencyError
 
@@ -18,13 +18,15 @@ except ImportError as error:
         f"install it with: pip install 'cvtgs[numba]', or use backend='torch'."
     ) from error
 
+F = TypeVar("F", bound=Callable[..., object])
+
 prange = numba.prange
 """A range whose steps run in parallel, in a function made by :func:`parallel`."""
 
 _SETTINGS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 
 
-def serial[F: Callable[..., object]](function: F) -> F:
+def serial(function: F) -> F:
     """Compile a function when it is first called.
 
     Args:
@@ -36,7 +38,7 @@ def serial[F: Callable[..., object]](function: F) -> F:
     return cast("F", numba.njit(**_SETTINGS)(function))
 
 
-def parallel[F: Callable[..., object]](function: F) -> F:
+def parallel(function: F) -> F:
     """Compile a function whose outer loop runs over :data:`prange`.
 
     Args:

@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 
 from cvtgs.math.activations import LOGIT_LIMIT
 from cvtgs.math.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
+from cvtgs.render.arrays import Array, GaussianArrays, Setting
 from cvtgs.render.compiled import parallel, prange, serial
 from cvtgs.render.rules import DILATION, MIN_ALPHA, NEAR_PLANE
-
-Array = NDArray[np.floating]
 
 C2A, C2B = SH_C2
 C3A, C3B, C3C, C3D = SH_C3
@@ -19,13 +18,25 @@ C3A, C3B, C3C, C3D = SH_C3
 @serial
 def rotation_of(quat: Array, out: Array) -> float:
     """Write the rotation matrix of a quaternion of any length; give its length."""
-    largest = max(max(abs(quat[0]), abs(quat[1])), max(abs(quat[2]), abs(quat[3])))
+    largest = max(abs(quat[0]), abs(quat[1]), abs(quat[2]), abs(quat[3]))
     w, x, y, z = quat[0] / largest, quat[1] / largest, quat[2] / largest, quat[3] / largest
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w / norm, x / norm, y / norm, z / norm
-    out[0, 0], out[0, 1], out[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    out[1, 0], out[1, 1], out[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    out[2, 0], out[2, 1], out[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    out[0, 0], out[0, 1], out[0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+    )
+    out[1, 0], out[1, 1], out[1, 2] = (
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+    )
+    out[2, 0], out[2, 1], out[2, 2] = (
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
     return norm * largest
 
 
@@ -45,14 +56,8 @@ def rest_basis_at(x: float, y: float, z: float, degree: int, out: Array) -> None
 
 
 @serial
-def axes_of(
-    rotation: Array, log_scales: Array, camera: Array, local: Array, out: Array
-) -> None:
-    """Write the own axes of a Gaussian in the camera (rows 0 to 2) and in the picture (3 and 4).
-
-    ``camera``: rotation (rows 0 to 2), centre (3), focal lengths and 0 (4), principal point and 0
-    (5), slope bounds along x and 0 (6) and along y and 0 (7), width, height and 0 (8).
-    """
+def axes_of(rotation: Array, log_scales: Array, camera: Array, local: Array, out: Array) -> None:
+    """Write the own axes of a Gaussian in the camera (rows 0 to 2) and in the picture (3, 4)."""
     x_slope = min(max(local[0] / local[2], camera[6, 0]), camera[6, 1])
     y_slope = min(max(local[1] / local[2], camera[7, 0]), camera[7, 1])
     for k in range(3):
@@ -84,17 +89,24 @@ def covariance_of(axes: Array) -> tuple[float, float, float, float]:
 
 
 @serial
+def survival_of(axes: Array) -> float:
+    """Give the share of its opacity that an antialiased Gaussian keeps."""
+    a, _, d, bare = covariance_of(axes)
+    return math.sqrt(bare / (bare + DILATION * (a + d - DILATION) / d))
+
+
+@serial
 def color_of(
-    sh0: Array, shN: Array, direction: Array, degree: int, basis: Array, out: Array
+    sh: tuple[Array, Array], direction: Array, degree: int, basis: Array, out: Array
 ) -> None:
     """Write red, green and blue, which may be below 0."""
     for channel in range(3):
-        out[channel] = 0.5 + SH_C0 * sh0[0, channel]
+        out[channel] = 0.5 + SH_C0 * sh[0][0, channel]
     if degree > 0:
         rest_basis_at(direction[0], direction[1], direction[2], degree, basis)
         for j in range((degree + 1) * (degree + 1) - 1):
             for channel in range(3):
-                out[channel] += basis[j] * shN[j, channel]
+                out[channel] += basis[j] * sh[1][j, channel]
 
 
 @serial
@@ -103,9 +115,7 @@ def local_of(mean: Array, camera: Array, offset: Array, local: Array) -> None:
     for k in range(3):
         offset[k] = mean[k] - camera[3, k]
     for j in range(3):
-        local[j] = (
-            camera[j, 0] * offset[0] + camera[j, 1] * offset[1] + camera[j, 2] * offset[2]
-        )
+        local[j] = camera[j, 0] * offset[0] + camera[j, 1] * offset[1] + camera[j, 2] * offset[2]
 
 
 @serial
@@ -144,19 +154,11 @@ def splat_of(axes: Array, local: Array, camera: Array, opacity: float, out: Arra
 
 @parallel
 def project_all(
-    means: Array,
-    quats: Array,
-    log_scales: Array,
-    logits: Array,
-    sh0: Array,
-    shN: Array,  # noqa: N803
-    camera: Array,
-    degree: int,
-    antialiased: bool,
-    packed: Array,
-    seen: NDArray[np.bool_],
+    gaussians: GaussianArrays, setting: Setting, packed: Array, seen: NDArray[np.bool_]
 ) -> None:
     """Write a packed splat for every Gaussian, and which of them are in view."""
+    means, quats, log_scales, logits, sh0, rest = gaussians
+    camera, _, degree, antialiased = setting
     for i in prange(len(means)):
         scratch = np.empty((11, 3))
         offset, local, color = scratch[0], scratch[1], scratch[2]
@@ -171,14 +173,11 @@ def project_all(
             continue
         axes_of(rotation, log_scales[i], camera, local, axes)
         if antialiased:
-            a, b, d, bare = covariance_of(axes)
-            opacity *= math.sqrt(bare / (bare + DILATION * (a + d - DILATION) / d))
-            if not opacity >= MIN_ALPHA:
-                continue
-        if not splat_of(axes, local, camera, opacity, packed[i]):
+            opacity *= survival_of(axes)
+        if not (opacity >= MIN_ALPHA and splat_of(axes, local, camera, opacity, packed[i])):
             continue
         normalize_in_place(offset)
-        color_of(sh0[i], shN[i], offset, degree, np.empty(15), color)
+        color_of((sh0[i], rest[i]), offset, degree, np.empty(15), color)
         for channel in range(3):
             packed[i, 6 + channel] = max(0.0, color[channel])
         seen[i] = True

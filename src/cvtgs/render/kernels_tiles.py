@@ -2,14 +2,9 @@
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from cvtgs.render.arrays import Array, Ints
 from cvtgs.render.compiled import parallel, prange, serial
 from cvtgs.render.rules import MIN_ALPHA
-
-Array = NDArray[np.floating]
-Ints = NDArray[np.integer]
 
 SLACK = 1e-3
 LOG_MIN_ALPHA = math.log(MIN_ALPHA)
@@ -42,9 +37,7 @@ def strip(
 
 
 @serial
-def tiles_of(
-    splat: Array, size: tuple[int, int], side: int, out: Ints, start: int
-) -> int:
+def tiles_of(splat: Array, size: tuple[int, int], side: int, out: Ints, start: int) -> int:
     """Count the tiles of a splat; write their numbers too, unless ``start`` is negative."""
     reach = max(0.0, 2.0 * (splat[5] - LOG_MIN_ALPHA))
     half = math.sqrt(reach / (-2.0 * splat[4]))
@@ -73,9 +66,7 @@ def count_tiles(packed: Array, size: tuple[int, int], side: int, counts: Ints) -
 
 
 @parallel
-def name_tiles(
-    packed: Array, size: tuple[int, int], side: int, starts: Ints, names: Ints
-) -> None:
+def name_tiles(packed: Array, size: tuple[int, int], side: int, starts: Ints, names: Ints) -> None:
     """Write the tiles that each splat touches."""
     for i in prange(len(packed)):
         tiles_of(packed[i], size, side, names, starts[i])

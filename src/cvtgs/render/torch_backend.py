@@ -23,6 +23,17 @@ TILE = {"cpu": 8}
 _TILE_ELSEWHERE = 16
 
 
+def require(device: torch.device) -> None:
+    """Check that this backend can work on a device: it can on every one.
+
+    Args:
+        device: Where the scene is.
+
+    Example:
+        >>> require(torch.device("cpu"))
+    """
+
+
 def rasterize(
     scene: GaussianScene,
     cameras: Cameras,

@@ -1,0 +1,36 @@
+"""The size of a PNG image, for camera files that do not give it."""
+
+import struct
+from pathlib import Path
+
+from cvtgs.errors import FileFormatError
+from cvtgs.io.cameras.files import open_input
+
+_START = struct.Struct(">8sI4sII")
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def png_size(path: Path) -> tuple[int, int]:
+    """Read the size of a PNG image from its first bytes.
+
+    Args:
+        path: The image.
+
+    Returns:
+        Width and height in pixels.
+
+    Raises:
+        InputNotFoundError: There is no such file.
+        InputError: It cannot be opened or read.
+        FileFormatError: It is not a PNG file.
+    """
+    with open_input(path) as file:
+        start = file.read(_START.size)
+    if len(start) == _START.size:
+        signature, _, chunk, width, height = _START.unpack(start)
+        if signature == _SIGNATURE and chunk == b"IHDR":
+            return width, height
+    raise FileFormatError(
+        f"{path}: must be a PNG file, since its size is not among the cameras; found another "
+        f"format. Give 'w' and 'h' in the file of the cameras."
+    )

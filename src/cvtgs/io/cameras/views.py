@@ -1,0 +1,166 @@
+"""What every camera format comes down to, and how it becomes cameras of one image size."""
+
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from cvtgs.cameras import Cameras
+from cvtgs.errors import DroppedDataWarning, FileFormatError
+
+MAX_PIXELS = 1 << 20
+"""Images may not be wider or higher; a size beyond it is a damaged number."""
+
+_SKEW = 0.01
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lens:
+    """Intrinsics of a camera, in pixels; pixel centres are at half-integers.
+
+    Attributes:
+        fx: Focal length along the rows.
+        fy: Focal length along the columns.
+        cx: Principal point, from the left edge.
+        cy: Principal point, from the upper edge.
+        width: Pixels per row.
+        height: Rows.
+        distorted: Whether the file gives a distortion, which is left out.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distorted: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class View:
+    """One photograph's camera.
+
+    Attributes:
+        name: Name or path of the photograph, as the file has it.
+        viewmat: ``(4, 4)`` from world to camera, OpenCV axes.
+        lens: Its intrinsics.
+    """
+
+    name: str
+    viewmat: Matrix
+    lens: Lens
+
+
+def checked_lens(lens: Lens, where: str) -> Lens:
+    """Refuse intrinsics that no camera has.
+
+    Args:
+        lens: What the file gives.
+        where: Path and row, for the error text.
+
+    Returns:
+        The same lens.
+
+    Raises:
+        FileFormatError: A size or focal length is out of range, or a number is not finite.
+
+    Example:
+        >>> checked_lens(Lens(fx=9.0, fy=9.0, cx=4.0, cy=3.0, width=8, height=6), "a.json").width
+        8
+    """
+    if not (1 <= lens.width <= MAX_PIXELS and 1 <= lens.height <= MAX_PIXELS):
+        raise FileFormatError(
+            f"{where}: the image size must be from 1 to {MAX_PIXELS:,} pixels, "
+            f"found {lens.width} x {lens.height}."
+        )
+    numbers = (lens.fx, lens.fy, lens.cx, lens.cy)
+    if not all(np.isfinite(numbers)) or min(lens.fx, lens.fy) <= 0:
+        raise FileFormatError(
+            f"{where}: focal lengths must be above 0 and the principal point finite, found "
+            f"fx {lens.fx:g}, fy {lens.fy:g}, cx {lens.cx:g}, cy {lens.cy:g}."
+        )
+    return lens
+
+
+def viewmat_of_pose(
+    rotation: Float[np.ndarray, "3 3"], center: Float[np.ndarray, "3"], *, where: str
+) -> Float[np.ndarray, "4 4"]:
+    """Invert a camera's pose.
+
+    Args:
+        rotation: From camera (OpenCV axes) to world; rounded numbers are set right to the
+            nearest rotation.
+        center: The camera's position in the world.
+        where: Path and row, for the error text.
+
+    Returns:
+        The matrix from world to camera.
+
+    Raises:
+        FileFormatError: The matrix is no rotation.
+
+    Example:
+        >>> viewmat_of_pose(np.eye(3), np.array([0.0, 0.0, -2.0]), where="a.json")[2].tolist()
+        [0.0, 0.0, 1.0, 2.0]
+    """
+    skew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    determinant = float(np.linalg.det(rotation))
+    if skew > _SKEW or determinant < 0:
+        raise FileFormatError(
+            f"{where}: the pose must hold a rotation without scale or mirror, "
+            f"found a matrix of determinant {determinant:.6g} that is {skew:.3g} away from one."
+        )
+    left, _, right = np.linalg.svd(rotation)
+    inverse = (left @ right).T
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = inverse
+    viewmat[:3, 3] = -inverse @ center
+    return viewmat
+
+
+def to_cameras(views: Sequence[View], path: str) -> Cameras:
+    """Bring views to the most frequent image size, and warn of distortion once.
+
+    Args:
+        views: At least one.
+        path: Where they came from, for the warning.
+
+    Returns:
+        The cameras, float32 on the CPU, in the same order.
+    """
+    sizes = Counter((view.lens.width, view.lens.height) for view in views)
+    (width, height), _ = sizes.most_common(1)[0]
+    _warn_of_distortion(views, path)
+    viewmats = np.stack([view.viewmat for view in views])
+    intrinsics = np.stack([_intrinsics(view.lens, width=width, height=height) for view in views])
+    return Cameras(
+        viewmats=torch.from_numpy(viewmats).float(),
+        Ks=torch.from_numpy(intrinsics).float(),
+        width=width,
+        height=height,
+        names=tuple(view.name for view in views),
+    )
+
+
+def _intrinsics(lens: Lens, *, width: int, height: int) -> Matrix:
+    x, y = width / lens.width, height / lens.height
+    return np.array([[lens.fx * x, 0, lens.cx * x], [0, lens.fy * y, lens.cy * y], [0, 0, 1]])
+
+
+def _warn_of_distortion(views: Sequence[View], path: str) -> None:
+    count = sum(view.lens.distorted for view in views)
+    if count:
+        warnings.warn(
+            f"{path}: left out the lens distortion of {count:,} of {len(views):,} cameras, since "
+            f"images are rendered by pinhole cameras; compare with undistorted photographs.",
+            DroppedDataWarning,
+            stacklevel=4,
+        )
