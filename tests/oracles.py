@@ -121,16 +121,16 @@ def gaussian(
     )
 
 
-def member_weights(cell: Sequence[Gaussian], *, weight: str) -> list[float]:
-    """Weights that sum to 1: by mass, or by opacity alone."""
-    raw = [g.mass if weight == "mass" else g.opacity for g in cell]
+def member_weights(cell: Sequence[Gaussian], *, area_power: float) -> list[float]:
+    """Weights that sum to 1: opacity times area to a power."""
+    raw = [g.opacity * g.area**area_power for g in cell]
     total = math.fsum(raw)
     return [value / total for value in raw]
 
 
-def merge(cell: Sequence[Gaussian], *, weight: str, opacity: str) -> Gaussian:
+def merge(cell: Sequence[Gaussian], *, area_power: float, opacity: str) -> Gaussian:
     """One Gaussian with the moments of the mixture that the cell is; nothing is widened."""
-    shares = member_weights(cell, weight=weight)
+    shares = member_weights(cell, area_power=area_power)
     mean = sum(w * g.mean for w, g in zip(shares, cell, strict=True))
     matrix = np.zeros((3, 3))
     sh = np.zeros_like(cell[0].sh)
@@ -148,10 +148,31 @@ def merge(cell: Sequence[Gaussian], *, weight: str, opacity: str) -> Gaussian:
     return Gaussian(mean=np.asarray(mean), covariance=matrix, depth=min(depth, limit), sh=sh)
 
 
-def widening(depth: float, members: int, *, strength: float) -> float:
-    """Factor on the scales of a merged Gaussian: ``1 + c (1 - exp(-tau))^2 min(log10(n)/2, 1)``."""
-    opaque = 1.0 - math.exp(-depth)
-    return 1.0 + strength * opaque**2 * min(math.log10(members) / 2.0, 1.0)
+def side_cover(
+    means: Array, quats: Array, scales: Array, opacities: Array, row: int, others: Sequence[int]
+) -> list[list[float]]:
+    """How opaquely others paint at both ends, three sigmas out, of each axis of a Gaussian."""
+    axes = rotation(quats[row])
+    cover = []
+    for axis in range(3):
+        sides = []
+        for sign in (1.0, -1.0):
+            end = means[row] + sign * 3.0 * scales[row][axis] * axes[:, axis]
+            through = 1.0
+            for other in others:
+                local = rotation(quats[other]).T @ (end - means[other]) / scales[other]
+                through *= 1.0 - opacities[other] * math.exp(-0.5 * float(local @ local))
+            sides.append(1.0 - through)
+        cover.append(sides)
+    return cover
+
+
+def widening(
+    opacity: float, members: int, cover: float, *, everywhere: float, covered: float
+) -> float:
+    """Factor on one scale of a merged Gaussian, ``cover`` being that of its barer side."""
+    crowding = min(math.log10(members) / 2.0, 1.0)
+    return 1.0 + opacity**2 * crowding * (everywhere + covered * min(cover / 0.1, 1.0))
 
 
 def nearest(points: Array, sites: Array) -> tuple[list[int], list[float]]:

@@ -16,7 +16,7 @@ INF = float("inf")
 
 def merged(scene: GaussianScene, labels: torch.Tensor, config) -> GaussianScene:
     cells = Partition.from_labels(labels, int(labels.amax()) + 1)
-    return merge_cells(scene, cells, scene.masses, config=config)
+    return merge_cells(scene, cells, config=config)
 
 
 def pairs(count: int) -> torch.Tensor:
@@ -132,7 +132,7 @@ def test_a_cell_of_a_hundred_thousand_beside_cells_of_one(dtype, config):
     large = small.select(torch.tensor([0]))
     assert_standard(large)
     assert torch.equal(small.means[1:], scene.means[100_000:])
-    raw = scene.masses if config.weight == "mass" else scene.opacities.double()
+    raw = scene.opacities.double() * scene.areas**config.area_power
     shares = raw[:100_000] / raw[:100_000].sum()
     wanted = (shares[:, None] * scene.means[:100_000].double()).sum(dim=0)
     torch.testing.assert_close(large.means[0].double(), wanted, rtol=0, atol=1e-6)

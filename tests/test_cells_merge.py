@@ -22,7 +22,7 @@ def merged(
 ) -> GaussianScene:
     labels = torch.as_tensor(labels)
     cells = Partition.from_labels(labels, int(labels.amax()) + 1)
-    return merge_cells(scene, cells, scene.masses, config=config)
+    return merge_cells(scene, cells, config=config)
 
 
 def pair(opacities: tuple[float, float], sizes: tuple[float, float]) -> GaussianScene:
@@ -55,7 +55,7 @@ def test_two_gaussians_in_the_paper():
 
 def test_two_gaussians_by_mass():
     """Areas pi and 4 pi, opacities 0.8 and 0.2: equal weights, mean 2, variances 6.5 and 2.5."""
-    config = MergeConfig(weight="mass", opacity="saturating", widening=0.0)
+    config = MergeConfig(area_power=1.0, opacity="saturating")
     small = merged(pair((0.8, 0.2), (1.0, 2.0)), [0, 0], config)
     torch.testing.assert_close(small.means, torch.tensor([[2.0, 0, 0]]).double())
     long, thin = math.sqrt(6.5), math.sqrt(2.5)
@@ -91,7 +91,6 @@ def test_shapes_and_dtypes(degree, dtype, config):
 @each_config
 def test_identical_members_change_neither_place_nor_shape_nor_colour(config):
     one = random_scene(1, dtype=torch.float64)
-    config = config.model_copy(update={"widening": 0.0})
     small = merged(one.select(torch.zeros(5, dtype=torch.int64)), [0] * 5, config)
     torch.testing.assert_close(small.means, one.means)
     torch.testing.assert_close(small.scales, one.scales.sort(descending=True).values)
@@ -148,7 +147,7 @@ def test_done_cells_are_told(monkeypatch):
     monkeypatch.setitem(merge_cells.__globals__, "CHUNK_MEMBERS", 4)
     scene, told = random_scene(10), []
     cells = Partition.from_labels(torch.tensor([0, 0, 1, 2, 2, 2, 3, 3, 4, 0]), 5)
-    merge_cells(scene, cells, scene.masses, config=STANDARD, on_cells=told.append)
+    merge_cells(scene, cells, config=STANDARD, on_cells=told.append)
     assert told == [3, 4, 5]
 
 

@@ -13,18 +13,17 @@ from cvtgs.cells import (
     mean_and_covariance,
     merge_cells,
     merged_depth,
-    widening_factors,
 )
-from cvtgs.config import MergeConfig, SimplifyConfig
+from cvtgs.config import MergeConfig
 from cvtgs.math import covariances
 from scenes import assert_same_gaussians, covariances_of, moved, oracle_rows, random_scene
 
 RULES = {
-    "paper": MergeConfig(weight="opacity", opacity="union", widening=0.0),
-    "standard": MergeConfig(weight="mass", opacity="saturating", widening=0.0),
+    "paper": MergeConfig(area_power=0.0, opacity="union"),
+    "between": MergeConfig(area_power=0.5, opacity="saturating"),
+    "standard": MergeConfig(area_power=1.0, opacity="saturating"),
 }
 each_rule = pytest.mark.parametrize("config", RULES.values(), ids=RULES)
-WIDENED = SimplifyConfig.from_preset("standard").merge
 
 
 def random_cells(total: int, count: int, seed: int = 0) -> Partition:
@@ -34,7 +33,7 @@ def random_cells(total: int, count: int, seed: int = 0) -> Partition:
 
 
 def merged(scene: GaussianScene, cells: Partition, config: MergeConfig) -> GaussianScene:
-    return merge_cells(scene, cells, scene.masses, config=config)
+    return merge_cells(scene, cells, config=config)
 
 
 def assert_equals_oracle(scene, cells, config, *, tolerance: float) -> None:
@@ -44,7 +43,7 @@ def assert_equals_oracle(scene, cells, config, *, tolerance: float) -> None:
     for cell in range(len(cells)):
         rows = order[offsets[cell] : offsets[cell + 1]]
         wanted = oracles.merge(
-            oracle_rows(scene, rows), weight=config.weight, opacity=config.opacity
+            oracle_rows(scene, rows), area_power=config.area_power, opacity=config.opacity
         )
         size = math.sqrt(float(wanted.covariance.max()))
         assert small.means[cell].tolist() == pytest.approx(wanted.mean, abs=tolerance * size)
@@ -78,13 +77,14 @@ def test_thin_and_faint_and_opaque_members_equal_the_oracle(config):
 def test_moments_of_the_mixture_are_conserved(config):
     """First and second raw moments of each cell, summed over the whole scene by weight."""
     scene, cells = random_scene(400, dtype=torch.float64), random_cells(400, 30)
-    members = gather_members(scene, cells, scene.masses, weight=config.weight)
-    means, matrices = mean_and_covariance(members)
+    members = gather_members(scene, cells)
+    all_weights = members.weights(config.area_power)
+    means, matrices = mean_and_covariance(members, all_weights)
     second = covariances.from_scales_and_quats(members.scales, members.quats)
     second = second + members.means[:, :, None] * members.means[:, None, :]
     for cell in range(30):
         rows = slice(int(cells.offsets[cell]), int(cells.offsets[cell + 1]))
-        weights = members.weights[rows]
+        weights = all_weights[rows]
         assert float(weights.sum()) == pytest.approx(1.0)
         torch.testing.assert_close(means[cell], (weights[:, None] * members.means[rows]).sum(0))
         torch.testing.assert_close(
@@ -98,7 +98,7 @@ def test_saturating_conserves_depth_times_area():
     scene, cells = random_scene(400, dtype=torch.float64), random_cells(400, 150)
     scene = scene.with_tensors({"logit_opacities": 0.3 * scene.logit_opacities - 7.0}, {})
     small = merged(scene, cells, RULES["standard"])
-    members = gather_members(scene, cells, scene.masses, weight="mass")
+    members = gather_members(scene, cells)
     wanted = torch.stack(
         [
             (members.depths * members.areas)[int(a) : int(b)].sum()
@@ -123,7 +123,7 @@ def test_saturating_never_gains_mass_and_never_exceeds_one():
 
 def test_union_adds_depths():
     scene, cells = random_scene(100, dtype=torch.float64), random_cells(100, 40)
-    members = gather_members(scene, cells, scene.masses, weight="opacity")
+    members = gather_members(scene, cells)
     depths = merged_depth(members, torch.ones(40).double(), rule="union")
     for cell in range(40):
         rows = cells.order[int(cells.offsets[cell]) : int(cells.offsets[cell + 1])]
@@ -131,41 +131,7 @@ def test_union_adds_depths():
         assert float(torch.exp(-depths[cell])) == pytest.approx(float(through))
 
 
-def test_widening_widens_scales_only_and_only_cells_of_several():
-    scene = random_scene(300, dtype=torch.float64)
-    labels = torch.cat([torch.arange(40), torch.randint(20, 40, (260,))])
-    cells = Partition.from_labels(labels, 40)
-    plain, wide = merged(scene, cells, RULES["standard"]), merged(scene, cells, WIDENED)
-    ratios = wide.scales / plain.scales
-    assert bool((ratios[:20] == 1).all())
-    assert bool((ratios >= 1 - 1e-12).all())
-    assert float(ratios.amax()) > 1.01
-    torch.testing.assert_close(wide.means, plain.means)
-    torch.testing.assert_close(wide.quats, plain.quats)
-
-
-def test_widening_equals_the_oracle():
-    scene = random_scene(300, dtype=torch.float64)
-    labels = torch.cat([torch.arange(6), torch.full((2,), 3), torch.full((292,), 4)])
-    cells = Partition.from_labels(labels, 6)
-    members = gather_members(scene, cells, scene.masses, weight="mass")
-    for depth in (1e-6, 0.3, 2.0, 13.8):
-        factors = widening_factors(members, torch.full((6,), depth).double(), strength=0.3)
-        wanted = [oracles.widening(depth, n, strength=0.3) for n in cells.counts.tolist()]
-        assert factors.tolist() == pytest.approx(wanted, rel=1e-6)
-
-
-def test_widening_leaves_haze_alone():
-    scene, cells = random_scene(300, dtype=torch.float64), random_cells(300, 20)
-    hazy = scene.with_tensors({"logit_opacities": scene.logit_opacities * 0 - 9.0}, {})
-    members = gather_members(hazy, cells, hazy.masses, weight="mass")
-    faint = torch.full((20,), 1e-3, dtype=torch.float64)
-    factors = widening_factors(members, faint, strength=0.3)
-    assert bool(((factors >= 1) & (factors < 1.001)).all())
-    assert bool((widening_factors(members, faint, strength=0.0) == 1).all())
-
-
-@pytest.mark.parametrize("config", [*RULES.values(), WIDENED], ids=[*RULES, "widened"])
+@each_rule
 @pytest.mark.parametrize(
     "motion",
     [

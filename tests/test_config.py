@@ -29,7 +29,8 @@ def test_paper_is_cvt_gs():
     paper = SimplifyConfig.from_preset("paper")
     assert paper.preset == "paper"
     assert paper.filter == FilterConfig(min_opacity=0.1, max_mass_share=1.0)
-    assert paper.cvt.weight == paper.merge.weight == "opacity"
+    assert paper.cvt.area_power == paper.merge.area_power == 0.0
+    assert not paper.cvt.perspective
     assert (paper.cvt.color, paper.cvt.unbounded, paper.cvt.iterations) == (0.0, "off", 5)
     assert (paper.cvt.seeding, paper.cvt.samples_per_site) == ("weighted", 0)
     assert (paper.merge.opacity, paper.merge.widening) == ("union", 0.0)
@@ -38,7 +39,8 @@ def test_paper_is_cvt_gs():
 def test_standard_is_mass_everywhere():
     standard = SimplifyConfig()
     assert standard.filter.max_mass_share == 0.01
-    assert standard.cvt.weight == standard.merge.weight == "mass"
+    assert standard.cvt.area_power == standard.merge.area_power == 1.0
+    assert standard.cvt.perspective
     assert standard.cvt.seeding == "stratified"
     assert standard.merge.opacity == "saturating"
 
@@ -51,7 +53,7 @@ def test_every_preset_is_valid_and_keeps_its_name(name):
 def test_values_win_over_their_preset():
     config = SimplifyConfig.from_mapping({"preset": "paper", "cvt": {"iterations": 9}})
     assert config.cvt.iterations == 9
-    assert config.cvt.weight == "opacity"
+    assert config.cvt.area_power == 0.0
     assert SimplifyConfig.from_preset("paper").cvt.iterations == 5
 
 
@@ -69,7 +71,9 @@ def test_a_partial_file_takes_the_rest_from_its_preset(tmp_path):
     path = tmp_path / "config.toml"
     path.write_text('preset = "paper"\n[merge]\nwidening = 0.5\n', encoding="utf-8")
     config = SimplifyConfig.from_toml(path)
-    assert config.merge == MergeConfig(weight="opacity", opacity="union", widening=0.5)
+    assert config.merge == MergeConfig(
+        area_power=0.0, opacity="union", widening=0.5, covered_widening=0.0
+    )
     assert config.cvt == SimplifyConfig.from_preset("paper").cvt
 
 
@@ -81,14 +85,14 @@ def test_settings_win_over_preset_and_preset_over_file(tmp_path):
     )
     assert config.preset == "paper"
     assert config.seed == 4
-    assert (config.cvt.iterations, config.cvt.color, config.cvt.weight) == (10, 0.5, "opacity")
+    assert (config.cvt.iterations, config.cvt.color, config.cvt.area_power) == (10, 0.5, 0.0)
 
 
 @pytest.mark.parametrize(
     ("key", "text", "value"),
     [
         ("cvt.color", "0.25", 0.25),
-        ("cvt.weight", "opacity", "opacity"),
+        ("cvt.seeding", "weighted", "weighted"),
         ("cvt.unbounded", "on", "on"),
         ("merge.widening", "0", 0.0),
         ("filter.max_mass_share", "1e-3", 1e-3),
@@ -128,8 +132,8 @@ def test_sections_stand_alone():
             "filter.min_opacity: input should be less than or equal to 1, found 1.5.",
         ),
         (
-            {"cvt": {"weight": "area"}},
-            "cvt.weight: input should be 'mass' or 'opacity', found 'area'.",
+            {"cvt": {"seeding": "grid"}},
+            "cvt.seeding: input should be 'stratified' or 'weighted', found 'grid'.",
         ),
         (
             {"merge": {"x": 1}, "y": 2},

@@ -1,5 +1,7 @@
 """What a Gaussian weighs, and where it lies, in the tessellation."""
 
+import math
+
 import pytest
 import torch
 
@@ -15,10 +17,10 @@ def test_falloff_beyond_the_radius_is_the_inverse_square():
 
 
 def test_weights_have_mean_one():
-    opacities, masses = torch.tensor([0.2, 0.6]), torch.tensor([1.0, 3.0])
-    by_mass = tessellation_weights(opacities, masses, weight="mass", floor=0.0)
-    by_opacity = tessellation_weights(opacities, masses * 7, weight="opacity", floor=0.0)
-    assert by_mass.tolist() == [0.5, 1.5]
+    opacities, areas = torch.tensor([0.2, 0.6]), torch.tensor([1.0, 3.0])
+    by_mass = tessellation_weights(opacities, areas, area_power=1.0, floor=0.0)
+    by_opacity = tessellation_weights(opacities, areas * 7, area_power=0.0, floor=0.0)
+    assert by_mass.tolist() == pytest.approx([0.2, 1.8])
     assert by_opacity.tolist() == pytest.approx([0.5, 1.5])
 
 
@@ -27,7 +29,7 @@ def test_embedding_of_known_points():
     plain = embed(means, sh0, FRAME, color=0.0, contracted=False)
     assert plain.tolist() == [[1.0, 0, 0], [0, 4, 0]]
     pulled = embed(means, sh0, FRAME, color=0.0, contracted=True)
-    assert pulled.tolist() == [[1.0, 0, 0], [0, 1.75, 0]]
+    assert pulled.tolist() == [[1.0, 0, 0], [0, pytest.approx(1 + math.log(4)), 0]]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -74,22 +76,22 @@ def test_extreme_colours_do_not_tear_points_apart():
 
 
 @pytest.mark.parametrize("size", [1e-300, 1.0, 1e300])
-def test_the_unit_of_mass_does_not_matter(size):
-    masses = torch.rand(100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    plain = tessellation_weights(masses, masses, weight="mass", floor=1e-3)
-    scaled = tessellation_weights(masses, size * masses, weight="mass", floor=1e-3)
+def test_the_unit_of_area_does_not_matter(size):
+    areas = torch.rand(100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    plain = tessellation_weights(areas, areas, area_power=0.9, floor=1e-3)
+    scaled = tessellation_weights(areas, size * areas, area_power=0.9, floor=1e-3)
     torch.testing.assert_close(scaled, plain, rtol=1e-12, atol=0)
 
 
 def test_no_weight_is_below_the_floor():
-    masses = torch.tensor([0.0, 1e-12, 1.0, 3.0], dtype=torch.float64)
-    weights = tessellation_weights(masses, masses, weight="mass", floor=0.01)
+    areas = torch.tensor([0.0, 1e-12, 1.0, 3.0], dtype=torch.float64)
+    weights = tessellation_weights(torch.ones(4), areas, area_power=1.0, floor=0.01)
     assert weights.tolist() == pytest.approx([0.01, 0.01, 1.0, 3.0])
 
 
-def test_masses_of_zero_weigh_the_same():
+def test_opacities_and_areas_of_zero_weigh_the_same():
     zero = torch.zeros(3)
-    assert tessellation_weights(zero, zero, weight="mass", floor=0.0).tolist() == [1.0, 1.0, 1.0]
+    assert tessellation_weights(zero, zero, area_power=1.0, floor=0.0).tolist() == [1.0, 1.0, 1.0]
 
 
 def test_flyaways_weigh_nothing_from_the_middle():

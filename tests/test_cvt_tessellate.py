@@ -90,7 +90,8 @@ def test_more_iterations_lower_the_energy(seeding):
     assert energies[-1] < 0.8 * energies[0]
 
 
-def test_a_sample_is_nearly_as_good_as_all_points():
+def test_a_sample_is_nearly_as_good_as_all_points(monkeypatch):
+    monkeypatch.setitem(tessellate.__globals__, "MIN_SAMPLES", 1)
     points, weights = weighted_cloud(20_000)
     of_sample, of_all, unmoved = (
         tessellate(
@@ -102,6 +103,18 @@ def test_a_sample_is_nearly_as_good_as_all_points():
     assert_complete(of_sample, 20_000, 100)
     assert not torch.equal(of_sample.labels, of_all.labels)
     assert of_sample.energy < 1.05 * of_all.energy < 0.95 * unmoved.energy
+
+
+def test_a_sample_is_never_tiny(monkeypatch):
+    points, weights = weighted_cloud(20_000)
+    config = TessellationConfig(samples_per_site=24)
+    monkeypatch.setitem(tessellate.__globals__, "MIN_SAMPLES", 8000)
+    some = tessellate(points, weights, 3, config=config)
+    monkeypatch.setitem(tessellate.__globals__, "MIN_SAMPLES", 1)
+    few = tessellate(points, weights, 3, config=config)
+    everything = tessellate(points, weights, 3, config=TessellationConfig(samples_per_site=0))
+    errors = [(result.sites - everything.sites).abs().max() for result in (some, few)]
+    assert errors[0] < errors[1]
 
 
 def test_a_sample_that_saves_little_is_not_taken():

@@ -23,6 +23,7 @@ LEVELS = [
     {"effects"},
     {"report", "io", "filters", "cvt", "cells", "synthetic", "render", "losses"},
     {"mergenet"},
+    {"stages"},
     {"simplify", "info", "evaluate"},
     {"train"},
     {"cli"},

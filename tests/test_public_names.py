@@ -45,6 +45,7 @@ STAGES = {
         "fill_empty_cells",
         "lloyd",
         "nearest_backend",
+        "nearest_neighbors",
         "nearest_scipy",
         "nearest_torch",
         "stratified_seeds",
@@ -61,8 +62,9 @@ STAGES = {
         "merge_cells",
         "merged_depth",
         "normalized_weights",
+        "side_cover",
         "weighted_mean",
-        "widening_factors",
+        "widen_cells",
     },
     "synthetic": {"KINDS", "demo_scene", "scene"},
 }

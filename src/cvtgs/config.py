@@ -35,11 +35,16 @@ class TessellationConfig(_Section):
     """How Gaussians are grouped into cells.
 
     Attributes:
-        weight: What a Gaussian weighs: its mass (opacity times mean projected area) or its
-            opacity alone.
+        area_power: A Gaussian weighs its opacity times its mean projected area to this power: 0
+            is the opacity alone, 1 the mass.
+        perspective: Whether areas count as they look from the middle of the scene, smaller when
+            far.
         weight_floor: No Gaussian weighs less than this share of the mean weight.
-        color: Length of one unit of colour, in robust radii; 0 groups by position alone.
-        unbounded: Whether far Gaussians weigh less and lie closer; ``auto`` decides by the scene.
+        color: Length of one unit of colour for 10,000 cells, in robust radii; 0 groups by position
+            alone.
+        color_power: The length grows with the number of cells to this power; with few cells,
+            colour counts more.
+        unbounded: Whether far positions are pulled in; ``auto`` decides by the scene.
         seeding: Deterministic strata of equal weight, or weighted random draws.
         iterations: Lloyd iterations, at most.
         tolerance: Lloyd stops when an iteration lowers the energy by less than this share.
@@ -47,9 +52,11 @@ class TessellationConfig(_Section):
         backend: What searches the nearest site; ``auto`` takes scipy on a CPU, else torch.
     """
 
-    weight: Literal["mass", "opacity"] = "mass"
+    area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)
+    perspective: bool = True
     weight_floor: float = pydantic.Field(default=1e-3, ge=0.0)
     color: float = pydantic.Field(default=0.05, ge=0.0)
+    color_power: float = pydantic.Field(default=-0.25, ge=-1.0, le=1.0)
     unbounded: Literal["auto", "on", "off"] = "auto"
     seeding: Literal["stratified", "weighted"] = "stratified"
     iterations: int = pydantic.Field(default=5, ge=0)
@@ -62,15 +69,20 @@ class MergeConfig(_Section):
     """How a cell becomes one Gaussian.
 
     Attributes:
-        weight: What a member weighs in the means of position, covariance and colour.
+        area_power: A member weighs its opacity times its mean projected area to this power: 0 is
+            the opacity alone, 1 the mass.
         opacity: ``saturating`` conserves mass, ``1 - exp(-tau)``; ``union`` is the opacity of
             members that lie exactly behind one another, ``1 - prod(1 - a)``.
-        widening: How much wider than its moments an opaque cell of many members becomes.
+        widening: How much wider than its moments an opaque cell of many members becomes, along
+            every axis.
+        covered_widening: How much more it becomes so along an axis on which other cells paint at
+            both its ends.
     """
 
-    weight: Literal["mass", "opacity"] = "mass"
+    area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)
     opacity: Literal["saturating", "union"] = "saturating"
-    widening: float = pydantic.Field(default=0.3, ge=0.0, le=2.0)
+    widening: float = pydantic.Field(default=0.1, ge=0.0, le=2.0)
+    covered_widening: float = pydantic.Field(default=0.4, ge=0.0, le=2.0)
 
 
 class SimplifyConfig(_Section):
@@ -198,7 +210,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": {
         "filter": {"max_mass_share": 1.0},
         "cvt": {
-            "weight": "opacity",
+            "area_power": 0.0,
+            "perspective": False,
             "weight_floor": 0.0,
             "color": 0.0,
             "unbounded": "off",
@@ -207,7 +220,12 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
             "tolerance": 0.0,
             "samples_per_site": 0,
         },
-        "merge": {"weight": "opacity", "opacity": "union", "widening": 0.0},
+        "merge": {
+            "area_power": 0.0,
+            "opacity": "union",
+            "widening": 0.0,
+            "covered_widening": 0.0,
+        },
     },
 }
 """What each preset changes of the defaults: ``standard`` nothing, ``paper`` is CVT-GS."""

@@ -88,13 +88,18 @@ class GaussianScene:
         return activations.opacity_from_logit(self.logit_opacities)
 
     @property
-    def masses(self) -> Float[Tensor, "n"]:
-        """Opacity times mean projected area, squared scene units, float64."""
-        areas = [
+    def areas(self) -> Float[Tensor, "n"]:
+        """Mean projected areas of the one-sigma ellipsoids, squared scene units, float64."""
+        parts = [
             covariances.mean_projected_area(torch.exp(part.double()))
             for part in self.log_scales.split(_CHUNK)
         ]
-        return torch.cat(areas).mul_(self.opacities)
+        return torch.cat([self.log_scales.new_empty(0, dtype=torch.float64), *parts])
+
+    @property
+    def masses(self) -> Float[Tensor, "n"]:
+        """Opacity times mean projected area, squared scene units, float64."""
+        return self.areas.mul_(self.opacities)
 
     @property
     def sh(self) -> Float[Tensor, "n k_plus_1 3"]:

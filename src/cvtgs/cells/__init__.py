@@ -3,7 +3,7 @@
 from cvtgs.cells.moments import Members, mean_and_covariance, normalized_weights, weighted_mean
 from cvtgs.cells.partition import Partition
 from cvtgs.cells.reference import gather_members, merge_cells, merged_depth
-from cvtgs.cells.widening import widening_factors
+from cvtgs.cells.widening import side_cover, widen_cells
 
 __all__ = [
     "Members",
@@ -13,6 +13,7 @@ __all__ = [
     "merge_cells",
     "merged_depth",
     "normalized_weights",
+    "side_cover",
     "weighted_mean",
-    "widening_factors",
+    "widen_cells",
 ]

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.math import covariances
-from cvtgs.math.segments import segment_ids, segment_sum
+from cvtgs.math import activations, covariances
+from cvtgs.math.segments import segment_ids, segment_max, segment_sum
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -18,19 +18,35 @@ class Members:
         means: ``(n, 3)`` positions.
         quats: ``(n, 4)`` unit quaternions.
         scales: ``(n, 3)`` standard deviations.
+        opacities: ``(n,)`` opacities.
         depths: ``(n,)`` optical depths ``-log(1 - a)``.
         areas: ``(n,)`` mean projected areas.
-        weights: ``(n,)`` weights; those of one cell sum to 1.
         offsets: ``(m + 1,)`` where each cell starts, and the end of the last one.
     """
 
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
     scales: Float[Tensor, "n 3"]
+    opacities: Float[Tensor, "n"]
     depths: Float[Tensor, "n"]
     areas: Float[Tensor, "n"]
-    weights: Float[Tensor, "n"]
     offsets: Int[Tensor, "m_plus_1"]
+
+    def weights(self, area_power: float) -> Float[Tensor, "n"]:
+        """Give what each member weighs in the means of its cell.
+
+        Args:
+            area_power: The weight is the opacity times the area to this power: 0 as in CVT-GS,
+                1 for the mass.
+
+        Returns:
+            Weights; those of one cell sum to 1.
+        """
+        if area_power == 0.0:
+            return normalized_weights(self.opacities, self.offsets)
+        largest = segment_max(self.areas, self.offsets)[segment_ids(self.offsets)]
+        shares = activations.divide(self.areas, largest) ** area_power
+        return normalized_weights(self.opacities * shares, self.offsets)
 
 
 def normalized_weights(
@@ -82,7 +98,7 @@ def weighted_mean(
 
 
 def mean_and_covariance(
-    members: Members,
+    members: Members, weights: Float[Tensor, "n"]
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3 3"]]:
     """Match the first two moments of the mixture that each cell is.
 
@@ -92,11 +108,12 @@ def mean_and_covariance(
 
     Args:
         members: Members of the cells.
+        weights: Weights that sum to 1 in each cell.
 
     Returns:
         Means and covariances of the cells, float64.
     """
-    offsets, weights = members.offsets, members.weights
+    offsets = members.offsets
     ids = segment_ids(offsets)
     first_rows = members.means[offsets[:-1]]
     local = members.means - first_rows[ids]

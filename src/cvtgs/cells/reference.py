@@ -7,9 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.cells.moments import Members, mean_and_covariance, normalized_weights, weighted_mean
+from cvtgs.cells.moments import Members, mean_and_covariance, weighted_mean
 from cvtgs.cells.partition import Partition
-from cvtgs.cells.widening import widening_factors
 from cvtgs.config import MergeConfig
 from cvtgs.math import activations, covariances, quaternions
 from cvtgs.math.segments import segment_argmax, segment_sum
@@ -22,7 +21,6 @@ CHUNK_MEMBERS = 1 << 15
 def merge_cells(
     scene: GaussianScene,
     partition: Partition,
-    masses: Float[Tensor, "n"],
     *,
     config: MergeConfig,
     on_cells: Callable[[int], None] = lambda done: None,
@@ -37,8 +35,7 @@ def merge_cells(
     Args:
         scene: The Gaussians, with valid rows.
         partition: Row numbers of every cell.
-        masses: Opacity times mean projected area of every Gaussian of the scene.
-        config: Weights, opacity rule and widening.
+        config: Weights and opacity rule.
         on_cells: Told how many cells are done.
 
     Returns:
@@ -48,7 +45,7 @@ def merge_cells(
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 4, sh_degree=0, seed=0)
         >>> cells = Partition.from_labels(torch.tensor([0, 0, 1, 1]), 2)
-        >>> len(merge_cells(scene, cells, scene.opacities.double(), config=MergeConfig()))
+        >>> len(merge_cells(scene, cells, config=MergeConfig()))
         2
     """
     heads = partition.order[partition.offsets[:-1]]
@@ -58,7 +55,7 @@ def merge_cells(
     done = len(partition) - len(cells)
     tensors, extras = merged.tensors(), dict(merged.extras)
     for run, part in partition.select(several).chunks(CHUNK_MEMBERS):
-        new_tensors, new_extras = _merge_chunk(scene, part, masses, config)
+        new_tensors, new_extras = _merge_chunk(scene, part, config)
         for name, values in new_tensors.items():
             tensors[name][cells[run]] = values.to(scene.dtype)
         for name, values in new_extras.items():
@@ -69,25 +66,25 @@ def merge_cells(
 
 
 def _merge_chunk(
-    scene: GaussianScene, part: Partition, masses: Tensor, config: MergeConfig
+    scene: GaussianScene, part: Partition, config: MergeConfig
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     rows, offsets = part.order, part.offsets
-    members = gather_members(scene, part, masses, weight=config.weight)
-    means, matrices = mean_and_covariance(members)
+    members = gather_members(scene, part)
+    weights = members.weights(config.area_power)
+    means, matrices = mean_and_covariance(members, weights)
     scales, quats = covariances.decompose(matrices)
     depths = merged_depth(members, covariances.mean_projected_area(scales), rule=config.opacity)
-    factors = widening_factors(members, depths, strength=config.widening)
     tensors = {
         "means": means,
         "quats": quats,
-        "log_scales": activations.positive_log(scales * factors[:, None]),
+        "log_scales": activations.positive_log(scales),
         "logit_opacities": activations.logit_from_optical_depth(depths),
-        "sh0": weighted_mean(scene.sh0[rows], members.weights, offsets),
-        "shN": weighted_mean(scene.shN[rows], members.weights, offsets),
+        "sh0": weighted_mean(scene.sh0[rows], weights, offsets),
+        "shN": weighted_mean(scene.shN[rows], weights, offsets),
     }
-    heaviest = rows[segment_argmax(masses[rows], offsets)]
+    heaviest = rows[segment_argmax(members.opacities * members.areas, offsets)]
     extras = {
-        name: weighted_mean(column[rows], members.weights, offsets).to(column.dtype)
+        name: weighted_mean(column[rows], weights, offsets).to(column.dtype)
         if column.is_floating_point()
         else column[heaviest]
         for name, column in scene.extras.items()
@@ -95,20 +92,12 @@ def _merge_chunk(
     return tensors, extras
 
 
-def gather_members(
-    scene: GaussianScene,
-    part: Partition,
-    masses: Float[Tensor, "n"],
-    *,
-    weight: Literal["mass", "opacity"],
-) -> Members:
+def gather_members(scene: GaussianScene, part: Partition) -> Members:
     """Collect what the moments of some cells need.
 
     Args:
         scene: The Gaussians.
         part: Row numbers of the cells.
-        masses: Opacity times mean projected area of every Gaussian of the scene.
-        weight: What a member weighs.
 
     Returns:
         The members in float64.
@@ -116,14 +105,13 @@ def gather_members(
     rows = part.order
     scales = torch.exp(scene.log_scales[rows].double())
     logits = scene.logit_opacities[rows].double()
-    raw = masses[rows] if weight == "mass" else activations.opacity_from_logit(logits)
     return Members(
         means=scene.means[rows].double(),
         quats=quaternions.normalize(scene.quats[rows].double()),
         scales=scales,
+        opacities=activations.opacity_from_logit(logits),
         depths=activations.optical_depth_from_logit(logits),
         areas=covariances.mean_projected_area(scales),
-        weights=normalized_weights(raw, part.offsets),
         offsets=part.offsets,
     )
 

@@ -6,6 +6,7 @@ from cvtgs.cvt.lloyd import LloydResult, lloyd, weighted_centroids
 from cvtgs.cvt.nearest import nearest_backend
 from cvtgs.cvt.nearest_scipy import nearest_scipy
 from cvtgs.cvt.nearest_torch import nearest_torch
+from cvtgs.cvt.neighbors import nearest_neighbors
 from cvtgs.cvt.seeding import stratified_seeds, weighted_seeds
 from cvtgs.cvt.tessellate import Tessellation, fill_empty_cells, tessellate
 
@@ -17,6 +18,7 @@ __all__ = [
     "fill_empty_cells",
     "lloyd",
     "nearest_backend",
+    "nearest_neighbors",
     "nearest_scipy",
     "nearest_torch",
     "stratified_seeds",

@@ -1,7 +1,5 @@
 """What a Gaussian weighs in the tessellation."""
 
-from typing import Literal
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,17 +9,21 @@ from cvtgs.math.frames import RobustFrame
 
 def tessellation_weights(
     opacities: Float[Tensor, "n"],
-    masses: Float[Tensor, "n"],
+    areas: Float[Tensor, "n"],
     *,
-    weight: Literal["mass", "opacity"],
+    area_power: float,
     floor: float,
 ) -> Float[Tensor, "n"]:
     """Give the weight of every Gaussian.
 
+    The mass (power 1) says how much of a picture a Gaussian paints. But a large Gaussian is
+    smooth inside: it needs fewer sites per painted area than many small ones, hence a power
+    below 1.
+
     Args:
         opacities: Opacities.
-        masses: Opacity times mean projected area, as seen from where people stand.
-        weight: ``opacity`` as in CVT-GS, or ``mass``.
+        areas: Mean projected areas, any unit, possibly as they look from the middle.
+        area_power: The weight is the opacity times the area to this power; 0 as in CVT-GS.
         floor: No weight is below this share of the mean weight.
 
     Returns:
@@ -29,11 +31,14 @@ def tessellation_weights(
 
     Example:
         >>> tessellation_weights(
-        ...     torch.tensor([0.5, 0.5]), torch.tensor([1.0, 3.0]), weight="mass", floor=0.0
+        ...     torch.tensor([0.5, 0.5]), torch.tensor([1.0, 3.0]).double(),
+        ...     area_power=1.0, floor=0.0,
         ... ).tolist()
         [0.5, 1.5]
     """
-    raw = (masses if weight == "mass" else opacities).double()
+    raw = opacities.double()
+    if area_power:
+        raw = raw * (areas / areas.amax().clamp_min(torch.finfo(torch.float64).tiny)) ** area_power
     largest = raw.amax()
     if not bool(largest > 0):
         return torch.ones_like(raw)

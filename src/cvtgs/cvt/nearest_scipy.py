@@ -1,5 +1,7 @@
 """Nearest site by scipy's k-d tree, on the CPU."""
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -29,9 +31,7 @@ def nearest_scipy(
         >>> labels.tolist()
         [1]
     """
-    from scipy.spatial import cKDTree  # noqa: PLC0415 (heavy; `import cvtgs` stays light)
-
-    tree = cKDTree(np.asarray(sites, dtype=np.float64))
+    tree = build_tree(sites)
     labels = np.empty(len(points), dtype=np.int64)
     squared = np.empty(len(points), dtype=np.float64)
     for start in range(0, len(points), CHUNK):
@@ -39,3 +39,21 @@ def nearest_scipy(
         distances, labels[part] = tree.query(np.asarray(points[part], np.float64), workers=-1)
         np.square(distances, out=squared[part])
     return torch.from_numpy(labels), torch.from_numpy(squared)
+
+
+def build_tree(sites: Float[Tensor, "m d"]) -> Any:
+    """Build scipy's k-d tree.
+
+    Args:
+        sites: Positions on the CPU, at least one.
+
+    Returns:
+        A ``scipy.spatial.cKDTree`` over them, in float64.
+
+    Example:
+        >>> build_tree(torch.zeros(1, 3)).n
+        1
+    """
+    from scipy.spatial import cKDTree  # noqa: PLC0415 (heavy; `import cvtgs` stays light)
+
+    return cKDTree(np.asarray(sites, dtype=np.float64))

@@ -15,6 +15,10 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.segments import segment_argmax, sort_by_label
 
 
+MIN_SAMPLES = 1 << 15
+"""Lloyd never looks at fewer points than this to save time; so few cost next to nothing."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tessellation:
     """Points grouped into cells.
@@ -102,9 +106,10 @@ def tessellate(
 
 def _sample(points: Tensor, weights: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Take fewer points, which stand for all by weight, if that saves at least half of them."""
-    if not 0 < size < len(points) // 2:
+    enough = max(size, MIN_SAMPLES)
+    if size == 0 or enough >= len(points) // 2:
         return points, weights
-    rows, shares = stratified_seeds(weights, size)
+    rows, shares = stratified_seeds(weights, enough)
     return points[rows], shares
 
 

@@ -52,20 +52,21 @@ class RobustFrame:
         return torch.cat(parts)
 
     def contract(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Express points in radii and pull those beyond the first radius into the second.
+        """Express points in radii and pull in those beyond the first radius, logarithmically.
 
-        A point at distance d > 1 goes to distance ``2 - 1/d`` in the same direction, the map of
-        mip-NeRF 360 (Barron et al. 2022, equation 10).
+        A point at distance d > 1 goes to distance ``1 + log(d)`` in the same direction. Seen
+        from the middle, equal steps along and across the view then shrink alike, so a far cell
+        keeps its shape; the map ``2 - 1/d`` of mip-NeRF 360 (Barron et al. 2022) flattens it.
 
         Args:
             points: Finite positions, scene units.
 
         Returns:
-            Positions in float64, all within a ball of radius 2.
+            Positions in float64; a flyaway of 1e30 radii lies at 70.
         """
         local = self.normalize(points)
         distance: Tensor = torch.linalg.vector_norm(local, dim=1, keepdim=True).clamp_min(1.0)
-        return local * ((2.0 - 1.0 / distance) / distance)
+        return local * ((1.0 + torch.log(distance)) / distance)
 
 
 def robust_frame(points: Float[Tensor, "n 3"]) -> RobustFrame:

@@ -70,8 +70,8 @@ def rest_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "
         Values, k in {0, 3, 8, 15}.
 
     Example:
-        >>> rest_basis(torch.tensor([[0.0, 0.0, 1.0]]), 1).round(decimals=4).tolist()
-        [[-0.0, 0.4886, -0.0]]
+        >>> rest_basis(torch.tensor([[0.0, 0.0, 1.0]]), 1)
+        tensor([[-0.0000, 0.4886, -0.0000]])
     """
     x, y, z = directions.unbind(1)
     columns: list[Tensor] = []

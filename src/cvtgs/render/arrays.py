@@ -1,12 +1,16 @@
 """What compiled kernels share: arrays that belong together."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.floating]
-Ints = NDArray[np.integer]
+Array = NDArray[Any]
+"""Floats, all of one dtype; numba works out which."""
+
+Ints = NDArray[Any]
+"""Integers."""
+
 Box = tuple[int, int, int, int]
 """Pixels: first column, column after the last, first row, row after the last."""
 

@@ -6,7 +6,7 @@ changing a function that a kernel of another file calls, clear the cache.
 """
 
 from collections.abc import Callable
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from cvtgs.errors import MissingDependencyError
 
@@ -23,7 +23,12 @@ F = TypeVar("F", bound=Callable[..., object])
 prange = numba.prange
 """A range whose steps run in parallel, in a function made by :func:`parallel`."""
 
-_SETTINGS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+_SETTINGS: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract"},
+}
 
 
 def serial(function: F) -> F:
@@ -56,4 +61,5 @@ def use_threads(count: int) -> None:
     Args:
         count: How many, at least 1; at most as many as numba was started with are used.
     """
-    numba.set_num_threads(max(1, min(count, numba.config.NUMBA_NUM_THREADS)))
+    most = vars(numba.config)["NUMBA_NUM_THREADS"]
+    numba.set_num_threads(max(1, min(count, most)))

@@ -114,8 +114,9 @@ def _gsplat() -> Any:
 def _failure(device: str) -> str:
     """Render one Gaussian and its gradient; say why that failed, or nothing if it did not."""
     try:
+        gsplat = _gsplat()
         means = torch.tensor([[0.0, 0.0, 1.0]], device=device, requires_grad=True)
-        colors, _, _ = _gsplat().rasterization(
+        colors, _, _ = gsplat.rasterization(
             means=means,
             quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device),
             scales=torch.full((1, 3), 0.1, device=device),
@@ -130,7 +131,12 @@ def _failure(device: str) -> str:
         colors.sum().backward()
         lit = float(colors.detach().amax())
     except ImportError as error:
-        return f"it cannot be imported ({error})"
+        return f"it cannot be imported ({_first_line(error)})"
     except Exception as error:  # whatever a build or a driver may raise
-        return f"it failed to render ({type(error).__name__}: {error})"
+        return f"it failed to render ({type(error).__name__}: {_first_line(error)})"
     return "" if 0.4 < lit < 0.6 else f"it rendered {lit:.3g} where 0.5 was expected"
+
+
+def _first_line(error: Exception) -> str:
+    """Shorten the message of a failed build, which may hold the compiler's whole output."""
+    return next(iter(str(error).splitlines()), "no reason given")

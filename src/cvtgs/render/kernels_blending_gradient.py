@@ -53,18 +53,12 @@ def blend_gradient(
     """Write the gradient of one splat in a tile; give how many pixels it finished.
 
     ``state`` is the light that reaches each pixel, 0 where it is finished, and the gradient times
-    everything that lies behind this splat.
+    everything that lies behind this splat. ``out`` is 0 before.
     """
     finished = 0
     light, behind = state
     x0, x1, y0, y1 = box
-    one, zero = centers.dtype.type(1), centers.dtype.type(0)
-    least, most = centers.dtype.type(MIN_TRANSMITTANCE), centers.dtype.type(MAX_ALPHA)
-    faintest = centers.dtype.type(MIN_ALPHA)
     square, shear, rest, log_opacity = splat[2], splat[3], splat[4], splat[5]
-    red, green, blue, depth = splat[6], splat[7], splat[8], splat[9]
-    g_x, g_y, g_square, g_shear, g_rest, g_log = zero, zero, zero, zero, zero, zero
-    g_red, g_green, g_blue, g_depth = zero, zero, zero, zero
     half = math.sqrt(max(0.0, (LOG_MIN_ALPHA - log_opacity) / rest))
     top, bottom = span(splat[1] - half, splat[1] + half, y0, y1)
     for y in range(top, bottom):
@@ -73,41 +67,61 @@ def blend_gradient(
         exponent = log_opacity + rest * down * down
         half = math.sqrt(max(0.0, (LOG_MIN_ALPHA - exponent) / square))
         first, end = span(middle - half, middle + half, x0, x1)
-        zeroth, moment, second = zero, zero, zero
-        for x in range(first, end):
-            reaching = light[y - y0, x - x0]
-            if reaching == zero:
-                continue
-            along = centers[x] - middle
-            alpha = min(most, math.exp(exponent + square * along * along))
-            if alpha < faintest:
-                continue
-            after = reaching * (one - alpha)
-            if after < least:
-                light[y - y0, x - x0] = zero
-                finished += 1
-                continue
-            light[y - y0, x - x0] = after
-            pixel = grad[y - y0, x - x0]
-            weight = alpha * reaching
-            worth = red * pixel[0] + green * pixel[1] + blue * pixel[2] + depth * pixel[3]
-            remaining = behind[y - y0, x - x0] - weight * worth
-            behind[y - y0, x - x0] = remaining
-            g_red += weight * pixel[0]
-            g_green += weight * pixel[1]
-            g_blue += weight * pixel[2]
-            g_depth += weight * pixel[3]
-            if alpha < most:
-                g = alpha * (reaching * worth - remaining / (one - alpha))
-                zeroth += g
-                moment += g * along
-                second += g * along * along
-        g_x -= 2 * square * moment
-        g_y -= 2 * (square * shear * moment + rest * down * zeroth)
-        g_square += second
-        g_shear += 2 * square * moment * down
-        g_rest += zeroth * down * down
-        g_log += zeroth
-    out[0], out[1], out[2], out[3], out[4], out[5] = g_x, g_y, g_square, g_shear, g_rest, g_log
-    out[6], out[7], out[8], out[9] = g_red, g_green, g_blue, g_depth
+        row = (
+            light[y - y0, first - x0 :],
+            behind[y - y0, first - x0 :],
+            grad[y - y0, first - x0 :],
+        )
+        done, zeroth, moment, second = blend_row_gradient(
+            splat, exponent, centers[first:end] - middle, row, out
+        )
+        finished += done
+        out[0] -= 2 * square * moment
+        out[1] -= 2 * (square * shear * moment + rest * down * zeroth)
+        out[2] += second
+        out[3] += 2 * square * moment * down
+        out[4] += zeroth * down * down
+        out[5] += zeroth
     return finished
+
+
+@serial
+def blend_row_gradient(
+    splat: Array,
+    exponent: float,
+    ways: Array,
+    row: tuple[Array, Array, Array],
+    out: Array,
+) -> tuple[int, float, float, float]:
+    """Add the gradients by colour and depth; give pixels finished, and the exponent's moments."""
+    finished = 0
+    one, zero = ways.dtype.type(1), ways.dtype.type(0)
+    least, most = ways.dtype.type(MIN_TRANSMITTANCE), ways.dtype.type(MAX_ALPHA)
+    faintest = ways.dtype.type(MIN_ALPHA)
+    light, behind, grad = row
+    zeroth, moment, second = zero, zero, zero
+    for x in range(len(ways)):
+        reaching = light[x]
+        if reaching == zero:
+            continue
+        along = ways[x]
+        alpha = min(most, math.exp(exponent + splat[2] * along * along))
+        if alpha < faintest:
+            continue
+        after = reaching * (one - alpha)
+        if after < least:
+            light[x] = zero
+            finished += 1
+            continue
+        light[x] = after
+        weight, worth = alpha * reaching, zero
+        for channel in range(4):
+            worth += splat[6 + channel] * grad[x, channel]
+            out[6 + channel] += weight * grad[x, channel]
+        behind[x] -= weight * worth
+        if alpha < most:
+            g = alpha * (reaching * worth - behind[x] / (one - alpha))
+            zeroth += g
+            moment += g * along
+            second += g * along * along
+    return finished, zeroth, moment, second

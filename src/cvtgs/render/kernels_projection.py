@@ -37,7 +37,7 @@ def rotation_of(quat: Array, out: Array) -> float:
         2 * (y * z + w * x),
         1 - 2 * (x * x + y * y),
     )
-    return norm * largest
+    return float(norm * largest)
 
 
 @serial

@@ -88,7 +88,7 @@ def reach_of(opacities: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
         Squared standard deviations; 0 for those that paint nothing.
 
     Example:
-        >>> reach_of(torch.tensor([1.0, 0.001])).round(decimals=2).tolist()
+        >>> [round(reach, 2) for reach in reach_of(torch.tensor([1.0, 0.001])).tolist()]
         [11.08, 0.0]
     """
     return (2 * activations.positive_log(opacities / MIN_ALPHA)).clamp_min(0)
@@ -122,7 +122,9 @@ def _candidates(scene: GaussianScene, view: View) -> Tensor:
     # 3.33 standard deviations is where even an opacity of 1 falls to 1/255.
     radius = 3.34 * deviation + 3.34 * DILATION**0.5
     quats = scene.quats.abs().amax(dim=1)
-    keep = (z >= NEAR_PLANE) & torch.isfinite(radius) & torch.isfinite(quats) & (quats > 0)
+    # The squares of larger ones would overflow.
+    keep: Tensor = deviation < torch.finfo(scene.dtype).max ** 0.5 / 4
+    keep &= (z >= NEAR_PLANE) & torch.isfinite(z) & torch.isfinite(quats) & (quats > 0)
     for way, focal, principal, size in zip(
         (x, y), view.focal, view.principal, view.size, strict=True
     ):

@@ -53,7 +53,8 @@ def render(
     falls under 1/255, so that no picture depends on tiles.
 
     The result is differentiable in means, quats, log scales, opacity logits, sh0, shN and in the
-    background; cameras are constants. Gaussians with values that are not finite paint nothing.
+    background; cameras are constants. Gaussians whose place, shape or opacity is not
+    finite paint nothing.
 
     Memory: cameras are rendered one by one; each backend's ``rasterize`` states its formula.
 

@@ -65,7 +65,7 @@ def rasterize(
 def _paint(scene: GaussianScene, view: View, sh_degree: int) -> Float[Tensor, "h w 5"]:
     splats = project(scene, view, sh_degree)
     lists = intersect(splats, view.size, TILE.get(scene.device.type, _TILE_ELSEWHERE))
-    tiles: Tensor = _Composite.apply(pack(splats), lists)
+    tiles: Tensor = _Composite.apply(pack(splats), lists)  # type: ignore[no-untyped-call]
     return _assemble(tiles, lists, view.size)
 
 
@@ -75,8 +75,8 @@ def _assemble(
     """Lay tiles side by side and cut off what hangs over the edges."""
     down = len(tiles) // lists.across
     grid = tiles.unflatten(0, (down, lists.across)).transpose(1, 2)
-    picture = grid.reshape(down * lists.side, lists.across * lists.side, -1)
-    return picture[: size[1], : size[0]]
+    overhanging: Tensor = grid.reshape(down * lists.side, lists.across * lists.side, -1)
+    return overhanging[: size[1], : size[0]]
 
 
 class _Composite(torch.autograd.Function):
@@ -91,10 +91,11 @@ class _Composite(torch.autograd.Function):
         tiles = composite(packed, lists)
         ctx.save_for_backward(packed, tiles)
         ctx.lists = lists
-        return tiles.unflatten(1, (lists.side, lists.side))
+        squares: Tensor = tiles.unflatten(1, (lists.side, lists.side))
+        return squares
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         packed, tiles = ctx.saved_tensors
         return composite_gradient(packed, ctx.lists, tiles, grad.flatten(1, 2)), None

@@ -1,0 +1,56 @@
+"""The nearest other sites of every site."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cvtgs.cvt.nearest_scipy import build_tree
+
+MAX_ENTRIES = 1 << 23
+"""Largest number of distances held at one time by the torch search."""
+
+
+def nearest_neighbors(
+    sites: Float[Tensor, "m d"], count: int, *, backend: str
+) -> Int[Tensor, "m k"]:
+    """Find the nearest other sites of every site.
+
+    Args:
+        sites: Positions.
+        count: How many neighbours each site gets; fewer if there are not so many others.
+        backend: ``scipy`` (CPU only, a k-d tree) or ``torch`` (any device; compares all sites with
+            all others in pieces, so time grows with m squared).
+
+    Returns:
+        Row numbers, k = min(count, m - 1); the site itself is not among them. Of equally near
+        sites any may be named.
+
+    Example:
+        >>> nearest_neighbors(torch.tensor([[0.0], [1.0], [9.0]]), 1, backend="scipy").tolist()
+        [[1], [0], [1]]
+    """
+    with_self = min(count + 1, len(sites))
+    if backend == "scipy":
+        _, found = build_tree(sites).query(
+            np.asarray(sites, np.float64), k=[*range(1, with_self + 1)], workers=-1
+        )
+        rows = torch.from_numpy(found.astype(np.int64))
+    else:
+        rows = _nearest_by_comparison(sites.double(), with_self)
+    # Among coincident sites the site itself may be anywhere, even missing: then the last one goes.
+    is_self = rows == torch.arange(len(sites), device=sites.device)[:, None]
+    others = torch.sort(is_self.to(torch.uint8), dim=1, stable=True).indices[:, : with_self - 1]
+    return rows.gather(1, others)
+
+
+def _nearest_by_comparison(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m k"]:
+    step = max(1, MAX_ENTRIES // len(sites))
+    return torch.cat(
+        [
+            torch.cdist(part, sites, compute_mode="donot_use_mm_for_euclid_dist")
+            .topk(count, dim=1, largest=False)
+            .indices
+            for part in sites.split(step)
+        ]
+    )

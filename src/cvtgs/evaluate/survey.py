@@ -1,0 +1,120 @@
+"""What automatic views know of a scene: where it is, how large, which way is up."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs.errors import InvalidSceneError
+from cvtgs.evaluate.orientation import find_up
+from cvtgs.evaluate.voxels import Voxels, voxels_of
+from cvtgs.filters import invalid_rows, with_finite_opacities
+from cvtgs.math.frames import RobustFrame, robust_frame
+from cvtgs.scene import GaussianScene
+
+MOST_GAUSSIANS = 60_000
+"""Larger scenes are looked at through a sample of this many Gaussians."""
+
+_HEAVIEST = 10_000
+_VISIBLE = 0.1
+_BOUNDED = 2.2
+_EXTENT = (0.02, 0.98)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Survey:
+    """One look at a scene.
+
+    Attributes:
+        sample: The scene, or a sample of it that covers the same; SH degree 0, on the CPU.
+        frame: Robust centre and radius of what is visible.
+        voxels: The surfaces near the middle.
+        up: Unit vector, float64.
+        bounded: Whether nearly all lies within about two robust radii: a thing, not a place.
+        center: Middle of what is to be shown, scene units, float64.
+        radius: Radius of what is to be shown, scene units.
+        height: Extent along ``up`` of what is near the middle, scene units.
+    """
+
+    sample: GaussianScene
+    frame: RobustFrame
+    voxels: Voxels
+    up: Float[Tensor, "3"]
+    bounded: bool
+    center: Float[Tensor, "3"]
+    radius: float
+    height: float
+
+
+def survey(scene: GaussianScene) -> Survey:
+    """Look at a scene once.
+
+    Memory: a mask per attribute, and a sample of at most 60,000 Gaussians.
+
+    Args:
+        scene: Any scene.
+
+    Returns:
+        What is known of it.
+
+    Raises:
+        InvalidSceneError: The scene has no valid row.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> survey(make("object", 2000, seed=0)).bounded
+        True
+    """
+    sample = _sample(_valid(scene))
+    visible = sample.means[sample.opacities > _VISIBLE]
+    frame = robust_frame(visible if len(visible) else sample.means)
+    voxels = voxels_of(sample, frame)
+    up = find_up(voxels)
+    places = voxels.points if len(voxels.points) else sample.means.new_zeros(1, 3).double()
+    distances = frame.distances(visible if len(visible) else sample.means)
+    bounded = float(torch.quantile(distances, 0.97)) < _BOUNDED
+    low, high = places.quantile(places.new_tensor(_EXTENT), dim=0)
+    heights = (places @ up).quantile(places.new_tensor(_EXTENT))
+    middle = 0.5 * (low + high) if bounded else torch.zeros_like(low)
+    if bounded:
+        spread = torch.linalg.vector_norm(places - middle, dim=1)
+        radius = float(spread.quantile(0.98))
+    else:
+        radius = 1.0
+    return Survey(
+        sample=sample,
+        frame=frame,
+        voxels=voxels,
+        up=up,
+        bounded=bounded,
+        center=frame.center + frame.radius * middle,
+        radius=frame.radius * max(radius, 1e-6),
+        height=frame.radius * float(heights[1] - heights[0]),
+    )
+
+
+def _valid(scene: GaussianScene) -> GaussianScene:
+    bad = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
+    for mask in invalid_rows(scene).values():
+        bad |= mask
+    if len(scene) == int(bad.sum()):
+        raise InvalidSceneError(
+            f"automatic views need a scene with valid Gaussians; none of {len(scene)} is valid."
+        )
+    return scene.select(~bad) if bool(bad.any()) else scene
+
+
+def _sample(scene: GaussianScene) -> GaussianScene:
+    """Keep the heaviest Gaussians and every k-th of the others, wider by as much as is missing."""
+    plain = scene.with_tensors({"shN": scene.shN[:, :0]}, {})
+    if len(scene) > MOST_GAUSSIANS:
+        heaviest_first = torch.sort(scene.masses, descending=True, stable=True).indices
+        rest = torch.sort(heaviest_first[_HEAVIEST:]).values
+        step = -(-len(rest) // (MOST_GAUSSIANS - _HEAVIEST))
+        rows = torch.cat([heaviest_first[:_HEAVIEST], rest[::step]])
+        widening = torch.zeros(len(rows), 1, dtype=scene.dtype, device=scene.device)
+        widening[_HEAVIEST:] = 0.5 * torch.log(widening.new_tensor(len(rest) / len(rest[::step])))
+        plain = plain.select(rows)
+        plain = plain.with_tensors({"log_scales": plain.log_scales + widening}, {})
+    return with_finite_opacities(plain.to("cpu"))

@@ -1,0 +1,242 @@
+"""What damaged COLMAP models and missing files get: one sentence, word for word."""
+
+import contextlib
+import os
+import random
+import struct
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+
+from camera_errors import text_of
+from camera_files import colmap_bin, colmap_txt, inria, write_json
+from cvtgs.errors import (
+    DroppedDataWarning,
+    FileFormatError,
+    InputError,
+    InputNotFoundError,
+)
+from cvtgs.io import load_cameras
+
+CAMERAS_TXT: Mapping[str, tuple[str, str]] = {
+    "few words": (
+        "1 PINHOLE 64",
+        "must be a camera: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[], found '1 PINHOLE 64'.",
+    ),
+    "few parameters": (
+        "1 PINHOLE 64 48 9 9 9",
+        "must be 4 parameters of PINHOLE, found '1 PINHOLE 64 48 9 9 9'.",
+    ),
+    "no number": (
+        "1 PINHOLE 64 48 9 9 9 x",
+        "must be a camera in numbers, found '1 PINHOLE 64 48 9 9 9 x'.",
+    ),
+    "fisheye": (
+        "1 OPENCV_FISHEYE 64 48 9 9 9 9 0 0 0 0",
+        "the camera model must be one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, "
+        "FULL_OPENCV, found OPENCV_FISHEYE; undistort the images first (colmap image_undistorter).",
+    ),
+    "infinite": (
+        "1 PINHOLE 64 48 9 inf 9 9",
+        "focal lengths must be above 0 and the principal point finite, "
+        "found fx 9, fy inf, cx 9, cy 9.",
+    ),
+    "nan distortion": (
+        "1 SIMPLE_RADIAL 64 48 9 9 9 nan",
+        "the distortion must be finite, found nan.",
+    ),
+    "size": (
+        "1 PINHOLE 64 99999999 9 9 9 9",
+        "the image size must be from 1 to 1,048,576 pixels, found 64 x 99999999.",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CAMERAS_TXT)
+def test_colmap_cameras_txt(case, tmp_path) -> None:
+    colmap_txt(tmp_path)
+    line, wanted = CAMERAS_TXT[case]
+    path = tmp_path / "cameras.txt"
+    path.write_text(f"# a comment\n\n{line}\n")
+    assert text_of(tmp_path) == f"{path}: line 3: {wanted}"
+
+
+IMAGES_TXT: Mapping[str, tuple[str, str]] = {
+    "few words": (
+        "1 1 0 0 0 0 0 1 7",
+        "line 2: must be an image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, "
+        "found '1 1 0 0 0 0 0 1 7'.",
+    ),
+    "no number": (
+        "1 1 0 0 0 0 0 x 7 a.jpg",
+        "line 2: must be an image in numbers, found '1 1 0 0 0 0 0 x 7 a.jpg'.",
+    ),
+    "zero quaternion": (
+        "1 0 0 0 0 0 0 5 7 a.jpg",
+        "line 2: the pose must be finite with a quaternion other than 0, "
+        "found 0, 0, 0, 0, 0, 0, 5.",
+    ),
+    "infinite": (
+        "1 1 0 0 0 0 nan 5 7 a.jpg",
+        "line 2: the pose must be finite with a quaternion other than 0, "
+        "found 1, 0, 0, 0, 0, nan, 5.",
+    ),
+    "no points line": (
+        "1 1 0 0 0 0 0 5 7 a.jpg\n2 1 0 0 0 0 0 5 7 b.jpg",
+        "line 3: must be the points of image 'a.jpg' as X Y POINT3D_ID, or empty, "
+        "found '2 1 0 0 0 0 0 5 7 b.jpg'.",
+    ),
+    "unknown camera": (
+        "1 1 0 0 0 0 0 5 8 a.jpg",
+        "image 'a.jpg' must have a camera of the file of cameras, found camera 8.",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", IMAGES_TXT)
+def test_colmap_images_txt(case, tmp_path) -> None:
+    colmap_txt(tmp_path)
+    lines, wanted = IMAGES_TXT[case]
+    path = tmp_path / "images.txt"
+    path.write_text(f"# a comment\n{lines}\n")
+    assert text_of(tmp_path) == f"{path}: {wanted}"
+
+
+def packed_cameras(count: int = 1, model: int = 1, **changes: Any) -> bytes:
+    numbers = changes.get("parameters", (9.0, 9.0, 9.0, 9.0))
+    width = changes.get("width", 64)
+    return struct.pack("<QiiQQ", count, 7, model, width, 48) + struct.pack("<4d", *numbers)
+
+
+def packed_image(
+    count: int = 1, name: bytes = b"a.jpg\0", points: int = 0, w: float = 1.0
+) -> bytes:
+    pose = struct.pack("<Qi7di", count, 1, w, 0, 0, 0, 0, 0, 5, 7)
+    return pose + name + struct.pack("<Q", points)
+
+
+BINARY: Mapping[str, tuple[str, bytes, str]] = {
+    "empty": (
+        "cameras", b"",
+        "the file is cut short: the count of cameras must have 8 bytes, found 0.",
+    ),
+    "lying count of cameras": (
+        "cameras", packed_cameras(count=1 << 60),
+        "the file is cut short: 1,152,921,504,606,846,976 cameras must have "
+        "27,670,116,110,564,327,424 bytes, found 56.",
+    ),
+    "cut camera": (
+        "cameras", packed_cameras()[:-1],
+        "the file is cut short: camera 0 must have 32 bytes, found 31.",
+    ),
+    "fisheye": (
+        "cameras", packed_cameras(model=5),
+        "camera 0: the camera model must be one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, "
+        "OPENCV, FULL_OPENCV, found OPENCV_FISHEYE; undistort the images first "
+        "(colmap image_undistorter).",
+    ),
+    "unknown model": (
+        "cameras", packed_cameras(model=99),
+        "camera 0: the camera model must be one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, "
+        "OPENCV, FULL_OPENCV, found number 99; undistort the images first "
+        "(colmap image_undistorter).",
+    ),
+    "width": (
+        "cameras", packed_cameras(width=1 << 63),
+        "camera 0: the image size must be from 1 to 1,048,576 pixels, "
+        "found 9223372036854775808 x 48.",
+    ),
+    "lying count of images": (
+        "images", packed_image(count=9),
+        "the file is cut short: 9 images must have 657 bytes, found 78.",
+    ),
+    "lying count of points": (
+        "images", packed_image(points=(1 << 64) - 1),
+        "the file is cut short: 18,446,744,073,709,551,615 points of image 0 must have "
+        "442,721,857,769,029,238,760 bytes, found 0.",
+    ),
+    "endless name": (
+        "images", packed_image(name=b"x" * 5000),
+        "the name of image 0 must end within 4,096 bytes, found no end.",
+    ),
+    "no name": (
+        "images", packed_image(name=b"\0"), "image 0: the image must have a name, found none.",
+    ),
+    "zero quaternion": (
+        "images", packed_image(w=0.0),
+        "image 0: the pose must be finite with a quaternion other than 0, "
+        "found 0, 0, 0, 0, 0, 0, 5.",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BINARY)
+def test_colmap_binary(case, tmp_path) -> None:
+    name, data, wanted = BINARY[case]
+    colmap_bin(tmp_path)
+    path = tmp_path / f"{name}.bin"
+    path.write_bytes(data)
+    assert text_of(tmp_path) == f"{path}: {wanted}"
+
+
+@pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "cameras.txt", "images.txt"])
+def test_any_damage_gives_cameras_or_one_sentence(name, tmp_path) -> None:
+    (colmap_bin if name.endswith("bin") else colmap_txt)(tmp_path)
+    path = tmp_path / name
+    good = path.read_bytes()
+    rng = random.Random(3)
+    for _ in range(300):
+        data = bytearray(good[: rng.randrange(len(good) + 1)] if rng.random() < 0.3 else good)
+        for _ in range(rng.randrange(1, 4)):
+            if data:
+                data[rng.randrange(len(data))] = rng.randrange(256)
+        path.write_bytes(data)
+        with contextlib.suppress(FileFormatError):
+            load_cameras(tmp_path)
+
+
+def test_what_is_not_there(tmp_path) -> None:
+    assert text_of(tmp_path, InputNotFoundError) == (
+        f"{tmp_path}: the folder must hold transforms.json, transforms_train.json, "
+        f"transforms_test.json, a COLMAP model in sparse/0, sparse or itself, or cameras.json; "
+        f"found none of them."
+    )
+    for name in ("no.json", "no"):
+        assert text_of(tmp_path / name, InputNotFoundError) == (
+            f"{tmp_path / name}: the file to read must exist, found none."
+        )
+    colmap_bin(tmp_path)
+    (tmp_path / "cameras.bin").unlink()
+    assert text_of(tmp_path, InputNotFoundError) == (
+        f"{tmp_path / 'cameras.bin'}: the file to read must exist, found none."
+    )
+    (tmp_path / "points.ply").write_bytes(b"ply\n")
+    assert text_of(tmp_path / "points.ply") == (
+        f"{tmp_path / 'points.ply'}: a file of cameras must be JSON (.json) or of a COLMAP model "
+        f"(cameras.bin, images.bin, cameras.txt, images.txt), found neither."
+    )
+
+
+def test_what_cannot_be_read(tmp_path) -> None:
+    os.mkfifo(tmp_path / "pipe.json")
+    assert text_of(tmp_path / "pipe.json", InputError) == (
+        f"{tmp_path / 'pipe.json'}: must be a regular file, found a device or a pipe."
+    )
+    if os.geteuid() == 0:
+        pytest.skip("root may read everything")
+    path = write_json(tmp_path / "cameras.json", inria())
+    path.chmod(0)
+    assert text_of(path, InputError) == (
+        f"{path}: the file must be readable, found: permission denied."
+    )
+
+
+def test_the_rest_of_the_files_is_left_alone(tmp_path) -> None:
+    """Reading writes nothing."""
+    colmap_bin(tmp_path, model="RADIAL", parameters=[50, 32, 24, 0.1, 0])
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.warns(DroppedDataWarning):
+        load_cameras(tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
