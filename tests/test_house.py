@@ -41,8 +41,9 @@ OWNERS = {
     "kornia": "losses/ssim.py",
     "numba": "render/compiled.py",
     "gsplat": "render/gsplat_backend.py",
+    "PIL": "evaluate/images.py",
 }
-HEAVY = ("scipy", "kornia", "plyfile", "rich", "matplotlib")
+HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "matplotlib")
 
 
 def relative(path: Path) -> str:

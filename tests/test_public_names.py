@@ -1,6 +1,8 @@
 """The public names are a contract."""
 
 import ast
+import subprocess
+import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -10,11 +12,13 @@ import cvtgs
 
 NAMES = {
     "PRESETS",
+    "Cameras",
     "CvtgsError",
     "EffectPlan",
     "GaussianScene",
     "ProgressEvent",
     "ProgressListener",
+    "Rendering",
     "SceneInfo",
     "Simplified",
     "Simplifier",
@@ -25,11 +29,15 @@ NAMES = {
     "describe",
     "effects",
     "errors",
+    "evaluate",
     "filters",
     "from_dict",
     "io",
     "load",
+    "load_cameras",
+    "losses",
     "math",
+    "render",
     "save",
     "synthetic",
     "target_count",
@@ -48,6 +56,7 @@ STAGES = {
         "nearest_neighbors",
         "nearest_scipy",
         "nearest_torch",
+        "openness",
         "stratified_seeds",
         "tessellate",
         "tessellation_weights",
@@ -65,6 +74,23 @@ STAGES = {
         "side_cover",
         "weighted_mean",
         "widen_cells",
+    },
+    "evaluate": {
+        "LPIPS_VARIABLE",
+        "Comparison",
+        "Evaluation",
+        "LpipsWeights",
+        "SceneScores",
+        "Score",
+        "automatic_views",
+        "compare",
+        "evaluate",
+        "load_lpips",
+        "load_photographs",
+        "lpips",
+        "psnr",
+        "ssim",
+        "write_exhibition",
     },
     "synthetic": {"KINDS", "demo_scene", "scene"},
 }
@@ -112,7 +138,8 @@ def test_every_name_resolves_and_is_listed(name):
 
 
 def test_tables_agree_with_what_type_checkers_see():
-    wanted = dict(cvtgs._HOME) | dict.fromkeys(cvtgs._MODULES, "cvtgs")
+    functions = {name: f"cvtgs.{name}" for name in cvtgs._CALLABLE}
+    wanted = dict(cvtgs._HOME) | dict.fromkeys(cvtgs._MODULES, "cvtgs") | functions
     assert names_for_type_checkers() == wanted
     assert set(wanted) == NAMES
 
@@ -120,6 +147,28 @@ def test_tables_agree_with_what_type_checkers_see():
 def test_names_live_where_the_table_says():
     for name, home in cvtgs._HOME.items():
         assert getattr(cvtgs, name) is getattr(import_module(home), name)
+
+
+@pytest.mark.parametrize("name", ["evaluate", "render"])
+@pytest.mark.parametrize(
+    "before",
+    ["", "import cvtgs.{0}", "from cvtgs.{0} import {0}", "import cvtgs.{0}.{0}", "cvtgs.{0}"],
+)
+def test_packages_are_called_like_their_function(name, before):
+    """Whatever was imported before, the package stays a package and can be called."""
+    code = f"""
+import cvtgs
+{before.format(name)}
+import cvtgs.{name} as package
+from cvtgs.{name} import {name} as function
+try:
+    cvtgs.{name}(no_such_argument=1)
+except TypeError as error:
+    assert function.__name__ + "()" in str(error), error
+assert package is cvtgs.{name} and package.{name} is function
+assert "{name}" in dir(cvtgs)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize(("module", "names"), STAGES.items(), ids=STAGES)

@@ -9,17 +9,22 @@
 Names are loaded when they are first used, so that ``import cvtgs`` costs nothing.
 """
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cvtgs import cells, cvt, effects, errors, filters, io, math, synthetic
+    from cvtgs import cells, cvt, effects, errors, filters, io, losses, math, synthetic
+    from cvtgs.cameras import Cameras
     from cvtgs.config import PRESETS, SimplifyConfig
     from cvtgs.effects import EffectPlan
     from cvtgs.errors import CvtgsError
+    from cvtgs.evaluate import evaluate
     from cvtgs.info import SceneInfo, describe
-    from cvtgs.io import from_dict, load, save, to_dict
+    from cvtgs.io import from_dict, load, load_cameras, save, to_dict
     from cvtgs.progress import ProgressEvent, ProgressListener
+    from cvtgs.render import Rendering, render
     from cvtgs.report import SimplifyReport
     from cvtgs.scene import GaussianScene
     from cvtgs.simplify import Simplified, Simplifier, target_count
@@ -27,6 +32,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
+    "Cameras": "cvtgs.cameras",
     "PRESETS": "cvtgs.config",
     "SimplifyConfig": "cvtgs.config",
     "EffectPlan": "cvtgs.effects",
@@ -35,25 +41,30 @@ _HOME = {
     "describe": "cvtgs.info",
     "from_dict": "cvtgs.io",
     "load": "cvtgs.io",
+    "load_cameras": "cvtgs.io",
     "save": "cvtgs.io",
     "to_dict": "cvtgs.io",
     "ProgressEvent": "cvtgs.progress",
     "ProgressListener": "cvtgs.progress",
+    "Rendering": "cvtgs.render",
     "SimplifyReport": "cvtgs.report",
     "GaussianScene": "cvtgs.scene",
     "Simplified": "cvtgs.simplify",
     "Simplifier": "cvtgs.simplify",
     "target_count": "cvtgs.simplify",
 }
-_MODULES = ("cells", "cvt", "effects", "errors", "filters", "io", "math", "synthetic")
+_MODULES = ("cells", "cvt", "effects", "errors", "filters", "io", "losses", "math", "synthetic")
+_CALLABLE = ("evaluate", "render")
 
 __all__ = [
     "PRESETS",
+    "Cameras",
     "CvtgsError",
     "EffectPlan",
     "GaussianScene",
     "ProgressEvent",
     "ProgressListener",
+    "Rendering",
     "SceneInfo",
     "Simplified",
     "Simplifier",
@@ -64,11 +75,15 @@ __all__ = [
     "describe",
     "effects",
     "errors",
+    "evaluate",
     "filters",
     "from_dict",
     "io",
     "load",
+    "load_cameras",
+    "losses",
     "math",
+    "render",
     "save",
     "synthetic",
     "target_count",
@@ -76,8 +91,28 @@ __all__ = [
 ]
 
 
+class _CallablePackage(ModuleType):
+    """A package that is called like its function of the same name: ``cvtgs.render(...)``."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        name: str = self.__name__.rpartition(".")[2]
+        return vars(self)[name](*args, **kwargs)
+
+
+class _FrontPage(ModuleType):
+    """Makes the packages that are named like their function callable when they are loaded."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in _CALLABLE and isinstance(value, ModuleType):
+            value.__class__ = _CallablePackage
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _FrontPage
+
+
 def __getattr__(name: str) -> Any:
-    if name in _MODULES:
+    if name in (*_MODULES, *_CALLABLE):
         return import_module(f"cvtgs.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'cvtgs' has no attribute {name!r}")

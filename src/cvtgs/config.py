@@ -39,6 +39,8 @@ class TessellationConfig(_Section):
             is the opacity alone, 1 the mass.
         perspective: Whether areas count as they look from the middle of the scene, smaller when
             far.
+        hidden_share: What an enclosed Gaussian counts, as a share of a free one; 1 does not look at
+            what is enclosed.
         weight_floor: No Gaussian weighs less than this share of the mean weight.
         color: Length of one unit of colour for 10,000 cells, in robust radii; 0 groups by position
             alone.
@@ -52,8 +54,9 @@ class TessellationConfig(_Section):
         backend: What searches the nearest site; ``auto`` takes scipy on a CPU, else torch.
     """
 
-    area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)
+    area_power: float = pydantic.Field(default=0.9, ge=0.0, le=2.0)
     perspective: bool = True
+    hidden_share: Share = 0.1
     weight_floor: float = pydantic.Field(default=1e-3, ge=0.0)
     color: float = pydantic.Field(default=0.05, ge=0.0)
     color_power: float = pydantic.Field(default=-0.25, ge=-1.0, le=1.0)
@@ -212,6 +215,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "cvt": {
             "area_power": 0.0,
             "perspective": False,
+            "hidden_share": 1.0,
             "weight_floor": 0.0,
             "color": 0.0,
             "unbounded": "off",

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cvtgs import cells, cvt, filters
-from cvtgs.config import SimplifyConfig
+from cvtgs.config import SimplifyConfig, TessellationConfig
 from cvtgs.effects import EffectPlan, plan_effects
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError
 from cvtgs.math.activations import divide
@@ -115,8 +115,20 @@ def _valid_scene(scene: GaussianScene, target: int) -> tuple[GaussianScene, dict
 def _look(scene: GaussianScene, config: SimplifyConfig) -> _Outlook:
     frame, areas = robust_frame(scene.means), scene.areas
     plan = plan_effects(scene, areas * scene.opacities, frame, unbounded=config.cvt.unbounded)
-    seen = areas * cvt.falloff(scene.means, frame) if config.cvt.perspective else areas
-    return _Outlook(frame, areas, seen, plan)
+    return _Outlook(frame, areas, _seen_areas(scene, areas, frame, config.cvt), plan)
+
+
+def _seen_areas(
+    scene: GaussianScene, areas: Tensor, frame: RobustFrame, config: TessellationConfig
+) -> Tensor:
+    """Give areas as they look from the middle, enclosed ones reduced."""
+    seen = areas
+    if config.perspective:
+        seen = seen * cvt.falloff(scene.means, frame)
+    if config.hidden_share < 1.0:
+        light = cvt.openness(scene.means, areas * scene.opacities, frame)
+        seen = seen * (config.hidden_share + (1 - config.hidden_share) * light)
+    return seen
 
 
 def _filter(

@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cvtgs.cli.display import file_size, progress_bars
-from cvtgs.errors import OutputError
 
 if TYPE_CHECKING:
+    from cvtgs.evaluate import SceneScores
     from cvtgs.report import StageCost
 
 RATIOS = (0.1, 0.01, 0.001)
+VIEWS, WIDTH, HEIGHT = 8, 640, 480
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -23,7 +24,8 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser = commands.add_parser(
         "demo",
         help="try it on a generated scene; needs no files",
-        description="Generate a scene, make it 10, 100 and 1000 times smaller, and write all four.",
+        description="Generate a scene, make it 10, 100 and 1000 times smaller, write all four, and a "
+        "page to look at them side by side.",
     )
     parser.add_argument(
         "-o",
@@ -51,28 +53,48 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: The parsed options.
     """
-    from cvtgs.io import save  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.evaluate import (  # noqa: PLC0415 (keeps --help fast)
+        automatic_views,
+        compare,
+        write_exhibition,
+    )
+    from cvtgs.evaluate.exhibition import make_folder  # noqa: PLC0415
+    from cvtgs.io import save  # noqa: PLC0415
     from cvtgs.simplify import Simplifier  # noqa: PLC0415
     from cvtgs.synthetic import demo_scene  # noqa: PLC0415
 
-    try:
-        options.output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{options.output}: cannot be made: {error.strerror}.") from None
+    make_folder(options.output)
     with progress_bars(quiet=options.quiet) as listener:
         simplifier = Simplifier(config=options.preset, device=options.device, listener=listener)
         scene = demo_scene(options.count, seed=options.seed)
         path = options.output / "full.ply"
         save(scene, path, overwrite=True)
         columns = [_column(path, len(scene), ())]
+        sizes, smaller = {path.name: path.stat().st_size}, {}
         for rho in RATIOS:
             small, report = simplifier.run(scene, rho)
             path = options.output / f"small_{rho:g}.ply"
             save(small, path, overwrite=True)
             columns.append(_column(path, len(small), report.stages))
+            sizes[path.name], smaller[path.name] = path.stat().st_size, small
+        comparison = compare(
+            scene,
+            smaller,
+            automatic_views(scene, VIEWS, width=WIDTH, height=HEIGHT),
+            reference_name="full.ply",
+            sizes=sizes,
+            lpips="off",
+            listener=listener,
+        )
+        write_exhibition(comparison, options.output, overwrite=True, listener=listener)
     if not options.quiet:
-        _print_table(columns)
+        scores = [{}, *map(_scores, comparison.evaluation.scenes)]
+        _print_table([one | other for one, other in zip(columns, scores, strict=True)])
         _print_next_steps(options.output)
+
+
+def _scores(scores: "SceneScores") -> dict[str, str]:
+    return {"PSNR, dB": f"{scores.psnr.mean:.2f}", "SSIM": f"{scores.ssim.mean:.3f}"}
 
 
 def _column(path: Path, count: int, stages: "Sequence[StageCost]") -> dict[str, str]:
@@ -96,6 +118,9 @@ def _print_table(columns: list[dict[str, str]]) -> None:
 
 
 def _print_next_steps(folder: Path) -> None:
+    print("Look at them side by side: open this page in a browser, it needs no network.")
+    print(f"  {(folder / 'index.html').resolve().as_uri()}")
     print(f"The scenes are in {folder}; any 3DGS viewer opens them. With a scene of your own:")
     print("  cvtgs info scene.ply")
     print("  cvtgs simplify scene.ply small.ply --rho 0.01")
+    print("  cvtgs compare scene.ply small.ply -o comparison")

@@ -7,6 +7,7 @@ from cvtgs.cvt.nearest import nearest_backend
 from cvtgs.cvt.nearest_scipy import nearest_scipy
 from cvtgs.cvt.nearest_torch import nearest_torch
 from cvtgs.cvt.neighbors import nearest_neighbors
+from cvtgs.cvt.openness import openness
 from cvtgs.cvt.seeding import stratified_seeds, weighted_seeds
 from cvtgs.cvt.tessellate import Tessellation, fill_empty_cells, tessellate
 
@@ -21,6 +22,7 @@ __all__ = [
     "nearest_neighbors",
     "nearest_scipy",
     "nearest_torch",
+    "openness",
     "stratified_seeds",
     "tessellate",
     "tessellation_weights",

@@ -14,7 +14,6 @@ from cvtgs.cvt.seeding import stratified_seeds, weighted_seeds
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.segments import segment_argmax, sort_by_label
 
-
 MIN_SAMPLES = 1 << 15
 """Lloyd never looks at fewer points than this to save time; so few cost next to nothing."""
 

@@ -7,21 +7,23 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cvtgs.evaluate.voxels import SIZE, Voxels
-from cvtgs.math.activations import divide
 
 _GUESSES = 256
 _REFINED = 24
 _MOST_VOXELS = 6000
 _THICKNESS = SIZE
 _ALIGNED = 0.85
-_LEAST_SUPPORT = 0.08
-"""Share of all voxels that a ground must hold."""
+_LEAST_SCORE = 0.12
+"""What a ground must reach: its share of all voxels, times how round and how wide it is."""
 
-_FLAT = 0.25
-"""A scene whose smallest variance is below this share of the next lies flat."""
+_ONE_SIDED = 0.6
+"""Up is not as usual only if the ground has so much more above it than below."""
 
-_LEVEL = 0.02
-"""Mass that lies this near the middle of its height tells nothing about up and down."""
+_TOP_HEAVY = 0.04
+"""Or if what is between floor and ceiling stands this far from the middle, of their distance."""
+
+_SKY = 0.12
+"""What is far away is a sky if it lies this far above the middle on average, of its distance."""
 
 _USUAL = ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 _USUAL_BONUS = (1.5, 1.25)
@@ -32,31 +34,32 @@ _SNAP_COSINE = 0.9986  # 3 degrees
 class _Plane(NamedTuple):
     normal: Tensor
     height: float
-    support: float
+    score: float
 
 
-def find_up(voxels: Voxels) -> Float[Tensor, "3"]:
+def find_up(voxels: Voxels, far: Float[Tensor, "k 3"]) -> Float[Tensor, "3"]:
     """Say which way is up.
 
-    The axis is at right angles to the ground, the plane with the largest area; planes that lie as
-    captures usually have it (y-down, then z-up) are preferred where areas are similar. Without a
-    ground it is the direction in which the scene is flat. Up is where the ground has the scene on
-    it; between a floor and a ceiling it is away from the one that has more standing on it.
-    Without any evidence, up is -y.
+        The axis is at right angles to the ground, the plane with the largest area; planes that lie as
+        captures usually have it (y-down, then z-up) are preferred where areas are similar. Without a
+        ground it is the direction in which the scene is flat. Up is where the ground has the scene on
+    X
 
-    Args:
-        voxels: The surfaces of the scene.
+        Args:
+            voxels: The surfaces of the scene.
+            far: Directions of the Gaussians far away, unit vectors, float64; none if there are few.
 
-    Returns:
-        A unit vector, float64; exactly along a coordinate axis if within 3 degrees of one.
+        Returns:
+            A unit vector, float64; exactly along a coordinate axis if within 3 degrees of one.
 
-    Example:
-        >>> from cvtgs.evaluate.voxels import voxels_of
-        >>> from cvtgs.math.frames import robust_frame
-        >>> from cvtgs.synthetic import demo_scene
-        >>> scene = demo_scene(3000)
-        >>> [round(part) for part in find_up(voxels_of(scene, robust_frame(scene.means))).tolist()]
-        [0, -1, 0]
+        Example:
+            >>> from cvtgs.evaluate.voxels import voxels_of
+            >>> from cvtgs.math.frames import robust_frame
+            >>> from cvtgs.synthetic import demo_scene
+            >>> scene = demo_scene(3000)
+            >>> voxels = voxels_of(scene, robust_frame(scene.means))
+            >>> [round(part) for part in find_up(voxels, voxels.points[:0]).tolist()]
+            [0, -1, 0]
     """
     usual = voxels.points.new_tensor(_USUAL)
     if len(voxels.points) < 8:
@@ -64,13 +67,12 @@ def find_up(voxels: Voxels) -> Float[Tensor, "3"]:
     voxels = _thinned(voxels)
     ground = _ground(voxels)
     if ground is None:
-        return _by_flatness(voxels.points)
-    axis = _snapped(ground.normal)
-    evidence = _evidence_of_up(voxels.points, axis, ground)
-    if abs(evidence) < _LEVEL:
-        evidence = float((usual @ axis).abs().argmax() == 0) * float(axis @ usual[0])
-        evidence = evidence or float(axis @ usual[1]) or 1.0
-    return axis * (1.0 if evidence > 0 else -1.0)
+        return usual[0]
+    axis = _usual_sense(_snapped(ground.normal))
+    at = ground.height * (1.0 if float(axis @ ground.normal) > 0 else -1.0)
+    if len(far) and abs(float((far @ axis).mean())) > _SKY:
+        return axis * torch.sign((far @ axis).mean())
+    return -axis if _stands_on_its_head(voxels.points @ axis, at) else axis
 
 
 def _thinned(voxels: Voxels) -> Voxels:
@@ -91,20 +93,36 @@ def _ground(voxels: Voxels) -> _Plane | None:
     )
     best = torch.sort(counts, descending=True, stable=True).indices[:_REFINED]
     planes = [_refined(voxels, normals[row], float(heights[row])) for row in best.tolist()]
-    largest = max(planes, key=lambda plane: plane.support * _bonus(plane.normal))
-    return largest if largest.support >= _LEAST_SUPPORT else None
+    largest = max(planes, key=lambda plane: plane.score * _bonus(plane.normal))
+    return largest if largest.score * _bonus(largest.normal) >= _LEAST_SCORE else None
 
 
 def _refined(voxels: Voxels, normal: Tensor, height: float) -> _Plane:
+    spread = torch.zeros(3, dtype=normal.dtype)
+    axes = torch.eye(3, dtype=normal.dtype)
     for _ in range(3):
-        members = _members(voxels, normal, height)
-        if int(members.sum()) < 3:
+        points = voxels.points[_members(voxels, normal, height)]
+        if len(points) < 3:
             break
-        points = voxels.points[members]
         middle = points.mean(dim=0)
-        normal = torch.linalg.eigh((points - middle).T @ (points - middle)).eigenvectors[:, 0]
+        spread, axes = torch.linalg.eigh(_scatter(points))
+        normal = axes[:, 0]
         height = float(middle @ normal)
-    return _Plane(normal, height, float(_members(voxels, normal, height).double().mean()))
+    support = float(_members(voxels, normal, height).double().mean())
+    heights = voxels.points @ normal
+    for end in heights.quantile(heights.new_tensor([0.01, 0.99])).tolist():
+        if abs(end - height) > 5 * _THICKNESS:
+            support += 0.5 * float(_members(voxels, normal, end).double().mean())
+    lengths = spread.clamp_min(0).sqrt()
+    everything = (axes.T @ _scatter(voxels.points) @ axes).diagonal().clamp_min(1e-12).sqrt()
+    roundness = float(lengths[1] / lengths[2].clamp_min(1e-6))
+    width = float((lengths[1:] / everything[1:]).clamp(max=1).amin())
+    return _Plane(normal, height, max(support * roundness * width**2, support**2))
+
+
+def _scatter(points: Float[Tensor, "v 3"]) -> Float[Tensor, "3 3"]:
+    away = points - points.mean(dim=0)
+    return away.T @ away / len(points)
 
 
 def _members(voxels: Voxels, normal: Tensor, height: Tensor | float) -> Bool[Tensor, "v"]:
@@ -118,33 +136,25 @@ def _bonus(normal: Tensor) -> float:
     return max([1.0, *(bonus for cosine, bonus in bonuses if cosine > _USUAL_COSINE)])
 
 
-def _evidence_of_up(points: Tensor, axis: Tensor, ground: _Plane) -> float:
-    """Give a number whose sign says whether the axis points up, and whose size how sure that is."""
-    heights = points @ axis
-    at = ground.height * (1.0 if float(axis @ ground.normal) > 0 else -1.0)
-    above = float((heights > at + 1.5 * _THICKNESS).double().mean())
-    below = float((heights < at - 1.5 * _THICKNESS).double().mean())
-    side = float(divide(heights.new_tensor(above - below), heights.new_tensor(above + below)))
-    low, high = heights.quantile(heights.new_tensor([0.01, 0.99], dtype=heights.dtype)).tolist()
-    opposite = low if abs(at - high) < abs(at - low) else high
-    lid = float(((heights - opposite).abs() < 1.5 * _THICKNESS).double().mean())
-    if lid < 0.5 * ground.support:
-        return side
-    between = heights[(heights > low + 2 * _THICKNESS) & (heights < high - 2 * _THICKNESS)]
-    if len(between) == 0:
-        return 0.0
-    return (0.5 * (low + high) - float(between.mean())) / max(high - low, 1e-9)
-
-
-def _by_flatness(points: Tensor) -> Float[Tensor, "3"]:
-    middle = points.median(dim=0).values
-    values, vectors = torch.linalg.eigh((points - middle).T @ (points - middle))
-    usual = points.new_tensor(_USUAL)
-    if float(values[0]) > _FLAT * float(values[1]):
-        return usual[0]
-    axis = _snapped(vectors[:, 0])
-    cosines = usual @ axis
+def _usual_sense(axis: Tensor) -> Tensor:
+    """Give the axis the sense that captures usually have: -y, else +z."""
+    cosines = axis.new_tensor(_USUAL) @ axis
     return axis * torch.sign(cosines[cosines.abs().argmax()])
+
+
+def _stands_on_its_head(heights: Float[Tensor, "v"], ground: float) -> bool:
+    """Tell whether the scene says clearly that up is the other way."""
+    low, high = heights.quantile(heights.new_tensor([0.01, 0.99])).tolist()
+    opposite = low if abs(ground - high) < abs(ground - low) else high
+    lid = float(((heights - opposite).abs() < _THICKNESS).double().mean())
+    floor = float(((heights - ground).abs() < _THICKNESS).double().mean())
+    if lid > 0.5 * floor and high - low > 5 * _THICKNESS:
+        between = heights[(heights > low + 2 * _THICKNESS) & (heights < high - 2 * _THICKNESS)]
+        lift = float(between.mean()) - 0.5 * (low + high) if len(between) else 0.0
+        return lift > _TOP_HEAVY * (high - low)
+    above = float((heights > ground + 1.5 * _THICKNESS).double().mean())
+    below = float((heights < ground - 1.5 * _THICKNESS).double().mean())
+    return below - above > _ONE_SIDED * (above + below)
 
 
 def _snapped(normal: Tensor) -> Float[Tensor, "3"]:

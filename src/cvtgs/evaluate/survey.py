@@ -18,7 +18,9 @@ MOST_GAUSSIANS = 60_000
 
 _HEAVIEST = 10_000
 _VISIBLE = 0.1
-_BOUNDED = 2.2
+_BOUNDED = 3.2
+_FAR = 4.0
+_FAR_SHARE = 0.02
 _EXTENT = (0.02, 0.98)
 
 
@@ -31,7 +33,7 @@ class Survey:
         frame: Robust centre and radius of what is visible.
         voxels: The surfaces near the middle.
         up: Unit vector, float64.
-        bounded: Whether nearly all lies within about two robust radii: a thing, not a place.
+        bounded: Whether nearly all lies within about three robust radii: a thing, not a place.
         center: Middle of what is to be shown, scene units, float64.
         radius: Radius of what is to be shown, scene units.
         height: Extent along ``up`` of what is near the middle, scene units.
@@ -70,7 +72,7 @@ def survey(scene: GaussianScene) -> Survey:
     visible = sample.means[sample.opacities > _VISIBLE]
     frame = robust_frame(visible if len(visible) else sample.means)
     voxels = voxels_of(sample, frame)
-    up = find_up(voxels)
+    up = find_up(voxels, _far_directions(sample, frame))
     places = voxels.points if len(voxels.points) else sample.means.new_zeros(1, 3).double()
     distances = frame.distances(visible if len(visible) else sample.means)
     bounded = float(torch.quantile(distances, 0.97)) < _BOUNDED
@@ -103,6 +105,13 @@ def _valid(scene: GaussianScene) -> GaussianScene:
             f"automatic views need a scene with valid Gaussians; none of {len(scene)} is valid."
         )
     return scene.select(~bad) if bool(bad.any()) else scene
+
+
+def _far_directions(sample: GaussianScene, frame: RobustFrame) -> Float[Tensor, "k 3"]:
+    places = frame.normalize(sample.means[sample.opacities > _VISIBLE])
+    far = places[torch.linalg.vector_norm(places, dim=1) > _FAR]
+    few = len(far) < _FAR_SHARE * len(places)
+    return torch.nn.functional.normalize(far[:0] if few else far, dim=1)
 
 
 def _sample(scene: GaussianScene) -> GaussianScene:

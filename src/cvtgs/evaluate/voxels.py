@@ -12,7 +12,7 @@ from cvtgs.math.frames import RobustFrame
 from cvtgs.math.segments import segment_sum
 from cvtgs.scene import GaussianScene
 
-REACH = 2.0
+REACH = 3.0
 """In robust radii: what lies beyond is not looked at."""
 
 SIZE = 0.1
@@ -46,13 +46,13 @@ def voxels_of(scene: GaussianScene, frame: RobustFrame) -> Voxels:
         frame: Where the middle is.
 
     Returns:
-        At most ``(4 / 0.1)^3`` voxels, in a fixed order; those of haze and floaters are left out.
+        At most ``(6 / 0.1)^3`` voxels, in a fixed order; those of haze and floaters are left out.
 
     Example:
         >>> from cvtgs.math.frames import robust_frame
         >>> from cvtgs.synthetic import demo_scene
         >>> scene = demo_scene(2000)
-        >>> bool((voxels_of(scene, robust_frame(scene.means)).points.abs() <= 2).all())
+        >>> bool((voxels_of(scene, robust_frame(scene.means)).points.abs() <= 3).all())
         True
     """
     places = frame.normalize(scene.means)

@@ -1,0 +1,216 @@
+"""What the commands that render share: scenes by name, cameras, sizes, background."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from cvtgs.errors import InvalidArgumentError
+
+if TYPE_CHECKING:
+    import torch
+
+    from cvtgs.cameras import Cameras
+    from cvtgs.scene import GaussianScene
+
+Color = tuple[float, float, float]
+
+_COLORS: dict[str, Color] = {
+    "black": (0.0, 0.0, 0.0),
+    "gray": (0.5, 0.5, 0.5),
+    "white": (1.0, 1.0, 1.0),
+}
+
+
+class Scenes(NamedTuple):
+    """Scenes by name, and the bytes of their files.
+
+    Attributes:
+        scenes: The scenes.
+        sizes: Bytes.
+    """
+
+    scenes: "dict[str, GaussianScene]"
+    sizes: dict[str, int]
+
+
+def add_looking_options(parser: argparse.ArgumentParser, *, size: int) -> None:
+    """Describe the options.
+
+    Args:
+        parser: Where to add them.
+        size: Longer side of the pictures of automatic views, pixels.
+    """
+    parser.add_argument(
+        "--cameras",
+        type=Path,
+        metavar="F",
+        help="cameras to use: transforms.json, a COLMAP model, cameras.json, or a folder of these "
+        "(default: automatic views)",
+    )
+    parser.add_argument(
+        "--split", choices=("train", "test"), help="only these of the cameras of --cameras"
+    )
+    parser.add_argument(
+        "--views",
+        type=int,
+        metavar="N",
+        help="number of views; of given cameras, N spread evenly (default 8, or all that are given)",
+    )
+    parser.add_argument(
+        "--size",
+        type=int,
+        metavar="N",
+        help=f"longer side of the pictures in pixels (default {size}, or that of the cameras)",
+    )
+    parser.add_argument(
+        "--background",
+        default="black",
+        metavar="COLOR",
+        help="black (default), gray, white, or red,green,blue from 0 to 1",
+    )
+    parser.add_argument(
+        "--backend",
+        default="auto",
+        choices=("auto", "torch", "numba", "gsplat"),
+        help="what renders (default: the fastest there is)",
+    )
+    parser.add_argument(
+        "--device", default="auto", metavar="DEVICE", help="auto (default), cpu or cuda"
+    )
+    parser.add_argument("--quiet", action="store_true", help="print errors and warnings only")
+    parser.set_defaults(default_size=size)
+
+
+def load_scenes(paths: Sequence[Path], device: "torch.device") -> Scenes:
+    """Read scenes and name them after their files.
+
+    Args:
+        paths: The files; a name that occurs twice is written with its folders.
+        device: Where the scenes are to be.
+
+    Returns:
+        The scenes in that order.
+
+    Raises:
+        InvalidArgumentError: A file is given twice.
+    """
+    from cvtgs.io import load  # noqa: PLC0415 (keeps --help fast)
+
+    names = [path.name for path in paths]
+    names = [
+        name if names.count(name) == 1 else str(path)
+        for name, path in zip(names, paths, strict=True)
+    ]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise InvalidArgumentError(f"every scene must be given once, found {twice[0]} twice.")
+    scenes = {name: load(path).to(device) for name, path in zip(names, paths, strict=True)}
+    sizes = {name: path.stat().st_size for name, path in zip(names, paths, strict=True)}
+    return Scenes(scenes, sizes)
+
+
+def looking_device(options: argparse.Namespace) -> "torch.device":
+    """Say where to render: CUDA if there is one, unless asked otherwise.
+
+    Args:
+        options: The parsed options.
+
+    Returns:
+        The device.
+
+    Raises:
+        DeviceError: There is no such device.
+    """
+    import torch  # noqa: PLC0415 (keeps --help fast)
+
+    from cvtgs.devices import resolve_device  # noqa: PLC0415
+
+    return resolve_device(options.device) or torch.device(
+        "cuda" if torch.cuda.is_available() else "cpu"
+    )
+
+
+def check_looking_options(options: argparse.Namespace) -> None:
+    """Refuse numbers that no picture can have, before any file is read.
+
+    Args:
+        options: The parsed options.
+
+    Raises:
+        InvalidArgumentError: A number or a colour is out of range.
+    """
+    for name in ("views", "size"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise InvalidArgumentError(f"--{name} must be at least 1, found {value}.")
+    if options.split is not None and options.cameras is None:
+        raise InvalidArgumentError("--split chooses among cameras and needs --cameras.")
+    background_color(options)
+
+
+def background_color(options: argparse.Namespace) -> Color:
+    """Read the colour behind the scenes.
+
+    Args:
+        options: The parsed options.
+
+    Returns:
+        Red, green and blue in [0, 1].
+
+    Raises:
+        InvalidArgumentError: It is no colour.
+    """
+    word = options.background.strip().lower()
+    if word in _COLORS:
+        return _COLORS[word]
+    try:
+        red, green, blue = (float(part) for part in word.split(","))
+    except ValueError:
+        red = green = blue = -1.0
+    if not all(0 <= part <= 1 for part in (red, green, blue)):
+        raise InvalidArgumentError(
+            f"--background must be {', '.join(_COLORS)} or red,green,blue from 0 to 1, "
+            f"found {options.background!r}."
+        )
+    return red, green, blue
+
+
+def chosen_cameras(
+    options: argparse.Namespace, scene: "GaussianScene", *, most: int | None = None
+) -> "Cameras":
+    """Read cameras, or find views of the scene.
+
+    Args:
+        options: The parsed options.
+        scene: What to look at.
+        most: Number of given cameras to take without ``--views``; None for all.
+
+    Returns:
+        The cameras.
+
+    Raises:
+        CvtgsError: The cameras cannot be read, or the scene has nothing to look at.
+    """
+    from cvtgs.evaluate import automatic_views  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.io import load_cameras  # noqa: PLC0415
+
+    if options.cameras is None:
+        size = options.size or options.default_size
+        height = max(1, round(0.75 * size))
+        return automatic_views(scene, options.views or 8, width=size, height=height)
+    cameras = _spread(load_cameras(options.cameras, split=options.split), options.views or most)
+    if options.size is None:
+        return cameras
+    factor = options.size / max(cameras.width, cameras.height)
+    sides = (max(1, round(factor * side)) for side in (cameras.width, cameras.height))
+    return cameras.resized(*sides)
+
+
+def _spread(cameras: "Cameras", count: int | None) -> "Cameras":
+    """Take cameras spread evenly over their order."""
+    import torch  # noqa: PLC0415 (keeps --help fast)
+
+    if count is None or count >= len(cameras):
+        return cameras
+    return cameras.select(torch.tensor([(k * len(cameras)) // count for k in range(count)]))

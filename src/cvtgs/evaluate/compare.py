@@ -1,0 +1,129 @@
+"""Pictures of a full scene and of simplified ones, side by side, with their scores."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from cvtgs.cameras import Cameras
+from cvtgs.evaluate.evaluate import evaluate
+from cvtgs.evaluate.judge import LpipsChoice
+from cvtgs.evaluate.scores import Evaluation, SceneScores
+from cvtgs.progress import ProgressListener, silent
+from cvtgs.render import BackendName
+from cvtgs.scene import GaussianScene
+
+Pictures = UInt8[np.ndarray, "c h w 3"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Comparison:
+    """What people look at: pictures, scores and sizes.
+
+    Attributes:
+        evaluation: The scores.
+        full: ``(c, h, w, 3)`` pictures of the full scene, 8 bits.
+        small: The same of each simplified scene, by name.
+        sizes: Bytes of the files by name of the scene, the full one included; may lack some.
+    """
+
+    evaluation: Evaluation
+    full: Pictures
+    small: Mapping[str, Pictures]
+    sizes: Mapping[str, int]
+
+    def ratio(self, scores: SceneScores) -> float:
+        """Give how many times fewer Gaussians a simplified scene has.
+
+        Args:
+            scores: Those of the simplified scene.
+
+        Returns:
+            For example 100.
+        """
+        return self.evaluation.reference_count / max(1, scores.count)
+
+
+def compare(
+    reference: GaussianScene,
+    small: Mapping[str, GaussianScene],
+    cameras: Cameras,
+    *,
+    reference_name: str = "full",
+    sizes: Mapping[str, int] | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    lpips: LpipsChoice = "auto",
+    backend: BackendName = "auto",
+    listener: ProgressListener = silent,
+) -> Comparison:
+    """Take pictures of a full scene and of simplified ones, and score them.
+
+    Memory: ``3 c h w`` bytes per scene, and what :func:`cvtgs.evaluate.evaluate` needs.
+
+    Args:
+        reference: The full scene.
+        small: Simplified scenes by name.
+        cameras: From where to look.
+        reference_name: Name of the full scene.
+        sizes: Bytes of the files, by name.
+        background: Colour behind the scenes, in [0, 1].
+        lpips: Which LPIPS to measure.
+        backend: What renders.
+        listener: Told about each picture.
+
+    Returns:
+        The pictures and the scores.
+
+    Raises:
+        InvalidArgumentError: There is no camera, or two scenes share a name.
+        DeviceError: The backend does not work on a scene's device.
+        MissingDependencyError: The backend's package or the LPIPS asked for is missing.
+
+    Example:
+        >>> from cvtgs.evaluate import automatic_views
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 500, sh_degree=0)
+        >>> cameras = automatic_views(scene, 2, width=32, height=24)
+        >>> compare(scene, {"same": scene}, cameras, lpips="off").full.shape
+        (2, 24, 32, 3)
+    """
+    shape = (len(cameras), cameras.height, cameras.width, 3)
+    pictures = {name: np.zeros(shape, np.uint8) for name in (reference_name, *small)}
+
+    def keep(view: int, name: str, picture: Float[Tensor, "h w 3"]) -> None:
+        pictures[name][view] = as_bytes(picture)
+
+    evaluation = evaluate(
+        reference,
+        small,
+        cameras,
+        reference_name=reference_name,
+        background=background,
+        lpips=lpips,
+        backend=backend,
+        listener=listener,
+        on_picture=keep,
+    )
+    full = pictures.pop(reference_name)
+    return Comparison(evaluation=evaluation, full=full, small=pictures, sizes=dict(sizes or {}))
+
+
+def as_bytes(picture: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Round colours to 8 bits.
+
+    Args:
+        picture: ``(h, w, 3)`` colours, clipped to [0, 1].
+
+    Returns:
+        The rounded colours.
+
+    Example:
+        >>> as_bytes(torch.tensor([[[0.0, 0.5, 2.0]]])).tolist()
+        [[[0, 128, 255]]]
+    """
+    rounded = (picture.detach().clamp(0, 1) * 255).round().to(torch.uint8)
+    array: UInt8[np.ndarray, "h w 3"] = rounded.cpu().numpy()
+    return array

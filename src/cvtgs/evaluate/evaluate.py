@@ -1,0 +1,167 @@
+"""Scores of simplified scenes against the full one, and against photographs."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs.cameras import Cameras
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.evaluate.judge import LpipsChoice, Tally, make_judge
+from cvtgs.evaluate.scores import Evaluation
+from cvtgs.progress import ProgressEvent, ProgressListener, silent
+from cvtgs.render import BackendName, render
+from cvtgs.scene import GaussianScene
+
+STAGE = "evaluate"
+"""The stage of the progress events; a step is a picture."""
+
+PictureListener = Callable[[int, str, Tensor], None]
+"""Told the number of the view, the name of the scene and its picture, ``(h, w, 3)``, clipped."""
+
+
+def ignore_picture(view: int, name: str, picture: Float[Tensor, "h w 3"]) -> None:
+    """Ignore a picture; the default listener.
+
+    Args:
+        view: Number of the view, from 0.
+        name: Name of the scene.
+        picture: ``(h, w, 3)`` colours in [0, 1].
+    """
+
+
+@torch.no_grad()
+def evaluate(
+    reference: GaussianScene,
+    small: Mapping[str, GaussianScene],
+    cameras: Cameras,
+    *,
+    reference_name: str = "full",
+    photographs: Float[Tensor, "c h w 3"] | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    lpips: LpipsChoice = "auto",
+    backend: BackendName = "auto",
+    listener: ProgressListener = silent,
+    on_picture: PictureListener = ignore_picture,
+) -> Evaluation:
+    """Score simplified scenes by pictures.
+
+    Every view of the full scene is rendered once, whatever the number of small ones. Memory:
+    what :func:`cvtgs.render.render` needs, and two pictures.
+
+    Args:
+        reference: The full scene.
+        small: Simplified scenes by name.
+        cameras: From where to look.
+        reference_name: Name of the full scene.
+        photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too.
+        background: Colour behind the scenes, in [0, 1].
+        lpips: Which LPIPS to measure; ``auto`` leaves it out where there are no weights.
+        backend: What renders.
+        listener: Told about each picture.
+        on_picture: Given each picture; those of the reference come first in each view.
+
+    Returns:
+        The scores, per view and on average.
+
+    Raises:
+        InvalidArgumentError: There is no camera, two scenes share a name, or the photographs
+            have another shape than the pictures.
+        DeviceError: The backend does not work on a scene's device.
+        MissingDependencyError: The backend's package or the LPIPS asked for is missing.
+
+    Example:
+        >>> from cvtgs.evaluate import automatic_views
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 500, sh_degree=0)
+        >>> cameras = automatic_views(scene, 2, width=32, height=24)
+        >>> evaluate(scene, {"same": scene}, cameras, lpips="off").scenes[0].psnr.mean
+        inf
+    """
+    _check(small, cameras, reference_name, photographs=photographs)
+    judge = make_judge(lpips, (cameras.width, cameras.height))
+    scenes = {reference_name: reference, **small}
+    tallies = {name: Tally(name=name, count=len(scene)) for name, scene in small.items()}
+    taken = {name: Tally(name=name, count=len(scene)) for name, scene in scenes.items()}
+    painter = _Painter(background=background, backend=backend)
+    total, done = len(cameras) * len(scenes), 0
+    backend_used = ""
+    listener(ProgressEvent(stage=STAGE, done=0, total=total))
+    for view in range(len(cameras)):
+        camera = cameras.select(torch.tensor([view]))
+        truth = reference.means.new_zeros(0)
+        for name, scene in scenes.items():
+            picture, backend_used = painter.paint(scene, camera)
+            on_picture(view, name, picture)
+            if name == reference_name:
+                truth = picture
+            else:
+                tallies[name].rows.append(judge.compare(picture, truth))
+            if photographs is not None:
+                taken[name].rows.append(judge.compare(picture, photographs[view]))
+            done += 1
+            listener(ProgressEvent(stage=STAGE, done=done, total=total))
+    return Evaluation(
+        reference=reference_name,
+        reference_count=len(reference),
+        views=view_names(cameras),
+        width=cameras.width,
+        height=cameras.height,
+        backend=backend_used,
+        lpips_network=judge.weights.network if judge.weights else None,
+        lpips_note=judge.note,
+        scenes=tuple(tally.scores() for tally in tallies.values()),
+        photographs=()
+        if photographs is None
+        else tuple(tally.scores() for tally in taken.values()),
+    )
+
+
+def view_names(cameras: Cameras) -> tuple[str, ...]:
+    """Give the names of the views.
+
+    Args:
+        cameras: The cameras.
+
+    Returns:
+        Their names; ``view 1`` and so on if they have none.
+
+    Example:
+        >>> view_names(Cameras(viewmats=torch.eye(4)[None], Ks=torch.eye(3)[None], width=4,
+        ...                    height=4))
+        ('view 1',)
+    """
+    return cameras.names or tuple(f"view {number}" for number in range(1, len(cameras) + 1))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Painter:
+    background: tuple[float, float, float]
+    backend: BackendName
+
+    def paint(self, scene: GaussianScene, camera: Cameras) -> tuple[Tensor, str]:
+        behind = torch.tensor(self.background) if any(self.background) else None
+        rendering = render(scene, camera, backend=self.backend, background=behind)
+        return rendering.rgb[0].clamp(0, 1), rendering.backend
+
+
+def _check(
+    small: Mapping[str, GaussianScene],
+    cameras: Cameras,
+    reference_name: str,
+    *,
+    photographs: Tensor | None,
+) -> None:
+    if len(cameras) == 0:
+        raise InvalidArgumentError("an evaluation needs at least one camera, found none.")
+    if reference_name in small:
+        raise InvalidArgumentError(
+            f"the scenes must have different names; {reference_name!r} is that of the full scene."
+        )
+    wanted = (len(cameras), cameras.height, cameras.width, 3)
+    if photographs is not None and tuple(photographs.shape) != wanted:
+        raise InvalidArgumentError(
+            f"photographs must have shape {wanted}, found {tuple(photographs.shape)}."
+        )

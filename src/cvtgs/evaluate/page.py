@@ -1,0 +1,124 @@
+"""One self-contained HTML page to look at a comparison: no network, no other file."""
+
+import base64
+import html
+import json
+from collections.abc import Iterable, Iterator
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from cvtgs import __version__
+from cvtgs.evaluate.compare import Comparison, Pictures
+from cvtgs.evaluate.error_maps import ERROR_SCALE, css_gradient, error_map
+from cvtgs.evaluate.images import encode, resized
+from cvtgs.evaluate.scores import SceneScores
+
+MOST_BYTES = 7_500_000
+"""Pages are kept below this: pictures are compressed harder, and then made smaller."""
+
+_TRIES = ((84, 1.0), (72, 1.0), (55, 1.0), (55, 0.7), (45, 0.5), (35, 0.35), (30, 0.25))
+
+
+def comparison_page(comparison: Comparison, *, most_bytes: int = MOST_BYTES) -> str:
+    """Write the page.
+
+    It has a divider between the full and a simplified scene, a chooser of scene and view, counts,
+    bytes and scores, and maps of the differences. ``#view=2&small=1&split=30&error=1`` at the end
+    of its address chooses what it shows first.
+
+    Args:
+        comparison: Pictures and scores, at least one simplified scene.
+        most_bytes: The page's size; pictures lose quality, then pixels, until it is kept, as far
+            as a quarter of their width goes.
+
+    Returns:
+        HTML.
+
+    Example:
+        >>> from cvtgs.evaluate import automatic_views, compare
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 300, sh_degree=0)
+        >>> views = automatic_views(scene, 2, width=32, height=24)
+        >>> page = comparison_page(compare(scene, {"same": scene}, views, lpips="off"))
+        >>> page.startswith("<!DOCTYPE html>"), "https:" in page
+        (True, False)
+    """
+    page = ""
+    for quality, factor in _TRIES:
+        page = _page(comparison, quality, factor)
+        if len(page) <= most_bytes:
+            break
+    return page
+
+
+def _page(comparison: Comparison, quality: int, factor: float) -> str:
+    title = html.escape(f"{comparison.evaluation.reference}: before and after")
+    parts = {
+        "TITLE": title,
+        "STYLE": _part("page.css"),
+        "GRADIENT": css_gradient(),
+        "ERROR_SCALE": f"{ERROR_SCALE:g}",
+        "SCRIPT": _part("page.js"),
+        "DATA": _for_script(_data(comparison, quality, factor)),
+    }
+    page = _part("page.html")
+    for name, content in parts.items():  # the data, which may hold anything, comes last
+        page = page.replace("{{" + name + "}}", content)
+    return page
+
+
+def _part(name: str) -> str:
+    return (files("cvtgs.evaluate") / "page_parts" / name).read_text(encoding="utf-8").strip()
+
+
+def _for_script(data: dict[str, Any]) -> str:
+    """Write JSON that cannot end the script element that holds it."""
+    return json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _data(comparison: Comparison, quality: int, factor: float) -> dict[str, Any]:
+    evaluation = comparison.evaluation
+    return {
+        "version": __version__,
+        "backend": evaluation.backend,
+        "width": evaluation.width,
+        "height": evaluation.height,
+        "lpips": evaluation.lpips_network,
+        "views": evaluation.views,
+        "reference": {
+            "name": evaluation.reference,
+            "count": evaluation.reference_count,
+            "bytes": comparison.sizes.get(evaluation.reference),
+        },
+        "full": list(_addresses(comparison.full, quality, factor)),
+        "small": [_small(comparison, scores, quality, factor) for scores in evaluation.scenes],
+    }
+
+
+def _small(
+    comparison: Comparison, scores: SceneScores, quality: int, factor: float
+) -> dict[str, Any]:
+    pictures = comparison.small[scores.name]
+    return {
+        **scores.model_dump(mode="json"),
+        "bytes": comparison.sizes.get(scores.name),
+        "pictures": list(_addresses(pictures, quality, factor)),
+        "errors": list(_addresses(_errors(comparison.full, pictures), quality - 10, factor)),
+    }
+
+
+def _errors(full: Pictures, small: Pictures) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    return (error_map(one, other) for one, other in zip(full, small, strict=True))
+
+
+def _addresses(
+    pictures: Iterable[UInt8[np.ndarray, "h w 3"]], quality: int, factor: float
+) -> Iterator[str]:
+    for picture in pictures:
+        height, width, _ = picture.shape
+        size = max(1, round(factor * width)), max(1, round(factor * height))
+        content = encode(resized(picture, size), "webp", quality=quality)
+        yield "data:image/webp;base64," + base64.b64encode(content).decode()

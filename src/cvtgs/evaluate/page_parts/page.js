@@ -1,0 +1,200 @@
+"use strict";
+(() => {
+  const data = JSON.parse(document.getElementById("data").textContent);
+  const state = { view: 1, small: 1, split: 50, error: 0 };
+  const root = document.documentElement;
+  const at = (id) => document.getElementById(id);
+  const stage = at("stage");
+
+  const number = (value, digits) => value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });
+  const count = (value) => number(value, 0);
+  const decibels = (value) => (Number.isFinite(Number(value)) ? number(Number(value), 2) + " dB" : "equal");
+  const bytes = (value) => {
+    if (value === null) return "";
+    let unit = "B";
+    for (const larger of ["kB", "MB", "GB"]) {
+      if (value < 1000) break;
+      value /= 1000;
+      unit = larger;
+    }
+    return number(value, unit === "B" || value >= 100 ? 0 : 1) + " " + unit;
+  };
+  const fewer = (scene) => {
+    const ratio = data.reference.count / Math.max(1, scene.count);
+    if (Math.abs(ratio - 1) < 0.005) return "As many";
+    return number(ratio, ratio >= 10 || Number.isInteger(ratio) ? 0 : 1) + "× fewer";
+  };
+  const join = (...parts) => parts.filter(Boolean).join(" · ");
+  const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
+
+  const make = (tag, text, attributes = {}) => {
+    const element = document.createElement(tag);
+    if (text !== undefined) element.textContent = text;
+    for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+    return element;
+  };
+
+  const metrics = [
+    ["PSNR", (scene) => scene.psnr, decibels],
+    ["SSIM", (scene) => scene.ssim, (value) => number(Number(value), 3)],
+    ["LPIPS", (scene) => scene.lpips, (value) => number(Number(value), 3)],
+  ].filter(([, of]) => data.small.every((scene) => of(scene)));
+
+  const table = (id, headings, rows) => {
+    const head = make("thead");
+    const top = head.appendChild(make("tr"));
+    const kind = (column) => (column && column <= headings.length - metrics.length - 1 ? { class: "more" } : {});
+    headings.forEach((heading, column) => top.append(make("th", heading, { scope: "col", ...kind(column) })));
+    const body = make("tbody");
+    for (const { cells, chosen } of rows) {
+      const row = body.appendChild(make("tr"));
+      row.classList.toggle("chosen", chosen);
+      cells.forEach((cell, column) => row.append(column ? make("td", cell, kind(column)) : make("th", cell, { scope: "row" })));
+    }
+    at(id).replaceChildren(head, body);
+  };
+
+  const choice = (group, value, content) => {
+    const label = make("label");
+    const input = make("input", undefined, { type: "radio", name: group, value: String(value) });
+    input.addEventListener("change", () => change({ [group]: value }));
+    label.append(input, ...content);
+    return label;
+  };
+
+  const build = () => {
+    const { reference, small, views } = data;
+    root.style.setProperty("--ratio", data.width / data.height);
+    root.style.setProperty("--columns", clamp(views.length, 1, 8));
+    at("title").textContent = reference.name;
+    at("lead").textContent =
+      join(count(reference.count) + " Gaussians", bytes(reference.bytes)) +
+      `, next to ${small.length === 1 ? "a simplified version" : small.length + " simplified versions"}` +
+      ` from ${views.length === 1 ? "one view" : views.length + " views"}. Drag the divider: full on the left, simplified on the right.`;
+    at("scenes").append(...small.map((scene, index) => choice("small", index + 1, [
+      make("b", fewer(scene)),
+      make("span", decibels(scene.psnr.mean), { class: "psnr" }),
+      make("small", join(count(scene.count) + " Gaussians", bytes(scene.bytes), scene.name)),
+    ])));
+    at("views").append(...views.map((name, index) => choice("view", index + 1, [
+      make("img", undefined, { src: data.full[index], alt: name, title: name, loading: "lazy" }),
+    ])));
+    const lpips = data.lpips ? `, LPIPS (${data.lpips === "vgg" ? "VGG" : "Alex"}) is lower for closer pictures` : "";
+    at("about").textContent =
+      `Scores compare pictures of each simplified scene with pictures of the full one, ${data.width} × ${data.height} pixels: ` +
+      `higher PSNR and SSIM mean closer${lpips}. Rendered by cvtgs ${data.version} (${data.backend}).`;
+  };
+
+  const show = () => {
+    const scene = data.small[state.small - 1];
+    const name = data.views[state.view - 1];
+    const index = state.view - 1;
+    at("full").src = data.full[index];
+    at("full").alt = `${name} of ${data.reference.name}, ${count(data.reference.count)} Gaussians`;
+    at("small").src = (state.error ? scene.errors : scene.pictures)[index];
+    at("small").alt = state.error
+      ? `Where ${scene.name} differs from the full scene in ${name}`
+      : `${name} of ${scene.name}, ${count(scene.count)} Gaussians`;
+    at("tag-full").textContent = `Full · ${count(data.reference.count)}`;
+    at("tag-small").textContent = state.error ? "Differences" : `Simplified · ${count(scene.count)}`;
+    at("view-name").textContent = name;
+    at("score").textContent = join(...metrics.map(([label, of, text]) => `${label} ${text(of(scene).views[index])}`));
+    at("differences").setAttribute("aria-pressed", String(Boolean(state.error)));
+    at("scale").hidden = !state.error;
+    for (const group of ["small", "view"]) {
+      document.querySelectorAll(`input[name=${group}]`).forEach((input) => { input.checked = Number(input.value) === state[group]; });
+    }
+    const labels = metrics.map(([label]) => label);
+    const sized = data.small.some((one) => one.bytes !== null);
+    table("means", ["Scene", "Gaussians", ...(sized ? ["Size"] : []), ...labels], data.small.map((one, row) => ({
+      chosen: row === state.small - 1,
+      cells: [one.name, count(one.count), ...(sized ? [bytes(one.bytes)] : []), ...metrics.map(([, of, text]) => text(of(one).mean))],
+    })));
+    at("views-title").textContent = `Per view of ${scene.name}`;
+    table("per-view", ["View", ...labels], data.views.map((view, row) => ({
+      chosen: row === index,
+      cells: [view, ...metrics.map(([, of, text]) => text(of(scene).views[row]))],
+    })));
+    slide();
+  };
+
+  const slide = () => {
+    root.style.setProperty("--split", state.split);
+    const input = at("split");
+    input.value = state.split;
+    input.setAttribute("aria-valuetext", `${state.split} % full scene`);
+    at("tag-full").classList.toggle("away", state.split < 24);
+    at("tag-small").classList.toggle("away", state.split > 76);
+    for (const key of Object.keys(state)) root.dataset[key] = state[key];
+  };
+
+  let waiting = 0;
+  const remember = () => {
+    clearTimeout(waiting);
+    waiting = setTimeout(() => {
+      const { view, small, split, error } = state;
+      const hash = `#view=${view}&small=${small}&split=${split}${error ? "&error=1" : ""}`;
+      try { history.replaceState(null, "", hash); } catch { /* not allowed everywhere, and not needed */ }
+    }, 150);
+  };
+
+  const change = (changes) => {
+    const only = Object.keys(changes).join() === "split";
+    Object.assign(state, changes);
+    only ? slide() : show();
+    remember();
+  };
+
+  const restore = () => {
+    const words = new URLSearchParams(location.hash.slice(1));
+    const read = (key, low, high) => {
+      const value = parseInt(words.get(key), 10);
+      if (Number.isFinite(value)) state[key] = clamp(value, low, high);
+    };
+    read("view", 1, data.views.length);
+    read("small", 1, data.small.length);
+    read("split", 0, 100);
+    read("error", 0, 1);
+    show();
+  };
+
+  const step = (by) => change({ view: ((state.view - 1 + by + data.views.length) % data.views.length) + 1 });
+  const toggle = () => change({ error: 1 - state.error });
+
+  const drag = (event) => {
+    const box = stage.getBoundingClientRect();
+    change({ split: Math.round(clamp((100 * (event.clientX - box.left)) / box.width, 0, 100)) });
+  };
+  stage.addEventListener("pointerdown", (event) => {
+    if (event.button !== 0) return;
+    stage.setPointerCapture(event.pointerId);
+    at("split").focus({ preventScroll: true, focusVisible: false });
+    drag(event);
+    event.preventDefault();
+  });
+  stage.addEventListener("pointermove", (event) => { if (stage.hasPointerCapture(event.pointerId)) drag(event); });
+  at("split").addEventListener("input", () => change({ split: Number(at("split").value) }));
+  at("previous").addEventListener("click", () => step(-1));
+  at("next").addEventListener("click", () => step(1));
+  at("differences").addEventListener("click", toggle);
+  document.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const typing = event.target instanceof HTMLInputElement;
+    const key = event.key.toLowerCase();
+    if (key === "n") step(1);
+    else if (key === "p") step(-1);
+    else if (key === "d") toggle();
+    else if (/^[1-9]$/.test(key) && Number(key) <= data.small.length) change({ small: Number(key) });
+    else if (!typing && key === "arrowleft") change({ split: clamp(state.split - 2, 0, 100) });
+    else if (!typing && key === "arrowright") change({ split: clamp(state.split + 2, 0, 100) });
+  });
+  window.addEventListener("hashchange", restore);
+
+  const measure = () => { root.dataset.layout = `${root.scrollWidth}/${window.innerWidth}`; };
+  window.addEventListener("resize", measure);
+  build();
+  restore();
+  measure();
+  window.addEventListener("load", measure);
+  root.dataset.ready = "yes";
+})();

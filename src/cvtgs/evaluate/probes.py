@@ -1,0 +1,113 @@
+"""Small pictures that tell whether a camera stands well."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from cvtgs.cameras import Cameras
+from cvtgs.evaluate.survey import Survey
+from cvtgs.evaluate.voxels import SIZE
+from cvtgs.math import quaternions
+from cvtgs.render import render
+
+PIXELS = 64
+"""Longer side of a probe."""
+
+_SOLID = 0.5
+_NEAR = 0.3
+"""What is nearer than this share of the way to what is to be shown stands in the way."""
+
+_MOST_NEAR = 0.08
+_MOST_BLOCKED = 0.3
+_LEAST_FILLED = {False: 0.12, True: 0.8}
+_HIDING = 0.25
+_WITHIN = 2.5
+"""Standard deviations within which a camera is inside of a Gaussian."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Verdicts:
+    """What probes say about cameras.
+
+    Attributes:
+        good: ``(c,)`` which cameras stand well.
+        demerits: ``(c,)`` how badly they stand, to choose among bad ones; 0 is best.
+        seen: ``(c, v)`` which voxels of the survey each camera sees.
+    """
+
+    good: Bool[Tensor, "c"]
+    demerits: Float[Tensor, "c"]
+    seen: Bool[Tensor, "c v"]
+
+
+def probe(known: Survey, cameras: Cameras, *, reach: Float[Tensor, "c"], inside: bool) -> Verdicts:
+    """Take small pictures and judge the cameras by them.
+
+    A camera stands badly if it is inside of a Gaussian, if something near fills part of the
+    picture or hides the middle, or if the picture is empty.
+
+    Args:
+        known: The survey of the scene.
+        cameras: The cameras, at least one.
+        reach: Distance from each camera to what it is to show, scene units.
+        inside: Whether they stand in a room, where pictures are full.
+
+    Returns:
+        The verdicts.
+    """
+    factor = PIXELS / max(cameras.width, cameras.height)
+    small = cameras.resized(
+        max(8, round(factor * cameras.width)), max(8, round(factor * cameras.height))
+    )
+    pictures = render(known.sample, small, depth=True)
+    depth = pictures.alpha.new_zeros(()) if pictures.depth is None else pictures.depth
+    near = (pictures.alpha > _HIDING) & (depth < _NEAR * reach.to(depth)[:, None, None])
+    near_share = near.double().mean(dim=(1, 2))
+    rows, columns = (slice(side // 4, side - side // 4) for side in (small.height, small.width))
+    halfway = (pictures.alpha > _SOLID) & (depth < 0.45 * reach.to(depth)[:, None, None])
+    blocked = halfway[:, rows, columns].double().mean(dim=(1, 2))
+    filled = pictures.alpha.double().mean(dim=(1, 2))
+    lacking = (_LEAST_FILLED[inside] - filled).clamp_min(0)
+    swallowed = _swallowed(known, small)
+    good = (near_share <= _MOST_NEAR) & (blocked <= _MOST_BLOCKED) & (lacking == 0) & ~swallowed
+    demerits = 2 * near_share + blocked + 2 * lacking + swallowed.double()
+    return Verdicts(
+        good=good, demerits=demerits, seen=_seen(known, small, pictures.alpha, depth=depth)
+    )
+
+
+def _swallowed(known: Survey, cameras: Cameras) -> Bool[Tensor, "c"]:
+    """Tell which cameras are inside of a Gaussian that hides something."""
+    sample = known.sample.select(known.sample.opacities > _HIDING)
+    eyes = cameras.centers.to(sample.means)
+    largest = sample.scales.amax(dim=1)
+    found = []
+    for eye in eyes:
+        offsets = eye - sample.means
+        near = torch.linalg.vector_norm(offsets, dim=1) < _WITHIN * largest
+        frames = quaternions.to_matrices(quaternions.normalize(sample.quats[near]))
+        local = (frames.transpose(1, 2) @ offsets[near][:, :, None])[:, :, 0]
+        squares = (local / sample.scales[near].clamp_min(1e-12)).square().sum(dim=1)
+        found.append(bool((squares < _WITHIN**2).any()))
+    return torch.tensor(found)
+
+
+def _seen(
+    known: Survey, cameras: Cameras, alpha: Float[Tensor, "c h w"], *, depth: Float[Tensor, "c h w"]
+) -> Bool[Tensor, "c v"]:
+    """Tell which voxels are in the pictures and not behind what the pictures show."""
+    points = known.frame.center + known.frame.radius * known.voxels.points
+    rotations, shifts = cameras.viewmats[:, :3, :3].double(), cameras.viewmats[:, :3, 3].double()
+    local = points @ rotations.transpose(1, 2) + shifts[:, None]
+    projected = local @ cameras.Ks.double().transpose(1, 2)
+    ahead = local[:, :, 2] > 0
+    pixels = (projected[:, :, :2] / projected[:, :, 2:].clamp_min(1e-9)).floor().long()
+    x, y = pixels.unbind(2)
+    framed = ahead & (x >= 0) & (x < cameras.width) & (y >= 0) & (y < cameras.height)
+    flat = (y * cameras.width + x).clamp(0, cameras.width * cameras.height - 1)
+    surface = depth.flatten(1).double().gather(1, flat)
+    solid = alpha.flatten(1).gather(1, flat) > _SOLID
+    slack = 1.5 * SIZE * known.frame.radius
+    return framed & (~solid | (local[:, :, 2] < 1.05 * surface + slack))

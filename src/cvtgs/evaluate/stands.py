@@ -1,0 +1,177 @@
+"""Where a camera might stand: around a thing or a place, or inside a room, with alternates."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs.cameras import Cameras, look_at
+from cvtgs.evaluate.survey import Survey
+
+_PER_SLOT_ELEVATIONS = (20.0, 35.0, 12.0, 28.0)
+_OUTSIDE = (
+    # turn (of a slot), further elevation (degrees), further distance (factor)
+    (0.0, 0.0, 1.0),
+    (0.0, 12.0, 1.0),
+    (0.3, 4.0, 1.0),
+    (-0.3, 4.0, 1.0),
+    (0.0, 8.0, 0.75),
+    (0.0, 25.0, 1.0),
+    (0.3, 16.0, 0.75),
+    (-0.3, 16.0, 0.75),
+    (0.0, 20.0, 1.4),
+    (0.0, 45.0, 1.0),
+    (0.0, 15.0, 0.5),
+    (0.0, 50.0, 1.5),
+)
+_INSIDE = (
+    # turn (of a slot), share of the way to the wall behind, lift (of the height)
+    (0.0, 0.65, 0.0),
+    (0.0, 0.75, 0.08),
+    (0.3, 0.65, 0.04),
+    (-0.3, 0.65, 0.04),
+    (0.0, 0.5, 0.0),
+    (0.0, 0.55, 0.12),
+    (0.3, 0.4, 0.04),
+    (-0.3, 0.4, 0.04),
+    (0.0, 0.8, -0.08),
+    (0.0, 0.25, 0.08),
+    (0.0, 0.0, 0.0),
+)
+OUTSIDE_FIELD = 45.0
+"""Field of view around a scene along the shorter side of the picture, degrees."""
+
+INSIDE_FIELD = 62.0
+"""The same inside a room."""
+
+_PLACE_RADIUS = 0.75
+_THING_RADIUS = 1.0
+_INSIDE_PITCH = -10.0
+_SHOULDERS = 0.15
+_WALL = 0.8  # of what is in a direction, the nearest part is furniture, the farthest stray
+_FARTHEST = 1.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stands:
+    """Places to look from, in rounds: the first choice of every view, then its alternates.
+
+    Attributes:
+        inside: Whether they are inside a room.
+        rounds: Cameras of one round; all rounds have one camera per view.
+        reach: Distance from each camera to what it is to show, scene units, one per round.
+    """
+
+    inside: bool
+    rounds: tuple[Cameras, ...]
+    reach: tuple[Float[Tensor, "c"], ...]
+
+
+def outside_stands(known: Survey, count: int, *, size: tuple[int, int], turn: float) -> Stands:
+    """Stand around the scene at several heights and look at its middle.
+
+    Args:
+        known: What is known of the scene.
+        count: Number of views.
+        size: Width and height of the pictures, pixels.
+        turn: Where the first camera stands on its circle, in slots.
+
+    Returns:
+        The places.
+    """
+    right, ahead = _level_axes(known.up)
+    shown = known.radius * (_THING_RADIUS if known.bounded else _PLACE_RADIUS)
+    distance = shown / math.sin(math.radians(0.5 * OUTSIDE_FIELD))
+    elevations = [_PER_SLOT_ELEVATIONS[slot % len(_PER_SLOT_ELEVATIONS)] for slot in range(count)]
+    rounds, reaches = [], []
+    for shift, lift, factor in _OUTSIDE:
+        eyes = []
+        for slot, elevation in enumerate(elevations):
+            angle = 2 * math.pi * (slot + turn + shift) / count
+            rise = math.radians(min(elevation + lift, 80.0))
+            level = math.cos(angle) * right + math.sin(angle) * ahead
+            eyes.append(math.cos(rise) * level + math.sin(rise) * known.up)
+        directions = torch.stack(eyes)
+        rounds.append(
+            _cameras(
+                known.center + distance * factor * directions,
+                -directions,
+                known.up,
+                size=size,
+                field=OUTSIDE_FIELD,
+            )
+        )
+        reaches.append(torch.full((count,), distance * factor))
+    return Stands(inside=False, rounds=tuple(rounds), reach=tuple(reaches))
+
+
+def inside_stands(
+    known: Survey, middle: Float[Tensor, "3"], count: int, *, size: tuple[int, int], turn: float
+) -> Stands:
+    """Stand in a room, back from its middle, and look across.
+
+    Args:
+        known: What is known of the scene.
+        middle: The middle of the room at the height of the eyes, scene units.
+        count: Number of views.
+        size: Width and height of the pictures, pixels.
+        turn: Where the first camera looks, in slots.
+
+    Returns:
+        The places.
+    """
+    right, ahead = _level_axes(known.up)
+    pitch = math.radians(_INSIDE_PITCH)
+    rounds, reaches = [], []
+    for shift, back, lift in _INSIDE:
+        angles = [2 * math.pi * (slot + turn + shift) / count for slot in range(count)]
+        level = torch.stack([math.cos(angle) * right + math.sin(angle) * ahead for angle in angles])
+        steps = back * _ways_to_walls(known, middle, -level)
+        eyes = middle - steps[:, None] * level + lift * known.height * known.up
+        directions = math.cos(pitch) * level + math.sin(pitch) * known.up
+        rounds.append(_cameras(eyes, directions, known.up, size=size, field=INSIDE_FIELD))
+        reaches.append(steps + 0.5 * known.frame.radius)
+    return Stands(inside=True, rounds=tuple(rounds), reach=tuple(reaches))
+
+
+def _ways_to_walls(
+    known: Survey, start: Float[Tensor, "3"], directions: Float[Tensor, "c 3"]
+) -> Float[Tensor, "c"]:
+    """Give the distances to the walls, past what stands in the room, scene units."""
+    points = known.frame.center + known.frame.radius * known.voxels.points - start
+    along = directions @ points.T
+    aside = (points.square().sum(dim=1) - along.square()).clamp_min(0).sqrt()
+    ahead = (along > 0) & (aside < _SHOULDERS * known.frame.radius)
+    ways = [
+        row[there].quantile(_WALL) if bool(there.any()) else row.new_zeros(())
+        for row, there in zip(along, ahead, strict=True)
+    ]
+    return torch.stack(ways).clamp_max(_FARTHEST * known.frame.radius)
+
+
+def _level_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Give two level directions, fixed by ``up`` alone."""
+    least = torch.eye(3, dtype=up.dtype)[up.abs().argmin()]
+    right = torch.nn.functional.normalize(torch.linalg.cross(up, least), dim=0)
+    return right, torch.linalg.cross(right, up)
+
+
+def _cameras(
+    eyes: Float[Tensor, "c 3"],
+    directions: Float[Tensor, "c 3"],
+    up: Float[Tensor, "3"],
+    *,
+    size: tuple[int, int],
+    field: float,
+) -> Cameras:
+    width, height = size
+    focal = 0.5 * min(size) / math.tan(math.radians(0.5 * field))
+    intrinsics = [[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]]
+    return Cameras(
+        viewmats=look_at(eyes, eyes + directions, up).float(),
+        Ks=torch.tensor(intrinsics).repeat(len(eyes), 1, 1),
+        width=width,
+        height=height,
+    )

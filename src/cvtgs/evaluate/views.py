@@ -1,0 +1,154 @@
+"""Automatic views: from where to look at a scene of which nothing is known."""
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs.cameras import Cameras
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.evaluate.probes import probe
+from cvtgs.evaluate.stands import Stands, inside_stands, outside_stands
+from cvtgs.evaluate.survey import Survey, survey
+from cvtgs.scene import GaussianScene
+
+_ENCLOSED = 0.7
+"""A room hides this share of the upper half of what a camera in its middle could see."""
+
+_WITHIN = 0.6
+"""From within a room one sees this share of what is seen from around it; in a vase, less."""
+
+_NEAR = 2.2
+"""Surfaces farther than this are no walls, in robust radii."""
+
+_FREE = 0.12
+"""Room to stand, in robust radii."""
+
+_BANDS = 5
+_SECTORS = 12
+_COMPARED = 6
+_COMPARED_SIZE = (64, 64)
+_GOLDEN = 0.6180339887498949
+
+
+def automatic_views(
+    scene: GaussianScene,
+    count: int = 8,
+    *,
+    width: int = 640,
+    height: int = 480,
+    seed: int = 0,
+) -> Cameras:
+    """Choose cameras that show a scene of which nothing else is known.
+
+    Where the scene is, how large and which way is up comes from robust statistics of what is
+    visible (:func:`cvtgs.evaluate.orientation.find_up`; y-down without evidence), so flyaways,
+    sky shells and haze do not matter. The cameras stand around the scene at several heights; if
+    its middle is free, surfaces are all around and above, and much of the scene can be seen from
+    there, they stand inside and look across. Every camera takes a picture of 64 pixels first: one that
+    is inside of a Gaussian, has something near in its picture, or sees nothing is moved to the
+    first alternate that stands well, or to the best of them.
+
+    The same scene, count, size and seed give the same cameras. Memory: a sample of at most
+    60,000 Gaussians, and masks of the scene.
+
+    Args:
+        scene: Any scene with at least one valid Gaussian.
+        count: Number of views, at least 1.
+        width: Pixels per row.
+        height: Rows.
+        seed: Turns the cameras around the scene: another seed, other views.
+
+    Returns:
+        The cameras, float32 on the CPU, named ``view 1`` and so on.
+
+    Raises:
+        InvalidArgumentError: Count or size is below 1.
+        InvalidSceneError: The scene has no valid row.
+
+    Example:
+        >>> from cvtgs.synthetic import scene
+        >>> automatic_views(scene("object", 1000), 3, width=64, height=48).names
+        ('view 1', 'view 2', 'view 3')
+    """
+    for name, value in (("count", count), ("width", width), ("height", height)):
+        if value < 1:
+            raise InvalidArgumentError(f"{name} must be at least 1, found {value}.")
+    known = survey(scene)
+    size, turn = (width, height), 0.5 + seed * _GOLDEN
+    stands = _stands(known, count, size=size, turn=turn)
+    names = tuple(f"view {number}" for number in range(1, count + 1))
+    return replace(_best(known, stands), names=names)
+
+
+def _stands(known: Survey, count: int, *, size: tuple[int, int], turn: float) -> Stands:
+    around = outside_stands(known, count, size=size, turn=turn)
+    middle = _middle_of_room(known)
+    if middle is None:
+        return around
+    outside = outside_stands(known, _COMPARED, size=_COMPARED_SIZE, turn=turn)
+    inside = inside_stands(known, middle, _COMPARED, size=_COMPARED_SIZE, turn=turn)
+    if _share_seen(known, inside) < _WITHIN * _share_seen(known, outside):
+        return around
+    return inside_stands(known, middle, count, size=size, turn=turn)
+
+
+def _middle_of_room(known: Survey) -> Float[Tensor, "3"] | None:
+    """Give the middle at the height of the eyes if there is room and surfaces are all around."""
+    points = known.voxels.points
+    if len(points) == 0:
+        return None
+    heights = points @ known.up
+    low, high = heights.quantile(heights.new_tensor([0.02, 0.98])).tolist()
+    center = (known.center - known.frame.center) / known.frame.radius
+    center = center - (center @ known.up) * known.up
+    steps = torch.linspace(-0.3, 0.3, 5, dtype=points.dtype)
+    level = torch.linalg.svd(known.up[None]).Vh[1:]
+    offsets = torch.cartesian_prod(steps, steps) @ level
+    lifts = torch.tensor([0.45, 0.55, 0.65], dtype=points.dtype) * (high - low) + low
+    eyes = (center + offsets)[:, None] + lifts[:, None] * known.up
+    eyes = eyes.reshape(-1, 3)
+    clearance = torch.cdist(eyes, points).amin(dim=1)
+    best = eyes[clearance.argmax()]
+    points = points[torch.linalg.vector_norm(points - best, dim=1) < _NEAR]
+    if float(clearance.amax()) < _FREE or _enclosure(points - best, known.up) < _ENCLOSED:
+        return None
+    middle = center + (0.58 * (high - low) + low) * known.up
+    return known.frame.center + known.frame.radius * middle
+
+
+def _enclosure(offsets: Float[Tensor, "v 3"], up: Float[Tensor, "3"]) -> float:
+    """Give the share of the upper half of all directions in which there is a surface."""
+    directions = torch.nn.functional.normalize(offsets, dim=1)
+    axes = torch.linalg.svd(up[None]).Vh[1:]
+    rise = directions @ up
+    x, y = (directions @ axes.T).unbind(1)
+    sectors = ((torch.atan2(y, x) / math.tau + 0.5) * _SECTORS).long().clamp(0, _SECTORS - 1)
+    bands = (rise * _BANDS).long().clamp(0, _BANDS - 1)  # bands of equal solid angle
+    filled = torch.zeros(_BANDS, _SECTORS, dtype=torch.bool)
+    filled[bands[rise > 0], sectors[rise > 0]] = True
+    return float(filled.double().mean())
+
+
+def _share_seen(known: Survey, stands: Stands) -> float:
+    verdicts = probe(known, stands.rounds[0], reach=stands.reach[0], inside=stands.inside)
+    return float(verdicts.seen.any(dim=0).double().mean())
+
+
+def _best(known: Survey, stands: Stands) -> Cameras:
+    """Take of every view the first place that stands well, else the least bad one."""
+    first = stands.rounds[0]
+    viewmats = first.viewmats.clone()
+    waiting = torch.arange(len(first))
+    least = torch.full((len(first),), math.inf, dtype=torch.float64)
+    for cameras, reach in zip(stands.rounds, stands.reach, strict=True):
+        if len(waiting) == 0:
+            break
+        verdicts = probe(known, cameras.select(waiting), reach=reach[waiting], inside=stands.inside)
+        better = verdicts.good | (verdicts.demerits < least[waiting])
+        viewmats[waiting[better]] = cameras.viewmats[waiting[better]]
+        least[waiting] = torch.minimum(least[waiting], verdicts.demerits)
+        waiting = waiting[~verdicts.good]
+    return replace(first, viewmats=viewmats)
