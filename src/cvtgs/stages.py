@@ -1,7 +1,6 @@
 """The stages in order: check, plan, filter, tessellate, merge; no algorithm of its own."""
 
 import warnings
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -152,13 +151,18 @@ def _place(
     scene: GaussianScene, rows: Tensor, outlook: _Outlook, target: int, config: SimplifyConfig
 ) -> tuple[Tensor, Tensor]:
     """Place Gaussians in the space of the tessellation; rows and points along a Morton curve."""
-    place = partial(cvt.embed, frame=outlook.frame)
-    means, colors = scene.means[rows], scene.sh0[rows]
     # A curve through contracted space stays fine where the bulk is, whatever flies away.
-    order = morton_order(place(means, colors, color=0.0, contracted=True))
-    color = config.cvt.color * (target / COLOR_CELLS) ** config.cvt.color_power
-    contracted = outlook.plan.unbounded.active
-    return rows[order], place(means[order], colors[order], color=color, contracted=contracted)
+    curve = cvt.embed(scene.means[rows], frame=outlook.frame, contracted=True)
+    rows = rows[morton_order(curve)]
+    del curve
+    points = cvt.embed(
+        scene.means[rows],
+        scene.sh0[rows],
+        frame=outlook.frame,
+        contracted=outlook.plan.unbounded.active,
+        color=config.cvt.color * (target / COLOR_CELLS) ** config.cvt.color_power,
+    )
+    return rows, points
 
 
 COLOR_CELLS = 10_000

@@ -9,20 +9,20 @@ from cvtgs.math.spherical_harmonics import SH_C0
 
 def embed(
     means: Float[Tensor, "n 3"],
-    sh0: Float[Tensor, "n 1 3"],
-    frame: RobustFrame,
+    sh0: Float[Tensor, "n 1 3"] | None = None,
     *,
-    color: float,
+    frame: RobustFrame,
     contracted: bool,
+    color: float = 0.0,
 ) -> Float[Tensor, "n d"]:
     """Place Gaussians in the space of the tessellation.
 
     Args:
         means: Positions, scene units.
-        sh0: Constant SH band.
+        sh0: Constant SH band; None leaves colour out.
         frame: Centre and radius of the scene.
-        color: Length of one unit of colour in robust radii; 0 leaves colour out.
         contracted: Whether positions beyond the robust radius are pulled in.
+        color: Length of one unit of colour in robust radii; 0 leaves colour out.
 
     Returns:
         Coordinates in robust radii, in the dtype of ``means``; d = 3, or 6 with colour.
@@ -30,18 +30,17 @@ def embed(
     Example:
         >>> import torch
         >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=2.0)
-        >>> embed(
-        ...     torch.ones(1, 3), torch.zeros(1, 1, 3), frame, color=0.0, contracted=False
-        ... ).tolist()
+        >>> embed(torch.ones(1, 3), frame=frame, contracted=False).tolist()
         [[0.5, 0.5, 0.5]]
     """
-    points = means.new_empty(len(means), 6 if color else 3)
+    colored = sh0 is not None and color > 0.0
+    points = means.new_empty(len(means), 6 if colored else 3)
     for start in range(0, len(means), CHUNK):
         part = slice(start, start + CHUNK)
         local = means[part]
         place = frame.contract(local) if contracted else frame.normalize(local)
         points[part, :3] = place.clamp_(-FARTHEST, FARTHEST)
-        if color:
+        if sh0 is not None and colored:
             rgb = (SH_C0 * sh0[part, 0].double()).clamp(-0.5, 0.5 + COLOR_HEADROOM)
             points[part, 3:] = color * rgb
     return points

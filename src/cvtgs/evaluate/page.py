@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from cvtgs import __version__
 from cvtgs.evaluate.compare import Comparison, Pictures
 from cvtgs.evaluate.error_maps import ERROR_SCALE, css_gradient, error_map
 from cvtgs.evaluate.images import encode, resized
@@ -82,7 +81,6 @@ def _for_script(data: dict[str, Any]) -> str:
 def _data(comparison: Comparison, quality: int, factor: float) -> dict[str, Any]:
     evaluation = comparison.evaluation
     return {
-        "version": __version__,
         "backend": evaluation.backend,
         "width": evaluation.width,
         "height": evaluation.height,

@@ -13,7 +13,7 @@ from cvtgs.filters import invalid_rows, with_finite_opacities
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.scene import GaussianScene
 
-MOST_GAUSSIANS = 60_000
+MOST_GAUSSIANS = 30_000
 """Larger scenes are looked at through a sample of this many Gaussians."""
 
 _HEAVIEST = 10_000
@@ -52,7 +52,7 @@ class Survey:
 def survey(scene: GaussianScene) -> Survey:
     """Look at a scene once.
 
-    Memory: a mask per attribute, and a sample of at most 60,000 Gaussians.
+    Memory: a mask per attribute, and a sample of at most 30,000 Gaussians.
 
     Args:
         scene: Any scene.

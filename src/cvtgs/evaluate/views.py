@@ -52,7 +52,7 @@ def automatic_views(
     first alternate that stands well, or to the best of them.
 
     The same scene, count, size and seed give the same cameras. Memory: a sample of at most
-    60,000 Gaussians, and masks of the scene.
+    30,000 Gaussians, and masks of the scene.
 
     Args:
         scene: Any scene with at least one valid Gaussian.

@@ -82,7 +82,7 @@
     const lpips = data.lpips ? `, LPIPS (${data.lpips === "vgg" ? "VGG" : "Alex"}) is lower for closer pictures` : "";
     at("about").textContent =
       `Scores compare pictures of each simplified scene with pictures of the full one, ${data.width} × ${data.height} pixels: ` +
-      `higher PSNR and SSIM mean closer${lpips}. Rendered by cvtgs ${data.version} (${data.backend}).`;
+      `higher PSNR and SSIM mean closer${lpips}. Rendered by cvtgs with its ${data.backend} backend.`;
   };
 
   const show = () => {
