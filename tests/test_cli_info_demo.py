@@ -24,19 +24,22 @@ def test_info_as_json_is_the_scene_info(tmp_path, capsys):
     assert facts == cvtgs.describe(cvtgs.load(path))
 
 
-def test_demo_writes_four_scenes_and_says_what_is_next(tmp_path, capsys):
+def test_demo_writes_four_scenes_and_a_page_and_says_what_is_next(tmp_path, capsys):
     folder = tmp_path / "demo"
     words = ["demo", "-o", str(folder), "--count", "3000"]
     assert main(words) == 0
-    counts = {path.name: len(cvtgs.load(path)) for path in folder.iterdir()}
+    counts = {path.name: len(cvtgs.load(path)) for path in folder.glob("*.ply")}
     assert counts == {
         "full.ply": 3000,
         "small_0.1.ply": 300,
         "small_0.01.ply": 30,
         "small_0.001.ply": 3,
     }
+    pages = sorted(path.name for path in folder.iterdir() if path.suffix != ".ply")
+    assert pages == ["errors.png", "index.html", "sheet.png"]
     printed = capsys.readouterr().out
-    for text in ("small_0.001.ply", "tessellate", "cvtgs simplify scene.ply"):
+    page = (folder / "index.html").resolve().as_uri()
+    for text in ("small_0.001.ply", "tessellate", "PSNR", "cvtgs simplify scene.ply", page):
         assert text in printed
     assert main([*words, "--quiet"]) == 0
     assert capsys.readouterr().out == ""

@@ -79,6 +79,7 @@ STAGES = {
         "LPIPS_VARIABLE",
         "Comparison",
         "Evaluation",
+        "EvaluationSettings",
         "LpipsWeights",
         "SceneScores",
         "Score",

@@ -52,7 +52,11 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: The parsed options.
     """
-    from cvtgs.evaluate import compare, write_exhibition  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.evaluate import (  # noqa: PLC0415 (keeps --help fast)
+        EvaluationSettings,
+        compare,
+        write_exhibition,
+    )
     from cvtgs.evaluate.exhibition import check_exhibition  # noqa: PLC0415
 
     check_looking_options(options)
@@ -66,9 +70,9 @@ def run(options: argparse.Namespace) -> None:
             chosen_cameras(options, scenes[name], most=MOST_CAMERAS),
             reference_name=name,
             sizes=sizes,
-            background=background_color(options),
-            lpips=options.lpips,
-            backend=options.backend,
+            settings=EvaluationSettings(
+                background=background_color(options), lpips=options.lpips, backend=options.backend
+            ),
             listener=listener,
         )
         paths = write_exhibition(

@@ -24,8 +24,8 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser = commands.add_parser(
         "demo",
         help="try it on a generated scene; needs no files",
-        description="Generate a scene, make it 10, 100 and 1000 times smaller, write all four, and a "
-        "page to look at them side by side.",
+        description="Generate a scene, make it 10, 100 and 1000 times smaller, write all four, "
+        "and a page to look at them side by side.",
     )
     parser.add_argument(
         "-o",
@@ -54,6 +54,7 @@ def run(options: argparse.Namespace) -> None:
         options: The parsed options.
     """
     from cvtgs.evaluate import (  # noqa: PLC0415 (keeps --help fast)
+        EvaluationSettings,
         automatic_views,
         compare,
         write_exhibition,
@@ -83,7 +84,7 @@ def run(options: argparse.Namespace) -> None:
             automatic_views(scene, VIEWS, width=WIDTH, height=HEIGHT),
             reference_name="full.ply",
             sizes=sizes,
-            lpips="off",
+            settings=EvaluationSettings(lpips="off"),
             listener=listener,
         )
         write_exhibition(comparison, options.output, overwrite=True, listener=listener)

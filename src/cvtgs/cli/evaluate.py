@@ -62,7 +62,11 @@ def run(options: argparse.Namespace) -> None:
     Raises:
         InvalidArgumentError: Photographs are given without cameras.
     """
-    from cvtgs.evaluate import evaluate, load_photographs  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.evaluate import (  # noqa: PLC0415 (keeps --help fast)
+        EvaluationSettings,
+        evaluate,
+        load_photographs,
+    )
 
     check_looking_options(options)
     if options.images is not None and options.cameras is None:
@@ -83,9 +87,9 @@ def run(options: argparse.Namespace) -> None:
             cameras,
             reference_name=name,
             photographs=photographs,
-            background=background,
-            lpips=options.lpips,
-            backend=options.backend,
+            settings=EvaluationSettings(
+                background=background, lpips=options.lpips, backend=options.backend
+            ),
             listener=listener,
         )
     if options.json:

@@ -55,7 +55,8 @@ def add_looking_options(parser: argparse.ArgumentParser, *, size: int) -> None:
         "--views",
         type=int,
         metavar="N",
-        help="number of views; of given cameras, N spread evenly (default 8, or all that are given)",
+        help="number of views; of given cameras, N spread evenly "
+        "(default 8, or all that are given)",
     )
     parser.add_argument(
         "--size",

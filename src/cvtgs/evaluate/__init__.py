@@ -8,12 +8,14 @@ from cvtgs.evaluate.lpips_weights import LPIPS_VARIABLE, LpipsWeights, load_lpip
 from cvtgs.evaluate.metrics import psnr, ssim
 from cvtgs.evaluate.photographs import load_photographs
 from cvtgs.evaluate.scores import Evaluation, SceneScores, Score
+from cvtgs.evaluate.settings import EvaluationSettings
 from cvtgs.evaluate.views import automatic_views
 
 __all__ = [
     "LPIPS_VARIABLE",
     "Comparison",
     "Evaluation",
+    "EvaluationSettings",
     "LpipsWeights",
     "SceneScores",
     "Score",

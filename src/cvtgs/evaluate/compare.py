@@ -10,10 +10,9 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.evaluate.evaluate import evaluate
-from cvtgs.evaluate.judge import LpipsChoice
 from cvtgs.evaluate.scores import Evaluation, SceneScores
+from cvtgs.evaluate.settings import EvaluationSettings
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.render import BackendName
 from cvtgs.scene import GaussianScene
 
 Pictures = UInt8[np.ndarray, "c h w 3"]
@@ -54,9 +53,7 @@ def compare(
     *,
     reference_name: str = "full",
     sizes: Mapping[str, int] | None = None,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    lpips: LpipsChoice = "auto",
-    backend: BackendName = "auto",
+    settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
     listener: ProgressListener = silent,
 ) -> Comparison:
     """Take pictures of a full scene and of simplified ones, and score them.
@@ -69,9 +66,7 @@ def compare(
         cameras: From where to look.
         reference_name: Name of the full scene.
         sizes: Bytes of the files, by name.
-        background: Colour behind the scenes, in [0, 1].
-        lpips: Which LPIPS to measure.
-        backend: What renders.
+        settings: Background, which LPIPS, and what renders.
         listener: Told about each picture.
 
     Returns:
@@ -87,7 +82,7 @@ def compare(
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 500, sh_degree=0)
         >>> cameras = automatic_views(scene, 2, width=32, height=24)
-        >>> compare(scene, {"same": scene}, cameras, lpips="off").full.shape
+        >>> compare(scene, {"same": scene}, cameras).full.shape
         (2, 24, 32, 3)
     """
     shape = (len(cameras), cameras.height, cameras.width, 3)
@@ -101,9 +96,7 @@ def compare(
         small,
         cameras,
         reference_name=reference_name,
-        background=background,
-        lpips=lpips,
-        backend=backend,
+        settings=settings,
         listener=listener,
         on_picture=keep,
     )

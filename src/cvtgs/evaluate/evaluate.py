@@ -1,7 +1,6 @@
 """Scores of simplified scenes against the full one, and against photographs."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -9,10 +8,11 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.evaluate.judge import LpipsChoice, Tally, make_judge
+from cvtgs.evaluate.judge import Tally, make_judge
 from cvtgs.evaluate.scores import Evaluation
+from cvtgs.evaluate.settings import EvaluationSettings
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.render import BackendName, render
+from cvtgs.render import render
 from cvtgs.scene import GaussianScene
 
 STAGE = "evaluate"
@@ -40,9 +40,7 @@ def evaluate(
     *,
     reference_name: str = "full",
     photographs: Float[Tensor, "c h w 3"] | None = None,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    lpips: LpipsChoice = "auto",
-    backend: BackendName = "auto",
+    settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
     listener: ProgressListener = silent,
     on_picture: PictureListener = ignore_picture,
 ) -> Evaluation:
@@ -57,9 +55,7 @@ def evaluate(
         cameras: From where to look.
         reference_name: Name of the full scene.
         photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too.
-        background: Colour behind the scenes, in [0, 1].
-        lpips: Which LPIPS to measure; ``auto`` leaves it out where there are no weights.
-        backend: What renders.
+        settings: Background, which LPIPS, and what renders.
         listener: Told about each picture.
         on_picture: Given each picture; those of the reference come first in each view.
 
@@ -77,15 +73,15 @@ def evaluate(
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 500, sh_degree=0)
         >>> cameras = automatic_views(scene, 2, width=32, height=24)
-        >>> evaluate(scene, {"same": scene}, cameras, lpips="off").scenes[0].psnr.mean
+        >>> settings = EvaluationSettings(lpips="off")
+        >>> evaluate(scene, {"same": scene}, cameras, settings=settings).scenes[0].psnr.mean
         inf
     """
     _check(small, cameras, reference_name, photographs=photographs)
-    judge = make_judge(lpips, (cameras.width, cameras.height))
+    judge = make_judge(settings.lpips, (cameras.width, cameras.height))
     scenes = {reference_name: reference, **small}
     tallies = {name: Tally(name=name, count=len(scene)) for name, scene in small.items()}
     taken = {name: Tally(name=name, count=len(scene)) for name, scene in scenes.items()}
-    painter = _Painter(background=background, backend=backend)
     total, done = len(cameras) * len(scenes), 0
     backend_used = ""
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
@@ -93,7 +89,7 @@ def evaluate(
         camera = cameras.select(torch.tensor([view]))
         truth = reference.means.new_zeros(0)
         for name, scene in scenes.items():
-            picture, backend_used = painter.paint(scene, camera)
+            picture, backend_used = _picture(scene, camera, settings)
             on_picture(view, name, picture)
             if name == reference_name:
                 truth = picture
@@ -136,15 +132,12 @@ def view_names(cameras: Cameras) -> tuple[str, ...]:
     return cameras.names or tuple(f"view {number}" for number in range(1, len(cameras) + 1))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Painter:
-    background: tuple[float, float, float]
-    backend: BackendName
-
-    def paint(self, scene: GaussianScene, camera: Cameras) -> tuple[Tensor, str]:
-        behind = torch.tensor(self.background) if any(self.background) else None
-        rendering = render(scene, camera, backend=self.backend, background=behind)
-        return rendering.rgb[0].clamp(0, 1), rendering.backend
+def _picture(
+    scene: GaussianScene, camera: Cameras, settings: EvaluationSettings
+) -> tuple[Float[Tensor, "h w 3"], str]:
+    behind = torch.tensor(settings.background) if any(settings.background) else None
+    rendering = render(scene, camera, backend=settings.backend, background=behind)
+    return rendering.rgb[0].clamp(0, 1), rendering.backend
 
 
 def _check(

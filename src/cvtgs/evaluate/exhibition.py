@@ -1,6 +1,7 @@
 """The files of a comparison: a page, a contact sheet and the error maps."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from cvtgs.errors import OutputError
@@ -83,13 +84,13 @@ def write_exhibition(
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 300, sh_degree=0)
         >>> views = automatic_views(scene, 2, width=32, height=24)
-        >>> comparison = compare(scene, {"same": scene}, views, lpips="off")
+        >>> comparison = compare(scene, {"same": scene}, views)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     [path.name for path in write_exhibition(comparison, folder)]
         ['sheet.png', 'errors.png', 'index.html']
     """
     check_exhibition(folder, overwrite=overwrite)
-    makers = {
+    makers: dict[str, Callable[[], bytes]] = {
         SHEET: lambda: encode(contact_sheet(comparison), "png"),
         ERRORS: lambda: encode(error_sheet(comparison), "png"),
         PAGE: lambda: comparison_page(comparison).encode(),

@@ -12,9 +12,7 @@ from cvtgs.errors import FileFormatError, InputError
 Encoding = Literal["png", "webp"]
 
 
-def encode(
-    image: UInt8[np.ndarray, "h w 3"], encoding: Encoding, *, quality: int = 82
-) -> bytes:
+def encode(image: UInt8[np.ndarray, "h w 3"], encoding: Encoding, *, quality: int = 82) -> bytes:
     """Write an image to bytes.
 
     Args:

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -30,7 +29,9 @@ class Judge:
     weights: LpipsWeights | None
     note: str = ""
 
-    def compare(self, picture: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> list[float]:
+    def compare(
+        self, picture: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
+    ) -> list[float]:
         """Give PSNR, SSIM and, with weights, LPIPS.
 
         Args:

@@ -28,7 +28,7 @@ _SKY = 0.12
 _USUAL = ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 _USUAL_BONUS = (1.5, 1.25)
 _USUAL_COSINE = 0.85
-_SNAP_COSINE = 0.9986  # 3 degrees
+_SNAP_COSINE = 0.9954  # 5.5 degrees
 
 
 class _Plane(NamedTuple):
@@ -40,19 +40,19 @@ class _Plane(NamedTuple):
 def find_up(voxels: Voxels, far: Float[Tensor, "k 3"]) -> Float[Tensor, "3"]:
     """Say which way is up.
 
-        The axis is at right angles to the ground, the plane with the largest area; planes that lie as
-        captures usually have it (y-down, then z-up) are preferred where areas are similar. Without a
-        ground it is the direction in which the scene is flat. Up is where the ground has the scene on
-    X
+    The axis is at right angles to the ground, the plane with the largest area; planes that lie
+    as captures usually have it (y-down, then z-up) are preferred where areas are similar. Up is
+    as captures usually have it, -y or else +z, unless the scene hangs below its ground, or more
+    below a ceiling than on a floor, or the sky is below. Without a ground, up is -y.
 
-        Args:
+    Args:
             voxels: The surfaces of the scene.
             far: Directions of the Gaussians far away, unit vectors, float64; none if there are few.
 
-        Returns:
-            A unit vector, float64; exactly along a coordinate axis if within 3 degrees of one.
+    Returns:
+            A unit vector, float64; exactly along a coordinate axis if within 5.5 degrees of one.
 
-        Example:
+    Example:
             >>> from cvtgs.evaluate.voxels import voxels_of
             >>> from cvtgs.math.frames import robust_frame
             >>> from cvtgs.synthetic import demo_scene
@@ -151,10 +151,10 @@ def _stands_on_its_head(heights: Float[Tensor, "v"], ground: float) -> bool:
     if lid > 0.5 * floor and high - low > 5 * _THICKNESS:
         between = heights[(heights > low + 2 * _THICKNESS) & (heights < high - 2 * _THICKNESS)]
         lift = float(between.mean()) - 0.5 * (low + high) if len(between) else 0.0
-        return lift > _TOP_HEAVY * (high - low)
+        return bool(lift > _TOP_HEAVY * (high - low))
     above = float((heights > ground + 1.5 * _THICKNESS).double().mean())
     below = float((heights < ground - 1.5 * _THICKNESS).double().mean())
-    return below - above > _ONE_SIDED * (above + below)
+    return bool(below - above > _ONE_SIDED * (above + below))
 
 
 def _snapped(normal: Tensor) -> Float[Tensor, "3"]:

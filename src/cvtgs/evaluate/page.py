@@ -41,7 +41,7 @@ def comparison_page(comparison: Comparison, *, most_bytes: int = MOST_BYTES) -> 
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 300, sh_degree=0)
         >>> views = automatic_views(scene, 2, width=32, height=24)
-        >>> page = comparison_page(compare(scene, {"same": scene}, views, lpips="off"))
+        >>> page = comparison_page(compare(scene, {"same": scene}, views))
         >>> page.startswith("<!DOCTYPE html>"), "https:" in page
         (True, False)
     """

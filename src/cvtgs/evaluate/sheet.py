@@ -32,7 +32,7 @@ def contact_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 300, sh_degree=0)
         >>> views = automatic_views(scene, 2, width=32, height=24)
-        >>> contact_sheet(compare(scene, {"same": scene}, views, lpips="off")).dtype
+        >>> contact_sheet(compare(scene, {"same": scene}, views)).dtype
         dtype('uint8')
     """
     sheet = _Sheet.of(comparison, rows=1 + len(comparison.small), foot=0)
@@ -60,7 +60,7 @@ def error_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 300, sh_degree=0)
         >>> views = automatic_views(scene, 2, width=32, height=24)
-        >>> error_sheet(compare(scene, {"same": scene}, views, lpips="off")).ndim
+        >>> error_sheet(compare(scene, {"same": scene}, views)).ndim
         3
     """
     sheet = _Sheet.of(comparison, rows=len(comparison.small), foot=_FOOT)

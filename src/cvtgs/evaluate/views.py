@@ -47,9 +47,9 @@ def automatic_views(
     visible (:func:`cvtgs.evaluate.orientation.find_up`; y-down without evidence), so flyaways,
     sky shells and haze do not matter. The cameras stand around the scene at several heights; if
     its middle is free, surfaces are all around and above, and much of the scene can be seen from
-    there, they stand inside and look across. Every camera takes a picture of 64 pixels first: one that
-    is inside of a Gaussian, has something near in its picture, or sees nothing is moved to the
-    first alternate that stands well, or to the best of them.
+    there, they stand inside and look across. Every camera takes a picture of 64 pixels first: one
+    that is inside of a Gaussian, has something near in its picture, or sees nothing is moved to
+    the first alternate that stands well, or to the best of them.
 
     The same scene, count, size and seed give the same cameras. Memory: a sample of at most
     30,000 Gaussians, and masks of the scene.
@@ -116,7 +116,8 @@ def _middle_of_room(known: Survey) -> Float[Tensor, "3"] | None:
     if float(clearance.amax()) < _FREE or _enclosure(points - best, known.up) < _ENCLOSED:
         return None
     middle = center + (0.58 * (high - low) + low) * known.up
-    return known.frame.center + known.frame.radius * middle
+    place: Tensor = known.frame.center + known.frame.radius * middle
+    return place
 
 
 def _enclosure(offsets: Float[Tensor, "v 3"], up: Float[Tensor, "3"]) -> float:

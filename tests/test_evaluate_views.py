@@ -1,0 +1,196 @@
+"""Automatic views: up, inside or outside, and cameras that stand well."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+import cvtgs
+from cvtgs.evaluate import automatic_views
+from cvtgs.evaluate.probes import probe
+from cvtgs.evaluate.survey import survey
+from cvtgs.evaluate.views import _stands
+from cvtgs.math import quaternions
+from cvtgs.render import render
+from cvtgs.synthetic import KINDS
+from scenes import random_scene
+
+COUNT = 20_000
+HALF = math.sqrt(0.5)
+TURNS = {"y-down": (1.0, 0.0, 0.0, 0.0), "z-up": (HALF, -HALF, 0.0, 0.0)}
+
+
+def generated(kind: str, count: int = COUNT) -> cvtgs.GaussianScene:
+    return cvtgs.synthetic.scene(kind, count, sh_degree=0, seed=1)
+
+
+def turned(scene: cvtgs.GaussianScene, quat: tuple[float, ...]) -> cvtgs.GaussianScene:
+    matrix = quaternions.to_matrices(torch.tensor([quat]))[0]
+    frames = quaternions.to_matrices(quaternions.normalize(scene.quats))
+    tensors = {
+        "means": scene.means @ matrix.T,
+        "quats": quaternions.from_matrices(matrix @ frames),
+    }
+    return scene.with_tensors(tensors, scene.extras)
+
+
+def with_rows(scene: cvtgs.GaussianScene, **changes: Tensor) -> cvtgs.GaussianScene:
+    """Append copies of the first Gaussian with other values."""
+    count = len(next(iter(changes.values())))
+    extra = scene.select(torch.zeros(count, dtype=torch.long)).with_tensors(changes, {})
+    tensors = {
+        name: torch.cat([old, extra.tensors()[name]]) for name, old in scene.tensors().items()
+    }
+    return scene.with_tensors(tensors, {})
+
+
+def with_flyaways(scene: cvtgs.GaussianScene, count: int = 40) -> cvtgs.GaussianScene:
+    g = torch.Generator().manual_seed(5)
+    return with_rows(
+        scene,
+        means=1e4 * torch.randn(count, 3, generator=g),
+        log_scales=torch.full((count, 3), 3.0),
+        logit_opacities=torch.full((count,), 4.0),
+    )
+
+
+def ups(cameras: cvtgs.Cameras) -> Tensor:
+    return -cameras.viewmats[:, 1, :3]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("turn", TURNS)
+def test_views_of_every_kind(kind, turn):
+    scene = turned(generated(kind), TURNS[turn])
+    cameras = automatic_views(scene, 6, width=48, height=36)
+    up = quaternions.to_matrices(torch.tensor([TURNS[turn]]))[0] @ torch.tensor([0.0, -1.0, 0.0])
+    assert (ups(cameras) @ up > 0.5).all(), "pictures are upright"
+    pictures = render(scene, cameras, depth=True)
+    assert (pictures.alpha.mean(dim=(1, 2)) > 0.1).all(), "no picture is empty"
+    radius = survey(scene).frame.radius
+    near = (pictures.alpha > 0.5) & (pictures.depth < 0.1 * radius)
+    assert (near.float().mean(dim=(1, 2)) < 0.05).all(), "nothing is before the lens"
+    assert (pictures.rgb.std(dim=(1, 2)).mean(dim=1) > 0.02).all(), "there is something to see"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_only_the_room_is_seen_from_inside(kind):
+    known = survey(generated(kind))
+    stands = _stands(known, 4, size=(64, 48), turn=0.5)
+    assert stands.inside == (kind == "room")
+    distances = torch.linalg.vector_norm(stands.rounds[0].centers.double() - known.center, dim=1)
+    assert (distances < known.radius).all() == (kind == "room")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_flyaways_change_next_to_nothing(kind):
+    scene = generated(kind)
+    plain = automatic_views(scene, 4, width=32, height=24)
+    strewn = automatic_views(with_flyaways(scene), 4, width=32, height=24)
+    radius = survey(scene).frame.radius
+    moves = torch.linalg.vector_norm(plain.centers - strewn.centers, dim=1)
+    assert float(moves.median()) < 0.3 * radius
+
+
+def test_a_camera_inside_of_a_floater_moves():
+    scene = generated("object")
+    first = automatic_views(scene, 4, width=32, height=24)
+    blocked = with_rows(
+        scene,
+        means=first.centers[:1],
+        log_scales=torch.full((1, 3), math.log(0.4)),
+        logit_opacities=torch.tensor([6.0]),
+    )
+    again = automatic_views(blocked, 4, width=32, height=24)
+    moves = torch.linalg.vector_norm(first.centers - again.centers, dim=1)
+    assert float(moves[0]) > 0.4
+    known = survey(blocked)
+    reach = torch.linalg.vector_norm(again.centers.double() - known.center, dim=1)
+    assert bool(probe(known, again, reach=reach, inside=False).good.all())
+
+
+def test_a_wall_before_the_camera_makes_it_move():
+    scene = generated("object")
+    first = automatic_views(scene, 1, width=32, height=24)
+    grid = torch.linspace(-0.6, 0.6, 13)
+    right, down, ahead = first.viewmats[0, :3, :3]
+    spots = torch.cartesian_prod(grid, grid)
+    wall = first.centers + 0.8 * ahead + spots[:, :1] * right + spots[:, 1:] * down
+    walled = with_rows(
+        scene,
+        means=wall,
+        log_scales=torch.full((len(wall), 3), math.log(0.06)),
+        logit_opacities=torch.full((len(wall),), 6.0),
+    )
+    again = automatic_views(walled, 1, width=32, height=24)
+    seen = render(walled, again, depth=True)
+    before = render(walled, first, depth=True)
+    assert float((before.depth < 1.0).float().mean()) > 0.3
+    assert float(((seen.alpha > 0.5) & (seen.depth < 1.0)).float().mean()) < 0.1
+
+
+def test_same_scene_same_views():
+    scene = generated("courtyard", 5000)
+    one, two = (automatic_views(scene, 5, width=40, height=30) for _ in range(2))
+    assert torch.equal(one.viewmats, two.viewmats)
+    assert one.names == ("view 1", "view 2", "view 3", "view 4", "view 5")
+    assert (one.width, one.height) == (40, 30)
+    other = automatic_views(scene, 5, width=40, height=30, seed=1)
+    assert not torch.equal(one.viewmats, other.viewmats)
+
+
+def test_the_scene_is_in_the_middle_of_upright_pictures():
+    scene = turned(generated("object"), (0.9, 0.2, 0.1, 0.3))
+    cameras = automatic_views(scene, 4, width=64, height=64)
+    center = scene.means.median(dim=0).values
+    local = cameras.viewmats[:, :3, :3] @ center + cameras.viewmats[:, :3, 3]
+    assert (local[:, :2].abs() < 0.2 * local[:, 2:]).all()
+    matrix = quaternions.to_matrices(quaternions.normalize(torch.tensor([[0.9, 0.2, 0.1, 0.3]])))[0]
+    assert (ups(cameras) @ (matrix @ torch.tensor([0.0, -1, 0])) > 0.7).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 50])
+def test_few_gaussians_have_views_too(count):
+    scene = random_scene(count, seed=count)
+    cameras = automatic_views(scene, 3, width=32, height=24)
+    assert bool(torch.isfinite(cameras.viewmats).all())
+    assert len(cameras) == 3
+
+
+def test_faint_coinciding_and_flat_scenes_have_views():
+    scene = random_scene(200)
+    faint = scene.with_tensors({"logit_opacities": torch.full((200,), -5.0)}, {})
+    heap = scene.with_tensors({"means": torch.ones(200, 3)}, {})
+    flat = scene.with_tensors({"means": scene.means * torch.tensor([1.0, 1.0, 0.0])}, {})
+    for one in (faint, heap, flat, with_flyaways(heap, 3)):
+        assert bool(torch.isfinite(automatic_views(one, 2, width=32, height=24).viewmats).all())
+
+
+def test_infinite_opacities_and_bad_rows_are_no_obstacle():
+    scene = generated("object", 2000)
+    logits = scene.logit_opacities.clone()
+    logits[:10] = math.inf
+    means = scene.means.clone()
+    means[20:30] = math.nan
+    damaged = scene.with_tensors({"logit_opacities": logits, "means": means}, {})
+    assert bool(torch.isfinite(automatic_views(damaged, 2, width=32, height=24).viewmats).all())
+
+
+def test_double_precision_scenes_have_views():
+    scene = generated("object", 2000)
+    double = scene.with_tensors({k: v.double() for k, v in scene.tensors().items()}, {})
+    assert automatic_views(double, 2, width=32, height=24).viewmats.dtype == torch.float32
+
+
+def test_bad_arguments():
+    scene = random_scene(10)
+    for words, text in (
+        ({"count": 0}, "count must be at least 1, found 0."),
+        ({"width": 0}, "width must be at least 1, found 0."),
+    ):
+        with pytest.raises(ValueError, match=text):
+            automatic_views(scene, **words)
+    bad = scene.with_tensors({"means": torch.full((10, 3), math.nan)}, {})
+    with pytest.raises(cvtgs.errors.InvalidSceneError, match="none of 10 is valid"):
+        automatic_views(bad)
