@@ -29,7 +29,7 @@ ABLATION: Mapping[str, Mapping[str, str]] = {
     "enclosed count fully": {"cvt.hidden_share": "1"},
     "weight by opacity (power 0)": {"cvt.area_power": "0"},
     "weight power 0.5": {"cvt.area_power": "0.5"},
-    "weight by mass (power 1)": {"cvt.area_power": "1"},
+    "weight power 0.8": {"cvt.area_power": "0.8"},
     "far not contracted": {"cvt.unbounded": "off"},
     "seeds only, no Lloyd": {"cvt.iterations": "0"},
     "20 Lloyd iterations over all": {"cvt.iterations": "20", "cvt.samples_per_site": "0"},

@@ -54,7 +54,7 @@ class TessellationConfig(_Section):
         backend: What searches the nearest site; ``auto`` takes scipy on a CPU, else torch.
     """
 
-    area_power: float = pydantic.Field(default=0.9, ge=0.0, le=2.0)
+    area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)
     perspective: bool = True
     hidden_share: Share = 0.1
     weight_floor: float = pydantic.Field(default=1e-3, ge=0.0)

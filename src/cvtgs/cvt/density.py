@@ -16,9 +16,8 @@ def tessellation_weights(
 ) -> Float[Tensor, "n"]:
     """Give the weight of every Gaussian.
 
-    The mass (power 1) says how much of a picture a Gaussian paints. But a large Gaussian is
-    smooth inside: it needs fewer sites per painted area than many small ones, hence a power
-    below 1.
+    The mass (power 1) says how much of a picture a Gaussian paints. A power below 1 gives small
+    Gaussians, which carry fine texture, more cells at the cost of large, smooth surfaces.
 
     Args:
         opacities: Opacities.
