@@ -56,3 +56,10 @@ def speed(session: nox.Session) -> None:
     """Time and memory of whole runs; takes minutes, wants a quiet machine."""
     session.install(*CONSTRAINTS, ".")
     session.run("python", "-m", "benchmarks.speed", *session.posargs)
+
+
+@nox.session
+def browser(session: nox.Session) -> None:
+    """Load the comparison page in a real headless browser (Debian package chromium)."""
+    session.install(*CONSTRAINTS, "-e", ".[test]")
+    session.run("pytest", "tests/test_page_browser.py", *session.posargs)

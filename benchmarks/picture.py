@@ -31,8 +31,8 @@ def main() -> None:
 
 def camera() -> Cameras:
     """Stand at the edge of the courtyard (y points down) and look at its middle."""
-    eye, target = torch.tensor([[4.2, -2.6, -5.6]]), torch.tensor([[0.0, -0.9, 0.0]])
-    focal = 1.1 * SIZE
+    eye, target = torch.tensor([[2.9, -2.3, -4.0]]), torch.tensor([[-0.2, -0.8, 0.0]])
+    focal = 0.95 * SIZE
     intrinsics = torch.tensor([[[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]]])
     return Cameras(
         viewmats=look_at(eye, target, torch.tensor([0.0, -1.0, 0.0])),

@@ -21,16 +21,22 @@ from cvtgs.evaluate import EvaluationSettings, automatic_views, evaluate
 Scores = list[tuple[float, float]]
 Scorer = Callable[[cvtgs.GaussianScene, list[cvtgs.GaussianScene]], Scores]
 
+
+def powers(power: str) -> dict[str, str]:
+    return {"cvt.area_power": power, "cvt.unbounded_area_power": power}
+
+
 ABLATION: Mapping[str, Mapping[str, str]] = {
     "standard": {},
     "by position only": {"cvt.color": "0"},
     "colour as for 10,000 cells": {"cvt.color_power": "0"},
     "no perspective": {"cvt.perspective": "false"},
     "enclosed count fully": {"cvt.hidden_share": "1"},
-    "weight by opacity (power 0)": {"cvt.area_power": "0"},
-    "weight power 0.5": {"cvt.area_power": "0.5"},
-    "weight power 0.8": {"cvt.area_power": "0.8"},
-    "far not contracted": {"cvt.unbounded": "off"},
+    "weight by opacity (power 0)": powers("0"),
+    "weight power 0.5": powers("0.5"),
+    "weight power 0.8": powers("0.8"),
+    "weight power 1 everywhere": powers("1"),
+    "unbounded not told": {"cvt.unbounded": "off"},
     "seeds only, no Lloyd": {"cvt.iterations": "0"},
     "20 Lloyd iterations over all": {"cvt.iterations": "20", "cvt.samples_per_site": "0"},
     "paper's filter": {"filter.max_mass_share": "1"},

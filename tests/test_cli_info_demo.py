@@ -1,6 +1,7 @@
 """``cvtgs info`` and ``cvtgs demo``."""
 
 import cvtgs
+from cvtgs.cli import demo
 from cvtgs.cli.display import size_text
 from cvtgs.cli.main import main
 
@@ -24,7 +25,9 @@ def test_info_as_json_is_the_scene_info(tmp_path, capsys):
     assert facts == cvtgs.describe(cvtgs.load(path))
 
 
-def test_demo_writes_four_scenes_and_a_page_and_says_what_is_next(tmp_path, capsys):
+def test_demo_writes_four_scenes_and_a_page_and_says_what_is_next(tmp_path, capsys, monkeypatch):
+    for name, value in (("VIEWS", 2), ("WIDTH", 64), ("HEIGHT", 48)):
+        monkeypatch.setattr(demo, name, value)
     folder = tmp_path / "demo"
     words = ["demo", "-o", str(folder), "--count", "3000"]
     assert main(words) == 0

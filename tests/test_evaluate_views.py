@@ -16,7 +16,7 @@ from cvtgs.render import render
 from cvtgs.synthetic import KINDS
 from scenes import random_scene
 
-COUNT = 20_000
+COUNT = 10_000
 HALF = math.sqrt(0.5)
 TURNS = {"y-down": (1.0, 0.0, 0.0, 0.0), "z-up": (HALF, -HALF, 0.0, 0.0)}
 

@@ -37,6 +37,8 @@ class TessellationConfig(_Section):
     Attributes:
         area_power: A Gaussian weighs its opacity times its mean projected area to this power: 0
             is the opacity alone, 1 the mass.
+        unbounded_area_power: The same in unbounded scenes, where the few huge and smooth Gaussians
+            of a sky would take too many cells.
         perspective: Whether areas count as they look from the middle of the scene, smaller when
             far.
         hidden_share: What an enclosed Gaussian counts, as a share of a free one; 1 does not look at
@@ -55,6 +57,7 @@ class TessellationConfig(_Section):
     """
 
     area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)
+    unbounded_area_power: float = pydantic.Field(default=0.8, ge=0.0, le=2.0)
     perspective: bool = True
     hidden_share: Share = 0.1
     weight_floor: float = pydantic.Field(default=1e-3, ge=0.0)
@@ -214,6 +217,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "filter": {"max_mass_share": 1.0},
         "cvt": {
             "area_power": 0.0,
+            "unbounded_area_power": 0.0,
             "perspective": False,
             "hidden_share": 1.0,
             "weight_floor": 0.0,

@@ -39,8 +39,8 @@ class EffectPlan(pydantic.BaseModel):
     Attributes:
         view_dependence: Colour depends on the direction of view: SH bands above the constant.
         antialiasing: The scene was trained with anti-aliasing, and its tag is kept.
-        unbounded: Part of the mass is far away: weights fall off with distance, and far
-            positions are contracted.
+        unbounded: Part of the mass is far away: far positions are contracted, and huge, smooth
+            Gaussians such as those of a sky get fewer cells.
         extras: Columns beyond the standard ones are carried along.
     """
 

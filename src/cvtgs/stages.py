@@ -61,7 +61,11 @@ def run_stages(
         weights = cvt.tessellation_weights(
             valid.opacities[rows],
             outlook.seen_areas[rows],
-            area_power=config.cvt.area_power,
+            area_power=(
+                config.cvt.unbounded_area_power
+                if outlook.plan.unbounded.active
+                else config.cvt.area_power
+            ),
             floor=config.cvt.weight_floor,
         )
         tessellation = cvt.tessellate(

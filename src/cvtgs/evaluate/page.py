@@ -101,7 +101,7 @@ def _small(
 ) -> dict[str, Any]:
     pictures = comparison.small[scores.name]
     return {
-        **scores.model_dump(mode="json"),
+        **json.loads(scores.model_dump_json()),  # which writes infinity as text
         "bytes": comparison.sizes.get(scores.name),
         "pictures": list(_addresses(pictures, quality, factor)),
         "errors": list(_addresses(_errors(comparison.full, pictures), quality - 10, factor)),

@@ -16,7 +16,8 @@ from cvtgs.scene import GaussianScene
 MOST_GAUSSIANS = 30_000
 """Larger scenes are looked at through a sample of this many Gaussians."""
 
-_HEAVIEST = 10_000
+_HEAVIEST = 5_000
+_MOST_PLACES = 100_000
 _VISIBLE = 0.1
 _BOUNDED = 3.2
 _FAR = 4.0
@@ -68,22 +69,19 @@ def survey(scene: GaussianScene) -> Survey:
         >>> survey(make("object", 2000, seed=0)).bounded
         True
     """
-    sample = _sample(_valid(scene))
-    visible = sample.means[sample.opacities > _VISIBLE]
-    frame = robust_frame(visible if len(visible) else sample.means)
-    voxels = voxels_of(sample, frame)
-    up = find_up(voxels, _far_directions(sample, frame))
-    places = voxels.points if len(voxels.points) else sample.means.new_zeros(1, 3).double()
-    distances = frame.distances(visible if len(visible) else sample.means)
-    bounded = float(torch.quantile(distances, 0.97)) < _BOUNDED
+    valid = _valid(scene)
+    sample, places = _sample(valid), _visible_places(valid)
+    frame = robust_frame(places)
+    voxels, local = voxels_of(sample, frame), frame.normalize(places)
+    distances = torch.linalg.vector_norm(local, dim=1)
+    bounded = float(distances.quantile(0.97)) < _BOUNDED
+    up = find_up(voxels, _far_directions(local, distances))
+    places = voxels.points if len(voxels.points) else local[:1]
     low, high = places.quantile(places.new_tensor(_EXTENT), dim=0)
     heights = (places @ up).quantile(places.new_tensor(_EXTENT))
     middle = 0.5 * (low + high) if bounded else torch.zeros_like(low)
-    if bounded:
-        spread = torch.linalg.vector_norm(places - middle, dim=1)
-        radius = float(spread.quantile(0.98))
-    else:
-        radius = 1.0
+    spread = torch.linalg.vector_norm(places - middle, dim=1)
+    radius = float(spread.quantile(0.98)) if bounded else 1.0
     return Survey(
         sample=sample,
         frame=frame,
@@ -107,9 +105,18 @@ def _valid(scene: GaussianScene) -> GaussianScene:
     return scene.select(~bad) if bool(bad.any()) else scene
 
 
-def _far_directions(sample: GaussianScene, frame: RobustFrame) -> Float[Tensor, "k 3"]:
-    places = frame.normalize(sample.means[sample.opacities > _VISIBLE])
-    far = places[torch.linalg.vector_norm(places, dim=1) > _FAR]
+def _visible_places(scene: GaussianScene) -> Float[Tensor, "k 3"]:
+    """Give the positions of every k-th Gaussian that is not faint; of any if all are."""
+    step = -(-len(scene) // _MOST_PLACES)
+    means = scene.means[::step].cpu()
+    visible = means[(scene.opacities[::step] > _VISIBLE).cpu()]
+    return visible if len(visible) else means
+
+
+def _far_directions(
+    places: Float[Tensor, "k 3"], distances: Float[Tensor, "k"]
+) -> Float[Tensor, "f 3"]:
+    far = places[distances > _FAR]
     few = len(far) < _FAR_SHARE * len(places)
     return torch.nn.functional.normalize(far[:0] if few else far, dim=1)
 

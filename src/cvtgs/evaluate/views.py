@@ -1,6 +1,8 @@
 """Automatic views: from where to look at a scene of which nothing is known."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
@@ -9,6 +11,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.evaluate.evaluate import view_names
 from cvtgs.evaluate.probes import probe
 from cvtgs.evaluate.stands import Stands, inside_stands, outside_stands
 from cvtgs.evaluate.survey import Survey, survey
@@ -17,7 +20,7 @@ from cvtgs.scene import GaussianScene
 _ENCLOSED = 0.7
 """A room hides this share of the upper half of what a camera in its middle could see."""
 
-_WITHIN = 0.6
+_WITHIN = 0.5
 """From within a room one sees this share of what is seen from around it; in a vase, less."""
 
 _NEAR = 2.2
@@ -76,11 +79,23 @@ def automatic_views(
     for name, value in (("count", count), ("width", width), ("height", height)):
         if value < 1:
             raise InvalidArgumentError(f"{name} must be at least 1, found {value}.")
-    known = survey(scene)
     size, turn = (width, height), 0.5 + seed * _GOLDEN
-    stands = _stands(known, count, size=size, turn=turn)
-    names = tuple(f"view {number}" for number in range(1, count + 1))
-    return replace(_best(known, stands), names=names)
+    with _one_thread():
+        known = survey(scene)
+        stands = _stands(known, count, size=size, turn=turn)
+        cameras = _best(known, stands)
+    return replace(cameras, names=view_names(cameras))
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Make torch use one thread: pieces this small only wait for one another on several."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _stands(known: Survey, count: int, *, size: tuple[int, int], turn: float) -> Stands:
