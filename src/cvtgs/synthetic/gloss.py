@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.math.spherical_harmonics import degree_of, rest_basis
+
 _BANDS = (1.0, 0.9, 0.72, 0.5)
 """How much of each band a highlight keeps: falling, so that it does not ring."""
 
@@ -26,13 +28,13 @@ def highlights(
     Returns:
         What is added to the colour on average, and the view-dependent coefficients.
     """
-    degree = math.isqrt(rest_count + 1) - 1
-    weights = [_BANDS[band] for band in range(degree + 1) for _ in range(2 * band + 1)]
-    peak = sum(weights) / (4 * math.pi)
-    basis = _basis(directions)[:, : rest_count + 1] * (torch.tensor(weights) / peak)
+    degree = degree_of(rest_count)
     if degree == 0:
         return 0.15 * peaks, torch.zeros(len(directions), 0, 3)
-    return peaks / (4 * math.pi * peak), basis[:, 1:, None] * peaks[:, None, :]
+    weights = [_BANDS[band] for band in range(degree + 1) for _ in range(2 * band + 1)]
+    peak = sum(weights) / (4 * math.pi)
+    rest = rest_basis(directions, degree) * (torch.tensor(weights[1:]) / peak)
+    return peaks / (4 * math.pi * peak), rest[:, :, None] * peaks[:, None, :]
 
 
 def mirrored(
@@ -48,22 +50,3 @@ def mirrored(
         Unit vectors from the camera to the surface.
     """
     return toward_light - 2 * (normals @ toward_light)[:, None] * normals
-
-
-def _basis(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 16"]:
-    """Evaluate the real spherical harmonics of degree 0 to 3 with the signs of 3DGS files."""
-    x, y, z = directions.unbind(1)
-    xx, yy, zz = x * x, y * y, z * z
-    values = [
-        torch.full_like(x, 0.28209479177387814),
-        -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
-        1.0925484305920792 * x * y, -1.0925484305920792 * y * z,
-        0.31539156525252005 * (2 * zz - xx - yy),
-        -1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy),
-        -0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4 * zz - xx - yy),
-        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-        -0.4570457994644658 * x * (4 * zz - xx - yy),
-        1.445305721320277 * z * (xx - yy), -0.5900435899266435 * x * (xx - 3 * yy),
-    ]  # fmt: skip
-    return torch.stack(values, dim=1)
