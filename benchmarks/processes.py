@@ -5,7 +5,6 @@ import platform
 import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,20 +34,26 @@ def run_python(*arguments: str) -> Cost:
 
 def run(command: Sequence[str]) -> Cost:
     """Run a command and measure it; a failure ends the benchmark."""
-    start = time.perf_counter()
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        output = process.stdout.read() if process.stdout else ""
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise SystemExit(f"{' '.join(command)} failed with exit code {process.returncode}.")
-    unit = 1 if sys.platform == "darwin" else 1024
-    return Cost(
-        user_seconds=usage.ru_utime,
-        wall_seconds=time.perf_counter() - start,
-        peak_bytes=usage.ru_maxrss * unit,
-        output=output,
+    launched = subprocess.run(
+        [sys.executable, "-S", "-c", LAUNCHER, *command], stdout=subprocess.PIPE, check=False
     )
+    output, _, line = launched.stdout.decode().rstrip("\n").rpartition("\n")
+    code, user, wall, peak = (float(number) for number in line.split())
+    if code:
+        raise SystemExit(f"{' '.join(command)} failed with exit code {code:.0f}.")
+    unit = 1 if sys.platform == "darwin" else 1024
+    return Cost(user_seconds=user, wall_seconds=wall, peak_bytes=int(peak) * unit, output=output)
+
+
+# A process inherits the peak of the one that starts it, so a small one must start it.
+LAUNCHER = """
+import os, sys, time
+start = time.perf_counter()
+process = os.spawnvp(os.P_NOWAIT, sys.argv[1], sys.argv[1:])
+_, status, usage = os.wait4(process, 0)
+wall = time.perf_counter() - start
+print(f"\\n{os.waitstatus_to_exitcode(status)} {usage.ru_utime} {wall} {usage.ru_maxrss}")
+"""
 
 
 def spread(values: Sequence[float]) -> str:

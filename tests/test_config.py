@@ -28,7 +28,7 @@ def test_standard_is_what_no_choice_gives():
 def test_paper_is_cvt_gs():
     paper = SimplifyConfig.from_preset("paper")
     assert paper.preset == "paper"
-    assert paper.filter == FilterConfig(min_opacity=0.1, max_mass_share=1.0)
+    assert paper.filter == FilterConfig(min_opacity=0.1, max_mass_share=1.0, max_flyaway_share=0.0)
     assert paper.cvt.area_power == paper.merge.area_power == 0.0
     assert not paper.cvt.perspective
     assert (paper.cvt.color, paper.cvt.unbounded, paper.cvt.iterations) == (0.0, "off", 5)

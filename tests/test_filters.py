@@ -3,7 +3,13 @@
 import pytest
 import torch
 
-from cvtgs.filters import invalid_rows, standardized, visible_rows, with_finite_opacities
+from cvtgs.filters import (
+    flyaway_rows,
+    invalid_rows,
+    standardized,
+    visible_rows,
+    with_finite_opacities,
+)
 from scenes import random_scene, same_bits
 
 NAN, INF = float("nan"), float("inf")
@@ -129,3 +135,16 @@ def test_standard_rows_have_opacities_inside():
     small = standardized(scene.with_tensors({"logit_opacities": logits}, {}))
     assert bool(((small.opacities > 0) & (small.opacities < 1)).all())
     assert small.logit_opacities[2].item() == 2.0
+
+
+def test_flyaways_are_far_and_paint_nothing():
+    distances = torch.tensor([1.0, 30.0, 1e6, 1e3, 200.0])
+    masses = torch.tensor([1.0, 5.0, 1e-9, 1e-8, 3.0])
+    found = flyaway_rows(distances, masses, max_share=1e-3)
+    assert found.tolist() == [False, False, True, True, False]
+    assert not bool(flyaway_rows(distances, masses, max_share=0.0).any())
+
+
+def test_a_crowd_of_flyaways_stays_when_its_mass_is_real():
+    distances, masses = torch.full((10,), 1e3), torch.ones(10)
+    assert int(flyaway_rows(distances, masses, max_share=0.35).sum()) == 3

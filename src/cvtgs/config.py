@@ -25,10 +25,13 @@ class FilterConfig(_Section):
         min_opacity: Only Gaussians fainter than this may be left out.
         max_mass_share: They are left out, faintest first, while they hold at most this share of
             the scene's mass; 1 leaves all of them out.
+        max_flyaway_share: Gaussians beyond 100 robust radii are left out, the least first, while
+            they hold at most this share of the mass as seen from the middle.
     """
 
     min_opacity: Share = 0.1
     max_mass_share: Share = 0.01
+    max_flyaway_share: Share = 1e-3
 
 
 class TessellationConfig(_Section):
@@ -65,9 +68,9 @@ class TessellationConfig(_Section):
     color_power: float = pydantic.Field(default=-0.25, ge=-1.0, le=1.0)
     unbounded: Literal["auto", "on", "off"] = "auto"
     seeding: Literal["stratified", "weighted"] = "stratified"
-    iterations: int = pydantic.Field(default=5, ge=0)
+    iterations: int = pydantic.Field(default=4, ge=0)
     tolerance: float = pydantic.Field(default=1e-3, ge=0.0)
-    samples_per_site: int = pydantic.Field(default=24, ge=0)
+    samples_per_site: int = pydantic.Field(default=12, ge=0)
     backend: Literal["auto", "scipy", "torch"] = "auto"
 
 
@@ -214,7 +217,7 @@ class SimplifyConfig(_Section):
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "standard": {},
     "paper": {
-        "filter": {"max_mass_share": 1.0},
+        "filter": {"max_mass_share": 1.0, "max_flyaway_share": 0.0},
         "cvt": {
             "area_power": 0.0,
             "unbounded_area_power": 0.0,

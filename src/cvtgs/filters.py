@@ -84,6 +84,39 @@ def visible_rows(
     return keep
 
 
+def flyaway_rows(
+    distances: Float[Tensor, "n"], masses: Float[Tensor, "n"], *, max_share: float
+) -> Bool[Tensor, "n"]:
+    """Find Gaussians that lie absurdly far away and paint next to nothing.
+
+    Merged with others they would become one huge blob. A sky has real mass, and stays.
+
+    Args:
+        distances: Distances from the middle of the scene, in robust radii.
+        masses: Masses as seen from there.
+        max_share: The least massive ones are found, while they hold at most this share.
+
+    Returns:
+        Mask of the flyaways.
+
+    Example:
+        >>> flyaway_rows(
+        ...     torch.tensor([1.0, 1e6]), torch.tensor([1.0, 1e-12]), max_share=1e-3
+        ... ).tolist()
+        [False, True]
+    """
+    far = (distances > FLYAWAY_RADII).nonzero()[:, 0]
+    far = far[torch.sort(masses[far], stable=True).indices]
+    lost = masses[far].double().cumsum(0)
+    found = torch.zeros(len(distances), dtype=torch.bool, device=distances.device)
+    found[far[lost <= max_share * masses.double().sum()]] = True
+    return found
+
+
+FLYAWAY_RADII = 100.0
+"""In robust radii: no sky lies so far."""
+
+
 def with_finite_opacities(scene: GaussianScene) -> GaussianScene:
     """Replace infinite opacity logits, which are valid input, by the largest finite ones.
 

@@ -145,10 +145,26 @@ def _filter(
         max_mass_share=config.filter.max_mass_share,
         at_least=target,
     )
+    keep = _without_flyaways(scene, keep, outlook, target, config)
     masses = outlook.areas * opacities
     left_out = divide(masses[~keep].sum(), masses.sum())
     facts = {"filtered_count": int((~keep).sum()), "filtered_mass_share": float(left_out)}
     return keep.nonzero()[:, 0], facts
+
+
+def _without_flyaways(
+    scene: GaussianScene, keep: Tensor, outlook: _Outlook, target: int, config: SimplifyConfig
+) -> Tensor:
+    share = config.filter.max_flyaway_share
+    if share == 0.0:
+        return keep
+    distances = outlook.frame.distances(scene.means)
+    if float(distances.amax()) <= filters.FLYAWAY_RADII:
+        return keep
+    seen = outlook.areas * scene.opacities * cvt.falloff(scene.means, outlook.frame)
+    flown = filters.flyaway_rows(distances, seen, max_share=share)
+    fewer = keep & ~flown
+    return fewer if int(fewer.sum()) >= target else keep
 
 
 def _place(

@@ -82,6 +82,8 @@ def _merge_chunk(
         "sh0": weighted_mean(scene.sh0[rows], weights, offsets),
         "shN": weighted_mean(scene.shN[rows], weights, offsets),
     }
+    if not scene.extras:
+        return tensors, {}
     heaviest = rows[segment_argmax(members.opacities * members.areas, offsets)]
     extras = {
         name: weighted_mean(column[rows], weights, offsets).to(column.dtype)

@@ -18,6 +18,7 @@ REACH = 6
 MAX_DEPTH = 1e6
 FIXED_POINT = 2**20
 
+SLAB = 32
 CHUNK = 1 << 16
 """Gaussians that are looked at together, to bound memory."""
 
@@ -40,7 +41,7 @@ def openness(
 
     Returns:
         Numbers from 0 (enclosed) to 1 (free) in float64; 1 beyond the grid. Memory is some
-        50 MB for the grid, and ``12 n`` bytes.
+        35 MB for the grid, and ``12 n`` bytes.
 
     Example:
         >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
@@ -81,13 +82,14 @@ def _light(grid: Float[Tensor, "g g g"]) -> Float[Tensor, "g g g"]:
     """Average the light that comes through the next voxels in the six directions."""
     light = torch.zeros_like(grid)
     for axis in range(3):
-        running = grid.cumsum(axis).movedim(axis, 0)
-        # Repeated at the ends, so that a window that leaves the grid meets nothing there.
-        first, last = torch.zeros_like(running[:1]), running[-1:]
-        running = torch.cat([*[first] * (REACH + 1), running, *[last] * REACH])
-        size = len(grid)
-        before = running[REACH : REACH + size] - running[:size]
-        beyond = running[2 * REACH + 1 :] - running[REACH + 1 : REACH + 1 + size]
-        for depth in (before, beyond):
-            light += depth.neg_().exp_().movedim(0, axis)
+        # A view with the axis first, in slabs of the next axis, to bound memory.
+        slabs = grid.movedim(axis, 0).split(SLAB, dim=1)
+        for slab, target in zip(slabs, light.movedim(axis, 0).split(SLAB, dim=1), strict=True):
+            running = slab.cumsum(0)
+            # Repeated at the ends, so that a window that leaves the grid meets nothing there.
+            first, last = torch.zeros_like(running[:1]), running[-1:]
+            running = torch.cat([*[first] * (REACH + 1), running, *[last] * REACH])
+            here = running[REACH + 1 : REACH + 1 + len(slab)]
+            target.add_(torch.exp(running[: len(slab)] - running[REACH : REACH + len(slab)]))
+            target.add_(torch.exp(here - running[2 * REACH + 1 :]))
     return light.div_(6)
