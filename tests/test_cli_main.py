@@ -78,10 +78,11 @@ def test_the_parser_is_made_anew():
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_leaves_no_output_behind(tmp_path, number, code):
     source = tmp_path / "in.ply"
-    cvtgs.save(cvtgs.synthetic.scene("object", 200_000, sh_degree=0, seed=0), source)
+    cvtgs.save(cvtgs.synthetic.scene("object", 400_000, sh_degree=0, seed=0), source)
     output = tmp_path / "out.ply"
-    command = [sys.executable, "-m", "cvtgs", "simplify", source, output, "--rho", "0.3"]
+    command = [sys.executable, "-m", "cvtgs", "simplify", source, output, "--rho", "0.05"]
     settings = ["--set", "cvt.iterations=1000", "--set", "cvt.tolerance=0"]
+    settings += ["--set", "cvt.samples_per_site=0"]
     with subprocess.Popen([*command, *settings], stderr=subprocess.PIPE, text=True) as process:
         wait_for_handler(process.pid, number)
         process.send_signal(number)

@@ -1,7 +1,5 @@
 """``python -m cvtgs``."""
 
-import sys
+from cvtgs.cli.main import run_process
 
-from cvtgs.cli.main import main
-
-sys.exit(main())
+run_process()

@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from types import FrameType
-from typing import TextIO
+from typing import NoReturn, TextIO
 
 import cvtgs
 from cvtgs.cli import compare, demo, evaluate, info, render, simplify
@@ -34,7 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Idle OpenMP threads that spin burn several times the useful work; read when torch starts.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     options = build_parser().parse_args(arguments)
-    signal.signal(signal.SIGTERM, _terminate)
+    interrupt = _Interrupt()
+    before = signal.signal(signal.SIGINT, interrupt), signal.signal(signal.SIGTERM, _terminate)
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         warnings.simplefilter("always", UserWarning)
@@ -43,10 +44,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except CvtgsError as error:
             print(f"cvtgs: error: {error}", file=sys.stderr)
             return 1
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, Exception):
+            # An import that is interrupted may turn the interrupt into an error of its own.
+            if not interrupt.happened:
+                raise
             print("cvtgs: interrupted; nothing was half-written.", file=sys.stderr)
             return INTERRUPTED
+        finally:
+            for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
+                signal.signal(number, handler)
     return 0
+
+
+def run_process() -> NoReturn:
+    """Run the command line as a process of its own, and leave.
+
+    What is done is done: an interrupt while Python shuts down must not spoil the exit code.
+    """
+    code = main()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.exit(code)
+
+
+class _Interrupt:
+    """Raises KeyboardInterrupt on SIGINT, and remembers that it did."""
+
+    def __init__(self) -> None:
+        self.happened = False
+
+    def __call__(self, signum: int, frame: FrameType | None) -> None:
+        self.happened = True
+        raise KeyboardInterrupt
 
 
 def build_parser() -> argparse.ArgumentParser:

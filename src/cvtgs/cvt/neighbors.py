@@ -33,7 +33,7 @@ def nearest_neighbors(
     with_self = min(count + 1, len(sites))
     if backend == "scipy":
         _, found = build_tree(sites).query(
-            np.asarray(sites, np.float64), k=[*range(1, with_self + 1)], workers=-1
+            np.asarray(sites, np.float64), k=[*range(1, with_self + 1)]
         )
         rows = torch.from_numpy(found.astype(np.int64))
     else:
