@@ -18,7 +18,7 @@ FILES = sorted(SOURCE.rglob("*.py"))
 # does; `devices` (names of devices) and `cameras` (data) stand as low as their imports allow.
 LEVELS = [
     {"errors", "progress"},
-    {"math", "devices"},
+    {"math", "devices", "plots"},
     {"config", "scene", "cameras"},
     {"effects"},
     {"report", "io", "filters", "cvt", "cells", "synthetic", "render", "losses"},
@@ -42,6 +42,8 @@ OWNERS = {
     "numba": "render/compiled.py",
     "gsplat": "render/gsplat_backend.py",
     "PIL": "evaluate/images.py",
+    "safetensors": "mergenet/weights.py",
+    "matplotlib": "plots.py",
 }
 HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "matplotlib")
 

@@ -1,7 +1,9 @@
 """GaussianScene: the only thing that travels between stages."""
 
+import copy
 import dataclasses
 import math
+import pickle
 
 import pytest
 import torch
@@ -188,3 +190,12 @@ def test_extra_columns_of_other_shapes_are_errors():
     assert error_of(extras={"heat": torch.zeros(4, 1)}) == (
         "extra column 'heat' must have shape (4,) on cpu, found (4, 1) on cpu."
     )
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda scene: pickle.loads(pickle.dumps(scene))])
+def test_scenes_can_be_copied_and_sent_to_other_processes(copied):
+    scene = random_scene(3, seed=0).with_tensors({}, {"label": torch.arange(3)})
+    other = copied(scene)
+    assert all(torch.equal(other.tensors()[name], value) for name, value in scene.tensors().items())
+    assert torch.equal(other.extras["label"], scene.extras["label"])
+    assert (other.comments, other.layout) == (scene.comments, scene.layout)

@@ -86,12 +86,14 @@ class MergeConfig(_Section):
             every axis.
         covered_widening: How much more it becomes so along an axis on which other cells paint at
             both its ends.
+        network: Whether MergeNet corrects the merged Gaussians.
     """
 
     area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)
     opacity: Literal["saturating", "union"] = "saturating"
     widening: float = pydantic.Field(default=0.1, ge=0.0, le=2.0)
     covered_widening: float = pydantic.Field(default=0.4, ge=0.0, le=2.0)
+    network: bool = True
 
 
 class SimplifyConfig(_Section):

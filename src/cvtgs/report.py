@@ -59,6 +59,7 @@ class SimplifyReport(_Record):
             Lloyd looked at, in squared robust radii.
         energy: The same of the final cells, over all Gaussians.
         backend: What searched the nearest site.
+        checkpoint: What corrected the merged Gaussians: a shipped name, a file, or ``none``.
         device: Where it ran.
         plan: The effects that the scene called for.
         stages: What each stage cost.
@@ -82,6 +83,7 @@ class SimplifyReport(_Record):
     energies: tuple[float, ...] = ()
     energy: float = 0.0
     backend: str = "none"
+    checkpoint: str = "none"
     device: str = "cpu"
     plan: EffectPlan | None = None
     stages: tuple[StageCost, ...] = ()

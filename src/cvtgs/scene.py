@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any, Self
 
@@ -182,6 +183,12 @@ class GaussianScene:
             {name: tensor.to(target) for name, tensor in self.tensors().items()},
             {name: column.to(target) for name, column in self.extras.items()},
         )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let scenes be pickled and deep-copied, though a mapping proxy cannot be."""
+        values: dict[str, Any] = {**self.tensors(), "extras": dict(self.extras)}
+        values |= {"comments": self.comments, "layout": self.layout}
+        return partial(type(self), **values), ()
 
     def __repr__(self) -> str:
         """Say count, degree, dtype and device, not the values."""

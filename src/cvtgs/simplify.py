@@ -1,15 +1,17 @@
 """Simplifier: the one call that users make."""
 
+import copy
 import math
+import os
 from fractions import Fraction
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
 
 from cvtgs.config import SimplifyConfig
 from cvtgs.devices import resolve_device
-from cvtgs.errors import CheckpointError, InvalidArgumentError
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.mergenet import Checkpoint, MergeNet, load_checkpoint
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport, StageClock
 from cvtgs.scene import GaussianScene
@@ -32,37 +34,40 @@ class Simplifier:
     """Makes scenes smaller: N Gaussians in, exactly ``ceil(rho * N)`` standard Gaussians out.
 
     Args:
-        ckpt: MergeNet checkpoint. This version has none: ``None`` merges by moments.
-        config: A configuration, or the name of a preset.
+        ckpt: MergeNet checkpoint: ``standard`` or ``paper``, which come with the package, or a
+            file; ``auto`` is the shipped one of the configuration's preset, ``None`` merges by
+            moments alone.
+        config: A configuration, or the name of a preset; None is the preset of the checkpoint.
         device: Where to compute: ``auto`` stays where the scene is, but takes CUDA for scenes on
             the CPU if there is one; or any torch device. The result is where the scene was.
         listener: Told about progress.
 
     Raises:
-        CheckpointError: A checkpoint was given.
+        CheckpointError: The checkpoint cannot be used.
         ConfigError: There is no such preset.
         DeviceError: There is no such device.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 1000, sh_degree=1, seed=0)
-        >>> Simplifier(device="cpu").simplify(scene, 0.01)
+        >>> Simplifier("standard", device="cpu").simplify(scene, 0.01)
         GaussianScene(10 Gaussians, SH degree 1, float32, cpu)
     """
 
     def __init__(
         self,
-        ckpt: str | Path | None = None,
+        ckpt: str | os.PathLike[str] | None = "auto",
         *,
-        config: SimplifyConfig | str = "standard",
+        config: SimplifyConfig | str | None = None,
         device: str | torch.device = "auto",
         listener: ProgressListener = silent,
     ) -> None:
-        if ckpt is not None:
-            raise CheckpointError(
-                f"this version merges without a network; ckpt must be None, found {str(ckpt)!r}."
-            )
-        self.config = SimplifyConfig.from_preset(config) if isinstance(config, str) else config
+        if isinstance(config, str):
+            config = SimplifyConfig.from_preset(config)
+        self.checkpoint = _checkpoint(ckpt, config)
+        self.config = config or SimplifyConfig.from_preset(
+            "standard" if self.checkpoint is None else self.checkpoint.info.preset
+        )
         self._device = resolve_device(device)
         self._listener = listener
 
@@ -106,24 +111,43 @@ class Simplifier:
         target = target_count(len(scene), rho, count=count)
         device = self._device_for(scene)
         clock = StageClock(self._listener, device)
-        small, facts = run_stages(scene.to(device), target, self.config, clock=clock)
+        small, facts = run_stages(
+            scene.to(device), target, self.config, net=self._net_for(scene, device), clock=clock
+        )
         report = SimplifyReport(
             input_count=len(scene),
             output_count=len(small),
             target_count=target,
             rho=target / len(scene),
             device=str(device),
+            checkpoint="none" if self.checkpoint is None else self.checkpoint.name,
             config=self.config,
             stages=tuple(clock.costs),
             **facts,
         )
         return Simplified(small.to(scene.device), report)
 
+    def _net_for(self, scene: GaussianScene, device: torch.device) -> MergeNet | None:
+        if self.checkpoint is None:
+            return None
+        net = copy.deepcopy(self.checkpoint.net)
+        return net.to(device=device, dtype=scene.dtype)
+
     def _device_for(self, scene: GaussianScene) -> torch.device:
         if self._device is not None:
             return self._device
         moves = scene.device.type == "cpu" and torch.cuda.is_available()
         return torch.device("cuda") if moves else scene.device
+
+
+def _checkpoint(
+    ckpt: str | os.PathLike[str] | None, config: SimplifyConfig | None
+) -> Checkpoint | None:
+    if ckpt is None or (config is not None and not config.merge.network):
+        return None
+    if ckpt == "auto":
+        return load_checkpoint("standard" if config is None else config.preset)
+    return load_checkpoint(ckpt)
 
 
 def target_count(total: int, rho: float | None, *, count: int | None = None) -> int:

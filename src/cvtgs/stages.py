@@ -1,4 +1,4 @@
-"""The stages in order: check, plan, filter, tessellate, merge; no algorithm of its own."""
+"""The stages in order: check, plan, filter, tessellate, merge, network; no algorithm here."""
 
 import warnings
 from typing import Any, NamedTuple
@@ -7,12 +7,14 @@ import torch
 from torch import Tensor
 
 from cvtgs import cells, cvt, filters
-from cvtgs.config import SimplifyConfig, TessellationConfig
+from cvtgs.config import SimplifyConfig
 from cvtgs.effects import EffectPlan, plan_effects
-from cvtgs.errors import DroppedDataWarning, InvalidSceneError
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
 from cvtgs.math.activations import divide
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.morton import morton_order
+from cvtgs.mergenet import MergeNet, correct_cells
+from cvtgs.progress import silent
 from cvtgs.report import StageClock
 from cvtgs.scene import GaussianScene
 
@@ -23,11 +25,39 @@ class _Outlook(NamedTuple):
     frame: RobustFrame
     areas: Tensor
     seen_areas: Tensor
+    light: Tensor
     plan: EffectPlan
+
+    def facts(self, scene: GaussianScene) -> dict[str, Any]:
+        """Give what the report says about it."""
+        return {"plan": self.plan, "mass_in": float((self.areas * scene.opacities).sum())}
+
+
+class Reference(NamedTuple):
+    """A small scene before its network sees it, and what the network needs to see.
+
+    Attributes:
+        scene: The valid Gaussians of the input.
+        merged: One Gaussian per cell.
+        partition: Rows of ``scene`` that make up every cell.
+        neighbors: ``(m, k)`` nearest other cells of every cell.
+        light: ``(n,)`` how freely every Gaussian of ``scene`` can be seen, 0 to 1.
+    """
+
+    scene: GaussianScene
+    merged: GaussianScene
+    partition: cells.Partition
+    neighbors: Tensor
+    light: Tensor
 
 
 def run_stages(
-    scene: GaussianScene, target: int, config: SimplifyConfig, *, clock: StageClock
+    scene: GaussianScene,
+    target: int,
+    config: SimplifyConfig,
+    *,
+    net: MergeNet | None,
+    clock: StageClock,
 ) -> tuple[GaussianScene, dict[str, Any]]:
     """Run the stages.
 
@@ -35,6 +65,7 @@ def run_stages(
         scene: The scene, on the device to compute on.
         target: Number of Gaussians to keep.
         config: Every choice.
+        net: Corrects merged Gaussians, on the same device; None for no correction.
         clock: Measures each stage.
 
     Returns:
@@ -46,14 +77,66 @@ def run_stages(
     """
     with clock.stage("check"):
         valid, facts = _valid_scene(scene, target)
-    with clock.stage("plan"):
-        outlook = _look(valid, config)
-        mass = float((outlook.areas * valid.opacities).sum())
-        facts |= {"plan": outlook.plan, "mass_in": mass}
     if target >= len(valid):
+        with clock.stage("plan"):
+            facts |= _look(valid, config, with_light=False).facts(valid)
         is_whole = target == len(scene)
         small = filters.with_finite_opacities(valid) if is_whole else filters.standardized(valid)
         return small, facts | {"mass_out": float(small.masses.sum())}
+    reference, more = _refer(valid, target, config, with_light=net is not None, clock=clock)
+    small, facts = reference.merged, facts | more
+    if net is not None:
+        with clock.stage("network", target) as advance:
+            small = correct_cells(
+                net,
+                reference.scene,
+                reference.merged,
+                reference.partition,
+                neighbors=reference.neighbors,
+                light=reference.light,
+                on_cells=advance,
+            )
+    small = filters.standardized(small)
+    return small, facts | {"mass_out": float(small.masses.sum())}
+
+
+def make_reference(scene: GaussianScene, target: int, config: SimplifyConfig) -> Reference:
+    """Run the stages up to the network, to train it.
+
+    Args:
+        scene: The scene, on the device to compute on.
+        target: Number of Gaussians to keep, fewer than there are valid ones.
+        config: Every choice.
+
+    Returns:
+        What the network is to correct.
+
+    Raises:
+        InvalidArgumentError: There are no more valid Gaussians than ``target``.
+        InvalidSceneError: The scene has no valid row.
+    """
+    valid, _ = _valid_scene(scene, target)
+    if target >= len(valid):
+        raise InvalidArgumentError(
+            f"target must be below the {len(valid)} valid Gaussians, found {target}."
+        )
+    clock = StageClock(silent, scene.device)
+    reference, _ = _refer(valid, target, config, with_light=True, clock=clock)
+    return reference._replace(merged=filters.standardized(reference.merged))
+
+
+def _refer(
+    valid: GaussianScene,
+    target: int,
+    config: SimplifyConfig,
+    *,
+    with_light: bool,
+    clock: StageClock,
+) -> tuple[Reference, dict[str, Any]]:
+    """Plan, filter, tessellate and merge."""
+    with clock.stage("plan"):
+        outlook = _look(valid, config, with_light=with_light)
+        facts = outlook.facts(valid)
     with clock.stage("filter"):
         rows, filter_facts = _filter(valid, outlook, target, config)
     with clock.stage("tessellate", config.cvt.iterations + 1) as advance:
@@ -75,18 +158,27 @@ def run_stages(
     with clock.stage("merge", target) as advance:
         local = cells.Partition.from_labels(tessellation.labels, target)
         partition = cells.Partition(order=rows[local.order], offsets=local.offsets)
-        small = cells.merge_cells(valid, partition, config=config.merge, on_cells=advance)
-        small = filters.standardized(_widen(small, partition, config, tessellation.backend))
+        merged = cells.merge_cells(valid, partition, config=config.merge, on_cells=advance)
+        widens = config.merge.widening > 0.0 or config.merge.covered_widening > 0.0
+        near = NEIGHBORS if widens or with_light else 0
+        neighbors = cvt.nearest_neighbors(merged.means, near, backend=tessellation.backend)
+        if widens:
+            merged = cells.widen_cells(
+                merged,
+                partition,
+                neighbors,
+                everywhere=config.merge.widening,
+                covered=config.merge.covered_widening,
+            )
     facts |= filter_facts | {
         "single_member_cells": int((partition.counts == 1).sum()),
         "largest_cell": int(partition.counts.amax()),
         "refilled_cells": tessellation.refilled,
-        "mass_out": float(small.masses.sum()),
         "energies": tessellation.energies,
         "energy": tessellation.energy,
         "backend": tessellation.backend,
     }
-    return small, facts
+    return Reference(valid, merged, partition, neighbors, outlook.light), facts
 
 
 def _valid_scene(scene: GaussianScene, target: int) -> tuple[GaussianScene, dict[str, Any]]:
@@ -115,23 +207,18 @@ def _valid_scene(scene: GaussianScene, target: int) -> tuple[GaussianScene, dict
     return scene.select(~dropped), facts
 
 
-def _look(scene: GaussianScene, config: SimplifyConfig) -> _Outlook:
+def _look(scene: GaussianScene, config: SimplifyConfig, *, with_light: bool) -> _Outlook:
     frame, areas = robust_frame(scene.means), scene.areas
-    plan = plan_effects(scene, areas * scene.opacities, frame, unbounded=config.cvt.unbounded)
-    return _Outlook(frame, areas, _seen_areas(scene, areas, frame, config.cvt), plan)
-
-
-def _seen_areas(
-    scene: GaussianScene, areas: Tensor, frame: RobustFrame, config: TessellationConfig
-) -> Tensor:
-    """Give areas as they look from the middle, enclosed ones reduced."""
+    masses = areas * scene.opacities
+    plan = plan_effects(scene, masses, frame, unbounded=config.cvt.unbounded)
+    hides = config.cvt.hidden_share < 1.0
+    light = cvt.openness(scene.means, masses, frame) if hides or with_light else masses[:0]
     seen = areas
-    if config.perspective:
+    if config.cvt.perspective:
         seen = seen * cvt.falloff(scene.means, frame)
-    if config.hidden_share < 1.0:
-        light = cvt.openness(scene.means, areas * scene.opacities, frame)
-        seen = seen * (config.hidden_share + (1 - config.hidden_share) * light)
-    return seen
+    if hides:
+        seen = seen * (config.cvt.hidden_share + (1 - config.cvt.hidden_share) * light)
+    return _Outlook(frame, areas, seen, light, plan)
 
 
 def _filter(
@@ -189,20 +276,5 @@ COLOR_CELLS = 10_000
 """The number of cells that ``cvt.color`` is meant for."""
 
 
-def _widen(
-    small: GaussianScene, partition: cells.Partition, config: SimplifyConfig, backend: str
-) -> GaussianScene:
-    merge = config.merge
-    if merge.widening == 0.0 and merge.covered_widening == 0.0:
-        return small
-    return cells.widen_cells(
-        small,
-        partition,
-        cvt.nearest_neighbors(small.means, WIDENING_NEIGHBORS, backend=backend),
-        everywhere=merge.widening,
-        covered=merge.covered_widening,
-    )
-
-
-WIDENING_NEIGHBORS = 8
-"""Cells around a cell that may cover its ends."""
+NEIGHBORS = 8
+"""Cells around a cell that may cover its ends, and that its network sees."""

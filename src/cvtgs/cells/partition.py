@@ -78,19 +78,23 @@ class Partition:
         offsets = torch.nn.functional.pad(counts[cells].cumsum(0), (1, 0))
         return type(self)(order=self.order[members], offsets=offsets)
 
-    def chunks(self, max_members: int) -> Iterator[tuple[slice, Self]]:
+    def chunks(self, max_members: int, *, cell_cost: int = 0) -> Iterator[tuple[slice, Self]]:
         """Cut the partition into runs of cells, to bound memory.
 
         Args:
             max_members: Members of one run at most; a larger cell is a run of its own.
+            cell_cost: A cell counts as this many members more than it has.
 
         Yields:
             The cells of the run, and their partition.
         """
         first = 0
+        costs = self.offsets
+        if cell_cost:
+            costs = costs + cell_cost * torch.arange(len(costs), device=costs.device)
         while first < len(self):
             start = int(self.offsets[first])
-            fitting = torch.searchsorted(self.offsets, start + max_members, right=True)
+            fitting = torch.searchsorted(costs, costs[first] + max_members, right=True)
             last = max(first + 1, int(fitting) - 1)
             members = self.order[start : int(self.offsets[last])]
             offsets = self.offsets[first : last + 1] - start

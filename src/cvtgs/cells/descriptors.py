@@ -1,0 +1,131 @@
+"""Descriptors: what MergeNet sees of a cell; nothing that tells where, how large or what colour."""
+
+from dataclasses import dataclass, fields
+from typing import Self
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cvtgs.cells.features import (
+    FARTHEST,
+    cell_features,
+    colors_of,
+    kernels_of,
+    member_features,
+    pair_features,
+    see_members,
+)
+from cvtgs.cells.partition import Partition
+from cvtgs.cells.reference import gather_members
+from cvtgs.cells.widening import side_cover
+from cvtgs.scene import GaussianScene
+
+MEMBER_FEATURES = 19
+"""Numbers that describe a member to its cell."""
+
+PAIR_FEATURES = 18
+"""Numbers that describe a neighbour to a cell."""
+
+CELL_FEATURES = 19
+"""Numbers that describe a cell by itself."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Descriptors:
+    """Some cells as a network sees them, in the dtype of the scene.
+
+    Every feature is relative to the merged Gaussian of the cell: in its frame, in its standard
+    deviations, and the same whichever way an axis points.
+
+    Attributes:
+        members: ``(n, 19)`` features of the members, those of one cell next to one another.
+        pairs: ``(m, k, 18)`` features of the neighbours of every cell.
+        cells: ``(m, 19)`` features of the cells.
+        weights: ``(n,)`` shares of the mass of the cell; those of one cell sum to 1.
+        offsets: ``(m + 1,)`` where each cell starts, and the end of the last one.
+        places: ``(n, 3)`` where members are, from the centre of the cell, in its frame and in
+            its standard deviations.
+        pair_places: ``(m, k, 3)`` the same of the neighbours.
+    """
+
+    members: Float[Tensor, "n d"]
+    pairs: Float[Tensor, "m k e"]
+    cells: Float[Tensor, "m c"]
+    weights: Float[Tensor, "n"]
+    offsets: Int[Tensor, "m_plus_1"]
+    places: Float[Tensor, "n 3"]
+    pair_places: Float[Tensor, "m k 3"]
+
+    def __len__(self) -> int:
+        """Give the number of cells."""
+        return len(self.cells)
+
+    def to(self, target: torch.device | torch.dtype) -> Self:
+        """Move the descriptors to a device, or give them another precision.
+
+        Args:
+            target: A device, or a dtype for all but ``offsets``.
+
+        Returns:
+            The descriptors there.
+        """
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        moves = {
+            name: value.to(target)
+            for name, value in values.items()
+            if isinstance(target, torch.device) or value.is_floating_point()
+        }
+        return type(self)(**(values | moves))
+
+
+def describe_cells(
+    scene: GaussianScene,
+    merged: GaussianScene,
+    part: Partition,
+    *,
+    cells: Int[Tensor, "m"],
+    neighbors: Int[Tensor, "m k"],
+    sizes: Int[Tensor, "m_all"],
+    light: Float[Tensor, "n_all"],
+) -> Descriptors:
+    """Describe some cells to their network.
+
+    After CVT-GS: place, size and direction of a member relative to its cell, its opacity, its
+    share of the mass, and how far its colour is from that of the cell. Ours differ: directions
+    are given by the extents along the axes of the cell (several quaternions say the same),
+    colours by their distance only; a cell knows its neighbours and which of its sides they
+    cover, and a member how freely it can be seen.
+
+    Memory: about ``1.5 kB`` per member and per pair of neighbours.
+
+    Args:
+        scene: The Gaussians.
+        merged: One Gaussian per cell, of all cells.
+        part: Members of the cells to describe.
+        cells: Which cells those are.
+        neighbors: The nearest other cells of each of them.
+        sizes: Number of members of every cell, of all cells.
+        light: How freely every Gaussian of the scene can be seen, 0 to 1
+            (:func:`cvtgs.cvt.openness`).
+
+    Returns:
+        The descriptors, in the dtype of the scene.
+    """
+    own = kernels_of(merged, cells)
+    members = gather_members(scene, part)
+    weights = members.weights(1.0)
+    sides = side_cover(merged, cells, neighbors)
+    bare = sides[:, :, 1] - sides[:, :, 0]
+    colors = colors_of(scene, part.order)
+    seen = see_members(members, weights, own, colors, light[part.order].double())
+    pairs, pair_places = pair_features(merged, own, cells, neighbors, bare, sizes)
+    return Descriptors(
+        members=member_features(members, weights, seen, bare).to(scene.dtype),
+        pairs=pairs.to(scene.dtype),
+        cells=cell_features(members, weights, own, seen, sides, pair_places).to(scene.dtype),
+        weights=weights.to(scene.dtype),
+        offsets=part.offsets,
+        places=seen.places.clamp(-FARTHEST, FARTHEST).to(scene.dtype),
+        pair_places=pair_places.clamp(-FARTHEST, FARTHEST).to(scene.dtype),
+    )

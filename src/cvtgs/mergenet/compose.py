@@ -1,0 +1,90 @@
+"""Compose: merged Gaussians and residuals to corrected Gaussians."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cvtgs.cells import Partition
+from cvtgs.math import quaternions
+from cvtgs.math.segments import segment_ids, segment_sum
+from cvtgs.mergenet.model import Residuals
+from cvtgs.scene import GaussianScene
+
+
+def compose(
+    scene: GaussianScene,
+    merged: GaussianScene,
+    part: Partition,
+    *,
+    cells: Int[Tensor, "m"],
+    neighbors: Int[Tensor, "m k"],
+    residuals: Residuals,
+) -> dict[str, Tensor]:
+    """Correct some merged Gaussians.
+
+    Centres move and shapes turn in the frame of each merged Gaussian; log scales and opacity
+    logits are added to; colours of every SH band mix in what sets members and neighbours apart.
+    Residuals of zero give the merged Gaussians bit for bit. Differentiable in the residuals.
+
+    Args:
+        scene: The Gaussians.
+        merged: One Gaussian per cell, of all cells.
+        part: Members of the cells to correct.
+        cells: Which cells those are.
+        neighbors: The nearest other cells of each of them.
+        residuals: What to change of them.
+
+    Returns:
+        The standard tensors of these cells, by name.
+    """
+    own = merged.select(cells)
+    quats = quaternions.normalize(own.quats)
+    moves = torch.einsum(
+        "mij,mj->mi", quaternions.to_matrices(quats), own.scales * residuals.shifts
+    )
+    tensors = {
+        "means": own.means + moves,
+        "quats": _turned(own.quats, residuals.turns),
+        "log_scales": own.log_scales + residuals.growths,
+        "logit_opacities": own.logit_opacities + residuals.logits,
+    }
+    for name in ("sh0", "shN"):
+        bands = getattr(own, name)
+        if bands.shape[1]:
+            mixed = _mixed(getattr(scene, name), bands, part, residuals.member_colors)
+            bands = bands + mixed + _borrowed(getattr(merged, name), bands, neighbors, residuals)
+        tensors[name] = bands
+    return tensors
+
+
+def _turned(quats: Float[Tensor, "m 4"], turns: Float[Tensor, "m 3"]) -> Float[Tensor, "m 4"]:
+    """Turn about the own axes: the product with ``(1, turn / 2)``, of the same length."""
+    w, v, half = quats[:, :1], quats[:, 1:], turns / 2
+    real = w - (v * half).sum(dim=1, keepdim=True)
+    imaginary = v + w * half + torch.linalg.cross(v, half)
+    growth = torch.sqrt(1 + half.square().sum(dim=1, keepdim=True))
+    return torch.cat([real, imaginary], dim=1) / growth
+
+
+def _mixed(
+    values: Float[Tensor, "n_all b 3"],
+    own: Float[Tensor, "m b 3"],
+    part: Partition,
+    gates: Float[Tensor, "n"],
+) -> Float[Tensor, "m b 3"]:
+    """Sum what sets members apart from their cell."""
+    differences = values[part.order] - own[segment_ids(part.offsets)]
+    return segment_sum(gates[:, None, None] * differences, part.offsets)
+
+
+def _borrowed(
+    values: Float[Tensor, "m_all b 3"],
+    own: Float[Tensor, "m b 3"],
+    neighbors: Int[Tensor, "m k"],
+    residuals: Residuals,
+) -> Float[Tensor, "m b 3"]:
+    """Sum what sets neighbours apart from a cell."""
+    total = torch.zeros_like(own)
+    for other, gates in zip(neighbors.unbind(1), residuals.pair_colors.unbind(1), strict=True):
+        total = total + gates[:, None, None] * (values[other] - own)
+    return total

@@ -1,0 +1,66 @@
+"""Correct: let MergeNet see every cell of a scene, a chunk at a time."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cvtgs.cells import Partition, describe_cells
+from cvtgs.mergenet.compose import compose
+from cvtgs.mergenet.model import MergeNet
+from cvtgs.scene import GaussianScene
+
+CHUNK_MEMBERS = 1 << 15
+"""Members and neighbours that are described together; each takes about ``2 kB``."""
+
+
+def correct_cells(
+    net: MergeNet,
+    scene: GaussianScene,
+    merged: GaussianScene,
+    partition: Partition,
+    *,
+    neighbors: Int[Tensor, "m k"],
+    light: Float[Tensor, "n"],
+    on_cells: Callable[[int], None] = lambda done: None,
+) -> GaussianScene:
+    """Correct every merged Gaussian that stands for several.
+
+    Args:
+        net: The network, on the device of the scene.
+        scene: The Gaussians, with valid rows.
+        merged: One Gaussian per cell.
+        partition: Members of the cells; cells of one member are not looked at.
+        neighbors: The nearest other cells of every cell.
+        light: How freely every Gaussian can be seen, 0 to 1.
+        on_cells: Told how many cells are done.
+
+    Returns:
+        The scene with corrected Gaussians.
+    """
+    several = partition.counts > 1
+    cells = several.nonzero()[:, 0]
+    done = len(partition) - len(cells)
+    tensors = {name: values.clone() for name, values in merged.tensors().items()}
+    with torch.no_grad():
+        chunks = partition.select(several).chunks(CHUNK_MEMBERS, cell_cost=neighbors.shape[1])
+        for run, part in chunks:
+            rows = cells[run]
+            seen = describe_cells(
+                scene,
+                merged,
+                part,
+                cells=rows,
+                neighbors=neighbors[rows],
+                sizes=partition.counts,
+                light=light,
+            )
+            changed = compose(
+                scene, merged, part, cells=rows, neighbors=neighbors[rows], residuals=net(seen)
+            )
+            for name, values in changed.items():
+                tensors[name][rows] = values
+            done += len(part)
+            on_cells(done)
+    return merged.with_tensors(tensors, merged.extras)

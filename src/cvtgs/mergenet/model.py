@@ -1,0 +1,189 @@
+"""MergeNet: a small network, shared by all cells, that corrects how a cell becomes one Gaussian."""
+
+from dataclasses import dataclass
+
+import pydantic
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES, Descriptors
+from cvtgs.math.segments import segment_ids, segment_max, segment_sum
+
+LARGEST_GROWTH = 0.6
+"""Log scales change by this much at most."""
+
+LARGEST_LOGIT_CHANGE = 2.0
+"""Opacity logits change by this much at most."""
+
+LARGEST_TURN = 0.5
+"""A cell turns by this much about each of its axes at most, in radians."""
+
+LARGEST_MEMBER_GATE = 2.0
+LARGEST_PAIR_GATE = 0.5
+
+
+class Architecture(pydantic.BaseModel):
+    """The shape of a MergeNet.
+
+    Attributes:
+        member_features: Numbers that describe a member.
+        pair_features: Numbers that describe a neighbour.
+        cell_features: Numbers that describe a cell.
+        width: Units of the layers that see members and neighbours.
+        cell_width: Units of the layers that see cells.
+    """
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
+
+    member_features: int = MEMBER_FEATURES
+    pair_features: int = PAIR_FEATURES
+    cell_features: int = CELL_FEATURES
+    width: int = pydantic.Field(default=32, ge=1, le=1024)
+    cell_width: int = pydantic.Field(default=64, ge=1, le=4096)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Residuals:
+    """What MergeNet changes of the merged Gaussians; zeros change nothing.
+
+    Attributes:
+        shifts: ``(m, 3)`` moves of the centres, in the frame and the standard deviations of each.
+        growths: ``(m, 3)`` added to the log scales.
+        turns: ``(m, 3)`` rotation vectors in the frame of each, radians.
+        logits: ``(m,)`` added to the opacity logits.
+        member_colors: ``(n,)`` how much of a member's difference in colour is added.
+        pair_colors: ``(m, k)`` how much of a neighbour's difference in colour is added.
+    """
+
+    shifts: Float[Tensor, "m 3"]
+    growths: Float[Tensor, "m 3"]
+    turns: Float[Tensor, "m 3"]
+    logits: Float[Tensor, "m"]
+    member_colors: Float[Tensor, "n"]
+    pair_colors: Float[Tensor, "m k"]
+
+    def cost(self) -> Float[Tensor, ""]:
+        """Give the mean square of all changes, each in units of its largest; training pays it.
+
+        Returns:
+            A number from 0 to 1.
+        """
+        parts = [
+            self.growths / LARGEST_GROWTH,
+            self.logits / LARGEST_LOGIT_CHANGE,
+            self.turns / LARGEST_TURN,
+            self.shifts.clamp(-1, 1),
+        ]
+        return torch.stack([part.square().mean() for part in parts]).mean()
+
+
+class MergeNet(nn.Module):
+    """Predicts residuals from descriptors.
+
+    After CVT-GS: a pointwise network over members, pooled by mean, maximum and mass, and a
+    decoder whose last layer starts at zero, so that an untrained network changes nothing. Ours
+    differs: neighbours are seen the same way as members; size and opacity come from the decoder,
+    but place, direction and colour are sums over members and neighbours of what sets them apart
+    from the cell, each times a gate that the network predicts. So the answer turns with the
+    scene, mixes the colours that are there, and any number of SH bands comes at no cost.
+
+    Args:
+        architecture: Its shape.
+
+    Example:
+        >>> sum(parameter.numel() for parameter in MergeNet(Architecture()).parameters())
+        26380
+    """
+
+    def __init__(self, architecture: Architecture) -> None:
+        super().__init__()
+        self.architecture = architecture
+        width, cell_width = architecture.width, architecture.cell_width
+        pooled = architecture.cell_features + 5 * width
+        self.member_layers = _layers(architecture.member_features, width)
+        self.pair_layers = _layers(architecture.pair_features, width)
+        self.cell_layers = _layers(pooled, cell_width)
+        self.decoder = nn.Linear(cell_width, 4)
+        self.member_gates = _Gates(width, cell_width)
+        self.pair_gates = _Gates(width, cell_width)
+        nn.init.zeros_(self.decoder.weight)
+        nn.init.zeros_(self.decoder.bias)
+
+    def forward(self, descriptors: Descriptors) -> Residuals:
+        """Predict what to change.
+
+        Args:
+            descriptors: Any number of cells, each with at least one member.
+
+        Returns:
+            Changes of each cell.
+        """
+        offsets, weights = descriptors.offsets, descriptors.weights[:, None]
+        ids = segment_ids(offsets)
+        members = self.member_layers(descriptors.members)
+        pairs = self.pair_layers(descriptors.pairs)
+        pooled = [
+            descriptors.cells,
+            segment_sum(members, offsets) / offsets.diff()[:, None],
+            segment_sum(members * weights, offsets),
+            segment_max(members, offsets),
+            *_pool_pairs(pairs),
+        ]
+        cells = self.cell_layers(torch.cat(pooled, dim=1))
+        sizes = self.decoder(cells)
+        of_members = LARGEST_MEMBER_GATE * self.member_gates(members, cells, ids)
+        of_pairs = LARGEST_PAIR_GATE * self.pair_gates(pairs, cells[:, None], None)
+        by_share = of_members * weights
+        shifts = segment_sum(by_share[:, :1] * descriptors.places, offsets)
+        twists = segment_sum(by_share[:, 2:] * _twists(descriptors.places.clamp(-5, 5)), offsets)
+        near = descriptors.pair_places / (1 + descriptors.pair_places.abs())
+        twists = twists + _mean_of_pairs(of_pairs[..., 2:] * _twists(near))
+        return Residuals(
+            shifts=shifts + _mean_of_pairs(of_pairs[..., :1] * descriptors.pair_places),
+            growths=LARGEST_GROWTH * torch.tanh(sizes[:, :3]),
+            turns=LARGEST_TURN
+            * torch.tanh(twists + _mean_of_pairs(of_pairs[..., 2:] * _twists(near))),
+            logits=LARGEST_LOGIT_CHANGE * torch.tanh(0.5 * sizes[:, 3]),
+            member_colors=by_share[:, 1],
+            pair_colors=of_pairs[..., 1] / max(1, of_pairs.shape[1]),
+        )
+
+
+class _Gates(nn.Module):
+    """Gates between -1 and 1: for place, colour, and turns about three axes; zero at the start."""
+
+    def __init__(self, width: int, cell_width: int) -> None:
+        super().__init__()
+        self.own = nn.Linear(width, width)
+        self.cell = nn.Linear(cell_width, width, bias=False)
+        self.gates = nn.Linear(width, 5)
+        nn.init.zeros_(self.gates.weight)
+        nn.init.zeros_(self.gates.bias)
+
+    def forward(self, own: Tensor, cells: Tensor, ids: Int[Tensor, "n"] | None) -> Tensor:
+        of_cells = self.cell(cells)
+        summed = self.own(own) + (of_cells if ids is None else of_cells[ids])
+        return torch.tanh(self.gates(nn.functional.silu(summed)))
+
+
+def _layers(features: int, width: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(features, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
+
+
+def _pool_pairs(pairs: Float[Tensor, "m k w"]) -> tuple[Tensor, Tensor]:
+    """Pool over neighbours; a cell without any gives zeros."""
+    if pairs.shape[1] == 0:
+        nothing = pairs.new_zeros(len(pairs), pairs.shape[2])
+        return nothing, nothing
+    return pairs.mean(dim=1), pairs.amax(dim=1)
+
+
+def _mean_of_pairs(values: Float[Tensor, "m k 3"]) -> Float[Tensor, "m 3"]:
+    return values.sum(dim=1) / max(1, values.shape[1])
+
+
+def _twists(places: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Give what makes a cell turn about each axis: products of the other two coordinates."""
+    x, y, z = places.unbind(-1)
+    return torch.stack([y * z, x * z, x * y], dim=-1)

@@ -1,0 +1,214 @@
+"""Checkpoints: a MergeNet and where it comes from, in one safetensors file."""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import pydantic
+import torch
+from torch import Tensor
+
+from cvtgs.errors import CheckpointError
+from cvtgs.mergenet.model import Architecture, MergeNet
+
+SHIPPED = ("standard", "paper")
+"""Names of the checkpoints that come with the package."""
+
+FORMAT = "cvtgs-mergenet"
+FORMAT_VERSION = 1
+LARGEST_FILE = 1 << 26
+"""Files above 64 MiB are not read; a MergeNet has less than one."""
+
+
+class CheckpointInfo(pydantic.BaseModel):
+    """What a checkpoint says about itself.
+
+    Attributes:
+        architecture: Shape of the network.
+        preset: The preset that the network corrects.
+        training: On what and how it was trained, in words.
+        seed: Seed of the training.
+        steps: Training steps.
+        version: Version of cvtgs that trained it.
+    """
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
+
+    architecture: Architecture
+    preset: str
+    training: str = ""
+    seed: int = 0
+    steps: int = 0
+    version: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Checkpoint:
+    """A network that is ready to use.
+
+    Attributes:
+        net: The network, on the CPU, float32, without gradients.
+        info: What the file says about it.
+        name: Name of the shipped checkpoint, or path of the file.
+        digest: SHA-256 of the weights, hexadecimal.
+    """
+
+    net: MergeNet
+    info: CheckpointInfo
+    name: str
+    digest: str
+
+
+def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
+    """Load a MergeNet.
+
+    Args:
+        source: ``standard`` or ``paper``, which come with the package, or a file.
+
+    Returns:
+        The checkpoint.
+
+    Raises:
+        CheckpointError: There is no such file, or it is no checkpoint, damaged, of a later
+            format or of another architecture.
+
+    Example:
+        >>> load_checkpoint("standard").info.preset
+        'standard'
+    """
+    name = os.fspath(source)
+    path = _shipped_path(name) if name in SHIPPED else Path(name)
+    content = _read(path, name)
+    tensors, metadata = _parse(content, name)
+    info = _described(metadata, name)
+    digest = _digest(tensors)
+    if metadata.get("sha256") != digest:
+        raise CheckpointError(
+            f"{name}: the checkpoint is damaged: its weights have the hash {digest[:12]}..., "
+            f"it says {str(metadata.get('sha256'))[:12]}..."
+        )
+    return Checkpoint(net=_filled(info, tensors, name), info=info, name=name, digest=digest)
+
+
+def save_checkpoint(net: MergeNet, info: CheckpointInfo) -> bytes:
+    """Give the bytes of a checkpoint file.
+
+    The same network and description give the same bytes.
+
+    Args:
+        net: The network.
+        info: What to say about it.
+
+    Returns:
+        A safetensors file, to be written with :func:`cvtgs.io.atomic_output`.
+
+    Example:
+        >>> info = CheckpointInfo(architecture=Architecture(), preset="standard")
+        >>> len(save_checkpoint(MergeNet(info.architecture), info)) < 200_000
+        True
+    """
+    from safetensors.torch import save  # noqa: PLC0415 (only those who use a network need it)
+
+    tensors = {
+        name: values.detach().to(torch.float32).cpu().contiguous()
+        for name, values in net.state_dict().items()
+    }
+    metadata = {
+        "format": FORMAT,
+        "format_version": str(FORMAT_VERSION),
+        "sha256": _digest(tensors),
+        "info": info.model_dump_json(),
+    }
+    return bytes(save(tensors, metadata))
+
+
+def _shipped_path(name: str) -> Path:
+    return Path(str(resources.files("cvtgs.mergenet.data").joinpath(f"{name}.safetensors")))
+
+
+def _read(path: Path, name: str) -> bytes:
+    try:
+        size = path.stat().st_size
+        if size > LARGEST_FILE or not path.is_file():
+            raise CheckpointError(
+                f"{name}: a checkpoint must be a file of at most {LARGEST_FILE >> 20} MiB."
+            )
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise CheckpointError(
+            f"{name}: no such checkpoint; it must be {' or '.join(SHIPPED)}, or a file."
+        ) from None
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise CheckpointError(f"{name}: the checkpoint cannot be read: {reason}.") from error
+
+
+def _parse(content: bytes, name: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    from safetensors import SafetensorError  # noqa: PLC0415 (only with a network)
+    from safetensors.torch import load  # noqa: PLC0415
+
+    try:
+        tensors = load(content)
+        length = int.from_bytes(content[:8], "little")
+        metadata = json.loads(content[8 : 8 + length]).get("__metadata__", {})
+    except (SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise CheckpointError(
+            f"{name}: the checkpoint is no safetensors file, or damaged."
+        ) from error
+    if metadata.get("format") != FORMAT:
+        raise CheckpointError(
+            f"{name}: the file holds no MergeNet; its format must be {FORMAT!r}, "
+            f"found {metadata.get('format')!r}."
+        )
+    return tensors, metadata
+
+
+def _described(metadata: Mapping[str, Any], name: str) -> CheckpointInfo:
+    version = str(metadata.get("format_version"))
+    if not version.isdecimal() or int(version) > FORMAT_VERSION:
+        raise CheckpointError(
+            f"{name}: the checkpoint has format version {version}, this cvtgs reads up to "
+            f"{FORMAT_VERSION}; update cvtgs."
+        )
+    try:
+        info = CheckpointInfo.model_validate_json(metadata.get("info", ""))
+    except pydantic.ValidationError as error:
+        raise CheckpointError(f"{name}: the checkpoint does not say what it is.") from error
+    ours, theirs = Architecture(), info.architecture
+    for feature in ("member_features", "pair_features", "cell_features"):
+        if getattr(ours, feature) != getattr(theirs, feature):
+            raise CheckpointError(
+                f"{name}: the checkpoint is of another architecture: {feature} must be "
+                f"{getattr(ours, feature)}, found {getattr(theirs, feature)}."
+            )
+    return info
+
+
+def _filled(info: CheckpointInfo, tensors: dict[str, Tensor], name: str) -> MergeNet:
+    net = MergeNet(info.architecture)
+    wanted = {key: (values.shape, values.dtype) for key, values in net.state_dict().items()}
+    found = {key: (values.shape, values.dtype) for key, values in tensors.items()}
+    if wanted != found:
+        odd = sorted(key for key in wanted | found if wanted.get(key) != found.get(key))
+        raise CheckpointError(
+            f"{name}: the checkpoint is of another architecture: {', '.join(odd[:3])} "
+            f"{'does' if len(odd) == 1 else 'do'} not fit."
+        )
+    if not all(bool(torch.isfinite(values).all()) for values in tensors.values()):
+        raise CheckpointError(f"{name}: the checkpoint holds weights that are not finite.")
+    net.load_state_dict(tensors)
+    return net.eval().requires_grad_(False)
+
+
+def _digest(tensors: Mapping[str, Tensor]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        values = tensors[name]
+        digest.update(f"{name} {values.dtype} {tuple(values.shape)}\n".encode())
+        digest.update(values.contiguous().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
