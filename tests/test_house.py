@@ -42,7 +42,7 @@ OWNERS = {
     "numba": "render/compiled.py",
     "gsplat": "render/gsplat_backend.py",
     "PIL": "evaluate/images.py",
-    "safetensors": "mergenet/weights.py",
+    "safetensors": "io/tensors.py",
     "matplotlib": "plots.py",
 }
 HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "matplotlib")

@@ -65,7 +65,8 @@ def test_json_holds_everything():
     assert set(values) == set(SimplifyReport.model_fields)
     assert values["output_count"] == 20
     assert values["plan"]["unbounded"]["active"] in (True, False)
-    assert [stage["stage"] for stage in values["stages"]][-1] == "merge"
+    assert [stage["stage"] for stage in values["stages"]][-2:] == ["merge", "network"]
+    assert values["checkpoint"] == "standard"
     assert report.to_json().endswith("}\n")
 
 

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from cvtgs import GaussianScene, ProgressEvent, Simplifier, SimplifyConfig
-from cvtgs.errors import CheckpointError, CvtgsError, DeviceError
+from cvtgs.errors import CvtgsError, DeviceError
 from scenes import random_scene, same_bits
 
 each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])
-STAGES = ["check", "plan", "filter", "tessellate", "merge"]
+STAGES = ["check", "plan", "filter", "tessellate", "merge", "network"]
 INF = float("inf")
 
 
@@ -94,7 +94,7 @@ def test_report_is_sane(preset, rho):
     assert math.isfinite(report.energy)
     assert report.backend == "scipy"
     assert report.device == "cpu"
-    assert report.config.preset == preset
+    assert report.config.preset == report.checkpoint == preset
     assert [stage.stage for stage in report.stages] == STAGES
     assert report.seconds == pytest.approx(sum(stage.seconds for stage in report.stages))
     assert all(stage.seconds >= 0 and stage.peak_memory_bytes >= 0 for stage in report.stages)
@@ -135,14 +135,6 @@ def test_config_may_be_an_object_or_a_name():
         Simplifier(config=c, device="cpu").simplify(scene, 0.1) for c in (config, "paper")
     )
     assert same_bits(first, second)
-
-
-def test_a_checkpoint_is_an_error_yet():
-    with pytest.raises(CheckpointError) as caught:
-        Simplifier("net.safetensors")
-    assert str(caught.value) == (
-        "this version merges without a network; ckpt must be None, found 'net.safetensors'."
-    )
 
 
 def test_an_unknown_preset_is_an_error():

@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cvtgs import cells, cvt, effects, errors, filters, io, losses, math, synthetic
+    from cvtgs import cells, cvt, effects, errors, filters, io, losses, math, mergenet, synthetic
     from cvtgs.cameras import Cameras
     from cvtgs.config import PRESETS, SimplifyConfig
     from cvtgs.effects import EffectPlan
@@ -53,7 +53,18 @@ _HOME = {
     "Simplifier": "cvtgs.simplify",
     "target_count": "cvtgs.simplify",
 }
-_MODULES = ("cells", "cvt", "effects", "errors", "filters", "io", "losses", "math", "synthetic")
+_MODULES = (
+    "cells",
+    "cvt",
+    "effects",
+    "errors",
+    "filters",
+    "io",
+    "losses",
+    "math",
+    "mergenet",
+    "synthetic",
+)
 _CALLABLE = ("evaluate", "render")
 
 __all__ = [
@@ -83,6 +94,7 @@ __all__ = [
     "load_cameras",
     "losses",
     "math",
+    "mergenet",
     "render",
     "save",
     "synthetic",

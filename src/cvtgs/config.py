@@ -12,13 +12,15 @@ from cvtgs.errors import ConfigError
 Share = Annotated[float, pydantic.Field(ge=0.0, le=1.0)]
 
 
-class _Section(pydantic.BaseModel):
+class Section(pydantic.BaseModel):
+    """Some settings: frozen, unknown keys and numbers that are not finite are errors."""
+
     model_config = pydantic.ConfigDict(
         frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
     )
 
 
-class FilterConfig(_Section):
+class FilterConfig(Section):
     """Which faint Gaussians are left out before the tessellation.
 
     Attributes:
@@ -34,7 +36,7 @@ class FilterConfig(_Section):
     max_flyaway_share: Share = 1e-3
 
 
-class TessellationConfig(_Section):
+class TessellationConfig(Section):
     """How Gaussians are grouped into cells.
 
     Attributes:
@@ -74,7 +76,7 @@ class TessellationConfig(_Section):
     backend: Literal["auto", "scipy", "torch"] = "auto"
 
 
-class MergeConfig(_Section):
+class MergeConfig(Section):
     """How a cell becomes one Gaussian.
 
     Attributes:
@@ -96,7 +98,7 @@ class MergeConfig(_Section):
     network: bool = True
 
 
-class SimplifyConfig(_Section):
+class SimplifyConfig(Section):
     """Every choice of a simplification; frozen, unknown keys are errors.
 
     Attributes:
@@ -153,7 +155,7 @@ class SimplifyConfig(_Section):
         try:
             return cls.model_validate(_merged(PRESETS[name], values))
         except pydantic.ValidationError as error:
-            raise ConfigError(_explain(error)) from None
+            raise ConfigError(explain(error)) from None
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
@@ -191,7 +193,7 @@ class SimplifyConfig(_Section):
         Raises:
             ConfigError: The file cannot be read, or a key is unknown or a value out of range.
         """
-        values = {} if file is None else _read_toml(Path(file))
+        values = {} if file is None else read_toml(Path(file))
         if preset is not None:
             values["preset"] = preset
         for key, text in (settings or {}).items():
@@ -244,7 +246,18 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 """What each preset changes of the defaults: ``standard`` nothing, ``paper`` is CVT-GS."""
 
 
-def _read_toml(path: Path) -> dict[str, Any]:
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its tables.
+
+    Raises:
+        ConfigError: It cannot be read, or is not TOML.
+    """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -262,7 +275,15 @@ def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
     return result
 
 
-def _explain(error: pydantic.ValidationError) -> str:
+def explain(error: pydantic.ValidationError) -> str:
+    """Say in one sentence what is wrong with some settings.
+
+    Args:
+        error: What pydantic found.
+
+    Returns:
+        Every problem, with key and value.
+    """
     problems = []
     for problem in error.errors():
         key = ".".join(str(part) for part in problem["loc"])

@@ -45,6 +45,10 @@ class CheckpointError(CvtgsError, ValueError):
     """A MergeNet checkpoint cannot be used."""
 
 
+class TrainingError(CvtgsError, RuntimeError):
+    """A training cannot go on; the text says where it stopped, and which file is good."""
+
+
 class MissingDependencyError(CvtgsError, ImportError):
     """An optional package is not installed; the text says what to install."""
 

@@ -10,14 +10,12 @@ from torch import Tensor
 from cvtgs.cells.features import (
     FARTHEST,
     cell_features,
-    colors_of,
     kernels_of,
     member_features,
     pair_features,
     see_members,
 )
 from cvtgs.cells.partition import Partition
-from cvtgs.cells.reference import gather_members
 from cvtgs.cells.widening import side_cover
 from cvtgs.scene import GaussianScene
 
@@ -111,21 +109,34 @@ def describe_cells(
 
     Returns:
         The descriptors, in the dtype of the scene.
+
+    Example:
+        >>> from cvtgs.cells import merge_cells
+        >>> from cvtgs.config import MergeConfig
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 5, sh_degree=0, seed=0)
+        >>> part = Partition.from_labels(torch.tensor([0, 0, 0, 1, 1]), 2)
+        >>> seen = describe_cells(
+        ...     scene, merge_cells(scene, part, config=MergeConfig()), part,
+        ...     cells=torch.arange(2), neighbors=torch.tensor([[1], [0]]), sizes=part.counts,
+        ...     light=torch.ones(5),
+        ... )
+        >>> tuple(seen.members.shape), tuple(seen.pairs.shape), tuple(seen.cells.shape)
+        ((5, 19), (2, 1, 18), (2, 19))
     """
-    own = kernels_of(merged, cells)
-    members = gather_members(scene, part)
-    weights = members.weights(1.0)
-    sides = side_cover(merged, cells, neighbors)
+    own, members = kernels_of(merged, cells), kernels_of(scene, part.order)
+    sides = side_cover(merged, cells, neighbors).to(scene.dtype)
     bare = sides[:, :, 1] - sides[:, :, 0]
-    colors = colors_of(scene, part.order)
-    seen = see_members(members, weights, own, colors, light[part.order].double())
+    seen = see_members(
+        members, own, part.offsets, light.index_select(0, part.order).to(scene.dtype)
+    )
     pairs, pair_places = pair_features(merged, own, cells, neighbors, bare, sizes)
     return Descriptors(
-        members=member_features(members, weights, seen, bare).to(scene.dtype),
-        pairs=pairs.to(scene.dtype),
-        cells=cell_features(members, weights, own, seen, sides, pair_places).to(scene.dtype),
-        weights=weights.to(scene.dtype),
+        members=member_features(seen, bare),
+        pairs=pairs,
+        cells=cell_features(own, seen, part.offsets, sides, pair_places),
+        weights=seen.weights,
         offsets=part.offsets,
-        places=seen.places.clamp(-FARTHEST, FARTHEST).to(scene.dtype),
-        pair_places=pair_places.clamp(-FARTHEST, FARTHEST).to(scene.dtype),
+        places=seen.places.clamp(-FARTHEST, FARTHEST),
+        pair_places=pair_places.clamp(-FARTHEST, FARTHEST),
     )

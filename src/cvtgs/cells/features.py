@@ -3,12 +3,11 @@
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cells.moments import Members
 from cvtgs.math import activations, covariances, quaternions
-from cvtgs.math.segments import segment_ids, segment_sum
+from cvtgs.math.segments import segment_ids, segment_max, segment_sum
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
@@ -16,21 +15,45 @@ FARTHEST = 50.0
 """All that is farther than this, in standard deviations, looks the same."""
 
 
+LARGEST_PLACE = 1e4
+LARGEST_LOG = 80.0
+"""Places and scales are limited so that no product of them leaves float32."""
+
+
 class Kernels(NamedTuple):
-    """Some merged Gaussians in float64."""
+    """Some Gaussians, activated, in the dtype of the scene; their centres in float64."""
 
     means: Tensor
     rotations: Tensor
-    scales: Tensor
-    areas: Tensor
-    opacities: Tensor
+    log_scales: Tensor
+    log_areas: Tensor
+    logits: Tensor
     colors: Tensor
+
+    @property
+    def opacities(self) -> Float[Tensor, "n"]:
+        """Opacities in (0, 1)."""
+        return torch.sigmoid(self.logits)
+
+    def take(self, ids: Int[Tensor, "r"]) -> "Kernels":
+        """Take some rows.
+
+        Args:
+            ids: Which ones.
+
+        Returns:
+            Those rows of every tensor.
+        """
+        return Kernels(*(values.index_select(0, ids) for values in self))
 
 
 class SeenMembers(NamedTuple):
-    """Members as their cell sees them."""
+    """Members as their cell sees them, and in ``counts``, ``contrast``, ``light`` the cells."""
 
     ids: Tensor
+    weights: Tensor
+    opacities: Tensor
+    depths: Tensor
     counts: Tensor
     places: Tensor
     extents: Tensor
@@ -39,64 +62,96 @@ class SeenMembers(NamedTuple):
     contrast: Tensor
     lights: Tensor
     light: Tensor
+    slope: Tensor
 
 
-def kernels_of(merged: GaussianScene, rows: Tensor) -> Kernels:
-    scales = torch.exp(merged.log_scales[rows].double())
+def kernels_of(scene: GaussianScene, rows: Int[Tensor, "r"]) -> Kernels:
+    """Activate some Gaussians.
+
+    Args:
+        scene: All of them.
+        rows: ``(r,)`` which ones.
+
+    Returns:
+        One row for each in every tensor; the rotations have the axes as columns, and colours are
+        those of the constant band, less the 0.5 that all colours have.
+    """
+    log_scales = scene.log_scales.index_select(0, rows)
     return Kernels(
-        means=merged.means[rows].double(),
-        rotations=quaternions.to_matrices(quaternions.normalize(merged.quats[rows].double())),
-        scales=scales,
-        areas=covariances.mean_projected_area(scales),
-        opacities=activations.opacity_from_logit(merged.logit_opacities[rows].double()),
-        colors=colors_of(merged, rows),
+        means=scene.means.index_select(0, rows).double(),
+        rotations=quaternions.to_matrices(quaternions.normalize(scene.quats.index_select(0, rows))),
+        log_scales=log_scales,
+        log_areas=covariances.log_mean_projected_area(log_scales),
+        logits=activations.clamp_logits(scene.logit_opacities.index_select(0, rows)),
+        colors=scene.sh0[:, 0].index_select(0, rows) * SH_C0,
     )
-
-
-def colors_of(scene: GaussianScene, rows: Tensor) -> Float[Tensor, "n 3"]:
-    return scene.sh0[rows, 0].double() * SH_C0
 
 
 def see_members(
-    members: Members, weights: Tensor, own: Kernels, colors: Tensor, lights: Tensor
+    members: Kernels, own: Kernels, offsets: Int[Tensor, "m_plus_1"], lights: Float[Tensor, "n"]
 ) -> SeenMembers:
-    ids = segment_ids(members.offsets)
-    rotations, scales = own.rotations[ids], own.scales[ids]
-    contrasts = (colors - own.colors[ids]).square().mean(dim=1).sqrt()
+    """Express members by what their cell became.
+
+    Args:
+        members: Members of some cells, those of one cell next to one another.
+        own: What each of these cells became.
+        offsets: Where each cell starts, and the end of the last one.
+        lights: ``(n,)`` how freely the members can be seen, 0 to 1.
+
+    Returns:
+        What is told about members and cells.
+    """
+    ids = segment_ids(offsets)
+    cell = own.take(ids)
+    weights = _shares(members.log_areas + activations.positive_log(members.opacities), offsets)
+    contrasts = _contrasts(members, cell)
+    places = _places(cell, members.means - cell.means)
+    light = _total(weights * lights, offsets)
+    lean = weights * (lights - light.index_select(0, ids))
     return SeenMembers(
         ids=ids,
-        counts=members.offsets.diff().double(),
-        places=_inside(rotations, members.means - own.means[ids]) / scales,
-        extents=_extents(rotations, quaternions.to_matrices(members.quats), members.scales, scales),
-        areas=_log_ratio(members.areas, own.areas[ids]),
+        weights=weights,
+        opacities=members.opacities,
+        depths=activations.optical_depth_from_logit(members.logits),
+        counts=offsets.diff().to(weights.dtype),
+        places=places,
+        extents=_extents(cell, members),
+        areas=(members.log_areas - cell.log_areas).clamp(-14, 14),
         contrasts=contrasts,
-        contrast=segment_sum(weights * contrasts.square(), members.offsets).sqrt(),
+        contrast=_total(weights * contrasts.square(), offsets).sqrt(),
         lights=lights,
-        light=segment_sum(weights * lights, members.offsets),
+        light=light,
+        slope=_total(lean[:, None] * places, offsets),
     )
 
 
-def member_features(
-    members: Members, weights: Tensor, seen: SeenMembers, bare: Tensor
-) -> Float[Tensor, "n d"]:
+def member_features(seen: SeenMembers, bare: Float[Tensor, "m 3"]) -> Float[Tensor, "n d"]:
+    """Describe members: place, extent, side, share, opacity, area, contrast and light.
+
+    Args:
+        seen: The members as their cell sees them.
+        bare: How much barer the positive than the negative side of each axis is.
+
+    Returns:
+        One row per member.
+    """
     ids, places = seen.ids, seen.places
-    lights = seen.lights - seen.light[ids]
-    slope = segment_sum((weights * lights)[:, None] * places, members.offsets)
-    towards_light = (slope[ids] * places).sum(dim=1)
+    share = activations.positive_log(seen.weights * seen.counts.index_select(0, ids)).clamp(-14, 14)
+    towards_light = (seen.slope.index_select(0, ids) * places).sum(dim=1)
     return torch.cat(
         [
             *_distances(places),
             0.3 * seen.extents,
-            *_facing(places.clamp(-4, 4), bare[ids]),
+            *_facing(places.clamp(-4, 4), bare.index_select(0, ids)),
             torch.stack(
                 [
-                    0.3 * _log_ratio(weights * seen.counts[ids]),
-                    members.opacities,
+                    0.3 * share,
+                    seen.opacities,
                     0.2 * seen.areas,
-                    3 * seen.contrasts.clamp_max(2.0),
-                    0.5 * seen.contrasts / (seen.contrast[ids] + 0.02),
+                    3 * seen.contrasts,
+                    0.5 * seen.contrasts / (seen.contrast.index_select(0, ids) + 0.02),
                     seen.lights,
-                    3 * lights,
+                    3 * (seen.lights - seen.light.index_select(0, ids)),
                     towards_light.clamp(-3, 3),
                 ],
                 dim=1,
@@ -114,25 +169,38 @@ def pair_features(
     bare: Tensor,
     sizes: Tensor,
 ) -> tuple[Float[Tensor, "m k e"], Float[Tensor, "m k 3"]]:
-    count = neighbors.shape[1]
-    other = kernels_of(merged, neighbors.flatten())
-    own = Kernels(*(values.repeat_interleave(count, dim=0) for values in own))
-    shifts = other.means - own.means
-    places = _inside(own.rotations, shifts) / own.scales
-    back = _inside(other.rotations, shifts) / other.scales
-    crowd = sizes[neighbors.flatten()].double() / sizes[cells].repeat_interleave(count).double()
+    """Describe neighbours to cells, the same way as members.
+
+    Args:
+        merged: One Gaussian per cell, of all cells.
+        own: Those of the cells to describe.
+        cells: ``(m,)`` which cells these are.
+        neighbors: ``(m, k)`` the nearest other cells of each.
+        bare: ``(m, 3)`` how much barer the positive than the negative side of each axis is.
+        sizes: ``(m_all,)`` number of members of every cell.
+
+    Returns:
+        Features, and places in the frame and the standard deviations of the cell.
+    """
+    count, others = neighbors.shape[1], neighbors.flatten()
+    other = kernels_of(merged, others)
+    ids = torch.arange(len(cells), device=cells.device).repeat_interleave(count)
+    cell = own.take(ids)
+    shifts = other.means - cell.means
+    places, back = _places(cell, shifts), _places(other, shifts)
+    crowd = sizes[others].to(places.dtype) / sizes[cells][ids].to(places.dtype)
     described = torch.cat(
         [
             *_distances(places),
-            0.3 * _extents(own.rotations, other.rotations, other.scales, own.scales),
-            *_facing(places / (1 + places.abs()), bare.repeat_interleave(count, dim=0)),
+            0.3 * _extents(cell, other),
+            *_facing(places / (1 + places.abs()), bare.index_select(0, ids)),
             torch.stack(
                 [
                     _length(back),
                     other.opacities,
-                    0.2 * _log_ratio(other.areas, own.areas),
+                    0.2 * (other.log_areas - cell.log_areas).clamp(-14, 14),
                     0.2 * torch.log(crowd),
-                    3 * (other.colors - own.colors).square().mean(dim=1).sqrt().clamp_max(2.0),
+                    3 * _contrasts(other, cell),
                     other.opacities * _bell(back),
                     _bell(places),
                 ],
@@ -146,19 +214,27 @@ def pair_features(
 
 
 def cell_features(
-    members: Members,
-    weights: Tensor,
     own: Kernels,
     seen: SeenMembers,
-    sides: Tensor,
-    pair_places: Tensor,
+    offsets: Int[Tensor, "m_plus_1"],
+    sides: Float[Tensor, "m 3 2"],
+    pair_places: Float[Tensor, "m k 3"],
 ) -> Float[Tensor, "m c"]:
-    offsets = members.offsets
-    lights = seen.lights - seen.light[seen.ids]
-    slope = segment_sum((weights * lights)[:, None] * seen.places, offsets)
-    inner = segment_sum(weights[:, None] * torch.exp(2 * seen.extents).clamp_max(4.0), offsets)
-    painted = segment_sum(members.depths * members.areas, offsets)
-    shape = activations.positive_log(own.scales)
+    """Describe cells: cover of the sides, share of inner extent, size, opacity, shape and light.
+
+    Args:
+        own: What each of the cells became.
+        seen: The members as their cell sees them.
+        offsets: Where each cell starts, and the end of the last one.
+        sides: How opaquely neighbours paint at the ends of every axis.
+        pair_places: Where neighbours are, in standard deviations.
+
+    Returns:
+        One row per cell.
+    """
+    inner = _total(seen.weights[:, None] * torch.exp(2 * seen.extents).clamp_max(4.0), offsets)
+    painted = activations.positive_log(_total(seen.depths * torch.exp(seen.areas), offsets))
+    shape = own.log_scales
     distances = torch.linalg.vector_norm(pair_places, dim=2)
     nearest = torch.nn.functional.pad(distances, (0, 1), value=FARTHEST).amin(dim=1)
     return torch.cat(
@@ -170,13 +246,13 @@ def cell_features(
                 [
                     0.2 * torch.log(seen.counts),
                     own.opacities,
-                    0.2 * activations.logit_from_opacity(own.opacities),
-                    0.3 * _log_ratio(painted, own.areas),
+                    0.2 * own.logits,
+                    0.3 * painted.clamp(-14, 14),
                     0.5 * (shape[:, 0] - shape[:, 1]).clamp(-8, 8),
                     0.3 * (shape[:, 1] - shape[:, 2]).clamp(-8, 8),
-                    5 * seen.contrast.clamp_max(2.0),
+                    5 * seen.contrast,
                     seen.light,
-                    torch.linalg.vector_norm(slope, dim=1).clamp_max(3.0),
+                    torch.linalg.vector_norm(seen.slope, dim=1).clamp_max(3.0),
                     torch.log1p(nearest),
                 ],
                 dim=1,
@@ -186,16 +262,37 @@ def cell_features(
     )
 
 
-def _inside(rotations: Tensor, vectors: Tensor) -> Tensor:
-    """Express vectors in frames given by the axes as columns."""
-    return torch.einsum("nij,ni->nj", rotations, vectors)
+def _shares(logs: Tensor, offsets: Tensor) -> Tensor:
+    """Turn logarithms of masses into shares of the mass of the cell."""
+    ids = segment_ids(offsets)
+    masses = torch.exp(logs - segment_max(logs, offsets).index_select(0, ids))
+    return masses / _total(masses, offsets).index_select(0, ids)
 
 
-def _extents(frames: Tensor, rotations: Tensor, scales: Tensor, units: Tensor) -> Tensor:
+def _total(values: Tensor, offsets: Tensor) -> Tensor:
+    """Sum over the members of every cell, in float64."""
+    return segment_sum(values.double(), offsets).to(values.dtype)
+
+
+def _places(frames: Kernels, shifts: Tensor) -> Tensor:
+    """Express shifts in frames and in their standard deviations."""
+    turned = torch.einsum("nij,ni->nj", frames.rotations, shifts.to(frames.rotations.dtype))
+    units = torch.exp((-frames.log_scales).clamp(-LARGEST_LOG, LARGEST_LOG))
+    return (turned * units).clamp(-LARGEST_PLACE, LARGEST_PLACE)
+
+
+def _contrasts(some: Kernels, others: Kernels) -> Tensor:
+    return (some.colors - others.colors).square().mean(dim=1).sqrt().clamp_max(2.0)
+
+
+def _extents(frames: Kernels, others: Kernels) -> Tensor:
     """Give the log of standard deviations along the axes of frames, in units of each axis."""
-    turned = torch.einsum("nij,nik->njk", frames, rotations) * scales[:, None, :]
-    lengths = torch.linalg.vector_norm(turned / units[:, :, None], dim=2)
-    return activations.positive_log(lengths).clamp(-9, 9)
+    cosines = torch.einsum("nij,nik->njk", frames.rotations, others.rotations)
+    largest = others.log_scales.amax(dim=1, keepdim=True)
+    scales = torch.exp(others.log_scales - largest)
+    squares = (cosines * scales[:, None, :]).square().sum(dim=2)
+    logs = 0.5 * activations.positive_log(squares) + largest - frames.log_scales
+    return logs.clamp(-9, 9)
 
 
 def _distances(places: Tensor) -> tuple[Tensor, Tensor]:
@@ -216,7 +313,3 @@ def _facing(places: Tensor, bare: Tensor) -> tuple[Tensor, Tensor]:
 
 def _bell(places: Tensor) -> Tensor:
     return torch.exp(-0.5 * places.square().sum(dim=1).clamp_max(60.0))
-
-
-def _log_ratio(values: Tensor, units: Tensor | float = 1.0) -> Tensor:
-    return (activations.positive_log(values / units)).clamp(-14, 14)

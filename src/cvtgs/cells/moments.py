@@ -66,7 +66,7 @@ def normalized_weights(
         [0.25, 0.75]
     """
     weights, ids = weights.double(), segment_ids(offsets)
-    totals = segment_sum(weights, offsets)[ids]
+    totals = segment_sum(weights, offsets).index_select(0, ids)
     shares = weights / totals.clamp_min(torch.finfo(weights.dtype).tiny)
     equal = offsets.diff().double().reciprocal()[ids]
     return torch.where(totals < torch.finfo(weights.dtype).tiny, equal, shares)
@@ -116,9 +116,9 @@ def mean_and_covariance(
     offsets = members.offsets
     ids = segment_ids(offsets)
     first_rows = members.means[offsets[:-1]]
-    local = members.means - first_rows[ids]
+    local = members.means - first_rows.index_select(0, ids)
     shift = weighted_mean(local, weights, offsets)
-    local = local - shift[ids]
+    local = local - shift.index_select(0, ids)
     inner = covariances.from_scales_and_quats(members.scales, members.quats)
     outer = local[:, :, None] * local[:, None, :]
     return first_rows + shift, weighted_mean(inner + outer, weights, offsets)

@@ -78,6 +78,17 @@ class Partition:
         offsets = torch.nn.functional.pad(counts[cells].cumsum(0), (1, 0))
         return type(self)(order=self.order[members], offsets=offsets)
 
+    def to(self, device: torch.device) -> Self:
+        """Move the partition to a device.
+
+        Args:
+            device: Where to.
+
+        Returns:
+            The partition there.
+        """
+        return type(self)(order=self.order.to(device), offsets=self.offsets.to(device))
+
     def chunks(self, max_members: int, *, cell_cost: int = 0) -> Iterator[tuple[slice, Self]]:
         """Cut the partition into runs of cells, to bound memory.
 

@@ -79,8 +79,8 @@ def _merge_chunk(
         "quats": quats,
         "log_scales": activations.positive_log(scales),
         "logit_opacities": activations.logit_from_optical_depth(depths),
-        "sh0": weighted_mean(scene.sh0[rows], weights, offsets),
-        "shN": weighted_mean(scene.shN[rows], weights, offsets),
+        "sh0": weighted_mean(scene.sh0.index_select(0, rows), weights, offsets),
+        "shN": weighted_mean(scene.shN.index_select(0, rows), weights, offsets),
     }
     if not scene.extras:
         return tensors, {}
@@ -105,11 +105,11 @@ def gather_members(scene: GaussianScene, part: Partition) -> Members:
         The members in float64.
     """
     rows = part.order
-    scales = torch.exp(scene.log_scales[rows].double())
-    logits = scene.logit_opacities[rows].double()
+    scales = torch.exp(scene.log_scales.index_select(0, rows).double())
+    logits = scene.logit_opacities.index_select(0, rows).double()
     return Members(
-        means=scene.means[rows].double(),
-        quats=quaternions.normalize(scene.quats[rows].double()),
+        means=scene.means.index_select(0, rows).double(),
+        quats=quaternions.normalize(scene.quats.index_select(0, rows).double()),
         scales=scales,
         opacities=activations.opacity_from_logit(logits),
         depths=activations.optical_depth_from_logit(logits),

@@ -98,13 +98,15 @@ def side_cover(
         offsets = (means - other_means)[:, :, None, None] + ends
         turned = torch.einsum("rij,riab->rjab", other_rotations, offsets)
         sigmas = activations.divide(turned, other_scales[:, :, None, None])
+        logits = scene.logit_opacities.index_select(0, other).double()
+        opacities = activations.opacity_from_logit(logits)
         painted = torch.exp(-0.5 * sigmas.square().sum(dim=1))
-        open_share *= 1 - scene.opacities[other].double()[:, None, None] * painted
+        open_share *= 1 - opacities[:, None, None] * painted
     return 1 - open_share
 
 
 def _frames(scene: GaussianScene, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Give centres, axes (columns) and scales of some Gaussians in float64."""
-    quats = quaternions.normalize(scene.quats[rows].double())
-    scales = torch.exp(scene.log_scales[rows].double())
-    return scene.means[rows].double(), quaternions.to_matrices(quats), scales
+    quats = quaternions.normalize(scene.quats.index_select(0, rows).double())
+    scales = torch.exp(scene.log_scales.index_select(0, rows).double())
+    return scene.means.index_select(0, rows).double(), quaternions.to_matrices(quats), scales

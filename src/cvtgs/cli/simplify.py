@@ -24,6 +24,13 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     size.add_argument("--rho", type=float, metavar="R", help="ratio of Gaussians to keep, (0, 1]")
     size.add_argument("--count", type=int, metavar="M", help="number of Gaussians to keep")
     parser.add_argument("--preset", metavar="NAME", help="standard (default) or paper")
+    parser.add_argument(
+        "--ckpt",
+        default="auto",
+        metavar="NAME",
+        help="MergeNet checkpoint: auto (default, that of the preset), standard, paper, a file, "
+        "or none to merge by moments alone",
+    )
     parser.add_argument("--config", type=Path, metavar="F.toml", help="configuration file")
     parser.add_argument(
         "--set",
@@ -50,10 +57,15 @@ def run(options: argparse.Namespace) -> None:
     """
     from cvtgs.config import SimplifyConfig  # noqa: PLC0415 (keeps --help fast)
     from cvtgs.io import atomic_output, check_output, check_save, load, save  # noqa: PLC0415
+    from cvtgs.mergenet import load_checkpoint  # noqa: PLC0415
     from cvtgs.simplify import Simplifier, target_count  # noqa: PLC0415
 
+    checkpoint = None if options.ckpt == "none" else options.ckpt
+    preset = options.preset
+    if checkpoint not in (None, "auto") and preset is None and options.config is None:
+        preset = load_checkpoint(checkpoint).info.preset
     config = SimplifyConfig.compose(
-        file=options.config, preset=options.preset, settings=_settings(options.settings)
+        file=options.config, preset=preset, settings=_settings(options.settings)
     )
     if options.rho is not None:
         target_count(1, options.rho)
@@ -61,7 +73,7 @@ def run(options: argparse.Namespace) -> None:
     if options.report is not None:
         check_output(options.report, overwrite=options.overwrite)
     with progress_bars(quiet=options.quiet) as listener:
-        simplifier = Simplifier(config=config, device=options.device, listener=listener)
+        simplifier = Simplifier(checkpoint, config=config, device=options.device, listener=listener)
         scene = load(options.input)
         small, report = simplifier.run(scene, options.rho, count=options.count)
         save(small, options.output, overwrite=options.overwrite)

@@ -139,7 +139,9 @@ def _bonus(normal: Tensor) -> float:
 def _usual_sense(axis: Tensor) -> Tensor:
     """Give the axis the sense that captures usually have: -y, else +z."""
     cosines = axis.new_tensor(_USUAL) @ axis
-    return axis * torch.sign(cosines[cosines.abs().argmax()])
+    # At right angles to both, either sense is as good: +x.
+    senses = torch.cat([cosines[cosines.abs().argmax()][None], axis[:1]])
+    return axis * torch.sign(senses[senses.abs() > 0][0])
 
 
 def _stands_on_its_head(heights: Float[Tensor, "v"], ground: float) -> bool:

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.math import quaternions
+from cvtgs.math.activations import positive_log
 
 EIGENVALUE_FLOOR = 1e-12
 """Eigenvalues are kept above this share of the largest one (scales: above 1e-6)."""
@@ -86,6 +87,25 @@ def mean_projected_area(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
     p = AREA_EXPONENT
     mean = ((a * b) ** p + (a * c) ** p + (b * c) ** p) / 3
     return math.pi * mean ** (1 / p) * largest * largest
+
+
+def log_mean_projected_area(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """Give the logarithm of :func:`mean_projected_area`, for scales of any magnitude.
+
+    Args:
+        log_scales: Natural logarithms of the semi-axes.
+
+    Returns:
+        Natural logarithms of the areas.
+
+    Example:
+        >>> round(log_mean_projected_area(torch.zeros(1, 3)).item(), 4)
+        1.1447
+    """
+    largest = log_scales.amax(dim=1)
+    a, b, c = (AREA_EXPONENT * (log_scales - largest[:, None])).unbind(-1)
+    mean = (torch.exp(a + b) + torch.exp(a + c) + torch.exp(b + c)) / 3
+    return 2 * largest + positive_log(mean) / AREA_EXPONENT + math.log(math.pi)
 
 
 def _canonical_axes(axes: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:

@@ -26,6 +26,26 @@ def normalize(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
     return scaled / norms
 
 
+def multiply(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
+    """Multiply quaternions: the rotation ``b`` followed by the rotation ``a``.
+
+    Args:
+        a: Quaternions, w first.
+        b: Quaternions, w first.
+
+    Returns:
+        Their Hamilton products.
+
+    Example:
+        >>> i, j = torch.tensor([[0.0, 1, 0, 0]]), torch.tensor([[0.0, 0, 1, 0]])
+        >>> multiply(i, j).tolist()
+        [[0.0, 0.0, 0.0, 1.0]]
+    """
+    w, v, other_w, other_v = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
+    real = w * other_w - (v * other_v).sum(dim=1, keepdim=True)
+    return torch.cat([real, w * other_v + other_w * v + torch.linalg.cross(v, other_v)], dim=1)
+
+
 def to_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
     """Give the rotation matrices of unit quaternions.
 
@@ -82,4 +102,5 @@ def from_matrices(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
     )
     best = candidates.diagonal(dim1=1, dim2=2).argmax(dim=-1)
     quats = normalize(candidates[torch.arange(len(best), device=best.device), best])
-    return torch.where(quats[:, :1] < 0, -quats, quats)
+    # Adding 0 leaves no zero with a sign, so that the same frame is the same bits.
+    return torch.where(quats[:, :1] < 0, -quats, quats) + 0.0

@@ -36,6 +36,24 @@ def compose(
 
     Returns:
         The standard tensors of these cells, by name.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 2, sh_degree=0, seed=0)
+        >>> merged, none = scene.select(torch.tensor([0])), torch.zeros(1, 3)
+        >>> residuals = Residuals(
+        ...     shifts=none, growths=none + 0.5, turns=none, logits=none[:, 0],
+        ...     member_colors=torch.tensor([0.0, 1.0]), pair_colors=torch.zeros(1, 0),
+        ... )
+        >>> tensors = compose(
+        ...     scene, merged, Partition.from_labels(torch.tensor([0, 0]), 1),
+        ...     cells=torch.tensor([0]), neighbors=torch.zeros(1, 0, dtype=torch.int64),
+        ...     residuals=residuals,
+        ... )
+        >>> bool((tensors["log_scales"] == merged.log_scales + 0.5).all())
+        True
+        >>> bool(torch.isclose(tensors["sh0"][0], scene.sh0[1], atol=1e-6).all())
+        True
     """
     own = merged.select(cells)
     quats = quaternions.normalize(own.quats)
@@ -59,11 +77,10 @@ def compose(
 
 def _turned(quats: Float[Tensor, "m 4"], turns: Float[Tensor, "m 3"]) -> Float[Tensor, "m 4"]:
     """Turn about the own axes: the product with ``(1, turn / 2)``, of the same length."""
-    w, v, half = quats[:, :1], quats[:, 1:], turns / 2
-    real = w - (v * half).sum(dim=1, keepdim=True)
-    imaginary = v + w * half + torch.linalg.cross(v, half)
-    growth = torch.sqrt(1 + half.square().sum(dim=1, keepdim=True))
-    return torch.cat([real, imaginary], dim=1) / growth
+    half = turns / 2
+    turn = torch.cat([torch.ones_like(half[:, :1]), half], dim=1)
+    length = torch.sqrt(1 + half.square().sum(dim=1, keepdim=True))
+    return quaternions.multiply(quats, turn) / length
 
 
 def _mixed(
@@ -73,7 +90,9 @@ def _mixed(
     gates: Float[Tensor, "n"],
 ) -> Float[Tensor, "m b 3"]:
     """Sum what sets members apart from their cell."""
-    differences = values[part.order] - own[segment_ids(part.offsets)]
+    differences = values.index_select(0, part.order) - own.index_select(
+        0, segment_ids(part.offsets)
+    )
     return segment_sum(gates[:, None, None] * differences, part.offsets)
 
 
@@ -86,5 +105,5 @@ def _borrowed(
     """Sum what sets neighbours apart from a cell."""
     total = torch.zeros_like(own)
     for other, gates in zip(neighbors.unbind(1), residuals.pair_colors.unbind(1), strict=True):
-        total = total + gates[:, None, None] * (values[other] - own)
+        total = total + gates[:, None, None] * (values.index_select(0, other) - own)
     return total

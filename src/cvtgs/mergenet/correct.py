@@ -38,6 +38,22 @@ def correct_cells(
 
     Returns:
         The scene with corrected Gaussians.
+
+    Example:
+        >>> from cvtgs.cells import merge_cells
+        >>> from cvtgs.config import MergeConfig
+        >>> from cvtgs.mergenet import Architecture
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 5, sh_degree=0, seed=0)
+        >>> cells = Partition.from_labels(torch.tensor([0, 0, 0, 1, 1]), 2)
+        >>> merged = merge_cells(scene, cells, config=MergeConfig())
+        >>> untrained = MergeNet(Architecture())
+        >>> corrected = correct_cells(
+        ...     untrained, scene, merged, cells,
+        ...     neighbors=torch.tensor([[1], [0]]), light=torch.ones(5),
+        ... )
+        >>> bool((corrected.means == merged.means).all())
+        True
     """
     several = partition.counts > 1
     cells = several.nonzero()[:, 0]

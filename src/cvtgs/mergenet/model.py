@@ -93,7 +93,7 @@ class MergeNet(nn.Module):
 
     Example:
         >>> sum(parameter.numel() for parameter in MergeNet(Architecture()).parameters())
-        26380
+        25838
     """
 
     def __init__(self, architecture: Architecture) -> None:
@@ -138,12 +138,12 @@ class MergeNet(nn.Module):
         shifts = segment_sum(by_share[:, :1] * descriptors.places, offsets)
         twists = segment_sum(by_share[:, 2:] * _twists(descriptors.places.clamp(-5, 5)), offsets)
         near = descriptors.pair_places / (1 + descriptors.pair_places.abs())
-        twists = twists + _mean_of_pairs(of_pairs[..., 2:] * _twists(near))
+        # Twice, so that neighbours may turn a cell as a gate of 1 does.
+        twists = twists + 2 * _mean_of_pairs(of_pairs[..., 2:] * _twists(near))
         return Residuals(
             shifts=shifts + _mean_of_pairs(of_pairs[..., :1] * descriptors.pair_places),
             growths=LARGEST_GROWTH * torch.tanh(sizes[:, :3]),
-            turns=LARGEST_TURN
-            * torch.tanh(twists + _mean_of_pairs(of_pairs[..., 2:] * _twists(near))),
+            turns=LARGEST_TURN * torch.tanh(twists),
             logits=LARGEST_LOGIT_CHANGE * torch.tanh(0.5 * sizes[:, 3]),
             member_colors=by_share[:, 1],
             pair_colors=of_pairs[..., 1] / max(1, of_pairs.shape[1]),
@@ -163,7 +163,7 @@ class _Gates(nn.Module):
 
     def forward(self, own: Tensor, cells: Tensor, ids: Int[Tensor, "n"] | None) -> Tensor:
         of_cells = self.cell(cells)
-        summed = self.own(own) + (of_cells if ids is None else of_cells[ids])
+        summed = self.own(own) + (of_cells if ids is None else of_cells.index_select(0, ids))
         return torch.tanh(self.gates(nn.functional.silu(summed)))
 
 

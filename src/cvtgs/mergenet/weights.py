@@ -1,19 +1,19 @@
 """Checkpoints: a MergeNet and where it comes from, in one safetensors file."""
 
 import hashlib
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import pydantic
 import torch
 from torch import Tensor
 
-from cvtgs.errors import CheckpointError
+from cvtgs.config import PRESETS
+from cvtgs.errors import CheckpointError, FileFormatError
+from cvtgs.io.tensors import pack_tensors, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet
 
 SHIPPED = ("standard", "paper")
@@ -55,7 +55,7 @@ class Checkpoint:
         net: The network, on the CPU, float32, without gradients.
         info: What the file says about it.
         name: Name of the shipped checkpoint, or path of the file.
-        digest: SHA-256 of the weights, hexadecimal.
+        digest: SHA-256 of the weights and the description, hexadecimal.
     """
 
     net: MergeNet
@@ -86,10 +86,10 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
     content = _read(path, name)
     tensors, metadata = _parse(content, name)
     info = _described(metadata, name)
-    digest = _digest(tensors)
+    digest = _digest(tensors, metadata["info"])
     if metadata.get("sha256") != digest:
         raise CheckpointError(
-            f"{name}: the checkpoint is damaged: its weights have the hash {digest[:12]}..., "
+            f"{name}: the checkpoint is damaged: its content has the hash {digest[:12]}..., "
             f"it says {str(metadata.get('sha256'))[:12]}..."
         )
     return Checkpoint(net=_filled(info, tensors, name), info=info, name=name, digest=digest)
@@ -112,19 +112,18 @@ def save_checkpoint(net: MergeNet, info: CheckpointInfo) -> bytes:
         >>> len(save_checkpoint(MergeNet(info.architecture), info)) < 200_000
         True
     """
-    from safetensors.torch import save  # noqa: PLC0415 (only those who use a network need it)
-
     tensors = {
         name: values.detach().to(torch.float32).cpu().contiguous()
         for name, values in net.state_dict().items()
     }
+    described = info.model_dump_json()
     metadata = {
         "format": FORMAT,
         "format_version": str(FORMAT_VERSION),
-        "sha256": _digest(tensors),
-        "info": info.model_dump_json(),
+        "sha256": _digest(tensors, described),
+        "info": described,
     }
-    return bytes(save(tensors, metadata))
+    return pack_tensors(tensors, metadata)
 
 
 def _shipped_path(name: str) -> Path:
@@ -133,30 +132,25 @@ def _shipped_path(name: str) -> Path:
 
 def _read(path: Path, name: str) -> bytes:
     try:
-        size = path.stat().st_size
-        if size > LARGEST_FILE or not path.is_file():
-            raise CheckpointError(
-                f"{name}: a checkpoint must be a file of at most {LARGEST_FILE >> 20} MiB."
-            )
-        return path.read_bytes()
-    except FileNotFoundError:
+        if path.is_file() and path.stat().st_size <= LARGEST_FILE:
+            return path.read_bytes()
+        path.stat()
+    except (FileNotFoundError, ValueError):
         raise CheckpointError(
             f"{name}: no such checkpoint; it must be {' or '.join(SHIPPED)}, or a file."
         ) from None
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise CheckpointError(f"{name}: the checkpoint cannot be read: {reason}.") from error
+    raise CheckpointError(
+        f"{name}: a checkpoint must be a file of at most {LARGEST_FILE >> 20} MiB."
+    )
 
 
-def _parse(content: bytes, name: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    from safetensors import SafetensorError  # noqa: PLC0415 (only with a network)
-    from safetensors.torch import load  # noqa: PLC0415
-
+def _parse(content: bytes, name: str) -> tuple[dict[str, Tensor], dict[str, str]]:
     try:
-        tensors = load(content)
-        length = int.from_bytes(content[:8], "little")
-        metadata = json.loads(content[8 : 8 + length]).get("__metadata__", {})
-    except (SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
+        tensors, metadata = unpack_tensors(content)
+    except FileFormatError as error:
         raise CheckpointError(
             f"{name}: the checkpoint is no safetensors file, or damaged."
         ) from error
@@ -168,9 +162,9 @@ def _parse(content: bytes, name: str) -> tuple[dict[str, Tensor], dict[str, Any]
     return tensors, metadata
 
 
-def _described(metadata: Mapping[str, Any], name: str) -> CheckpointInfo:
-    version = str(metadata.get("format_version"))
-    if not version.isdecimal() or int(version) > FORMAT_VERSION:
+def _described(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
+    version = metadata.get("format_version")
+    if version not in map(str, range(1, FORMAT_VERSION + 1)):
         raise CheckpointError(
             f"{name}: the checkpoint has format version {version}, this cvtgs reads up to "
             f"{FORMAT_VERSION}; update cvtgs."
@@ -179,6 +173,11 @@ def _described(metadata: Mapping[str, Any], name: str) -> CheckpointInfo:
         info = CheckpointInfo.model_validate_json(metadata.get("info", ""))
     except pydantic.ValidationError as error:
         raise CheckpointError(f"{name}: the checkpoint does not say what it is.") from error
+    if info.preset not in PRESETS:
+        raise CheckpointError(
+            f"{name}: the preset of the checkpoint must be one of {', '.join(PRESETS)}, "
+            f"found {info.preset!r}."
+        )
     ours, theirs = Architecture(), info.architecture
     for feature in ("member_features", "pair_features", "cell_features"):
         if getattr(ours, feature) != getattr(theirs, feature):
@@ -205,10 +204,10 @@ def _filled(info: CheckpointInfo, tensors: dict[str, Tensor], name: str) -> Merg
     return net.eval().requires_grad_(False)
 
 
-def _digest(tensors: Mapping[str, Tensor]) -> str:
-    digest = hashlib.sha256()
+def _digest(tensors: Mapping[str, Tensor], described: str) -> str:
+    digest = hashlib.sha256(f"{described}\n".encode())
     for name in sorted(tensors):
         values = tensors[name]
         digest.update(f"{name} {values.dtype} {tuple(values.shape)}\n".encode())
-        digest.update(values.contiguous().view(torch.uint8).numpy().tobytes())
+        digest.update(values.contiguous().flatten().view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()

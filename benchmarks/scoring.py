@@ -1,0 +1,222 @@
+"""Score variants of a simplification against the full scene, and tabulate them."""
+
+import argparse
+import json
+import shlex
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean
+
+from torch import Tensor
+
+import cvtgs
+from cvtgs.errors import FileFormatError
+from cvtgs.evaluate import (
+    EvaluationSettings,
+    LpipsWeights,
+    automatic_views,
+    evaluate,
+    load_lpips,
+    lpips,
+)
+
+VIEWS = 8
+SIZE = 400
+"""What cvtgs' own renderer looks at: automatic views, and pixels on each side."""
+
+RATIOS = (0.1, 0.01, 0.001)
+FULL = "full scene"
+MEAN = "mean"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Quality:
+    """How close the pictures of a small scene come to those of the full one.
+
+    Attributes:
+        psnr: dB.
+        ssim: At most 1.
+        lpips: At least 0, less is better; None if it was not measured.
+    """
+
+    psnr: float
+    ssim: float
+    lpips: float | None = None
+
+
+Simplify = Callable[[cvtgs.GaussianScene, float], cvtgs.GaussianScene]
+"""Takes a scene and the ratio to keep."""
+
+Scorer = Callable[[cvtgs.GaussianScene, Sequence[cvtgs.GaussianScene]], list[Quality]]
+"""Takes the full scene and small ones."""
+
+Table = Mapping[str, Mapping[str, Sequence[Quality]]]
+"""One quality per ratio, by the name of the variant, by the name of the scene."""
+
+
+def scoring_parser(description: str | None) -> argparse.ArgumentParser:
+    """Make a parser that knows what to score, at which ratios, and by whom."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("files", nargs="*", type=Path, help="scenes; generated ones if none")
+    parser.add_argument("--rho", type=float, nargs="+", default=list(RATIOS))
+    parser.add_argument("--count", type=int, default=100_000, help="size of generated scenes")
+    parser.add_argument("--means", action="store_true", help="leave out the single scenes")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    judges = parser.add_mutually_exclusive_group()
+    judges.add_argument(
+        "--scorer", help="command with {full} and {small}; prints a JSON list with psnr and ssim"
+    )
+    judges.add_argument("--lpips", type=Path, help="weights file: measure LPIPS too")
+    return parser
+
+
+def configuration(options: argparse.Namespace, settings: Mapping[str, str]) -> cvtgs.SimplifyConfig:
+    """Put together what the command line sets, and ``settings``, which win; ``preset`` is one."""
+    values = {**dict(item.split("=", 1) for item in options.set), **settings}
+    return cvtgs.SimplifyConfig.compose(preset=values.pop("preset", None), settings=values)
+
+
+def variants_of(
+    options: argparse.Namespace, table: Mapping[str, Mapping[str, str]]
+) -> dict[str, Simplify]:
+    """Give a simplifier for every row of settings."""
+    return {
+        name: cvtgs.Simplifier(config=configuration(options, settings)).simplify
+        for name, settings in table.items()
+    }
+
+
+def measure(variants: Mapping[str, Simplify], options: argparse.Namespace) -> Iterator[Table]:
+    """Score every variant on every scene; give the table so far after each scene."""
+    score = make_scorer(options)
+    table: dict[str, dict[str, list[Quality]]] = {}
+    for name, scene in scenes(options.files, options.count):
+        small = [simplify(scene, rho) for simplify in variants.values() for rho in options.rho]
+        found = iter(score(scene, small))
+        table[name] = {variant: [next(found) for _ in options.rho] for variant in variants}
+        print(f"scored {name}: {len(scene)} Gaussians, {len(small)} small scenes", file=sys.stderr)
+        yield dict(table)
+
+
+def scenes(files: Sequence[Path], count: int) -> Iterator[tuple[str, cvtgs.GaussianScene]]:
+    """Give the scenes of the files, or one generated scene of each kind, with their names."""
+    stems = Counter(file.stem for file in files)
+    for file in files:
+        yield file.stem if stems[file.stem] == 1 else str(file), cvtgs.load(file)
+    for seed, kind in enumerate(() if files else cvtgs.synthetic.KINDS):
+        yield kind, cvtgs.synthetic.scene(kind, count, sh_degree=1, seed=seed)
+
+
+def make_scorer(options: argparse.Namespace) -> Scorer:
+    """Make what the options ask for; weights are read once."""
+    if options.scorer:
+        return command_scorer(options.scorer)
+    return own_scorer(None if options.lpips is None else any_lpips(options.lpips))
+
+
+def any_lpips(path: Path) -> LpipsWeights:
+    """Read LPIPS weights of whichever network the file holds."""
+    try:
+        return load_lpips("vgg", path)
+    except FileFormatError:
+        return load_lpips("alex", path)
+
+
+def own_scorer(weights: LpipsWeights | None) -> Scorer:
+    """Score by cvtgs' own renderer and views."""
+
+    def score(full: cvtgs.GaussianScene, small: Sequence[cvtgs.GaussianScene]) -> list[Quality]:
+        named = {str(number): scene for number, scene in enumerate(small)}
+        distances: dict[str, list[float]] = {name: [] for name in (FULL, *named)}
+        truth: list[Tensor] = []
+
+        def look(view: int, name: str, picture: Tensor) -> None:
+            if weights is None:
+                return
+            if name == FULL:
+                truth[:] = [picture[None]]
+            found = lpips(picture[None], truth[0], network=weights.network, weights=weights)
+            distances[name].append(float(found))
+
+        found = evaluate(
+            full,
+            named,
+            automatic_views(full, VIEWS, width=SIZE, height=SIZE),
+            reference_name=FULL,
+            settings=EvaluationSettings(lpips="off"),
+            on_picture=look,
+        )
+        return [
+            Quality(
+                psnr=scores.psnr.mean,
+                ssim=scores.ssim.mean,
+                lpips=mean_or_none(distances[scores.name] or [None]),
+            )
+            for scores in found.scenes
+        ]
+
+    return score
+
+
+def command_scorer(template: str) -> Scorer:
+    """Score by a command, which gets files and prints JSON: ``psnr``, ``ssim``, maybe ``lpips``."""
+
+    def score(full: cvtgs.GaussianScene, small: Sequence[cvtgs.GaussianScene]) -> list[Quality]:
+        with tempfile.TemporaryDirectory() as folder:
+            paths = [Path(folder) / f"{number}.ply" for number in range(len(small) + 1)]
+            for scene, path in zip([full, *small], paths, strict=True):
+                cvtgs.save(scene, path)
+            first, *others = (shlex.quote(str(path)) for path in paths)
+            command = shlex.split(template.format(full=first, small=" ".join(others)))
+            output = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+        return [
+            Quality(psnr=entry["psnr"], ssim=entry["ssim"], lpips=entry.get("lpips"))
+            for entry in json.loads(output)
+        ]
+
+    return score
+
+
+def means(table: Table) -> dict[str, list[Quality]]:
+    """Average over the scenes: one quality per ratio, by variant."""
+    first, *_ = table.values()
+    return {
+        variant: [
+            Quality(
+                psnr=mean(quality.psnr for quality in column),
+                ssim=mean(quality.ssim for quality in column),
+                lpips=mean_or_none([quality.lpips for quality in column]),
+            )
+            for column in zip(*(rows[variant] for rows in table.values()), strict=True)
+        ]
+        for variant in first
+    }
+
+
+def mean_or_none(values: Sequence[float | None]) -> float | None:
+    """Average, if every value is known."""
+    known = [value for value in values if value is not None]
+    return mean(known) if len(known) == len(values) else None
+
+
+def markdown(table: Table, ratios: Sequence[float], *, means_only: bool = False) -> str:
+    """Give a Markdown table: the mean first, then scene by scene."""
+    heads = [f"{name} at {rho:g}" for rho in ratios for name in ("PSNR", "SSIM", "LPIPS")]
+    lines = [f"| scene | variant | {' | '.join(heads)} |", "|---" * (len(heads) + 2) + "|"]
+    shown = {MEAN: means(table)} if means_only else {MEAN: means(table), **table}
+    for scene, rows in shown.items():
+        for variant, row in rows.items():
+            cells = [cell for quality in row for cell in cells_of(quality)]
+            lines.append(f"| {scene} | {variant} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def cells_of(quality: Quality) -> tuple[str, str, str]:
+    """Give the text of three columns; a dash for what was not measured."""
+    distance = "-" if quality.lpips is None else f"{quality.lpips:.4f}"
+    return f"{quality.psnr:.2f}", f"{quality.ssim:.4f}", distance

@@ -1,0 +1,105 @@
+"""Named tensors in safetensors files: what networks and caches are stored in, never a pickle."""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from torch import Tensor
+
+from cvtgs.errors import FileFormatError, InputNotFoundError
+from cvtgs.io.atomic import atomic_output
+
+
+def pack_tensors(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
+    """Give the bytes of a safetensors file; the same content gives the same bytes.
+
+    Args:
+        tensors: Tensors by name, on any device.
+        metadata: Texts by name.
+
+    Returns:
+        The bytes.
+
+    Example:
+        >>> import torch
+        >>> tensors, metadata = unpack_tensors(pack_tensors({"a": torch.ones(2)}, {"by": "me"}))
+        >>> tensors["a"].tolist(), metadata
+        ([1.0, 1.0], {'by': 'me'})
+    """
+    from safetensors.torch import save  # noqa: PLC0415 (only those who need it load it)
+
+    own = {name: values.detach().cpu().contiguous() for name, values in tensors.items()}
+    content = save(own)
+    length = int.from_bytes(content[:8], "little")
+    # safetensors would write the texts in another order every time.
+    header = {"__metadata__": dict(sorted(metadata.items())), **json.loads(content[8 : 8 + length])}
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    return b"".join([len(text).to_bytes(8, "little"), text, memoryview(content)[8 + length :]])
+
+
+def unpack_tensors(content: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read the bytes of a safetensors file.
+
+    Args:
+        content: The bytes.
+
+    Returns:
+        Tensors by name, and texts by name.
+
+    Raises:
+        FileFormatError: The bytes are no safetensors file, or damaged.
+    """
+    from safetensors import SafetensorError  # noqa: PLC0415
+    from safetensors.torch import load  # noqa: PLC0415
+
+    try:
+        tensors = load(content)
+        length = int.from_bytes(content[:8], "little")
+        metadata = json.loads(content[8 : 8 + length]).get("__metadata__") or {}
+    except (SafetensorError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise FileFormatError("these are no safetensors, or damaged ones.") from error
+    return tensors, metadata
+
+
+def save_tensors(
+    path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
+) -> None:
+    """Write tensors to a file, completely or not at all; an existing file is replaced.
+
+    Args:
+        path: The file.
+        tensors: Tensors by name.
+        metadata: Texts by name.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    with atomic_output(path, overwrite=True) as file:
+        file.write(pack_tensors(tensors, metadata))
+
+
+def map_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read tensors from a file without loading what is not looked at.
+
+    Args:
+        path: The file; it must not change as long as the tensors are used.
+
+    Returns:
+        Tensors by name, and texts by name.
+
+    Raises:
+        InputNotFoundError: There is no such file.
+        FileFormatError: It is no safetensors file, or damaged.
+    """
+    from safetensors import SafetensorError, safe_open  # noqa: PLC0415
+
+    if not Path(path).is_file():
+        raise InputNotFoundError(f"{path}: the file to read must exist, found none.")
+    try:
+        with safe_open(os.fspath(path), framework="pt") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return tensors, dict(file.metadata() or {})
+    except (SafetensorError, OSError) as error:
+        raise FileFormatError(f"{path}: the file is no safetensors file, or damaged.") from error

@@ -1,0 +1,240 @@
+"""Cases: scenes at a ratio, as far as no training step changes them."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cvtgs.cameras import Cameras
+from cvtgs.cells import Descriptors, Partition, describe_cells
+from cvtgs.config import SimplifyConfig
+from cvtgs.evaluate import automatic_views
+from cvtgs.mergenet import Residuals, compose
+from cvtgs.render import render
+from cvtgs.scene import GaussianScene
+from cvtgs.simplify import target_count
+from cvtgs.stages import Reference, make_reference
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Views:
+    """Pictures of a full scene; the background is left open.
+
+    Attributes:
+        cameras: From where.
+        rgb: ``(c, h, w, 3)`` colours over black, half precision.
+        alpha: ``(c, h, w)`` opacity, half precision.
+    """
+
+    cameras: Cameras
+    rgb: Float[Tensor, "c h w 3"]
+    alpha: Float[Tensor, "c h w"]
+
+    def over(self, background: Float[Tensor, "3"], rows: slice) -> Float[Tensor, "r h w 3"]:
+        """Put some of the pictures over a background.
+
+        Args:
+            background: Red, green, blue.
+            rows: Which pictures.
+
+        Returns:
+            Pictures in float32.
+        """
+        through = 1 - self.alpha[rows].float()
+        return self.rgb[rows].float() + through[..., None] * background
+
+    def to(self, device: torch.device) -> "Views":
+        """Move the pictures to a device.
+
+        Args:
+            device: Where to.
+
+        Returns:
+            The pictures there.
+        """
+        return Views(
+            cameras=self.cameras.to(device), rgb=self.rgb.to(device), alpha=self.alpha.to(device)
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Case:
+    """A scene at a ratio: its merged Gaussians, and what the network sees of them.
+
+    Attributes:
+        scene_name: Name of the scene.
+        ratio: Gaussians kept, as a share.
+        reference: Scene, merged Gaussians, cells, neighbours.
+        cells: ``(r,)`` cells of several members: those that the network corrects.
+        part: Members of these cells.
+        descriptors: What the network sees of these cells.
+    """
+
+    scene_name: str
+    ratio: float
+    reference: Reference
+    cells: Int[Tensor, "r"]
+    part: Partition
+    descriptors: Descriptors
+
+    @property
+    def name(self) -> str:
+        """Scene and ratio."""
+        return f"{self.scene_name} at {self.ratio:g}"
+
+    def select(self, rows: Int[Tensor, "s"]) -> "Case":
+        """Take some of the cells, and describe them anew.
+
+        Args:
+            rows: Which of ``cells``.
+
+        Returns:
+            A case of these cells only.
+        """
+        chosen = torch.zeros(len(self.cells), dtype=torch.bool, device=self.cells.device)
+        chosen[rows] = True
+        part = self.part.select(chosen)
+        return make_case(self.scene_name, self.ratio, self.reference, self.cells[chosen], part)
+
+    def changed(self, residuals: Residuals) -> dict[str, Tensor]:
+        """Change the cells, differentiably.
+
+        Args:
+            residuals: What the network wants changed.
+
+        Returns:
+            The standard tensors of the cells.
+        """
+        return compose(
+            self.reference.scene,
+            self.reference.merged,
+            self.part,
+            cells=self.cells,
+            neighbors=self.reference.neighbors[self.cells],
+            residuals=residuals,
+        )
+
+    def corrected(self, residuals: Residuals) -> GaussianScene:
+        """Give the whole small scene with its cells changed, differentiably.
+
+        Args:
+            residuals: What the network wants changed.
+
+        Returns:
+            The small scene.
+        """
+        merged = self.reference.merged
+        changed = self.changed(residuals)
+        return merged.with_tensors(
+            {
+                name: values.index_copy(0, self.cells, changed[name])
+                for name, values in merged.tensors().items()
+            },
+            {},
+        )
+
+    def to(self, device: torch.device) -> "Case":
+        """Move the case to a device.
+
+        Args:
+            device: Where to.
+
+        Returns:
+            The case there.
+        """
+        reference, part = self.reference, self.part
+        if reference.scene.device == device:
+            return self
+        moved = Reference(
+            scene=reference.scene.to(device),
+            merged=reference.merged.to(device),
+            partition=reference.partition.to(device),
+            neighbors=reference.neighbors.to(device),
+            light=reference.light.to(device),
+        )
+        return Case(
+            scene_name=self.scene_name,
+            ratio=self.ratio,
+            reference=moved,
+            cells=self.cells.to(device),
+            part=part.to(device),
+            descriptors=self.descriptors.to(device),
+        )
+
+
+def make_case(
+    scene_name: str, ratio: float, reference: Reference, cells: Tensor, part: Partition
+) -> Case:
+    """Describe some cells of a reference.
+
+    Args:
+        scene_name: Name of the scene.
+        ratio: Gaussians kept, as a share.
+        reference: What the network is to correct.
+        cells: Which cells.
+        part: Their members.
+
+    Returns:
+        The case.
+    """
+    described = describe_cells(
+        reference.scene,
+        reference.merged,
+        part,
+        cells=cells,
+        neighbors=reference.neighbors[cells],
+        sizes=reference.partition.counts,
+        light=reference.light,
+    )
+    return Case(
+        scene_name=scene_name,
+        ratio=ratio,
+        reference=reference,
+        cells=cells,
+        part=part,
+        descriptors=described,
+    )
+
+
+def refer_case(
+    scene_name: str, scene: GaussianScene, ratio: float, config: SimplifyConfig
+) -> Case | None:
+    """Simplify a scene without a network, and describe its cells.
+
+    Args:
+        scene_name: Name of the scene.
+        scene: The scene.
+        ratio: Gaussians to keep, as a share.
+        config: How to simplify.
+
+    Returns:
+        The case; None if no cell has several members, so that there is nothing to learn.
+    """
+    target = target_count(len(scene), ratio)
+    if target >= len(scene):
+        return None
+    reference = make_reference(scene, target, config)
+    several = reference.partition.counts > 1
+    cells = several.nonzero()[:, 0]
+    if not len(cells):
+        return None
+    return make_case(scene_name, ratio, reference, cells, reference.partition.select(several))
+
+
+def look_at_scene(scene: GaussianScene, count: int, *, size: int, seed: int) -> Views:
+    """Render a full scene once.
+
+    Args:
+        scene: The scene.
+        count: Number of automatic views.
+        size: Side of the square pictures, pixels.
+        seed: Which views.
+
+    Returns:
+        The pictures, on the CPU.
+    """
+    cameras = automatic_views(scene, count, width=size, height=size, seed=seed)
+    with torch.no_grad():
+        pictures = render(scene, cameras)
+    return Views(cameras=cameras, rgb=pictures.rgb.cpu().half(), alpha=pictures.alpha.cpu().half())

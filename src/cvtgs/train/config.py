@@ -1,0 +1,141 @@
+"""TrainConfig: every choice of a training, from a TOML file."""
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import pydantic
+
+from cvtgs.config import Section, explain, read_toml
+from cvtgs.errors import ConfigError
+
+Ratio = Annotated[float, pydantic.Field(gt=0.0, lt=1.0)]
+Count = Annotated[int, pydantic.Field(ge=1)]
+
+
+class DataConfig(Section):
+    """Which scenes are learned from, and which decide when to stop.
+
+    Attributes:
+        folders: Folders of PLY files; relative ones start at the configuration file.
+        validation: Names of files (without .ply) that are never learned from; every fifth file,
+            from the second on, if none is named.
+        generated: Generated scenes of each kind to learn from.
+        generated_validation: Generated scenes of each kind that are never learned from.
+        generated_counts: Gaussians of generated scenes, in turn.
+        blocks: Compact pieces that are cut from each file that is larger than a piece.
+        block_count: Gaussians of a piece.
+        copies: Perturbed copies of each scene or piece: thinned, stretched, with other contrast
+            and opacity.
+        ratios: Ratios to learn from.
+        validation_ratios: Ratios to validate with.
+        largest_case: Files with more Gaussians are learned from in pieces only, to bound the time
+            of a step.
+    """
+
+    folders: tuple[Path, ...] = ()
+    validation: tuple[str, ...] = ()
+    generated: int = pydantic.Field(default=4, ge=0)
+    generated_validation: int = pydantic.Field(default=1, ge=0)
+    generated_counts: tuple[Count, ...] = (20_000, 40_000, 60_000, 80_000)
+    blocks: int = pydantic.Field(default=4, ge=0)
+    block_count: Count = 60_000
+    copies: int = pydantic.Field(default=0, ge=0)
+    ratios: tuple[Ratio, ...] = (0.15, 0.06, 0.02, 0.008, 0.003, 0.001)
+    validation_ratios: tuple[Ratio, ...] = (0.1, 0.01, 0.001)
+    largest_case: Count = 130_000
+
+
+class ViewsConfig(Section):
+    """How scenes are looked at.
+
+    Attributes:
+        count: Views of each scene at each size.
+        sizes: Sides of the square pictures, pixels.
+        validation_count: Views of each validation scene.
+        validation_size: Side of their pictures, pixels.
+    """
+
+    count: Count = 16
+    sizes: tuple[Count, ...] = (128, 192, 320)
+    validation_count: Count = 8
+    validation_size: Count = 256
+
+
+class LossConfig(Section):
+    """What is made small.
+
+    Attributes:
+        squared: Weight of the squared error, in units of that of the reference.
+        image: Weight of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) + 0.2 gradient``, in units
+            of that of the reference.
+        residual: Price of the changes.
+    """
+
+    squared: float = pydantic.Field(default=0.5, ge=0.0)
+    image: float = pydantic.Field(default=0.5, ge=0.0)
+    residual: float = pydantic.Field(default=0.0, ge=0.0)
+
+
+class TrainConfig(Section):
+    """Every choice of a training; frozen, unknown keys are errors.
+
+    Attributes:
+        kind: ``scene``: whole simplified scenes are rendered; ``local``: single cells.
+        preset: The preset whose merged Gaussians the network learns to correct.
+        start: A checkpoint to start from; its width must be the same.
+        seed: Seed of all that is drawn.
+        steps: Training steps.
+        learning_rate: Largest step of the optimiser (AdamW); it falls to zero along a cosine.
+        width: Units of the layers that see members and neighbours.
+        cell_width: Units of the layers that see cells.
+        validate_every: Steps between validations.
+        patience: Validations without a new best after which training stops.
+        cells: Cells of one step of a ``local`` training.
+        note: A sentence about the training data, for the checkpoint.
+        data: Scenes.
+        views: Pictures.
+        loss: Loss.
+
+    Example:
+        >>> TrainConfig(steps=10).data.ratios[0]
+        0.15
+    """
+
+    kind: Literal["scene", "local"] = "scene"
+    preset: Literal["standard", "paper"] = "standard"
+    start: Path | None = None
+    seed: int = pydantic.Field(default=0, ge=0)
+    steps: Count = 6000
+    learning_rate: float = pydantic.Field(default=5e-3, gt=0.0)
+    width: Count = 48
+    cell_width: Count = 96
+    validate_every: Count = 500
+    patience: Count = 1000
+    cells: Count = 49
+    note: str = ""
+    data: DataConfig = DataConfig()
+    views: ViewsConfig = ViewsConfig()
+    loss: LossConfig = LossConfig()
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """Read a configuration file.
+
+        Args:
+            path: A TOML file with the keys of this class; missing keys keep their defaults.
+
+        Returns:
+            The configuration; relative paths are made relative to the file.
+
+        Raises:
+            ConfigError: The file cannot be read, is not TOML, or holds a bad key or value.
+        """
+        path = Path(path)
+        try:
+            config = cls.model_validate(read_toml(path))
+        except pydantic.ValidationError as error:
+            raise ConfigError(f"{path}: {explain(error)}") from None
+        folders = tuple(path.parent / folder for folder in config.data.folders)
+        start = None if config.start is None else path.parent / config.start
+        data = config.data.model_copy(update={"folders": folders})
+        return config.model_copy(update={"data": data, "start": start})

@@ -1,0 +1,227 @@
+"""The training loop: steps, validations, files; the same answer whether interrupted or not."""
+
+import copy
+import math
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import cvtgs
+from cvtgs.errors import ConfigError, TrainingError
+from cvtgs.io import atomic_output
+from cvtgs.mergenet import Architecture, CheckpointInfo, MergeNet, load_checkpoint, save_checkpoint
+from cvtgs.progress import ProgressEvent, ProgressListener, silent
+from cvtgs.train.cache import Prepared, prepare
+from cvtgs.train.cases import Case, Views
+from cvtgs.train.config import TrainConfig
+from cvtgs.train.history import History, Validation
+from cvtgs.train.losses import local_loss, scene_loss, scores
+from cvtgs.train.scenes import Source, find_sources
+from cvtgs.train.state import TrainState
+
+WARM_UP = 50
+"""Steps in which the learning rate rises."""
+
+LARGEST_GRADIENT = 1.0
+"""Gradients are shortened to this length."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainFiles:
+    """Where a training writes.
+
+    Attributes:
+        checkpoint: The best network so far.
+        state: All that is needed to go on.
+        curves: A picture of the history.
+        cache: Folder of prepared scenes.
+    """
+
+    checkpoint: Path
+    state: Path
+    curves: Path
+    cache: Path
+
+    @classmethod
+    def beside(cls, checkpoint: Path, cache: Path | None = None) -> "TrainFiles":
+        """Give the usual names.
+
+        Args:
+            checkpoint: The best network so far.
+            cache: Folder of prepared scenes; beside the checkpoint if None.
+
+        Returns:
+            Names that start like that of the checkpoint.
+        """
+        return cls(
+            checkpoint=checkpoint,
+            state=checkpoint.with_suffix(".state"),
+            curves=checkpoint.with_suffix(".png"),
+            cache=cache or checkpoint.with_suffix(".cache"),
+        )
+
+
+def train(
+    config: TrainConfig,
+    files: TrainFiles,
+    *,
+    resume: bool = False,
+    device: torch.device | str = "cpu",
+    listener: ProgressListener = silent,
+    on_validation: Callable[[History], None] = lambda history: None,
+) -> History:
+    """Train a MergeNet.
+
+    Each step takes one scene at one ratio. Which, and from where it is seen, depends on the seed
+    and the number of the step only, so a training that is resumed gives the same bits as one
+    that was never interrupted. The network that is kept is a running mean over steps, at the
+    validation where it gained most.
+
+    Args:
+        config: Every choice.
+        files: Where to write; checkpoint, state and curves are replaced as training goes on.
+        resume: Whether to go on from ``files.state``, if there is one.
+        device: Where to train.
+        listener: Told about scenes that are prepared, and steps.
+        on_validation: Called after each validation.
+
+    Returns:
+        All validations.
+
+    Raises:
+        ConfigError: There are no scenes to learn from or to validate with.
+        CheckpointError: The start, or the state to resume, cannot be used.
+        TrainingError: The loss is not finite; the text says where, and which file is good.
+        OutputError: A file cannot be written.
+    """
+    sources = find_sources(config.data, seed=config.seed)
+    device = torch.device(device)
+    state = TrainState(_first_net(config).to(device), config)
+    if resume and files.state.is_file():
+        state.load(files.state, config)
+    files.cache.mkdir(parents=True, exist_ok=True)
+    lessons, exams = _prepare_all(sources, config, files.cache, listener)
+    if not state.history.validations:
+        _validate(state, exams, math.nan, config, files, device)
+        on_validation(state.history)
+    losses: list[float] = []
+    while state.step < config.steps and state.history.since_best() < config.patience:
+        losses.append(_step(state, lessons, config, files, device))
+        listener(ProgressEvent(stage="train", done=state.step, total=config.steps))
+        if state.step % config.validate_every == 0 or state.step == config.steps:
+            _validate(state, exams, sum(losses) / len(losses), config, files, device)
+            on_validation(state.history)
+            losses = []
+    return state.history
+
+
+def _first_net(config: TrainConfig) -> MergeNet:
+    if config.start is not None:
+        net = copy.deepcopy(load_checkpoint(config.start).net).requires_grad_(True).train()
+        shape = net.architecture
+        if (shape.width, shape.cell_width) != (config.width, config.cell_width):
+            raise ConfigError(
+                f"start: width and cell_width must be {shape.width} and {shape.cell_width} as in "
+                f"{config.start}, found {config.width} and {config.cell_width}."
+            )
+        return net
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        return MergeNet(Architecture(width=config.width, cell_width=config.cell_width))
+
+
+def _prepare_all(
+    sources: Sequence[Source], config: TrainConfig, cache: Path, listener: ProgressListener
+) -> tuple[list[tuple[Case, tuple[Views, ...]]], list[Prepared]]:
+    lessons, exams = [], []
+    for number, source in enumerate(sources):
+        listener(ProgressEvent(stage="prepare", done=number, total=len(sources)))
+        prepared = prepare(source, config, cache)
+        if source.validates:
+            exams.append(prepared)
+        else:
+            lessons += [(case, prepared.views) for case in prepared.cases]
+    listener(ProgressEvent(stage="prepare", done=len(sources), total=len(sources)))
+    return lessons, exams
+
+
+def _step(
+    state: TrainState,
+    lessons: Sequence[tuple[Case, tuple[Views, ...]]],
+    config: TrainConfig,
+    files: TrainFiles,
+    device: torch.device,
+) -> float:
+    dice = random.Random(f"{config.seed}/{state.step}")
+    case, views = dice.choice(lessons)
+    some_views = dice.choice(views)
+    for group in state.optimizer.param_groups:
+        group["lr"] = _learning_rate(config, state.step)
+    loss = _loss(state.net, case.to(device), some_views.to(device), config, dice)
+    state.optimizer.zero_grad()
+    loss.backward()
+    length = torch.nn.utils.clip_grad_norm_(state.net.parameters(), LARGEST_GRADIENT)
+    error = float(loss.detach())
+    if not (math.isfinite(error) and math.isfinite(float(length))):
+        good = files.checkpoint if files.checkpoint.is_file() else "none yet"
+        raise TrainingError(
+            f"the loss or its gradient is not finite at step {state.step}, {case.name}; "
+            f"the last good checkpoint is {good}."
+        )
+    state.optimizer.step()
+    state.average()
+    state.step += 1
+    return error
+
+
+def _loss(
+    net: MergeNet, case: Case, views: Views, config: TrainConfig, dice: random.Random
+) -> Tensor:
+    if config.kind == "local":
+        return local_loss(net, case, config.cells, config=config.loss, dice=dice)
+    return scene_loss(net, case, views, config=config.loss, dice=dice)
+
+
+def _learning_rate(config: TrainConfig, step: int) -> float:
+    warm = min(1.0, (step + 1) / WARM_UP)
+    return config.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / config.steps))
+
+
+def _validate(
+    state: TrainState,
+    exams: Sequence[Prepared],
+    loss: float,
+    config: TrainConfig,
+    files: TrainFiles,
+    device: torch.device,
+) -> None:
+    gains: dict[str, dict[float, float]] = {}
+    for exam in exams:
+        views = exam.views[0].to(device)
+        for case in exam.cases:
+            before, after = scores(state.mean_net, case.to(device), views)
+            gains.setdefault(exam.name, {})[case.ratio] = after - before
+    history = state.history
+    history.validations.append(Validation(step=state.step, loss=loss, gains=gains))
+    if history.since_best() == 0:
+        with atomic_output(files.checkpoint, overwrite=True) as file:
+            file.write(save_checkpoint(state.mean_net, _description(state, config)))
+    state.save(files.state, config)
+    if len(history.validations) > 1:
+        with atomic_output(files.curves, overwrite=True) as file:
+            file.write(history.curves())
+
+
+def _description(state: TrainState, config: TrainConfig) -> CheckpointInfo:
+    return CheckpointInfo(
+        architecture=state.net.architecture,
+        preset=config.preset,
+        training=config.note or f"{config.kind} training",
+        seed=config.seed,
+        steps=state.step,
+        version=cvtgs.__version__,
+    )

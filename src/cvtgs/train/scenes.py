@@ -1,0 +1,216 @@
+"""Scenes to learn from and to validate with: files, pieces of them, copies, generated ones."""
+
+import random
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from cvtgs import synthetic
+from cvtgs.errors import ConfigError
+from cvtgs.filters import invalid_rows
+from cvtgs.io import load
+from cvtgs.math import covariances, quaternions
+from cvtgs.math.activations import positive_log
+from cvtgs.scene import GaussianScene
+from cvtgs.train.config import DataConfig
+
+VALIDATION_SEED = 1_000_000
+"""Generated scenes for validation have seeds from here on."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """A scene by name, made when it is needed.
+
+    Attributes:
+        name: Unique name.
+        identity: A text that changes when the scene does.
+        validates: Whether it is for validation only.
+        make: Makes it.
+    """
+
+    name: str
+    identity: str
+    validates: bool
+    make: Callable[[], GaussianScene]
+
+
+def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
+    """List the scenes of a training, without loading them.
+
+    Args:
+        config: Which.
+        seed: Seed of pieces, copies and generated scenes.
+
+    Returns:
+        Sources with unique names, those of files in alphabetical order.
+
+    Raises:
+        ConfigError: A folder or a validation file is missing, or there is nothing to learn from
+            or to validate with.
+    """
+    files = [path for folder in config.folders for path in _files_in(folder)]
+    names = [path.stem for path in files]
+    held_out = set(config.validation) or set(names[1::5])
+    missing = sorted(held_out - set(names))
+    if missing:
+        raise ConfigError(f"data.validation: no file named {missing[0]}.ply in data.folders.")
+    sources = [*_from_files(files, held_out, config, seed), *_generated(config, seed)]
+    if len({source.name for source in sources}) < len(sources):
+        raise ConfigError("data.folders: two files have the same name.")
+    for validates, text in ((False, "learn from"), (True, "validate with")):
+        if not any(source.validates == validates for source in sources):
+            raise ConfigError(f"data: there is no scene to {text}.")
+    return sources
+
+
+def _files_in(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise ConfigError(f"data.folders: {folder} is not a folder.")
+    files = sorted(folder.rglob("*.ply"))
+    if not files:
+        raise ConfigError(f"data.folders: {folder} holds no PLY file.")
+    return files
+
+
+def _from_files(
+    files: list[Path], held_out: set[str], config: DataConfig, seed: int
+) -> Iterator[Source]:
+    for path in files:
+        count = len(load(path))
+        whole = Source(
+            name=path.stem,
+            identity=_identity(path),
+            validates=path.stem in held_out,
+            make=partial(_load_valid, path),
+        )
+        if whole.validates:
+            yield whole
+            continue
+        originals = [whole] if count <= config.largest_case else []
+        yield from originals
+        for number in range(config.blocks if count > config.block_count else 0):
+            block = Source(
+                name=f"{path.stem}-block{number}",
+                identity=f"{whole.identity} block {config.block_count} {seed + number}",
+                validates=False,
+                make=partial(_block_of, whole, config.block_count, seed + number),
+            )
+            originals.append(block)
+            yield block
+        yield from _copies(originals, config.copies, seed)
+
+
+def _load_valid(path: Path) -> GaussianScene:
+    scene = load(path)
+    invalid = invalid_rows(scene)
+    if not invalid:
+        return scene
+    return scene.select(~torch.stack(list(invalid.values())).any(dim=0))
+
+
+def _block_of(source: Source, count: int, seed: int) -> GaussianScene:
+    return cut_block(source.make(), count, seed=seed)
+
+
+def _perturbed(source: Source, seed: str) -> GaussianScene:
+    return perturb(source.make(), random.Random(seed))
+
+
+def _identity(path: Path) -> str:
+    facts = path.stat()
+    return f"{path.resolve()} {facts.st_size} {facts.st_mtime_ns}"
+
+
+def _copies(originals: list[Source], count: int, seed: int) -> Iterator[Source]:
+    for original in originals:
+        for number in range(count):
+            name = f"{original.name}-copy{number}"
+            yield Source(
+                name=name,
+                identity=f"{original.identity} copy {seed} {number}",
+                validates=False,
+                make=partial(_perturbed, original, f"{seed}/{name}"),
+            )
+
+
+def _generated(config: DataConfig, seed: int) -> Iterator[Source]:
+    counts = config.generated_counts
+    for validates, number, first in (
+        (False, config.generated, 1000 * seed),
+        (True, config.generated_validation, VALIDATION_SEED + 1000 * seed),
+    ):
+        for turn in range(number):
+            for place, kind in enumerate(synthetic.KINDS):
+                count, degree = counts[(turn + place) % len(counts)], (turn + place) % 3
+                name = f"generated-{kind}-{first + turn}"
+                yield Source(
+                    name=name,
+                    identity=f"{name} {count} {degree}",
+                    validates=validates,
+                    make=partial(synthetic.scene, kind, count, sh_degree=degree, seed=first + turn),
+                )
+
+
+def cut_block(scene: GaussianScene, count: int, *, seed: int) -> GaussianScene:
+    """Cut a compact piece out of a scene: a Gaussian, and those that are nearest to it.
+
+    Args:
+        scene: The scene.
+        count: Gaussians of the piece; a scene that has no more is returned whole.
+        seed: Which piece.
+
+    Returns:
+        The piece, in the order of the scene.
+
+    Example:
+        >>> len(cut_block(synthetic.scene("room", 500), 100, seed=1))
+        100
+    """
+    if len(scene) <= count:
+        return scene
+    middle = scene.means[random.Random(seed).randrange(len(scene))]
+    distances = torch.linalg.vector_norm(scene.means - middle, dim=1)
+    return scene.select(distances.topk(count, largest=False).indices.sort().values)
+
+
+def perturb(scene: GaussianScene, dice: random.Random) -> GaussianScene:
+    """Make a scene that looks like another one: thinned, stretched, recoloured.
+
+    Turning, moving or scaling a scene would teach nothing: descriptors do not change then.
+
+    Args:
+        scene: The scene, on the CPU.
+        dice: Draws the changes.
+
+    Returns:
+        Another scene.
+
+    Example:
+        >>> len(perturb(synthetic.scene("object", 500), random.Random(0))) <= 500
+        True
+    """
+    generator = torch.Generator().manual_seed(dice.getrandbits(62))
+    share = dice.uniform(0.4, 1.0)
+    kept = scene.select(torch.rand(len(scene), generator=generator) < share)
+    stretch = torch.tensor([dice.uniform(0.6, 1.5) for _ in range(3)], dtype=scene.dtype)
+    wider = share ** (-1 / 3)
+    quats = quaternions.normalize(kept.quats.double())
+    shapes = covariances.from_scales_and_quats(kept.scales.double() * wider, quats)
+    scales, turned = covariances.decompose(shapes * stretch[:, None] * stretch)
+    mix = torch.eye(3) * dice.uniform(0.5, 1.4) + 0.3 * torch.randn(3, 3, generator=generator)
+    mix = mix.to(scene.dtype)
+    return kept.with_tensors(
+        {
+            "means": kept.means * stretch,
+            "log_scales": positive_log(scales).to(scene.dtype),
+            "quats": turned.to(scene.dtype),
+            "logit_opacities": kept.logit_opacities + dice.uniform(-1.0, 1.0),
+            "sh0": kept.sh0 @ mix,
+            "shN": kept.shN @ mix,
+        },
+        {},
+    )

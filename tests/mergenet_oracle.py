@@ -1,0 +1,265 @@
+"""What MergeNet sees and does, cell by cell in float64; nothing here imports cvtgs."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from oracles import Array, clamped_opacity, rotation, thomsen_area
+
+C0 = 0.28209479177387814
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kernel:
+    """One Gaussian, activated; the axes are the columns of ``axes``."""
+
+    mean: Array
+    axes: Array
+    scales: Array
+    opacity: float
+    color: Array
+
+    @property
+    def area(self) -> float:
+        return thomsen_area(self.scales)
+
+    @property
+    def covariance(self) -> Array:
+        return (self.axes * self.scales**2) @ self.axes.T
+
+    def locate(self, point: Array) -> Array:
+        """The point in the frame and in the standard deviations of this Gaussian."""
+        return np.array(
+            [
+                float(axis @ (point - self.mean)) / scale
+                for axis, scale in zip(self.axes.T, self.scales, strict=True)
+            ]
+        )
+
+    def extents(self, other: "Kernel") -> list[float]:
+        """Logs of the standard deviations of another along the axes of this one, in its own."""
+        lengths = [math.sqrt(axis @ other.covariance @ axis) for axis in self.axes.T]
+        return [
+            clamp(math.log(length / scale), 9.0)
+            for length, scale in zip(lengths, self.scales, strict=True)
+        ]
+
+    def contrast(self, other: "Kernel") -> float:
+        return math.sqrt(float(np.mean((self.color - other.color) ** 2)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cell:
+    """What became of a cell, its members, how freely they are seen, and its neighbours."""
+
+    own: Kernel
+    members: Sequence[Kernel]
+    lights: Sequence[float]
+    others: Sequence[Kernel]
+    other_sizes: Sequence[int]
+
+    @property
+    def shares(self) -> list[float]:
+        masses = [member.opacity * member.area for member in self.members]
+        return [mass / math.fsum(masses) for mass in masses]
+
+    @property
+    def light(self) -> float:
+        return math.fsum(w * light for w, light in zip(self.shares, self.lights, strict=True))
+
+    @property
+    def contrast(self) -> float:
+        squares = [member.contrast(self.own) ** 2 for member in self.members]
+        return math.sqrt(math.fsum(w * s for w, s in zip(self.shares, squares, strict=True)))
+
+    @property
+    def slope(self) -> Array:
+        """Towards where members are seen more freely."""
+        total = np.zeros(3)
+        for share, light, member in zip(self.shares, self.lights, self.members, strict=True):
+            total += share * (light - self.light) * self.own.locate(member.mean)
+        return total
+
+    @property
+    def cover(self) -> Array:
+        """How opaquely neighbours paint three sigmas out, by axis, positive side first."""
+        sides = np.zeros((3, 2))
+        for axis in range(3):
+            for side, sign in enumerate((1.0, -1.0)):
+                end = self.own.mean + sign * 3.0 * self.own.scales[axis] * self.own.axes[:, axis]
+                through = [1.0 - other.opacity * bell(other.locate(end)) for other in self.others]
+                sides[axis, side] = 1.0 - math.prod(through)
+        return sides
+
+
+def kernel(
+    mean: Sequence[float],
+    quat: Sequence[float],
+    log_scales: Sequence[float],
+    logit: float,
+    sh0: Sequence[float],
+) -> Kernel:
+    return Kernel(
+        mean=np.array(mean),
+        axes=rotation(quat),
+        scales=np.exp(np.array(log_scales)),
+        opacity=clamped_opacity(logit),
+        color=C0 * np.array(sh0),
+    )
+
+
+def clamp(value: float, limit: float) -> float:
+    return min(max(value, -limit), limit)
+
+
+def bell(place: Array) -> float:
+    return math.exp(-0.5 * min(float(place @ place), 60.0))
+
+
+def squashed_length(place: Array) -> float:
+    return math.log1p(min(math.sqrt(float(place @ place)), 50.0))
+
+
+def distances(place: Array) -> list[float]:
+    return [*(math.log1p(min(abs(x), 50.0)) for x in place), squashed_length(place)]
+
+
+def facing(cell: Cell, place: Sequence[float]) -> list[float]:
+    """On the bare (positive) or on the covered side (negative), by axis and in all."""
+    sides = [0.5 * (minus - plus) * x for (plus, minus), x in zip(cell.cover, place, strict=True)]
+    return [*sides, math.fsum(sides)]
+
+
+def describe_members(cell: Cell) -> list[list[float]]:
+    rows = []
+    for share, light, member in zip(cell.shares, cell.lights, cell.members, strict=True):
+        place, contrast = cell.own.locate(member.mean), member.contrast(cell.own)
+        rows.append(
+            [
+                *distances(place),
+                *(0.3 * extent for extent in cell.own.extents(member)),
+                *facing(cell, [clamp(x, 4.0) for x in place]),
+                0.3 * clamp(math.log(share * len(cell.members)), 14.0),
+                member.opacity,
+                0.2 * clamp(math.log(member.area / cell.own.area), 14.0),
+                3.0 * min(contrast, 2.0),
+                0.5 * contrast / (cell.contrast + 0.02),
+                light,
+                3.0 * (light - cell.light),
+                clamp(float(cell.slope @ place), 3.0),
+            ]
+        )
+    return rows
+
+
+def describe_pairs(cell: Cell) -> list[list[float]]:
+    rows = []
+    for other, size in zip(cell.others, cell.other_sizes, strict=True):
+        place, back = cell.own.locate(other.mean), other.locate(cell.own.mean)
+        rows.append(
+            [
+                *distances(place),
+                *(0.3 * extent for extent in cell.own.extents(other)),
+                *facing(cell, [x / (1.0 + abs(x)) for x in place]),
+                squashed_length(back),
+                other.opacity,
+                0.2 * clamp(math.log(other.area / cell.own.area), 14.0),
+                0.2 * math.log(size / len(cell.members)),
+                3.0 * min(other.contrast(cell.own), 2.0),
+                other.opacity * bell(back),
+                bell(place),
+            ]
+        )
+    return rows
+
+
+def describe_cell(cell: Cell) -> list[float]:
+    cover, own = cell.cover, cell.own
+    inner = np.zeros(3)
+    for share, member in zip(cell.shares, cell.members, strict=True):
+        inner += share * np.minimum(np.exp(2.0 * np.array(own.extents(member))), 4.0)
+    painted = math.fsum(-math.log1p(-member.opacity) * member.area for member in cell.members)
+    logs = np.log(own.scales)
+    places = [own.locate(other.mean) for other in cell.others]
+    return [
+        *cover.min(axis=1),
+        *cover.max(axis=1),
+        *inner,
+        0.2 * math.log(len(cell.members)),
+        own.opacity,
+        0.2 * math.log(own.opacity / (1.0 - own.opacity)),
+        0.3 * clamp(math.log(painted / own.area), 14.0),
+        0.5 * clamp(logs[0] - logs[1], 8.0),
+        0.3 * clamp(logs[1] - logs[2], 8.0),
+        5.0 * min(cell.contrast, 2.0),
+        cell.light,
+        min(float(np.linalg.norm(cell.slope)), 3.0),
+        min((squashed_length(place) for place in places), default=math.log1p(50.0)),
+    ]
+
+
+def dense(weights: Mapping[str, Array], name: str, values: Array) -> Array:
+    """One linear layer of a network given as its weights by name."""
+    return weights[f"{name}.weight"] @ values + weights.get(f"{name}.bias", 0.0)
+
+
+def silu(values: Array) -> Array:
+    return values / (1.0 + np.exp(-values))
+
+
+def layers(weights: Mapping[str, Array], name: str, values: Array) -> Array:
+    return silu(dense(weights, f"{name}.2", silu(dense(weights, f"{name}.0", values))))
+
+
+def gates(weights: Mapping[str, Array], name: str, own: Array, cell: Array) -> Array:
+    summed = dense(weights, f"{name}.own", own) + dense(weights, f"{name}.cell", cell)
+    return np.tanh(dense(weights, f"{name}.gates", silu(summed)))
+
+
+def twist(place: Array) -> Array:
+    x, y, z = place
+    return np.array([y * z, x * z, x * y])
+
+
+def predict(weights: Mapping[str, Array], cell: Cell) -> dict[str, Array]:
+    """The residuals of one cell, by name."""
+    shares = np.array(cell.shares)
+    members = [layers(weights, "member_layers", np.array(row)) for row in describe_members(cell)]
+    pairs = [layers(weights, "pair_layers", np.array(row)) for row in describe_pairs(cell)]
+    nothing = np.zeros_like(members[0])
+    pooled = layers(
+        weights,
+        "cell_layers",
+        np.concatenate(
+            [
+                describe_cell(cell),
+                np.mean(members, axis=0),
+                shares @ np.array(members),
+                np.max(members, axis=0),
+                np.mean(pairs, axis=0) if pairs else nothing,
+                np.max(pairs, axis=0) if pairs else nothing,
+            ]
+        ),
+    )
+    of_members = [2.0 * gates(weights, "member_gates", own, pooled) for own in members]
+    of_pairs = [0.5 * gates(weights, "pair_gates", own, pooled) for own in pairs]
+    shift, turn = np.zeros(3), np.zeros(3)
+    for share, gate, member in zip(shares, of_members, cell.members, strict=True):
+        place = np.clip(cell.own.locate(member.mean), -50.0, 50.0)
+        shift += share * gate[0] * place
+        turn += share * gate[2:] * twist(np.clip(place, -5.0, 5.0))
+    for gate, other in zip(of_pairs, cell.others, strict=True):
+        place = np.clip(cell.own.locate(other.mean), -50.0, 50.0)
+        shift += gate[0] * place / len(of_pairs)
+        turn += 2.0 * gate[2:] * twist(place / (1.0 + np.abs(place))) / len(of_pairs)
+    sizes = dense(weights, "decoder", pooled)
+    return {
+        "shifts": shift,
+        "growths": 0.6 * np.tanh(sizes[:3]),
+        "turns": 0.5 * np.tanh(turn),
+        "logits": 2.0 * np.tanh(0.5 * sizes[3]),
+        "member_colors": shares * [gate[1] for gate in of_members],
+        "pair_colors": np.array([gate[1] for gate in of_pairs]) / max(1, len(of_pairs)),
+    }

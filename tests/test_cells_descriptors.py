@@ -1,0 +1,228 @@
+"""Descriptors: against the oracle, hand-computed, and blind to what gives a scene away."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import mergenet_oracle as oracle
+import oracles
+from cvtgs import GaussianScene
+from cvtgs.cells import describe_cells
+from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES
+from mergenet_cases import (
+    Case,
+    assert_same_features,
+    case_of,
+    features_of,
+    some_case,
+    some_labels,
+)
+from scenes import moved, random_scene
+
+HALF_TURNS = {"x": (0, 1, 0, 0), "y": (0, 0, 1, 0), "z": (0, 0, 0, 1)}
+
+
+def turned_about_own_axis(quats: torch.Tensor, axis: str) -> torch.Tensor:
+    """Flip the other two axes: the same Gaussians by another quaternion."""
+    products = [oracles.quaternion_product(quat, HALF_TURNS[axis]) for quat in quats.tolist()]
+    return torch.tensor(products, dtype=quats.dtype)
+
+
+def test_two_round_members_side_by_side():
+    """Weights 1/2; mean 2, scales sqrt(5), 1, 1; the other colour is half a step away."""
+    row = random_scene(1, degree=0, dtype=torch.float64).select(torch.tensor([0, 0]))
+    scene = row.with_tensors(
+        {
+            "means": torch.tensor([[0.0, 0, 0], [4, 0, 0]]).double(),
+            "quats": torch.tensor([[1.0, 0, 0, 0]] * 2).double(),
+            "log_scales": torch.zeros(2, 3).double(),
+            "logit_opacities": torch.zeros(2).double(),
+            "sh0": torch.tensor([[[0.0] * 3], [[0.5 / oracle.C0] * 3]]).double(),
+        },
+        {},
+    )
+    case = case_of(scene, torch.tensor([0, 0]), light=torch.tensor([1.0, 0.0]))
+    seen = case.describe()
+    far = math.log1p(2 / math.sqrt(5))
+    inside = 0.3 * math.log(1 / math.sqrt(5))
+    assert seen.places.abs().tolist() == [pytest.approx([2 / math.sqrt(5), 0, 0])] * 2
+    first = seen.members[0].tolist()
+    assert first[:7] == pytest.approx([far, 0, 0, far, inside, 0, 0])
+    assert first[7:11] == [0, 0, 0, 0]
+    assert first[11:13] == pytest.approx([0, 0.5])
+    assert first[14:18] == pytest.approx([3 * 0.25, 0.5 * 0.25 / 0.27, 1, 1.5])
+    assert first[18] == pytest.approx(0.5 * 4 / 5)
+    cell = seen.cells[0].tolist()
+    assert cell[:9] == pytest.approx([0] * 6 + [1 / 5, 1, 1])
+    assert cell[9] == pytest.approx(0.2 * math.log(2))
+    assert cell[13:15] == pytest.approx([0.5 * math.log(5) / 2, 0])
+    assert cell[15:] == pytest.approx([5 * 0.25, 0.5, 0.5 * 2 / math.sqrt(5), math.log(51)])
+    assert seen.pairs.shape == (1, 0, PAIR_FEATURES)
+    assert seen.weights.tolist() == [0.5, 0.5]
+
+
+@pytest.mark.parametrize("near", [0, 1, 8])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_descriptors_equal_the_oracle(seed, near):
+    case = some_case(60, 12, seed=seed, near=near)
+    seen = case.describe()
+    cells = case.oracle_cells()
+    members = [row for cell in cells for row in oracle.describe_members(cell)]
+    shares = [share for cell in cells for share in cell.shares]
+    np.testing.assert_allclose(seen.members, members, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        seen.cells, [oracle.describe_cell(cell) for cell in cells], rtol=1e-9, atol=1e-9
+    )
+    np.testing.assert_allclose(seen.weights, shares, rtol=1e-12)
+    assert seen.offsets.tolist() == case.part.offsets.tolist()
+    assert seen.pairs.shape == (12, near, PAIR_FEATURES)
+    if near:
+        pairs = [oracle.describe_pairs(cell) for cell in cells]
+        np.testing.assert_allclose(seen.pairs, pairs, rtol=1e-9, atol=1e-9)
+        places = [[cell.own.locate(other.mean) for other in cell.others] for cell in cells]
+        np.testing.assert_allclose(seen.pair_places, places, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_shapes_and_dtypes(dtype):
+    seen = some_case(60, 12, degree=3, dtype=dtype).describe()
+    assert len(seen) == 12
+    assert seen.members.shape == (60, MEMBER_FEATURES)
+    assert seen.pairs.shape == (12, 8, PAIR_FEATURES)
+    assert seen.cells.shape == (12, CELL_FEATURES)
+    assert seen.places.shape == (60, 3)
+    assert seen.pair_places.shape == (12, 8, 3)
+    assert {values.dtype for values in features_of(seen).values()} == {dtype}
+    assert seen.offsets.dtype == torch.int64
+
+
+def test_some_cells_are_described_as_among_all():
+    """Cells by number, with the neighbours and sizes of all."""
+    case = some_case(60, 12)
+    whole, keep = case.describe(), torch.tensor([1, 4, 5, 11])
+    mask = torch.zeros(12, dtype=torch.bool)
+    mask[keep] = True
+    some = describe_cells(
+        case.scene,
+        case.merged,
+        case.part.select(mask),
+        cells=keep,
+        neighbors=case.neighbors[keep],
+        sizes=case.part.counts,
+        light=case.light,
+    )
+    members = torch.repeat_interleave(mask, case.part.counts)
+    torch.testing.assert_close(some.cells, whole.cells[keep])
+    torch.testing.assert_close(some.pairs, whole.pairs[keep])
+    torch.testing.assert_close(some.members, whole.members[members])
+
+
+def test_another_precision_and_device():
+    seen = some_case().describe()
+    single = seen.to(torch.float32).to(torch.device("cpu"))
+    assert {values.dtype for values in features_of(single).values()} == {torch.float32}
+    assert single.offsets.dtype == torch.int64
+    assert seen.members.dtype == torch.float64
+
+
+MOTIONS = {
+    "turned": {"quat": (0.9, 0.1, -0.3, 0.2)},
+    "shifted": {"shift": (3.0, -50.0, 100.0)},
+    "in millimetres": {"scale": 1e3},
+    "in kilometres": {"scale": 1e-3},
+    "all of it": {"quat": (0.1, 0.7, 0.2, -0.6), "shift": (1.0, 2.0, 3.0), "scale": 30.0},
+}
+
+
+@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS)
+@pytest.mark.parametrize("degree", [0, 2])
+def test_where_how_large_and_which_way_up_does_not_show(motion, degree):
+    case = some_case(degree=degree)
+    there = case_of(moved(case.scene, **motion), some_labels(60, 12))
+    assert_same_features(case.describe(), there.describe())
+    carried = case._replace(scene=there.scene, merged=moved(case.merged, **motion))
+    assert_same_features(case.describe(), carried.describe())
+
+
+@pytest.mark.parametrize("axis", HALF_TURNS)
+def test_which_way_axes_point_does_not_show(axis):
+    case = some_case()
+    quats = case.merged.quats.clone()
+    quats[::2] = turned_about_own_axis(quats[::2], axis)
+    flipped = case._replace(merged=case.merged.with_tensors({"quats": quats}, {}))
+    assert_same_features(case.describe(), flipped.describe())
+    assert not torch.allclose(case.describe().places, flipped.describe().places)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 1e-3, 1e3])
+def test_length_and_sign_of_quaternions_do_not_show(factor):
+    case = some_case()
+    other = case._replace(
+        merged=case.merged.with_tensors({"quats": factor * case.merged.quats}, {}),
+        scene=case.scene.with_tensors({"quats": factor * case.scene.quats}, {}),
+    )
+    assert_same_features(case.describe(), other.describe())
+
+
+def test_colours_show_by_their_distance_only():
+    """An offset does not show, nor a permutation of the channels, nor exchanging dark for light."""
+    case = some_case()
+    offset = torch.tensor([5.0, -1.0, 0.3]).double()
+    for change in (lambda c: c + offset, lambda c: c.flip(-1), lambda c: -c):
+        other = case._replace(
+            scene=case.scene.with_tensors({"sh0": change(case.scene.sh0)}, {}),
+            merged=case.merged.with_tensors({"sh0": change(case.merged.sh0)}, {}),
+        )
+        assert_same_features(case.describe(), other.describe())
+
+
+def test_view_dependent_colours_are_not_looked_at():
+    case = some_case(degree=3)
+    blank = case._replace(
+        scene=case.scene.with_tensors({"shN": case.scene.shN * math.nan}, {}),
+        merged=case.merged.with_tensors({"shN": case.merged.shN * math.nan}, {}),
+    )
+    for name, values in features_of(case.describe()).items():
+        assert torch.equal(values, getattr(blank.describe(), name))
+
+
+def test_order_of_members_does_not_matter():
+    case = some_case()
+    shuffle = torch.randperm(60, generator=torch.Generator().manual_seed(0))
+    labels = some_labels(60, 12)
+    other = case_of(case.scene.select(shuffle), labels[shuffle], light=case.light[shuffle])
+    first, second = case.describe(), other.describe()
+    rows = shuffle[other.part.order].argsort()[case.part.order]  # where each member went
+    torch.testing.assert_close(first.members, second.members[rows])
+    torch.testing.assert_close(first.weights, second.weights[rows])
+    torch.testing.assert_close(first.cells, second.cells)
+    torch.testing.assert_close(first.pairs, second.pairs)
+
+
+def test_order_of_neighbours_does_not_matter():
+    case = some_case()
+    shuffle = torch.tensor([3, 1, 7, 0, 2, 6, 5, 4])
+    first = case.describe()
+    second = case._replace(neighbors=case.neighbors[:, shuffle]).describe()
+    torch.testing.assert_close(first.members, second.members)
+    torch.testing.assert_close(first.cells, second.cells)
+    torch.testing.assert_close(first.pairs[:, shuffle], second.pairs)
+
+
+def test_the_other_side_shows():
+    """A mirrored cell differs by nothing that is seen; light from the other end does show."""
+    case = some_case()
+    dark = case._replace(light=1 - case.light)
+    assert not torch.allclose(case.describe().members, dark.describe().members)
+    mirror = torch.tensor([-1.0, 1, 1]).double()
+    flip = torch.tensor([1.0, 1, -1, -1]).double()  # of a quaternion, in the mirror x -> -x
+
+    def mirrored(scene: GaussianScene) -> GaussianScene:
+        return scene.with_tensors(
+            {"means": scene.means * mirror, "quats": scene.quats * flip}, scene.extras
+        )
+
+    other = Case(mirrored(case.scene), mirrored(case.merged), *case[2:])
+    assert_same_features(case.describe(), other.describe())

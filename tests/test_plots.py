@@ -1,0 +1,114 @@
+"""Charts: PNG bytes of the asked size, and clear errors."""
+
+import importlib.util
+import io
+import struct
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from cvtgs.errors import InvalidArgumentError, MissingDependencyError
+from cvtgs.plots import COLORS, Panel, Series, line_chart
+
+needs_matplotlib = pytest.mark.skipif(
+    importlib.util.find_spec("matplotlib") is None, reason="matplotlib is optional"
+)
+LOSS = Series(name="loss", x=[0, 1, 2], y=[3.0, 2.0, 1.0])
+GAIN = Series(name="gain", x=[0, 2], y=[0.1, 0.4], markers=True)
+
+
+def pixels(png: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+
+
+def shows(picture: np.ndarray, color: str) -> bool:
+    wanted = [int(color[start : start + 2], 16) for start in (1, 3, 5)]
+    return bool((picture == wanted).all(axis=-1).any())
+
+
+@needs_matplotlib
+@pytest.mark.parametrize("size", [(100, 100), (640, 333)])
+def test_the_bytes_are_a_png_of_the_asked_size(size):
+    png = line_chart([Panel(series=[LOSS])], width=size[0], height=size[1])
+    assert png[:8] == b"\x89PNG\r\n\x1a\n"
+    assert struct.unpack(">II", png[16:24]) == size
+
+
+@needs_matplotlib
+def test_same_arguments_give_the_same_bytes():
+    panels = [Panel(series=[LOSS, GAIN], title="training", x_label="step", log_y=False)]
+    assert line_chart(panels) == line_chart(panels)
+
+
+@needs_matplotlib
+def test_a_name_has_one_colour_in_every_panel():
+    """The second panel alone would draw in the first colour."""
+    both = line_chart([Panel(series=[LOSS]), Panel(series=[GAIN])], width=800, height=300)
+    left, right = np.split(pixels(both)[:240], 2, axis=1)
+    assert shows(left, COLORS[0])
+    assert not shows(left, COLORS[1])
+    assert shows(right, COLORS[1])
+    assert not shows(right, COLORS[0])
+
+
+@needs_matplotlib
+def test_what_is_not_finite_is_a_gap():
+    gappy = Series(name="loss", x=[1, 2, 3, 4], y=[1.0, float("nan"), float("inf"), 2.0])
+    assert line_chart([Panel(series=[gappy], log_y=True)])
+    nothing = Series(name="loss", x=[1], y=[float("nan")])
+    assert line_chart([Panel(series=[nothing])])
+
+
+@needs_matplotlib
+def test_more_series_than_colours_and_fewer_panels_than_places():
+    many = [Series(name=str(number), x=[0.1, 0.01], y=[number, 1]) for number in range(20)]
+    panel = Panel(series=many, x_ticks=[0.1, 0.01], log_x=True)
+    assert line_chart([panel] * 3, columns=2, share_y=True, height=900)
+
+
+def test_a_missing_package_is_one_clear_error(monkeypatch):
+    for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(MissingDependencyError) as caught:
+        line_chart([Panel(series=[LOSS])])
+    assert str(caught.value) == (
+        "charts need matplotlib, which is not installed; "
+        "install it with: pip install 'cvtgs[plots]'."
+    )
+
+
+@pytest.mark.parametrize(
+    ("panels", "text"),
+    [
+        ([], "a chart needs at least one panel, found none."),
+        (
+            [Panel(series=[], title="loss")],
+            "every panel needs at least one series, found none in 'loss'.",
+        ),
+        (
+            [Panel(series=[Series(name="loss", x=[], y=[])])],
+            "series 'loss' must have as many x as y, and at least one; found 0 and 0.",
+        ),
+        (
+            [Panel(series=[Series(name="loss", x=[1, 2], y=[1])])],
+            "series 'loss' must have as many x as y, and at least one; found 2 and 1.",
+        ),
+        (
+            [Panel(series=[LOSS], log_x=True)],
+            "series 'loss' must be above 0 on the logarithmic x axis; "
+            "1 values are not, the first is x[0] = 0.",
+        ),
+    ],
+)
+def test_what_cannot_be_drawn_is_an_error(panels, text):
+    with pytest.raises(InvalidArgumentError) as caught:
+        line_chart(panels)
+    assert str(caught.value) == text
+
+
+@pytest.mark.parametrize("wrong", [{"columns": 0}, {"width": 99}, {"height": 0}])
+def test_a_size_that_cannot_be_is_an_error(wrong):
+    with pytest.raises(InvalidArgumentError, match="at least 1 column and 100 pixels"):
+        line_chart([Panel(series=[LOSS])], **wrong)
