@@ -1,5 +1,6 @@
 """Cells, networks and comparisons that the tests of descriptors and MergeNet share."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -65,7 +66,7 @@ class Case(NamedTuple):
                 others=[merged[other] for other in self.neighbors[cell].tolist()],
                 other_sizes=self.part.counts[self.neighbors[cell]].tolist(),
             )
-            for cell, (start, end) in enumerate(zip(ends[:-1], ends[1:], strict=True))
+            for cell, (start, end) in enumerate(pairwise(ends))
         ]
 
 

@@ -47,7 +47,7 @@ class Kernel:
         ]
 
     def contrast(self, other: "Kernel") -> float:
-        return math.sqrt(float(np.mean((self.color - other.color) ** 2)))
+        return min(math.sqrt(float(np.mean((self.color - other.color) ** 2))), 2.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,7 +144,7 @@ def describe_members(cell: Cell) -> list[list[float]]:
                 0.3 * clamp(math.log(share * len(cell.members)), 14.0),
                 member.opacity,
                 0.2 * clamp(math.log(member.area / cell.own.area), 14.0),
-                3.0 * min(contrast, 2.0),
+                3.0 * contrast,
                 0.5 * contrast / (cell.contrast + 0.02),
                 light,
                 3.0 * (light - cell.light),
@@ -167,7 +167,7 @@ def describe_pairs(cell: Cell) -> list[list[float]]:
                 other.opacity,
                 0.2 * clamp(math.log(other.area / cell.own.area), 14.0),
                 0.2 * math.log(size / len(cell.members)),
-                3.0 * min(other.contrast(cell.own), 2.0),
+                3.0 * other.contrast(cell.own),
                 other.opacity * bell(back),
                 bell(place),
             ]
@@ -193,7 +193,7 @@ def describe_cell(cell: Cell) -> list[float]:
         0.3 * clamp(math.log(painted / own.area), 14.0),
         0.5 * clamp(logs[0] - logs[1], 8.0),
         0.3 * clamp(logs[1] - logs[2], 8.0),
-        5.0 * min(cell.contrast, 2.0),
+        5.0 * cell.contrast,
         cell.light,
         min(float(np.linalg.norm(cell.slope)), 3.0),
         min((squashed_length(place) for place in places), default=math.log1p(50.0)),

@@ -82,6 +82,17 @@ def test_round_trip_has_positive_w():
     torch.testing.assert_close(back, aligned, rtol=0, atol=1e-13)
 
 
+@pytest.mark.parametrize("about", ["x", "y", "z"])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_no_component_is_minus_zero(about, sign):
+    """Turns about the axes have many zeros; they have one sign, though ``w`` is made positive."""
+    axis = torch.eye(3, dtype=torch.float64)["xyz".index(about)]
+    halves = torch.tensor([[1.0, 0.0], [0.6, 0.8], [0.0, 1.0], [-0.6, 0.8], [0.6, -0.8]]).double()
+    quats = sign * torch.cat([halves[:, :1], halves[:, 1:] * axis], dim=1)
+    back = quaternions.from_matrices(quaternions.to_matrices(quats))
+    assert not bool((back.signbit() & (back == 0)).any())
+
+
 def test_gradients():
     quats = random_quats(4).requires_grad_()
     assert torch.autograd.gradcheck(

@@ -40,9 +40,7 @@ MOTIONS = {
 def test_the_correction_moves_with_the_scene(motion, degree):
     case, net = some_case(200, 30, degree=degree), lively_net()
     there = case_of(moved(case.scene, **motion), some_labels(200, 30))
-    assert_same_gaussians(
-        there.correct(net), moved(case.correct(net), **motion), tolerance=1e-6
-    )
+    assert_same_gaussians(there.correct(net), moved(case.correct(net), **motion), tolerance=1e-6)
     assert biggest_change(case.correct(net), case.merged) > 0.1
 
 
@@ -140,21 +138,6 @@ def test_identical_members_keep_colour_and_place_when_alone(copies, dtype):
     assert not torch.allclose(small.log_scales, case.merged.log_scales)
 
 
-@dtypes
-def test_cells_of_two_and_of_a_hundred_thousand(dtype):
-    total = 100_020
-    scene = random_scene(total, degree=0, dtype=dtype)
-    labels = torch.cat([torch.zeros(100_000, dtype=torch.int64), 1 + torch.arange(20) // 2])
-    case = case_of(scene, labels)
-    small = case.correct(lively_net(dtype))
-    assert all(bool(values.isfinite().all()) for values in small.tensors().values())
-    growth = (small.log_scales - case.merged.log_scales).abs()
-    assert float(growth.amax()) <= 0.6 + 1e-5
-    assert float(growth[0].amax()) > 1e-3
-    alone = some_case(40, 1)  # the same rule for few members as for many
-    assert float((alone.correct(lively_net()).log_scales - alone.merged.log_scales).amax()) < 0.61
-
-
 def double_of(case: Case) -> Case:
     """The same case in float64, merged Gaussians included."""
 
@@ -164,14 +147,26 @@ def double_of(case: Case) -> Case:
     return case._replace(scene=doubled(case.scene), merged=doubled(case.merged))
 
 
+def test_cells_of_two_and_of_a_hundred_thousand():
+    """Sums of so many float32 numbers keep their digits: to 1e-5 as in float64."""
+    scene = random_scene(100_020, degree=0)
+    labels = torch.cat([torch.zeros(100_000, dtype=torch.int64), 1 + torch.arange(20) // 2])
+    case = case_of(scene, labels)
+    small = case.correct(lively_net(torch.float32))
+    assert_close(small, double_of(case).correct(lively_net()), 1e-5)
+    growth = (small.log_scales - case.merged.log_scales).abs()
+    assert float(growth.amax()) <= 0.6 + 1e-5
+    assert bool((growth.amax(dim=1) > 1e-3).all())
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_float32_agrees_with_float64(seed):
-    """To 2e-5 of the extent of the scene, and of colours, logs and logits of the order of 1."""
+    """To 5e-6 of the extent of the scene, and of colours, logs and logits of the order of 1."""
     case = some_case(2000, 300, degree=2, dtype=torch.float32, seed=seed)
     single = case.correct(lively_net(torch.float32, seed=seed))
     double = double_of(case).correct(lively_net(seed=seed))
     assert single.dtype == torch.float32
-    assert_close(single, double, 2e-5)
+    assert_close(single, double, 5e-6)
 
 
 def test_input_is_not_changed():

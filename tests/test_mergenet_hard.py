@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from cvtgs import GaussianScene
-from cvtgs.mergenet import MergeNet
 from mergenet_cases import Case, case_of, features_of, fields_of, lively_net
 from scenes import random_scene
 
@@ -120,19 +119,33 @@ def test_a_network_out_of_bounds_still_gives_gaussians(factor, dtype):
     net = lively_net(dtype)
     with torch.no_grad():
         for values in net.parameters():
-            values *= factor
+            values.mul_(factor)
     case = hard_case(lambda scene: {}, dtype)
     assert_finite(case.correct(net).tensors())
 
 
-def test_extreme_neighbours_of_one_member():
-    """A cell of one is not corrected, but its neighbours see it: a point beside, or a whole sky."""
-    scene = random_scene(6, dtype=torch.float64)
-    labels = torch.tensor([0, 0, 0, 1, 1, 2])
-    net: MergeNet = lively_net()
-    for log_scale in (-700.0, -40.0, 88.0):
-        scales = scene.log_scales.clone()
-        scales[5] = log_scale
-        case = case_of(scene.with_tensors({"log_scales": scales}, {}), labels)
-        assert_finite(features_of(case.describe()))
-        assert_finite(case.correct(net).tensors())
+@dtypes
+@pytest.mark.parametrize("log_scale", [-800.0, -400.0, -40.0, 88.0])
+@pytest.mark.parametrize("beside", [0.0, 1.0, 1e30])
+def test_extreme_neighbours_of_one_member(beside, log_scale, dtype):
+    """A cell of one is not corrected, but others see it: a point in the middle, or a whole sky."""
+    scene = random_scene(5, dtype=dtype)
+    means, log_scales = scene.means.clone(), scene.log_scales.clone()
+    means[:4] = torch.tensor([1.0, 0, 0]) * torch.tensor([[-1.0], [1.0], [-2.0], [2.0]])
+    logits = torch.full((5,), 3.0, dtype=dtype)
+    means[4], log_scales[:] = beside * torch.tensor([0.0, 0, 1]), 0.0
+    log_scales[4] = log_scale
+    tensors = {"means": means, "log_scales": log_scales, "logit_opacities": logits}
+    case = case_of(scene.with_tensors(tensors, {}), torch.tensor([0, 0, 1, 1, 2]))
+    assert_finite(features_of(case.describe()))
+    assert_finite(case.correct(lively_net(dtype)).tensors())
+
+
+@pytest.mark.parametrize("far", [3e38, -3e38])
+def test_what_overflows_keeps_the_reference(far):
+    case = hard_case(flown(far), torch.float32)
+    assert_finite(case.merged.tensors())
+    assert_finite(features_of(case.describe()))
+    small = case.correct(lively_net(torch.float32))
+    assert_finite(small.tensors())
+    assert not torch.equal(small.log_scales, case.merged.log_scales)

@@ -83,7 +83,7 @@ def test_changes_are_limited(seed):
     net = lively_net(seed=seed)
     with torch.no_grad():
         for values in net.parameters():
-            values *= 30
+            values.mul_(30)
     case = some_case()
     with torch.no_grad():
         found = net(case.describe())

@@ -43,6 +43,7 @@ NAMES = {
     "synthetic",
     "target_count",
     "to_dict",
+    "train",
 }
 
 STAGES = {
@@ -109,6 +110,18 @@ STAGES = {
         "save_checkpoint",
     },
     "synthetic": {"KINDS", "demo_scene", "scene"},
+    "train": {
+        "DataConfig",
+        "History",
+        "LossConfig",
+        "Source",
+        "TrainConfig",
+        "TrainFiles",
+        "Validation",
+        "ViewsConfig",
+        "find_sources",
+        "train",
+    },
 }
 
 ERRORS = {
@@ -123,6 +136,7 @@ ERRORS = {
     "DeviceError": RuntimeError,
     "CheckpointError": ValueError,
     "MissingDependencyError": ImportError,
+    "TrainingError": RuntimeError,
 }
 
 

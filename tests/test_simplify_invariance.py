@@ -1,11 +1,12 @@
 """What must not change the result: order, place and unit; and the same bits every time.
 
 Scenes are float64 here, so that a moved scene is the same scene but for rounding. Where exact
-equality is not to be expected: the Morton curve that the seeds follow, and the median that the
-frame is centred on, know the axes. A turned scene therefore has other seeds and other, equally
-good, cells. So turns are tested with every seed certain (few Gaussians hold nearly all of the
-mass), where the curve no longer matters, by quarter turns where the median matters; and for
-any turn and any scene with given cells, in test_cells_moments.py.
+equality is not to be expected: the Morton curve that the seeds follow, the median that the
+frame is centred on, and the light that MergeNet sees know the axes. A turned scene therefore has
+other seeds and other, equally good, cells. So turns are tested with every seed certain (few
+Gaussians hold nearly all of the mass), where the curve no longer matters, by quarter turns where
+the median matters, and with a network only where all light is even; and for any turn and any
+scene with given cells and light, in test_cells_moments.py and test_mergenet_correct.py.
 """
 
 import hashlib
@@ -17,6 +18,7 @@ import sys
 import pytest
 import torch
 
+import cvtgs
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from scenes import assert_same_gaussians, moved, random_scene, same_bits
 
@@ -24,8 +26,19 @@ each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])
 HALF = math.sqrt(0.5)
 
 
-def simplified(scene: GaussianScene, config: str | SimplifyConfig, rho: float) -> GaussianScene:
-    return Simplifier(config=config, device="cpu").simplify(scene, rho)
+def simplified(
+    scene: GaussianScene, config: str | SimplifyConfig, rho: float, *, ckpt: str | None = "auto"
+) -> GaussianScene:
+    return Simplifier(ckpt, config=config, device="cpu").simplify(scene, rho)
+
+
+@pytest.fixture(params=[None, "auto"], ids=["moments", "network"])
+def ckpt(request, monkeypatch) -> str | None:
+    """No network, or the shipped one in a scene where everything is seen freely."""
+    if request.param is not None:
+        even = lambda means, masses, frame: torch.ones(len(means), dtype=torch.float64)  # noqa: E731
+        monkeypatch.setattr(cvtgs.cvt, "openness", even)
+    return request.param
 
 
 def dominated_scene(heavy: int, total: int, degree: int) -> GaussianScene:
@@ -88,23 +101,23 @@ def test_shift(preset, shift):
     [(0.5, 0.5, 0.5, 0.5), (HALF, 0, 0, HALF), (0, 1, 0, 0)],
     ids=["x to y to z", "quarter turn about z", "half turn about x"],
 )
-def test_turns_that_keep_the_axes(quat, degree):
+def test_turns_that_keep_the_axes(quat, degree, ckpt):
     scene = dominated_scene(31, 301, degree)
     assert_same_gaussians(
-        simplified(moved(scene, quat=quat), "standard", 0.1),
-        moved(simplified(scene, "standard", 0.1), quat=quat),
+        simplified(moved(scene, quat=quat), "standard", 0.1, ckpt=ckpt),
+        moved(simplified(scene, "standard", 0.1, ckpt=ckpt), quat=quat),
     )
 
 
 @pytest.mark.parametrize("quat", [(0.9, 0.1, -0.3, 0.2), (0.1, 0.7, 0.2, -0.6)])
-def test_any_turn_without_colour_and_contraction(quat):
+def test_any_turn_without_colour_and_contraction(quat, ckpt):
     """Colour and contraction are measured in robust radii about the median, which knows axes."""
     config = SimplifyConfig.from_mapping({"cvt": {"color": 0.0, "unbounded": "off"}})
     scene = dominated_scene(31, 301, 3)
     motion = {"quat": quat, "shift": (1.0, 2.0, 3.0), "scale": 10.0}
     assert_same_gaussians(
-        simplified(moved(scene, **motion), config, 0.1),
-        moved(simplified(scene, config, 0.1), **motion),
+        simplified(moved(scene, **motion), config, 0.1, ckpt=ckpt),
+        moved(simplified(scene, config, 0.1, ckpt=ckpt), **motion),
     )
 
 

@@ -65,14 +65,14 @@ def test_infinite_opacities_are_valid_input():
         assert bool(result.scene.logit_opacities.isfinite().all())
 
 
-def test_mass_of_haze_is_conserved_without_widening():
+def test_mass_of_haze_is_conserved_without_widening_and_network():
     """In transparent cells opacity is depth, and depth times area adds up."""
     config = SimplifyConfig.from_mapping(
         {"filter": {"max_mass_share": 0.0}, "merge": {"widening": 0.0}}
     )
     scene = random_scene(1000)
     scene = scene.with_tensors({"logit_opacities": 0.2 * scene.logit_opacities - 6.0}, {})
-    report = Simplifier(config=config, device="cpu").run(scene, 0.3).report
+    report = Simplifier(None, config=config, device="cpu").run(scene, 0.3).report
     assert report.mass_in == pytest.approx(float(scene.masses.sum()))
     assert report.mass_out == pytest.approx(report.mass_in, rel=0.05)
 

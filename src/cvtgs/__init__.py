@@ -15,7 +15,19 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cvtgs import cells, cvt, effects, errors, filters, io, losses, math, mergenet, synthetic
+    from cvtgs import (
+        cells,
+        cvt,
+        effects,
+        errors,
+        filters,
+        io,
+        losses,
+        math,
+        mergenet,
+        synthetic,
+        train,
+    )
     from cvtgs.cameras import Cameras
     from cvtgs.config import PRESETS, SimplifyConfig
     from cvtgs.effects import EffectPlan
@@ -64,6 +76,7 @@ _MODULES = (
     "math",
     "mergenet",
     "synthetic",
+    "train",
 )
 _CALLABLE = ("evaluate", "render")
 
@@ -100,6 +113,7 @@ __all__ = [
     "synthetic",
     "target_count",
     "to_dict",
+    "train",
 ]
 
 

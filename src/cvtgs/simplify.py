@@ -10,7 +10,7 @@ import torch
 
 from cvtgs.config import SimplifyConfig
 from cvtgs.devices import resolve_device
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.errors import ConfigError, InvalidArgumentError
 from cvtgs.mergenet import Checkpoint, MergeNet, load_checkpoint
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport, StageClock
@@ -44,7 +44,7 @@ class Simplifier:
 
     Raises:
         CheckpointError: The checkpoint cannot be used.
-        ConfigError: There is no such preset.
+        ConfigError: There is no such preset, or it has no network but a checkpoint is given.
         DeviceError: There is no such device.
 
     Example:
@@ -143,8 +143,14 @@ class Simplifier:
 def _checkpoint(
     ckpt: str | os.PathLike[str] | None, config: SimplifyConfig | None
 ) -> Checkpoint | None:
-    if ckpt is None or (config is not None and not config.merge.network):
+    if ckpt is None:
         return None
+    if config is not None and not config.merge.network:
+        if ckpt == "auto":
+            return None
+        raise ConfigError(
+            f"merge.network is false, so ckpt must be None or auto; found {os.fspath(ckpt)!r}."
+        )
     if ckpt == "auto":
         return load_checkpoint("standard" if config is None else config.preset)
     return load_checkpoint(ckpt)

@@ -10,11 +10,11 @@ from torch import Tensor
 from cvtgs.cells.features import (
     FARTHEST,
     cell_features,
-    kernels_of,
     member_features,
     pair_features,
     see_members,
 )
+from cvtgs.cells.kernels import kernels_of
 from cvtgs.cells.partition import Partition
 from cvtgs.cells.widening import side_cover
 from cvtgs.scene import GaussianScene

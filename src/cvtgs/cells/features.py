@@ -6,45 +6,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.math import activations, covariances, quaternions
+from cvtgs.cells.kernels import Kernels, contrasts_of, extents_in, kernels_of, places_in
+from cvtgs.math import activations
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
-from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
 FARTHEST = 50.0
 """All that is farther than this, in standard deviations, looks the same."""
-
-
-LARGEST_PLACE = 1e4
-LARGEST_LOG = 80.0
-"""Places and scales are limited so that no product of them leaves float32."""
-
-
-class Kernels(NamedTuple):
-    """Some Gaussians, activated, in the dtype of the scene; their centres in float64."""
-
-    means: Tensor
-    rotations: Tensor
-    log_scales: Tensor
-    log_areas: Tensor
-    logits: Tensor
-    colors: Tensor
-
-    @property
-    def opacities(self) -> Float[Tensor, "n"]:
-        """Opacities in (0, 1)."""
-        return torch.sigmoid(self.logits)
-
-    def take(self, ids: Int[Tensor, "r"]) -> "Kernels":
-        """Take some rows.
-
-        Args:
-            ids: Which ones.
-
-        Returns:
-            Those rows of every tensor.
-        """
-        return Kernels(*(values.index_select(0, ids) for values in self))
 
 
 class SeenMembers(NamedTuple):
@@ -65,28 +33,6 @@ class SeenMembers(NamedTuple):
     slope: Tensor
 
 
-def kernels_of(scene: GaussianScene, rows: Int[Tensor, "r"]) -> Kernels:
-    """Activate some Gaussians.
-
-    Args:
-        scene: All of them.
-        rows: ``(r,)`` which ones.
-
-    Returns:
-        One row for each in every tensor; the rotations have the axes as columns, and colours are
-        those of the constant band, less the 0.5 that all colours have.
-    """
-    log_scales = scene.log_scales.index_select(0, rows)
-    return Kernels(
-        means=scene.means.index_select(0, rows).double(),
-        rotations=quaternions.to_matrices(quaternions.normalize(scene.quats.index_select(0, rows))),
-        log_scales=log_scales,
-        log_areas=covariances.log_mean_projected_area(log_scales),
-        logits=activations.clamp_logits(scene.logit_opacities.index_select(0, rows)),
-        colors=scene.sh0[:, 0].index_select(0, rows) * SH_C0,
-    )
-
-
 def see_members(
     members: Kernels, own: Kernels, offsets: Int[Tensor, "m_plus_1"], lights: Float[Tensor, "n"]
 ) -> SeenMembers:
@@ -104,8 +50,8 @@ def see_members(
     ids = segment_ids(offsets)
     cell = own.take(ids)
     weights = _shares(members.log_areas + activations.positive_log(members.opacities), offsets)
-    contrasts = _contrasts(members, cell)
-    places = _places(cell, members.means - cell.means)
+    contrasts = contrasts_of(members, cell)
+    places = places_in(cell, members.means - cell.means)
     light = _total(weights * lights, offsets)
     lean = weights * (lights - light.index_select(0, ids))
     return SeenMembers(
@@ -115,7 +61,7 @@ def see_members(
         depths=activations.optical_depth_from_logit(members.logits),
         counts=offsets.diff().to(weights.dtype),
         places=places,
-        extents=_extents(cell, members),
+        extents=extents_in(cell, members),
         areas=(members.log_areas - cell.log_areas).clamp(-14, 14),
         contrasts=contrasts,
         contrast=_total(weights * contrasts.square(), offsets).sqrt(),
@@ -187,12 +133,12 @@ def pair_features(
     ids = torch.arange(len(cells), device=cells.device).repeat_interleave(count)
     cell = own.take(ids)
     shifts = other.means - cell.means
-    places, back = _places(cell, shifts), _places(other, shifts)
+    places, back = places_in(cell, shifts), places_in(other, shifts)
     crowd = sizes[others].to(places.dtype) / sizes[cells][ids].to(places.dtype)
     described = torch.cat(
         [
             *_distances(places),
-            0.3 * _extents(cell, other),
+            0.3 * extents_in(cell, other),
             *_facing(places / (1 + places.abs()), bare.index_select(0, ids)),
             torch.stack(
                 [
@@ -200,7 +146,7 @@ def pair_features(
                     other.opacities,
                     0.2 * (other.log_areas - cell.log_areas).clamp(-14, 14),
                     0.2 * torch.log(crowd),
-                    3 * _contrasts(other, cell),
+                    3 * contrasts_of(other, cell),
                     other.opacities * _bell(back),
                     _bell(places),
                 ],
@@ -272,27 +218,6 @@ def _shares(logs: Tensor, offsets: Tensor) -> Tensor:
 def _total(values: Tensor, offsets: Tensor) -> Tensor:
     """Sum over the members of every cell, in float64."""
     return segment_sum(values.double(), offsets).to(values.dtype)
-
-
-def _places(frames: Kernels, shifts: Tensor) -> Tensor:
-    """Express shifts in frames and in their standard deviations."""
-    turned = torch.einsum("nij,ni->nj", frames.rotations, shifts.to(frames.rotations.dtype))
-    units = torch.exp((-frames.log_scales).clamp(-LARGEST_LOG, LARGEST_LOG))
-    return (turned * units).clamp(-LARGEST_PLACE, LARGEST_PLACE)
-
-
-def _contrasts(some: Kernels, others: Kernels) -> Tensor:
-    return (some.colors - others.colors).square().mean(dim=1).sqrt().clamp_max(2.0)
-
-
-def _extents(frames: Kernels, others: Kernels) -> Tensor:
-    """Give the log of standard deviations along the axes of frames, in units of each axis."""
-    cosines = torch.einsum("nij,nik->njk", frames.rotations, others.rotations)
-    largest = others.log_scales.amax(dim=1, keepdim=True)
-    scales = torch.exp(others.log_scales - largest)
-    squares = (cosines * scales[:, None, :]).square().sum(dim=2)
-    logs = 0.5 * activations.positive_log(squares) + largest - frames.log_scales
-    return logs.clamp(-9, 9)
 
 
 def _distances(places: Tensor) -> tuple[Tensor, Tensor]:

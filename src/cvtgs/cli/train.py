@@ -1,6 +1,7 @@
 """``cvtgs train``: scenes in, a MergeNet checkpoint out."""
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,8 +63,9 @@ def run(options: argparse.Namespace) -> None:
     config = _with_scenes(TrainConfig.from_toml(options.config), options.scenes)
     if options.output.suffix != ".safetensors":
         raise OutputError(f"{options.output}: the name must end in .safetensors.")
-    check_output(options.output, overwrite=options.overwrite or options.resume)
     files = TrainFiles.beside(options.output, options.cache)
+    goes_on = options.resume and files.state.is_file()
+    check_output(options.output, overwrite=options.overwrite or goes_on)
     fastest = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     device = resolve_device(options.device) or fastest
     with progress_bars(quiet=options.quiet) as listener:
@@ -93,4 +95,5 @@ def _show(history: "History") -> None:
         f"{sum(row) / len(row):+.2f} (least {min(row):+.2f}) at {ratio:g}"
         for ratio, row in last.by_ratio().items()
     )
-    print(f"step {last.step}: loss {last.loss:.3f}, dB gained: {gains}")
+    loss = "-" if math.isnan(last.loss) else f"{last.loss:.3f}"
+    print(f"step {last.step}: loss {loss}, dB gained: {gains}")

@@ -1,6 +1,7 @@
 """Reductions over consecutive runs of rows (CSR segments), deterministic on every device."""
 
 import math
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -48,11 +49,7 @@ def segment_sum(
     flat = values.reshape(len(values), math.prod(values.shape[1:]))
     if flat.numel() == 0:
         return values.new_zeros(len(offsets) - 1, *values.shape[1:])
-    # The sum of a bag of consecutive rows: ten times as fast as torch.segment_reduce.
-    rows = torch.arange(len(flat), device=flat.device)
-    sums = torch.nn.functional.embedding_bag(
-        rows, flat, offsets, mode="sum", include_last_offset=True
-    )
+    sums: Tensor = _SumOfRuns.apply(flat, offsets)  # type: ignore[no-untyped-call]
     return sums.reshape(len(offsets) - 1, *values.shape[1:])
 
 
@@ -116,3 +113,20 @@ def segment_argmax(
     candidates = torch.where(is_top, rows, len(values))
     first = torch.full((len(offsets) - 1,), len(values), device=values.device)
     return first.scatter_reduce(0, ids, candidates, "amin")
+
+
+class _SumOfRuns(torch.autograd.Function):
+    """Bags of consecutive rows: ten times as fast as torch.segment_reduce."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, offsets: Tensor) -> Tensor:
+        ctx.save_for_backward(offsets)
+        rows = torch.arange(len(values), device=values.device)
+        return torch.nn.functional.embedding_bag(
+            rows, values, offsets, mode="sum", include_last_offset=True
+        )
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        (offsets,) = ctx.saved_tensors
+        return grad.index_select(0, segment_ids(offsets)), None

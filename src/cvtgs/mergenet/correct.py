@@ -76,7 +76,11 @@ def correct_cells(
                 scene, merged, part, cells=rows, neighbors=neighbors[rows], residuals=net(seen)
             )
             for name, values in changed.items():
-                tensors[name][rows] = values
+                if values.numel() == 0:  # SH bands that the scene does not have
+                    continue
+                # Near the limits of the dtype (a flyaway at 3e38) a change may overflow.
+                kept = tensors[name][rows]
+                tensors[name][rows] = torch.where(values.isfinite(), values, kept)
             done += len(part)
             on_cells(done)
     return merged.with_tensors(tensors, merged.extras)

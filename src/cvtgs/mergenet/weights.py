@@ -164,7 +164,7 @@ def _parse(content: bytes, name: str) -> tuple[dict[str, Tensor], dict[str, str]
 
 def _described(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
     version = metadata.get("format_version")
-    if version not in map(str, range(1, FORMAT_VERSION + 1)):
+    if version not in {str(number) for number in range(1, FORMAT_VERSION + 1)}:
         raise CheckpointError(
             f"{name}: the checkpoint has format version {version}, this cvtgs reads up to "
             f"{FORMAT_VERSION}; update cvtgs."

@@ -2,10 +2,11 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -13,15 +14,17 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Descriptors, Partition
 from cvtgs.config import SimplifyConfig
-from cvtgs.errors import FileFormatError
 from cvtgs.io.tensors import map_tensors, save_tensors
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
 from cvtgs.stages import Reference
-from cvtgs.train.cases import Case, Views, look_at_scene, refer_case
+from cvtgs.train.cases import Case, refer_case
 from cvtgs.train.config import TrainConfig
 from cvtgs.train.scenes import Source
+from cvtgs.train.views import Views, look_at_scene
 
-CACHE_VERSION = 1
+Part = TypeVar("Part")
+
+CACHE_VERSION = 3
 """Part of the key of every file; to be raised when the content changes its meaning."""
 
 
@@ -43,6 +46,7 @@ class Prepared:
 def prepare(source: Source, config: TrainConfig, folder: Path) -> Prepared:
     """Give what a training needs of a scene, from the cache if it is there.
 
+    Pictures and cases are kept in two files, so that trainings for other presets share pictures.
     Memory: that of one scene while it is prepared; what comes from the cache is mapped.
 
     Args:
@@ -57,106 +61,110 @@ def prepare(source: Source, config: TrainConfig, folder: Path) -> Prepared:
         OutputError: The cache cannot be written.
     """
     simplify = SimplifyConfig.from_preset(config.preset)
-    path = folder / f"{source.name}-{_key(source, config, simplify)}.safetensors"
-    if path.is_file():
-        try:
-            return _unpacked(source.name, *map_tensors(path))
-        except (FileFormatError, KeyError):
-            path.unlink()
-    prepared = _made(source, config, simplify)
-    tensors, facts = _packed(prepared)
-    save_tensors(path, tensors, {"facts": json.dumps(facts)})
-    return _unpacked(source.name, *map_tensors(path))
-
-
-def _key(source: Source, config: TrainConfig, simplify: SimplifyConfig) -> str:
-    data = config.data
-    parts = {
-        "version": CACHE_VERSION,
-        "identity": source.identity,
-        "simplify": simplify.model_dump(mode="json"),
-        "ratios": data.validation_ratios if source.validates else data.ratios,
-        "views": config.views.model_dump(mode="json"),
-        "seed": config.seed,
-    }
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _made(source: Source, config: TrainConfig, simplify: SimplifyConfig) -> Prepared:
-    scene, data, views = source.make(), config.data, config.views
-    ratios = data.validation_ratios if source.validates else data.ratios
-    sizes = (views.validation_size,) if source.validates else views.sizes
-    count = views.validation_count if source.validates else views.count
-    cases = []
-    for ratio in ratios:
-        case = refer_case(source.name, scene, ratio, simplify)
-        if case is not None:
-            cases.append(case)
-    return Prepared(
-        name=source.name,
-        views=tuple(
-            look_at_scene(scene, count, size=size, seed=config.seed + place)
+    ratios = config.data.validation_ratios if source.validates else config.data.ratios
+    sizes = (config.views.validation_size,) if source.validates else config.views.sizes
+    count = config.views.validation_count if source.validates else config.views.count
+    scene = cache(source.make)
+    views = _cached(
+        folder / f"{source.name}-views-{_key(source, sizes, count, config.seed)}.safetensors",
+        lambda: _packed_views(
+            look_at_scene(scene(), count, size=size, seed=config.seed + place)
             for place, size in enumerate(sizes)
         ),
-        cases=tuple(cases),
+        _unpacked_views,
     )
+    cases = _cached(
+        folder / f"{source.name}-cases-{_key(source, ratios, simplify.model_dump())}.safetensors",
+        lambda: _packed_cases(
+            refer_case(source.name, scene(), ratio, simplify) for ratio in ratios
+        ),
+        partial(_unpacked_cases, source.name),
+    )
+    return Prepared(name=source.name, views=views, cases=cases)
 
 
-def _packed(prepared: Prepared) -> tuple[dict[str, Tensor], dict[str, list[float]]]:
+def _key(source: Source, *parts: Any) -> str:
+    text = json.dumps([CACHE_VERSION, source.identity, *parts], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _cached(
+    path: Path,
+    make: Callable[[], dict[str, Tensor]],
+    unpack: Callable[[Mapping[str, Tensor]], tuple[Part, ...]],
+) -> tuple[Part, ...]:
+    """Unpack a file; make it first if it is missing or damaged."""
+    if path.is_file():
+        try:
+            return unpack(map_tensors(path)[0])
+        except (ValueError, KeyError, TypeError):
+            path.unlink()
+    save_tensors(path, make(), {})
+    return unpack(map_tensors(path)[0])
+
+
+def _packed_views(all_views: Iterable[Views]) -> dict[str, Tensor]:
     tensors: dict[str, Tensor] = {}
-    for place, views in enumerate(prepared.views):
+    for place, views in enumerate(all_views):
         tensors |= {
-            f"views{place}/viewmats": views.cameras.viewmats,
-            f"views{place}/Ks": views.cameras.Ks,
-            f"views{place}/rgb": views.rgb,
-            f"views{place}/alpha": views.alpha,
+            f"{place}/viewmats": views.cameras.viewmats,
+            f"{place}/Ks": views.cameras.Ks,
+            f"{place}/rgb": views.rgb,
+            f"{place}/alpha": views.alpha,
         }
-    for place, case in enumerate(prepared.cases):
-        reference, prefix = case.reference, f"case{place}/"
+    return tensors
+
+
+def _unpacked_views(tensors: Mapping[str, Tensor]) -> tuple[Views, ...]:
+    return tuple(_views(_below(f"{place}/", tensors)) for place in range(_places(tensors)))
+
+
+def _packed_cases(cases: Iterable[Case | None]) -> dict[str, Tensor]:
+    tensors: dict[str, Tensor] = {}
+    some = (case for case in cases if case is not None)
+    for place, case in enumerate(some):
+        reference, prefix = case.reference, f"{place}/"
         if place == 0:
             tensors |= _prefixed("scene/", reference.scene.tensors())
             tensors["light"] = reference.light.to(torch.float32)
+            if reference.scene.antialiased:
+                tensors["antialiased"] = torch.ones(1)
         tensors |= _prefixed(prefix + "merged/", reference.merged.tensors())
         tensors |= _prefixed(prefix + "seen/", _values(case.descriptors))
         tensors |= {
+            prefix + "ratio": torch.tensor(case.ratio, dtype=torch.float64),
             prefix + "order": reference.partition.order.to(torch.int32),
             prefix + "offsets": reference.partition.offsets,
             prefix + "neighbors": reference.neighbors.to(torch.int32),
         }
-    return tensors, {
-        "ratios": [case.ratio for case in prepared.cases],
-        "views": [float(len(views.cameras)) for views in prepared.views],
-    }
+    return tensors
 
 
-def _unpacked(name: str, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> Prepared:
-    facts = json.loads(metadata["facts"])
-    scene = None
-    cases = []
-    for place, ratio in enumerate(facts["ratios"]):
-        if scene is None:
-            scene = GaussianScene(**_below("scene/", tensors))
-        cases.append(_case(name, ratio, scene, tensors["light"], _below(f"case{place}/", tensors)))
-    return Prepared(
-        name=name,
-        views=tuple(
-            _views(_below(f"views{place}/", tensors)) for place in range(len(facts["views"]))
-        ),
-        cases=tuple(cases),
-    )
+def _unpacked_cases(name: str, tensors: Mapping[str, Tensor]) -> tuple[Case, ...]:
+    count = _places(tensors)
+    if count == 0:
+        return ()
+    # Merged Gaussians must be rendered as their scene is.
+    comments = (ANTIALIASED_TAG,) if "antialiased" in tensors else ()
+    scene = GaussianScene(**_below("scene/", tensors), comments=comments)
+    light = tensors["light"]
+    return tuple(_case(name, scene, light, _below(f"{place}/", tensors)) for place in range(count))
 
 
-def _case(
-    name: str, ratio: float, scene: GaussianScene, light: Tensor, tensors: Mapping[str, Tensor]
-) -> Case:
+def _places(tensors: Mapping[str, Tensor]) -> int:
+    """Count the numbered entries."""
+    return len({name.split("/")[0] for name in tensors if name.split("/")[0].isdecimal()})
+
+
+def _case(name: str, scene: GaussianScene, light: Tensor, tensors: Mapping[str, Tensor]) -> Case:
     partition = Partition(order=tensors["order"].long(), offsets=tensors["offsets"])
     several = partition.counts > 1
     return Case(
         scene_name=name,
-        ratio=ratio,
+        ratio=float(tensors["ratio"]),
         reference=Reference(
             scene=scene,
-            merged=GaussianScene(**_below("merged/", tensors)),
+            merged=GaussianScene(**_below("merged/", tensors), comments=scene.comments),
             partition=partition,
             neighbors=tensors["neighbors"].long(),
             light=light,

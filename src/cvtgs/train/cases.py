@@ -3,59 +3,15 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
-from cvtgs.cameras import Cameras
 from cvtgs.cells import Descriptors, Partition, describe_cells
 from cvtgs.config import SimplifyConfig
-from cvtgs.evaluate import automatic_views
 from cvtgs.mergenet import Residuals, compose
-from cvtgs.render import render
 from cvtgs.scene import GaussianScene
 from cvtgs.simplify import target_count
 from cvtgs.stages import Reference, make_reference
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Views:
-    """Pictures of a full scene; the background is left open.
-
-    Attributes:
-        cameras: From where.
-        rgb: ``(c, h, w, 3)`` colours over black, half precision.
-        alpha: ``(c, h, w)`` opacity, half precision.
-    """
-
-    cameras: Cameras
-    rgb: Float[Tensor, "c h w 3"]
-    alpha: Float[Tensor, "c h w"]
-
-    def over(self, background: Float[Tensor, "3"], rows: slice) -> Float[Tensor, "r h w 3"]:
-        """Put some of the pictures over a background.
-
-        Args:
-            background: Red, green, blue.
-            rows: Which pictures.
-
-        Returns:
-            Pictures in float32.
-        """
-        through = 1 - self.alpha[rows].float()
-        return self.rgb[rows].float() + through[..., None] * background
-
-    def to(self, device: torch.device) -> "Views":
-        """Move the pictures to a device.
-
-        Args:
-            device: Where to.
-
-        Returns:
-            The pictures there.
-        """
-        return Views(
-            cameras=self.cameras.to(device), rgb=self.rgb.to(device), alpha=self.alpha.to(device)
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -220,21 +176,3 @@ def refer_case(
     if not len(cells):
         return None
     return make_case(scene_name, ratio, reference, cells, reference.partition.select(several))
-
-
-def look_at_scene(scene: GaussianScene, count: int, *, size: int, seed: int) -> Views:
-    """Render a full scene once.
-
-    Args:
-        scene: The scene.
-        count: Number of automatic views.
-        size: Side of the square pictures, pixels.
-        seed: Which views.
-
-    Returns:
-        The pictures, on the CPU.
-    """
-    cameras = automatic_views(scene, count, width=size, height=size, seed=seed)
-    with torch.no_grad():
-        pictures = render(scene, cameras)
-    return Views(cameras=cameras, rgb=pictures.rgb.cpu().half(), alpha=pictures.alpha.cpu().half())

@@ -18,7 +18,7 @@ class Validation(NamedTuple):
 
     Attributes:
         step: After this step.
-        loss: Mean training loss since the last validation; 1 changes nothing.
+        loss: Mean training loss since the last validation; NaN before the first step.
         gains: Decibels gained, by scene and ratio.
     """
 
@@ -44,7 +44,16 @@ class Validation(NamedTuple):
 
 
 class History:
-    """The validations of a training, in order."""
+    """The validations of a training, in order.
+
+    Example:
+        >>> history = History()
+        >>> for step, gain in ((0, 0.0), (500, 0.3), (1000, 0.2)):
+        ...     entry = Validation(step=step, loss=1.0, gains={"room": {0.1: gain}})
+        ...     history.validations.append(entry)
+        >>> history.best().step, history.since_best()
+        (500, 1)
+    """
 
     def __init__(self) -> None:
         self.validations: list[Validation] = []
@@ -96,17 +105,18 @@ class History:
     def curves(self) -> bytes:
         """Draw the training loss, and the gains by ratio: mean, and the scene that gains least.
 
+        There must have been a validation.
+
         Returns:
             A PNG file.
 
         Raises:
             MissingDependencyError: matplotlib is missing.
-        InvalidArgumentError: There are not two validations yet.
         """
         steps = [entry.step for entry in self.validations]
         losses = Panel(
-            series=[Series(name="loss", x=steps[1:], y=[e.loss for e in self.validations[1:]])],
-            title="training loss, 1 changes nothing",
+            series=[Series(name="loss", x=steps, y=[entry.loss for entry in self.validations])],
+            title="training loss",
             x_label="step",
         )
         table = [entry.by_ratio() for entry in self.validations]

@@ -11,17 +11,18 @@ import torch
 from torch import Tensor
 
 import cvtgs
-from cvtgs.errors import ConfigError, TrainingError
+from cvtgs.errors import ConfigError, OutputError, TrainingError
 from cvtgs.io import atomic_output
 from cvtgs.mergenet import Architecture, CheckpointInfo, MergeNet, load_checkpoint, save_checkpoint
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.train.cache import Prepared, prepare
-from cvtgs.train.cases import Case, Views
+from cvtgs.train.cases import Case
 from cvtgs.train.config import TrainConfig
 from cvtgs.train.history import History, Validation
 from cvtgs.train.losses import local_loss, scene_loss, scores
 from cvtgs.train.scenes import Source, find_sources
 from cvtgs.train.state import TrainState
+from cvtgs.train.views import Views
 
 WARM_UP = 50
 """Steps in which the learning rate rises."""
@@ -56,6 +57,10 @@ class TrainFiles:
 
         Returns:
             Names that start like that of the checkpoint.
+
+        Example:
+            >>> TrainFiles.beside(Path("net.safetensors")).curves.name
+            'net.png'
         """
         return cls(
             checkpoint=checkpoint,
@@ -97,13 +102,34 @@ def train(
         CheckpointError: The start, or the state to resume, cannot be used.
         TrainingError: The loss is not finite; the text says where, and which file is good.
         OutputError: A file cannot be written.
+        MissingDependencyError: matplotlib, which draws the curves, is missing.
+
+    Example:
+        >>> import tempfile
+        >>> from cvtgs import save, synthetic
+        >>> from cvtgs.train import DataConfig, ViewsConfig
+        >>> with tempfile.TemporaryDirectory() as name:
+        ...     folder = Path(name)
+        ...     for seed, file in enumerate(["lesson.ply", "exam.ply"]):
+        ...         save(synthetic.scene("object", 300, sh_degree=0, seed=seed), folder / file)
+        ...     data = DataConfig(
+        ...         folders=(folder,), validation=("exam",), generated=0, generated_validation=0,
+        ...         ratios=(0.1,), validation_ratios=(0.1,),
+        ...     )
+        ...     views = ViewsConfig(count=2, sizes=(32,), validation_count=2, validation_size=32)
+        ...     history = train(
+        ...         TrainConfig(steps=2, width=4, cell_width=4, data=data, views=views),
+        ...         TrainFiles.beside(folder / "net.safetensors"),
+        ...     )
+        >>> [validation.step for validation in history.validations]
+        [0, 2]
     """
     sources = find_sources(config.data, seed=config.seed)
     device = torch.device(device)
     state = TrainState(_first_net(config).to(device), config)
     if resume and files.state.is_file():
         state.load(files.state, config)
-    files.cache.mkdir(parents=True, exist_ok=True)
+    _make_folder(files.cache)
     lessons, exams = _prepare_all(sources, config, files.cache, listener)
     if not state.history.validations:
         _validate(state, exams, math.nan, config, files, device)
@@ -134,6 +160,14 @@ def _first_net(config: TrainConfig) -> MergeNet:
         return MergeNet(Architecture(width=config.width, cell_width=config.cell_width))
 
 
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise OutputError(f"{path}: the cache must be a folder, found: {reason}.") from error
+
+
 def _prepare_all(
     sources: Sequence[Source], config: TrainConfig, cache: Path, listener: ProgressListener
 ) -> tuple[list[tuple[Case, tuple[Views, ...]]], list[Prepared]]:
@@ -145,6 +179,13 @@ def _prepare_all(
             exams.append(prepared)
         else:
             lessons += [(case, prepared.views) for case in prepared.cases]
+    exams = [exam for exam in exams if exam.cases]
+    for found, text in ((lessons, "learn from"), (exams, "validate with")):
+        if not found:
+            raise ConfigError(
+                f"data: the scenes to {text} are too small for their ratios: "
+                f"no cell has several members."
+            )
     listener(ProgressEvent(stage="prepare", done=len(sources), total=len(sources)))
     return lessons, exams
 
@@ -182,8 +223,8 @@ def _loss(
     net: MergeNet, case: Case, views: Views, config: TrainConfig, dice: random.Random
 ) -> Tensor:
     if config.kind == "local":
-        return local_loss(net, case, config.cells, config=config.loss, dice=dice)
-    return scene_loss(net, case, views, config=config.loss, dice=dice)
+        return local_loss(net, case, config=config, dice=dice)
+    return scene_loss(net, case, views, config=config, dice=dice)
 
 
 def _learning_rate(config: TrainConfig, step: int) -> float:
@@ -211,9 +252,8 @@ def _validate(
         with atomic_output(files.checkpoint, overwrite=True) as file:
             file.write(save_checkpoint(state.mean_net, _description(state, config)))
     state.save(files.state, config)
-    if len(history.validations) > 1:
-        with atomic_output(files.curves, overwrite=True) as file:
-            file.write(history.curves())
+    with atomic_output(files.curves, overwrite=True) as file:
+        file.write(history.curves())
 
 
 def _description(state: TrainState, config: TrainConfig) -> CheckpointInfo:

@@ -8,59 +8,56 @@ from torch import Tensor
 
 from cvtgs.evaluate import psnr
 from cvtgs.losses import image_loss
+from cvtgs.math.activations import positive_log
 from cvtgs.mergenet import MergeNet, Residuals
 from cvtgs.render import render
-from cvtgs.train.cases import Case, Views
-from cvtgs.train.config import LossConfig
+from cvtgs.train.cases import Case
+from cvtgs.train.config import LossConfig, TrainConfig
 from cvtgs.train.crops import crop_cells
+from cvtgs.train.views import Views
 
 FAINTEST_SQUARED = 1e-5
 FAINTEST_IMAGE = 1e-3
-"""What is added to the errors of the reference, so that pictures without any do not count."""
+"""What is added to errors before their logarithm, so that near-perfect pictures count less."""
 
 
 def scene_loss(
-    net: MergeNet, case: Case, views: Views, *, config: LossConfig, dice: random.Random
+    net: MergeNet, case: Case, views: Views, *, config: TrainConfig, dice: random.Random
 ) -> Float[Tensor, ""]:
-    """Render the corrected scene from one view, over a random background.
+    """Render a random crop of the corrected scene from one view, over a random background.
 
     Args:
         net: The network.
         case: A scene at a ratio.
         views: Pictures of the full scene.
-        config: What counts how much.
-        dice: Draws view and background.
+        config: Size of the crop, and what counts how much.
+        dice: Draws view, crop and background.
 
     Returns:
-        The loss; about 1 for a network that changes nothing.
+        The loss.
     """
-    row = dice.randrange(len(views.cameras))
     background = _drawn_color(dice, case)
-    target = views.over(background, slice(row, row + 1))
-    camera = views.cameras.select(torch.tensor([row]))
+    view = views.crop(dice.randrange(len(views.cameras)), config.views.crop, dice)
     residuals: Residuals = net(case.descriptors)
-    with torch.no_grad():
-        before = render(case.reference.merged, camera, background=background).rgb
-    after = render(case.corrected(residuals), camera, background=background).rgb
-    return relative_loss(before, after, target, config) + config.residual * residuals.cost()
+    picture = render(case.corrected(residuals), view.cameras, background=background).rgb
+    return _loss(picture, view.over(background), residuals, config.loss)
 
 
 def local_loss(
-    net: MergeNet, case: Case, count: int, *, config: LossConfig, dice: random.Random
+    net: MergeNet, case: Case, *, config: TrainConfig, dice: random.Random
 ) -> Float[Tensor, ""]:
     """Render some cells, each alone, in random crops: members against the corrected Gaussian.
 
     Args:
         net: The network.
         case: A scene at a ratio.
-        count: Cells to take at most.
-        config: What counts how much.
+        config: Number of cells, and what counts how much.
         dice: Draws cells, turns, crops and background.
 
     Returns:
-        The loss; about 1 for a network that changes nothing.
+        The loss.
     """
-    number = min(count, len(case.cells))
+    number = min(config.cells, len(case.cells))
     rows = torch.tensor(sorted(dice.sample(range(len(case.cells)), number)))
     some = case.select(rows)
     residuals: Residuals = net(some.descriptors)
@@ -68,32 +65,37 @@ def local_loss(
     background = _drawn_color(dice, case)
     with torch.no_grad():
         target = render(crops.members, crops.camera, background=background).rgb
-        before = render(crops.merged, crops.camera, background=background).rgb
-    after = render(crops.corrected, crops.camera, background=background).rgb
-    return relative_loss(before, after, target, config) + config.residual * residuals.cost()
+    picture = render(crops.corrected, crops.camera, background=background).rgb
+    return _loss(picture, target, residuals, config.loss)
 
 
-def relative_loss(
-    before: Float[Tensor, "1 h w 3"],
-    after: Float[Tensor, "1 h w 3"],
-    target: Float[Tensor, "1 h w 3"],
-    config: LossConfig,
+def picture_loss(
+    picture: Float[Tensor, "1 h w 3"], target: Float[Tensor, "1 h w 3"], config: LossConfig
 ) -> Float[Tensor, ""]:
-    """Compare two pictures with a target, so that every scene and ratio counts the same.
+    """Compare a picture with what it should be.
 
     Args:
-        before: Picture of the merged Gaussians.
-        after: Picture of the corrected ones.
+        picture: Picture of the corrected Gaussians.
         target: What it should be.
         config: What counts how much.
 
     Returns:
-        The loss of ``after`` in units of that of ``before``.
+        The sum of logarithms of :class:`LossConfig`.
     """
-    error, old_error = ((picture - target).square().mean() for picture in (after, before))
-    squared = error / (old_error + FAINTEST_SQUARED)
-    image = image_loss(after, target) / (image_loss(before, target) + FAINTEST_IMAGE)
-    return config.squared * squared + config.image * image
+    loss = picture.new_zeros(())
+    if config.squared:
+        squared = (picture - target).square().mean()
+        loss = loss + config.squared * positive_log(squared + FAINTEST_SQUARED)
+    if config.image:
+        loss = loss + config.image * positive_log(image_loss(picture, target) + FAINTEST_IMAGE)
+    return loss
+
+
+def _loss(
+    picture: Tensor, target: Tensor, residuals: Residuals, config: LossConfig
+) -> Float[Tensor, ""]:
+    loss = picture_loss(picture, target, config)
+    return loss + config.residual * residuals.cost() if config.residual else loss
 
 
 @torch.no_grad()
@@ -109,7 +111,7 @@ def scores(net: MergeNet, case: Case, views: Views) -> tuple[float, float]:
         PSNR before and after, the mean over the views.
     """
     grey = views.cameras.Ks.new_full((3,), 0.5)
-    target = views.over(grey, slice(None))
+    target = views.over(grey)
     before, after = case.reference.merged, case.corrected(net(case.descriptors))
     found = [
         psnr(render(scene, views.cameras, background=grey).rgb, target).mean()

@@ -39,18 +39,26 @@ class Source:
 
 
 def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
-    """List the scenes of a training, without loading them.
+    """List the scenes of a training, and make none of them yet.
 
     Args:
         config: Which.
         seed: Seed of pieces, copies and generated scenes.
 
     Returns:
-        Sources with unique names, those of files in alphabetical order.
+        Sources with unique names: those of files, folder by folder in alphabetical order, then
+        generated ones.
 
     Raises:
         ConfigError: A folder or a validation file is missing, or there is nothing to learn from
             or to validate with.
+        FileFormatError: A file is no PLY file with Gaussians, or damaged.
+
+    Example:
+        >>> config = DataConfig(generated=1, generated_validation=1, generated_counts=(1000,))
+        >>> sources = find_sources(config, seed=0)
+        >>> sources[0].name, sources[0].make()
+        ('generated-object-0', GaussianScene(1,000 Gaussians, SH degree 0, float32, cpu))
     """
     files = [path for folder in config.folders for path in _files_in(folder)]
     names = [path.stem for path in files]

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cvtgs.errors import CheckpointError, FileFormatError
+from cvtgs.errors import CheckpointError
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.mergenet import MergeNet
 from cvtgs.train.config import TrainConfig
@@ -68,7 +68,7 @@ class TrainState:
 
         Args:
             path: The file.
-            config: The training; it must be the same, but for the number of steps.
+            config: The training; it must be the same, but for note and patience.
 
         Raises:
             CheckpointError: The file is damaged, or of another training.
@@ -82,7 +82,7 @@ class TrainState:
                     f"remove it, or train to another output."
                 )
             self._fill(tensors, facts)
-        except (FileFormatError, KeyError, ValueError, RuntimeError) as error:
+        except (KeyError, ValueError, TypeError, RuntimeError) as error:
             if isinstance(error, CheckpointError):
                 raise
             raise CheckpointError(f"{path}: the state of the training is damaged.") from error

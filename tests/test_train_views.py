@@ -1,0 +1,121 @@
+"""Views: pictures of full scenes, pieces of them, and from where they are taken."""
+
+import random
+
+import pytest
+import torch
+
+from cvtgs.cameras import Cameras
+from cvtgs.evaluate import automatic_views
+from cvtgs.math.frames import robust_frame
+from cvtgs.render import render
+from cvtgs.train.views import Views, look_at_scene, views_from_anywhere
+from scenes import random_scene
+from train_cases import bits_of_views, small_scene
+
+
+def numbered_views(size: int = 8) -> Views:
+    """One picture whose red tells the column and whose green tells the row."""
+    steps = torch.arange(size, dtype=torch.float16)
+    rgb = torch.zeros(1, size, size, 3, dtype=torch.float16)
+    rgb[..., 0], rgb[..., 1] = steps, steps[:, None]
+    intrinsics = torch.tensor([[[10.0, 0, size / 2], [0, 10.0, size / 2], [0, 0, 1]]])
+    cameras = Cameras(viewmats=torch.eye(4)[None], Ks=intrinsics, width=size, height=size)
+    return Views(cameras=cameras, rgb=rgb, alpha=rgb[..., 0] / 10)
+
+
+def test_pictures_over_a_background():
+    views = numbered_views()
+    picture = views.over(torch.tensor([1.0, 0.5, 0.0]))[0]
+    assert picture.dtype == torch.float32
+    assert picture[2, 5].tolist() == pytest.approx([5 + 0.5, 2 + 0.25, 0.0], abs=1e-3)
+    assert picture[0, 0].tolist() == [1.0, 0.5, 0.0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_crop_is_a_piece_and_its_camera_sees_it(seed):
+    piece = numbered_views().crop(0, 3, random.Random(seed))
+    x, y = (int(value) for value in piece.rgb[0, 0, 0, :2].tolist())
+    assert piece.rgb.shape == (1, 3, 3, 3)
+    assert (piece.cameras.width, piece.cameras.height) == (3, 3)
+    assert piece.rgb[0, 2, 1].tolist() == [x + 1, y + 2, 0]
+    assert piece.alpha[0, 0, 2].item() == pytest.approx((x + 2) / 10, abs=1e-3)
+    assert piece.cameras.Ks[0].tolist() == [[10, 0, 4 - x], [0, 10, 4 - y], [0, 0, 1]]
+
+
+def test_crops_reach_every_corner():
+    views, dice = numbered_views(), random.Random(0)
+    starts = {tuple(views.crop(0, 7, dice).rgb[0, 0, 0, :2].tolist()) for _ in range(40)}
+    assert starts == {(0, 0), (0, 1), (1, 0), (1, 1)}
+
+
+@pytest.mark.parametrize("side", [8, 100])
+def test_a_crop_as_large_as_the_picture_is_the_picture(side):
+    views = numbered_views()
+    assert bits_of_views(views.crop(0, side, random.Random(0))) == bits_of_views(views)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_crop_is_what_its_camera_renders(seed):
+    """For Gaussians that it shows: those far beside a picture are drawn by its own margins."""
+    camera = numbered_views(40).cameras
+    scene = random_scene(20, degree=0, spread=0.05, size=0.1)
+    scene = scene.with_tensors({"means": scene.means + torch.tensor([0.0, 0.0, 3.0])}, {})
+    whole = render(scene, camera)
+    views = Views(cameras=camera, rgb=whole.rgb.half(), alpha=whole.alpha.half())
+    piece = views.crop(0, 32, random.Random(seed))
+    cut = render(scene, piece.cameras)
+    torch.testing.assert_close(cut.rgb, piece.rgb.float(), rtol=0, atol=2e-3)
+    torch.testing.assert_close(cut.alpha, piece.alpha.float(), rtol=0, atol=2e-3)
+
+
+def test_half_of_the_views_are_the_automatic_ones():
+    scene = small_scene()
+    views = look_at_scene(scene, 3, size=32, seed=2)
+    usual = automatic_views(scene, 2, width=32, height=32, seed=2)
+    around = views_from_anywhere(scene, 1, size=32, seed=2)
+    assert torch.equal(views.cameras.viewmats, torch.cat([usual.viewmats, around.viewmats]))
+    assert torch.equal(views.cameras.Ks, torch.cat([usual.Ks, around.Ks]))
+    assert views.rgb.shape == (3, 32, 32, 3)
+    assert views.rgb.dtype == views.alpha.dtype == torch.float16
+    pictures = render(scene, views.cameras)
+    torch.testing.assert_close(views.rgb.float(), pictures.rgb, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(views.alpha.float(), pictures.alpha, rtol=1e-3, atol=1e-3)
+
+
+def test_one_view_is_an_automatic_one():
+    scene = small_scene()
+    usual = automatic_views(scene, 1, width=32, height=32, seed=0)
+    views = look_at_scene(scene, 1, size=32, seed=0)
+    assert torch.equal(views.cameras.viewmats, usual.viewmats)
+
+
+def test_the_seed_decides_the_views():
+    scene = small_scene()
+    first, again, other = (look_at_scene(scene, 2, size=32, seed=seed) for seed in (0, 0, 1))
+    assert bits_of_views(first) == bits_of_views(again)
+    assert not torch.equal(first.cameras.viewmats, other.cameras.viewmats)
+
+
+def test_views_from_anywhere_look_at_the_middle_from_around():
+    scene = small_scene()
+    frame = robust_frame(scene.means[scene.opacities > 0.1])
+    cameras = views_from_anywhere(scene, 60, size=100, seed=0)
+    steps = (cameras.centers - frame.center.float()) / float(frame.radius)
+    distances = torch.linalg.vector_norm(steps, dim=1)
+    assert 1.1 <= float(distances.amin()) < 1.4
+    assert 2.6 < float(distances.amax()) <= 3.0 + 1e-4
+    assert float(steps.amin(dim=0).amax()) < -1
+    assert float(steps.amax(dim=0).amin()) > 1
+    forward = cameras.viewmats[:, 2, :3]
+    # The target is within a quarter of a radius (a box of that side) around the middle.
+    off = steps - (steps * forward).sum(dim=1, keepdim=True) * forward
+    assert float(torch.linalg.vector_norm(off, dim=1).amax()) < 0.25
+    assert bool(((steps * forward).sum(dim=1) < 0).all())
+    assert cameras.Ks[0, 0, 0].item() == pytest.approx(50 / 0.46630766)
+
+
+def test_a_faint_scene_can_be_looked_at_too():
+    scene = small_scene(100)
+    faint = scene.with_tensors({"logit_opacities": scene.logit_opacities * 0 - 5}, {})
+    assert len(views_from_anywhere(faint, 3, size=32, seed=0)) == 3
