@@ -67,6 +67,40 @@ def test_a_cell_larger_than_a_chunk_is_a_run_of_its_own():
     assert runs == [[1], [50], [1, 1]]
 
 
+def test_cells_cost_more_than_their_members():
+    """Each counts 3 members more: 5, 5, 4, 8, 4, 4 for runs of 10."""
+    partition = partition_of([2, 2, 1, 5, 1, 1])
+    runs = [part.counts.tolist() for _, part in partition.chunks(10, cell_cost=3)]
+    assert runs == [[2, 2], [1], [5], [1, 1]]
+    runs = [part.counts.tolist() for _, part in partition.chunks(12, cell_cost=3)]
+    assert runs == [[2, 2], [1, 5], [1, 1]]
+
+
+def test_a_cell_that_costs_more_than_a_chunk_is_a_run_of_its_own():
+    runs = [part.counts.tolist() for _, part in partition_of([1, 2, 1]).chunks(3, cell_cost=100)]
+    assert runs == [[1], [2], [1]]
+
+
+@pytest.mark.parametrize("cost", [0, 1, 8])
+@pytest.mark.parametrize("limit", [1, 7, 20])
+def test_costly_cells_come_once_and_whole(limit, cost):
+    partition = partition_of([1, 2, 3, 1, 1, 9, 1, 2])
+    found: list[list[int]] = []
+    for run, part in partition.chunks(limit, cell_cost=cost):
+        assert run.stop - run.start == len(part)
+        assert len(part.order) + cost * len(part) <= limit or len(part) == 1
+        found += lists_of(part)
+    assert found == lists_of(partition)
+
+
+def test_moving_to_a_device():
+    """``meta`` stands for another device: it has shapes and no values."""
+    moved = partition_of([2, 1]).to(torch.device("meta"))
+    assert isinstance(moved, Partition)
+    assert {moved.order.device.type, moved.offsets.device.type} == {"meta"}
+    assert (moved.order.shape, moved.offsets.shape) == ((3,), (3,))
+
+
 def test_a_label_out_of_range_is_an_error():
     for labels, found in (([0, 3], "0 to 3"), ([-1, 2], "-1 to 2")):
         with pytest.raises(InvalidArgumentError) as caught:

@@ -43,6 +43,7 @@ def test_no_rows():
     assert scales.shape == (0, 3)
     assert quats.shape == (0, 4)
     assert covariances.mean_projected_area(torch.zeros(0, 3)).shape == (0,)
+    assert covariances.log_mean_projected_area(torch.zeros(0, 3)).shape == (0,)
 
 
 def test_zero_matrix_gives_positive_scales():
@@ -133,9 +134,44 @@ def test_area_of_extreme_scales_in_float32(exponent):
     assert area == pytest.approx(math.pi * size * size, rel=1e-5)
 
 
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
+def test_logarithm_of_the_area(dtype, tolerance):
+    """A sphere of radius 2 has a shadow of 4 pi; the rest is as without logarithms."""
+    sphere = torch.full((1, 3), math.log(2.0), dtype=dtype)
+    found = covariances.log_mean_projected_area(sphere)
+    assert found.dtype == dtype
+    assert found.item() == pytest.approx(math.log(4 * math.pi), rel=tolerance)
+    scales, _ = random_shapes(100, seed=6)
+    areas = covariances.mean_projected_area(scales)
+    found = covariances.log_mean_projected_area(scales.log().to(dtype)).double()
+    torch.testing.assert_close(found, areas.log(), rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("exponent", [-80.0, 80.0])
+def test_logarithm_of_the_area_of_extreme_scales(dtype, exponent):
+    """e^-80 and e^80, whose areas are beyond float32."""
+    shapes = torch.tensor([[0.0, 0.0, 0.0], [2.0, 0.0, -1.0], [0.0, -3.0, 1.0]], dtype=dtype)
+    found = covariances.log_mean_projected_area(shapes + exponent)
+    wanted = [math.log(oracles.thomsen_area(row)) for row in shapes.double().exp().tolist()]
+    assert found.tolist() == pytest.approx([w + 2 * exponent for w in wanted], rel=1e-5)
+
+
+def test_logarithm_of_the_area_of_discs_and_needles_is_finite():
+    """A disc as its area is; a needle is e^-200 thin, and so is its shadow, or nearly nothing."""
+    shapes = torch.tensor([[0.0, 0.0, -500.0], [0.0, -200.0, -200.0]], requires_grad=True)
+    disc, needle = covariances.log_mean_projected_area(shapes)
+    flat = math.log(covariances.mean_projected_area(torch.tensor([[1.0, 1.0, 0.0]])).item())
+    assert disc.item() == pytest.approx(flat, rel=1e-5)
+    assert needle.item() < -50
+    (disc + needle).backward()
+    assert bool(shapes.grad.isfinite().all())
+
+
 def test_gradients():
     scales, quats = random_shapes(3, seed=4)
     scales.requires_grad_()
     quats.requires_grad_()
     assert torch.autograd.gradcheck(covariances.from_scales_and_quats, (scales, quats))
     assert torch.autograd.gradcheck(covariances.mean_projected_area, (scales,))
+    assert torch.autograd.gradcheck(covariances.log_mean_projected_area, (scales,))

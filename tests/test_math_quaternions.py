@@ -32,7 +32,34 @@ def test_half_turns_have_their_axis_as_quaternion(axis):
     assert quaternions.from_matrices(matrix[None])[0].abs().tolist() == wanted
 
 
+def test_products_of_the_units():
+    """``ij = k``, ``jk = i``, ``ki = j``; turned round, the sign changes; ``ii = -1``."""
+    units = torch.eye(4, dtype=torch.float64)
+    one, i, j, k = units
+    table = [(i, j, k), (j, k, i), (k, i, j), (j, i, -k), (i, i, -one), (one, j, j), (j, one, j)]
+    for a, b, wanted in table:
+        assert torch.equal(quaternions.multiply(a[None], b[None])[0] + 0.0, wanted + 0.0)
+
+
+def test_product_of_known_quaternions():
+    a, b = torch.tensor([[1.0, 2.0, 3.0, 4.0]]), torch.tensor([[5.0, 6.0, 7.0, 8.0]])
+    assert quaternions.multiply(a, b).tolist() == [[-60.0, 12.0, 30.0, 24.0]]
+
+
+def test_products_equal_the_oracle_and_are_one_rotation_after_the_other():
+    a, b = random_quats(40), random_quats(40, seed=1)
+    found = quaternions.multiply(a, b)
+    pairs = zip(a.tolist(), b.tolist(), strict=True)
+    wanted = torch.tensor(
+        [oracles.quaternion_product(*pair) for pair in pairs], dtype=torch.float64
+    )
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-15)
+    turns = [quaternions.to_matrices(quats) for quats in (a, b, found)]
+    torch.testing.assert_close(turns[0] @ turns[1], turns[2], rtol=0, atol=1e-14)
+
+
 def test_no_rows():
+    assert quaternions.multiply(torch.zeros(0, 4), torch.zeros(0, 4)).shape == (0, 4)
     assert quaternions.normalize(torch.zeros(0, 4)).shape == (0, 4)
     assert quaternions.to_matrices(torch.zeros(0, 4)).shape == (0, 3, 3)
     assert quaternions.from_matrices(torch.zeros(0, 3, 3)).shape == (0, 4)
@@ -98,3 +125,5 @@ def test_gradients():
     assert torch.autograd.gradcheck(
         lambda q: quaternions.to_matrices(quaternions.normalize(q)), (quats,)
     )
+    others = random_quats(4, seed=1).requires_grad_()
+    assert torch.autograd.gradcheck(quaternions.multiply, (quats, others))

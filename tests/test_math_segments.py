@@ -66,12 +66,55 @@ def test_a_segment_of_a_million_keeps_its_digits():
     assert total == pytest.approx(1e5, rel=1e-10)
 
 
-def test_gradients():
-    values = torch.tensor(
-        [[1.0, 5.0], [2.0, 1.0], [0.5, 0.1], [4.0, 2.0], [3.0, 9.0]],
-        dtype=torch.float64,
-        requires_grad=True,
-    )
-    assert torch.autograd.gradcheck(lambda v: segments.segment_sum(v, OFFSETS), (values,))
-    filled = torch.tensor([0, 2, 5])
-    assert torch.autograd.gradcheck(lambda v: segments.segment_max(v, filled), (values,))
+def test_sums_in_the_order_of_rows_whatever_the_segments_beside():
+    """A cell gives the same bits alone and among others."""
+    g = torch.Generator().manual_seed(1)
+    values = torch.randn(4000, 5, generator=g)
+    ends = torch.randint(0, 4000, (300,), generator=g).sort().values
+    offsets = torch.cat([torch.tensor([0]), ends, torch.tensor([4000])])
+    sums = segments.segment_sum(values, offsets)
+    for segment in range(0, 301, 7):
+        rows = values[offsets[segment] : offsets[segment + 1]]
+        alone = segments.segment_sum(rows, torch.tensor([0, len(rows)]))
+        assert torch.equal(alone[0], sums[segment])
+
+
+def test_columns_do_not_touch_one_another():
+    """Infinity and NaN stay in their column and segment."""
+    values = torch.ones(5, 3)
+    values[1, 0], values[3, 2] = torch.inf, torch.nan
+    sums = segments.segment_sum(values, OFFSETS)
+    wanted = torch.ones(4, 3, dtype=torch.bool)
+    wanted[0, 0] = wanted[2, 2] = False
+    assert torch.equal(sums.isfinite(), wanted)
+
+
+def smooth_rows(*shape: int) -> torch.Tensor:
+    """Numbers of which no two are near each other, so that a maximum stays where it is."""
+    count = torch.Size(shape).numel()
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(2))
+    return (order.double() / count).reshape(shape).requires_grad_()
+
+
+@pytest.mark.parametrize("inner", [(), (1,), (3,), (2, 3)], ids=str)
+@pytest.mark.parametrize("offsets", [[0, 2, 2, 5, 5], [0, 0, 5], [0, 1, 2, 3, 4, 5], [0, 5]])
+def test_gradients_equal_finite_differences(inner, offsets):
+    values, ends = smooth_rows(5, *inner), torch.tensor(offsets)
+    assert torch.autograd.gradcheck(lambda rows: segments.segment_sum(rows, ends), (values,))
+
+    def finite_max(rows: torch.Tensor) -> torch.Tensor:
+        return segments.segment_max(rows, ends)[ends.diff() > 0]
+
+    assert torch.autograd.gradcheck(finite_max, (values,))
+
+
+def test_gradients_of_known_rows():
+    """A sum hands its gradient to every row, a maximum to the largest, equals share it."""
+    values = torch.tensor([1.0, 2.0, 5.0, 3.0, 5.0], requires_grad=True)
+    weights = torch.tensor([10.0, 0.0, 20.0, 0.0])
+    (segments.segment_sum(values, OFFSETS) * weights).sum().backward()
+    assert values.grad.tolist() == [10.0, 10.0, 20.0, 20.0, 20.0]
+    values.grad = None
+    ends = torch.tensor([0, 2, 5])
+    (segments.segment_max(values, ends) * torch.tensor([10.0, 20.0])).sum().backward()
+    assert values.grad.tolist() == [0.0, 10.0, 10.0, 0.0, 10.0]

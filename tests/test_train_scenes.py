@@ -153,7 +153,7 @@ def test_folders_that_cannot_be_used_are_errors(tmp_path, changes, text):
 
 def test_a_file_is_no_folder(tmp_path):
     write_scenes(tmp_path, ["a"], 5)
-    with pytest.raises(ConfigError, match="a.ply is not a folder"):
+    with pytest.raises(ConfigError, match=r"a\.ply is not a folder"):
         find_sources(tiny_data(tmp_path / "a.ply"), seed=0)
 
 

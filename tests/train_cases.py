@@ -73,7 +73,9 @@ def run(config: TrainConfig, name: Path, cache: Path | None = None, **options: A
 
 def source_of(scene: GaussianScene, *, name: str = "made", validates: bool = False) -> Source:
     """A source that is there already."""
-    return Source(name=name, identity=f"identity of {name}", validates=validates, make=lambda: scene)
+    return Source(
+        name=name, identity=f"identity of {name}", validates=validates, make=lambda: scene
+    )
 
 
 def some_case(

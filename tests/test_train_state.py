@@ -1,0 +1,195 @@
+"""The state of a training: what is saved is what goes on."""
+
+import copy
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from cvtgs.errors import CheckpointError
+from cvtgs.io.tensors import map_tensors, save_tensors
+from cvtgs.mergenet import Architecture, MergeNet
+from cvtgs.train import LossConfig, TrainConfig, Validation
+from cvtgs.train.state import AVERAGED_STEPS, TrainState
+from mergenet_cases import some_case
+from train_cases import bits_of, small_net
+
+CONFIG = TrainConfig(steps=10, width=6, cell_width=10)
+
+
+def stepped(state: TrainState, steps: int) -> TrainState:
+    """Take steps on something that depends on every weight."""
+    seen = some_case(dtype=torch.float32).describe()
+    for _ in range(steps):
+        residuals = state.net(seen)
+        loss = (residuals.growths - 0.1).square().sum() + (residuals.shifts - 0.1).square().sum()
+        state.optimizer.zero_grad()
+        loss.backward()
+        state.optimizer.step()
+        state.average()
+        state.step += 1
+    return state
+
+
+def saved(path: Path) -> Path:
+    state = stepped(TrainState(small_net(), CONFIG), 3)
+    gains = {"room": {0.1: 0.1 + 0.2, 0.01: -1e-9}}
+    state.history.validations.append(Validation(step=0, loss=math.nan, gains=gains))
+    state.save(path, CONFIG)
+    return path
+
+
+def loaded(path: Path, config: TrainConfig = CONFIG) -> TrainState:
+    state = TrainState(small_net(seed=1), config)
+    state.load(path, config)
+    return state
+
+
+def test_what_was_saved_is_taken_over(tmp_path):
+    path = saved(tmp_path / "a.state")
+    state, wanted = loaded(path), stepped(TrainState(small_net(), CONFIG), 3)
+    assert state.step == 3
+    assert bits_of(state.net.state_dict()) == bits_of(wanted.net.state_dict())
+    assert bits_of(state.mean_net.state_dict()) == bits_of(wanted.mean_net.state_dict())
+    entry = state.history.validations[0]
+    assert math.isnan(entry.loss)
+    assert entry.gains == {"room": {0.1: 0.1 + 0.2, 0.01: -1e-9}}
+
+
+def test_going_on_gives_the_same_bits(tmp_path):
+    state = stepped(loaded(saved(tmp_path / "a.state")), 4)
+    wanted = stepped(TrainState(small_net(), CONFIG), 7)
+    assert bits_of(state.net.state_dict()) == bits_of(wanted.net.state_dict())
+    assert bits_of(state.mean_net.state_dict()) == bits_of(wanted.mean_net.state_dict())
+
+
+def test_saving_again_gives_the_same_bytes(tmp_path):
+    path = saved(tmp_path / "a.state")
+    state = loaded(path)
+    state.save(tmp_path / "b.state", CONFIG)
+    assert (tmp_path / "b.state").read_bytes() == path.read_bytes()
+
+
+def test_going_on_does_not_touch_the_file(tmp_path):
+    path = saved(tmp_path / "a.state")
+    before = path.read_bytes()
+    stepped(loaded(path), 2)
+    assert path.read_bytes() == before
+
+
+def test_a_state_before_the_first_step(tmp_path):
+    path = tmp_path / "a.state"
+    TrainState(small_net(), CONFIG).save(path, CONFIG)
+    state = stepped(loaded(path), 2)
+    wanted = stepped(TrainState(small_net(), CONFIG), 2)
+    assert bits_of(state.net.state_dict()) == bits_of(wanted.net.state_dict())
+
+
+def test_the_running_mean_starts_fast_and_becomes_slow():
+    """After the first step a tenth is left of the start, and late a five hundredth is new."""
+    state = TrainState(small_net(), CONFIG)
+    with torch.no_grad():
+        for values in (*state.net.parameters(), *state.mean_net.parameters()):
+            values.zero_()
+        for values in state.net.parameters():
+            values.fill_(1.0)
+    state.average()
+    share = next(state.mean_net.parameters()).flatten()[0].item()
+    assert share == pytest.approx(1 - 1 / 10)
+    state.step = 10**6
+    state.average()
+    late = next(state.mean_net.parameters()).flatten()[0].item()
+    assert late == pytest.approx(share + (1 - share) / AVERAGED_STEPS)
+
+
+def test_the_running_mean_is_a_network_of_its_own():
+    state = TrainState(small_net(), CONFIG)
+    before = copy.deepcopy(state.mean_net.state_dict())
+    with torch.no_grad():
+        next(state.net.parameters()).fill_(5.0)
+    assert bits_of(state.mean_net.state_dict()) == bits_of(before)
+    assert not any(values.requires_grad for values in state.mean_net.parameters())
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"seed": 1},
+        {"steps": 11},
+        {"learning_rate": 0.1},
+        {"kind": "local"},
+        {"width": 7},
+        {"loss": LossConfig(residual=1.0)},
+    ],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_another_configuration_is_one_clear_error(tmp_path, changes):
+    path = saved(tmp_path / "a.state")
+    config = CONFIG.model_copy(update=changes)
+    state = TrainState(
+        MergeNet(Architecture(width=config.width, cell_width=config.cell_width)), config
+    )
+    with pytest.raises(CheckpointError) as caught:
+        state.load(path, config)
+    assert str(caught.value) == (
+        f"{path}: the state belongs to a training with another configuration; "
+        f"remove it, or train to another output."
+    )
+    assert state.step == 0
+
+
+def test_note_and_patience_may_change(tmp_path):
+    path = saved(tmp_path / "a.state")
+    assert loaded(path, CONFIG.model_copy(update={"note": "more", "patience": 3})).step == 3
+
+
+def damaged(path: Path, kind: str) -> None:
+    content, (tensors, metadata) = path.read_bytes(), map_tensors(path)
+    tensors = {name: values.clone() for name, values in tensors.items()}
+    facts = json.loads(metadata["state"])
+    path.unlink()
+    if kind == "empty":
+        path.write_bytes(b"")
+    elif kind == "cut short":
+        path.write_bytes(content[:-1])
+    elif kind == "header":
+        path.write_bytes(content[:9] + b"\xff" + content[10:])
+    elif kind == "a network":
+        save_tensors(path, tensors, {})
+    elif kind == "without weights":
+        tensors.pop(next(name for name in tensors if name.startswith("net/")))
+        save_tensors(path, tensors, metadata)
+    elif kind == "weights of another shape":
+        tensors["mean/decoder.bias"] = torch.zeros(7)
+        save_tensors(path, tensors, metadata)
+    elif kind == "without a step":
+        facts.pop("step")
+        save_tensors(path, tensors, {"state": json.dumps(facts)})
+    elif kind == "no facts":
+        save_tensors(path, tensors, {"state": "[]"})
+    elif kind == "facts cut short":
+        save_tensors(path, tensors, {"state": metadata["state"][:-5]})
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "empty",
+        "cut short",
+        "header",
+        "a network",
+        "without weights",
+        "weights of another shape",
+        "without a step",
+        "no facts",
+        "facts cut short",
+    ],
+)
+def test_a_damaged_file_is_one_clear_error(tmp_path, kind):
+    path = saved(tmp_path / "a.state")
+    damaged(path, kind)
+    with pytest.raises(CheckpointError) as caught:
+        loaded(path)
+    assert str(caught.value) == f"{path}: the state of the training is damaged."
