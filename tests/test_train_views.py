@@ -1,7 +1,5 @@
 """Views: pictures of full scenes, pieces of them, and from where they are taken."""
 
-import random
-
 import pytest
 import torch
 
@@ -10,7 +8,6 @@ from cvtgs.evaluate import automatic_views
 from cvtgs.math.frames import robust_frame
 from cvtgs.render import render
 from cvtgs.train.views import Views, look_at_scene, views_from_anywhere
-from scenes import random_scene
 from train_cases import bits_of_views, small_scene
 
 
@@ -32,41 +29,14 @@ def test_pictures_over_a_background():
     assert picture[0, 0].tolist() == [1.0, 0.5, 0.0]
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_a_crop_is_a_piece_and_its_camera_sees_it(seed):
-    piece = numbered_views().crop(0, 3, random.Random(seed))
-    x, y = (int(value) for value in piece.rgb[0, 0, 0, :2].tolist())
-    assert piece.rgb.shape == (1, 3, 3, 3)
-    assert (piece.cameras.width, piece.cameras.height) == (3, 3)
-    assert piece.rgb[0, 2, 1].tolist() == [x + 1, y + 2, 0]
-    assert piece.alpha[0, 0, 2].item() == pytest.approx((x + 2) / 10, abs=1e-3)
-    assert piece.cameras.Ks[0].tolist() == [[10, 0, 4 - x], [0, 10, 4 - y], [0, 0, 1]]
-
-
-def test_crops_reach_every_corner():
-    views, dice = numbered_views(), random.Random(0)
-    starts = {tuple(views.crop(0, 7, dice).rgb[0, 0, 0, :2].tolist()) for _ in range(40)}
-    assert starts == {(0, 0), (0, 1), (1, 0), (1, 1)}
-
-
-@pytest.mark.parametrize("side", [8, 100])
-def test_a_crop_as_large_as_the_picture_is_the_picture(side):
-    views = numbered_views()
-    assert bits_of_views(views.crop(0, side, random.Random(0))) == bits_of_views(views)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_a_crop_is_what_its_camera_renders(seed):
-    """For Gaussians that it shows: those far beside a picture are drawn by its own margins."""
-    camera = numbered_views(40).cameras
-    scene = random_scene(20, degree=0, spread=0.05, size=0.1)
-    scene = scene.with_tensors({"means": scene.means + torch.tensor([0.0, 0.0, 3.0])}, {})
-    whole = render(scene, camera)
-    views = Views(cameras=camera, rgb=whole.rgb.half(), alpha=whole.alpha.half())
-    piece = views.crop(0, 32, random.Random(seed))
-    cut = render(scene, piece.cameras)
-    torch.testing.assert_close(cut.rgb, piece.rgb.float(), rtol=0, atol=2e-3)
-    torch.testing.assert_close(cut.alpha, piece.alpha.float(), rtol=0, atol=2e-3)
+def test_one_picture_keeps_its_camera():
+    scene = small_scene()
+    views = look_at_scene(scene, 3, size=32, seed=2)
+    one = views.select(1)
+    assert torch.equal(one.rgb[0], views.rgb[1])
+    assert torch.equal(one.alpha[0], views.alpha[1])
+    assert torch.equal(one.cameras.viewmats[0], views.cameras.viewmats[1])
+    assert len(one.cameras) == 1
 
 
 def test_half_of_the_views_are_the_automatic_ones():

@@ -51,13 +51,15 @@ class ViewsConfig(Section):
     Attributes:
         count: Views of each scene at each size.
         sizes: Sides of the square pictures, pixels.
-        crop: Side of the random crop that one step renders, pixels.
+        per_step: Views that one step renders.
+        crop: Side of the random crop of each that is compared, pixels.
         validation_count: Views of each validation scene.
         validation_size: Side of their pictures, pixels.
     """
 
     count: Count = 16
     sizes: tuple[Count, ...] = (256, 448)
+    per_step: Count = 2
     crop: Count = 256
     validation_count: Count = 8
     validation_size: Count = 400

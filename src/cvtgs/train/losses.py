@@ -24,23 +24,32 @@ FAINTEST_IMAGE = 1e-3
 def scene_loss(
     net: MergeNet, case: Case, views: Views, *, config: TrainConfig, dice: random.Random
 ) -> Float[Tensor, ""]:
-    """Render a random crop of the corrected scene from one view, over a random background.
+    """Render the corrected scene from some views, and compare a random crop of each.
+
+    Each has a random background. Whole pictures are rendered: a camera that sees the crop only
+    would draw what lies beside it differently.
 
     Args:
         net: The network.
         case: A scene at a ratio.
-        views: Pictures of the full scene.
-        config: Size of the crop, and what counts how much.
-        dice: Draws view, crop and background.
+        views: Pictures of the full scene, squares of one size.
+        config: Number of views, size of the crops, and what counts how much.
+        dice: Draws views, crops and backgrounds.
 
     Returns:
         The loss.
     """
-    background = _drawn_color(dice, case)
-    view = views.crop(dice.randrange(len(views.cameras)), config.views.crop, dice)
     residuals: Residuals = net(case.descriptors)
-    picture = render(case.corrected(residuals), view.cameras, background=background).rgb
-    return _loss(picture, view.over(background), residuals, config.loss)
+    corrected = case.corrected(residuals)
+    losses = []
+    for _ in range(config.views.per_step):
+        background = _drawn_color(dice, case)
+        view = views.select(dice.randrange(len(views.cameras)))
+        y, x = (_drawn_slice(view.cameras.width, config.views.crop, dice) for _ in range(2))
+        picture = render(corrected, view.cameras, background=background).rgb
+        target = view.over(background)
+        losses.append(picture_loss(picture[:, y, x], target[:, y, x], config.loss))
+    return torch.stack(losses).mean() + _price(residuals, config.loss)
 
 
 def local_loss(
@@ -66,7 +75,7 @@ def local_loss(
     with torch.no_grad():
         target = render(crops.members, crops.camera, background=background).rgb
     picture = render(crops.corrected, crops.camera, background=background).rgb
-    return _loss(picture, target, residuals, config.loss)
+    return picture_loss(picture, target, config.loss) + _price(residuals, config.loss)
 
 
 def picture_loss(
@@ -91,11 +100,15 @@ def picture_loss(
     return loss
 
 
-def _loss(
-    picture: Tensor, target: Tensor, residuals: Residuals, config: LossConfig
-) -> Float[Tensor, ""]:
-    loss = picture_loss(picture, target, config)
-    return loss + config.residual * residuals.cost() if config.residual else loss
+def _price(residuals: Residuals, config: LossConfig) -> Float[Tensor, ""]:
+    if not config.residual:
+        return residuals.logits.new_zeros(())
+    return config.residual * residuals.cost()
+
+
+def _drawn_slice(size: int, crop: int, dice: random.Random) -> slice:
+    start = dice.randint(0, max(0, size - crop))
+    return slice(start, start + crop)
 
 
 @torch.no_grad()

@@ -1,8 +1,7 @@
 """Views: pictures of full scenes that networks are compared with."""
 
 import math
-import random
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -40,27 +39,20 @@ class Views:
         """
         return self.rgb.float() + (1 - self.alpha.float())[..., None] * background
 
-    def crop(self, row: int, side: int, dice: random.Random) -> "Views":
-        """Cut a random square out of one picture.
+    def select(self, row: int) -> "Views":
+        """Take one picture.
 
         Args:
-            row: Which picture.
-            side: Side of the square, pixels; the whole picture if it is not larger.
-            dice: Draws the place.
+            row: Which one.
 
         Returns:
-            The piece, and a camera that sees it.
+            The picture and its camera.
         """
-        cameras = self.cameras.select(torch.tensor([row], device=self.cameras.Ks.device))
-        side = min(side, cameras.width)
-        x, y = dice.randint(0, cameras.width - side), dice.randint(0, cameras.height - side)
-        intrinsics = cameras.Ks.clone()
-        intrinsics[:, 0, 2] -= x
-        intrinsics[:, 1, 2] -= y
+        rows = torch.tensor([row], device=self.cameras.Ks.device)
         return Views(
-            cameras=replace(cameras, Ks=intrinsics, width=side, height=side),
-            rgb=self.rgb[row : row + 1, y : y + side, x : x + side],
-            alpha=self.alpha[row : row + 1, y : y + side, x : x + side],
+            cameras=self.cameras.select(rows),
+            rgb=self.rgb[row : row + 1],
+            alpha=self.alpha[row : row + 1],
         )
 
     def to(self, device: torch.device) -> "Views":
