@@ -1,0 +1,73 @@
+"""LightGaussian's pruning (Fan, Wang, Wen, Zhu, Xu, Wang: arXiv 2311.17245, NeurIPS 2024).
+
+The global significance of a Gaussian (the paper's equation of GS_j; its number was not at hand) is
+
+    GS_j = sum over the pixels of all views that it hits of  opacity_j * T * gamma(V_j)
+
+with T the transmittance in front of it, V_j its volume, and ``gamma(V) = V_norm ^ beta``, where
+``V_norm = min(max(V / V_max90, 0), 1)`` and beta = 0.1. The M most significant ones are kept.
+
+Where ours differs:
+
+- A hit counts with the alpha that is blended there, ``opacity * G(pixel)``, instead of the bare
+  opacity: what is summed is the contribution to the picture, and no threshold decides what a hit
+  is.
+- V_max90, "the 90 % largest of all sorted Gaussians", is read as the 90 % quantile: only the
+  largest tenth is clipped, which is what the clipping is there for (excessive floaters).
+- The training views are not there in this protocol: automatic views stand for them, other ones
+  than those that judge.
+- The recovery training, distillation and quantisation that follow in the paper are left out.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from benchmarks.baselines.rows import keep_largest, usable
+from cvtgs.cameras import Cameras
+from cvtgs.evaluate import automatic_views
+from cvtgs.math.spherical_harmonics import SH_C0
+from cvtgs.render import BackendName, render
+from cvtgs.scene import GaussianScene
+
+VIEWS = 24
+SIZE = 256
+BETA = 0.1
+QUANTILE = 0.9
+
+
+def simplify(scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScene:
+    """Keep the ``count`` Gaussians of most global significance; the seed turns the views."""
+    valid = usable(scene, count)
+    cameras = automatic_views(valid, VIEWS, width=SIZE, height=SIZE, seed=seed + 1)
+    significance = contributions(valid, cameras) * volume_factor(valid.log_scales)
+    return keep_largest(valid, significance, count=count)
+
+
+def contributions(
+    scene: GaussianScene, cameras: Cameras, *, backend: BackendName = "auto"
+) -> Float[Tensor, "n"]:
+    """Sum ``alpha * T`` of every Gaussian over all pixels of all views, float64.
+
+    The colour of a pixel is ``sum alpha_i T_i color_i``, so the sum is the gradient of the
+    picture's sum with respect to ``color_i``: one backward pass per view, by the same renderer.
+    """
+    sh0 = torch.zeros_like(scene.sh0).requires_grad_()  # colour 0.5, where nothing is clipped
+    gray = scene.with_tensors({"sh0": sh0, "shN": scene.shN[:, :0]}, {})
+    total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
+    for view in range(len(cameras)):
+        picture = render(gray, cameras.select(torch.tensor([view])), backend=backend).rgb
+        (gradient,) = torch.autograd.grad(picture[..., 0].sum(), sh0)
+        total += gradient[:, 0, 0].double() / SH_C0
+    return total
+
+
+def volume_factor(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """Give ``gamma``: the volume over the 90 % quantile of all, at most 1, to the power 0.1.
+
+    In logarithms, so that no volume under- or overflows. ``4 pi / 3`` cancels.
+    """
+    log_volumes = log_scales.double().sum(dim=1)
+    ranked = log_volumes.sort().values
+    largest = ranked[min(int(QUANTILE * len(ranked)), len(ranked) - 1)]
+    return torch.exp(BETA * (log_volumes - largest).clamp_max(0.0))

@@ -1,0 +1,228 @@
+r"""Compare the presets, other methods and external tools: quality against seconds.
+
+``python -m benchmarks.compare SCENE.ply ... -o DIR`` follows the protocol of CVT-GS: every method
+gets the same scenes and the same number of Gaussians M, the same judge looks at what it writes, as
+it is, without fine-tuning, and its seconds are those of a process of its own, from its start over
+reading and writing to its end. Printed is one Markdown table, the mean over the scenes first; the
+folder gets that and a plot, anew after every scene.
+
+Methods are the presets of cvtgs, ``standard, no network``, the baselines of
+``benchmarks.baselines``, and any tool that reads and writes PLY files:
+
+    python -m benchmarks.compare a.ply b.ply --rho 0.1 0.01 -o compared \
+        --methods standard "mass pruning" NanoGS \
+        --tool "other=other-tool {IN} -o {OUT} --keep {RHO} --max {COUNT}"
+
+Scenes and judges are chosen as in ``benchmarks.quality``. Let it run once on a small scene first:
+what compiles itself does so then.
+"""
+
+import argparse
+import re
+import shlex
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cvtgs
+from benchmarks.baselines import BASELINES
+from benchmarks.compare_report import Result, chart, failures, markdown, wrong_counts
+from benchmarks.processes import Cost, machine, run
+from benchmarks.scoring import SIZE, VIEWS, Scorer, make_scorer, scenes, scoring_parser
+from cvtgs.io import atomic_output
+
+NO_NETWORK = "standard, no network"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """One scene, and how far to go.
+
+    Attributes:
+        source: The scene's file.
+        rho: Share of Gaussians to keep.
+        count: Number of Gaussians to keep.
+    """
+
+    source: Path
+    rho: float
+    count: int
+
+
+Table = Mapping[str, Mapping[str, Sequence[Result | None]]]
+"""One result per ratio, None for a failure, by method, by scene."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    options = parser().parse_args(arguments)
+    commands = commands_of(options)
+    text = ""
+    for table in measure(commands, options):
+        text = report(table, options)
+        if options.output is not None:
+            write(options.output / "compare.md", text.encode())
+            plot = chart(table, options.rho, clock=options.clock)
+            if plot is not None:
+                write(options.output / "compare.png", plot)
+    print(text)
+
+
+def parser() -> argparse.ArgumentParser:
+    found = scoring_parser(__doc__)
+    found.formatter_class = argparse.RawDescriptionHelpFormatter
+    found.add_argument(
+        "--methods", nargs="*", choices=[*own_methods([]), *BASELINES], metavar="NAME",
+        help=f"some of: {'; '.join([*own_methods([]), *BASELINES])} (all of them)",
+    )  # fmt: skip
+    found.add_argument(
+        "--tool", action="append", default=[], metavar="NAME=COMMAND",
+        help="an external tool; {IN}, {OUT}, {RHO} and {COUNT} are filled in; may be repeated",
+    )  # fmt: skip
+    found.add_argument("--clock", choices=("wall", "cpu"), default="wall", help="whose seconds")
+    found.add_argument("-o", "--output", type=Path, help="folder for compare.md and compare.png")
+    return found
+
+
+def own_methods(settings: Sequence[str]) -> dict[str, list[str]]:
+    """Give the commands of cvtgs itself, by name."""
+    command = [sys.executable, "-m", "cvtgs", "simplify", "{IN}", "{OUT}", "--count", "{COUNT}"]
+    command += ["--overwrite", "--quiet"]
+    command += [part for setting in settings for part in ("--set", setting)]
+    methods = {name: [*command, "--preset", name] for name in cvtgs.PRESETS}
+    return methods | {
+        NO_NETWORK: [*command, "--preset", "standard", "--set", "merge.network=false"]
+    }
+
+
+def commands_of(options: argparse.Namespace) -> dict[str, list[str]]:
+    """Give every method's command, with places to fill in, by name."""
+    run_baseline = [sys.executable, "-m", "benchmarks.baselines"]
+    methods = own_methods(options.set) | {
+        name: [*run_baseline, name, "{IN}", "{OUT}", "--count", "{COUNT}"] for name in BASELINES
+    }
+    names = list(methods) if options.methods is None else options.methods
+    commands = {name: methods[name] for name in names}
+    for tool in options.tool:
+        name, separator, command = tool.partition("=")
+        if not separator or "{OUT}" not in command or "{IN}" not in command:
+            raise SystemExit(
+                f"--tool must be NAME=COMMAND with {{IN}} and {{OUT}}; found {tool!r}."
+            )
+        if name in commands:
+            raise SystemExit(f"--tool: there is a method named {name!r} already.")
+        commands[name] = shlex.split(command)
+    if not commands:
+        raise SystemExit("name at least one method or tool.")
+    return commands
+
+
+def measure(commands: Mapping[str, list[str]], options: argparse.Namespace) -> Iterator[Table]:
+    """Run every method on every scene; give the table so far after each scene."""
+    score = make_scorer(options)
+    table: dict[str, dict[str, list[Result | None]]] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for scene_name, scene, source in sources(options, folder):
+            tasks = [
+                Task(source=source, rho=rho, count=cvtgs.target_count(len(scene), rho))
+                for rho in options.rho
+            ]
+            runs = {
+                method: [attempt(command, task, folder / "small.ply") for task in tasks]
+                for method, command in commands.items()
+            }
+            table[scene_name] = judged(scene, runs, tasks, score=score)
+            print(f"compared on {scene_name}: {len(scene)} Gaussians", file=sys.stderr)
+            yield dict(table)
+
+
+def sources(
+    options: argparse.Namespace, folder: Path
+) -> Iterator[tuple[str, cvtgs.GaussianScene, Path]]:
+    """Give name, scene and file of every scene; generated ones are written to the folder."""
+    for number, (name, scene) in enumerate(scenes(options.files, options.count)):
+        path = options.files[number] if options.files else folder / "full.ply"
+        if not options.files:
+            cvtgs.save(scene, path, overwrite=True)
+        yield name, scene, path.resolve()
+
+
+Run = tuple[cvtgs.GaussianScene, Cost]
+
+
+def attempt(command: Sequence[str], task: Task, output: Path) -> Run | None:
+    """Run a method's command on a task; None if it fails."""
+    output.unlink(missing_ok=True)
+    places = {
+        "{IN}": str(task.source),
+        "{OUT}": str(output),
+        "{RHO}": f"{task.rho:.12g}",
+        "{COUNT}": str(task.count),
+    }
+    try:
+        cost = run([filled(part, places) for part in command])
+        return cvtgs.load(output), cost
+    except (SystemExit, OSError, cvtgs.CvtgsError) as error:
+        print(f"failed: {error}", file=sys.stderr)
+        return None
+
+
+def filled(part: str, places: Mapping[str, str]) -> str:
+    """Replace the places in one argument; other braces stay as they are."""
+    anywhere = "|".join(re.escape(place) for place in places)
+    return re.sub(anywhere, lambda found: places[found[0]], part)
+
+
+def judged(
+    scene: cvtgs.GaussianScene,
+    runs: Mapping[str, Sequence[Run | None]],
+    tasks: Sequence[Task],
+    *,
+    score: Scorer,
+) -> dict[str, list[Result | None]]:
+    """Score everything that was made of one scene, all at once."""
+    small = [made[0] for row in runs.values() for made in row if made is not None]
+    found = iter(score(scene, small) if small else [])
+    return {
+        method: [
+            None
+            if made is None
+            else Result(
+                quality=next(found),
+                wall_seconds=made[1].wall_seconds,
+                cpu_seconds=made[1].user_seconds,
+                count=len(made[0]),
+                wanted=task.count,
+            )
+            for made, task in zip(row, tasks, strict=True)
+        ]
+        for method, row in runs.items()
+    }
+
+
+def report(table: Table, options: argparse.Namespace) -> str:
+    """Say what was measured, the table, and what is not as it should be."""
+    own = f"cvtgs' own renderer, {VIEWS} automatic views of {SIZE} x {SIZE} pixels"
+    judge = "the command of --scorer" if options.scorer else own
+    clock = "wall-clock" if options.clock == "wall" else "user CPU"
+    parts = [
+        f"Scenes: {', '.join(table)}. Judge: {judge}. "
+        f"Seconds: {clock}, one process per run, reading and writing included; {machine()}. "
+        f"cvtgs {cvtgs.__version__}.",
+        markdown(table, options.rho, means_only=options.means, clock=options.clock),
+        wrong_counts(table, options.rho),
+        failures(table, options.rho),
+    ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def write(path: Path, content: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_output(path, overwrite=True) as file:
+        file.write(content)
+
+
+if __name__ == "__main__":
+    main()
