@@ -25,7 +25,7 @@ LEVELS = [
     {"mergenet"},
     {"stages"},
     {"simplify", "info", "evaluate"},
-    {"train"},
+    {"train", "refine"},
     {"cli"},
     {"__main__"},
 ]

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.losses import gradient_loss, image_loss, l1_loss, ssim_loss
+from cvtgs.losses import gradient_loss, image_loss, l1_loss, relative_loss, ssim_loss
 
 LOSSES = [l1_loss, ssim_loss, gradient_loss, image_loss]
 
@@ -170,6 +170,17 @@ def test_weights_out_of_range() -> None:
 def test_gradients_against_finite_differences(loss) -> None:
     first, second = (images.requires_grad_() for images in pair(11, 12))
     assert torch.autograd.gradcheck(loss, (first, second), fast_mode=True)
+
+
+def test_the_relative_loss_by_hand() -> None:
+    target = torch.full((1, 12, 12, 3), 0.4, dtype=torch.float64)
+    squared = relative_loss(target + 0.1, target, squared_weight=0.5, image_weight=0.0)
+    assert squared.item() == pytest.approx(0.5 * math.log(0.01 + 1e-5))
+    both = relative_loss(target + 0.1, target, squared_weight=0.5, image_weight=2.0)
+    image = 2.0 * math.log(image_loss(target + 0.1, target).item() + 1e-3)
+    assert both.item() == pytest.approx(squared.item() + image)
+    nothing = relative_loss(target + 0.1, target, squared_weight=0.0, image_weight=0.0)
+    assert nothing.item() == 0
 
 
 @pytest.mark.cuda

@@ -38,6 +38,7 @@ NAMES = {
     "losses",
     "math",
     "mergenet",
+    "refine",
     "render",
     "save",
     "synthetic",
@@ -95,6 +96,7 @@ STAGES = {
         "lpips",
         "psnr",
         "ssim",
+        "views_from_anywhere",
         "write_exhibition",
     },
     "mergenet": {
@@ -109,6 +111,7 @@ STAGES = {
         "load_checkpoint",
         "save_checkpoint",
     },
+    "refine": {"RefineConfig", "Refined", "join_reports", "refine"},
     "synthetic": {"KINDS", "demo_scene", "scene"},
     "train": {
         "DataConfig",
@@ -179,7 +182,7 @@ def test_names_live_where_the_table_says():
         assert getattr(cvtgs, name) is getattr(import_module(home), name)
 
 
-@pytest.mark.parametrize("name", ["evaluate", "render"])
+@pytest.mark.parametrize("name", ["evaluate", "refine", "render"])
 @pytest.mark.parametrize(
     "before",
     ["", "import cvtgs.{0}", "from cvtgs.{0} import {0}", "import cvtgs.{0}.{0}", "cvtgs.{0}"],

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from cvtgs.cameras import Cameras
-from cvtgs.evaluate import automatic_views
+from cvtgs.evaluate import automatic_views, views_from_anywhere
 from cvtgs.math.frames import robust_frame
 from cvtgs.render import render
-from cvtgs.train.views import Views, look_at_scene, views_from_anywhere
+from cvtgs.train.views import Views, look_at_scene
 from train_cases import bits_of_views, small_scene
 
 
@@ -89,3 +89,13 @@ def test_a_faint_scene_can_be_looked_at_too():
     scene = small_scene(100)
     faint = scene.with_tensors({"logit_opacities": scene.logit_opacities * 0 - 5}, {})
     assert len(views_from_anywhere(faint, 3, size=32, seed=0)) == 3
+
+
+def test_how_far_away_views_from_anywhere_are():
+    scene = small_scene()
+    frame = robust_frame(scene.means[scene.opacities > 0.1])
+    cameras = views_from_anywhere(scene, 60, size=100, seed=0, reach=(0.2, 1.4))
+    steps = (cameras.centers - frame.center.float()) / float(frame.radius)
+    distances = torch.linalg.vector_norm(steps, dim=1)
+    assert 0.2 - 1e-4 <= float(distances.amin()) < 0.4
+    assert 1.2 < float(distances.amax()) <= 1.4 + 1e-4

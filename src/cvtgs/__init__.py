@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from cvtgs.info import SceneInfo, describe
     from cvtgs.io import from_dict, load, load_cameras, save, to_dict
     from cvtgs.progress import ProgressEvent, ProgressListener
+    from cvtgs.refine import refine
     from cvtgs.render import Rendering, render
     from cvtgs.report import SimplifyReport
     from cvtgs.scene import GaussianScene
@@ -78,7 +79,7 @@ _MODULES = (
     "synthetic",
     "train",
 )
-_CALLABLE = ("evaluate", "render")
+_CALLABLE = ("evaluate", "refine", "render")
 
 __all__ = [
     "PRESETS",
@@ -108,6 +109,7 @@ __all__ = [
     "losses",
     "math",
     "mergenet",
+    "refine",
     "render",
     "save",
     "synthetic",

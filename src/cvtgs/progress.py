@@ -12,11 +12,13 @@ class ProgressEvent:
         stage: Name of the stage, for example ``"tessellate"``.
         done: Steps finished so far, 0 when the stage starts.
         total: Steps of the whole stage; ``done == total`` when it has ended.
+        note: What the stage has to say so far, for example ``"+1.20 dB"``; empty if nothing.
     """
 
     stage: str
     done: int
     total: int
+    note: str = ""
 
 
 ProgressListener = Callable[[ProgressEvent], None]

@@ -36,6 +36,37 @@ class StageCost(_Record):
     peak_device_memory_bytes: int = 0
 
 
+class RefineReport(_Record):
+    """What a refinement did.
+
+    Attributes:
+        steps: Steps that were taken.
+        pictures: Pictures of the full scene that were rendered to learn from.
+        heldout: Views that were held out and decided.
+        psnr_before: PSNR of the scene that came in over the held-out views, dB, at most 60 each.
+        psnr_after: The same of the scene that came out; never less.
+        gain: Their difference, dB.
+        changed_count: Gaussians that are not what they were.
+        stopped: Why it ended: ``steps``, ``time``, ``patience`` (held-out views did not improve
+            any more), or ``perfect`` (there was nothing to gain).
+        backend: What rendered.
+        device: Where it ran.
+        cost: What it cost, as the stage ``refine``.
+    """
+
+    steps: int
+    pictures: int
+    heldout: int
+    psnr_before: float
+    psnr_after: float
+    gain: float
+    changed_count: int
+    stopped: str
+    backend: str
+    device: str
+    cost: StageCost
+
+
 class SimplifyReport(_Record):
     """What a simplification did.
 
@@ -63,6 +94,7 @@ class SimplifyReport(_Record):
         device: Where it ran.
         plan: The effects that the scene called for.
         stages: What each stage cost.
+        refinement: What a refinement gained afterwards; None if there was none.
         config: The configuration.
     """
 
@@ -87,6 +119,7 @@ class SimplifyReport(_Record):
     device: str = "cpu"
     plan: EffectPlan | None = None
     stages: tuple[StageCost, ...] = ()
+    refinement: RefineReport | None = None
     config: SimplifyConfig
 
     @property

@@ -94,5 +94,8 @@ def progress_bars(*, quiet: bool) -> Iterator[ProgressListener]:
             if event.done == 0 or event.stage not in bars:
                 bars[event.stage] = progress.add_task(event.stage, total=event.total)
             progress.update(bars[event.stage], completed=event.done, total=event.total)
+            if event.note:
+                said = f"{event.stage} {event.note}"
+                progress.update(bars[event.stage], description=said)
 
         yield listen

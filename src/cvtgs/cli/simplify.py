@@ -2,9 +2,16 @@
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cvtgs.cli.display import file_size, progress_bars, stage_seconds
 from cvtgs.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cvtgs.progress import ProgressListener
+    from cvtgs.report import SimplifyReport
+    from cvtgs.scene import GaussianScene
+    from cvtgs.simplify import Simplified
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -40,6 +47,16 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         dest="settings",
         help="change one setting, for example cvt.iterations=10; may be repeated",
     )
+    parser.add_argument(
+        "--refine",
+        type=float,
+        metavar="SECONDS",
+        help="fine-tune the result against pictures of IN for so long at most, while views that "
+        "are held out improve",
+    )
+    parser.add_argument(
+        "--refine-steps", type=int, metavar="N", help="fine-tune for N steps at most"
+    )
     parser.add_argument("--report", type=Path, metavar="R.json", help="write what was done as JSON")
     parser.add_argument(
         "--device", default="auto", metavar="DEVICE", help="auto (default), cpu or cuda"
@@ -69,13 +86,15 @@ def run(options: argparse.Namespace) -> None:
     )
     if options.rho is not None:
         target_count(1, options.rho)
+    _check_refinement(options)
     check_save(options.output, overwrite=options.overwrite)
     if options.report is not None:
         check_output(options.report, overwrite=options.overwrite)
     with progress_bars(quiet=options.quiet) as listener:
         simplifier = Simplifier(checkpoint, config=config, device=options.device, listener=listener)
         scene = load(options.input)
-        small, report = simplifier.run(scene, options.rho, count=options.count)
+        simplified = simplifier.run(scene, options.rho, count=options.count)
+        small, report = _refined(simplified, scene, options=options, listener=listener)
         save(small, options.output, overwrite=options.overwrite)
     if options.report is not None:
         with atomic_output(options.report, overwrite=options.overwrite) as file:
@@ -86,8 +105,50 @@ def run(options: argparse.Namespace) -> None:
             f"{file_size(options.input)} -> {file_size(options.output)}, "
             f"{stage_seconds(report.stages)}"
         )
-        if report.shortfall:
-            print(f"Fewer than the {report.target_count:,} asked for: {report.shortfall}.")
+        _print_details(report)
+
+
+def _print_details(report: "SimplifyReport") -> None:
+    if report.shortfall:
+        print(f"Fewer than the {report.target_count:,} asked for: {report.shortfall}.")
+    if report.refinement is not None:
+        gained = report.refinement
+        print(
+            f"Refined in {gained.steps:,} steps: {gained.gain:+.2f} dB on views that were held "
+            f"out, {gained.psnr_before:.2f} -> {gained.psnr_after:.2f}."
+        )
+
+
+def _check_refinement(options: argparse.Namespace) -> None:
+    if options.refine is not None or options.refine_steps is not None:
+        from cvtgs.refine.budget import check_budget  # noqa: PLC0415 (keeps --help fast)
+
+        check_budget(options.refine, steps=options.refine_steps)
+
+
+def _refined(
+    simplified: "Simplified",
+    full: "GaussianScene",
+    *,
+    options: argparse.Namespace,
+    listener: "ProgressListener",
+) -> "Simplified":
+    """Refine the small scene if that is asked for."""
+    if options.refine is None and options.refine_steps is None:
+        return simplified
+    from cvtgs.refine import join_reports, refine  # noqa: PLC0415 (only those who ask need it)
+    from cvtgs.simplify import Simplified  # noqa: PLC0415
+
+    refined = refine(
+        simplified.scene,
+        full,
+        seconds=options.refine,
+        steps=options.refine_steps,
+        seed=simplified.report.config.seed,
+        device=options.device,
+        listener=listener,
+    )
+    return Simplified(refined.scene, join_reports(simplified.report, refined))
 
 
 def _settings(words: list[str]) -> dict[str, str]:

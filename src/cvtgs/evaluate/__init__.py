@@ -1,5 +1,6 @@
 """How good a simplified scene looks next to the full one: views, scores, pages."""
 
+from cvtgs.evaluate.anywhere import views_from_anywhere
 from cvtgs.evaluate.compare import Comparison, compare
 from cvtgs.evaluate.evaluate import evaluate
 from cvtgs.evaluate.exhibition import write_exhibition
@@ -27,5 +28,6 @@ __all__ = [
     "lpips",
     "psnr",
     "ssim",
+    "views_from_anywhere",
     "write_exhibition",
 ]

@@ -7,18 +7,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.evaluate import psnr
-from cvtgs.losses import image_loss
-from cvtgs.math.activations import positive_log
+from cvtgs.losses import relative_loss
 from cvtgs.mergenet import MergeNet, Residuals
 from cvtgs.render import render
 from cvtgs.train.cases import Case
 from cvtgs.train.config import LossConfig, TrainConfig
 from cvtgs.train.crops import crop_cells
 from cvtgs.train.views import Views
-
-FAINTEST_SQUARED = 1e-5
-FAINTEST_IMAGE = 1e-3
-"""What is added to errors before their logarithm, so that near-perfect pictures count less."""
 
 
 def scene_loss(
@@ -91,13 +86,7 @@ def picture_loss(
     Returns:
         The sum of logarithms of :class:`LossConfig`.
     """
-    loss = picture.new_zeros(())
-    if config.squared:
-        squared = (picture - target).square().mean()
-        loss = loss + config.squared * positive_log(squared + FAINTEST_SQUARED)
-    if config.image:
-        loss = loss + config.image * positive_log(image_loss(picture, target) + FAINTEST_IMAGE)
-    return loss
+    return relative_loss(picture, target, squared_weight=config.squared, image_weight=config.image)
 
 
 def _price(residuals: Residuals, config: LossConfig) -> Float[Tensor, ""]:

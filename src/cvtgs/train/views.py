@@ -1,15 +1,13 @@
 """Views: pictures of full scenes that networks are compared with."""
 
-import math
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.cameras import Cameras, look_at
-from cvtgs.evaluate import automatic_views
-from cvtgs.math.frames import robust_frame
+from cvtgs.cameras import Cameras
+from cvtgs.evaluate import automatic_views, views_from_anywhere
 from cvtgs.render import render
 from cvtgs.scene import GaussianScene
 
@@ -92,36 +90,3 @@ def look_at_scene(scene: GaussianScene, count: int, *, size: int, seed: int) -> 
     with torch.no_grad():
         pictures = render(scene, cameras)
     return Views(cameras=cameras, rgb=pictures.rgb.cpu().half(), alpha=pictures.alpha.cpu().half())
-
-
-def views_from_anywhere(scene: GaussianScene, count: int, *, size: int, seed: int) -> Cameras:
-    """Look at a scene from random directions and distances, from below and from near too.
-
-    A network that only sees what automatic views show would spoil all other sides.
-
-    Args:
-        scene: The scene.
-        count: Number of views.
-        size: Side of the square pictures, pixels.
-        seed: Which views.
-
-    Returns:
-        Cameras from 1.1 to 3 robust radii around the middle of the opaque Gaussians, which look
-        at places up to a quarter of a radius from it, over 50 degrees.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    opaque = scene.opacities > 0.1
-    frame = robust_frame(scene.means[opaque] if bool(opaque.any()) else scene.means)
-    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
-    distances = frame.radius * (1.1 + 1.9 * torch.rand(count, 1, generator=generator))
-    center = frame.center.float().cpu()
-    targets = center + 0.25 * frame.radius * (torch.rand(count, 3, generator=generator) - 0.5)
-    up = torch.randn(3, generator=generator)
-    focal = 0.5 * size / math.tan(math.radians(25))
-    intrinsics = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
-    return Cameras(
-        viewmats=look_at(center + distances * directions, targets, up),
-        Ks=intrinsics.repeat(count, 1, 1),
-        width=size,
-        height=size,
-    )

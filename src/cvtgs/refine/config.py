@@ -1,0 +1,71 @@
+"""RefineConfig: every choice that a refinement makes."""
+
+from typing import Annotated
+
+import pydantic
+
+from cvtgs.config import Section
+
+Rate = Annotated[float, pydantic.Field(ge=0.0)]
+Count = Annotated[int, pydantic.Field(ge=1)]
+
+
+class Rates(Section):
+    """The first step of every parameter; 0 leaves it as it is.
+
+    Attributes:
+        means: Positions, in mean standard deviations of each Gaussian.
+        quats: Unit quaternions.
+        log_scales: Logarithms of the standard deviations.
+        logit_opacities: Opacity logits.
+        sh0: Constant colours.
+        shN: Colours that depend on the direction.
+    """
+
+    means: Rate = 0.01
+    quats: Rate = 0.004
+    log_scales: Rate = 0.005
+    logit_opacities: Rate = 0.05
+    sh0: Rate = 0.02
+    shN: Rate = 0.005  # noqa: N815 (the name that scenes give it)
+
+
+class RefineConfig(Section):
+    """Every choice of a refinement; frozen, unknown keys are errors.
+
+    Attributes:
+        rates: Learning rates at the start.
+        last_rate: Share of them at the end; in between they fall exponentially.
+        damping: Gaussians whose gradients are below this share of the usual size move less.
+        squared: Weight of the logarithm of the squared error.
+        image: Weight of the logarithm of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) + 0.2
+            gradient``.
+        size: Longer side of the pictures, pixels.
+        batch: Views that are found together: half automatic ones, a quarter from anywhere around,
+            a quarter from anywhere near, within the scene too.
+        steps_per_picture: Steps for every new picture of the full scene; the others look again at
+            one that is there.
+        pictures: Pictures that are kept at most, 8 bytes per pixel each.
+        heldout: Views that decide what is kept, and are never learnt from.
+        check_every: Steps between two looks at them.
+        patience: Looks without a new best after which the refinement ends.
+        default_steps: Steps if neither a time nor a number of steps is asked for.
+
+    Example:
+        >>> RefineConfig(size=128).rates.means
+        0.01
+    """
+
+    rates: Rates = Rates()
+    last_rate: float = pydantic.Field(default=0.1, gt=0.0, le=1.0)
+    damping: Rate = 0.1
+    squared: Rate = 0.5
+    image: Rate = 0.5
+    size: int = pydantic.Field(default=256, ge=16)
+    batch: int = pydantic.Field(default=32, ge=4)
+    steps_per_picture: Count = 2
+    pictures: Count = 256
+    heldout: Count = 8
+    check_every: Count = 25
+    patience: Count = 8
+    default_steps: Count = 500

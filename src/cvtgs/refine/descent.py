@@ -1,0 +1,86 @@
+"""The steps of a refinement, and what of them is kept."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from cvtgs.losses import relative_loss
+from cvtgs.refine.budget import Budget
+from cvtgs.refine.config import RefineConfig
+from cvtgs.refine.pictures import BEST_PSNR, Album, Picture, score
+from cvtgs.refine.variables import Variables
+from cvtgs.render import render
+from cvtgs.scene import GaussianScene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Descent:
+    """What came out.
+
+    Attributes:
+        scene: The best scene, by held-out pictures; what came in if none was better.
+        before: Score of what came in, dB.
+        after: Score of the best, dB.
+        stopped: Why it ended: ``steps``, ``time``, ``patience`` or ``perfect``.
+    """
+
+    scene: GaussianScene
+    before: float
+    after: float
+    stopped: str
+
+
+def descend(
+    small: GaussianScene,
+    album: Album,
+    heldout: tuple[Picture, ...],
+    *,
+    budget: Budget,
+    config: RefineConfig,
+    tell: Callable[[float], None],
+) -> Descent:
+    """Move the Gaussians of a scene towards pictures of the full one, one picture per step.
+
+    Args:
+        small: The scene to refine.
+        album: Pictures to learn from.
+        heldout: Pictures that decide.
+        budget: When to stop.
+        config: Learning rates, loss, checks and patience.
+        tell: Told the gain so far, dB, after every step.
+
+    Returns:
+        The best scene, and why it ended.
+    """
+    budget.begin()
+    best, before = small, score(small, heldout)
+    budget.end("check")
+    after, waited, variables = before, 0, Variables(small, config.rates, damping=config.damping)
+    stopped = "perfect" if before >= BEST_PSNR else budget.spent()
+    while not stopped:
+        factor = config.last_rate ** budget.share()
+        budget.begin()
+        _step(variables, album, config=config, factor=factor)
+        budget.end("step")
+        stopped = budget.spent()
+        if stopped or budget.steps % config.check_every == 0:
+            found = variables.result()
+            reached = score(found, heldout)
+            budget.end("check")
+            waited = 0 if reached > after else waited + 1
+            best, after = (found, reached) if reached > after else (best, after)
+            stopped = stopped or ("patience" if waited >= config.patience else budget.spent())
+        tell(after - before)
+    return Descent(scene=best, before=before, after=after, stopped=stopped)
+
+
+def _step(variables: Variables, album: Album, *, config: RefineConfig, factor: float) -> None:
+    """Look at one picture, over a random background: a wrong opacity shows over some."""
+    target, background = album.draw(), album.draw_color()
+    picture = render(variables.scene(), target.camera, background=background).rgb
+    loss = relative_loss(
+        picture,
+        target.over(background),
+        squared_weight=config.squared,
+        image_weight=config.image,
+    )
+    variables.step(loss, factor=factor)

@@ -1,0 +1,102 @@
+"""From where a refinement looks: endless new views, and others that are held out."""
+
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain, count
+
+import torch
+
+from cvtgs.cameras import Cameras
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.evaluate import automatic_views, views_from_anywhere
+from cvtgs.losses.ssim import SSIM_WINDOW
+from cvtgs.refine.config import RefineConfig
+from cvtgs.scene import GaussianScene
+
+HELDOUT_SEED = 101
+"""Added to the seed: held-out views are others than those of evaluations, and those learnt from."""
+
+LEARNING_SEED = 211
+
+NEAR = (0.2, 1.4)
+"""Distances of near views, robust radii: without them, what is seen from close by is spoiled."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Outlook:
+    """From where to look.
+
+    Attributes:
+        heldout: Cameras of one size that decide.
+        learning: Single cameras to learn from, endless or not.
+    """
+
+    heldout: tuple[Cameras, ...]
+    learning: Iterator[Cameras]
+
+
+def own_outlook(full: GaussianScene, *, config: RefineConfig, seed: int) -> Outlook:
+    """Find views of a scene: half automatic ones, half from anywhere around.
+
+    Args:
+        full: The scene, with valid rows.
+        config: Sizes and numbers of views.
+        seed: Which views.
+
+    Returns:
+        The held-out cameras, and endless ones to learn from, found when they are needed.
+    """
+
+    def batch(number: int, seed: int) -> list[Cameras]:
+        size = config.size
+        around = views_from_anywhere(full, number // 4, size=size, seed=seed)
+        near = views_from_anywhere(full, number // 4, size=size, seed=seed + 1, reach=NEAR)
+        left = number - 2 * (number // 4)
+        usual = automatic_views(full, left, width=size, height=size, seed=seed)
+        return [*_each(usual), *_each(around), *_each(near)]
+
+    def endless() -> Iterator[Cameras]:
+        for number in count():
+            views = batch(config.batch, seed + LEARNING_SEED + number)
+            random.Random(seed + number).shuffle(views)
+            yield from views
+
+    return Outlook(
+        heldout=tuple(batch(config.heldout, seed + HELDOUT_SEED)), learning=iter(endless())
+    )
+
+
+def given_outlook(cameras: Cameras, *, config: RefineConfig, seed: int) -> Outlook:
+    """Divide given cameras into some that are held out, spread evenly, and the others.
+
+    Args:
+        cameras: At least two cameras; larger pictures are made smaller.
+        config: Size of pictures, and how many are held out at most: no more than every eighth.
+        seed: Order of the others.
+
+    Returns:
+        The cameras; those to learn from come once each.
+
+    Raises:
+        InvalidArgumentError: There are fewer than two.
+    """
+    if len(cameras) < 2:
+        raise InvalidArgumentError(
+            f"a refinement needs at least 2 cameras, one of them to be held out; found "
+            f"{len(cameras)}."
+        )
+    factor = min(1.0, config.size / max(cameras.width, cameras.height))
+    width, height = (
+        max(SSIM_WINDOW, round(factor * side)) for side in (cameras.width, cameras.height)
+    )
+    views = _each(cameras.resized(width, height))
+    number = max(1, min(config.heldout, len(views) // 8))
+    held = {(2 * k + 1) * len(views) // (2 * number) for k in range(number)}
+    others = [view for row, view in enumerate(views) if row not in held]
+    random.Random(seed).shuffle(others)
+    return Outlook(heldout=tuple(views[row] for row in sorted(held)), learning=chain(others))
+
+
+def _each(cameras: Cameras) -> list[Cameras]:
+    return [cameras.select(torch.tensor([row])) for row in range(len(cameras))]

@@ -1,0 +1,132 @@
+"""Pictures of the full scene: some to learn from, rendered when needed, and some that decide."""
+
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs.cameras import Cameras
+from cvtgs.refine.config import RefineConfig
+from cvtgs.render import render
+from cvtgs.scene import GaussianScene
+
+BEST_PSNR = 60.0
+"""Pictures that are nearer to each other count as equal, dB."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Picture:
+    """One picture of the full scene; the background is left open.
+
+    Attributes:
+        camera: From where.
+        rgb: ``(1, h, w, 3)`` colours over black.
+        alpha: ``(1, h, w)`` opacity.
+    """
+
+    camera: Cameras
+    rgb: Float[Tensor, "1 h w 3"]
+    alpha: Float[Tensor, "1 h w"]
+
+    def over(self, background: Float[Tensor, "3"]) -> Float[Tensor, "1 h w 3"]:
+        """Put the picture over a background.
+
+        Args:
+            background: Red, green, blue.
+
+        Returns:
+            The picture, in the dtype of the background.
+        """
+        rgb, alpha = self.rgb.to(background.dtype), self.alpha.to(background.dtype)
+        return rgb + (1 - alpha)[..., None] * background
+
+
+@torch.no_grad()
+def take_picture(full: GaussianScene, camera: Cameras) -> Picture:
+    """Render the full scene once.
+
+    Args:
+        full: The scene.
+        camera: One camera.
+
+    Returns:
+        The picture, in the scene's dtype.
+    """
+    found = render(full, camera)
+    return Picture(camera=camera, rgb=found.rgb, alpha=found.alpha)
+
+
+class Album:
+    """Pictures to learn from: a new one now and then, else one that is there.
+
+    Memory: 8 bytes per pixel of at most ``config.pictures`` pictures.
+
+    Args:
+        full: The full scene.
+        cameras: Where new pictures are taken from, endless or not; at least one.
+        config: How often, and how many are kept.
+        seed: Which of them are looked at again.
+    """
+
+    def __init__(
+        self, full: GaussianScene, cameras: Iterator[Cameras], *, config: RefineConfig, seed: int
+    ) -> None:
+        self._full = full
+        self._cameras = cameras
+        self._config = config
+        self._dice = random.Random(seed)
+        self._kept: list[Picture] = []
+        self._drawn = 0
+        self.taken = 0
+
+    def draw(self) -> Picture:
+        """Give a picture to learn from.
+
+        Returns:
+            A new one for every ``steps_per_picture``, if there are cameras left, else an old one.
+        """
+        is_turn = self._drawn % self._config.steps_per_picture == 0
+        self._drawn += 1
+        camera = next(self._cameras, None) if is_turn else None
+        if camera is None:
+            return self._dice.choice(self._kept)
+        if len(self._kept) == self._config.pictures:
+            self._kept.pop(self._dice.randrange(len(self._kept)))
+        picture = take_picture(self._full, camera)
+        self._kept.append(
+            Picture(camera=camera, rgb=picture.rgb.half(), alpha=picture.alpha.half())
+        )
+        self.taken += 1
+        return self._kept[-1]
+
+    def draw_color(self) -> Float[Tensor, "3"]:
+        """Give a background.
+
+        Returns:
+            Red, green, blue in [0, 1], with dtype and device of the scene.
+        """
+        return self._full.means.new_tensor([self._dice.random() for _ in range(3)])
+
+
+@torch.no_grad()
+def score(scene: GaussianScene, pictures: tuple[Picture, ...]) -> float:
+    """Tell how near a scene comes to pictures of the full one.
+
+    Args:
+        scene: The scene.
+        pictures: Pictures of the full one.
+
+    Returns:
+        Mean of the PSNR of the pictures over black and over white, each at most 60 dB.
+    """
+    values = []
+    for picture in pictures:
+        found = take_picture(scene, picture.camera)
+        for shade in (0.0, 1.0):
+            background = scene.means.new_full((3,), shade)
+            error = found.over(background).clamp(0, 1) - picture.over(background).clamp(0, 1)
+            values.append(-10 * torch.log10(error.double().square().mean()))
+    return float(torch.stack(values).clamp(max=BEST_PSNR).mean())

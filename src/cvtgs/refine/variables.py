@@ -1,0 +1,175 @@
+"""What a refinement changes: the six tensors of a scene, row by row."""
+
+import torch
+from torch import Tensor
+
+from cvtgs.cvt import openness
+from cvtgs.filters import invalid_rows, standardized, with_finite_opacities
+from cvtgs.math import quaternions
+from cvtgs.math.frames import robust_frame
+from cvtgs.refine.config import Rates
+from cvtgs.scene import GaussianScene
+
+_BETAS = (0.9, 0.99)
+_LEAST_ROOT = 1e-15
+
+
+class Variables:
+    """A scene as a start plus changes, and the optimiser of the changes.
+
+    A step moves the Gaussians alone that a picture shows (Adam of Kingma and Ba 2015, as
+    ``SparseAdam`` does it): all others have no gradient, keep their momentum for later, and stay
+    as they are. Adam moves a Gaussian that hardly shows as far as any other. Here it moves less,
+    by its openness and by ``damping``, for it may be all that is seen from elsewhere. Memory:
+    five times the scene.
+
+    Args:
+        scene: The simplified scene; it is not changed.
+        rates: Learning rates at the start.
+        damping: Share of the usual gradient below which a Gaussian moves less.
+    """
+
+    def __init__(self, scene: GaussianScene, rates: Rates, *, damping: float = 0.0) -> None:
+        self._damping = damping
+        self._usual: dict[str, float] = {}
+        self._scene = scene
+        self._start = _started(scene)
+        self._units = _units(scene)
+        self._changes = {
+            name: torch.zeros_like(tensor, requires_grad=True)
+            for name, tensor in self._start.items()
+        }
+        self._rates = {
+            name: rate
+            for name, rate in rates.model_dump().items()
+            if rate > 0 and self._start[name].numel()
+        }
+        self._moved = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
+        groups = [
+            {"params": [self._changes[name]], "lr": rate} for name, rate in self._rates.items()
+        ]
+        self._optimizer = torch.optim.SparseAdam(groups, betas=_BETAS) if groups else None
+
+    def scene(self) -> GaussianScene:
+        """Give the scene, differentiable in the changes.
+
+        Returns:
+            The scene as it is now.
+        """
+        tensors = {
+            name: start + self._changes[name] * self._units[name]
+            for name, start in self._start.items()
+        }
+        return self._scene.with_tensors(tensors, self._scene.extras)
+
+    def step(self, loss: Tensor, *, factor: float) -> None:
+        """Move every Gaussian that has a finite gradient which is not zero.
+
+        Args:
+            loss: What to make small, from :meth:`scene`.
+            factor: Share of the learning rates.
+        """
+        if not self._rates or self._optimizer is None or not loss.requires_grad:
+            return
+        names = list(self._rates)
+        changes = [self._changes[name] for name in names]
+        gradients = torch.autograd.grad(loss, changes, materialize_grads=True)
+        rows = _rows_to_move(gradients)
+        for group, change, gradient in zip(
+            self._optimizer.param_groups, changes, gradients, strict=True
+        ):
+            name = names.pop(0)
+            group["lr"] = factor * self._rates[name]
+            group["eps"] = self._smallest_root(name, gradient[rows])
+            change.grad = torch.sparse_coo_tensor(
+                rows[None], gradient[rows], change.shape, is_coalesced=True, check_invariants=True
+            )
+        self._optimizer.step()
+        self._moved[rows] = True
+
+    def _smallest_root(self, name: str, gradient: Tensor) -> float:
+        """Give the epsilon of Adam: a share of the running mean size of gradients."""
+        if gradient.numel():
+            now = float(gradient.double().square().mean().sqrt())
+            old = self._usual.get(name, now)
+            self._usual[name] = old + 0.1 * (now - old)
+        return self._damping * self._usual.get(name, 0.0) + _LEAST_ROOT
+
+    @torch.no_grad()
+    def result(self) -> GaussianScene:
+        """Give the scene as it would be saved.
+
+        Returns:
+            Gaussians that were never moved, or moved to where no renderer can draw them, are
+            those of the start, bit for bit; all others have unit quaternions and finite opacities.
+        """
+        now = standardized(self.scene())
+        moved = self._moved.clone()
+        for mask in invalid_rows(now).values():
+            moved &= ~mask
+        tensors = {
+            name: torch.where(_beside(moved, old), now.tensors()[name], old)
+            for name, old in self._scene.tensors().items()
+        }
+        return self._scene.with_tensors(tensors, self._scene.extras)
+
+
+def changed_count(before: GaussianScene, after: GaussianScene) -> int:
+    """Count the Gaussians that are not what they were.
+
+    Args:
+        before: A scene.
+        after: The same with changes.
+
+    Returns:
+        The number of rows in which a tensor differs.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 10, sh_degree=0, seed=0)
+        >>> changed_count(scene, scene)
+        0
+    """
+    changed = torch.zeros(len(before), dtype=torch.bool, device=before.device)
+    for name, old in before.tensors().items():
+        new = after.tensors()[name]
+        differs = (new != old) & ~(new.isnan() & old.isnan())
+        changed |= differs.flatten(start_dim=1).any(dim=1) if old.ndim > 1 else differs
+    return int(changed.sum())
+
+
+def _started(scene: GaussianScene) -> dict[str, Tensor]:
+    """Give the tensors with finite opacities and unit quaternions, which paint the same."""
+    start = with_finite_opacities(scene).tensors()
+    return start | {"quats": quaternions.normalize(start["quats"])}
+
+
+def _units(scene: GaussianScene) -> dict[str, Tensor]:
+    """Give the length of one unit of change of every Gaussian.
+
+    What is enclosed moves less, by :func:`cvtgs.cvt.openness`; places are measured in the mean
+    standard deviation. Rows that no renderer can draw do not move.
+    """
+    valid = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
+    for mask in invalid_rows(scene).values():
+        valid &= ~mask
+    some = scene.select(valid)
+    light = torch.zeros_like(scene.logit_opacities)
+    light[valid] = openness(some.means, some.masses, robust_frame(some.means)).to(scene.dtype)
+    widths = torch.where(valid, torch.exp(scene.log_scales).mean(dim=1), 0.0)
+    units = {name: _beside(light, tensor) for name, tensor in scene.tensors().items()}
+    return units | {"means": (light * widths)[:, None]}
+
+
+def _rows_to_move(gradients: tuple[Tensor, ...]) -> Tensor:
+    some = torch.zeros(len(gradients[0]), dtype=torch.bool, device=gradients[0].device)
+    sane = ~some
+    for gradient in gradients:
+        flat = gradient.reshape(len(gradient), -1)
+        some |= (flat != 0).any(dim=1)
+        sane &= flat.isfinite().all(dim=1)
+    return (some & sane).nonzero()[:, 0]
+
+
+def _beside(mask: Tensor, tensor: Tensor) -> Tensor:
+    return mask.reshape(-1, *[1] * (tensor.ndim - 1))
