@@ -54,8 +54,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     comments, layout and extra columns stay; Gaussians that no picture shows stay bit for bit.
 
     The same scenes, steps, configuration and seed give the same bits on a CPU; with ``seconds``
-    the clock decides how many steps there are. The time includes everything but the compilation
-    of numba's code, which happens once per machine.
+    the clock decides how many steps there are. The time includes everything, also the compilation
+    of numba's code, some ten seconds, when it is used for the first time on a machine.
 
     Memory: ten times the small scene, pictures of at most ``8 * size ** 2 * pictures`` bytes, and
     what rendering the full scene takes.
