@@ -116,11 +116,17 @@ def segment_argmax(
 
 
 class _SumOfRuns(torch.autograd.Function):
-    """Bags of consecutive rows: ten times as fast as torch.segment_reduce."""
+    """Bags of consecutive rows in float32, up to ten times as fast as torch.segment_reduce.
+
+    In float64 bags take the slow way, up to twenty times as slow.
+    """
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, offsets: Tensor) -> Tensor:
         ctx.save_for_backward(offsets)
+        if values.dtype == torch.float64:
+            sums: Tensor = torch.segment_reduce(values, "sum", lengths=offsets.diff(), axis=0)
+            return sums
         rows = torch.arange(len(values), device=values.device)
         return torch.nn.functional.embedding_bag(
             rows, values, offsets, mode="sum", include_last_offset=True
