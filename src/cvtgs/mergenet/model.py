@@ -133,7 +133,9 @@ class MergeNet(nn.Module):
         cells = self.cell_layers(torch.cat(pooled, dim=1))
         sizes = self.decoder(cells)
         of_members = LARGEST_MEMBER_GATE * self.member_gates(members, cells, ids)
-        of_pairs = LARGEST_PAIR_GATE * self.pair_gates(pairs, cells[:, None], None)
+        pair_ids = torch.arange(len(cells), device=ids.device).repeat_interleave(pairs.shape[1])
+        of_pairs = self.pair_gates(pairs.flatten(0, 1), cells, pair_ids)
+        of_pairs = LARGEST_PAIR_GATE * of_pairs.unflatten(0, pairs.shape[:2])
         by_share = of_members * weights
         shifts = segment_sum(by_share[:, :1] * descriptors.places, offsets)
         twists = segment_sum(by_share[:, 2:] * _twists(descriptors.places.clamp(-5, 5)), offsets)
@@ -161,9 +163,10 @@ class _Gates(nn.Module):
         nn.init.zeros_(self.gates.weight)
         nn.init.zeros_(self.gates.bias)
 
-    def forward(self, own: Tensor, cells: Tensor, ids: Int[Tensor, "n"] | None) -> Tensor:
-        of_cells = self.cell(cells)
-        summed = self.own(own) + (of_cells if ids is None else of_cells.index_select(0, ids))
+    def forward(self, own: Tensor, cells: Tensor, ids: Int[Tensor, "n"]) -> Tensor:
+        of_cells = self.cell(cells) + self.own.bias
+        # One product that adds in place of a product and two sums over all members.
+        summed = torch.addmm(of_cells.index_select(0, ids), own, self.own.weight.T)
         return torch.tanh(self.gates(nn.functional.silu(summed)))
 
 
