@@ -6,6 +6,7 @@ from pathlib import Path
 from cvtgs.cli.display import progress_bars
 from cvtgs.cli.looking import (
     add_looking_options,
+    add_scoring_options,
     background_color,
     check_looking_options,
     chosen_cameras,
@@ -30,16 +31,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "REF and each SMALL; sheet.png, all pictures with their scores; and errors.png, where "
         "they differ. Of given cameras, 8 are used unless --views says otherwise.",
     )
-    parser.add_argument("reference", metavar="REF", type=Path, help="the full scene (.ply)")
-    parser.add_argument("small", metavar="SMALL", type=Path, nargs="+", help="simplified scenes")
+    add_scoring_options(parser)
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="DIR", help="directory to write to"
-    )
-    parser.add_argument(
-        "--lpips",
-        default="auto",
-        choices=("auto", "vgg", "alex", "off"),
-        help="which LPIPS to measure (default: VGG or Alex if there are weights)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace existing files")
     add_looking_options(parser, size=SIZE)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from cvtgs.cli.display import progress_bars, size_text
 from cvtgs.cli.looking import (
     add_looking_options,
+    add_scoring_options,
     background_color,
     check_looking_options,
     chosen_cameras,
@@ -34,19 +35,12 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "where its weights are, LPIPS against the pictures of REF; with --images also against "
         "photographs.",
     )
-    parser.add_argument("reference", metavar="REF", type=Path, help="the full scene (.ply)")
-    parser.add_argument("small", metavar="SMALL", type=Path, nargs="+", help="simplified scenes")
+    add_scoring_options(parser)
     parser.add_argument(
         "--images",
         type=Path,
         metavar="DIR",
         help="photographs of the cameras of --cameras, found by name",
-    )
-    parser.add_argument(
-        "--lpips",
-        default="auto",
-        choices=("auto", "vgg", "alex", "off"),
-        help="which LPIPS to measure (default: VGG or Alex if there are weights)",
     )
     parser.add_argument("--json", action="store_true", help="print JSON, with every view")
     add_looking_options(parser, size=SIZE)

@@ -34,6 +34,22 @@ class Scenes(NamedTuple):
     sizes: dict[str, int]
 
 
+def add_scoring_options(parser: argparse.ArgumentParser) -> None:
+    """Add the scenes to compare, and which LPIPS to measure.
+
+    Args:
+        parser: Where to add them.
+    """
+    parser.add_argument("reference", metavar="REF", type=Path, help="the full scene (.ply)")
+    parser.add_argument("small", metavar="SMALL", type=Path, nargs="+", help="simplified scenes")
+    parser.add_argument(
+        "--lpips",
+        default="auto",
+        choices=("auto", "vgg", "alex", "off"),
+        help="which LPIPS to measure (default: VGG or Alex if there are weights)",
+    )
+
+
 def add_looking_options(parser: argparse.ArgumentParser, *, size: int) -> None:
     """Describe the options.
 

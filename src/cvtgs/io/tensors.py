@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
@@ -103,3 +104,43 @@ def map_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[s
             return tensors, dict(file.metadata() or {})
     except (SafetensorError, OSError) as error:
         raise FileFormatError(f"{path}: the file is no safetensors file, or damaged.") from error
+
+
+def add_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Put tensors under a common name, to store several groups in one file.
+
+    Args:
+        prefix: What all names are to start with.
+        tensors: Tensors by name.
+
+    Returns:
+        The same tensors by longer names.
+
+    Example:
+        >>> import torch
+        >>> list(add_prefix("net/", {"a": torch.ones(1)}))
+        ['net/a']
+    """
+    return {prefix + name: values for name, values in tensors.items()}
+
+
+def under_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Take the tensors of one group, the inverse of :func:`add_prefix`.
+
+    Args:
+        prefix: What their names start with.
+        tensors: Tensors of all groups by name.
+
+    Returns:
+        Those of the group, by name without the prefix.
+
+    Example:
+        >>> import torch
+        >>> list(under_prefix("net/", {"net/a": torch.ones(1), "b": torch.ones(1)}))
+        ['a']
+    """
+    return {
+        name.removeprefix(prefix): values
+        for name, values in tensors.items()
+        if name.startswith(prefix)
+    }

@@ -14,7 +14,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Descriptors, Partition
 from cvtgs.config import SimplifyConfig
-from cvtgs.io.tensors import map_tensors, save_tensors
+from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
 from cvtgs.stages import Reference
 from cvtgs.train.cases import Case, refer_case
@@ -116,7 +116,7 @@ def _packed_views(all_views: Iterable[Views]) -> dict[str, Tensor]:
 
 
 def _unpacked_views(tensors: Mapping[str, Tensor]) -> tuple[Views, ...]:
-    return tuple(_views(_below(f"{place}/", tensors)) for place in range(_places(tensors)))
+    return tuple(_views(under_prefix(f"{place}/", tensors)) for place in range(_places(tensors)))
 
 
 def _packed_cases(cases: Iterable[Case | None]) -> dict[str, Tensor]:
@@ -125,12 +125,12 @@ def _packed_cases(cases: Iterable[Case | None]) -> dict[str, Tensor]:
     for place, case in enumerate(some):
         reference, prefix = case.reference, f"{place}/"
         if place == 0:
-            tensors |= _prefixed("scene/", reference.scene.tensors())
+            tensors |= add_prefix("scene/", reference.scene.tensors())
             tensors["light"] = reference.light.to(torch.float32)
             if reference.scene.antialiased:
                 tensors["antialiased"] = torch.ones(1)
-        tensors |= _prefixed(prefix + "merged/", reference.merged.tensors())
-        tensors |= _prefixed(prefix + "seen/", _values(case.descriptors))
+        tensors |= add_prefix(prefix + "merged/", reference.merged.tensors())
+        tensors |= add_prefix(prefix + "seen/", _values(case.descriptors))
         tensors |= {
             prefix + "ratio": torch.tensor(case.ratio, dtype=torch.float64),
             prefix + "order": reference.partition.order.to(torch.int32),
@@ -146,9 +146,11 @@ def _unpacked_cases(name: str, tensors: Mapping[str, Tensor]) -> tuple[Case, ...
         return ()
     # Merged Gaussians must be rendered as their scene is.
     comments = (ANTIALIASED_TAG,) if "antialiased" in tensors else ()
-    scene = GaussianScene(**_below("scene/", tensors), comments=comments)
+    scene = GaussianScene(**under_prefix("scene/", tensors), comments=comments)
     light = tensors["light"]
-    return tuple(_case(name, scene, light, _below(f"{place}/", tensors)) for place in range(count))
+    return tuple(
+        _case(name, scene, light, under_prefix(f"{place}/", tensors)) for place in range(count)
+    )
 
 
 def _places(tensors: Mapping[str, Tensor]) -> int:
@@ -164,14 +166,14 @@ def _case(name: str, scene: GaussianScene, light: Tensor, tensors: Mapping[str, 
         ratio=float(tensors["ratio"]),
         reference=Reference(
             scene=scene,
-            merged=GaussianScene(**_below("merged/", tensors), comments=scene.comments),
+            merged=GaussianScene(**under_prefix("merged/", tensors), comments=scene.comments),
             partition=partition,
             neighbors=tensors["neighbors"].long(),
             light=light,
         ),
         cells=several.nonzero()[:, 0],
         part=partition.select(several),
-        descriptors=Descriptors(**_below("seen/", tensors)),
+        descriptors=Descriptors(**under_prefix("seen/", tensors)),
     )
 
 
@@ -185,15 +187,3 @@ def _views(tensors: Mapping[str, Tensor]) -> Views:
 
 def _values(descriptors: Descriptors) -> dict[str, Tensor]:
     return {field.name: getattr(descriptors, field.name) for field in fields(descriptors)}
-
-
-def _prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {prefix + name: values for name, values in tensors.items()}
-
-
-def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-    return {
-        name.removeprefix(prefix): values
-        for name, values in tensors.items()
-        if name.startswith(prefix)
-    }

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cvtgs.errors import CheckpointError
-from cvtgs.io.tensors import map_tensors, save_tensors
+from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.mergenet import MergeNet
 from cvtgs.train.config import TrainConfig
 from cvtgs.train.history import History
@@ -52,10 +52,10 @@ class TrainState:
         Raises:
             OutputError: The file cannot be written.
         """
-        tensors = _named("net/", self.net.state_dict())
-        tensors |= _named("mean/", self.mean_net.state_dict())
+        tensors = add_prefix("net/", self.net.state_dict())
+        tensors |= add_prefix("mean/", self.mean_net.state_dict())
         for number, values in self.optimizer.state_dict()["state"].items():
-            tensors |= _named(f"optimizer/{number}/", values)
+            tensors |= add_prefix(f"optimizer/{number}/", values)
         facts = {
             "step": self.step,
             "history": self.history.to_json(),
@@ -90,11 +90,11 @@ class TrainState:
     def _fill(self, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
         # Mapped tensors must not be written to: load_state_dict copies, the optimiser does not.
         tensors = {name: values.clone() for name, values in tensors.items()}
-        self.net.load_state_dict(_below("net/", tensors))
-        self.mean_net.load_state_dict(_below("mean/", tensors))
+        self.net.load_state_dict(under_prefix("net/", tensors))
+        self.mean_net.load_state_dict(under_prefix("mean/", tensors))
         state = self.optimizer.state_dict()
         count = len(state["param_groups"][0]["params"])
-        kept = {number: _below(f"optimizer/{number}/", tensors) for number in range(count)}
+        kept = {number: under_prefix(f"optimizer/{number}/", tensors) for number in range(count)}
         state["state"] = {number: values for number, values in kept.items() if values}
         self.optimizer.load_state_dict(state)
         self.step = int(facts["step"])
@@ -103,15 +103,3 @@ class TrainState:
 
 def _fingerprint(config: TrainConfig) -> dict[str, Any]:
     return config.model_dump(mode="json", exclude={"note", "patience"})
-
-
-def _named(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {prefix + name: values for name, values in tensors.items()}
-
-
-def _below(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {
-        name.removeprefix(prefix): values
-        for name, values in tensors.items()
-        if name.startswith(prefix)
-    }
