@@ -88,10 +88,6 @@ class Dice:
         drawn = self.order(len(choices))[0]
         return choices[(drawn if which is None else which) % len(choices)]
 
-    def palette(self, count: int, saturation: float, value: float) -> Float[Tensor, "k 3"]:
-        """Draw several colours."""
-        return torch.tensor([self.hue(saturation, value) for _ in range(count)])
-
     def spots(self, count: int, ring: tuple[float, float]) -> list[tuple[float, float]]:
         """Spread places in a ring around the origin, no two in the same sector.
 
