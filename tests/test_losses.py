@@ -179,6 +179,9 @@ def test_the_relative_loss_by_hand() -> None:
     both = relative_loss(target + 0.1, target, squared_weight=0.5, image_weight=2.0)
     image = 2.0 * math.log(image_loss(target + 0.1, target).item() + 1e-3)
     assert both.item() == pytest.approx(squared.item() + image)
+    whole = relative_loss(target + 0.1, target, image_weight=0.0, ssim_weight=0.3)
+    structure = 0.3 * math.log(ssim_loss(target + 0.1, target).item() + 1e-3)
+    assert whole.item() == pytest.approx(squared.item() + structure)
     nothing = relative_loss(target + 0.1, target, squared_weight=0.0, image_weight=0.0)
     assert nothing.item() == 0
 

@@ -4,6 +4,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.losses.image import image_loss
+from cvtgs.losses.ssim import ssim_loss
 from cvtgs.math.activations import positive_log
 
 FAINTEST_SQUARED = 1e-5
@@ -17,8 +18,11 @@ def relative_loss(
     *,
     squared_weight: float = 0.5,
     image_weight: float = 0.5,
+    ssim_weight: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """Give ``w_s log(mse) + w_i log(image_loss)``, which falls with the PSNR of the images.
+    """Give ``w_s log(mse) + w_i log(image_loss) + w_d log(1 - SSIM)``.
+
+    It falls with the PSNR of the images by as much whether they are good or poor.
 
     A term of weight 0 is not computed.
 
@@ -27,6 +31,7 @@ def relative_loss(
         target: ``(c, h, w, 3)`` what they should be.
         squared_weight: ``w_s``, at least 0.
         image_weight: ``w_i``, at least 0.
+        ssim_weight: ``w_d``, at least 0.
 
     Returns:
         A scalar, negative for good images; differentiable in both.
@@ -47,4 +52,6 @@ def relative_loss(
         loss = loss + squared_weight * positive_log(squared + FAINTEST_SQUARED)
     if image_weight:
         loss = loss + image_weight * positive_log(image_loss(prediction, target) + FAINTEST_IMAGE)
+    if ssim_weight:
+        loss = loss + ssim_weight * positive_log(ssim_loss(prediction, target) + FAINTEST_IMAGE)
     return loss

@@ -66,18 +66,21 @@ class ViewsConfig(Section):
 
 
 class LossConfig(Section):
-    """What is made small: ``squared log(mse) + image log(loss of CVT-GS) + residual cost``.
+    """What is made small, a sum of logarithms and the cost of the changes.
 
+    ``squared log(mse) + image log(loss of CVT-GS) + ssim log(1 - SSIM) + residual cost``.
     Logarithms make every scene, ratio and view count the same, as their mean PSNR does.
 
     Attributes:
         squared: Weight of the squared error.
         image: Weight of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) + 0.2 gradient``.
+        ssim: Weight of the structural dissimilarity, ``1 - SSIM``.
         residual: Price of the changes.
     """
 
     squared: float = pydantic.Field(default=0.5, ge=0.0)
     image: float = pydantic.Field(default=0.5, ge=0.0)
+    ssim: float = pydantic.Field(default=0.0, ge=0.0)
     residual: float = pydantic.Field(default=0.0, ge=0.0)
 
 

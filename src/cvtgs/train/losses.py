@@ -86,7 +86,13 @@ def picture_loss(
     Returns:
         The sum of logarithms of :class:`LossConfig`.
     """
-    return relative_loss(picture, target, squared_weight=config.squared, image_weight=config.image)
+    return relative_loss(
+        picture,
+        target,
+        squared_weight=config.squared,
+        image_weight=config.image,
+        ssim_weight=config.ssim,
+    )
 
 
 def _price(residuals: Residuals, config: LossConfig) -> Float[Tensor, ""]:
