@@ -16,14 +16,8 @@ from torch import Tensor
 
 import cvtgs
 from cvtgs.errors import FileFormatError
-from cvtgs.evaluate import (
-    EvaluationSettings,
-    LpipsWeights,
-    automatic_views,
-    evaluate,
-    load_lpips,
-    lpips,
-)
+from cvtgs.evaluate import EvaluationSettings, LpipsWeights, evaluate, load_lpips, lpips
+from cvtgs.views import automatic_views
 
 VIEWS = 8
 SIZE = 400

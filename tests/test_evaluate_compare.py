@@ -12,7 +12,6 @@ import cvtgs
 from cvtgs.evaluate import (
     Evaluation,
     EvaluationSettings,
-    automatic_views,
     compare,
     evaluate,
     load_photographs,
@@ -25,6 +24,7 @@ from cvtgs.evaluate.images import encode
 from cvtgs.evaluate.page import comparison_page
 from cvtgs.evaluate.sheet import contact_sheet, error_sheet
 from cvtgs.render import render
+from cvtgs.views import automatic_views
 
 OFF = EvaluationSettings(lpips="off")
 

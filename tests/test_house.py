@@ -22,10 +22,10 @@ LEVELS = [
     {"config", "scene", "cameras"},
     {"effects"},
     {"report", "io", "filters", "cvt", "cells", "synthetic", "render", "losses"},
-    {"mergenet"},
-    {"stages"},
+    {"mergenet", "views"},
+    {"stages", "refine"},
     {"simplify", "info", "evaluate"},
-    {"train", "refine"},
+    {"train"},
     {"cli"},
     {"__main__"},
 ]
@@ -36,7 +36,7 @@ EVERYWHERE = {"torch", "numpy", "jaxtyping", "pydantic"}
 OWNERS = {
     "scipy": "cvt/nearest_scipy.py",
     "plyfile": "io/ply/generic.py",
-    "tomli_w": "config.py",
+    "tomli_w": "config/simplify.py",
     "rich": "cli/",
     "kornia": "losses/ssim.py",
     "numba": "render/compiled.py",

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 import cvtgs
-from cvtgs.evaluate import EvaluationSettings, automatic_views, compare, write_exhibition
+from cvtgs.evaluate import EvaluationSettings, compare, write_exhibition
+from cvtgs.views import automatic_views
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)

@@ -45,9 +45,11 @@ NAMES = {
     "target_count",
     "to_dict",
     "train",
+    "views",
 }
 
 STAGES = {
+    "views": {"automatic_views", "views_from_anywhere"},
     "cvt": {
         "LloydResult",
         "Tessellation",
@@ -88,7 +90,6 @@ STAGES = {
         "LpipsWeights",
         "SceneScores",
         "Score",
-        "automatic_views",
         "compare",
         "evaluate",
         "load_lpips",
@@ -96,7 +97,6 @@ STAGES = {
         "lpips",
         "psnr",
         "ssim",
-        "views_from_anywhere",
         "write_exhibition",
     },
     "mergenet": {

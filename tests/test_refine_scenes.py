@@ -35,7 +35,7 @@ def test_a_simplified_scene_gets_better_on_views_that_nobody_chose():
     full = full_scene(2000, degree=0)
     small = small_scene(full, 0.02)
     refined = refine(small, full, steps=80, config=quick(size=48))
-    views = cvtgs.evaluate.automatic_views(full, 6, width=64, height=64, seed=5)
+    views = cvtgs.views.automatic_views(full, 6, width=64, height=64, seed=5)
     before, after = (
         cvtgs.evaluate.psnr(cvtgs.render(scene, views).rgb, cvtgs.render(full, views).rgb).mean()
         for scene in (small, refined.scene)

@@ -25,10 +25,10 @@ from torch import Tensor
 
 from benchmarks.baselines.rows import keep_largest, usable
 from cvtgs.cameras import Cameras
-from cvtgs.evaluate import automatic_views
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.render import BackendName, render
 from cvtgs.scene import GaussianScene
+from cvtgs.views import automatic_views
 
 VIEWS = 24
 SIZE = 256

@@ -28,9 +28,9 @@ from torch import Tensor
 
 from benchmarks.baselines.rows import keep_largest, usable
 from cvtgs.cameras import Cameras
-from cvtgs.evaluate import automatic_views
 from cvtgs.render import BackendName, render
 from cvtgs.scene import GaussianScene
+from cvtgs.views import automatic_views
 
 VIEWS = 24
 SIZE = 256

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         mergenet,
         synthetic,
         train,
+        views,
     )
     from cvtgs.cameras import Cameras
     from cvtgs.config import PRESETS, SimplifyConfig
@@ -78,6 +79,7 @@ _MODULES = (
     "mergenet",
     "synthetic",
     "train",
+    "views",
 )
 _CALLABLE = ("evaluate", "refine", "render")
 
@@ -116,6 +118,7 @@ __all__ = [
     "target_count",
     "to_dict",
     "train",
+    "views",
 ]
 
 

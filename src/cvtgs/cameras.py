@@ -68,6 +68,11 @@ class Cameras:
         return len(self.viewmats)
 
     @property
+    def view_names(self) -> tuple[str, ...]:
+        """Names of the views: ``view 1`` and so on if they have none."""
+        return self.names or tuple(f"view {number}" for number in range(1, len(self) + 1))
+
+    @property
     def centers(self) -> Float[Tensor, "c 3"]:
         """Positions of the cameras in the world."""
         rotations, shifts = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3:]

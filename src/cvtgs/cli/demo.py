@@ -55,7 +55,6 @@ def run(options: argparse.Namespace) -> None:
     """
     from cvtgs.evaluate import (  # noqa: PLC0415 (keeps --help fast)
         EvaluationSettings,
-        automatic_views,
         compare,
         write_exhibition,
     )
@@ -63,6 +62,7 @@ def run(options: argparse.Namespace) -> None:
     from cvtgs.io import save  # noqa: PLC0415
     from cvtgs.simplify import Simplifier  # noqa: PLC0415
     from cvtgs.synthetic import demo_scene  # noqa: PLC0415
+    from cvtgs.views import automatic_views  # noqa: PLC0415
 
     make_folder(options.output)
     with progress_bars(quiet=options.quiet) as listener:

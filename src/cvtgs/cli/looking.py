@@ -209,8 +209,8 @@ def chosen_cameras(
     Raises:
         CvtgsError: The cameras cannot be read, or the scene has nothing to look at.
     """
-    from cvtgs.evaluate import automatic_views  # noqa: PLC0415 (keeps --help fast)
     from cvtgs.io import load_cameras  # noqa: PLC0415
+    from cvtgs.views import automatic_views  # noqa: PLC0415 (keeps --help fast)
 
     if options.cameras is None:
         size = options.size or options.default_size

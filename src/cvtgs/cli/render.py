@@ -46,7 +46,6 @@ def run(options: argparse.Namespace) -> None:
     import torch  # noqa: PLC0415 (keeps --help fast)
 
     from cvtgs.evaluate.compare import as_bytes  # noqa: PLC0415
-    from cvtgs.evaluate.evaluate import view_names  # noqa: PLC0415
     from cvtgs.evaluate.exhibition import make_folder  # noqa: PLC0415
     from cvtgs.evaluate.images import encode  # noqa: PLC0415
     from cvtgs.io import atomic_output, check_output, load  # noqa: PLC0415
@@ -57,7 +56,7 @@ def run(options: argparse.Namespace) -> None:
     scene = load(options.input).to(looking_device(options))
     cameras = chosen_cameras(options, scene)
     make_folder(options.output)
-    paths = [options.output / name for name in file_names(view_names(cameras))]
+    paths = [options.output / name for name in file_names(cameras.view_names)]
     for path in paths:
         check_output(path, options.overwrite)
     background = torch.tensor(background_color(options))

@@ -1,6 +1,5 @@
 """How good a simplified scene looks next to the full one: views, scores, pages."""
 
-from cvtgs.evaluate.anywhere import views_from_anywhere
 from cvtgs.evaluate.compare import Comparison, compare
 from cvtgs.evaluate.evaluate import evaluate
 from cvtgs.evaluate.exhibition import write_exhibition
@@ -10,7 +9,6 @@ from cvtgs.evaluate.metrics import psnr, ssim
 from cvtgs.evaluate.photographs import load_photographs
 from cvtgs.evaluate.scores import Evaluation, SceneScores, Score
 from cvtgs.evaluate.settings import EvaluationSettings
-from cvtgs.evaluate.views import automatic_views
 
 __all__ = [
     "LPIPS_VARIABLE",
@@ -20,7 +18,6 @@ __all__ = [
     "LpipsWeights",
     "SceneScores",
     "Score",
-    "automatic_views",
     "compare",
     "evaluate",
     "load_lpips",
@@ -28,6 +25,5 @@ __all__ = [
     "lpips",
     "psnr",
     "ssim",
-    "views_from_anywhere",
     "write_exhibition",
 ]

@@ -78,7 +78,7 @@ def compare(
         MissingDependencyError: The backend's package or the LPIPS asked for is missing.
 
     Example:
-        >>> from cvtgs.evaluate import automatic_views
+        >>> from cvtgs.views import automatic_views
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 500, sh_degree=0)
         >>> cameras = automatic_views(scene, 2, width=32, height=24)

@@ -69,7 +69,7 @@ def evaluate(
         MissingDependencyError: The backend's package or the LPIPS asked for is missing.
 
     Example:
-        >>> from cvtgs.evaluate import automatic_views
+        >>> from cvtgs.views import automatic_views
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 500, sh_degree=0)
         >>> cameras = automatic_views(scene, 2, width=32, height=24)
@@ -102,7 +102,7 @@ def evaluate(
     return Evaluation(
         reference=reference_name,
         reference_count=len(reference),
-        views=view_names(cameras),
+        views=cameras.view_names,
         width=cameras.width,
         height=cameras.height,
         backend=backend_used,
@@ -113,23 +113,6 @@ def evaluate(
         if photographs is None
         else tuple(tally.scores() for tally in taken.values()),
     )
-
-
-def view_names(cameras: Cameras) -> tuple[str, ...]:
-    """Give the names of the views.
-
-    Args:
-        cameras: The cameras.
-
-    Returns:
-        Their names; ``view 1`` and so on if they have none.
-
-    Example:
-        >>> view_names(Cameras(viewmats=torch.eye(4)[None], Ks=torch.eye(3)[None], width=4,
-        ...                    height=4))
-        ('view 1',)
-    """
-    return cameras.names or tuple(f"view {number}" for number in range(1, len(cameras) + 1))
 
 
 def _picture(

@@ -80,7 +80,8 @@ def write_exhibition(
 
     Example:
         >>> import tempfile
-        >>> from cvtgs.evaluate import automatic_views, compare
+        >>> from cvtgs.evaluate import compare
+        >>> from cvtgs.views import automatic_views
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 300, sh_degree=0)
         >>> views = automatic_views(scene, 2, width=32, height=24)

@@ -28,7 +28,8 @@ def contact_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
         picture its PSNR below.
 
     Example:
-        >>> from cvtgs.evaluate import automatic_views, compare
+        >>> from cvtgs.evaluate import compare
+        >>> from cvtgs.views import automatic_views
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 300, sh_degree=0)
         >>> views = automatic_views(scene, 2, width=32, height=24)
@@ -56,7 +57,8 @@ def error_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
         The sheet: a row per simplified scene, a column per view.
 
     Example:
-        >>> from cvtgs.evaluate import automatic_views, compare
+        >>> from cvtgs.evaluate import compare
+        >>> from cvtgs.views import automatic_views
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 300, sh_degree=0)
         >>> views = automatic_views(scene, 2, width=32, height=24)

@@ -9,10 +9,10 @@ import torch
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.evaluate import automatic_views, views_from_anywhere
 from cvtgs.losses.ssim import SSIM_WINDOW
 from cvtgs.refine.config import RefineConfig
 from cvtgs.scene import GaussianScene
+from cvtgs.views import automatic_views, views_from_anywhere
 
 HELDOUT_SEED = 101
 """Added to the seed: held-out views are others than those of evaluations, and those learnt from."""

@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.evaluate import automatic_views, views_from_anywhere
 from cvtgs.render import render
 from cvtgs.scene import GaussianScene
+from cvtgs.views import automatic_views, views_from_anywhere
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

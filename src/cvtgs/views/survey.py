@@ -7,11 +7,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.errors import InvalidSceneError
-from cvtgs.evaluate.orientation import find_up
-from cvtgs.evaluate.voxels import Voxels, voxels_of
 from cvtgs.filters import invalid_rows, with_finite_opacities
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.scene import GaussianScene
+from cvtgs.views.orientation import find_up
+from cvtgs.views.voxels import Voxels, voxels_of
 
 MOST_GAUSSIANS = 30_000
 """Larger scenes are looked at through a sample of this many Gaussians."""

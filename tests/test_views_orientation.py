@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from cvtgs.evaluate.orientation import find_up
-from cvtgs.evaluate.voxels import Voxels
+from cvtgs.views.orientation import find_up
+from cvtgs.views.voxels import Voxels
 
 
 @pytest.mark.parametrize("sense", [1.0, -1.0])

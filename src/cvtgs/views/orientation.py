@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cvtgs.evaluate.voxels import SIZE, Voxels
+from cvtgs.views.voxels import SIZE, Voxels
 
 _GUESSES = 256
 _REFINED = 24
@@ -53,7 +53,7 @@ def find_up(voxels: Voxels, far: Float[Tensor, "k 3"]) -> Float[Tensor, "3"]:
             A unit vector, float64; exactly along a coordinate axis if within 5.5 degrees of one.
 
     Example:
-            >>> from cvtgs.evaluate.voxels import voxels_of
+            >>> from cvtgs.views.voxels import voxels_of
             >>> from cvtgs.math.frames import robust_frame
             >>> from cvtgs.synthetic import demo_scene
             >>> scene = demo_scene(3000)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.evaluate.survey import Survey
+from cvtgs.views.survey import Survey
 
 _PER_SLOT_ELEVATIONS = (20.0, 35.0, 12.0, 28.0)
 _OUTSIDE = (

@@ -7,13 +7,13 @@ import torch
 from torch import Tensor
 
 import cvtgs
-from cvtgs.evaluate import automatic_views
-from cvtgs.evaluate.probes import probe
-from cvtgs.evaluate.survey import survey
-from cvtgs.evaluate.views import _stands
 from cvtgs.math import quaternions
 from cvtgs.render import render
 from cvtgs.synthetic import KINDS
+from cvtgs.views import automatic_views
+from cvtgs.views.automatic import _stands
+from cvtgs.views.probes import probe
+from cvtgs.views.survey import survey
 from scenes import random_scene
 
 COUNT = 10_000

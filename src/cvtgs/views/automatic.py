@@ -11,11 +11,10 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.evaluate.evaluate import view_names
-from cvtgs.evaluate.probes import probe
-from cvtgs.evaluate.stands import Stands, inside_stands, outside_stands
-from cvtgs.evaluate.survey import Survey, survey
 from cvtgs.scene import GaussianScene
+from cvtgs.views.probes import probe
+from cvtgs.views.stands import Stands, inside_stands, outside_stands
+from cvtgs.views.survey import Survey, survey
 
 _ENCLOSED = 0.7
 """A room hides this share of the upper half of what a camera in its middle could see."""
@@ -47,7 +46,7 @@ def automatic_views(
     """Choose cameras that show a scene of which nothing else is known.
 
     Where the scene is, how large and which way is up comes from robust statistics of what is
-    visible (:func:`cvtgs.evaluate.orientation.find_up`; y-down without evidence), so flyaways,
+    visible (:func:`cvtgs.views.orientation.find_up`; y-down without evidence), so flyaways,
     sky shells and haze do not matter. The cameras stand around the scene at several heights; if
     its middle is free, surfaces are all around and above, and much of the scene can be seen from
     there, they stand inside and look across. Every camera takes a picture of 64 pixels first: one
@@ -84,7 +83,7 @@ def automatic_views(
         known = survey(scene)
         stands = _stands(known, count, size=size, turn=turn)
         cameras = _best(known, stands)
-    return replace(cameras, names=view_names(cameras))
+    return replace(cameras, names=cameras.view_names)
 
 
 @contextmanager

@@ -7,10 +7,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.evaluate.survey import Survey
-from cvtgs.evaluate.voxels import SIZE
 from cvtgs.math import quaternions
 from cvtgs.render import render
+from cvtgs.views.survey import Survey
+from cvtgs.views.voxels import SIZE
 
 PIXELS = 64
 """Longer side of a probe."""

@@ -1,0 +1,31 @@
+"""Named configurations, from the fastest to the best."""
+
+from collections.abc import Mapping
+from typing import Any
+
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "standard": {},
+    "paper": {
+        "filter": {"max_mass_share": 1.0, "max_flyaway_share": 0.0},
+        "cvt": {
+            "area_power": 0.0,
+            "unbounded_area_power": 0.0,
+            "perspective": False,
+            "hidden_share": 1.0,
+            "weight_floor": 0.0,
+            "color": 0.0,
+            "unbounded": "off",
+            "seeding": "weighted",
+            "iterations": 5,
+            "tolerance": 0.0,
+            "samples_per_site": 0,
+        },
+        "merge": {
+            "area_power": 0.0,
+            "opacity": "union",
+            "widening": 0.0,
+            "covered_widening": 0.0,
+        },
+    },
+}
+"""What each preset changes of the defaults: ``standard`` nothing, ``paper`` is CVT-GS."""

@@ -1,0 +1,87 @@
+"""The settings of each stage."""
+
+from typing import Annotated, Literal
+
+import pydantic
+
+from cvtgs.config.base import Section
+
+Share = Annotated[float, pydantic.Field(ge=0.0, le=1.0)]
+
+
+class FilterConfig(Section):
+    """Which faint Gaussians are left out before the tessellation.
+
+    Attributes:
+        min_opacity: Only Gaussians fainter than this may be left out.
+        max_mass_share: They are left out, faintest first, while they hold at most this share of
+            the scene's mass; 1 leaves all of them out.
+        max_flyaway_share: Gaussians beyond 100 robust radii are left out, the least first, while
+            they hold at most this share of the mass as seen from the middle.
+    """
+
+    min_opacity: Share = 0.1
+    max_mass_share: Share = 0.01
+    max_flyaway_share: Share = 1e-3
+
+
+class TessellationConfig(Section):
+    """How Gaussians are grouped into cells.
+
+    Attributes:
+        area_power: A Gaussian weighs its opacity times its mean projected area to this power: 0
+            is the opacity alone, 1 the mass.
+        unbounded_area_power: The same in unbounded scenes, where the few huge and smooth Gaussians
+            of a sky would take too many cells.
+        perspective: Whether areas count as they look from the middle of the scene, smaller when
+            far.
+        hidden_share: What an enclosed Gaussian counts, as a share of a free one; 1 does not look at
+            what is enclosed.
+        weight_floor: No Gaussian weighs less than this share of the mean weight.
+        color: Length of one unit of colour for 10,000 cells, in robust radii; 0 groups by position
+            alone.
+        color_power: The length grows with the number of cells to this power; with few cells,
+            colour counts more.
+        unbounded: Whether far positions are pulled in; ``auto`` decides by the scene.
+        seeding: Deterministic strata of equal weight, or weighted random draws.
+        iterations: Lloyd iterations, at most.
+        tolerance: Lloyd stops when an iteration lowers the energy by less than this share.
+        samples_per_site: Lloyd looks at this many Gaussians per cell at most; 0 looks at all.
+        backend: What searches the nearest site; ``auto`` takes scipy on a CPU, else torch.
+    """
+
+    area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)
+    unbounded_area_power: float = pydantic.Field(default=0.8, ge=0.0, le=2.0)
+    perspective: bool = True
+    hidden_share: Share = 0.1
+    weight_floor: float = pydantic.Field(default=1e-3, ge=0.0)
+    color: float = pydantic.Field(default=0.05, ge=0.0)
+    color_power: float = pydantic.Field(default=-0.25, ge=-1.0, le=1.0)
+    unbounded: Literal["auto", "on", "off"] = "auto"
+    seeding: Literal["stratified", "weighted"] = "stratified"
+    iterations: int = pydantic.Field(default=4, ge=0)
+    tolerance: float = pydantic.Field(default=1e-3, ge=0.0)
+    samples_per_site: int = pydantic.Field(default=12, ge=0)
+    backend: Literal["auto", "scipy", "torch"] = "auto"
+
+
+class MergeConfig(Section):
+    """How a cell becomes one Gaussian.
+
+    Attributes:
+        area_power: A member weighs its opacity times its mean projected area to this power: 0 is
+            the opacity alone, 1 the mass.
+        opacity: ``saturating`` conserves mass, ``1 - exp(-tau)``; ``union`` is the opacity of
+            members that lie exactly behind one another, ``1 - prod(1 - a)``.
+        widening: How much wider than its moments an opaque cell of many members becomes, along
+            every axis.
+        covered_widening: How much more it becomes so along an axis on which other cells paint at
+            both its ends.
+        network: Whether MergeNet corrects the merged Gaussians.
+    """
+
+    area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)
+    opacity: Literal["saturating", "union"] = "saturating"
+    widening: float = pydantic.Field(default=0.1, ge=0.0, le=2.0)
+    covered_widening: float = pydantic.Field(default=0.4, ge=0.0, le=2.0)
+    network: bool = True

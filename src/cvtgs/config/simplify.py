@@ -1,0 +1,141 @@
+"""SimplifyConfig: every choice that a simplification makes."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import pydantic
+
+from cvtgs.config.base import Section, explain, read_toml
+from cvtgs.config.presets import PRESETS
+from cvtgs.config.sections import FilterConfig, MergeConfig, TessellationConfig
+from cvtgs.errors import ConfigError
+
+
+class SimplifyConfig(Section):
+    """Every choice of a simplification; frozen, unknown keys are errors.
+
+    Attributes:
+        preset: Name of the preset that the values started from.
+        seed: Seed of whatever is drawn at random.
+        filter: Which Gaussians are left out.
+        cvt: How Gaussians are grouped.
+        merge: How a group becomes one Gaussian.
+
+    Example:
+        >>> SimplifyConfig.from_preset("paper").filter.max_mass_share
+        1.0
+    """
+
+    preset: str = "standard"
+    seed: int = pydantic.Field(default=0, ge=0)
+    filter: FilterConfig = FilterConfig()
+    cvt: TessellationConfig = TessellationConfig()
+    merge: MergeConfig = MergeConfig()
+
+    @classmethod
+    def from_preset(cls, name: str) -> Self:
+        """Give a preset.
+
+        Args:
+            name: One of :data:`PRESETS`.
+
+        Returns:
+            The configuration.
+
+        Raises:
+            ConfigError: There is no such preset.
+        """
+        if name not in PRESETS:
+            raise ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {name!r}.")
+        return cls.from_mapping({"preset": name})
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> Self:
+        """Build a configuration from nested values on top of the preset that they name.
+
+        Args:
+            values: For example ``{"preset": "paper", "cvt": {"iterations": 10}}``.
+
+        Returns:
+            The configuration.
+
+        Raises:
+            ConfigError: A key is unknown or a value out of range; the text names it.
+        """
+        name = values.get("preset", "standard")
+        if not isinstance(name, str) or name not in PRESETS:
+            raise ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {name!r}.")
+        try:
+            return cls.model_validate(_merged(PRESETS[name], values))
+        except pydantic.ValidationError as error:
+            raise ConfigError(explain(error)) from None
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """Read a configuration file.
+
+        Args:
+            path: A TOML file with the keys of this class; missing keys come from its preset.
+
+        Returns:
+            The configuration.
+
+        Raises:
+            ConfigError: The file cannot be read, is not TOML, or holds a bad key or value.
+        """
+        return cls.compose(file=path)
+
+    @classmethod
+    def compose(
+        cls,
+        *,
+        file: str | Path | None = None,
+        preset: str | None = None,
+        settings: Mapping[str, str] | None = None,
+    ) -> Self:
+        """Put a configuration together, as the command line does.
+
+        Args:
+            file: A TOML file; what it leaves open comes from the preset.
+            preset: Name of the preset, instead of the one that the file names.
+            settings: Texts by dotted key, for example ``{"cvt.iterations": "10"}``; they win.
+
+        Returns:
+            The configuration.
+
+        Raises:
+            ConfigError: The file cannot be read, or a key is unknown or a value out of range.
+        """
+        values = {} if file is None else read_toml(Path(file))
+        if preset is not None:
+            values["preset"] = preset
+        for key, text in (settings or {}).items():
+            section, _, name = key.rpartition(".")
+            target = values.setdefault(section, {}) if section else values
+            if not isinstance(target, dict):
+                raise ConfigError(f"{key}: is not a known setting.")
+            target[name] = text
+        try:
+            return cls.from_mapping(values)
+        except ConfigError as error:
+            raise ConfigError(str(error) if file is None else f"{file}: {error}") from None
+
+    def to_toml(self) -> str:
+        """Write the configuration as TOML text that :meth:`from_toml` reads back.
+
+        Returns:
+            TOML text, all keys included.
+        """
+        import tomli_w  # noqa: PLC0415 (only those who write a file need it)
+
+        return tomli_w.dumps(self.model_dump())
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    result = dict(base)
+    for key, value in changes.items():
+        old = result.get(key)
+        both = isinstance(old, Mapping) and isinstance(value, Mapping)
+        result[key] = _merged(old, value) if both else value  # type: ignore[arg-type]
+    return result
