@@ -93,6 +93,12 @@ def test_costly_cells_come_once_and_whole(limit, cost):
     assert found == lists_of(partition)
 
 
+def test_consecutive_cells_are_cut_out():
+    partition = partition_of([2, 1, 3, 1])
+    assert lists_of(partition.cut(slice(1, 3))) == lists_of(partition)[1:3]
+    assert lists_of(partition.cut(slice(2, 99))) == lists_of(partition)[2:]
+
+
 def test_moving_to_a_device():
     """``meta`` stands for another device: it has shapes and no values."""
     moved = partition_of([2, 1]).to(torch.device("meta"))

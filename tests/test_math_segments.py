@@ -89,6 +89,33 @@ def test_columns_do_not_touch_one_another():
     assert torch.equal(sums.isfinite(), wanted)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_weighted_rows(dtype):
+    """By weights in place, and from a table: 2 * [1, 2] - [3, 4], nothing, and 0.5 * [1, 2]."""
+    table = torch.tensor([[3.0, 4.0], [1.0, 2.0]], dtype=dtype)
+    rows, offsets = torch.tensor([1, 0, 1]), torch.tensor([0, 2, 2, 3])
+    weights = torch.tensor([2.0, -1.0, 0.5], dtype=dtype)
+    wanted = torch.tensor([[-1.0, 0.0], [0.0, 0.0], [0.5, 1.0]], dtype=dtype)
+    assert torch.equal(segments.segment_sum_of(table, rows, offsets, weights), wanted)
+    assert torch.equal(segments.segment_sum(table[rows], offsets, weights), wanted)
+    assert segments.segment_sum(table[rows, 0], offsets, weights).tolist() == [-1.0, 0.0, 0.5]
+
+
+def test_a_table_of_which_no_row_is_named():
+    nothing = torch.zeros(0, dtype=torch.int64)
+    offsets = torch.zeros(3, dtype=torch.int64)
+    sums = segments.segment_sum_of(torch.ones(4, 2, 3), nothing, offsets, torch.zeros(0))
+    assert torch.equal(sums, torch.zeros(2, 2, 3))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_how_rows_lie_in_memory_does_not_matter(dtype):
+    values = torch.randn(5, 3, generator=torch.Generator().manual_seed(3), dtype=dtype)
+    by_column = values.T.contiguous().T
+    wanted = segments.segment_sum(values, OFFSETS)
+    assert torch.equal(segments.segment_sum(by_column, OFFSETS), wanted)
+
+
 def smooth_rows(*shape: int) -> torch.Tensor:
     """Numbers of which no two are near each other, so that a maximum stays where it is."""
     count = torch.Size(shape).numel()
@@ -106,6 +133,24 @@ def test_gradients_equal_finite_differences(inner, offsets):
         return segments.segment_max(rows, ends)[ends.diff() > 0]
 
     assert torch.autograd.gradcheck(finite_max, (values,))
+    weights = torch.tensor([0.5, -1.0, 2.0, 0.0, 3.0]).double()
+    weighted = segments.segment_sum(values, ends, weights)
+    (found,) = torch.autograd.grad(weighted.sum(), values)
+    assert torch.equal(found, weights_like(values, weights))
+
+
+def weights_like(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    return weights.reshape(-1, *[1] * (values.ndim - 1)).expand_as(values)
+
+
+@pytest.mark.parametrize("inner", [(3,), (2, 3)], ids=str)
+def test_gradients_of_weights_of_a_table_equal_finite_differences(inner):
+    table, rows = smooth_rows(4, *inner), torch.tensor([3, 0, 0, 2, 1])
+    weights = smooth_rows(5)
+    assert torch.autograd.gradcheck(
+        lambda shares: segments.segment_sum_of(table, rows, OFFSETS, shares), (weights,)
+    )
+    assert not segments.segment_sum_of(table, rows, OFFSETS, weights.detach()).requires_grad
 
 
 def test_gradients_of_known_rows():

@@ -7,16 +7,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cells.features import (
-    FARTHEST,
-    cell_features,
-    member_features,
-    pair_features,
-    see_members,
-)
+from cvtgs.cells.features import FARTHEST, cell_features, member_features, see_members
 from cvtgs.cells.kernels import kernels_of
 from cvtgs.cells.partition import Partition
-from cvtgs.cells.widening import side_cover
+from cvtgs.cells.surroundings import Surroundings, look_around
 from cvtgs.scene import GaussianScene
 
 MEMBER_FEATURES = 19
@@ -124,19 +118,33 @@ def describe_cells(
         >>> tuple(seen.members.shape), tuple(seen.pairs.shape), tuple(seen.cells.shape)
         ((5, 19), (2, 1, 18), (2, 19))
     """
-    own, members = kernels_of(merged, cells), kernels_of(scene, part.order)
-    sides = side_cover(merged, cells, neighbors).to(scene.dtype)
-    bare = sides[:, :, 1] - sides[:, :, 0]
-    seen = see_members(
-        members, own, part.offsets, light.index_select(0, part.order).to(scene.dtype)
-    )
-    pairs, pair_places = pair_features(merged, own, cells, neighbors, bare, sizes)
+    around = look_around(merged, cells=cells, neighbors=neighbors, sizes=sizes)
+    return describe_members(scene, part, around=around, light=light)
+
+
+def describe_members(
+    scene: GaussianScene, part: Partition, *, around: Surroundings, light: Float[Tensor, "n_all"]
+) -> Descriptors:
+    """Describe some cells whose surroundings are known, as :func:`describe_cells` does.
+
+    Args:
+        scene: The Gaussians.
+        part: Members of the cells to describe.
+        around: The surroundings of these cells.
+        light: How freely every Gaussian of the scene can be seen, 0 to 1.
+
+    Returns:
+        The descriptors, in the dtype of the scene.
+    """
+    members = kernels_of(scene, part.order)
+    lights = light.index_select(0, part.order).to(scene.dtype)
+    seen = see_members(members, around.own, part.offsets, lights)
     return Descriptors(
-        members=member_features(seen, bare),
-        pairs=pairs,
-        cells=cell_features(own, seen, part.offsets, sides, pair_places),
+        members=member_features(seen, around.bare),
+        pairs=around.pairs,
+        cells=cell_features(around.own, seen, around.sides, around.places),
         weights=seen.weights,
         offsets=part.offsets,
         places=seen.places.clamp(-FARTHEST, FARTHEST),
-        pair_places=pair_places.clamp(-FARTHEST, FARTHEST),
+        pair_places=around.places.clamp(-FARTHEST, FARTHEST),
     )

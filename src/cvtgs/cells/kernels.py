@@ -1,5 +1,10 @@
-"""Kernels: Gaussians activated and set against one another, pair by pair."""
+"""Kernels: Gaussians activated and set against one another, pair by pair.
 
+What belongs to one component of all of them lies in one run of memory: sums of products over
+three components are then as fast as memory, and many times as fast as products of small matrices.
+"""
+
+import math
 from typing import NamedTuple
 
 import torch
@@ -16,7 +21,7 @@ LARGEST_LOG = 80.0
 
 
 class Kernels(NamedTuple):
-    """Some Gaussians, activated, in the dtype of the scene; their centres in float64."""
+    """Some Gaussians, activated, in the dtype of the scene."""
 
     means: Tensor
     rotations: Tensor
@@ -39,7 +44,7 @@ class Kernels(NamedTuple):
         Returns:
             Those rows of every tensor.
         """
-        return Kernels(*(values.index_select(0, ids) for values in self))
+        return Kernels(*(take(values, ids) for values in self))
 
 
 def kernels_of(scene: GaussianScene, rows: Int[Tensor, "r"]) -> Kernels:
@@ -53,15 +58,42 @@ def kernels_of(scene: GaussianScene, rows: Int[Tensor, "r"]) -> Kernels:
         One row for each in every tensor; the rotations have the axes as columns, and colours are
         those of the constant band, less the 0.5 that all colours have.
     """
-    log_scales = scene.log_scales.index_select(0, rows)
+    log_scales = gather(scene.log_scales, rows)
     return Kernels(
-        means=scene.means.index_select(0, rows).double(),
-        rotations=quaternions.to_matrices(quaternions.normalize(scene.quats.index_select(0, rows))),
+        means=gather(scene.means, rows),
+        rotations=quaternions.to_matrices(quaternions.normalize(gather(scene.quats, rows))),
         log_scales=log_scales,
         log_areas=covariances.log_mean_projected_area(log_scales),
         logits=activations.clamp_logits(scene.logit_opacities.index_select(0, rows)),
-        colors=scene.sh0[:, 0].index_select(0, rows) * SH_C0,
+        colors=gather(scene.sh0[:, 0], rows) * SH_C0,
     )
+
+
+def gather(values: Float[Tensor, "n c"], rows: Int[Tensor, "r"]) -> Float[Tensor, "r c"]:
+    """Take rows from all over a table.
+
+    Args:
+        values: The table.
+        rows: Which rows.
+
+    Returns:
+        Those rows, in memory component by component.
+    """
+    return values.index_select(0, rows).T.contiguous().T
+
+
+def take(values: Float[Tensor, "n *c"], rows: Int[Tensor, "r"]) -> Float[Tensor, "r *c"]:
+    """Take rows of what lies in memory component by component, as the result does.
+
+    Args:
+        values: The table.
+        rows: Which rows.
+
+    Returns:
+        Those rows.
+    """
+    columns = values.reshape(-1, math.prod(values.shape[1:])).T.contiguous()
+    return columns.index_select(1, rows).T.reshape(-1, *values.shape[1:])
 
 
 def places_in(frames: Kernels, shifts: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -74,9 +106,39 @@ def places_in(frames: Kernels, shifts: Float[Tensor, "n 3"]) -> Float[Tensor, "n
     Returns:
         Coordinates along its axes, limited to 1e4.
     """
-    turned = torch.einsum("nij,ni->nj", frames.rotations, shifts.to(frames.rotations.dtype))
+    turned = coordinates(frames.rotations, shifts[:, :, None])[:, :, 0]
     units = torch.exp((-frames.log_scales).clamp(-LARGEST_LOG, LARGEST_LOG))
     return (turned * units).clamp(-LARGEST_PLACE, LARGEST_PLACE)
+
+
+def coordinates(
+    rotations: Float[Tensor, "n 3 3"], vectors: Float[Tensor, "n 3 k"]
+) -> Float[Tensor, "n 3 k"]:
+    """Express vectors in frames.
+
+    Args:
+        rotations: Frames, with their axes as columns.
+        vectors: As columns, any number for each frame.
+
+    Returns:
+        Coordinates along the axes: the products of transposed rotations and vectors.
+    """
+    rows = zip(rotations[:, :, :, None].unbind(1), vectors[:, :, None, :].unbind(1), strict=True)
+    first, second, third = rows
+    return (first[0] * first[1]).addcmul_(*second).addcmul_(*third)
+
+
+def squared_lengths(vectors: Float[Tensor, "n k 3"]) -> Float[Tensor, "n k"]:
+    """Give the squared lengths of vectors.
+
+    Args:
+        vectors: As rows, any number for each frame.
+
+    Returns:
+        Sums of three squares; many times as fast as a reduction where components lie in runs.
+    """
+    x, y, z = vectors.unbind(-1)
+    return x.square().addcmul_(y, y).addcmul_(z, z)
 
 
 def contrasts_of(some: Kernels, others: Kernels) -> Float[Tensor, "n"]:
@@ -102,9 +164,9 @@ def extents_in(frames: Kernels, others: Kernels) -> Float[Tensor, "n 3"]:
     Returns:
         Logarithms of standard deviations in units of those of the frame, from -9 to 9.
     """
-    cosines = torch.einsum("nij,nik->njk", frames.rotations, others.rotations)
+    cosines = coordinates(frames.rotations, others.rotations)
     largest = others.log_scales.amax(dim=1, keepdim=True)
     scales = torch.exp(others.log_scales - largest)
-    squares = (cosines * scales[:, None, :]).square().sum(dim=2)
+    squares = squared_lengths(cosines * scales[:, None, :])
     logs = 0.5 * activations.positive_log(squares) + largest - frames.log_scales
     return logs.clamp(-9, 9)

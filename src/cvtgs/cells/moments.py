@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.math import activations, covariances
+from cvtgs.cells.kernels import take
+from cvtgs.math import activations, quaternions
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
 
 
@@ -44,7 +45,8 @@ class Members:
         """
         if area_power == 0.0:
             return normalized_weights(self.opacities, self.offsets)
-        largest = segment_max(self.areas, self.offsets)[segment_ids(self.offsets)]
+        ids = segment_ids(self.offsets)
+        largest = segment_max(self.areas, self.offsets).index_select(0, ids)
         shares = activations.divide(self.areas, largest) ** area_power
         return normalized_weights(self.opacities * shares, self.offsets)
 
@@ -68,7 +70,7 @@ def normalized_weights(
     weights, ids = weights.double(), segment_ids(offsets)
     totals = segment_sum(weights, offsets).index_select(0, ids)
     shares = weights / totals.clamp_min(torch.finfo(weights.dtype).tiny)
-    equal = offsets.diff().double().reciprocal()[ids]
+    equal = offsets.diff().double().reciprocal().index_select(0, ids)
     return torch.where(totals < torch.finfo(weights.dtype).tiny, equal, shares)
 
 
@@ -93,8 +95,7 @@ def weighted_mean(
         ... ).tolist()
         [3.0]
     """
-    spread = weights.double().reshape(-1, *[1] * (values.ndim - 1))
-    return segment_sum(values.double() * spread, offsets)
+    return segment_sum(values.double(), offsets, weights.double())
 
 
 def mean_and_covariance(
@@ -115,10 +116,13 @@ def mean_and_covariance(
     """
     offsets = members.offsets
     ids = segment_ids(offsets)
-    first_rows = members.means[offsets[:-1]]
-    local = members.means - first_rows.index_select(0, ids)
+    first_rows = members.means.index_select(0, offsets[:-1])
+    local = members.means - take(first_rows, ids)
     shift = weighted_mean(local, weights, offsets)
-    local = local - shift.index_select(0, ids)
-    inner = covariances.from_scales_and_quats(members.scales, members.quats)
-    outer = local[:, :, None] * local[:, None, :]
-    return first_rows + shift, weighted_mean(inner + outer, weights, offsets)
+    local = local - take(shift, ids)
+    axes = quaternions.to_matrices(members.quats) * members.scales[:, None, :]
+    # Sums of products of columns; products of so many small matrices take ten times as long.
+    matrices = local[:, :, None] * local[:, None, :]
+    for axis in axes.unbind(2):
+        matrices.addcmul_(axis[:, :, None], axis[:, None, :])
+    return first_rows + shift, weighted_mean(matrices, weights, offsets)

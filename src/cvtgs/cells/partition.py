@@ -78,6 +78,18 @@ class Partition:
         offsets = torch.nn.functional.pad(counts[cells].cumsum(0), (1, 0))
         return type(self)(order=self.order[members], offsets=offsets)
 
+    def cut(self, run: slice) -> Self:
+        """Keep some consecutive cells.
+
+        Args:
+            run: From which cell to which, at least one.
+
+        Returns:
+            Their partition; its order is a view.
+        """
+        ends = self.offsets[run.start : run.stop + 1]
+        return type(self)(order=self.order[int(ends[0]) : int(ends[-1])], offsets=ends - ends[0])
+
     def to(self, device: torch.device) -> Self:
         """Move the partition to a device.
 
@@ -104,10 +116,7 @@ class Partition:
         if cell_cost:
             costs = costs + cell_cost * torch.arange(len(costs), device=costs.device)
         while first < len(self):
-            start = int(self.offsets[first])
             fitting = torch.searchsorted(costs, costs[first] + max_members, right=True)
             last = max(first + 1, int(fitting) - 1)
-            members = self.order[start : int(self.offsets[last])]
-            offsets = self.offsets[first : last + 1] - start
-            yield slice(first, last), type(self)(order=members, offsets=offsets)
+            yield slice(first, last), self.cut(slice(first, last))
             first = last

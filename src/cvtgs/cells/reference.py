@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.cells.kernels import gather
 from cvtgs.cells.moments import Members, mean_and_covariance, weighted_mean
 from cvtgs.cells.partition import Partition
 from cvtgs.config import MergeConfig
@@ -105,15 +106,15 @@ def gather_members(scene: GaussianScene, part: Partition) -> Members:
         The members in float64.
     """
     rows = part.order
-    scales = torch.exp(scene.log_scales.index_select(0, rows).double())
+    log_scales = gather(scene.log_scales, rows).double()
     logits = scene.logit_opacities.index_select(0, rows).double()
     return Members(
-        means=scene.means.index_select(0, rows).double(),
-        quats=quaternions.normalize(scene.quats.index_select(0, rows).double()),
-        scales=scales,
+        means=gather(scene.means, rows).double(),
+        quats=quaternions.normalize(gather(scene.quats, rows).double()),
+        scales=torch.exp(log_scales),
         opacities=activations.opacity_from_logit(logits),
         depths=activations.optical_depth_from_logit(logits),
-        areas=covariances.mean_projected_area(scales),
+        areas=torch.exp(covariances.log_mean_projected_area(log_scales)),
         offsets=part.offsets,
     )
 

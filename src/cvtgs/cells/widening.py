@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.cells.kernels import coordinates, gather, squared_lengths, take
 from cvtgs.cells.partition import Partition
 from cvtgs.math import activations, quaternions
 from cvtgs.scene import GaussianScene
@@ -14,8 +15,8 @@ PROBE_SIGMAS = 3.0
 FULL_COVER = 0.1
 """Where neighbours paint at least this opaquely, an axis counts as covered."""
 
-CHUNK = 1 << 14
-"""Cells that are looked at together; each takes about ``1 kB``."""
+CHUNK = 1 << 11
+"""Cells that are looked at together; each takes about ``1 kB`` for every neighbour."""
 
 
 def widen_cells(
@@ -89,24 +90,31 @@ def side_cover(
         >>> side_cover(scene, torch.tensor([0]), torch.tensor([[1]])).shape
         torch.Size([1, 3, 2])
     """
+    count, others = neighbors.shape[1], neighbors.flatten()
     means, rotations, scales = _frames(scene, rows)
-    axes = rotations * (PROBE_SIGMAS * scales)[:, None, :]
-    ends = torch.stack([axes, -axes], dim=3)
-    open_share = torch.ones(len(rows), 3, 2, dtype=torch.float64, device=scene.device)
-    for other in neighbors.unbind(1):
-        other_means, other_rotations, other_scales = _frames(scene, other)
-        offsets = (means - other_means)[:, :, None, None] + ends
-        turned = torch.einsum("rij,riab->rjab", other_rotations, offsets)
-        sigmas = activations.divide(turned, other_scales[:, :, None, None])
-        logits = scene.logit_opacities.index_select(0, other).double()
-        opacities = activations.opacity_from_logit(logits)
-        painted = torch.exp(-0.5 * sigmas.square().sum(dim=1))
-        open_share *= 1 - opacities[:, None, None] * painted
-    return 1 - open_share
+    other_means, other_rotations, other_scales = _frames(scene, others)
+    ids = torch.arange(len(rows), device=rows.device).repeat_interleave(count)
+    shifts = coordinates(other_rotations, (take(means, ids) - other_means)[:, :, None])
+    axes = take(rotations * (PROBE_SIGMAS * scales)[:, None, :], ids)
+    arms = coordinates(other_rotations, axes)
+    logits = scene.logit_opacities.index_select(0, others).double()
+    opacities = activations.opacity_from_logit(logits)[:, None]
+    painted = [
+        opacities * _bell(activations.divide(ends, other_scales[:, :, None]))
+        for ends in (shifts + arms, shifts - arms)
+    ]
+    return 1 - torch.stack(
+        [(1 - paint).unflatten(0, neighbors.shape).prod(dim=1) for paint in painted], dim=2
+    )
+
+
+def _bell(places: Float[Tensor, "n 3 k"]) -> Float[Tensor, "n k"]:
+    """Give how much of its opacity a Gaussian has at places in its standard deviations."""
+    return torch.exp(-0.5 * squared_lengths(places.mT))
 
 
 def _frames(scene: GaussianScene, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Give centres, axes (columns) and scales of some Gaussians in float64."""
-    quats = quaternions.normalize(scene.quats.index_select(0, rows).double())
-    scales = torch.exp(scene.log_scales.index_select(0, rows).double())
-    return scene.means.index_select(0, rows).double(), quaternions.to_matrices(quats), scales
+    quats = quaternions.normalize(gather(scene.quats, rows).double())
+    scales = torch.exp(gather(scene.log_scales, rows).double())
+    return gather(scene.means, rows).double(), quaternions.to_matrices(quats), scales

@@ -82,14 +82,20 @@ def _light(grid: Float[Tensor, "g g g"]) -> Float[Tensor, "g g g"]:
     """Average the light that comes through the next voxels in the six directions."""
     light = torch.zeros_like(grid)
     for axis in range(3):
-        # A view with the axis first, in slabs of the next axis, to bound memory.
-        slabs = grid.movedim(axis, 0).split(SLAB, dim=1)
-        for slab, target in zip(slabs, light.movedim(axis, 0).split(SLAB, dim=1), strict=True):
-            running = slab.cumsum(0)
-            # Repeated at the ends, so that a window that leaves the grid meets nothing there.
-            first, last = torch.zeros_like(running[:1]), running[-1:]
-            running = torch.cat([*[first] * (REACH + 1), running, *[last] * REACH])
-            here = running[REACH + 1 : REACH + 1 + len(slab)]
-            target.add_(torch.exp(running[: len(slab)] - running[REACH : REACH + len(slab)]))
-            target.add_(torch.exp(here - running[2 * REACH + 1 :]))
+        across = 1 if axis == 0 else 0  # slabs of another axis, to bound memory
+        slabs = zip(grid.split(SLAB, across), light.split(SLAB, across), strict=True)
+        for slab, target in slabs:
+            through = torch.exp(-_windows(slab, axis))
+            target.add_(through.narrow(axis, 0, len(grid)))
+            target.add_(through.narrow(axis, REACH + 1, len(grid)))
     return light.div_(6)
+
+
+def _windows(slab: Float[Tensor, "a b c"], axis: int) -> Float[Tensor, "d e f"]:
+    """Sum every run of voxels as long as the reach, those that leave the grid at the ends too."""
+    padded = torch.nn.functional.pad(slab, [0, 0] * (2 - axis) + [REACH, REACH])
+    count = slab.shape[axis] + REACH + 1
+    sums = padded.narrow(axis, 0, count).clone()
+    for start in range(1, REACH):
+        sums.add_(padded.narrow(axis, start, count))
+    return sums

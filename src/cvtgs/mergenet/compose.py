@@ -6,7 +6,7 @@ from torch import Tensor
 
 from cvtgs.cells import Partition
 from cvtgs.math import quaternions
-from cvtgs.math.segments import segment_ids, segment_sum
+from cvtgs.math.segments import segment_sum, segment_sum_of
 from cvtgs.mergenet.model import Residuals
 from cvtgs.scene import GaussianScene
 
@@ -66,11 +66,17 @@ def compose(
         "log_scales": own.log_scales + residuals.growths,
         "logit_opacities": own.logit_opacities + residuals.logits,
     }
+    near = torch.arange(len(cells) + 1, device=cells.device) * neighbors.shape[1]
     for name in ("sh0", "shN"):
         bands = getattr(own, name)
         if bands.shape[1]:
-            mixed = _mixed(getattr(scene, name), bands, part, residuals.member_colors)
-            bands = bands + mixed + _borrowed(getattr(merged, name), bands, neighbors, residuals)
+            mixed = _mixed(
+                getattr(scene, name), bands, part.order, part.offsets, residuals.member_colors
+            )
+            borrowed = _mixed(
+                getattr(merged, name), bands, neighbors.flatten(), near, residuals.pair_colors
+            )
+            bands = bands + mixed + borrowed
         tensors[name] = bands
     return tensors
 
@@ -86,24 +92,13 @@ def _turned(quats: Float[Tensor, "m 4"], turns: Float[Tensor, "m 3"]) -> Float[T
 def _mixed(
     values: Float[Tensor, "n_all b 3"],
     own: Float[Tensor, "m b 3"],
-    part: Partition,
-    gates: Float[Tensor, "n"],
+    rows: Int[Tensor, "r"],
+    offsets: Int[Tensor, "m_plus_1"],
+    gates: Float[Tensor, "..."],
 ) -> Float[Tensor, "m b 3"]:
-    """Sum what sets members apart from their cell."""
-    differences = values.index_select(0, part.order) - own.index_select(
-        0, segment_ids(part.offsets)
+    """Sum what sets the members or the neighbours of cells apart from them, each by its gate."""
+    shares = gates.flatten()
+    return (
+        segment_sum_of(values, rows, offsets, shares)
+        - own * segment_sum(shares, offsets)[:, None, None]
     )
-    return segment_sum(gates[:, None, None] * differences, part.offsets)
-
-
-def _borrowed(
-    values: Float[Tensor, "m_all b 3"],
-    own: Float[Tensor, "m b 3"],
-    neighbors: Int[Tensor, "m k"],
-    residuals: Residuals,
-) -> Float[Tensor, "m b 3"]:
-    """Sum what sets neighbours apart from a cell."""
-    total = torch.zeros_like(own)
-    for other, gates in zip(neighbors.unbind(1), residuals.pair_colors.unbind(1), strict=True):
-        total = total + gates[:, None, None] * (values.index_select(0, other) - own)
-    return total

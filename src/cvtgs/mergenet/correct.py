@@ -6,7 +6,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cells import Partition, describe_cells
+from cvtgs.cells import Partition
+from cvtgs.cells.descriptors import describe_members
+from cvtgs.cells.surroundings import look_around
 from cvtgs.mergenet.compose import compose
 from cvtgs.mergenet.model import MergeNet
 from cvtgs.scene import GaussianScene
@@ -55,32 +57,30 @@ def correct_cells(
         >>> bool((corrected.means == merged.means).all())
         True
     """
-    several = partition.counts > 1
-    cells = several.nonzero()[:, 0]
+    sizes, near = partition.counts, neighbors.shape[1]
+    cells = (sizes > 1).nonzero()[:, 0]
+    several = partition.select(sizes > 1)
     done = len(partition) - len(cells)
     tensors = {name: values.clone() for name, values in merged.tensors().items()}
+    filled = [name for name, values in tensors.items() if values.numel()]  # not SH of degree 0
     with torch.no_grad():
-        chunks = partition.select(several).chunks(CHUNK_MEMBERS, cell_cost=neighbors.shape[1])
-        for run, part in chunks:
-            rows = cells[run]
-            seen = describe_cells(
-                scene,
-                merged,
-                part,
-                cells=rows,
-                neighbors=neighbors[rows],
-                sizes=partition.counts,
-                light=light,
+        step = max(1, CHUNK_MEMBERS // max(1, near))
+        for block in (slice(start, start + step) for start in range(0, len(cells), step)):
+            around = look_around(
+                merged, cells=cells[block], neighbors=neighbors[cells[block]], sizes=sizes
             )
-            changed = compose(
-                scene, merged, part, cells=rows, neighbors=neighbors[rows], residuals=net(seen)
-            )
-            for name, values in changed.items():
-                if values.numel() == 0:  # SH bands that the scene does not have
-                    continue
-                # Near the limits of the dtype (a flyaway at 3e38) a change may overflow.
-                kept = tensors[name][rows]
-                tensors[name][rows] = torch.where(values.isfinite(), values, kept)
-            done += len(part)
-            on_cells(done)
+            for run, part in several.cut(block).chunks(CHUNK_MEMBERS, cell_cost=near):
+                rows = cells[block][run]
+                seen = describe_members(scene, part, around=around.cut(run), light=light)
+                changed = compose(
+                    scene, merged, part, cells=rows, neighbors=neighbors[rows], residuals=net(seen)
+                )
+                for name in filled:
+                    tensors[name][rows] = changed[name]
+                done += len(part)
+                on_cells(done)
+    for name in filled:
+        # Near the limits of the dtype (a flyaway at 3e38) a change may overflow.
+        kept = getattr(merged, name)
+        tensors[name] = torch.where(tensors[name].isfinite(), tensors[name], kept)
     return merged.with_tensors(tensors, merged.extras)

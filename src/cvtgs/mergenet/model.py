@@ -119,37 +119,43 @@ class MergeNet(nn.Module):
         Returns:
             Changes of each cell.
         """
-        offsets, weights = descriptors.offsets, descriptors.weights[:, None]
-        ids = segment_ids(offsets)
+        offsets, weights = descriptors.offsets, descriptors.weights
+        ids, shape = segment_ids(offsets), descriptors.pairs.shape[:2]
         members = self.member_layers(descriptors.members)
-        pairs = self.pair_layers(descriptors.pairs)
+        pairs = self.pair_layers(descriptors.pairs.flatten(0, 1))
         pooled = [
             descriptors.cells,
             segment_sum(members, offsets) / offsets.diff()[:, None],
-            segment_sum(members * weights, offsets),
+            segment_sum(members, offsets, weights),
             segment_max(members, offsets),
-            *_pool_pairs(pairs),
+            *_pool_pairs(pairs.unflatten(0, shape)),
         ]
         cells = self.cell_layers(torch.cat(pooled, dim=1))
         sizes = self.decoder(cells)
         of_members = LARGEST_MEMBER_GATE * self.member_gates(members, cells, ids)
-        pair_ids = torch.arange(len(cells), device=ids.device).repeat_interleave(pairs.shape[1])
-        of_pairs = self.pair_gates(pairs.flatten(0, 1), cells, pair_ids)
-        of_pairs = LARGEST_PAIR_GATE * of_pairs.unflatten(0, pairs.shape[:2])
-        by_share = of_members * weights
-        shifts = segment_sum(by_share[:, :1] * descriptors.places, offsets)
-        twists = segment_sum(by_share[:, 2:] * _twists(descriptors.places.clamp(-5, 5)), offsets)
-        near = descriptors.pair_places / (1 + descriptors.pair_places.abs())
+        pair_ids = torch.arange(len(cells), device=ids.device).repeat_interleave(shape[1])
+        of_pairs = LARGEST_PAIR_GATE / max(1, shape[1]) * self.pair_gates(pairs, cells, pair_ids)
+        places, pair_places = descriptors.places, descriptors.pair_places.flatten(0, 1)
+        pulls = segment_sum(_pulls(of_members, places, places.clamp(-5, 5)), offsets, weights)
+        near = pair_places / (1 + pair_places.abs())
+        others = _pulls(of_pairs, pair_places, near).unflatten(0, shape).sum(dim=1)
         # Twice, so that neighbours may turn a cell as a gate of 1 does.
-        twists = twists + 2 * _mean_of_pairs(of_pairs[..., 2:] * _twists(near))
+        twists = pulls[:, 3:] + 2 * others[:, 3:]
         return Residuals(
-            shifts=shifts + _mean_of_pairs(of_pairs[..., :1] * descriptors.pair_places),
+            shifts=pulls[:, :3] + others[:, :3],
             growths=LARGEST_GROWTH * torch.tanh(sizes[:, :3]),
             turns=LARGEST_TURN * torch.tanh(twists),
             logits=LARGEST_LOGIT_CHANGE * torch.tanh(0.5 * sizes[:, 3]),
-            member_colors=by_share[:, 1],
-            pair_colors=of_pairs[..., 1] / max(1, of_pairs.shape[1]),
+            member_colors=of_members[:, 1] * weights,
+            pair_colors=of_pairs[:, 1].unflatten(0, shape),
         )
+
+
+class _SiLU(nn.Module):
+    """The activation of sums that nobody else needs: in place unless autograd keeps them."""
+
+    def forward(self, sums: Tensor) -> Tensor:
+        return nn.functional.silu(sums, inplace=not sums.requires_grad)
 
 
 class _Gates(nn.Module):
@@ -160,18 +166,20 @@ class _Gates(nn.Module):
         self.own = nn.Linear(width, width)
         self.cell = nn.Linear(cell_width, width, bias=False)
         self.gates = nn.Linear(width, 5)
+        self.activation = _SiLU()
         nn.init.zeros_(self.gates.weight)
         nn.init.zeros_(self.gates.bias)
 
     def forward(self, own: Tensor, cells: Tensor, ids: Int[Tensor, "n"]) -> Tensor:
         of_cells = self.cell(cells) + self.own.bias
         # One product that adds in place of a product and two sums over all members.
-        summed = torch.addmm(of_cells.index_select(0, ids), own, self.own.weight.T)
-        return torch.tanh(self.gates(nn.functional.silu(summed)))
+        hidden = self.activation(of_cells.index_select(0, ids).addmm_(own, self.own.weight.T))
+        # Few gates of many: the product is faster with one gate of all in one run of memory.
+        return torch.tanh(torch.addmm(self.gates.bias[:, None], self.gates.weight, hidden.T)).T
 
 
 def _layers(features: int, width: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(features, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
+    return nn.Sequential(nn.Linear(features, width), _SiLU(), nn.Linear(width, width), _SiLU())
 
 
 def _pool_pairs(pairs: Float[Tensor, "m k w"]) -> tuple[Tensor, Tensor]:
@@ -182,11 +190,13 @@ def _pool_pairs(pairs: Float[Tensor, "m k w"]) -> tuple[Tensor, Tensor]:
     return pairs.mean(dim=1), pairs.amax(dim=1)
 
 
-def _mean_of_pairs(values: Float[Tensor, "m k 3"]) -> Float[Tensor, "m 3"]:
-    return values.sum(dim=1) / max(1, values.shape[1])
+def _pulls(
+    gates: Float[Tensor, "n 5"], places: Float[Tensor, "n 3"], levers: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 6"]:
+    """Give where each would move its cell, and how it would turn it about each axis.
 
-
-def _twists(places: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Give what makes a cell turn about each axis: products of the other two coordinates."""
-    x, y, z = places.unbind(-1)
-    return torch.stack([y * z, x * z, x * y], dim=-1)
+    What makes a cell turn about an axis is the product of the other two coordinates.
+    """
+    x, y, z = levers.unbind(1)
+    twists = torch.stack([y * z, x * z, x * y])
+    return torch.cat([gates.T[:1] * places.T, gates.T[2:] * twists]).T

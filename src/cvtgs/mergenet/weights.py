@@ -11,7 +11,6 @@ import pydantic
 import torch
 from torch import Tensor
 
-from cvtgs.config import PRESETS
 from cvtgs.errors import CheckpointError, FileFormatError
 from cvtgs.io.tensors import pack_tensors, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet
@@ -173,9 +172,9 @@ def _described(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
         info = CheckpointInfo.model_validate_json(metadata.get("info", ""))
     except pydantic.ValidationError as error:
         raise CheckpointError(f"{name}: the checkpoint does not say what it is.") from error
-    if info.preset not in PRESETS:
+    if info.preset not in SHIPPED:
         raise CheckpointError(
-            f"{name}: the preset of the checkpoint must be one of {', '.join(PRESETS)}, "
+            f"{name}: the preset of the checkpoint must be one of {', '.join(SHIPPED)}, "
             f"found {info.preset!r}."
         )
     ours, theirs = Architecture(), info.architecture
