@@ -25,6 +25,7 @@ LEVELS = [
     {"mergenet", "views"},
     {"stages", "refine"},
     {"simplify", "info", "evaluate"},
+    {"goals", "tradeoff"},
     {"train"},
     {"cli"},
     {"__main__"},
@@ -34,14 +35,15 @@ RANKS = {name: rank for rank, level in enumerate(LEVELS) for name in level}
 # Packages that any file may import, and the only places that may import others.
 EVERYWHERE = {"torch", "numpy", "jaxtyping", "pydantic"}
 OWNERS = {
-    "scipy": "cvt/nearest_scipy.py",
+    "scipy": ("cvt/nearest_scipy.py", "goals/fit.py"),
     "plyfile": "io/ply/generic.py",
     "tomli_w": "config/simplify.py",
     "rich": "cli/",
     "kornia": "losses/ssim.py",
     "numba": "render/compiled.py",
     "gsplat": "render/gsplat_backend.py",
-    "PIL": "evaluate/images.py",
+    "PIL": ("evaluate/images.py", "io/webp.py"),
+    "zstandard": "io/spz/zstd.py",
     "safetensors": "io/tensors.py",
     "matplotlib": "plots.py",
 }

@@ -211,7 +211,8 @@ def test_early_check_of_what_cannot_work(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_early_check_of_the_suffix(tmp_path: Path) -> None:
-    with pytest.raises(FileFormatError, match=r"the file name must end in \.ply, found no suffix"):
+    ends = r"\.compressed\.ply, \.ply, \.spz, \.splat or \.sog"
+    with pytest.raises(FileFormatError, match=f"the file name must end in {ends}, found no suffix"):
         check_save(tmp_path / "scene")
 
 

@@ -26,7 +26,10 @@ def test_a_directory_is_no_file(tmp_path: Path, name: str) -> None:
     path.mkdir()
     with pytest.raises(InputError) as caught:
         load(path)
-    assert str(caught.value) == f"{path}: must be a file, found a directory."
+    assert str(caught.value) == (
+        f"{path}: must be a file or the folder of a trained model, found a directory without "
+        f"point_cloud/iteration_*/point_cloud.ply, step-*.ckpt, point_cloud.ply or meta.json."
+    )
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
@@ -51,15 +54,16 @@ def test_no_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert str(caught.value) == f"{path}: the file must be readable, found: permission denied."
 
 
-@pytest.mark.parametrize(
-    ("name", "found"), [("s.splat", "the suffix '.splat'"), ("s", "no suffix")]
-)
+@pytest.mark.parametrize(("name", "found"), [("s.xyz", "the suffix '.xyz'"), ("s", "no suffix")])
 def test_unknown_suffix(tmp_path: Path, name: str, found: str) -> None:
     path = tmp_path / name
     path.write_bytes(GOOD)
     with pytest.raises(FileFormatError) as caught:
         load(path)
-    assert str(caught.value) == f"{path}: the file name must end in .ply, found {found}."
+    assert str(caught.value) == (
+        f"{path}: the file name must end in .compressed.ply, .ply, .spz, .splat, .sog, meta.json, "
+        f".ckpt or .pt, found {found}."
+    )
 
 
 def test_suffixes_ignore_case(tmp_path: Path) -> None:

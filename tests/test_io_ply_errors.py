@@ -151,9 +151,7 @@ VERTEX_CASES: Mapping[str, tuple[bytes, str]] = {
             [[1, 2]],
             before={"chunk": ([("min_x", "float")], [[0.0]])},
         ),
-        "must be an uncompressed PLY, found a compressed one (PlayCanvas: 'packed_position'), "
-        "which cvtgs does not read yet; convert it to a plain PLY first, for example with "
-        "splat-transform.",
+        "element 'chunk' of a compressed PLY must have the float property 'min_y', found none.",
     ),
 }
 

@@ -264,7 +264,8 @@ def test_an_empty_scene_is_not_written(tmp_path: Path) -> None:
 
 def test_unknown_suffix(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError) as caught:
-        save(make_scene(), tmp_path / "s.sog")
+        save(make_scene(), tmp_path / "s.ckpt")
     assert str(caught.value) == (
-        f"{tmp_path}/s.sog: the file name must end in .ply, found the suffix '.sog'."
+        f"{tmp_path}/s.ckpt: the file name must end in .compressed.ply, .ply, .spz, .splat or "
+        f".sog, found the suffix '.ckpt'."
     )

@@ -49,6 +49,14 @@ class TrainingError(CvtgsError, RuntimeError):
     """A training cannot go on; the text says where it stopped, and which file is good."""
 
 
+class RunError(CvtgsError, RuntimeError):
+    """A process that cvtgs started has failed; the text says why."""
+
+
+class GoalError(CvtgsError, ValueError):
+    """No result meets what was asked for (a quality, a time); the text says what comes closest."""
+
+
 class MissingDependencyError(CvtgsError, ImportError):
     """An optional package is not installed; the text says what to install."""
 

@@ -12,6 +12,13 @@ if TYPE_CHECKING:
     from cvtgs.report import StageCost
 
 
+READABLE = ".ply, .spz, .splat, .sog, .ckpt, .pt or the folder of a trained model"
+"""What ``cvtgs.load`` reads, for help texts."""
+
+WRITABLE = ".ply, .compressed.ply, .spz, .splat or .sog"
+"""What ``cvtgs.save`` writes, for help texts."""
+
+
 def size_text(count: int) -> str:
     """Give a number of bytes in decimal units.
 
@@ -36,10 +43,10 @@ def size_text(count: int) -> str:
 
 
 def file_size(path: Path) -> str:
-    """Give the size of a file.
+    """Give the size of a file, or of the scene in a folder.
 
     Args:
-        path: An existing file.
+        path: An existing file or folder.
 
     Returns:
         For example ``68.0 MB``.
@@ -50,7 +57,9 @@ def file_size(path: Path) -> str:
         ...     file_size(Path(file.name))
         '0 B'
     """
-    return size_text(path.stat().st_size)
+    from cvtgs.io import scene_size  # noqa: PLC0415 (keeps --help fast)
+
+    return size_text(scene_size(path))
 
 
 def stage_seconds(stages: Sequence["StageCost"]) -> str:

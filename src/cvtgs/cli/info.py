@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cvtgs.cli.display import file_size
+from cvtgs.cli.display import READABLE, file_size
 
 if TYPE_CHECKING:
     from cvtgs.info import SceneInfo
@@ -19,7 +19,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser = commands.add_parser(
         "info", help="show facts about a scene", description="Show facts about a scene."
     )
-    parser.add_argument("input", metavar="IN", type=Path, help="scene to read (.ply)")
+    parser.add_argument("input", metavar="IN", type=Path, help=f"scene to read ({READABLE})")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
 

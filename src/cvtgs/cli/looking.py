@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from cvtgs.cli.display import READABLE
 from cvtgs.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -12,6 +13,8 @@ if TYPE_CHECKING:
 
     from cvtgs.cameras import Cameras
     from cvtgs.scene import GaussianScene
+
+AUTOMATIC_VIEWS = 8
 
 Color = tuple[float, float, float]
 
@@ -40,7 +43,7 @@ def add_scoring_options(parser: argparse.ArgumentParser) -> None:
     Args:
         parser: Where to add them.
     """
-    parser.add_argument("reference", metavar="REF", type=Path, help="the full scene (.ply)")
+    parser.add_argument("reference", metavar="REF", type=Path, help=f"the full scene ({READABLE})")
     parser.add_argument("small", metavar="SMALL", type=Path, nargs="+", help="simplified scenes")
     parser.add_argument(
         "--lpips",
@@ -62,7 +65,8 @@ def add_looking_options(parser: argparse.ArgumentParser, *, size: int) -> None:
         type=Path,
         metavar="F",
         help="cameras to use: transforms.json, a COLMAP model, cameras.json, or a folder of these "
-        "(default: automatic views)",
+        "(default: those in the folder that REF or IN is, if it is a model of INRIA's code, else "
+        "automatic views)",
     )
     parser.add_argument(
         "--split", choices=("train", "test"), help="only these of the cameras of --cameras"
@@ -112,7 +116,7 @@ def load_scenes(paths: Sequence[Path], device: "torch.device") -> Scenes:
     Raises:
         InvalidArgumentError: A file is given twice.
     """
-    from cvtgs.io import load  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.io import load, scene_size  # noqa: PLC0415 (keeps --help fast)
 
     names = [path.name for path in paths]
     names = [
@@ -123,7 +127,7 @@ def load_scenes(paths: Sequence[Path], device: "torch.device") -> Scenes:
     if twice:
         raise InvalidArgumentError(f"every scene must be given once, found {twice[0]} twice.")
     scenes = {name: load(path).to(device) for name, path in zip(names, paths, strict=True)}
-    sizes = {name: path.stat().st_size for name, path in zip(names, paths, strict=True)}
+    sizes = {name: scene_size(path) for name, path in zip(names, paths, strict=True)}
     return Scenes(scenes, sizes)
 
 
@@ -212,14 +216,27 @@ def chosen_cameras(
     from cvtgs.io import load_cameras  # noqa: PLC0415
     from cvtgs.views import automatic_views  # noqa: PLC0415 (keeps --help fast)
 
-    if options.cameras is None:
-        size = options.size or options.default_size
-        height = max(1, round(0.75 * size))
-        return automatic_views(scene, options.views or 8, width=size, height=height)
-    cameras = _spread(load_cameras(options.cameras, split=options.split), options.views or most)
-    if options.size is None:
-        return cameras
-    factor = options.size / max(cameras.width, cameras.height)
+    size = options.size or options.default_size
+    if options.cameras is not None:
+        cameras = _spread(load_cameras(options.cameras, split=options.split), options.views or most)
+        return cameras if options.size is None else _resized(cameras, size)
+    beside = _cameras_of_model(options)
+    if beside is not None:
+        return _resized(_spread(load_cameras(beside), options.views or AUTOMATIC_VIEWS), size)
+    height = max(1, round(0.75 * size))
+    return automatic_views(scene, options.views or AUTOMATIC_VIEWS, width=size, height=height)
+
+
+def _cameras_of_model(options: argparse.Namespace) -> Path | None:
+    """Find the cameras that lie in the folder of the scene, as INRIA's code writes them."""
+    path = getattr(options, "reference", None) or getattr(options, "input", None)
+    beside = path / "cameras.json" if path is not None else None
+    return beside if beside is not None and beside.is_file() else None
+
+
+def _resized(cameras: "Cameras", size: int) -> "Cameras":
+    """Give the longer side of the pictures a size."""
+    factor = size / max(cameras.width, cameras.height)
     sides = (max(1, round(factor * side)) for side in (cameras.width, cameras.height))
     return cameras.resized(*sides)
 

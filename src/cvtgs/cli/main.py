@@ -10,7 +10,7 @@ from types import FrameType
 from typing import NoReturn, TextIO
 
 import cvtgs
-from cvtgs.cli import compare, demo, evaluate, info, render, simplify, train
+from cvtgs.cli import compare, convert, demo, evaluate, info, render, simplify, tradeoff, train
 from cvtgs.errors import CvtgsError
 
 INTERRUPTED = 130
@@ -94,7 +94,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"cvtgs {cvtgs.__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for command in (simplify, info, evaluate, render, compare, demo, train):
+    for command in (simplify, convert, info, evaluate, render, compare, tradeoff, demo, train):
         command.add_parser(commands)
     return parser
 

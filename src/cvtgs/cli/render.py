@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-from cvtgs.cli.display import progress_bars
+from cvtgs.cli.display import READABLE, progress_bars
 from cvtgs.cli.looking import (
     add_looking_options,
     background_color,
@@ -28,7 +28,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         help="write pictures of a scene",
         description="Write one PNG per view into DIR, named after the cameras.",
     )
-    parser.add_argument("input", metavar="IN", type=Path, help="scene to read (.ply)")
+    parser.add_argument("input", metavar="IN", type=Path, help=f"scene to read ({READABLE})")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="DIR", help="directory to write to"
     )

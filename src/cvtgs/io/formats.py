@@ -1,39 +1,79 @@
-"""Load and save scenes; the suffix of the file says which format it is."""
+"""Load and save scenes; the end of the file name says which format it is."""
 
 import os
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 import torch
 
-from cvtgs.errors import DeviceError, FileFormatError
+from cvtgs.errors import DeviceError, DroppedDataWarning, FileFormatError
 from cvtgs.io.atomic import atomic_output, check_output
+from cvtgs.io.checkpoints import read_checkpoint
+from cvtgs.io.compressed_ply import (
+    COMPRESSED_PLY_HOLDS,
+    is_compressed_ply,
+    read_compressed_ply,
+    write_compressed_ply,
+)
+from cvtgs.io.folders import scene_file
+from cvtgs.io.holds import Holds, Losses, losses_of
 from cvtgs.io.ply import read_ply, write_ply
+from cvtgs.io.sog import SOG_HOLDS, read_sog, write_sog
+from cvtgs.io.splat import SPLAT_HOLDS, read_splat, write_splat
+from cvtgs.io.spz import SPZ_HOLDS, read_spz, write_spz
 from cvtgs.scene import GaussianScene
+
+Read = Callable[[Path], GaussianScene]
+Entry = TypeVar("Entry")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Format:
-    read: Callable[[Path], GaussianScene]
+class _Output:
+    """How a format is written; ``holds`` is None where nothing is lost."""
+
     write: Callable[[GaussianScene, BinaryIO], None]
+    holds: Holds | None = None
 
 
-_FORMATS: Mapping[str, _Format] = MappingProxyType(
-    {".ply": _Format(read=read_ply, write=write_ply)}
+# By the end of the file name; the first that fits counts.
+_READERS: Mapping[str, Read] = MappingProxyType(
+    {
+        ".compressed.ply": read_ply,
+        ".ply": read_ply,
+        ".spz": read_spz,
+        ".splat": read_splat,
+        ".sog": read_sog,
+        "meta.json": read_sog,
+        ".ckpt": read_checkpoint,
+        ".pt": read_checkpoint,
+    }
+)
+_OUTPUTS: Mapping[str, _Output] = MappingProxyType(
+    {
+        ".compressed.ply": _Output(write=write_compressed_ply, holds=COMPRESSED_PLY_HOLDS),
+        ".ply": _Output(write=write_ply),
+        ".spz": _Output(write=write_spz, holds=SPZ_HOLDS),
+        ".splat": _Output(write=write_splat, holds=SPLAT_HOLDS),
+        ".sog": _Output(write=write_sog, holds=SOG_HOLDS),
+    }
 )
 
 
 def load(path: str | os.PathLike[str], *, device: str | torch.device = "cpu") -> GaussianScene:
-    """Read a scene from a file.
+    """Read a scene from a file or the folder of a trained model.
 
     PLY files of any encoding, property order and number type are read, with SH degree 0 to 3.
     Unknown columns become extras; NaN and infinite values are returned as they are.
 
     Args:
-        path: The file; its suffix says the format (``.ply``).
+        path: The file; the end of its name says the format: ``.ply`` (plain, or compressed by
+            PlayCanvas' tools), ``.spz``, ``.splat``, ``.sog`` or the ``meta.json`` of a SOG,
+            ``.ckpt`` of nerfstudio's Splatfacto, ``.pt`` of gsplat's trainer. Of a folder, the
+            scene that :func:`cvtgs.io.scene_file` finds.
         device: Where the tensors are to be.
 
     Returns:
@@ -41,8 +81,9 @@ def load(path: str | os.PathLike[str], *, device: str | torch.device = "cpu") ->
 
     Raises:
         InputNotFoundError: There is no such file.
-        InputError: It cannot be opened or read.
+        InputError: It cannot be opened or read, or the folder holds no scene.
         FileFormatError: The format is unknown, or the file is not what its format promises.
+        MissingDependencyError: Reading this file needs an optional package.
         DeviceError: The device is not there.
 
     Example:
@@ -57,26 +98,32 @@ def load(path: str | os.PathLike[str], *, device: str | torch.device = "cpu") ->
         ...     load(Path(folder) / "two.ply")
         GaussianScene(2 Gaussians, SH degree 0, float32, cpu)
     """
-    source = Path(path)
     _check_device(device)
+    source = scene_file(path)
     if not os.path.isfile(source):  # noqa: PTH113 (Path.is_file raises without permission)
         return read_ply(source)  # says what is wrong, whatever the suffix
-    return _format_of(source).read(source).to(device)
+    read = _by_name(source, _READERS)
+    if read is read_ply and is_compressed_ply(source):
+        read = read_compressed_ply
+    return read(source).to(device)
 
 
 def save(scene: GaussianScene, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
     """Write a scene to a file, completely or not at all.
 
-    A scene that was loaded is written with the properties, their order, types and comments that
-    it came with, so that ``load(save(scene))`` gives the same bits.
+    A scene that was loaded from a PLY is written to one with the properties, their order, types
+    and comments that it came with, so that ``load(save(scene))`` gives the same bits. The other
+    formats round. What they cannot hold at all is warned about before anything is written
+    (:class:`cvtgs.errors.DroppedDataWarning`); :func:`cvtgs.io.losses` says it without writing.
 
     Args:
         scene: The scene, on any device.
-        path: The file to write; its suffix says the format (``.ply``).
+        path: The file to write; the end of its name says the format: ``.ply``,
+            ``.compressed.ply``, ``.spz``, ``.splat`` or ``.sog``.
         overwrite: Whether an existing file may be replaced.
 
     Raises:
-        FileFormatError: The format is unknown.
+        FileFormatError: The format is unknown or cannot be written.
         OutputExistsError: The file exists and may not be replaced.
         OutputError: The file cannot be written (directory missing, no permission, disk full).
         InvalidSceneError: Something in the scene has no place in the format.
@@ -92,9 +139,42 @@ def save(scene: GaussianScene, path: str | os.PathLike[str], *, overwrite: bool 
         ...     save(scene, Path(folder) / "two.ply")
         ...     save(scene, Path(folder) / "two.ply", overwrite=True)
     """
-    write = _format_of(Path(path)).write
+    write = _by_name(Path(path), _OUTPUTS).write
+    check_output(path, overwrite)
+    dropped = losses(scene, path).dropped
+    if dropped:
+        warnings.warn(
+            f"{os.fspath(path)}: files of this format do not hold {'; '.join(dropped)}.",
+            DroppedDataWarning,
+            stacklevel=2,
+        )
     with atomic_output(path, overwrite=overwrite) as file:
         write(scene, file)
+
+
+def losses(scene: GaussianScene, path: str | os.PathLike[str]) -> Losses:
+    """Say what of a scene a file would not hold, before it is written.
+
+    Args:
+        scene: The scene.
+        path: The file; only its name is looked at.
+
+    Returns:
+        What would be dropped, what rounded or reordered (nothing for a ``.ply``), how many
+        Gaussians are left, and of which SH degree.
+
+    Raises:
+        FileFormatError: The format is unknown or cannot be written.
+
+    Example:
+        >>> from cvtgs.synthetic import scene
+        >>> losses(scene("object", 10, sh_degree=1, seed=0), "small.splat").dropped
+        ('SH bands above degree 0 (the scene has degree 1)',)
+    """
+    holds = _by_name(Path(path), _OUTPUTS).holds
+    if holds is None:
+        return Losses(dropped=(), changed=(), count=len(scene), sh_degree=scene.sh_degree)
+    return losses_of(scene, holds)
 
 
 def check_save(path: str | os.PathLike[str], overwrite: bool = False) -> None:
@@ -105,7 +185,7 @@ def check_save(path: str | os.PathLike[str], overwrite: bool = False) -> None:
         overwrite: Whether an existing file may be replaced.
 
     Raises:
-        FileFormatError: The format is unknown.
+        FileFormatError: The format is unknown or cannot be written.
         OutputExistsError: The file exists and may not be replaced.
         OutputError: It is not a regular file, or its directory is missing or not writable.
 
@@ -114,18 +194,20 @@ def check_save(path: str | os.PathLike[str], overwrite: bool = False) -> None:
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     check_save(Path(folder) / "new.ply")
     """
-    _format_of(Path(path))
+    _by_name(Path(path), _OUTPUTS)
     check_output(path, overwrite)
 
 
-def _format_of(path: Path) -> _Format:
-    suffix = path.suffix.lower()
-    if suffix not in _FORMATS:
-        raise FileFormatError(
-            f"{path}: the file name must end in {' or '.join(_FORMATS)}, "
-            f"found {f'the suffix {path.suffix!r}' if suffix else 'no suffix'}."
-        )
-    return _FORMATS[suffix]
+def _by_name(path: Path, formats: Mapping[str, Entry]) -> Entry:
+    name = path.name.lower()
+    for end, one in formats.items():
+        if name.endswith(end):
+            return one
+    *ends, last = formats
+    raise FileFormatError(
+        f"{path}: the file name must end in {', '.join(ends)} or {last}, "
+        f"found {f'the suffix {path.suffix!r}' if path.suffix else 'no suffix'}."
+    )
 
 
 def _check_device(device: str | torch.device) -> None:

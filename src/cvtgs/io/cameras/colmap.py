@@ -9,8 +9,8 @@ import torch
 from cvtgs.errors import FileFormatError
 from cvtgs.io.cameras import colmap_binary, colmap_text
 from cvtgs.io.cameras.colmap_image import ColmapImage
-from cvtgs.io.cameras.files import is_file
 from cvtgs.io.cameras.views import Lens, View
+from cvtgs.io.files import is_file
 from cvtgs.math import quaternions
 
 

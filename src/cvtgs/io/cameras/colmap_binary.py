@@ -9,8 +9,8 @@ from typing import Any, BinaryIO
 from cvtgs.errors import FileFormatError
 from cvtgs.io.cameras.colmap_image import ColmapImage, checked_image
 from cvtgs.io.cameras.colmap_models import find_model, lens_of, model_name
-from cvtgs.io.cameras.files import open_input
 from cvtgs.io.cameras.views import Lens
+from cvtgs.io.files import open_input
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<iiQQ")

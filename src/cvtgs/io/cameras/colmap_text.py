@@ -8,8 +8,8 @@ from typing import BinaryIO
 from cvtgs.errors import FileFormatError
 from cvtgs.io.cameras.colmap_image import ColmapImage, checked_image
 from cvtgs.io.cameras.colmap_models import find_model, lens_of
-from cvtgs.io.cameras.files import open_input
 from cvtgs.io.cameras.views import Lens
+from cvtgs.io.files import open_input
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:

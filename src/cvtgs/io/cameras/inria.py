@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cvtgs.io.cameras.fields import Fields
 from cvtgs.io.cameras.views import Lens, View, checked_lens, viewmat_of_pose
+from cvtgs.io.fields import Fields
 
 
 def inria_views(entries: Sequence[Any], path: Path) -> list[View]:

@@ -6,11 +6,11 @@ from pathlib import Path
 from cvtgs.cameras import Cameras
 from cvtgs.errors import FileFormatError, InputNotFoundError, InvalidArgumentError
 from cvtgs.io.cameras.colmap import colmap_views, is_colmap
-from cvtgs.io.cameras.files import is_file, read_json
 from cvtgs.io.cameras.holdout import SPLITS, Split, hold_out
 from cvtgs.io.cameras.inria import inria_views
 from cvtgs.io.cameras.transforms import transforms_views
 from cvtgs.io.cameras.views import View, to_cameras
+from cvtgs.io.files import is_file, read_json
 
 _COLMAP_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 _LOOKED_FOR = (

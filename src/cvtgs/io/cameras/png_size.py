@@ -4,7 +4,7 @@ import struct
 from pathlib import Path
 
 from cvtgs.errors import FileFormatError
-from cvtgs.io.cameras.files import open_input
+from cvtgs.io.files import open_input
 
 _START = struct.Struct(">8sI4sII")
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from cvtgs.errors import FileFormatError, InvalidArgumentError
-from cvtgs.io.cameras.fields import Fields
-from cvtgs.io.cameras.files import is_file
 from cvtgs.io.cameras.holdout import SPLITS, Split, hold_out
 from cvtgs.io.cameras.png_size import png_size
 from cvtgs.io.cameras.views import Lens, View, checked_lens, viewmat_of_pose
+from cvtgs.io.fields import Fields
+from cvtgs.io.files import is_file
 
 _PINHOLE_MODELS = (
     "PINHOLE",

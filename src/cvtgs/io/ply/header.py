@@ -15,6 +15,7 @@ MAX_HEADER_BYTES = 1 << 20
 """Longer headers are refused; a 3DGS header has about two thousand bytes."""
 
 _MAX_COUNT_DIGITS = 18
+_MAX_NAME_LETTERS = 200
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,13 +122,15 @@ def read_header(file: BinaryIO, path: str) -> Header:
                 comments.append(line.lstrip()[len("comment ") :].rstrip())
             case ["format", kind, "1.0"] if encoding is None and kind in get_args(Encoding):
                 encoding = kind  # type: ignore[assignment]
-            case ["element", name, count] if _is_count(count):
+            case ["element", name, count] if _is_count(count) and _is_name(name):
                 tables.append((name, int(count), []))
-            case ["property", "list", length, kind, name] if tables and _is_list(length, kind):
+            case ["property", "list", length, kind, name] if (
+                tables and _is_list(length, kind) and _is_name(name)
+            ):
                 tables[-1][2].append(
                     Property(name=name, type=TYPE_NAMES[kind], count_type=TYPE_NAMES[length])
                 )
-            case ["property", kind, name] if tables and kind in TYPE_NAMES:
+            case ["property", kind, name] if tables and kind in TYPE_NAMES and _is_name(name):
                 tables[-1][2].append(Property(name=name, type=TYPE_NAMES[kind]))
             case _:
                 _refuse(path, number, line)
@@ -179,6 +182,11 @@ def _decode(line: bytes) -> str:
 
 def _is_count(text: str) -> bool:
     return text.isascii() and text.isdecimal() and len(text) <= _MAX_COUNT_DIGITS
+
+
+def _is_name(text: str) -> bool:
+    """Tell whether a name can stand in a sentence; real ones have some twenty letters."""
+    return len(text) <= _MAX_NAME_LETTERS
 
 
 def _is_list(length: str, kind: str) -> bool:

@@ -30,9 +30,9 @@ def find_vertices(header: Header, path: str) -> Element:
     """
     vertex = next((element for element in header.elements if element.name == "vertex"), None)
     if vertex is None:
-        found = ", ".join(repr(element.name) for element in header.elements) or "no element"
+        found = ", ".join(repr(element.name) for element in header.elements[:5]) or "no element"
+        found += ", ..." if len(header.elements) > 5 else ""
         raise FileFormatError(f"{path}: must have an element 'vertex', found {found}.")
-    _check_not_compressed(header, vertex, path)
     _check_properties(vertex, path)
     _check_rest(vertex, path)
     if vertex.count == 0:
@@ -88,17 +88,6 @@ def layout_of(vertex: Element) -> Layout:
         for prop in vertex.properties
         if prop.count_type is None
     )
-
-
-def _check_not_compressed(header: Header, vertex: Element, path: str) -> None:
-    names = {prop.name for prop in vertex.properties}
-    has_chunks = any(element.name == "chunk" for element in header.elements)
-    if "packed_position" in names or (has_chunks and "x" not in names):
-        raise FileFormatError(
-            f"{path}: must be an uncompressed PLY, found a compressed one (PlayCanvas: "
-            f"'packed_position'), which cvtgs does not read yet; convert it to a plain PLY first, "
-            f"for example with splat-transform."
-        )
 
 
 def _check_properties(vertex: Element, path: str) -> None:

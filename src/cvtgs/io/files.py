@@ -1,4 +1,4 @@
-"""Open the files of cameras, or say in one sentence why not."""
+"""Open the files of scenes and cameras, or say in one sentence why not."""
 
 import json
 import os
@@ -51,6 +51,30 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
         raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
 
 
+def read_bytes(path: Path) -> bytes:
+    """Read a whole file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its content.
+
+    Raises:
+        InputNotFoundError: There is no such file.
+        InputError: It cannot be opened or read.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = (Path(folder) / "a").write_bytes(b"text")
+        ...     read_bytes(Path(folder) / "a")
+        b'text'
+    """
+    with open_input(path) as file:
+        return file.read()
+
+
 def read_json(path: Path) -> Any:
     """Parse a JSON file.
 
@@ -72,8 +96,26 @@ def read_json(path: Path) -> Any:
         ...     read_json(Path(folder) / "a.json")
         [1, 2]
     """
-    with open_input(path) as file:
-        data = file.read()
+    return parse_json(read_bytes(path), path)
+
+
+def parse_json(data: bytes, path: str | Path) -> Any:
+    """Parse JSON that is read already.
+
+    Args:
+        data: The text; UTF-8, with or without a byte order mark.
+        path: Where it stands, for error texts.
+
+    Returns:
+        What is in it.
+
+    Raises:
+        FileFormatError: It is not JSON.
+
+    Example:
+        >>> parse_json(b"[1, 2]", "a.json")
+        [1, 2]
+    """
     try:
         return json.loads(data.decode("utf-8-sig"))
     except json.JSONDecodeError as error:

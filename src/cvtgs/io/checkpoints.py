@@ -1,0 +1,125 @@
+"""Checkpoints of gsplat's trainer and of nerfstudio's Splatfacto: scenes before the export."""
+
+import pickle
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from cvtgs.errors import FileFormatError, InvalidSceneError
+from cvtgs.io.dicts import from_dict
+from cvtgs.io.files import open_input
+from cvtgs.math.spherical_harmonics import SH_C0
+from cvtgs.scene import GaussianScene
+
+_NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN", "features_dc", "features_rest")
+_PREFIXES = ("", "_model.gauss_params.", "_model.", "module._model.gauss_params.")
+
+
+def read_checkpoint(path: Path) -> GaussianScene:
+    """Read the scene of a checkpoint.
+
+    Two kinds are known: ``step-000029999.ckpt`` of nerfstudio, which holds the scene under
+    ``pipeline`` as ``_model.gauss_params.means`` (``_model.means`` before 2024) and so on; and
+    ``ckpt_29999_rank0.pt`` of gsplat's examples, which holds it under ``splats``. Nothing in the
+    file is executed, and only the scene is loaded, not the state of the optimiser. Splatfacto
+    trains colours without SH through a sigmoid; these become ordinary colours.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The scene, on the CPU. Whether it was trained with anti-aliasing is not in the file.
+
+    Raises:
+        InputNotFoundError: There is no such file.
+        InputError: It cannot be opened or read.
+        FileFormatError: It is not a checkpoint of a scene, or damaged.
+    """
+    tensors, splatfacto = _scene_tensors(_unpickled(path), path)
+    try:
+        scene = from_dict({name: tensor.clone() for name, tensor in tensors.items()})
+    except InvalidSceneError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    if splatfacto and scene.sh_degree == 0:
+        colors = torch.sigmoid(scene.sh0)
+        return scene.with_tensors({"sh0": (colors - 0.5) / SH_C0}, {})
+    return scene
+
+
+def _scene_tensors(content: Any, path: Path) -> tuple[dict[str, Tensor], bool]:
+    """Find the tensors, and say whether Splatfacto trained them."""
+    groups = content if isinstance(content, Mapping) else {}
+    for group in ("splats", "pipeline"):
+        state = groups.get(group)
+        if not isinstance(state, Mapping):
+            continue
+        for prefix in _PREFIXES:
+            tensors = {name: state[prefix + name] for name in _NAMES if prefix + name in state}
+            if "means" in tensors:
+                return tensors, "features_dc" in tensors
+    raise FileFormatError(
+        f"{path}: a checkpoint must hold a scene under 'splats' (gsplat) or "
+        f"'pipeline' (nerfstudio's Splatfacto), found {', '.join(map(repr, groups)) or 'neither'}."
+    )
+
+
+def _unpickled(path: Path) -> Any:
+    """Map the file into memory, so that only what is copied is read."""
+    with open_input(path) as file:
+        if not zipfile.is_zipfile(file):
+            raise FileFormatError(
+                f"{path}: must be a checkpoint that torch.save wrote as a zip, found another file."
+            )
+    try:
+        with _numpy_numbers_ignored():
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
+        reason = str(error).strip().splitlines()[0].rstrip(".")
+        raise FileFormatError(
+            f"{path}: must be a whole checkpoint of tensors and plain numbers, found: {reason}."
+        ) from error
+
+
+class _IgnoredType:
+    """Stands in for the types of numpy numbers."""
+
+    def __init__(self, *_: Any) -> None:
+        pass
+
+    def __setstate__(self, state: Any) -> None:
+        pass
+
+
+def _ignored_number(module: str) -> Any:
+    """Stand in for the maker of numpy numbers, which lives in another module since numpy 2."""
+
+    def scalar(*_: Any) -> float:
+        return 0.0
+
+    scalar.__module__, scalar.__qualname__ = module, "scalar"
+    return scalar
+
+
+@contextmanager
+def _numpy_numbers_ignored() -> Iterator[None]:
+    """Let torch's restricted reader pass the learning rates that schedulers leave behind.
+
+    They are numpy numbers, which it refuses. It gets makers of nothing by the same names instead.
+    """
+    stand_ins = [
+        _ignored_number("numpy.core.multiarray"),
+        _ignored_number("numpy._core.multiarray"),
+        type("dtype", (_IgnoredType,), {"__module__": "numpy"}),
+    ]
+    before = torch.serialization.get_safe_globals()
+    torch.serialization.add_safe_globals(stand_ins)
+    try:
+        yield
+    finally:
+        torch.serialization.clear_safe_globals()
+        torch.serialization.add_safe_globals(before)

@@ -1,0 +1,138 @@
+"""Choose the few numbers and the few colour functions that a SOG stores."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from numpy.typing import NDArray
+
+CODES = 256
+PALETTE = 1 << 16
+_ITERATIONS = 30
+_KNOTS = 4096
+
+
+class Codebook(NamedTuple):
+    """Numbers, and which of them stands for each value.
+
+    Attributes:
+        codes: ``(256,)`` numbers, ascending.
+        labels: Bytes of the shape of the values.
+    """
+
+    codes: Float[np.ndarray, "256"]
+    labels: UInt8[np.ndarray, "*n"]
+
+
+def codebook(values: Float[np.ndarray, "*n"]) -> Codebook:
+    """Find 256 numbers that values are rounded to with little squared error.
+
+    One-dimensional k-means (Lloyd 1982) on the sorted values, from codes whose density follows
+    the cube root of that of the values (Panter and Dite 1951). Up to 256 different values are
+    kept. Memory: three copies of the values in float64.
+
+    Args:
+        values: Finite numbers.
+
+    Returns:
+        The numbers and the label of each value.
+
+    Example:
+        >>> codes, labels = codebook(np.array([[0.0, 1.0], [1.0, 5.0]]))
+        >>> codes[labels].tolist()
+        [[0.0, 1.0], [1.0, 5.0]]
+    """
+    ordered = np.sort(values, axis=None).astype(np.float64)
+    sums = np.concatenate([[0.0], np.cumsum(ordered)])
+    codes = _first_codes(ordered)
+    for _ in range(_ITERATIONS):
+        inner = np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2)
+        bounds = np.concatenate([[0], inner, [len(ordered)]])
+        counts = np.diff(bounds)
+        means = np.diff(sums[bounds]) / np.maximum(counts, 1)
+        codes = np.sort(np.where(counts > 0, means, codes))
+    codes = codes.astype(np.float32)
+    labels = np.searchsorted((codes[1:] + codes[:-1]) / 2, values).astype(np.uint8)
+    return Codebook(codes, labels)
+
+
+def _first_codes(ordered: Float[np.ndarray, "n"]) -> Float[np.ndarray, "256"]:
+    different = np.flatnonzero(np.diff(ordered, prepend=-np.inf))
+    if len(different) <= CODES:
+        few: Float[np.ndarray, 256] = ordered[different]
+        return np.pad(few, (0, CODES - len(few)), "edge")
+    count = min(len(ordered), _KNOTS)
+    knots = ordered[np.linspace(0, len(ordered) - 1, count).round().astype(np.int64)]
+    passed = np.concatenate([[0.0], np.cumsum(np.diff(knots) ** (2 / 3))])
+    codes: Float[np.ndarray, 256] = np.interp(np.linspace(0, passed[-1], CODES), passed, knots)
+    return codes
+
+
+class Palette(NamedTuple):
+    """Rows that stand for many rows.
+
+    Attributes:
+        entries: ``(p, d)`` with p at most 65,536.
+        labels: ``(n,)`` which entry stands for each row.
+    """
+
+    entries: Float[np.ndarray, "p d"]
+    labels: Int[np.ndarray, "n"]
+
+
+def palette(rows: Float[np.ndarray, "n d"], most: int = PALETTE) -> Palette:
+    """Find few rows that stand for many.
+
+    Up to ``most`` rows stand for themselves. More are halved again and again, each group at the
+    mean of its most varied column (Wu 1991, in all groups at once); entries are means of groups.
+    This takes seconds for a million rows, where k-means would take an hour on a CPU. Memory: two
+    copies of the rows.
+
+    Args:
+        rows: Finite numbers.
+        most: A power of two.
+
+    Returns:
+        The entries and the label of each row.
+
+    Example:
+        >>> rows = np.array([[0.0], [0.1], [5.0], [5.1]])
+        >>> palette(rows, 2).entries.round(2).tolist()
+        [[0.05], [5.05]]
+    """
+    if len(rows) <= most:
+        return Palette(rows, np.arange(len(rows)))
+    order, starts = np.arange(len(rows)), np.zeros(1, np.int64)
+    for _ in range(most.bit_length() - 1):
+        order, starts = _halved(rows, order, starts)
+    groups = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(rows))))
+    labels = np.empty(len(rows), np.int64)
+    labels[order] = groups
+    return Palette(_means(rows[order], starts).astype(rows.dtype), labels)
+
+
+def _halved(
+    rows: Float[np.ndarray, "n d"], order: NDArray[np.int64], starts: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Split every group that is not constant; give the new order and the new starts."""
+    sorted_rows = rows[order]
+    counts = np.diff(np.append(starts, len(rows)))
+    means = _means(sorted_rows, starts)
+    squares = np.add.reduceat(np.square(sorted_rows), starts, axis=0, dtype=np.float64)
+    column = (squares / counts[:, None] - np.square(means)).argmax(axis=1)
+    groups = np.repeat(np.arange(len(starts)), counts)
+    values = sorted_rows[np.arange(len(rows)), column[groups]]
+    above = values > means[np.arange(len(starts)), column].astype(rows.dtype)[groups]
+    key = 2 * groups + above
+    step = np.argsort(key, kind="stable")
+    new_starts = np.flatnonzero(np.diff(key[step], prepend=-1))
+    return order[step], new_starts
+
+
+def _means(
+    sorted_rows: Float[np.ndarray, "n d"], starts: NDArray[np.int64]
+) -> Float[np.ndarray, "g d"]:
+    counts = np.diff(np.append(starts, len(sorted_rows)))
+    sums = np.add.reduceat(sorted_rows, starts, axis=0, dtype=np.float64)
+    means: Float[np.ndarray, "g d"] = sums / counts[:, None]
+    return means

@@ -1,0 +1,92 @@
+"""Where the files of a SOG lie: in a zip, or beside ``meta.json``."""
+
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path, PurePosixPath
+
+from cvtgs.errors import FileFormatError
+from cvtgs.io.files import open_input, read_bytes
+
+META = "meta.json"
+_MOST_META_BYTES = 1 << 24
+
+Reader = Callable[[str, int], bytes]
+"""Gives the content of a file by its name, unless it is longer than so many bytes."""
+
+
+def open_container(path: Path) -> AbstractContextManager[Reader]:
+    """Open a bundled or an unbundled SOG.
+
+    Args:
+        path: The ``.sog`` file, or the ``meta.json``.
+
+    Returns:
+        A context that gives the files by name.
+    """
+    return _beside(path) if path.name == META else _inside(path)
+
+
+def read_meta(read: Reader) -> bytes:
+    """Read the ``meta.json``.
+
+    Args:
+        read: The open container.
+
+    Returns:
+        Its text.
+    """
+    return read(META, _MOST_META_BYTES)
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[Reader]:
+    def read(name: str, most: int) -> bytes:
+        _check_name(name, path)
+        content = read_bytes(path.with_name(name))
+        if len(content) > most:
+            raise _too_long(f"{path.with_name(name)}", most, len(content))
+        return content
+
+    yield read
+
+
+@contextmanager
+def _inside(path: Path) -> Iterator[Reader]:
+    with open_input(path) as file:
+        try:
+            archive = zipfile.ZipFile(file)
+        except (zipfile.BadZipFile, ValueError) as error:
+            raise FileFormatError(
+                f"{path}: a .sog file must be a zip of meta.json and images, found none: "
+                f"{str(error).lower()}."
+            ) from error
+
+        def read(name: str, most: int) -> bytes:
+            _check_name(name, path)
+            try:
+                size = archive.getinfo(name).file_size
+                if size > most:
+                    raise _too_long(f"{path}: {name}", most, size)
+                with archive.open(name) as member:
+                    return member.read(most)
+            except KeyError as error:
+                raise FileFormatError(f"{path}: must contain {name}, found none.") from error
+            except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+                raise FileFormatError(
+                    f"{path}: {name} must be whole, found damage: {error}."
+                ) from error
+
+        with archive:
+            yield read
+
+
+def _check_name(name: str, path: Path) -> None:
+    if PurePosixPath(name).name != name or "\\" in name:
+        raise FileFormatError(
+            f"{path}: the files of a SOG must be named without folders, found {name!r}."
+        )
+
+
+def _too_long(where: str, most: int, found: int) -> FileFormatError:
+    return FileFormatError(f"{where} must have at most {most:,} bytes, found {found:,}.")

@@ -1,0 +1,119 @@
+"""The ``.splat`` files of antimatter15's viewer: 32 bytes per Gaussian, nothing else."""
+
+import os
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from cvtgs.errors import FileFormatError
+from cvtgs.io.arrays import (
+    Arrays,
+    arrays_of,
+    colors_of_sh0,
+    logits_of_bytes,
+    opacity_bytes,
+    scene_of,
+    sh0_of_colors,
+    to_bytes,
+    unit_quats,
+)
+from cvtgs.io.files import open_input
+from cvtgs.io.holds import Holds
+from cvtgs.scene import GaussianScene
+
+_ROW = np.dtype(
+    [
+        ("mean", "<f4", 3),
+        ("scale", "<f4", 3),
+        ("rgb", "u1", 3),
+        ("opacity", "u1"),
+        ("quat", "u1", 4),
+    ]
+)
+_CHUNK_ROWS = 1 << 16
+_LEAST_SCALE = np.finfo(np.float32).tiny
+
+SPLAT_HOLDS = Holds(
+    sh_degree=0,
+    tag=False,
+    # colours in [0, 1] and half a step; scales that are float32
+    limits={"sh0": (-1.7794, 1.7794), "log_scales": (-87.3, 88.7)},
+    changed=(
+        "colours and opacities in steps of 1/255",
+        "rotations in steps of 1/128 per component",
+    ),
+)
+"""What a ``.splat`` file holds."""
+
+
+def read_splat(path: Path) -> GaussianScene:
+    """Read a ``.splat`` file.
+
+    A Gaussian is three f32 of position, three f32 of scale (not its logarithm), and bytes:
+    red, green, blue, opacity, and the quaternion, w first, as ``128 + 128 q``.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The scene, of SH degree 0. Numbers are returned as they are, NaN and infinity too; a
+        scale of 0 becomes the least normal float32.
+
+    Raises:
+        InputNotFoundError: There is no such file.
+        InputError: It cannot be opened or read.
+        FileFormatError: It is empty or not a whole number of Gaussians.
+    """
+    with open_input(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size == 0 or size % _ROW.itemsize:
+            raise FileFormatError(
+                f"{path}: a .splat file must be one or more Gaussians of {_ROW.itemsize} bytes, "
+                f"found {size:,} bytes."
+            )
+        rows = np.fromfile(file, _ROW)
+    with np.errstate(invalid="ignore"):
+        log_scales = np.log(np.maximum(rows["scale"], _LEAST_SCALE))
+    return scene_of(
+        Arrays(
+            means=rows["mean"],
+            quats=unit_quats((rows["quat"].astype(np.float32) - 128) / np.float32(128)),
+            log_scales=log_scales,
+            logit_opacities=logits_of_bytes(rows["opacity"]),
+            sh0=sh0_of_colors(rows["rgb"].astype(np.float32) / np.float32(255)),
+            shN=np.empty((len(rows), 0, 3), np.float32),
+        )
+    )
+
+
+def write_splat(scene: GaussianScene, file: BinaryIO) -> None:
+    """Write a ``.splat`` file, in the order of the scene.
+
+    Args:
+        scene: The scene, on any device; only SH degree 0 is written.
+        file: Where to, open for writing.
+
+    Raises:
+        InvalidSceneError: No Gaussian of the scene is finite.
+        OSError: The file cannot be written.
+
+    Example:
+        >>> import io
+        >>> from cvtgs.synthetic import scene
+        >>> file = io.BytesIO()
+        >>> write_splat(scene("object", 5, sh_degree=0, seed=0), file)
+        >>> len(file.getvalue())
+        160
+    """
+    arrays = arrays_of(scene, sh_degree=0)
+    for start in range(0, len(arrays.means), _CHUNK_ROWS):
+        part = slice(start, start + _CHUNK_ROWS)
+        rows = np.empty(len(arrays.means[part]), _ROW)
+        rows["mean"] = arrays.means[part]
+        with np.errstate(over="ignore"):
+            rows["scale"] = np.exp(arrays.log_scales[part])
+        rows["rgb"] = to_bytes(255 * colors_of_sh0(arrays.sh0[part]))
+        rows["opacity"] = opacity_bytes(arrays.logit_opacities[part])
+        rows["quat"] = to_bytes(128 + 128 * arrays.quats[part])
+        file.write(rows.tobytes())

@@ -1,0 +1,103 @@
+"""The blocks of an ``.spz`` file: header, sizes, axes."""
+
+import struct
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from cvtgs.io.arrays import Arrays
+
+Axes = Literal["RUB", "RDF"]
+"""Where x, y and z point: right, up, back, as Niantic's files do; right, down, forward, as PLYs."""
+
+MAGIC = 0x5053474E
+HEADER = struct.Struct("<IIIBBBB")
+ANTIALIASED_FLAG = 1
+EXTENSIONS_FLAG = 2
+COLOR_SCALE = np.float32(0.15)
+"""Bytes of colour are ``0.5 + 0.15 sh0``, so that they hold more than what can be shown."""
+
+STORED_REST_COUNTS = (0, 3, 8, 15, 24)
+"""View-dependent coefficients per channel that files may hold, by degree."""
+
+# Half a turn about x takes right-down-forward to right-up-back and back. It changes the sign of
+# y and z, and of every SH function that is odd in y and z together.
+_SIGNS = np.array([1, -1, -1], np.float32)
+_SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpzHeader:
+    """What an ``.spz`` file says of itself.
+
+    Attributes:
+        version: 1 to 4.
+        count: Number of Gaussians.
+        sh_degree: 0 to 4.
+        fractional_bits: Binary places of coordinates.
+        flags: Antialiased, extensions.
+        streams: Number of compressed blocks of version 4; reserved before.
+    """
+
+    version: int
+    count: int
+    sh_degree: int
+    fractional_bits: int
+    flags: int
+    streams: int = 0
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether the scene was trained with anti-aliasing."""
+        return bool(self.flags & ANTIALIASED_FLAG)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Bytes of each block, in the order of the file."""
+        per_row = {
+            "means": 6 if self.version == 1 else 9,
+            "opacities": 1,
+            "colors": 3,
+            "log_scales": 3,
+            "quats": 3 if self.version < 3 else 4,
+            "sh": 3 * STORED_REST_COUNTS[self.sh_degree],
+        }
+        return {name: self.count * size for name, size in per_row.items()}
+
+    def packed(self) -> bytes:
+        """Give the first 16 bytes of the file.
+
+        Returns:
+            The bytes.
+        """
+        return HEADER.pack(
+            MAGIC,
+            self.version,
+            self.count,
+            self.sh_degree,
+            self.fractional_bits,
+            self.flags,
+            self.streams,
+        )
+
+
+def turned(arrays: Arrays) -> Arrays:
+    """Turn a scene by half a turn about x: between right-up-back and right-down-forward axes.
+
+    Args:
+        arrays: The scene.
+
+    Returns:
+        The turned scene; turned twice it is itself.
+    """
+    quats = arrays.quats.copy()
+    quats[:, 1:] *= _SIGNS  # of y z, x z and x y, which are the same
+    return Arrays(
+        means=arrays.means * _SIGNS,
+        quats=quats,
+        log_scales=arrays.log_scales,
+        logit_opacities=arrays.logit_opacities,
+        sh0=arrays.sh0,
+        shN=arrays.shN * _SH_SIGNS[: arrays.shN.shape[1], None],
+    )

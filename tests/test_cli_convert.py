@@ -1,0 +1,109 @@
+"""``cvtgs convert``, and other formats in other commands."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from cvtgs import load, save
+from cvtgs.cli.main import main
+from cvtgs.io import Losses, losses
+from format_cases import DATA, storable_scene
+
+FORMATS = ("ply", "compressed.ply", "spz", "splat", "sog")
+
+
+def test_what_is_lost_is_said_before_it_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, target = DATA / "source.ply", tmp_path / "a.splat"
+    assert main(["convert", str(source), str(target)]) == 0
+    printed = capsys.readouterr()
+    dropped = (
+        "SH bands above degree 0 (the scene has degree 3); the tag 'SplatRenderMode: mip', without "
+        "which viewers show the scene too sharp"
+    )
+    assert printed.err == (
+        f"cvtgs: warning: {target}: files of this format do not hold {dropped}.\n"
+    )
+    assert printed.out == (
+        f"{source}: 40 Gaussians of SH degree 3\n"
+        "Files like a.splat hold:\n"
+        "  colours and opacities in steps of 1/255\n"
+        "  rotations in steps of 1/128 per component\n"
+        f"{target}: 40 Gaussians of SH degree 0, 11.5 kB -> 1.3 kB\n"
+        f"Lost: {dropped}.\n"
+    )
+
+
+def test_nothing_is_lost_in_a_ply(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, target = DATA / "source.ply", tmp_path / "a.ply"
+    assert main(["convert", str(source), str(target)]) == 0
+    assert capsys.readouterr().out == (
+        f"{source}: 40 Gaussians of SH degree 3\n"
+        f"{target}: 40 Gaussians of SH degree 3, 11.5 kB -> 11.5 kB\n"
+        "Lost: nothing.\n"
+    )
+    assert target.read_bytes() == source.read_bytes()
+
+
+def test_quiet_warns_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["convert", str(DATA / "source.ply"), "--quiet"]
+    assert main([*words, str(tmp_path / "a.spz")]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert main([*words, str(tmp_path / "a.splat")]) == 0
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("cvtgs: warning: ")
+
+
+def test_outputs_are_not_replaced_unasked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["convert", str(DATA / "source.ply"), str(tmp_path / "a.sog"), "--quiet"]
+    assert [main(words), main(words), main([*words, "--overwrite"])] == [0, 1, 0]
+    assert "must not exist yet" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["a.ckpt", "a.xyz"])
+def test_what_cannot_be_written_is_refused_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    assert main(["convert", str(tmp_path / "missing.ply"), str(tmp_path / name)]) == 1
+    assert "must end in .compressed.ply, .ply, .spz, .splat or .sog" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("first", FORMATS)
+@pytest.mark.parametrize("second", FORMATS)
+def test_every_format_into_every_other(tmp_path: Path, first: str, second: str) -> None:
+    scene = replace(storable_scene(30, degree=0), comments=())
+    save(scene, tmp_path / f"a.{first}")
+    words = ["convert", str(tmp_path / f"a.{first}"), str(tmp_path / f"b.{second}"), "--quiet"]
+    assert main(words) == 0
+    again = load(tmp_path / f"b.{second}")
+    assert len(again) == 30
+    distances = torch.cdist(scene.means, again.means).amin(dim=1)
+    assert float(distances.max()) < 0.01
+
+
+@pytest.mark.parametrize("end", FORMATS[1:])
+def test_simplify_and_info_take_every_format(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], end: str
+) -> None:
+    scene = replace(storable_scene(300, degree=0), comments=())
+    save(scene, tmp_path / f"a.{end}")
+    words = [str(tmp_path / f"a.{end}"), str(tmp_path / f"b.{end}")]
+    assert main(["simplify", *words, "--count", "20", "--ckpt", "none"]) == 0
+    assert "300 -> 20 Gaussians" in capsys.readouterr().out
+    assert main(["info", words[1]]) == 0
+    assert "Gaussians        20" in capsys.readouterr().out
+
+
+def test_losses_of_a_ply_are_none() -> None:
+    scene = storable_scene(3)
+    assert losses(scene, "a.ply") == Losses(dropped=(), changed=(), count=3, sh_degree=3)
+    assert losses(scene, "A.SPLAT").sh_degree == 0
+    other = replace(scene, comments=("made by hand", "SplatRenderMode: mip"))
+    assert losses(other, "a.spz").changed[-1] == "without 1 comment"
+    assert losses(other, "a.spz").dropped == ()

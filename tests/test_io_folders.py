@@ -1,0 +1,98 @@
+"""Folders of trained models."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from cvtgs import load, load_cameras, save, to_dict
+from cvtgs.cli.main import main
+from cvtgs.errors import InputError
+from cvtgs.io import scene_file, scene_size
+from format_cases import DATA
+from scenes import random_scene
+
+
+def inria_model(folder: Path, iterations: tuple[int, ...] = (7000, 30000)) -> Path:
+    """Write a model as INRIA's code does, with as many Gaussians as thousands of iterations."""
+    for iteration in iterations:
+        part = folder / "point_cloud" / f"iteration_{iteration}"
+        part.mkdir(parents=True)
+        save(random_scene(iteration // 1000, degree=1), part / "point_cloud.ply")
+    cameras = [
+        {
+            "id": i, "img_name": f"{i:05}", "width": 64, "height": 48, "fx": 60.0, "fy": 60.0,
+            "position": [0.0, 0.0, -4.0 - i], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        }
+        for i in range(12)
+    ]  # fmt: skip
+    (folder / "cameras.json").write_text(json.dumps(cameras))
+    (folder / "cfg_args").write_text("Namespace()")
+    return folder
+
+
+def test_the_largest_iteration_counts(tmp_path: Path) -> None:
+    model = inria_model(tmp_path / "model", (7000, 30000, 9000))
+    assert scene_file(model) == model / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    assert len(load(model)) == 30
+    assert scene_size(model) == scene_file(model).stat().st_size
+    shutil.rmtree(model / "point_cloud" / "iteration_30000")
+    (model / "point_cloud" / "iteration_30000").mkdir()  # training was stopped while it saved
+    (model / "point_cloud" / "iteration_last").mkdir()
+    assert len(load(model)) == 9
+
+
+def test_its_cameras_are_found(tmp_path: Path) -> None:
+    assert len(load_cameras(inria_model(tmp_path))) == 12
+
+
+def test_splatfacto_runs(tmp_path: Path) -> None:
+    steps = tmp_path / "nerfstudio_models"
+    steps.mkdir()
+    for step, count in ((999, 3), (29999, 5)):
+        state = {"step": step, "splats": to_dict(random_scene(count))}
+        torch.save(state, steps / f"step-{step:09}.ckpt")
+    assert len(load(tmp_path)) == len(load(steps)) == 5
+
+
+def test_other_folders(tmp_path: Path) -> None:
+    shutil.copy(DATA / "source.ply", tmp_path / "point_cloud.ply")
+    assert len(load(tmp_path)) == 40
+    with pytest.raises(InputError, match="found a directory without"):
+        load(tmp_path.parent / tmp_path.name / "..")
+
+
+def test_the_size_of_an_unbundled_sog(tmp_path: Path) -> None:
+    shutil.unpack_archive(DATA / "splat-transform.sog", tmp_path, "zip")
+    assert scene_size(tmp_path) == sum(file.stat().st_size for file in tmp_path.iterdir())
+
+
+def test_commands_take_the_folder_and_its_cameras(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, small = inria_model(tmp_path / "model"), tmp_path / "small.spz"
+    assert main(["simplify", str(model), str(small), "--count", "20", "--ckpt", "none"]) == 0
+    assert "30 -> 20 Gaussians" in capsys.readouterr().out
+    assert main(["info", str(model)]) == 0
+    assert "Gaussians        30" in capsys.readouterr().out
+    words = [
+        str(model),
+        str(small),
+        "--size",
+        "32",
+        "--lpips",
+        "off",
+        "--json",
+        "--backend",
+        "torch",
+    ]
+    assert main(["evaluate", *words]) == 0
+    views = json.loads(capsys.readouterr().out)["views"]
+    assert views == ["00000", "00001", "00003", "00004", "00006", "00007", "00009", "00010"]
+    assert main(["evaluate", *words, "--cameras", str(model), "--views", "2"]) == 0
+    assert json.loads(capsys.readouterr().out)["views"] == ["00000", "00006"]
+    assert main(["evaluate", *words, "--views", "1"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["views"], found["width"], found["height"]) == (["00000"], 32, 24)

@@ -1,0 +1,269 @@
+"""SOG: bundled and not, version 1 and 2."""
+
+import json
+import math
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cvtgs import load, save
+from cvtgs.errors import FileFormatError, InputNotFoundError
+from cvtgs.io.sog.codebook import codebook, palette
+from cvtgs.io.webp import encode_webp
+from format_cases import (
+    DATA,
+    assert_as_oracle,
+    assert_within,
+    nearest_rows,
+    refusal,
+    storable_scene,
+)
+from format_oracles import read_sog
+
+THEIRS = DATA / "splat-transform.sog"
+
+
+def unpacked(folder: Path, source: Path = THEIRS) -> Path:
+    """Unpack a bundle; give its meta.json."""
+    with zipfile.ZipFile(source) as archive:
+        archive.extractall(folder)
+    return folder / "meta.json"
+
+
+def changed(folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    """Unpack the bundle and change its meta.json."""
+    path = unpacked(folder)
+    meta = json.loads(path.read_text())
+    change(meta)
+    path.write_text(json.dumps(meta))
+    return path
+
+
+def test_file_of_splat_transform() -> None:
+    scene, source = load(THEIRS), load(DATA / "source.ply")
+    assert_as_oracle(scene, read_sog(THEIRS))
+    assert scene.comments == ("SplatRenderMode: mip",)
+    assert scene.sh_degree == 1
+    bounds = {"means": 2e-3, "log_scales": 0.02, "opacities": 1 / 255, "sh0": 0.05, "angle": 0.03}
+    assert_within(source, nearest_rows(source, scene), bounds)
+
+
+def test_unbundled_by_file_and_by_folder(tmp_path: Path) -> None:
+    path, scene = unpacked(tmp_path), load(THEIRS)
+    for source in (path, tmp_path):
+        for name, tensor in load(source).tensors().items():
+            assert torch.equal(tensor, scene.tensors()[name])
+
+
+def image(rows: list[list[int]]) -> bytes:
+    return encode_webp(np.array(rows, np.uint8).reshape(1, -1, 4))
+
+
+def test_version_1_by_hand(tmp_path: Path) -> None:
+    """Two Gaussians; numbers lie in equal steps between a least and a largest."""
+    meta = {
+        "means": {
+            "shape": [2, 3], "mins": [0, 0, -math.log(3)], "maxs": [math.log(2), 1, 0],
+            "files": ["l.webp", "u.webp"],
+        },
+        "scales": {"shape": [2, 3], "mins": [-5, -4, -3], "maxs": [0, 0, 0], "files": ["s.webp"]},
+        "quats": {"shape": [2, 4], "files": ["q.webp"]},
+        "sh0": {"mins": [-1, -1, -1, -4], "maxs": [1, 1, 1, 4], "files": ["c.webp"]},
+        "shN": {"mins": -2, "maxs": 2, "files": ["p.webp", "i.webp"]},
+    }  # fmt: skip
+    (tmp_path / "meta.json").write_text(json.dumps(meta))
+    files = {
+        "l": [[255, 0, 0, 255], [0, 0, 255, 255]],
+        "u": [[255, 0, 0, 255], [0, 0, 255, 255]],
+        "s": [[255, 0, 255, 255], [0, 255, 0, 255]],
+        "q": [[128, 128, 128, 253], [1, 2, 3, 7]],  # half a turn about x; no rotation
+        "c": [[255, 0, 0, 255], [0, 255, 0, 0]],
+        "i": [[1, 0, 0, 255], [0, 0, 0, 255]],
+    }
+    for name, rows in files.items():
+        (tmp_path / f"{name}.webp").write_bytes(image(rows))
+    pixels = np.zeros((1, 192, 4), np.uint8)
+    pixels[0, 3:6, 0] = 255
+    (tmp_path / "p.webp").write_bytes(encode_webp(pixels))
+    scene = load(tmp_path)
+    torch.testing.assert_close(scene.means, torch.tensor([[1.0, 0, -2], [0, 0, 0]]))
+    torch.testing.assert_close(scene.log_scales, torch.tensor([[0.0, -4, 0], [-5, 0, -3]]))
+    assert scene.logit_opacities.tolist() == [4, -4]
+    assert scene.sh0[:, 0].tolist() == [[1, -1, -1], [-1, 1, -1]]
+    assert scene.shN.tolist() == [[[2, -2, -2]] * 3, [[-2, -2, -2]] * 3]
+    half_turn = torch.tensor([[0.0, 1, 0, 0], [1, 0, 0, 0]])
+    torch.testing.assert_close(scene.quats, half_turn, rtol=0, atol=3e-3)
+
+
+@settings(max_examples=15, deadline=None)
+@given(count=st.integers(1, 80), seed=st.integers(0, 1000), degree=st.integers(0, 3))
+def test_round_trip(
+    tmp_path_factory: pytest.TempPathFactory, count: int, seed: int, degree: int
+) -> None:
+    path = tmp_path_factory.mktemp("sog") / "a.sog"
+    scene = storable_scene(count, seed=seed, degree=degree)
+    save(scene, path)
+    again = load(path)
+    assert_as_oracle(again, read_sog(path))
+    bounds = {
+        "means": 1e-3,
+        "log_scales": 0.03,
+        "opacities": 0.5 / 255 + 1e-6,
+        "sh0": 0.03,
+        "shN": 0.02,
+        "angle": 0.02,
+    }
+    assert_within(scene, nearest_rows(scene, again), bounds)
+    assert again.antialiased
+
+
+def test_the_same_scene_gives_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a.sog", "b.sog"):
+        save(storable_scene(50), tmp_path / name)
+    assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
+
+
+def test_faint_gaussians_keep_their_colour(tmp_path: Path) -> None:
+    """Pixels of opacity 0 must not be blackened by the encoder."""
+    scene = storable_scene(20, degree=0)
+    hidden = scene.with_tensors({"logit_opacities": scene.logit_opacities * 0 - 30}, {})
+    save(hidden, tmp_path / "a.sog")
+    again = nearest_rows(scene, load(tmp_path / "a.sog"))
+    assert_within(scene, again, {"sh0": 0.03})
+
+
+def test_codebook_against_no_codebook_at_all() -> None:
+    rng = np.random.default_rng(0)
+    values = np.append(rng.normal(size=(5000, 3)), [[9.0, -9, 30]], axis=0)
+    codes, labels = codebook(values)
+    assert codes.shape == (256,)
+    assert np.all(np.diff(codes) >= 0)
+    error = np.abs(codes[labels] - values)
+    assert error.max() < 0.3
+    uniform = np.linspace(-9, 30, 256)
+    coarse = np.abs(uniform[:, None] - values.ravel()).min(axis=0)
+    assert np.square(error).mean() < 0.05 * np.square(coarse).mean()
+
+
+@pytest.mark.parametrize("values", [np.zeros((3, 3)), np.array([[1.0, 2.0, 2.0]])])
+def test_few_values_are_kept(values: np.ndarray) -> None:
+    codes, labels = codebook(values)
+    assert np.array_equal(codes[labels], values)
+
+
+def test_palette_of_many_rows() -> None:
+    rng = np.random.default_rng(0)
+    centres = rng.normal(size=(16, 9))
+    rows = centres[rng.integers(0, 16, 4000)] + 1e-3 * rng.normal(size=(4000, 9))
+    entries, labels = palette(rows, 64)
+    assert len(entries) <= 64
+    assert np.abs(entries[labels] - rows).max() < 0.01
+    few, same = palette(rows[:5], 64)
+    assert np.array_equal(few[same], rows[:5])
+
+
+def test_equal_rows_need_one_entry() -> None:
+    assert len(palette(np.ones((100, 3)), 16).entries) == 1
+
+
+DAMAGED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "version": (lambda m: m.update(version=3), "'version' must be 1 or 2, found 3."),
+    "count": (lambda m: m.update(count=0), "a SOG must hold 1 to 268,402,689 Gaussians, found 0."),
+    "lying count": (
+        lambda m: m.update(count=10_000_000),
+        "must have a pixel for each of 10,000,000 Gaussians, found",
+    ),
+    "no means": (lambda m: m.pop("means"), "'means': must be a JSON object, found None."),
+    "ranges": (lambda m: m["means"].update(mins=[0, 1]), "'mins' must be 3 finite numbers, found"),
+    "codebook": (lambda m: m["scales"].update(codebook=[]), "'codebook' must be 1 finite numbers"),
+    "bands": (lambda m: m["shN"].update(bands=4), "'bands' must be 1, 2 or 3, found 4."),
+    "other bands": (
+        lambda m: m["shN"].update(bands=2),
+        "shN_centroids.webp must be 512 pixels wide, found 192.",
+    ),
+    "files": (lambda m: m["sh0"].update(files=[]), "'files' must be 1 file names, found []."),
+    "folder": (
+        lambda m: m["sh0"].update(files=["../sh0.webp"]),
+        "the files of a SOG must be named without folders, found '../sh0.webp'.",
+    ),
+    "no image": (
+        lambda m: m["sh0"].update(files=["meta.json"]),
+        "meta.json must be a WebP image, found something else.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_each_damage_has_its_sentence(tmp_path: Path, name: str) -> None:
+    change, text = DAMAGED[name]
+    path = changed(tmp_path, change)
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    assert str(caught.value).startswith(str(tmp_path))
+    assert text in str(caught.value)
+
+
+def test_missing_images(tmp_path: Path) -> None:
+    path = unpacked(tmp_path)
+    (tmp_path / "quats.webp").unlink()
+    with pytest.raises(InputNotFoundError, match=r"quats\.webp: the file to read must exist"):
+        load(path)
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+        archive.write(path, "meta.json")
+    with pytest.raises(FileFormatError) as caught:
+        load(tmp_path / "a.sog")
+    assert str(caught.value) == f"{tmp_path}/a.sog: must contain means_l.webp, found none."
+
+
+def test_images_that_are_cut_short(tmp_path: Path) -> None:
+    path = unpacked(tmp_path)
+    image = tmp_path / "quats.webp"
+    image.write_bytes(image.read_bytes()[:-40])
+    with pytest.raises(FileFormatError, match=r"quats\.webp must be a whole image, found: "):
+        load(path)
+
+
+def test_no_zip(tmp_path: Path) -> None:
+    path = tmp_path / "a.sog"
+    path.write_bytes(b"ply\n")
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    assert str(caught.value) == (
+        f"{path}: a .sog file must be a zip of meta.json and images, found none: file is not a "
+        f"zip file."
+    )
+
+
+def test_bombs_are_not_unpacked(tmp_path: Path) -> None:
+    """A meta.json of a gigabyte, and an image of 16 million pixels for 40 Gaussians."""
+    path = tmp_path / "a.sog"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("meta.json", bytes(1 << 25))
+    with pytest.raises(FileFormatError, match=r"meta\.json must have at most 16,777,216 bytes"):
+        load(path)
+    folder = tmp_path / "sog"
+    meta = unpacked(folder)
+    (folder / "quats.webp").write_bytes(encode_webp(np.zeros((4096, 4096, 4), np.uint8)))
+    with pytest.raises(FileFormatError, match="must have at most 65,696 pixels, found 4096 x 4096"):
+        load(meta)
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_any_damage_is_an_error_of_ours(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    content = bytearray(THEIRS.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.mktemp("sog") / "a.sog"
+    path.write_bytes(bytes(content[: data.draw(st.integers(0, len(content)))]))
+    text = refusal(path)
+    assert text is None or text.startswith(str(path))

@@ -1,0 +1,136 @@
+"""``.splat`` files."""
+
+import math
+import struct
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cvtgs import GaussianScene, load, save
+from cvtgs.errors import DroppedDataWarning, FileFormatError, InvalidSceneError
+from format_cases import DATA, assert_as_oracle, assert_within, nearest_rows, storable_scene
+from format_oracles import read_splat
+
+BOUNDS = {
+    "means": 0.0,
+    "log_scales": 1e-6,
+    "opacities": 0.5 / 255 + 1e-6,
+    "sh0": 0.5 / 255 / 0.2820948 + 1e-6,
+    "angle": 0.02,
+}
+
+
+def test_a_row_by_hand(tmp_path: Path) -> None:
+    """One Gaussian: at (1, 2, 3), scales 1, 2, e, red, opacity 51 / 255, a half turn about x."""
+    path = tmp_path / "a.splat"
+    path.write_bytes(struct.pack("<6f8B", 1, 2, 3, 1, 2, math.e, 255, 0, 0, 51, 128, 255, 128, 128))
+    scene = load(path)
+    assert repr(scene) == "GaussianScene(1 Gaussians, SH degree 0, float32, cpu)"
+    assert scene.means.tolist() == [[1, 2, 3]]
+    torch.testing.assert_close(scene.log_scales, torch.tensor([[0, math.log(2), 1]]))
+    torch.testing.assert_close(scene.opacities, torch.tensor([0.2]))
+    red = 0.5 / 0.28209479
+    torch.testing.assert_close(scene.sh0, torch.tensor([[[red, -red, -red]]]))
+    assert scene.quats.tolist() == [[0, 1, 0, 0]]
+    assert scene.comments == ()
+
+
+def test_written_bytes_by_hand(tmp_path: Path) -> None:
+    scene = GaussianScene(
+        means=torch.tensor([[1.0, 2.0, 3.0]]),
+        quats=torch.tensor([[0.0, 5.0, 0.0, 0.0]]),
+        log_scales=torch.tensor([[0.0, 0.0, 0.0]]),
+        logit_opacities=torch.tensor([float("inf")]),
+        sh0=torch.zeros(1, 1, 3),
+        shN=torch.zeros(1, 0, 3),
+    )
+    save(scene, tmp_path / "a.splat")
+    assert (tmp_path / "a.splat").read_bytes() == struct.pack(
+        "<6f8B", 1, 2, 3, 1, 1, 1, 128, 128, 128, 255, 128, 255, 128, 128
+    )
+
+
+def test_file_of_the_first_viewer() -> None:
+    path = DATA / "antimatter15.splat"
+    scene = load(path)
+    assert_as_oracle(scene, read_splat(path.read_bytes()))
+    # It cuts off instead of rounding, and so is a step away at most.
+    bounds = {name: 2 * bound for name, bound in BOUNDS.items() if name != "means"}
+    source = load(DATA / "source.ply")
+    assert_within(source, nearest_rows(source, scene), bounds)
+
+
+@settings(max_examples=20, deadline=None)
+@given(count=st.integers(1, 40), seed=st.integers(0, 1000))
+def test_round_trip(tmp_path_factory: pytest.TempPathFactory, count: int, seed: int) -> None:
+    path = tmp_path_factory.mktemp("splat") / "a.splat"
+    scene = storable_scene(count, seed=seed, degree=0)
+    with pytest.warns(DroppedDataWarning, match="mip"):
+        save(scene, path)
+    again = load(path)
+    assert_within(scene, again, BOUNDS)
+    assert_as_oracle(again, read_splat(path.read_bytes()))
+    assert path.stat().st_size == 32 * count
+
+
+def test_what_has_no_place_is_said_before_anything_is_written(tmp_path: Path) -> None:
+    scene = storable_scene(4, degree=2)
+    scene = scene.with_tensors({"sh0": 9 * scene.sh0.sign()}, {"label": torch.arange(4)})
+    scene = scene.with_tensors(
+        {name: tensor.double() for name, tensor in scene.tensors().items()}, scene.extras
+    )
+    means = scene.means.clone()
+    means[1, 0] = float("nan")
+    scene = scene.with_tensors({"means": means}, scene.extras)
+    path = tmp_path / "a.splat"
+    with pytest.warns(DroppedDataWarning) as caught:
+        save(scene, path)
+    assert [str(one.message) for one in caught] == [
+        f"{path}: files of this format do not hold extra column 'label'; SH bands above degree 0 "
+        f"(the scene has degree 2); the tag 'SplatRenderMode: mip', without which viewers show the "
+        f"scene too sharp; double precision; 1 Gaussian that are not finite or have no rotation; "
+        f"what lies beyond [-1.7794, 1.7794] in a constant SH band of 3 Gaussians."
+    ]
+    assert caught[0].filename == __file__
+    assert len(load(path)) == 3
+
+
+def test_a_warning_that_is_an_error_leaves_no_file(tmp_path: Path) -> None:
+    with pytest.raises(DroppedDataWarning):
+        save(storable_scene(4, degree=1), tmp_path / "a.splat")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("size", [0, 31, 33])
+def test_half_a_gaussian(tmp_path: Path, size: int) -> None:
+    path = tmp_path / "a.splat"
+    path.write_bytes(bytes(size))
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    assert str(caught.value) == (
+        f"{path}: a .splat file must be one or more Gaussians of 32 bytes, found {size} bytes."
+    )
+
+
+def test_zeros_are_read_as_small_faint_gaussians(tmp_path: Path) -> None:
+    path = tmp_path / "a.splat"
+    path.write_bytes(bytes(32))
+    scene = load(path)
+    assert scene.log_scales.isfinite().all()
+    torch.testing.assert_close(scene.quats, torch.full((1, 4), -0.5))
+    assert float(scene.opacities) < 2e-6
+
+
+def test_a_scene_of_nothing_is_not_written(tmp_path: Path) -> None:
+    scene = storable_scene(2, degree=0)
+    scene = scene.with_tensors({"means": scene.means * float("nan")}, {})
+    with pytest.warns(DroppedDataWarning), pytest.raises(InvalidSceneError) as caught:
+        save(scene, tmp_path / "a.splat")
+    assert str(caught.value) == (
+        "a scene must hold at least one Gaussian of finite numbers to be written, found 2 "
+        "Gaussians and none that is."
+    )
+    assert list(tmp_path.iterdir()) == []

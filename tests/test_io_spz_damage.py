@@ -1,0 +1,224 @@
+"""``.spz`` files that are not fine: one sentence each, and never much memory."""
+
+import gzip
+import struct
+import sys
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cvtgs import load
+from cvtgs.errors import DroppedDataWarning, FileFormatError, MissingDependencyError
+from format_cases import DATA, refusal
+from format_oracles import read_gzip_spz
+
+GOOD = gzip.decompress((DATA / "niantic-v3.spz").read_bytes())
+FOURTH = (DATA / "niantic-v4.spz").read_bytes()
+
+
+def header(*, magic=b"NGSP", version=3, count=40, degree=3, bits=12, flags=0, last=0) -> bytes:
+    return struct.pack("<4sIIBBBB", magic, version, count, degree, bits, flags, last)
+
+
+WANTED = "must hold 2,600 bytes for the 40 Gaussians of SH degree 3 that the header promises"
+
+DAMAGED = {
+    "empty": (b"", "an .spz file must start with gzip's or its own magic number, found b''."),
+    "other": (
+        b"ply\n",
+        "an .spz file must start with gzip's or its own magic number, found b'ply\\n'.",
+    ),
+    "short": (
+        gzip.compress(GOOD[:10]),
+        "an .spz file must start with a header of 16 bytes, found 10.",
+    ),
+    "magic": (
+        gzip.compress(header(magic=b"NOPE") + GOOD[16:]),
+        "the header of an .spz file must start with b'NGSP', found b'NOPE'.",
+    ),
+    "version": (
+        gzip.compress(header(version=7) + GOOD[16:]),
+        "the version of the .spz file must be 1 to 3, or 4 without gzip, found 7.",
+    ),
+    "zipped version 4": (
+        gzip.compress(header(version=4) + GOOD[16:]),
+        "the version of the .spz file must be 1 to 3, or 4 without gzip, found 4.",
+    ),
+    "none": (
+        gzip.compress(header(count=0)),
+        "an .spz file must hold at least one Gaussian of SH degree 0 to 4 with at most 24 "
+        "fractional bits, found 0 of degree 3 with 12.",
+    ),
+    "degree": (
+        gzip.compress(header(degree=5) + GOOD[16:]),
+        "an .spz file must hold at least one Gaussian of SH degree 0 to 4 with at most 24 "
+        "fractional bits, found 40 of degree 5 with 12.",
+    ),
+    "bits": (
+        gzip.compress(header(bits=25) + GOOD[16:]),
+        "an .spz file must hold at least one Gaussian of SH degree 0 to 4 with at most 24 "
+        "fractional bits, found 40 of degree 3 with 25.",
+    ),
+    "one byte less": (gzip.compress(GOOD[:-1]), f"{WANTED}, found 2,599."),
+    "too many": (
+        gzip.compress(header(count=41) + GOOD[16:]),
+        "must hold 2,665 bytes for the 41 Gaussians of SH degree 3 that the header promises, "
+        "found 2,600.",
+    ),
+    "cut off": (gzip.compress(GOOD)[:-30], f"{WANTED}, found "),
+    "without checksum": (
+        gzip.compress(GOOD)[:-4],
+        "must be whole gzip, found it cut short.",
+    ),
+    "wrong checksum": (
+        gzip.compress(GOOD)[:-8] + bytes(8),
+        "must be whole gzip, found damage: Error -3 while decompressing data: incorrect data "
+        "check.",
+    ),
+    "not gzip": (b"\x1f\x8b" + bytes(50), "must be whole gzip, found damage: Error -3 while"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_each_damage_has_its_sentence(tmp_path: Path, name: str) -> None:
+    content, text = DAMAGED[name]
+    path = tmp_path / "a.spz"
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    assert str(caught.value).startswith(f"{path}: {text}")
+
+
+def test_the_undamaged_file_is_fine(tmp_path: Path) -> None:
+    path = tmp_path / "a.spz"
+    path.write_bytes(gzip.compress(GOOD))
+    assert len(load(path)) == len(read_gzip_spz(path.read_bytes())) == 40
+
+
+@pytest.mark.parametrize("count", [2**20, 2**32 - 1])
+def test_a_lying_count_takes_no_memory(tmp_path: Path, count: int) -> None:
+    path = tmp_path / "a.spz"
+    path.write_bytes(gzip.compress(header(count=count) + GOOD[16:]))
+    tracemalloc.start()
+    with pytest.raises(FileFormatError, match="that the header promises, found"):
+        load(path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 4 << 20
+
+
+def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
+    """A gigabyte of zeros behind 40 Gaussians, in a megabyte."""
+    squeeze = zlib.compressobj(9, wbits=31)
+    content = squeeze.compress(GOOD)
+    content += b"".join(squeeze.compress(bytes(1 << 24)) for _ in range(16)) + squeeze.flush()
+    path = tmp_path / "a.spz"
+    path.write_bytes(content)
+    tracemalloc.start()
+    with pytest.warns(DroppedDataWarning) as caught:
+        assert len(load(path)) == 40
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 8 << 20
+    assert str(caught[0].message) == (
+        f"{path}: left out what stands behind the 40 Gaussians that the header promises."
+    )
+    assert caught[0].filename == __file__
+
+
+def test_extensions_before_version_4_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.spz"
+    path.write_bytes(gzip.compress(header(flags=2) + bytes(20) + GOOD[16:]))
+    with pytest.raises(FileFormatError, match="version 3 must have no extensions, found some"):
+        load(path)
+
+
+def test_bands_above_the_third_are_left_out(tmp_path: Path) -> None:
+    rest = bytes(range(72))
+    path = tmp_path / "a.spz"
+    path.write_bytes(gzip.compress(header(count=1, degree=4) + bytes(20) + rest))
+    with pytest.warns(DroppedDataWarning) as caught:
+        scene = load(path)
+    assert str(caught[0].message) == (
+        f"{path}: left out the SH bands above degree 3 (the file has degree 4), since a scene "
+        f"holds degree 0 to 3."
+    )
+    assert caught[0].filename == __file__
+    assert scene.sh_degree == 3
+
+
+def test_version_4_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    path = DATA / "niantic-v4.spz"
+    with pytest.raises(MissingDependencyError, match=r'pip install "cvtgs\[spz\]"'):
+        load(path)
+
+
+FOURTH_DAMAGED = {
+    "header": (FOURTH[:12], "an .spz file must start with a header of 16 bytes, found 12."),
+    "version": (
+        FOURTH[:4] + b"\x05" + FOURTH[5:],
+        "the version of the .spz file must be 1 to 3, or 4 without gzip, found 5.",
+    ),
+    "table": (
+        FOURTH[:16] + b"\xff\xff\xff\x7f" + FOURTH[20:],
+        f"must hold 6 blocks, found a table of 6 at byte 2,147,483,647 of {len(FOURTH):,}.",
+    ),
+    "blocks": (
+        FOURTH[:15] + b"\x03" + FOURTH[16:],
+        f"must hold 6 blocks, found a table of 3 at byte 32 of {len(FOURTH):,}.",
+    ),
+    "count": (
+        FOURTH[:8] + b"\xff\xff\xff\xff" + FOURTH[12:],
+        "block 'means' must have 38,654,705,655 bytes for 4,294,967,295 Gaussians, found 360 in",
+    ),
+    "cut short": (FOURTH[:-1], "block 'sh' must have 1,800 bytes for 40 Gaussians, found 1,800 in"),
+    "no zstd": (FOURTH[:128] + bytes(len(FOURTH) - 128), "block 'means' must be whole zstd, found"),
+}
+
+
+@pytest.mark.parametrize("name", FOURTH_DAMAGED)
+def test_each_damage_of_version_4_has_its_sentence(tmp_path: Path, name: str) -> None:
+    pytest.importorskip("zstandard")
+    content, text = FOURTH_DAMAGED[name]
+    path = tmp_path / "a.spz"
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    assert str(caught.value).startswith(f"{path}: {text}")
+
+
+@pytest.mark.parametrize(("size", "found"), [(359, "359"), (400, "more"), (1 << 28, "more")])
+def test_blocks_of_another_size_than_the_table_says(tmp_path: Path, size: int, found: str) -> None:
+    zstandard = pytest.importorskip("zstandard")
+    block = zstandard.ZstdCompressor().compress(bytes(size))
+    table = struct.pack("<QQ", len(block), 360)
+    path = tmp_path / "a.spz"
+    path.write_bytes(FOURTH[:32] + table + FOURTH[48:128] + block + bytes(len(FOURTH)))
+    tracemalloc.start()
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert str(caught.value) == f"{path}: block 'means' must have 360 bytes, found {found}."
+    assert peak < 4 << 20
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data(), which=st.sampled_from(["niantic-v2.spz", "niantic-v4.spz"]))
+@pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
+def test_any_damage_is_an_error_of_ours(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, which: str
+) -> None:
+    pytest.importorskip("zstandard")
+    content = bytearray((DATA / which).read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.mktemp("spz") / "a.spz"
+    path.write_bytes(bytes(content[: data.draw(st.integers(0, len(content)))]))
+    text = refusal(path)
+    assert text is None or text.startswith(str(path))
