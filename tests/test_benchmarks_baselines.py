@@ -123,34 +123,6 @@ def test_pruning_by_hand():
 # LightGaussian
 
 
-def test_contributions_are_alpha_times_transmittance_over_all_pixels():
-    """A picture of one Gaussian alone is its alpha; what stands in front dims those behind."""
-    scene = gaussians(
-        [[0.0, 0, 0], [0.2, 0, 1], [-0.5, 0.1, -1]], opacities=[0.6, 0.9, 0.3], scales=[0.2] * 3
-    )
-    cameras = one_camera(16, 12)
-    alone = [
-        cvtgs.render(scene.select(torch.tensor([row])), cameras, backend="torch").alpha[0]
-        for row in range(3)
-    ]
-    through, wanted = torch.ones_like(alone[0]), {}
-    for row in (2, 0, 1):  # front to back
-        wanted[row] = float((alone[row] * through).sum())
-        through = through * (1 - alone[row])
-    found = light_gaussian.contributions(scene, cameras, backend="torch")
-    assert found.tolist() == pytest.approx([wanted[row] for row in range(3)], rel=1e-9)
-
-
-def test_contributions_do_not_depend_on_colours_and_sum_to_the_alpha_of_the_pictures():
-    scene = random_scene(50, degree=1, dtype=torch.float64)
-    dark = scene.with_tensors({"sh0": scene.sh0 - 100.0}, {})
-    cameras = one_camera(16, 12)
-    found = light_gaussian.contributions(scene, cameras, backend="torch")
-    assert torch.equal(found, light_gaussian.contributions(dark, cameras, backend="torch"))
-    alpha = cvtgs.render(scene, cameras, backend="torch").alpha
-    assert float(found.sum()) == pytest.approx(float(alpha.sum()), rel=1e-9)
-
-
 def test_volume_factor_by_hand():
     """Ten volumes from 1 to 10: the 90 % quantile is the tenth; of eleven, the eleventh is cut."""
     volumes = torch.arange(1.0, 11.0, dtype=torch.float64)
@@ -160,16 +132,6 @@ def test_volume_factor_by_hand():
     assert torch.allclose(
         light_gaussian.volume_factor(with_floater), torch.cat([(volumes / 10) ** 0.1, volumes[:1]])
     )
-
-
-def test_what_is_hidden_is_not_significant():
-    """Behind an opaque wall nothing is, however opaque."""
-    shield = [[x / 4, y / 4, -1.0] for x in range(-4, 5) for y in range(-4, 5)]
-    back = [[x, y, z + 2] for x, y, z in shield]
-    cameras = one_camera(16, 16)
-    scene = gaussians(shield + back, opacities=[0.99] * 162, scales=[0.3] * 162)
-    seen = light_gaussian.contributions(scene, cameras, backend="torch")
-    assert float(seen[:81].sum()) > 50 * float(seen[81:].sum())
 
 
 @pytest.mark.parametrize("name", ["LightGaussian", "PUP 3D-GS"])

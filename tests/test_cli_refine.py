@@ -54,11 +54,14 @@ def test_it_is_off_by_default(source, tmp_path):
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--refine", "0"], "the seconds to refine for must be above 0 and finite, found 0.0."),
-        (["--refine", "nan"], "the seconds to refine for must be above 0 and finite, found nan."),
         (
-            ["--refine-steps", "0"],
-            "the steps to refine for must be a whole number of at least 1, found 0.",
+            ["--refine", "-1"],
+            "refine.seconds: input should be greater than or equal to 0, found '-1.0'.",
+        ),
+        (["--refine", "nan"], "refine.seconds: input should be a finite number, found 'nan'."),
+        (
+            ["--refine-steps", "-1"],
+            "refine.steps: input should be greater than or equal to 0, found '-1'.",
         ),
     ],
 )

@@ -152,7 +152,7 @@ def test_numbers_that_are_not_finite_are_errors(key, value):
     assert error_of({"cvt": {key: value}}) == message
 
 
-@pytest.mark.parametrize("name", ["fast", "", None, 3, ["paper"]])
+@pytest.mark.parametrize("name", ["best", "", None, 3, ["paper"]])
 def test_unknown_presets_are_errors(name):
     wanted = f"preset must be one of {', '.join(PRESETS)}; found {name!r}."
     assert error_of({"preset": name}) == wanted
@@ -160,8 +160,8 @@ def test_unknown_presets_are_errors(name):
 
 def test_an_unknown_preset_by_name_is_an_error():
     with pytest.raises(ConfigError) as caught:
-        SimplifyConfig.from_preset("fast")
-    assert str(caught.value) == f"preset must be one of {', '.join(PRESETS)}; found 'fast'."
+        SimplifyConfig.from_preset("best")
+    assert str(caught.value) == f"preset must be one of {', '.join(PRESETS)}; found 'best'."
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,7 @@ NAMES = {
     "evaluate",
     "filters",
     "from_dict",
+    "goals",
     "io",
     "load",
     "load_cameras",
@@ -44,12 +45,13 @@ NAMES = {
     "synthetic",
     "target_count",
     "to_dict",
+    "tradeoff",
     "train",
     "views",
 }
 
 STAGES = {
-    "views": {"automatic_views", "views_from_anywhere"},
+    "views": {"automatic_views", "views_from_anywhere", "visibility"},
     "cvt": {
         "LloydResult",
         "Tessellation",
@@ -112,6 +114,25 @@ STAGES = {
         "save_checkpoint",
     },
     "refine": {"RefineConfig", "Refined", "join_reports", "refine"},
+    "goals": {
+        "Choice",
+        "CostModel",
+        "Found",
+        "Tried",
+        "Work",
+        "choose_preset",
+        "cost_model",
+        "find_count",
+    },
+    "tradeoff": {
+        "Failure",
+        "Measured",
+        "Tradeoff",
+        "TradeoffResult",
+        "measure_tradeoff",
+        "on_front",
+        "write_tradeoff",
+    },
     "synthetic": {"KINDS", "demo_scene", "scene"},
     "train": {
         "DataConfig",
@@ -140,6 +161,8 @@ ERRORS = {
     "CheckpointError": ValueError,
     "MissingDependencyError": ImportError,
     "TrainingError": RuntimeError,
+    "RunError": RuntimeError,
+    "GoalError": ValueError,
 }
 
 

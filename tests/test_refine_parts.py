@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from cvtgs.cameras import Cameras
+from cvtgs.config import Rates
 from cvtgs.refine import RefineConfig
 from cvtgs.refine import budget as budget_module
 from cvtgs.refine.budget import Budget
-from cvtgs.refine.config import Rates
 from cvtgs.refine.looking import given_outlook, own_outlook
 from cvtgs.refine.pictures import Album, Picture, score, take_picture
 from cvtgs.refine.variables import Variables, changed_count

@@ -6,11 +6,10 @@ import pytest
 import torch
 
 import cvtgs
-from cvtgs.config import SimplifyConfig
+from cvtgs.config import Rates, SimplifyConfig
 from cvtgs.errors import DeviceError, InvalidArgumentError, InvalidSceneError
 from cvtgs.progress import ProgressEvent
 from cvtgs.refine import RefineConfig, join_reports, refine
-from cvtgs.refine.config import Rates
 from refine_cases import discolored, full_scene, quick, ring, small_scene
 from scenes import same_bits
 
@@ -112,9 +111,9 @@ def test_time_ends_it_before_the_steps():
     assert report.cost.seconds < 3
 
 
-def test_default_steps():
+def test_steps_of_the_configuration():
     full = full_scene()
-    report = refine(discolored(full), full, config=quick(default_steps=3)).report
+    report = refine(discolored(full), full, config=quick(steps=3)).report
     assert report.steps == 3
 
 

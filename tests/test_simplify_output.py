@@ -139,9 +139,10 @@ def test_config_may_be_an_object_or_a_name():
 
 def test_an_unknown_preset_is_an_error():
     with pytest.raises(CvtgsError) as caught:
-        Simplifier(config="fast")
-    assert str(caught.value).startswith("preset must be one of standard, paper")
-    assert str(caught.value).endswith("; found 'fast'.")
+        Simplifier(config="best")
+    presets = "draft, fast, standard, high, max, paper"
+    assert str(caught.value).startswith(f"preset must be one of {presets}")
+    assert str(caught.value).endswith("; found 'best'.")
 
 
 @pytest.mark.parametrize("device", ["gpu", "cpu:x", ""])

@@ -24,11 +24,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.baselines.rows import keep_largest, usable
-from cvtgs.cameras import Cameras
-from cvtgs.math.spherical_harmonics import SH_C0
-from cvtgs.render import BackendName, render
 from cvtgs.scene import GaussianScene
-from cvtgs.views import automatic_views
+from cvtgs.views import automatic_views, visibility
 
 VIEWS = 24
 SIZE = 256
@@ -40,26 +37,8 @@ def simplify(scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScen
     """Keep the ``count`` Gaussians of most global significance; the seed turns the views."""
     valid = usable(scene, count)
     cameras = automatic_views(valid, VIEWS, width=SIZE, height=SIZE, seed=seed + 1)
-    significance = contributions(valid, cameras) * volume_factor(valid.log_scales)
+    significance = visibility(valid, cameras) * volume_factor(valid.log_scales)
     return keep_largest(valid, significance, count=count)
-
-
-def contributions(
-    scene: GaussianScene, cameras: Cameras, *, backend: BackendName = "auto"
-) -> Float[Tensor, "n"]:
-    """Sum ``alpha * T`` of every Gaussian over all pixels of all views, float64.
-
-    The colour of a pixel is ``sum alpha_i T_i color_i``, so the sum is the gradient of the
-    picture's sum with respect to ``color_i``: one backward pass per view, by the same renderer.
-    """
-    sh0 = torch.zeros_like(scene.sh0).requires_grad_()  # colour 0.5, where nothing is clipped
-    gray = scene.with_tensors({"sh0": sh0, "shN": scene.shN[:, :0]}, {})
-    total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
-    for view in range(len(cameras)):
-        picture = render(gray, cameras.select(torch.tensor([view])), backend=backend).rgb
-        (gradient,) = torch.autograd.grad(picture[..., 0].sum(), sh0)
-        total += gradient[:, 0, 0].double() / SH_C0
-    return total
 
 
 def volume_factor(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:

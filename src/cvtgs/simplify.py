@@ -8,11 +8,13 @@ from typing import NamedTuple
 
 import torch
 
+from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
 from cvtgs.devices import resolve_device
 from cvtgs.errors import ConfigError, InvalidArgumentError
-from cvtgs.mergenet import Checkpoint, MergeNet, load_checkpoint
+from cvtgs.mergenet import SHIPPED, Checkpoint, MergeNet, load_checkpoint
 from cvtgs.progress import ProgressListener, silent
+from cvtgs.refine import join_reports, refine
 from cvtgs.report import SimplifyReport, StageClock
 from cvtgs.scene import GaussianScene
 from cvtgs.stages import run_stages
@@ -35,8 +37,8 @@ class Simplifier:
 
     Args:
         ckpt: MergeNet checkpoint: ``standard`` or ``paper``, which come with the package, or a
-            file; ``auto`` is the shipped one of the configuration's preset, ``None`` merges by
-            moments alone.
+            file; ``auto`` is the shipped one that fits the configuration's preset, ``None``
+            merges by moments alone.
         config: A configuration, or the name of a preset; None is the preset of the checkpoint.
         device: Where to compute: ``auto`` stays where the scene is, but takes CUDA for scenes on
             the CPU if there is one; or any torch device. The result is where the scene was.
@@ -72,7 +74,12 @@ class Simplifier:
         self._listener = listener
 
     def simplify(
-        self, scene: GaussianScene, rho: float | None = None, *, count: int | None = None
+        self,
+        scene: GaussianScene,
+        rho: float | None = None,
+        *,
+        count: int | None = None,
+        cameras: Cameras | None = None,
     ) -> GaussianScene:
         """Make a scene smaller.
 
@@ -80,6 +87,7 @@ class Simplifier:
             scene: The scene; it is not changed.
             rho: Ratio of Gaussians to keep, in (0, 1].
             count: Number of Gaussians to keep, instead of ``rho``.
+            cameras: From where presets that look at the scene do so; None finds views.
 
         Returns:
             A scene of exactly ``ceil(rho * N)`` (or ``count``) Gaussians; fewer only if so many
@@ -89,10 +97,15 @@ class Simplifier:
             InvalidArgumentError: Ratio or count is out of range, or both or neither are given.
             InvalidSceneError: The scene has no valid row.
         """
-        return self.run(scene, rho, count=count).scene
+        return self.run(scene, rho, count=count, cameras=cameras).scene
 
     def run(
-        self, scene: GaussianScene, rho: float | None = None, *, count: int | None = None
+        self,
+        scene: GaussianScene,
+        rho: float | None = None,
+        *,
+        count: int | None = None,
+        cameras: Cameras | None = None,
     ) -> Simplified:
         """Make a scene smaller, and report.
 
@@ -100,6 +113,7 @@ class Simplifier:
             scene: The scene; it is not changed.
             rho: Ratio of Gaussians to keep, in (0, 1].
             count: Number of Gaussians to keep, instead of ``rho``.
+            cameras: From where presets that look at the scene do so; None finds views.
 
         Returns:
             The scene and the report.
@@ -112,7 +126,12 @@ class Simplifier:
         device = self._device_for(scene)
         clock = StageClock(self._listener, device)
         small, facts = run_stages(
-            scene.to(device), target, self.config, net=self._net_for(scene, device), clock=clock
+            scene.to(device),
+            target,
+            self.config,
+            net=self._net_for(scene, device),
+            clock=clock,
+            cameras=cameras,
         )
         report = SimplifyReport(
             input_count=len(scene),
@@ -125,7 +144,24 @@ class Simplifier:
             stages=tuple(clock.costs),
             **facts,
         )
-        return Simplified(small.to(scene.device), report)
+        simplified = Simplified(small.to(scene.device), report)
+        if not self.config.refine.asked_for or len(small) == len(scene):
+            return simplified
+        return self._refined(simplified, scene, cameras)
+
+    def _refined(
+        self, simplified: Simplified, full: GaussianScene, cameras: Cameras | None
+    ) -> Simplified:
+        refined = refine(
+            simplified.scene,
+            full,
+            cameras=cameras,
+            config=self.config.refine,
+            seed=self.config.seed,
+            device=simplified.report.device,
+            listener=self._listener,
+        )
+        return Simplified(refined.scene, join_reports(simplified.report, refined))
 
     def _net_for(self, scene: GaussianScene, device: torch.device) -> MergeNet | None:
         if self.checkpoint is None:
@@ -152,7 +188,8 @@ def _checkpoint(
             f"merge.network is false, so ckpt must be None or auto; found {os.fspath(ckpt)!r}."
         )
     if ckpt == "auto":
-        return load_checkpoint("standard" if config is None else config.preset)
+        preset = "standard" if config is None else config.preset
+        return load_checkpoint(preset if preset in SHIPPED else "standard")
     return load_checkpoint(ckpt)
 
 

@@ -4,14 +4,17 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cvtgs.cli.display import file_size, progress_bars, stage_seconds
+from cvtgs.cli.display import (
+    READABLE,
+    WRITABLE,
+    file_size,
+    progress_bars,
+    stage_seconds,
+)
 from cvtgs.errors import ConfigError
 
 if TYPE_CHECKING:
-    from cvtgs.progress import ProgressListener
     from cvtgs.report import SimplifyReport
-    from cvtgs.scene import GaussianScene
-    from cvtgs.simplify import Simplified
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -25,12 +28,16 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         help="make a scene smaller",
         description="Write a scene with exactly ceil(rho * N) of the N Gaussians of IN.",
     )
-    parser.add_argument("input", metavar="IN", type=Path, help="scene to read (.ply)")
-    parser.add_argument("output", metavar="OUT", type=Path, help="scene to write (.ply)")
+    parser.add_argument("input", metavar="IN", type=Path, help=f"scene to read ({READABLE})")
+    parser.add_argument("output", metavar="OUT", type=Path, help=f"scene to write ({WRITABLE})")
     size = parser.add_mutually_exclusive_group(required=True)
     size.add_argument("--rho", type=float, metavar="R", help="ratio of Gaussians to keep, (0, 1]")
     size.add_argument("--count", type=int, metavar="M", help="number of Gaussians to keep")
-    parser.add_argument("--preset", metavar="NAME", help="standard (default) or paper")
+    parser.add_argument(
+        "--preset",
+        metavar="NAME",
+        help="from the fastest to the best: draft, fast, standard (default), high, max; or paper",
+    )
     parser.add_argument(
         "--ckpt",
         default="auto",
@@ -52,10 +59,17 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         type=float,
         metavar="SECONDS",
         help="fine-tune the result against pictures of IN for so long at most, while views that "
-        "are held out improve",
+        "are held out improve; 0 does not, whatever the preset",
     )
     parser.add_argument(
         "--refine-steps", type=int, metavar="N", help="fine-tune for N steps at most"
+    )
+    parser.add_argument(
+        "--cameras",
+        type=Path,
+        metavar="F",
+        help="from where to look, for presets that look and for --refine: transforms.json, a "
+        "COLMAP model, cameras.json, or a folder of these (default: automatic views)",
     )
     parser.add_argument("--report", type=Path, metavar="R.json", help="write what was done as JSON")
     parser.add_argument(
@@ -73,7 +87,14 @@ def run(options: argparse.Namespace) -> None:
         options: The parsed options.
     """
     from cvtgs.config import SimplifyConfig  # noqa: PLC0415 (keeps --help fast)
-    from cvtgs.io import atomic_output, check_output, check_save, load, save  # noqa: PLC0415
+    from cvtgs.io import (  # noqa: PLC0415
+        atomic_output,
+        check_output,
+        check_save,
+        load,
+        load_cameras,
+        save,
+    )
     from cvtgs.mergenet import load_checkpoint  # noqa: PLC0415
     from cvtgs.simplify import Simplifier, target_count  # noqa: PLC0415
 
@@ -81,20 +102,18 @@ def run(options: argparse.Namespace) -> None:
     preset = options.preset
     if checkpoint not in (None, "auto") and preset is None and options.config is None:
         preset = load_checkpoint(checkpoint).info.preset
-    config = SimplifyConfig.compose(
-        file=options.config, preset=preset, settings=_settings(options.settings)
-    )
+    settings = _refinement(options) | _settings(options.settings)
+    config = SimplifyConfig.compose(file=options.config, preset=preset, settings=settings)
     if options.rho is not None:
         target_count(1, options.rho)
-    _check_refinement(options)
     check_save(options.output, overwrite=options.overwrite)
     if options.report is not None:
         check_output(options.report, overwrite=options.overwrite)
     with progress_bars(quiet=options.quiet) as listener:
         simplifier = Simplifier(checkpoint, config=config, device=options.device, listener=listener)
         scene = load(options.input)
-        simplified = simplifier.run(scene, options.rho, count=options.count)
-        small, report = _refined(simplified, scene, options=options, listener=listener)
+        cameras = None if options.cameras is None else load_cameras(options.cameras)
+        small, report = simplifier.run(scene, options.rho, count=options.count, cameras=cameras)
         save(small, options.output, overwrite=options.overwrite)
     if options.report is not None:
         with atomic_output(options.report, overwrite=options.overwrite) as file:
@@ -119,36 +138,12 @@ def _print_details(report: "SimplifyReport") -> None:
         )
 
 
-def _check_refinement(options: argparse.Namespace) -> None:
-    if options.refine is not None or options.refine_steps is not None:
-        from cvtgs.refine.budget import check_budget  # noqa: PLC0415 (keeps --help fast)
-
-        check_budget(options.refine, steps=options.refine_steps)
-
-
-def _refined(
-    simplified: "Simplified",
-    full: "GaussianScene",
-    *,
-    options: argparse.Namespace,
-    listener: "ProgressListener",
-) -> "Simplified":
-    """Refine the small scene if that is asked for."""
+def _refinement(options: argparse.Namespace) -> dict[str, str]:
+    """Give the settings that the options of the refinement stand for; either replaces both."""
     if options.refine is None and options.refine_steps is None:
-        return simplified
-    from cvtgs.refine import join_reports, refine  # noqa: PLC0415 (only those who ask need it)
-    from cvtgs.simplify import Simplified  # noqa: PLC0415
-
-    refined = refine(
-        simplified.scene,
-        full,
-        seconds=options.refine,
-        steps=options.refine_steps,
-        seed=simplified.report.config.seed,
-        device=options.device,
-        listener=listener,
-    )
-    return Simplified(refined.scene, join_reports(simplified.report, refined))
+        return {}
+    steps, seconds = options.refine_steps or 0, options.refine or 0.0
+    return {"refine.steps": str(steps), "refine.seconds": str(seconds)}
 
 
 def _settings(words: list[str]) -> dict[str, str]:

@@ -2,16 +2,25 @@
 
 from cvtgs.config.base import Section, explain, read_toml
 from cvtgs.config.presets import PRESETS
-from cvtgs.config.sections import FilterConfig, MergeConfig, TessellationConfig
+from cvtgs.config.refine import Rates, RefineConfig
+from cvtgs.config.sections import (
+    FilterConfig,
+    MergeConfig,
+    TessellationConfig,
+    VisibilityConfig,
+)
 from cvtgs.config.simplify import SimplifyConfig
 
 __all__ = [
     "PRESETS",
     "FilterConfig",
     "MergeConfig",
+    "Rates",
+    "RefineConfig",
     "Section",
     "SimplifyConfig",
     "TessellationConfig",
+    "VisibilityConfig",
     "explain",
     "read_toml",
 ]

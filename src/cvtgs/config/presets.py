@@ -4,7 +4,11 @@ from collections.abc import Mapping
 from typing import Any
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "draft": {"cvt": {"iterations": 0}, "merge": {"network": False}},
+    "fast": {"merge": {"network": False}},
     "standard": {},
+    "high": {"visibility": {"views": 24}, "refine": {"steps": 60}},
+    "max": {"visibility": {"views": 24}, "refine": {"steps": 500}},
     "paper": {
         "filter": {"max_mass_share": 1.0, "max_flyaway_share": 0.0},
         "cvt": {

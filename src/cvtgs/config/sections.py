@@ -65,6 +65,22 @@ class TessellationConfig(Section):
     backend: Literal["auto", "scipy", "torch"] = "auto"
 
 
+class VisibilityConfig(Section):
+    """Whether small pictures of the scene tell which Gaussians are seen.
+
+    Attributes:
+        views: Pictures; half from automatic views, half from anywhere around. 0 takes none: what
+            a Gaussian paints is then told by its size, opacity and place alone.
+        size: Side of the pictures, pixels.
+        mass_share: Share of the weight that still comes from size, opacity and place, for all
+            that no picture shows.
+    """
+
+    views: int = pydantic.Field(default=0, ge=0)
+    size: int = pydantic.Field(default=256, ge=16)
+    mass_share: Share = 0.2
+
+
 class MergeConfig(Section):
     """How a cell becomes one Gaussian.
 

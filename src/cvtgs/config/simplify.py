@@ -8,7 +8,13 @@ import pydantic
 
 from cvtgs.config.base import Section, explain, read_toml
 from cvtgs.config.presets import PRESETS
-from cvtgs.config.sections import FilterConfig, MergeConfig, TessellationConfig
+from cvtgs.config.refine import RefineConfig
+from cvtgs.config.sections import (
+    FilterConfig,
+    MergeConfig,
+    TessellationConfig,
+    VisibilityConfig,
+)
 from cvtgs.errors import ConfigError
 
 
@@ -19,8 +25,10 @@ class SimplifyConfig(Section):
         preset: Name of the preset that the values started from.
         seed: Seed of whatever is drawn at random.
         filter: Which Gaussians are left out.
+        visibility: Whether pictures tell what is seen.
         cvt: How Gaussians are grouped.
         merge: How a group becomes one Gaussian.
+        refine: Whether, and how, the result is moved towards pictures of the scene.
 
     Example:
         >>> SimplifyConfig.from_preset("paper").filter.max_mass_share
@@ -30,8 +38,10 @@ class SimplifyConfig(Section):
     preset: str = "standard"
     seed: int = pydantic.Field(default=0, ge=0)
     filter: FilterConfig = FilterConfig()
+    visibility: VisibilityConfig = VisibilityConfig()
     cvt: TessellationConfig = TessellationConfig()
     merge: MergeConfig = MergeConfig()
+    refine: RefineConfig = RefineConfig()
 
     @classmethod
     def from_preset(cls, name: str) -> Self:

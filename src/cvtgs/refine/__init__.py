@@ -1,6 +1,6 @@
 """Fine-tune a simplified scene against pictures of the full one."""
 
-from cvtgs.refine.config import RefineConfig
+from cvtgs.config import RefineConfig
 from cvtgs.refine.refine import Refined, join_reports, refine
 
 __all__ = ["RefineConfig", "Refined", "join_reports", "refine"]

@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from cvtgs.config import RefineConfig
 from cvtgs.losses import relative_loss
 from cvtgs.refine.budget import Budget
-from cvtgs.refine.config import RefineConfig
 from cvtgs.refine.pictures import BEST_PSNR, Album, Picture, score
 from cvtgs.refine.variables import Variables
 from cvtgs.render import render

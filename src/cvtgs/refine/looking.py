@@ -8,9 +8,9 @@ from itertools import chain, count
 import torch
 
 from cvtgs.cameras import Cameras
+from cvtgs.config import RefineConfig
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.losses.ssim import SSIM_WINDOW
-from cvtgs.refine.config import RefineConfig
 from cvtgs.scene import GaussianScene
 from cvtgs.views import automatic_views, views_from_anywhere
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.refine.config import RefineConfig
+from cvtgs.config import RefineConfig
 from cvtgs.render import render
 from cvtgs.scene import GaussianScene
 

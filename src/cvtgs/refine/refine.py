@@ -5,12 +5,12 @@ from typing import NamedTuple
 import torch
 
 from cvtgs.cameras import Cameras
+from cvtgs.config import RefineConfig
 from cvtgs.devices import resolve_device
 from cvtgs.errors import InvalidSceneError
 from cvtgs.filters import invalid_rows
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.refine.budget import Budget, check_budget
-from cvtgs.refine.config import RefineConfig
 from cvtgs.refine.descent import Descent, descend
 from cvtgs.refine.looking import Outlook, given_outlook, own_outlook
 from cvtgs.refine.pictures import Album, take_picture
@@ -20,6 +20,9 @@ from cvtgs.report import RefineReport, SimplifyReport, StageClock
 from cvtgs.scene import GaussianScene
 
 STAGE = "refine"
+
+DEFAULT_STEPS = 500
+"""Steps if neither a time nor a number of steps is asked for."""
 
 
 class Refined(NamedTuple):
@@ -64,7 +67,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         small: The simplified scene; it is not changed.
         full: The scene that it was made from.
         seconds: Wall-clock seconds to refine for, at most.
-        steps: Steps, at most; without either, ``config.default_steps``.
+        steps: Steps, at most; without either, those of the configuration, else 500.
         cameras: From where to look, at least 2; every eighth is held out. None looks at the scene
             from new automatic views and from anywhere around.
         config: Everything else; None for the defaults.
@@ -88,11 +91,13 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         >>> result.report.stopped, result.report.gain
         ('perfect', 0.0)
     """
-    check_budget(seconds, steps=steps)
     config = config or RefineConfig()
+    if seconds is None and steps is None:
+        seconds, steps = config.seconds or None, config.steps or None
+    check_budget(seconds, steps=steps)
     place = _device_for(small, device)
     ours, theirs = _prepared(small, full, place)
-    limit = config.default_steps if seconds is None and steps is None else steps
+    limit = DEFAULT_STEPS if seconds is None and steps is None else steps
     budget, clock = Budget(seconds, steps=limit), StageClock(listener, place)
 
     def tell(gain: float) -> None:

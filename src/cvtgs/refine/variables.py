@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor
 
+from cvtgs.config import Rates
 from cvtgs.cvt import openness
 from cvtgs.filters import invalid_rows, standardized, with_finite_opacities
 from cvtgs.math import quaternions
 from cvtgs.math.frames import robust_frame
-from cvtgs.refine.config import Rates
 from cvtgs.scene import GaussianScene
 
 _BETAS = (0.9, 0.99)

@@ -2,5 +2,6 @@
 
 from cvtgs.views.anywhere import views_from_anywhere
 from cvtgs.views.automatic import automatic_views
+from cvtgs.views.visibility import visibility
 
-__all__ = ["automatic_views", "views_from_anywhere"]
+__all__ = ["automatic_views", "views_from_anywhere", "visibility"]

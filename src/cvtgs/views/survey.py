@@ -82,6 +82,7 @@ def survey(scene: GaussianScene) -> Survey:
     middle = 0.5 * (low + high) if bounded else torch.zeros_like(low)
     spread = torch.linalg.vector_norm(places - middle, dim=1)
     radius = float(spread.quantile(0.98)) if bounded else 1.0
+    width = 2 * float(sample.scales.amax(dim=1).median())  # where all centres are one, all there is
     return Survey(
         sample=sample,
         frame=frame,
@@ -89,7 +90,7 @@ def survey(scene: GaussianScene) -> Survey:
         up=up,
         bounded=bounded,
         center=frame.center + frame.radius * middle,
-        radius=frame.radius * max(radius, 1e-6),
+        radius=max(frame.radius * radius, width),
         height=frame.radius * float(heights[1] - heights[0]),
     )
 

@@ -1,36 +1,20 @@
 """The stages in order: check, plan, filter, tessellate, merge, network; no algorithm here."""
 
-import warnings
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor
 
 from cvtgs import cells, cvt, filters
+from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
-from cvtgs.effects import EffectPlan, plan_effects
-from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
-from cvtgs.math.activations import divide
-from cvtgs.math.frames import RobustFrame, robust_frame
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.morton import morton_order
 from cvtgs.mergenet import MergeNet, correct_cells
 from cvtgs.progress import silent
 from cvtgs.report import StageClock
 from cvtgs.scene import GaussianScene
-
-
-class _Outlook(NamedTuple):
-    """What one look at the scene tells: where it is, and what each Gaussian paints."""
-
-    frame: RobustFrame
-    areas: Tensor
-    seen_areas: Tensor
-    light: Tensor
-    plan: EffectPlan
-
-    def facts(self, scene: GaussianScene) -> dict[str, Any]:
-        """Give what the report says about it."""
-        return {"plan": self.plan, "mass_in": float((self.areas * scene.opacities).sum())}
+from cvtgs.stages.entering import entering_rows, valid_scene
+from cvtgs.stages.outlook import Outlook, look_at_pictures, look_at_scene
 
 
 class Reference(NamedTuple):
@@ -58,6 +42,7 @@ def run_stages(
     *,
     net: MergeNet | None,
     clock: StageClock,
+    cameras: Cameras | None = None,
 ) -> tuple[GaussianScene, dict[str, Any]]:
     """Run the stages.
 
@@ -67,6 +52,7 @@ def run_stages(
         config: Every choice.
         net: Corrects merged Gaussians, on the same device; None for no correction.
         clock: Measures each stage.
+        cameras: From where a configuration that looks at the scene does so; None finds views.
 
     Returns:
         The small scene, and the facts that :class:`cvtgs.report.SimplifyReport` holds beyond
@@ -76,14 +62,16 @@ def run_stages(
         InvalidSceneError: The scene has no valid row.
     """
     with clock.stage("check"):
-        valid, facts = _valid_scene(scene, target)
+        valid, facts = valid_scene(scene, target)
     if target >= len(valid):
         with clock.stage("plan"):
-            facts |= _look(valid, config, with_light=False).facts(valid)
+            facts |= look_at_scene(valid, config, with_light=False).facts(valid)
         is_whole = target == len(scene)
         small = filters.with_finite_opacities(valid) if is_whole else filters.standardized(valid)
         return small, facts | {"mass_out": float(small.masses.sum())}
-    reference, more = _refer(valid, target, config, with_light=net is not None, clock=clock)
+    reference, more = _refer(
+        valid, target, config, with_light=net is not None, clock=clock, cameras=cameras
+    )
     small, facts = reference.merged, facts | more
     if net is not None:
         with clock.stage("network", target) as advance:
@@ -115,7 +103,7 @@ def make_reference(scene: GaussianScene, target: int, config: SimplifyConfig) ->
         InvalidArgumentError: There are no more valid Gaussians than ``target``.
         InvalidSceneError: The scene has no valid row.
     """
-    valid, _ = _valid_scene(scene, target)
+    valid, _ = valid_scene(scene, target)
     if target >= len(valid):
         raise InvalidArgumentError(
             f"target must be below the {len(valid)} valid Gaussians, found {target}."
@@ -132,13 +120,19 @@ def _refer(
     *,
     with_light: bool,
     clock: StageClock,
+    cameras: Cameras | None = None,
 ) -> tuple[Reference, dict[str, Any]]:
     """Plan, filter, tessellate and merge."""
     with clock.stage("plan"):
-        outlook = _look(valid, config, with_light=with_light)
+        outlook = look_at_scene(valid, config, with_light=with_light)
         facts = outlook.facts(valid)
+    if config.visibility.views:
+        with clock.stage("visibility"):
+            outlook = look_at_pictures(
+                valid, outlook, config.visibility, cameras=cameras, seed=config.seed
+            )
     with clock.stage("filter"):
-        rows, filter_facts = _filter(valid, outlook, target, config)
+        rows, filter_facts = entering_rows(valid, outlook, target, config)
     with clock.stage("tessellate", config.cvt.iterations + 1) as advance:
         rows, points = _place(valid, rows, outlook, target, config)
         weights = cvt.tessellation_weights(
@@ -181,86 +175,13 @@ def _refer(
     return Reference(valid, merged, partition, neighbors, outlook.light), facts
 
 
-def _valid_scene(scene: GaussianScene, target: int) -> tuple[GaussianScene, dict[str, Any]]:
-    if len(scene) == 0:
-        raise InvalidSceneError("a scene needs at least one Gaussian to be simplified; found none.")
-    invalid = filters.invalid_rows(scene)
-    if not invalid:
-        return scene, {}
-    dropped = torch.stack(list(invalid.values())).any(dim=0)
-    count = int(dropped.sum())
-    reasons = {name: int(mask.sum()) for name, mask in invalid.items()}
-    text = ", ".join(f"{name} {number}" for name, number in reasons.items())
-    left = len(scene) - count
-    if left == 0:
-        raise InvalidSceneError(
-            f"none of the {len(scene)} Gaussians is valid; "
-            f"found NaN, infinite or zero values in {text}."
-        )
-    warnings.warn(
-        f"dropped {count} of {len(scene)} Gaussians with NaN, infinite or zero values ({text}).",
-        DroppedDataWarning,
-        stacklevel=2,
-    )
-    shortfall = f"only {left} of {len(scene)} Gaussians are valid" if left < target else ""
-    facts = {"invalid_rows": reasons, "invalid_count": count, "shortfall": shortfall}
-    return scene.select(~dropped), facts
-
-
-def _look(scene: GaussianScene, config: SimplifyConfig, *, with_light: bool) -> _Outlook:
-    frame, areas = robust_frame(scene.means), scene.areas
-    masses = areas * scene.opacities
-    plan = plan_effects(scene, masses, frame, unbounded=config.cvt.unbounded)
-    hides = config.cvt.hidden_share < 1.0
-    light = cvt.openness(scene.means, masses, frame) if hides or with_light else masses[:0]
-    seen = areas
-    if config.cvt.perspective:
-        seen = seen * cvt.falloff(scene.means, frame)
-    if hides:
-        seen = seen * (config.cvt.hidden_share + (1 - config.cvt.hidden_share) * light)
-    return _Outlook(frame, areas, seen, light, plan)
-
-
-def _filter(
-    scene: GaussianScene, outlook: _Outlook, target: int, config: SimplifyConfig
-) -> tuple[Tensor, dict[str, Any]]:
-    opacities = scene.opacities
-    keep = filters.visible_rows(
-        opacities,
-        outlook.seen_areas * opacities,
-        min_opacity=config.filter.min_opacity,
-        max_mass_share=config.filter.max_mass_share,
-        at_least=target,
-    )
-    keep = _without_flyaways(scene, keep, outlook, target, config)
-    masses = outlook.areas * opacities
-    left_out = divide(masses[~keep].sum(), masses.sum())
-    facts = {"filtered_count": int((~keep).sum()), "filtered_mass_share": float(left_out)}
-    return keep.nonzero()[:, 0], facts
-
-
-def _without_flyaways(
-    scene: GaussianScene, keep: Tensor, outlook: _Outlook, target: int, config: SimplifyConfig
-) -> Tensor:
-    share = config.filter.max_flyaway_share
-    if share == 0.0:
-        return keep
-    distances = outlook.frame.distances(scene.means)
-    if float(distances.amax()) <= filters.FLYAWAY_RADII:
-        return keep
-    seen = outlook.areas * scene.opacities * cvt.falloff(scene.means, outlook.frame)
-    flown = filters.flyaway_rows(distances, seen, max_share=share)
-    fewer = keep & ~flown
-    return fewer if int(fewer.sum()) >= target else keep
-
-
 def _place(
-    scene: GaussianScene, rows: Tensor, outlook: _Outlook, target: int, config: SimplifyConfig
+    scene: GaussianScene, rows: Tensor, outlook: Outlook, target: int, config: SimplifyConfig
 ) -> tuple[Tensor, Tensor]:
     """Place Gaussians in the space of the tessellation; rows and points along a Morton curve."""
     # A curve through contracted space stays fine where the bulk is, whatever flies away.
     curve = cvt.embed(scene.means[rows], frame=outlook.frame, contracted=True)
-    rows = rows[morton_order(curve)]
+    rows = rows[morton_order(curve, ties=outlook.seen_areas[rows] * scene.opacities[rows])]
     del curve
     points = cvt.embed(
         scene.means[rows],

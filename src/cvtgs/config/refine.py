@@ -4,7 +4,7 @@ from typing import Annotated
 
 import pydantic
 
-from cvtgs.config import Section
+from cvtgs.config.base import Section
 
 Rate = Annotated[float, pydantic.Field(ge=0.0)]
 Count = Annotated[int, pydantic.Field(ge=1)]
@@ -34,6 +34,9 @@ class RefineConfig(Section):
     """Every choice of a refinement; frozen, unknown keys are errors.
 
     Attributes:
+        steps: Steps, at most; 0 leaves it to ``seconds``.
+        seconds: Wall-clock seconds, at most; 0 leaves it to ``steps``. With both 0, a
+            simplification is not refined.
         rates: Learning rates at the start.
         last_rate: Share of them at the end; in between they fall exponentially.
         damping: Gaussians whose gradients are below this share of the usual size move less.
@@ -49,13 +52,14 @@ class RefineConfig(Section):
         heldout: Views that decide what is kept, and are never learnt from.
         check_every: Steps between two looks at them.
         patience: Looks without a new best after which the refinement ends.
-        default_steps: Steps if neither a time nor a number of steps is asked for.
 
     Example:
         >>> RefineConfig(size=128).rates.means
         0.01
     """
 
+    steps: int = pydantic.Field(default=0, ge=0)
+    seconds: float = pydantic.Field(default=0.0, ge=0.0)
     rates: Rates = Rates()
     last_rate: float = pydantic.Field(default=0.1, gt=0.0, le=1.0)
     damping: Rate = 0.1
@@ -68,4 +72,8 @@ class RefineConfig(Section):
     heldout: Count = 8
     check_every: Count = 25
     patience: Count = 8
-    default_steps: Count = 500
+
+    @property
+    def asked_for(self) -> bool:
+        """Whether there are steps or seconds to refine for."""
+        return bool(self.steps or self.seconds)

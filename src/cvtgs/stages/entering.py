@@ -1,0 +1,96 @@
+"""Which Gaussians enter the tessellation: valid ones, that are not left out."""
+
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from cvtgs import cvt, filters
+from cvtgs.config import SimplifyConfig
+from cvtgs.errors import DroppedDataWarning, InvalidSceneError
+from cvtgs.math.activations import divide
+from cvtgs.scene import GaussianScene
+from cvtgs.stages.outlook import Outlook
+
+
+def valid_scene(scene: GaussianScene, target: int) -> tuple[GaussianScene, dict[str, Any]]:
+    """Drop rows with NaN, infinite or zero values where there must be none, and warn.
+
+    Args:
+        scene: The Gaussians.
+        target: Number of Gaussians to keep.
+
+    Returns:
+        The valid rows, and what the report says of the others.
+
+    Raises:
+        InvalidSceneError: No row is valid.
+    """
+    if len(scene) == 0:
+        raise InvalidSceneError("a scene needs at least one Gaussian to be simplified; found none.")
+    invalid = filters.invalid_rows(scene)
+    if not invalid:
+        return scene, {}
+    dropped = torch.stack(list(invalid.values())).any(dim=0)
+    count = int(dropped.sum())
+    reasons = {name: int(mask.sum()) for name, mask in invalid.items()}
+    text = ", ".join(f"{name} {number}" for name, number in reasons.items())
+    left = len(scene) - count
+    if left == 0:
+        raise InvalidSceneError(
+            f"none of the {len(scene)} Gaussians is valid; "
+            f"found NaN, infinite or zero values in {text}."
+        )
+    warnings.warn(
+        f"dropped {count} of {len(scene)} Gaussians with NaN, infinite or zero values ({text}).",
+        DroppedDataWarning,
+        stacklevel=2,
+    )
+    shortfall = f"only {left} of {len(scene)} Gaussians are valid" if left < target else ""
+    facts = {"invalid_rows": reasons, "invalid_count": count, "shortfall": shortfall}
+    return scene.select(~dropped), facts
+
+
+def entering_rows(
+    scene: GaussianScene, outlook: Outlook, target: int, config: SimplifyConfig
+) -> tuple[Tensor, dict[str, Any]]:
+    """Leave out faint Gaussians and flyaways, but never more than can be spared.
+
+    Args:
+        scene: The Gaussians, with valid rows.
+        outlook: What each paints.
+        target: Number of Gaussians that must be left.
+        config: Every choice.
+
+    Returns:
+        The rows that stay, in ascending order, and what the report says of the others.
+    """
+    opacities = scene.opacities
+    keep = filters.visible_rows(
+        opacities,
+        outlook.seen_areas * opacities,
+        min_opacity=config.filter.min_opacity,
+        max_mass_share=config.filter.max_mass_share,
+        at_least=target,
+    )
+    keep = _without_flyaways(scene, keep, outlook, target, config)
+    masses = outlook.areas * opacities
+    left_out = divide(masses[~keep].sum(), masses.sum())
+    facts = {"filtered_count": int((~keep).sum()), "filtered_mass_share": float(left_out)}
+    return keep.nonzero()[:, 0], facts
+
+
+def _without_flyaways(
+    scene: GaussianScene, keep: Tensor, outlook: Outlook, target: int, config: SimplifyConfig
+) -> Tensor:
+    share = config.filter.max_flyaway_share
+    if share == 0.0:
+        return keep
+    distances = outlook.frame.distances(scene.means)
+    if float(distances.amax()) <= filters.FLYAWAY_RADII:
+        return keep
+    seen = outlook.areas * scene.opacities * cvt.falloff(scene.means, outlook.frame)
+    flown = filters.flyaway_rows(distances, seen, max_share=share)
+    fewer = keep & ~flown
+    return fewer if int(fewer.sum()) >= target else keep

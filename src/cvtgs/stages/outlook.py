@@ -1,0 +1,113 @@
+"""One look at a scene before anything is done to it."""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from cvtgs import cvt
+from cvtgs.cameras import Cameras
+from cvtgs.config import SimplifyConfig, VisibilityConfig
+from cvtgs.effects import EffectPlan, plan_effects
+from cvtgs.math import activations
+from cvtgs.math.frames import RobustFrame, robust_frame
+from cvtgs.scene import GaussianScene
+from cvtgs.views import automatic_views, views_from_anywhere, visibility
+
+
+class Outlook(NamedTuple):
+    """What one look at the scene tells: where it is, and what each Gaussian paints.
+
+    Attributes:
+        frame: Centre and radius of the scene.
+        areas: ``(n,)`` mean projected areas, squared scene units.
+        seen_areas: ``(n,)`` the same as they look in pictures; smaller for what is far or hidden.
+        light: ``(n,)`` how freely every Gaussian can be seen, 0 to 1; empty if nobody asks.
+        plan: What the scene calls for.
+    """
+
+    frame: RobustFrame
+    areas: Tensor
+    seen_areas: Tensor
+    light: Tensor
+    plan: EffectPlan
+
+    def facts(self, scene: GaussianScene) -> dict[str, Any]:
+        """Give what the report says about it."""
+        return {"plan": self.plan, "mass_in": float((self.areas * scene.opacities).sum())}
+
+
+def look_at_scene(scene: GaussianScene, config: SimplifyConfig, *, with_light: bool) -> Outlook:
+    """Find out what a scene is like, without a picture of it.
+
+    Args:
+        scene: The Gaussians, with valid rows.
+        config: Every choice.
+        with_light: Whether a network will ask how freely Gaussians can be seen.
+
+    Returns:
+        What was found.
+    """
+    frame, areas = robust_frame(scene.means), scene.areas
+    masses = areas * scene.opacities
+    plan = plan_effects(scene, masses, frame, unbounded=config.cvt.unbounded)
+    hides = config.cvt.hidden_share < 1.0
+    light = cvt.openness(scene.means, masses, frame) if hides or with_light else masses[:0]
+    seen = areas
+    if config.cvt.perspective:
+        seen = seen * cvt.falloff(scene.means, frame)
+    if hides:
+        seen = seen * (config.cvt.hidden_share + (1 - config.cvt.hidden_share) * light)
+    return Outlook(frame, areas, seen, light, plan)
+
+
+def look_at_pictures(
+    scene: GaussianScene,
+    outlook: Outlook,
+    config: VisibilityConfig,
+    *,
+    cameras: Cameras | None,
+    seed: int,
+) -> Outlook:
+    """Correct what every Gaussian paints by pictures of the scene.
+
+    Args:
+        scene: The Gaussians, with valid rows.
+        outlook: What is known without pictures.
+        config: How many pictures, and how far they are trusted.
+        cameras: From where to look; None finds views.
+        seed: Which views.
+
+    Returns:
+        The outlook with other ``seen_areas``.
+    """
+    found = _own_views(scene, config, seed) if cameras is None else [_some(cameras, config)]
+    painted = torch.stack([visibility(scene, views) for views in found]).sum(dim=0)
+    masses = (outlook.seen_areas * scene.opacities).double()
+    total, all_painted = masses.sum(), painted.sum()
+    if not float(all_painted) > 0.0:
+        return outlook
+    trust = 1.0 - config.mass_share
+    blended = config.mass_share * masses + trust * painted * (total / all_painted)
+    seen = activations.divide(blended, scene.opacities.double().clamp_min(FAINTEST))
+    return outlook._replace(seen_areas=seen.to(outlook.seen_areas.dtype))
+
+
+FAINTEST = 1e-6
+"""Opacities below count as this where something is divided by them."""
+
+
+def _own_views(scene: GaussianScene, config: VisibilityConfig, seed: int) -> list[Cameras]:
+    size, around = config.size, config.views // 2
+    usual = automatic_views(scene, config.views - around, width=size, height=size, seed=seed)
+    anywhere = views_from_anywhere(scene, around, size=size, seed=seed)
+    return [usual, anywhere]
+
+
+def _some(cameras: Cameras, config: VisibilityConfig) -> Cameras:
+    """Take cameras spread over their order, with small pictures."""
+    count = min(config.views, len(cameras))
+    rows = torch.tensor([(k * len(cameras)) // count for k in range(count)])
+    factor = min(1.0, config.size / max(cameras.width, cameras.height))
+    width, height = (max(1, round(factor * side)) for side in (cameras.width, cameras.height))
+    return cameras.select(rows).resized(width, height)
