@@ -51,7 +51,7 @@ NAMES = {
 }
 
 STAGES = {
-    "views": {"automatic_views", "views_from_anywhere", "visibility"},
+    "views": {"automatic_views", "views_from_anywhere"},
     "cvt": {
         "LloydResult",
         "Tessellation",

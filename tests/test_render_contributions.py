@@ -1,4 +1,4 @@
-"""Visibility: what every Gaussian paints of some pictures, and what presets make of it."""
+"""Contributions: what every Gaussian paints of some pictures, and what presets make of it."""
 
 import pytest
 import torch
@@ -7,7 +7,8 @@ import cvtgs
 from baseline_cases import gaussians
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.views import automatic_views, visibility
+from cvtgs.render import contributions
+from cvtgs.views import automatic_views
 from scenes import random_scene
 
 
@@ -25,7 +26,8 @@ def one_camera(width: int, height: int) -> Cameras:
     )
 
 
-def test_visibility_is_alpha_times_transmittance_over_all_pixels():
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_contributions_are_alpha_times_transmittance_over_all_pixels(backend):
     """A picture of one Gaussian alone is its alpha; what stands in front dims those behind."""
     scene = gaussians(
         [[0.0, 0, 0], [0.2, 0, 1], [-0.5, 0.1, -1]], opacities=[0.6, 0.9, 0.3], scales=[0.2] * 3
@@ -39,16 +41,17 @@ def test_visibility_is_alpha_times_transmittance_over_all_pixels():
     for row in (2, 0, 1):  # front to back
         wanted[row] = float((alone[row] * through).sum())
         through = through * (1 - alone[row])
-    found = visibility(scene, cameras, backend="torch")
+    found = contributions(scene, cameras, backend=backend)
     assert found.tolist() == pytest.approx([wanted[row] for row in range(3)], rel=1e-9)
 
 
-def test_it_does_not_depend_on_colours_and_sums_to_the_alpha_of_the_pictures():
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_they_do_not_depend_on_colours_and_sum_to_the_alpha_of_the_pictures(backend):
     scene = random_scene(50, degree=1, dtype=torch.float64)
     dark = scene.with_tensors({"sh0": scene.sh0 - 100.0}, {})
     cameras = one_camera(16, 12)
-    found = visibility(scene, cameras, backend="torch")
-    assert torch.equal(found, visibility(dark, cameras, backend="torch"))
+    found = contributions(scene, cameras, backend=backend)
+    assert torch.equal(found, contributions(dark, cameras, backend=backend))
     alpha = cvtgs.render(scene, cameras, backend="torch").alpha
     assert float(found.sum()) == pytest.approx(float(alpha.sum()), rel=1e-9)
 
@@ -59,14 +62,14 @@ def test_what_is_hidden_is_not_visible():
     back = [[x, y, z + 2] for x, y, z in shield]
     cameras = one_camera(16, 16)
     scene = gaussians(shield + back, opacities=[0.99] * 162, scales=[0.3] * 162)
-    seen = visibility(scene, cameras, backend="torch")
+    seen = contributions(scene, cameras, backend="torch")
     assert float(seen[:81].sum()) > 50 * float(seen[81:].sum())
 
 
 def test_it_needs_no_gradients_and_leaves_none():
     scene = random_scene(20)
     with torch.no_grad():
-        found = visibility(scene, automatic_views(scene, 1, width=16, height=16))
+        found = contributions(scene, automatic_views(scene, 1, width=16, height=16))
     assert not found.requires_grad
     assert scene.sh0.grad is None
 

@@ -24,8 +24,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.baselines.rows import keep_largest, usable
+from cvtgs.render import contributions
 from cvtgs.scene import GaussianScene
-from cvtgs.views import automatic_views, visibility
+from cvtgs.views import automatic_views
 
 VIEWS = 24
 SIZE = 256
@@ -37,7 +38,7 @@ def simplify(scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScen
     """Keep the ``count`` Gaussians of most global significance; the seed turns the views."""
     valid = usable(scene, count)
     cameras = automatic_views(valid, VIEWS, width=SIZE, height=SIZE, seed=seed + 1)
-    significance = visibility(valid, cameras) * volume_factor(valid.log_scales)
+    significance = contributions(valid, cameras) * volume_factor(valid.log_scales)
     return keep_largest(valid, significance, count=count)
 
 

@@ -5,6 +5,7 @@ imported only when they are chosen.
 """
 
 from cvtgs.render.backends import BackendName, choose_backend
+from cvtgs.render.contributions import contributions
 from cvtgs.render.render import Rendering, render
 
-__all__ = ["BackendName", "Rendering", "choose_backend", "render"]
+__all__ = ["BackendName", "Rendering", "choose_backend", "contributions", "render"]

@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import Literal, Protocol, cast, get_args
 
 import torch
+from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError, InvalidArgumentError, MissingDependencyError
@@ -31,6 +32,10 @@ class Backend(Protocol):
         listener: ProgressListener,
     ) -> Painting:
         """Render pictures on black; scene and cameras share a device."""
+        ...
+
+    def contributions(self, scene: GaussianScene, camera: Cameras) -> Tensor:
+        """Give the pixels that every Gaussian paints of one picture."""
         ...
 
 

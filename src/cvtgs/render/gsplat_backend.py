@@ -15,6 +15,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError, MissingDependencyError
 from cvtgs.math.spherical_harmonics import REST_COUNTS, evaluate
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
+from cvtgs.render.contributions import contributions_by_gradient
 from cvtgs.render.painting import STAGE, Painting
 from cvtgs.render.rules import DILATION, NEAR_PLANE
 from cvtgs.render.views import views_of
@@ -77,6 +78,19 @@ def rasterize(
     listener(ProgressEvent(stage=STAGE, done=len(cameras), total=len(cameras)))
     layers, alpha = layers.to(scene.dtype), alpha.to(scene.dtype)
     return Painting(rgb=layers[..., :3], depth=layers[..., 3], alpha=alpha[..., 0])
+
+
+def contributions(scene: GaussianScene, camera: Cameras) -> Tensor:
+    """Give the pixels that every Gaussian paints of one picture.
+
+    Args:
+        scene: The Gaussians.
+        camera: One camera, on the scene's device.
+
+    Returns:
+        ``(n,)`` pixels, float64.
+    """
+    return contributions_by_gradient(rasterize, scene, camera)
 
 
 def _paint(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tuple[Tensor, Tensor]:

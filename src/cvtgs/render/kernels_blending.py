@@ -39,8 +39,14 @@ def box_of(tile: int, side: int, size: tuple[int, int]) -> Box:
 
 
 @parallel
-def composite_all(packed: Array, tiles: TileArrays, centers: Array, picture: Array) -> None:
-    """Write red, green, blue and depth, times what they hide, and transmittance of each pixel."""
+def composite_all(
+    packed: Array, tiles: TileArrays, centers: Array, picture: Array, painted: Array
+) -> None:
+    """Write red, green, blue and depth, times what they hide, and transmittance of each pixel.
+
+    Where ``painted`` is not empty, it gets the pixels that every intersection of a splat and a
+    tile paints, by its place.
+    """
     starts, lists, side = tiles
     height, width = picture.shape[:2]
     for step in prange(len(starts) - 1):
@@ -57,7 +63,10 @@ def composite_all(packed: Array, tiles: TileArrays, centers: Array, picture: Arr
         pending = (y1 - y0) * (x1 - x0)
         for entry in range(starts[tile], starts[tile + 1]):
             splat = packed[lists[entry, 1]]
-            pending -= blend(splat, box, centers, light, is_open)
+            finished, pixels = blend(splat, box, centers, light, is_open)
+            pending -= finished
+            if len(painted):
+                painted[lists[entry, 0]] = pixels
             if pending == 0:
                 break
 
@@ -69,9 +78,9 @@ def blend(
     centers: Array,
     light: Array,
     is_open: NDArray[np.bool_],
-) -> int:
-    """Blend one splat into a tile; give how many pixels it finished."""
-    finished = 0
+) -> tuple[int, float]:
+    """Blend one splat into a tile; give how many pixels it finished, and how many it painted."""
+    finished, painted = 0, 0.0
     x0, x1, y0, y1 = box
     one, least = centers.dtype.type(1), centers.dtype.type(MIN_TRANSMITTANCE)
     faintest, most = centers.dtype.type(MIN_ALPHA), centers.dtype.type(MAX_ALPHA)
@@ -101,4 +110,5 @@ def blend(
             for channel in range(4):
                 pixel[channel] += weight * splat[6 + channel]
             pixel[4] = after
-    return finished
+            painted += weight
+    return finished, painted

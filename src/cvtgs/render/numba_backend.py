@@ -84,6 +84,30 @@ def rasterize(
     return paint_each(views, blank, listener)
 
 
+def contributions(scene: GaussianScene, camera: Cameras) -> Float[Tensor, "n"]:
+    """Give the pixels that every Gaussian paints of one picture, by one forward pass.
+
+    Args:
+        scene: The Gaussians, on the CPU.
+        camera: One camera, on the CPU.
+
+    Returns:
+        Pixels, float64.
+    """
+    use_threads(torch.get_num_threads())
+    found = np.zeros(len(scene))
+    arrays = {name: tensor.detach().contiguous() for name, tensor in scene.tensors().items()}
+    gaussians = GaussianArrays(*(tensor.numpy() for tensor in arrays.values()))
+    for view in views_of(camera):
+        splats, tiles = _listed(gaussians, Setting(_numbers(view), view.size, 0, scene.antialiased))
+        picture = np.empty((view.size[1], view.size[0], 5), splats.packed.dtype)
+        painted = np.zeros(len(tiles.lists))
+        composite_all(splats.packed, tiles, _centers(picture), picture, painted)
+        sums = np.concatenate([[0.0], np.cumsum(painted)])[splats.starts]
+        found[splats.rows] += np.diff(sums)
+    return torch.from_numpy(found)
+
+
 class _Render(torch.autograd.Function):
     """One picture. The backward pass uses the lists of the forward pass, and blends once more."""
 
@@ -92,7 +116,7 @@ class _Render(torch.autograd.Function):
         gaussians = GaussianArrays(*(tensor.detach().numpy() for tensor in tensors))
         splats, tiles = _listed(gaussians, setting)
         picture = np.empty((setting.size[1], setting.size[0], 5), splats.packed.dtype)
-        composite_all(splats.packed, tiles, _centers(picture), picture)
+        composite_all(splats.packed, tiles, _centers(picture), picture, np.empty(0))
         result = torch.from_numpy(picture)
         ctx.save_for_backward(result, *tensors)
         ctx.setting, ctx.splats, ctx.tiles = setting, splats, tiles

@@ -11,6 +11,7 @@ from torch.autograd.function import once_differentiable
 from cvtgs.cameras import Cameras
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.render.blending import composite, composite_gradient
+from cvtgs.render.contributions import contributions_by_gradient
 from cvtgs.render.painting import Painting, pack, paint_each
 from cvtgs.render.projection import project
 from cvtgs.render.tiles import TileLists, intersect
@@ -60,6 +61,19 @@ def rasterize(
     blank = scene.means.new_zeros(0, cameras.height, cameras.width, 5)
     views = [partial(_paint, scene, view, sh_degree) for view in views_of(cameras)]
     return paint_each(views, blank, listener)
+
+
+def contributions(scene: GaussianScene, camera: Cameras) -> Tensor:
+    """Give the pixels that every Gaussian paints of one picture.
+
+    Args:
+        scene: The Gaussians.
+        camera: One camera, on the scene's device.
+
+    Returns:
+        ``(n,)`` pixels, float64.
+    """
+    return contributions_by_gradient(rasterize, scene, camera)
 
 
 def _paint(scene: GaussianScene, view: View, sh_degree: int) -> Float[Tensor, "h w 5"]:

@@ -11,8 +11,9 @@ from cvtgs.config import SimplifyConfig, VisibilityConfig
 from cvtgs.effects import EffectPlan, plan_effects
 from cvtgs.math import activations
 from cvtgs.math.frames import RobustFrame, robust_frame
+from cvtgs.render import contributions
 from cvtgs.scene import GaussianScene
-from cvtgs.views import automatic_views, views_from_anywhere, visibility
+from cvtgs.views import automatic_views, views_from_anywhere
 
 
 class Outlook(NamedTuple):
@@ -82,7 +83,7 @@ def look_at_pictures(
         The outlook with other ``seen_areas``.
     """
     found = _own_views(scene, config, seed) if cameras is None else [_some(cameras, config)]
-    painted = torch.stack([visibility(scene, views) for views in found]).sum(dim=0)
+    painted = torch.stack([contributions(scene, views) for views in found]).sum(dim=0)
     masses = (outlook.seen_areas * scene.opacities).double()
     total, all_painted = masses.sum(), painted.sum()
     if not float(all_painted) > 0.0:

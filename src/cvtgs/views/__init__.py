@@ -2,6 +2,5 @@
 
 from cvtgs.views.anywhere import views_from_anywhere
 from cvtgs.views.automatic import automatic_views
-from cvtgs.views.visibility import visibility
 
-__all__ = ["automatic_views", "views_from_anywhere", "visibility"]
+__all__ = ["automatic_views", "views_from_anywhere"]
