@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES, Descriptors
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
 
-LARGEST_GROWTH = 0.6
-"""Log scales change by this much at most."""
+LARGE_GROWTH = 0.6
+"""A large change of a log scale."""
 
 LARGEST_LOGIT_CHANGE = 2.0
 """Opacity logits change by this much at most."""
@@ -32,6 +32,7 @@ class Architecture(pydantic.BaseModel):
         cell_features: Numbers that describe a cell.
         width: Units of the layers that see members and neighbours.
         cell_width: Units of the layers that see cells.
+        largest_growth: Log scales change by this much at most.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -41,6 +42,7 @@ class Architecture(pydantic.BaseModel):
     cell_features: int = CELL_FEATURES
     width: int = pydantic.Field(default=32, ge=1, le=1024)
     cell_width: int = pydantic.Field(default=64, ge=1, le=4096)
+    largest_growth: float = pydantic.Field(default=0.6, gt=0.0, le=3.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,13 +66,13 @@ class Residuals:
     pair_colors: Float[Tensor, "m k"]
 
     def cost(self) -> Float[Tensor, ""]:
-        """Give the mean square of all changes, each in units of its largest; training pays it.
+        """Give the mean square of all changes, each in units of a large one; training pays it.
 
         Returns:
-            A number from 0 to 1.
+            A number, 0 for no change.
         """
         parts = [
-            self.growths / LARGEST_GROWTH,
+            self.growths / LARGE_GROWTH,
             self.logits / LARGEST_LOGIT_CHANGE,
             self.turns / LARGEST_TURN,
             self.shifts.clamp(-1, 1),
@@ -143,7 +145,7 @@ class MergeNet(nn.Module):
         twists = pulls[:, 3:] + 2 * others[:, 3:]
         return Residuals(
             shifts=pulls[:, :3] + others[:, :3],
-            growths=LARGEST_GROWTH * torch.tanh(sizes[:, :3]),
+            growths=self.architecture.largest_growth * torch.tanh(sizes[:, :3]),
             turns=LARGEST_TURN * torch.tanh(twists),
             logits=LARGEST_LOGIT_CHANGE * torch.tanh(0.5 * sizes[:, 3]),
             member_colors=of_members[:, 1] * weights,

@@ -90,12 +90,13 @@ class TrainConfig(Section):
     Attributes:
         kind: ``scene``: whole simplified scenes are rendered; ``local``: single cells.
         preset: The preset whose merged Gaussians the network learns to correct.
-        start: A checkpoint to start from; its width must be the same.
+        start: A checkpoint to start from; its widths and largest growth must be the same.
         seed: Seed of all that is drawn.
         steps: Training steps.
         learning_rate: Largest step of the optimiser (AdamW); it falls to zero along a cosine.
         width: Units of the layers that see members and neighbours.
         cell_width: Units of the layers that see cells.
+        largest_growth: Log scales change by this much at most.
         validate_every: Steps between validations.
         patience: Validations without a new best after which training stops.
         cells: Cells of one step of a ``local`` training.
@@ -117,6 +118,7 @@ class TrainConfig(Section):
     learning_rate: float = pydantic.Field(default=5e-3, gt=0.0)
     width: Count = 48
     cell_width: Count = 96
+    largest_growth: float = pydantic.Field(default=0.6, gt=0.0, le=3.0)
     validate_every: Count = 500
     patience: Count = 1000
     cells: Count = 49

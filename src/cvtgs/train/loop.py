@@ -146,18 +146,22 @@ def train(
 
 
 def _first_net(config: TrainConfig) -> MergeNet:
+    shape = Architecture(
+        width=config.width, cell_width=config.cell_width, largest_growth=config.largest_growth
+    )
     if config.start is not None:
         net = copy.deepcopy(load_checkpoint(config.start).net).requires_grad_(True).train()
-        shape = net.architecture
-        if (shape.width, shape.cell_width) != (config.width, config.cell_width):
-            raise ConfigError(
-                f"start: width and cell_width must be {shape.width} and {shape.cell_width} as in "
-                f"{config.start}, found {config.width} and {config.cell_width}."
+        if net.architecture != shape:
+            names = ("width", "cell_width", "largest_growth")
+            theirs, ours = (
+                ", ".join(f"{name} {getattr(one, name):g}" for name in names)
+                for one in (net.architecture, shape)
             )
+            raise ConfigError(f"start: {config.start} has {theirs}; the configuration has {ours}.")
         return net
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        return MergeNet(Architecture(width=config.width, cell_width=config.cell_width))
+        return MergeNet(shape)
 
 
 def _make_folder(path: Path) -> None:
