@@ -59,6 +59,14 @@ def speed(session: nox.Session) -> None:
 
 
 @nox.session
+def fuzz(session: nox.Session) -> None:
+    """Read damaged scenes, checkpoints and configurations; takes minutes, needs Linux."""
+    session.install(*CONSTRAINTS, "-e", ".[test]")
+    words = session.posargs or ["--count", "100000"]
+    session.run("python", "tests/fuzz_files.py", *words, env={"OMP_NUM_THREADS": "1"})
+
+
+@nox.session
 def browser(session: nox.Session) -> None:
     """Load the comparison page in a real headless browser (Debian package chromium)."""
     session.install(*CONSTRAINTS, "-e", ".[test]")

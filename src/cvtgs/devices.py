@@ -1,5 +1,8 @@
 """The device to compute on, by name."""
 
+import platform
+from pathlib import Path
+
 import torch
 
 from cvtgs.errors import DeviceError
@@ -30,3 +33,28 @@ def resolve_device(device: str | torch.device) -> torch.device | None:
         reason = str(error).split("\n")[0].rstrip(".")
         raise DeviceError(f"device {str(device)!r} cannot be used here: {reason}.") from None
     return resolved
+
+
+def device_name(device: torch.device) -> str:
+    """Name what a device is made of.
+
+    Args:
+        device: The device.
+
+    Returns:
+        The model of the processor or of the GPU, as far as the system tells.
+
+    Example:
+        >>> len(device_name(torch.device("cpu"))) > 0
+        True
+    """
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    if device.type != "cpu":
+        return device.type
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()

@@ -56,7 +56,8 @@ def visible_rows(
         opacities: Opacities.
         masses: Opacity times mean projected area, any unit.
         min_opacity: Gaussians at or above this opacity always stay.
-        max_mass_share: The faintest go while their mass is at most this share of the total.
+        max_mass_share: The faintest go while their mass is at most this share of the total; of
+            equally faint ones, those of least mass go first.
         at_least: If fewer than this many would stay, the heaviest of the others stay too.
 
     Returns:
@@ -71,6 +72,7 @@ def visible_rows(
         [False, True, True]
     """
     faint = (opacities < min_opacity).nonzero()[:, 0]
+    faint = faint[torch.sort(masses[faint], stable=True).indices]  # of equally faint ones
     faint = faint[torch.sort(opacities[faint], stable=True).indices]
     lost = masses[faint].double().cumsum(0)
     limit = max_mass_share * float(masses.double().sum()) if max_mass_share < 1 else math.inf

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.cvt.distinct import distinct_rows
+
 CHUNK = 1 << 15
 """Points that a thread searches together, to bound memory."""
 
@@ -33,7 +35,8 @@ def nearest_scipy(
         >>> labels.tolist()
         [1]
     """
-    tree = build_tree(sites)
+    distinct = distinct_rows(sites)  # a tree cannot part coincident sites: it would compare all
+    tree = build_tree(sites if distinct is None else sites[distinct])
     labels = np.empty(len(points), dtype=np.int64)
     squared = np.empty(len(points), dtype=np.float64)
 
@@ -46,7 +49,8 @@ def nearest_scipy(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for _ in pool.map(search, range(0, len(points), CHUNK)):
             pass
-    return torch.from_numpy(labels), torch.from_numpy(squared)
+    found = torch.from_numpy(labels)
+    return found if distinct is None else distinct[found], torch.from_numpy(squared)
 
 
 def build_tree(sites: Float[Tensor, "m d"]) -> Any:

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.cvt.distinct import distinct_rows
 from cvtgs.math.morton import morton_order
 
 POINT_BLOCK = 32
@@ -42,6 +43,10 @@ def nearest_torch(
         >>> labels.tolist()
         [1]
     """
+    distinct = distinct_rows(sites)
+    if distinct is not None:  # no box can rule out one of several coincident sites
+        labels, squared = nearest_torch(points, sites[distinct])
+        return distinct[labels], squared
     site_rows = _curve_order(sites)
     site_blocks, site_ids = (
         _blocks(sites[site_rows].double(), SITE_BLOCK),

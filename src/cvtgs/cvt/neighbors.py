@@ -5,10 +5,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.cvt.distinct import runs_of_equal
 from cvtgs.cvt.nearest_scipy import build_tree
 
 MAX_ENTRIES = 1 << 23
 """Largest number of distances held at one time by the torch search."""
+
+TINY_SHIFT = 1e-9
+"""Coincident sites are parted by at most this share of the extent of all sites."""
 
 
 def nearest_neighbors(
@@ -32,9 +36,8 @@ def nearest_neighbors(
     """
     with_self = min(count + 1, len(sites))
     if backend == "scipy":
-        _, found = build_tree(sites).query(
-            np.asarray(sites, np.float64), k=[*range(1, with_self + 1)]
-        )
+        apart = _apart(sites)
+        _, found = build_tree(apart).query(np.asarray(apart), k=[*range(1, with_self + 1)])
         rows = torch.from_numpy(found.astype(np.int64))
     else:
         rows = _nearest_by_comparison(sites.double(), with_self)
@@ -42,6 +45,21 @@ def nearest_neighbors(
     is_self = rows == torch.arange(len(sites), device=sites.device)[:, None]
     others = torch.sort(is_self.to(torch.uint8), dim=1, stable=True).indices[:, : with_self - 1]
     return rows.gather(1, others)
+
+
+def _apart(sites: Float[Tensor, "m d"]) -> Float[Tensor, "m e"]:
+    """Add a coordinate that parts coincident sites, which a tree would compare all with all.
+
+    It is so small that among sites that differ, distances stay the same but for rounding.
+    """
+    runs = runs_of_equal(sites)
+    if runs is None:
+        return sites.double()
+    (order, ranks), places = runs, sites.double()
+    extent = float((places.amax(dim=0) - places.amin(dim=0)).amax()) or 1.0
+    shifts = torch.empty_like(places[:, 0])
+    shifts[order] = ranks.double() * (TINY_SHIFT * extent / len(sites))
+    return torch.cat([places, shifts[:, None]], dim=1)
 
 
 def _nearest_by_comparison(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m k"]:

@@ -16,14 +16,18 @@ _SPREAD = (
 )
 
 
-def morton_order(points: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+def morton_order(
+    points: Float[Tensor, "n 3"], ties: Float[Tensor, "n"] | None = None
+) -> Int[Tensor, "n"]:
     """Order points along a Morton curve through their bounding cube (Morton 1966).
 
     Args:
         points: Finite positions, best without far outliers (2^21 steps span the cube).
+        ties: Points of the same code come in ascending order of these, so that the order of the
+            rows does not decide.
 
     Returns:
-        Row numbers; equal codes keep their order.
+        Row numbers; what is equal in code and ties keeps its order.
 
     Example:
         >>> morton_order(torch.tensor([[1.0, 1, 1], [0, 0, 0], [1, 0, 0]])).tolist()
@@ -35,7 +39,14 @@ def morton_order(points: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
     for axis in range(3):
         steps = ((points[:, axis] - low[axis]) / side * (2**BITS - 1)).to(torch.int64)
         code |= _spread_bits(steps) << axis
-    return torch.sort(code, stable=True).indices
+    codes, order = torch.sort(code, stable=True)
+    if ties is not None:
+        same = torch.nn.functional.pad(codes[1:] == codes[:-1], (1, 1))
+        places = (same[1:] | same[:-1]).nonzero()[:, 0]
+        rows = order[places]
+        rows = rows[torch.sort(ties[rows], stable=True).indices]
+        order[places] = rows[torch.sort(code[rows], stable=True).indices]
+    return order
 
 
 def _spread_bits(values: Int[Tensor, "n"]) -> Int[Tensor, "n"]:

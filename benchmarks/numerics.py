@@ -1,0 +1,207 @@
+"""How numbers fare on hard scenes: condition, residuals, float32 against float64, and time.
+
+``python -m benchmarks.numerics -o docs/numerics.md`` renews the tables of that page, from the
+catalogue of ``tests/hard_cases.py``.
+"""
+
+import argparse
+import sys
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+import cvtgs
+from benchmarks.processes import machine
+from cvtgs import GaussianScene, Simplifier, SimplifyConfig
+from cvtgs.cells import Partition, gather_members, mean_and_covariance, merge_cells
+from cvtgs.cvt import embed, nearest_neighbors, tessellate
+from cvtgs.filters import invalid_rows
+from cvtgs.math import covariances, quaternions
+from cvtgs.math.frames import robust_frame
+from cvtgs.math.morton import morton_order
+from cvtgs.mergenet import correct_cells
+from cvtgs.views import automatic_views
+
+COUNT = 2000
+TIMED = 20_000
+MARKS = "<!-- tables: python -m benchmarks.numerics -->", "<!-- end of tables -->"
+Cases = Mapping[str, Callable[[int, torch.dtype], GaussianScene]]
+
+
+class Figures(NamedTuple):
+    """One row of the table; errors are those of float32 against float64."""
+
+    condition: float
+    residual: float
+    energy: float
+    means: float
+    matrices: float
+    opacities: float
+    colors: float
+    network: float
+    pictures: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("-o", "--output", type=Path, help="page whose tables are renewed")
+    parser.add_argument("--case", nargs="+", help="some of the cases; all if none")
+    parser.add_argument("--count", type=int, default=COUNT)
+    parser.add_argument(
+        "--timed", type=int, default=TIMED, help="size for times; 0 leaves them out"
+    )
+    options = parser.parse_args()
+    cases = {name: make for name, make in catalogue().items() if name in (options.case or [name])}
+    text = error_table(cases, options.count)
+    if options.timed:
+        text += "\n" + time_table(cases, options.timed)
+    if options.output is None:
+        print(text)
+    else:
+        renew(options.output, text)
+
+
+def catalogue() -> Cases:
+    """Give the hard cases of the tests."""
+    sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+    from hard_cases import CASES  # noqa: PLC0415 (found there only)
+
+    return CASES
+
+
+def renew(page: Path, text: str) -> None:
+    """Put text between the marks of a page."""
+    before, rest = page.read_text(encoding="utf-8").split(MARKS[0])
+    after = rest.split(MARKS[1])[1]
+    page.write_text(f"{before}{MARKS[0]}\n\n{text}\n{MARKS[1]}{after}", encoding="utf-8")
+
+
+def error_table(cases: Cases, count: int) -> str:
+    names = Figures._fields
+    lines = ["| case | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    lines += [
+        f"| {name} | " + " | ".join(f"{value:.0e}" for value in figures(make, count)) + " |"
+        for name, make in cases.items()
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def time_table(cases: Cases, count: int) -> str:
+    """CPU seconds of a simplification to a tenth, and how many times those of the easy scene."""
+    easy = {preset: cpu_seconds(catalogue()["ball"], count, preset) for preset in PRESETS}
+    lines = [f"{machine()}; {count:,} Gaussians to a tenth, the faster of two runs, CPU seconds.\n"]
+    lines += ["| case | " + " | ".join(f"{p} | / ball" for p in PRESETS) + " |"]
+    lines += ["|---" * (2 * len(PRESETS) + 1) + "|"]
+    for name, make in cases.items():
+        cells = []
+        for preset in PRESETS:
+            seconds = cpu_seconds(make, count, preset)
+            cells += [f"{seconds:.2f}", f"{seconds / easy[preset]:.1f}"]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+PRESETS = ("standard", "paper")
+
+
+def cpu_seconds(
+    make: Callable[[int, torch.dtype], GaussianScene], count: int, preset: str
+) -> float:
+    scene, simplifier = make(count, torch.float32), Simplifier(config=preset, device="cpu")
+    found = []
+    for _ in range(2):
+        start = time.process_time()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of dropped rows
+            simplifier.simplify(scene, 0.1)
+        found.append(time.process_time() - start)
+    return min(found)
+
+
+def figures(make: Callable[[int, torch.dtype], GaussianScene], count: int) -> Figures:
+    """Take one scene through the stages in both precisions, with the cells of float64."""
+    single = valid(make(count, torch.float32))
+    double = in_float64(single)
+    target = max(1, len(single) // 10)
+    labels, energy = grouped(double, target)
+    part = Partition.from_labels(labels, target)
+    config = SimplifyConfig().merge
+    first, second = (merge_cells(scene, part, config=config) for scene in (double, single))
+    wanted = exact_covariances(double, part, config.area_power)
+    size = wanted.abs().amax(dim=(1, 2))
+    place = (second.means.double() - first.means).norm(dim=1) / size.sqrt()
+    neighbors = nearest_neighbors(first.means, 8, backend="scipy")
+    corrected = corrected_scales(double, first, part, neighbors)
+    approximate = corrected_scales(single, second, part, neighbors)
+    return Figures(
+        condition=float(
+            torch.exp(2 * (first.log_scales.amax(1) - first.log_scales.amin(1))).amax()
+        ),
+        residual=worst((matrices_of(first) - wanted).abs().amax(dim=(1, 2)) / size),
+        energy=abs(grouped(single, target)[1] - energy) / (energy or 1.0),
+        means=worst(place),
+        matrices=worst((matrices_of(second) - matrices_of(first)).abs().amax(dim=(1, 2)) / size),
+        opacities=worst((second.opacities.double() - first.opacities).abs()),
+        colors=worst((second.sh - first.sh).abs() / (1 + first.sh.abs().amax())),
+        network=worst((approximate - corrected).abs()),
+        pictures=picture_error(first, second),
+    )
+
+
+def valid(scene: GaussianScene) -> GaussianScene:
+    bad = [mask[:, None] for mask in invalid_rows(scene).values()]
+    return scene.select(~torch.cat(bad, dim=1).any(dim=1)) if bad else scene
+
+
+def in_float64(scene: GaussianScene) -> GaussianScene:
+    return scene.with_tensors({k: v.double() for k, v in scene.tensors().items()}, {})
+
+
+def grouped(scene: GaussianScene, target: int) -> tuple[Tensor, float]:
+    """Group by position alone; labels in the order of the rows, and the energy."""
+    points = embed(scene.means, frame=robust_frame(scene.means), contracted=True)
+    order = morton_order(points, ties=scene.masses)
+    weights = torch.ones(len(scene), dtype=torch.float64)
+    found = tessellate(points[order], weights, target, config=SimplifyConfig().cvt)
+    labels = torch.empty_like(found.labels)
+    labels[order] = found.labels
+    return labels, found.energy
+
+
+def exact_covariances(scene: GaussianScene, part: Partition, power: float) -> Tensor:
+    """Covariances before they are split into scales and turns, in float64."""
+    members = gather_members(scene, part)
+    return mean_and_covariance(members, members.weights(power))[1]
+
+
+def matrices_of(scene: GaussianScene) -> Tensor:
+    quats = quaternions.normalize(scene.quats.double())
+    return covariances.from_scales_and_quats(torch.exp(scene.log_scales.double()), quats)
+
+
+def corrected_scales(
+    scene: GaussianScene, merged: GaussianScene, part: Partition, neighbors: Tensor
+) -> Tensor:
+    net = Simplifier(device="cpu").checkpoint.net.to(scene.dtype)  # type: ignore[union-attr]
+    light = torch.ones(len(scene), dtype=torch.float64)
+    small = correct_cells(net, scene, merged, part, neighbors=neighbors, light=light)
+    return small.log_scales.double()
+
+
+def picture_error(first: GaussianScene, second: GaussianScene) -> float:
+    cameras = automatic_views(second, 2, width=64, height=64)
+    ours, theirs = (cvtgs.render(scene, cameras).rgb.double() for scene in (first, second))
+    return worst((ours.clamp(0, 1) - theirs.clamp(0, 1)).abs())
+
+
+def worst(values: Tensor) -> float:
+    return float(values.amax()) if values.numel() else 0.0
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,223 @@
+"""Fuzz the readers: PLY scenes, checkpoints and configurations, damaged in every way.
+
+``python tests/fuzz_files.py --count 100000`` (the nox session ``fuzz``) ends with a line of counts,
+or names the first input that did not end in a result or in one clear sentence, and keeps it. Each
+input has a limit of CPU time, and the process one of memory, so hangs and lying headers are found.
+"""
+
+import argparse
+import random
+import re
+import resource
+import signal
+import sys
+import tempfile
+import warnings
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+
+import cvtgs
+from cvtgs import SimplifyConfig
+from cvtgs.errors import CvtgsError, DroppedDataWarning
+from cvtgs.mergenet import Architecture, CheckpointInfo, load_checkpoint, save_checkpoint
+from mergenet_cases import lively_net
+from ply_files import gaussian_properties, gaussian_rows, ply_bytes
+
+Dice = random.Random
+CPU_SECONDS = 5.0
+MEMORY = 1 << 29
+"""Half a GiB more than the process has when it starts; no seed has more than 100 kB."""
+
+LIES = (b"-1", b"0", b"1", b"7", b"4294967296", b"999999999999999999", b"9" * 40, b"1e3", b"0x10")
+WORDS = (
+    b"nan", b"inf", b"-inf", b"1e999", b"1e-999", b"0x1p3", b"--1", b"", b" ", b"\n", b"\r\n",
+    b"\x00", b"\xff\xff\xff\xff", b"\x7f", b"9" * 400, b"list uint float",
+    b"property list uint int a", b"element vertex 1000000000", b"end_header\n", b"comment ",
+    b"double", b"int64", b"[[]]", b"{}",
+    b"=", b"[a]\n", b'"""', "\u00fc\u2028".encode(), b"format ascii 1.0\n", b"e", b"-",
+)  # fmt: skip
+
+
+class HangError(Exception):
+    """An input took too long."""
+
+
+def seeds_of_ply() -> list[bytes]:
+    """Small files of every layout: binary of both orders, ASCII, with lists, faces, 2DGS."""
+    plain = gaussian_properties()
+    flat = [(name, kind) for name, kind in gaussian_properties(9) if name != "scale_2"]
+    lists = [*plain, ("seen_by", "list uchar uint")]
+    listed = [[*row, [1.0, 2.0, 3.0]] for row in gaussian_rows(plain, 4)]
+    faces = {"face": ([("corners", "list uint int")], [[[0, 1, 2]], [[2, 1, 0]]])}
+    label = [*gaussian_properties(kind="double"), ("label", "ushort")]
+    seeds = []
+    for encoding in ("binary_little_endian", "binary_big_endian", "ascii"):
+        seeds += [
+            ply_bytes(plain, gaussian_rows(plain, 5), encoding=encoding, comments=["by hand"]),
+            ply_bytes(flat, gaussian_rows(flat, 3), encoding=encoding),
+            ply_bytes(lists, listed, encoding=encoding),
+            ply_bytes(plain, gaussian_rows(plain, 2), encoding=encoding, before=faces),
+            ply_bytes(label, gaussian_rows(label, 2), encoding=encoding, newline="\r\n"),
+        ]
+    return seeds
+
+
+def seeds_of_checkpoints() -> list[bytes]:
+    """One small checkpoint."""
+    shape = Architecture(width=2, cell_width=3)
+    info = CheckpointInfo(architecture=shape, preset="paper")
+    return [save_checkpoint(lively_net(torch.float32, architecture=shape), info)]
+
+
+def seeds_of_configs() -> list[bytes]:
+    """Both presets in full, and a short file."""
+    full = [SimplifyConfig.from_preset(name).to_toml().encode() for name in ("standard", "paper")]
+    return [*full, b'preset = "paper"\nseed = 3\n[cvt]\niterations = 7\n']
+
+
+READERS: dict[str, tuple[str, Callable[[], list[bytes]], Callable[[Path], object]]] = {
+    "ply": (".ply", seeds_of_ply, cvtgs.load),
+    "checkpoint": (".safetensors", seeds_of_checkpoints, load_checkpoint),
+    "config": (".toml", seeds_of_configs, SimplifyConfig.from_toml),
+}
+
+
+def mutant(seed: bytes, dice: Dice) -> bytes:
+    """Damage an input in one to four ways."""
+    data = bytearray(seed)
+    for _ in range(dice.choice((1, 1, 2, 4))):
+        data = bytearray(dice.choice(DAMAGES)(data, dice))
+    return bytes(data)
+
+
+def flip(data: bytearray, dice: Dice) -> bytes:
+    """Flip some bits."""
+    for _ in range(dice.choice((1, 1, 3, 20)) if data else 0):
+        data[dice.randrange(len(data))] ^= 1 << dice.randrange(8)
+    return data
+
+
+def cut(data: bytearray, dice: Dice) -> bytes:
+    """Cut the end off, or a piece out."""
+    start = dice.randrange(len(data) + 1)
+    stop = dice.choice((len(data), min(len(data), start + dice.randrange(40))))
+    return data[:start] + data[stop:]
+
+
+def insert(data: bytearray, dice: Dice) -> bytes:
+    """Put a word anywhere, instead of a few bytes or between them."""
+    at = dice.randrange(len(data) + 1)
+    return data[:at] + dice.choice(WORDS) + data[at + dice.randrange(8) :]
+
+
+def lie(data: bytearray, dice: Dice) -> bytes:
+    """Change a number of the text."""
+    numbers = list(re.finditer(rb"\d+", bytes(data[:4000])))
+    if not numbers:
+        return data
+    number = dice.choice(numbers)
+    return data[: number.start()] + dice.choice(LIES) + data[number.end() :]
+
+
+def swap_lines(data: bytearray, dice: Dice) -> bytes:
+    """Drop, repeat or exchange lines."""
+    lines = bytes(data).split(b"\n")
+    one, other = dice.randrange(len(lines)), dice.randrange(len(lines))
+    way = dice.randrange(3)
+    if way == 0:
+        lines[one], lines[other] = lines[other], lines[one]
+    elif way == 1:
+        lines.insert(one, lines[other])
+    else:
+        del lines[one]
+    return b"\n".join(lines)
+
+
+def swap_words(data: bytearray, dice: Dice) -> bytes:
+    """Put one word of the text in the place of another."""
+    words = list(re.finditer(rb"[\w.+-]+", bytes(data[:4000])))
+    if not words:
+        return data
+    one, other = dice.choice(words), dice.choice((*words,))
+    return data[: one.start()] + other[0] + data[one.end() :]
+
+
+DAMAGES: Sequence[Callable[[bytearray, Dice], bytes]] = (
+    flip, cut, insert, lie, lie, swap_lines, swap_words
+)  # fmt: skip
+
+
+def verdict(read: Callable[[Path], object], path: Path) -> str:
+    """Read a file: ``read``, ``refused``, or what is wrong with how it ended."""
+    before = sorted(path.parent.iterdir())
+    signal.setitimer(signal.ITIMER_PROF, CPU_SECONDS)
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            read(path)
+        result = "read"
+    except CvtgsError as error:
+        text = str(error)
+        clear = text.startswith(f"{path}: ") and text.endswith(".") and "\n" not in text
+        result = "refused" if clear and len(text) < 4000 else f"unclear: {text!r}"
+    except HangError:
+        result = f"more than {CPU_SECONDS:g} s"
+    except MemoryError:
+        result = f"more than {MEMORY >> 20} MiB"
+    except Exception as error:  # whatever is not ours is what is looked for
+        result = f"{type(error).__name__}: {error}"
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+    if any(w.category is not DroppedDataWarning for w in caught) or len(caught) > 1:
+        result = f"warnings: {[str(w.message) for w in caught]}"
+    return result if sorted(path.parent.iterdir()) == before else "files were written"
+
+
+def limit() -> None:
+    """Let nothing take much memory or time."""
+
+    def stop(number: int, frame: object) -> None:
+        raise HangError
+
+    signal.signal(signal.SIGPROF, stop)
+    torch.set_num_threads(1)
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    now = 1024 * int(re.search(r"VmSize:\s+(\d+) kB", status)[1])  # type: ignore[index]
+    resource.setrlimit(resource.RLIMIT_AS, (now + MEMORY, now + MEMORY))
+
+
+def main() -> None:
+    """Fuzz all readers, and say how it ended."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=100_000, help="inputs of all kinds together")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    dice, ends = random.Random(options.seed), Counter[str]()
+    pools = {kind: seeds() for kind, (_, seeds, _) in READERS.items()}
+    with tempfile.TemporaryDirectory() as folder:
+        for kind, pool in pools.items():
+            for number, seed in enumerate(pool):
+                path = Path(folder) / f"{kind}{number}{READERS[kind][0]}"
+                path.write_bytes(seed)
+                if verdict(READERS[kind][2], path) != "read":
+                    sys.exit(f"{kind} {number} cannot be read before it is damaged.")
+        limit()
+        for number in range(options.count):
+            kind = dice.choice(("ply", "ply", "ply", "checkpoint", "config"))
+            suffix, _, read = READERS[kind]
+            path = Path(folder) / f"damaged{suffix}"
+            path.write_bytes(mutant(dice.choice(pools[kind]), dice))
+            end = verdict(read, path)
+            if end not in ("read", "refused"):
+                kept = Path(tempfile.gettempdir()) / f"fuzzed-{number}{suffix}"
+                kept.write_bytes(path.read_bytes())
+                sys.exit(f"input {number} of seed {options.seed}, kept as {kept}: {end}")
+            ends[f"{kind} {end}"] += 1
+    print(", ".join(f"{count} {end}" for end, count in sorted(ends.items())))  # noqa: T201
+
+
+if __name__ == "__main__":
+    main()

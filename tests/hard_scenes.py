@@ -1,0 +1,104 @@
+"""An easy scene, ways to spoil it, and what every result of a hard one is checked for."""
+
+import math
+from functools import cache
+from importlib import import_module
+
+import pytest
+import torch
+from torch import Tensor
+
+from cvtgs import GaussianScene, Simplifier
+
+dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["32", "64"])
+devices = pytest.mark.parametrize("device", ["cpu", *["cuda"] * torch.cuda.is_available()])
+presets = pytest.mark.parametrize("preset", ["standard", "paper"])
+
+
+@cache
+def simplifier(preset: str, device: str = "cpu") -> Simplifier:
+    """A simplifier that loads its network once for all tests."""
+    return Simplifier(config=preset, device=device)
+
+
+def coarsen_light(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Look through a grid of 16 voxels a side, not 128, which takes most of the time here."""
+    monkeypatch.setattr(import_module("cvtgs.cvt.openness"), "HALF_GRID", 8)
+
+
+def ball(count: int, dtype: torch.dtype, *, seed: int = 0) -> GaussianScene:
+    """A ball of smooth colours, SH degree 1, of flat and mostly opaque Gaussians: easy."""
+    g = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    out = torch.nn.functional.normalize(normal(count, 3), dim=1)
+    pole = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    turn = torch.cat([1 + out @ pole[:, None], torch.linalg.cross(pole.expand_as(out), out)], dim=1)
+    size = math.log(math.sqrt(4 / count))
+    tensors = {
+        "means": out * (1 + 0.05 * normal(count, 1)),
+        "quats": turn,
+        "log_scales": torch.tensor([size, size, size - 1.5]) + 0.3 * normal(count, 3),
+        "logit_opacities": 1.5 + 1.5 * normal(count),
+        "sh0": 1.5 * torch.sin(3 * out + torch.tensor([0.0, 1.0, 2.0]))[:, None],
+        "shN": 0.1 * normal(count, 3, 3),
+    }
+    return GaussianScene(**{name: values.to(dtype) for name, values in tensors.items()})
+
+
+def changed(scene: GaussianScene, **tensors: Tensor) -> GaussianScene:
+    """The scene with some of its tensors replaced, in its own dtype."""
+    cast = {name: values.to(scene.dtype) for name, values in tensors.items()}
+    return scene.with_tensors(cast, scene.extras)
+
+
+def every(step: int, count: int, values: tuple[float, float]) -> Tensor:
+    """The first value in every ``step``-th row, the second in all others."""
+    return torch.where(torch.arange(count) % step == 0, *values).double()
+
+
+def flown(count: int, dtype: torch.dtype, far: float) -> GaussianScene:
+    """A ball with (at most) five Gaussians far away, each in another direction."""
+    scene = ball(count, dtype)
+    away = torch.zeros(count, 3, dtype=torch.float64)
+    ways = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, -1], [1, 1, 1]])
+    some = min(5, count // 4)
+    away[:some] = far * ways[:some].double()
+    return changed(scene, means=scene.means + away)
+
+
+def spoiled(count: int, dtype: torch.dtype, name: str) -> GaussianScene:
+    """A ball with NaN in one property of the second and of every ninth row."""
+    scene = ball(count, dtype)
+    values = getattr(scene, name).clone()
+    values.view(count, -1)[1:2, 0], values.view(count, -1)[4::9, -1] = math.nan, math.nan
+    return changed(scene, **{name: values})
+
+
+def measured_in(scene: GaussianScene, exponent: float) -> GaussianScene:
+    """The scene with all lengths times ``e^exponent``."""
+    means, log_scales = scene.means.double() * math.exp(exponent), scene.log_scales + exponent
+    return changed(scene, means=means, log_scales=log_scales)
+
+
+def valid_rows(scene: GaussianScene) -> Tensor:
+    """Tell row by row what a renderer can draw: finite, a rotation, a scale that float32 holds."""
+    rows = torch.cat([scene.means, scene.quats, scene.log_scales, scene.sh.flatten(1)], dim=1)
+    return (
+        rows.isfinite().all(dim=1)
+        & (scene.log_scales < 88.72).all(dim=1)
+        & scene.quats.any(dim=1)
+        & ~scene.logit_opacities.isnan()
+    )
+
+
+def assert_standard(scene: GaussianScene) -> None:
+    """Everything finite, unit quaternions, opacities strictly between 0 and 1."""
+    for name, values in scene.tensors().items():
+        assert bool(values.isfinite().all()), name
+    norms = torch.linalg.vector_norm(scene.quats.double(), dim=1)
+    assert bool(((norms - 1).abs() < 1e-5).all())
+    opacities = torch.sigmoid(scene.logit_opacities)
+    assert bool(((opacities > 0) & (opacities < 1)).all())

@@ -1,0 +1,176 @@
+"""The catalogue of hard cases itself, and the stages that only look at rows: io and filters."""
+
+import re
+import warnings
+
+import pytest
+import torch
+
+import cvtgs
+import hard_cases
+from cvtgs.errors import DroppedDataWarning
+from cvtgs.filters import flyaway_rows, invalid_rows, standardized, visible_rows
+from cvtgs.math.frames import robust_frame
+from hard_cases import CASES, each_case
+from hard_scenes import (
+    assert_standard,
+    ball,
+    changed,
+    devices,
+    dtypes,
+    simplifier,
+    valid_rows,
+)
+from scenes import same_bits
+
+COUNT = 60
+
+
+def test_every_case_is_in_the_catalogue_and_says_where_it_is_from():
+    own = {
+        name: value
+        for name, value in vars(hard_cases).items()
+        if callable(value) and getattr(value, "__module__", "") == "hard_cases"
+    }
+    assert own == {name: make for name, make in CASES.items() if name != "ball"}
+    assert len(own) >= 35
+    for make in own.values():
+        assert re.search(r"\. *\s+Source: \w.*\.$", make.__doc__.strip(), re.DOTALL), make.__name__
+
+
+@dtypes
+@each_case
+def test_cases_are_what_they_say(make, dtype):
+    scene = make(COUNT, dtype)
+    assert scene.dtype == dtype
+    assert len(scene) == {"one": 1, "two": 2, "three": 3}.get(make.__name__, COUNT)
+    spoiled = make.__name__.startswith("nan_") or make.__name__ == "zero_quaternions"
+    assert bool(valid_rows(scene).all()) is not spoiled
+    if make is not CASES["half_precision"]:
+        assert make is CASES["ball"] or not same_bits(scene, ball(COUNT, dtype)) or scene.comments
+
+
+@dtypes
+@each_case
+def test_files_keep_every_bit(make, dtype, tmp_path):
+    scene = make(COUNT, dtype)
+    cvtgs.save(scene, tmp_path / "case.ply")
+    read = cvtgs.load(tmp_path / "case.ply")
+    assert same_bits(read, scene)
+    assert read.comments == scene.comments
+    assert scene.layout in ((), read.layout)
+    before = (tmp_path / "case.ply").read_bytes()
+    cvtgs.save(read, tmp_path / "again.ply")
+    assert (tmp_path / "again.ply").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("preset", "dtype"), [("standard", torch.float32), ("paper", torch.float64)]
+)
+@each_case
+def test_results_go_through_files(make, dtype, preset, tmp_path):
+    """Results of 2DGS files lose their third scale, with a warning, for the file has none."""
+    scene = make(COUNT, dtype)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DroppedDataWarning)
+        small = simplifier(preset).simplify(scene, 0.2)
+        cvtgs.save(small, tmp_path / "small.ply")
+    read = cvtgs.load(tmp_path / "small.ply")
+    if make is CASES["flat_file"]:
+        assert "scale_2" not in dict(read.layout)
+        flat = small.log_scales.clone()
+        flat[:, 2] = -20.0
+        small = changed(small, log_scales=flat)
+    assert same_bits(read, small)
+
+
+def test_a_file_without_a_third_scale_stays_one(tmp_path):
+    cvtgs.save(CASES["flat_file"](COUNT, torch.float32), tmp_path / "flat.ply")
+    header = (tmp_path / "flat.ply").read_bytes().split(b"end_header")[0]
+    assert b"scale_1" in header
+    assert b"scale_2" not in header
+    read = cvtgs.load(tmp_path / "flat.ply")
+    assert read.log_scales[:, 2].unique().tolist() == [-20.0]
+    small = simplifier("standard").simplify(read, 0.5)
+    with pytest.warns(DroppedDataWarning, match="the third scale of .* was left out"):
+        cvtgs.save(small, tmp_path / "small.ply")
+    assert b"scale_2" not in (tmp_path / "small.ply").read_bytes().split(b"end_header")[0]
+
+
+def test_half_precision_becomes_float32_without_rounding():
+    scene = CASES["half_precision"](COUNT, torch.float32)
+    assert torch.equal(scene.means.half().float(), scene.means)
+    assert not torch.equal(scene.means, ball(COUNT, torch.float32).means)
+
+
+# Filters
+
+
+@dtypes
+@devices
+@each_case
+def test_invalid_rows_are_found_by_their_property(make, device, dtype):
+    scene = make(COUNT, dtype)
+    found = invalid_rows(scene.to(device))
+    bad = torch.stack([*found.values(), torch.zeros(len(scene), device=device) > 0]).any(dim=0)
+    assert torch.equal(bad.cpu(), ~valid_rows(scene))
+    name = make.__name__.removeprefix("nan_")
+    names = {"zero_quaternions": ["quats"]}.get(name, [name] if name in scene.tensors() else [])
+    assert list(found) == names
+
+
+@dtypes
+@devices
+@each_case
+def test_what_the_filter_leaves_out_is_bounded(make, device, dtype):
+    scene = make(COUNT, dtype)
+    scene = scene.select(valid_rows(scene)).to(device)
+    opacities, masses = scene.opacities, scene.masses
+    for share, at_least in ((1.0, 1), (1.0, len(scene)), (0.01, 1), (0.01, len(scene) // 2 + 1)):
+        keep = visible_rows(
+            opacities, masses, min_opacity=0.1, max_mass_share=share, at_least=at_least
+        )
+        assert int(keep.sum()) >= at_least
+        assert bool(keep[opacities >= 0.1].all())
+        if share < 1:
+            assert float(masses[~keep].sum()) <= share * float(masses.sum())
+
+
+@dtypes
+@each_case
+def test_only_what_flew_away_is_a_flyaway(make, dtype):
+    scene = make(COUNT, dtype)
+    scene = scene.select(valid_rows(scene))
+    distances = robust_frame(scene.means).distances(scene.means)
+    assert bool(distances.isfinite().all())
+    seen = scene.masses * distances.clamp_min(1).pow(-2)
+    rows = flyaway_rows(distances, seen, max_share=1e-3).nonzero()[:, 0].tolist()
+    assert rows == ([0, 1, 2, 3, 4] if "flyaways" in make.__name__ else [])
+
+
+def test_equally_faint_gaussians_go_by_mass_not_by_row():
+    scene = CASES["all_faint"](COUNT, torch.float32)
+    shuffle = torch.randperm(COUNT, generator=torch.Generator().manual_seed(0))
+    keeps = [
+        visible_rows(s.opacities, s.masses, min_opacity=0.1, max_mass_share=0.05, at_least=1)
+        for s in (scene, scene.select(shuffle))
+    ]
+    assert int((~keeps[0]).sum()) >= 3
+    assert torch.equal(keeps[0][shuffle], keeps[1])
+    assert float(scene.masses[~keeps[0]].amax()) <= float(scene.masses[keeps[0]].amin())
+
+
+@dtypes
+@devices
+@each_case
+def test_valid_rows_become_standard_and_keep_what_they_are(make, device, dtype):
+    scene = make(COUNT, dtype)
+    scene = scene.select(valid_rows(scene)).to(device)
+    small = standardized(scene)
+    assert_standard(small)
+    for name in ("means", "log_scales", "sh0", "shN"):
+        assert torch.equal(small.tensors()[name], scene.tensors()[name])
+    cosines = torch.nn.functional.cosine_similarity(
+        small.quats.double(), scene.quats.double() / scene.quats.double().abs().amax(1)[:, None]
+    )
+    assert float(cosines.amin()) > 1 - 1e-5

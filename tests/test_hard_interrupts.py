@@ -1,0 +1,143 @@
+"""Interrupts, kills and full disks at any moment of writing: the old file, the new one, or none."""
+
+import os
+import signal
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs.errors import OutputError
+from cvtgs.io import atomic_output
+from cvtgs.io.tensors import save_tensors
+from hard_cases import CASES
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+HOMES = ("/cvtgs/io/",)
+
+
+def scene():
+    return CASES["ball"](20, torch.float32)
+
+
+WRITERS: dict[str, Callable[[Path, bool], None]] = {
+    "scene": lambda path, overwrite: cvtgs.save(scene(), path, overwrite=overwrite),
+    "tensors": lambda path, overwrite: save_tensors(path, {"a": torch.arange(99.0)}, {"by": "me"}),
+}
+STEPS = {"scene": 23, "tensors": 5}
+"""Every so many lines there is a signal: a few dozen of each."""
+
+
+def leave(number: int, frame: FrameType | None) -> NoReturn:
+    sys.exit(143)  # as the command line does
+
+
+def in_child(action: Callable[[], None], *, moment: int, number: int) -> int:
+    """Fork, send a signal at the given line of the code that writes, and give how it ended."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # the child uses no thread
+        process = os.fork()
+    if process:
+        return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+    lines = 0
+
+    def trace(frame: FrameType, event: str, value: object) -> object:
+        nonlocal lines
+        if not any(home in frame.f_code.co_filename for home in HOMES):
+            return None
+        if event == "line":
+            lines += 1
+            if lines == moment:
+                os.kill(os.getpid(), number)
+        return trace
+
+    try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, leave)
+        sys.settrace(trace)
+        action()
+    except BaseException:  # what it is does not matter here, and pytest must not see it
+        os._exit(1)
+    os._exit(0)
+
+
+@pytest.fixture(params=[b"old", None], ids=["over an old file", "as a new file"])
+def old(request) -> bytes | None:
+    return request.param
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("name", WRITERS)
+def test_any_moment_leaves_the_old_file_or_none_or_the_new_one(tmp_path, name, number, old):
+    write = WRITERS[name]
+    write(tmp_path / "whole.ply", False)
+    new, path, ends, litter = (tmp_path / "whole.ply").read_bytes(), tmp_path / "a.ply", set(), 0
+    for moment in range(1, 100_000, STEPS[name]):
+        path.unlink(missing_ok=True)
+        if old is not None:
+            path.write_bytes(old)
+        code = in_child(lambda: write(path, True), moment=moment, number=number)
+        found = path.read_bytes() if path.exists() else None
+        assert found in (old, new)
+        ends.add(found)
+        rest = [p for p in tmp_path.iterdir() if p not in (path, tmp_path / "whole.ply")]
+        assert all(p.name.startswith(".a.ply.") and p.suffix == ".tmp" for p in rest)
+        litter += len(rest)
+        for left in rest:
+            left.unlink()
+        if code == 0:
+            break
+    assert code == 0  # in the end there was no such line any more
+    assert moment > 8 * STEPS[name]
+    assert ends == {old, new}
+    # A kill leaves its temporary file; others only where they hit the line that removes it.
+    assert litter > 0 if number == signal.SIGKILL else litter <= 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits the file size as Linux does")
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_a_disk_that_is_full_at_any_byte_leaves_the_old_file_or_none(tmp_path, write, old):
+    import resource  # noqa: PLC0415 (not on Windows)
+
+    write(tmp_path / "whole.ply", False)
+    size, path = (tmp_path / "whole.ply").stat().st_size, tmp_path / "a.ply"
+    if old is not None:
+        path.write_bytes(old)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for room in sorted({0, 1, size // 3, size // 2, size - 1}):
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
+            with pytest.raises(OutputError, match="must be writable, found: file too large"):
+                write(path, True)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert (path.read_bytes() if path.exists() else None) == old
+        assert len(list(tmp_path.iterdir())) == 1 + (old is not None)
+    write(path, True)
+    assert path.read_bytes() == (tmp_path / "whole.ply").read_bytes()
+
+
+def test_a_scene_that_cannot_be_written_leaves_nothing(tmp_path):
+    bad = cvtgs.GaussianScene(**scene().tensors(), comments=("two\nlines",))
+    with pytest.raises(cvtgs.errors.InvalidSceneError):
+        cvtgs.save(bad, tmp_path / "a.ply")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_two_writers_of_one_name_do_not_mix(tmp_path):
+    path = tmp_path / "a.bin"
+    with (
+        atomic_output(path, overwrite=True) as one,
+        atomic_output(path, overwrite=True) as other,
+    ):
+        one.write(b"1" * 1000)
+        other.write(b"2" * 1000)
+        one.write(b"1" * 1000)
+    assert path.read_bytes() == b"1" * 2000
+    assert list(tmp_path.iterdir()) == [path]
