@@ -3,11 +3,13 @@
 import os
 import platform
 import statistics
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from cvtgs.errors import RunError
+from cvtgs.tradeoff.processes import run_process
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,26 +36,17 @@ def run_python(*arguments: str) -> Cost:
 
 def run(command: Sequence[str]) -> Cost:
     """Run a command and measure it; a failure ends the benchmark."""
-    launched = subprocess.run(
-        [sys.executable, "-S", "-c", LAUNCHER, *command], stdout=subprocess.PIPE, check=False
+    try:
+        cost = run_process(command)
+    except RunError as error:
+        raise SystemExit(f"{' '.join(command)} failed: {error}") from None
+    sys.stderr.write(cost.errors)
+    return Cost(
+        user_seconds=cost.user_seconds,
+        wall_seconds=cost.wall_seconds,
+        peak_bytes=cost.peak_memory_bytes,
+        output=cost.output,
     )
-    output, _, line = launched.stdout.decode().rstrip("\n").rpartition("\n")
-    code, user, wall, peak = (float(number) for number in line.split())
-    if code:
-        raise SystemExit(f"{' '.join(command)} failed with exit code {code:.0f}.")
-    unit = 1 if sys.platform == "darwin" else 1024
-    return Cost(user_seconds=user, wall_seconds=wall, peak_bytes=int(peak) * unit, output=output)
-
-
-# A process inherits the peak of the one that starts it, so a small one must start it.
-LAUNCHER = """
-import os, sys, time
-start = time.perf_counter()
-process = os.spawnvp(os.P_NOWAIT, sys.argv[1], sys.argv[1:])
-_, status, usage = os.wait4(process, 0)
-wall = time.perf_counter() - start
-print(f"\\n{os.waitstatus_to_exitcode(status)} {usage.ru_utime} {wall} {usage.ru_maxrss}")
-"""
 
 
 def spread(values: Sequence[float]) -> str:

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from cvtgs.errors import InvalidArgumentError, MissingDependencyError
-from cvtgs.plots import COLORS, Panel, Series, line_chart
+from cvtgs.plots import COLORS, Panel, Series, _cost, _shared, _styles, line_chart
 
 needs_matplotlib = pytest.mark.skipif(
     importlib.util.find_spec("matplotlib") is None, reason="matplotlib is optional"
@@ -112,3 +112,65 @@ def test_what_cannot_be_drawn_is_an_error(panels, text):
 def test_a_size_that_cannot_be_is_an_error(wrong):
     with pytest.raises(InvalidArgumentError, match="at least 1 column and 100 pixels"):
         line_chart([Panel(series=[LOSS])], **wrong)
+
+
+@needs_matplotlib
+def test_more_names_than_colours_and_styles_still_look_different():
+    """The 25th line has the first colour and style again, but marks in another shape."""
+    names = [str(number) for number in range(25)]
+    panel = Panel(series=[Series(name=name, x=[0, 1], y=[1, 1]) for name in names])
+    looks = _styles([panel])
+    assert len({tuple(look.items()) for look in looks.values()}) == 25
+    assert looks["0"]["marker"] != looks["24"]["marker"]
+    first, last = (
+        line_chart([Panel(series=[*panel.series[:24], Series(name=name, x=[0, 1], y=[2, 3])])])
+        for name in ("0", "24")
+    )
+    assert first != last
+
+
+def test_more_names_than_looks_is_an_error():
+    many = [Series(name=str(number), x=[0], y=[0]) for number in range(217)]
+    with pytest.raises(InvalidArgumentError, match="at most 216 names apart, found 217"):
+        line_chart([Panel(series=many)])
+
+
+@needs_matplotlib
+def test_points_aside_are_hollow_and_passed_by():
+    """A line through all three points would pass below the middle of the chart."""
+    line = Series(name="a", x=[0, 1, 2], y=[1, 0, 1], markers=True, aside=[False, True, False])
+    drawn = pixels(line_chart([Panel(series=[line])], width=400, height=300))
+    wanted = [int(COLORS[0][start : start + 2], 16) for start in (1, 3, 5)]
+    blue = (drawn == wanted).all(axis=-1)
+    rows = np.flatnonzero(blue.any(axis=1))
+    middle = (rows.min() + rows.max()) // 2
+    assert not blue[middle - 20 : middle + 20].any()
+    alone = Series(name="a", x=[1], y=[1], aside=[True])
+    assert shows(pixels(line_chart([Panel(series=[alone])])), COLORS[0])
+
+
+@needs_matplotlib
+def test_labels_stand_next_to_their_points_and_not_on_one_another():
+    labelled = Series(
+        name="a", x=[1, 1.01, 5], y=[1, 1, 1], markers=True, labels=["one", "two", ""]
+    )
+    plain = Series(name="a", x=[1, 1.01, 5], y=[1, 1, 1], markers=True)
+    panels = [[Panel(series=[series])] for series in (labelled, plain)]
+    assert line_chart(panels[0]) == line_chart(panels[0])
+    assert line_chart(panels[0]) != line_chart(panels[1])
+    assert _shared((0, 0, 2, 2), (1, 1, 3, 5)) == 1
+    assert _shared((0, 0, 2, 2), (2, 0, 3, 5)) == 0
+    assert _cost((0, 0, 2, 2), [(0, 0, 1, 1)], (1, 0, 9, 9)) == 1 + 2
+
+
+@pytest.mark.parametrize(
+    ("more", "text"),
+    [
+        ({"labels": ["a"]}, "must have labels for all points or none; found 1 for 3."),
+        ({"aside": [True]}, "must have points aside for all points or none; found 1 for 3."),
+    ],
+)
+def test_labels_for_some_points_are_an_error(more, text):
+    with pytest.raises(InvalidArgumentError) as caught:
+        line_chart([Panel(series=[Series(name="loss", x=[0, 1, 2], y=[0, 1, 2], **more)])])
+    assert str(caught.value) == f"series 'loss' {text}"

@@ -14,8 +14,26 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#00
 STYLES = ("-", "--", ":")
 """Further series take the colours again, in the next style."""
 
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<")
+"""When the styles are used up, too, points are marked, in the next shape."""
+
 DPI = 100
 SMALLEST_SIDE = 100
+
+_PLACES = (
+    (0, 7, "center", "bottom"),
+    (0, -7, "center", "top"),
+    (7, 0, "left", "center"),
+    (-7, 0, "right", "center"),
+    (6, 6, "left", "bottom"),
+    (6, -6, "left", "top"),
+    (-6, 6, "right", "bottom"),
+    (-6, -6, "right", "top"),
+)
+"""Where the label of a point may stand: how far right and up, and how it is aligned there."""
+
+Box = tuple[float, float, float, float]
+"""Left, lower, right and upper end in pixels."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,12 +45,16 @@ class Series:
         x: Where its points are.
         y: Their values; the line has gaps where they are not finite.
         markers: Whether its points are marked.
+        labels: What stands at each point; empty for nothing.
+        aside: Which points are hollow, and passed by by the line; empty for none.
     """
 
     name: str
     x: Sequence[float]
     y: Sequence[float]
     markers: bool = False
+    labels: Sequence[str] = ()
+    aside: Sequence[bool] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,8 +101,9 @@ def line_chart(
         A PNG file; the same arguments give the same bytes with the same matplotlib.
 
     Raises:
-        InvalidArgumentError: There is nothing to draw, a series has not as many x as y, the size
-            is too small, or a value does not fit its logarithmic axis.
+        InvalidArgumentError: There is nothing to draw, a series has not as many x as y, labels
+            or points aside, there are more names than looks, the size is too small, or a value
+            does not fit its logarithmic axis.
         MissingDependencyError: matplotlib is not installed.
 
     Example:
@@ -106,6 +129,10 @@ def line_chart(
             ncols=min(len(lines), 6),
             frameon=False,
         )
+    if any(series.labels for panel in panels for series in panel.series):
+        figure.draw_without_rendering()  # the layout moves axes, and so the places of labels
+        for panel, axes in zip(panels, figure.axes, strict=False):
+            _write_labels(axes, panel)
     file = io.BytesIO()
     figure.canvas.print_png(file, metadata={"Software": None})
     return file.getvalue()
@@ -129,26 +156,38 @@ def _figure(width: float, height: float) -> Any:
 def _styles(panels: Sequence[Panel]) -> dict[str, dict[str, str]]:
     """Give every name a look of its own, in the order of appearance."""
     names = dict.fromkeys(series.name for panel in panels for series in panel.series)
-    return {
-        name: {
-            "color": COLORS[number % len(COLORS)],
-            "linestyle": STYLES[number // len(COLORS) % len(STYLES)],
-        }
-        for number, name in enumerate(names)
-    }
+    most = len(COLORS) * len(STYLES) * len(MARKERS)
+    if len(names) > most:
+        raise InvalidArgumentError(f"a chart tells at most {most} names apart, found {len(names)}.")
+    looks = [
+        {"color": color, "linestyle": style, "marker": marker}
+        for marker in MARKERS
+        for style in STYLES
+        for color in COLORS
+    ]
+    return dict(zip(names, looks, strict=False))
 
 
 def _draw(axes: Any, panel: Panel, styles: dict[str, dict[str, str]]) -> dict[str, Any]:
     lines = {}
     for series in panel.series:
-        y = [value if math.isfinite(value) else math.nan for value in series.y]
-        marker = "o" if series.markers or len(y) == 1 else None
-        (lines[series.name],) = axes.plot(series.x, y, marker=marker, **styles[series.name])
+        look = dict(styles[series.name])
+        if not series.markers and len(series.y) > 1 and look["marker"] == MARKERS[0]:
+            del look["marker"]
+        aside = series.aside or [False] * len(series.y)
+        points = list(zip(series.x, map(_or_gap, series.y), aside, strict=True))
+        x, y = _columns([point for point in points if not point[2]])
+        (lines[series.name],) = axes.plot(x, y, **look)
+        if any(aside):
+            look |= {"linestyle": "", "marker": styles[series.name]["marker"]}
+            axes.plot(*_columns([point for point in points if point[2]]), mfc="white", **look)
     axes.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
     if panel.log_x:
         axes.set_xscale("log")
     if panel.log_y:
         axes.set_yscale("log")
+    if any(series.labels for series in panel.series):
+        axes.margins(0.08, 0.12)  # before the ticks, which may widen the axis
     if panel.x_ticks:
         axes.set_xticks(panel.x_ticks, [f"{tick:g}" for tick in panel.x_ticks])
         axes.set_xticks([], minor=True)
@@ -156,6 +195,61 @@ def _draw(axes: Any, panel: Panel, styles: dict[str, dict[str, str]]) -> dict[st
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     return lines
+
+
+def _or_gap(value: float) -> float:
+    return value if math.isfinite(value) else math.nan
+
+
+def _columns(points: Sequence[tuple[float, float, bool]]) -> tuple[list[float], list[float]]:
+    return [point[0] for point in points], [point[1] for point in points]
+
+
+def _write_labels(axes: Any, panel: Panel) -> None:
+    """Write labels next to their points, where they hide least of points and other labels."""
+    points = [
+        (label, (x, y))
+        for series in panel.series
+        for label, x, y in zip(
+            series.labels or [""] * len(series.x), series.x, series.y, strict=True
+        )
+        if math.isfinite(y)
+    ]
+    middles = [axes.transData.transform(place) for _, place in points]
+    taken = [(x - 4, y - 4, x + 4, y + 4) for x, y in middles]
+    frame = axes.get_window_extent().extents
+    for label, place in points:
+        if label:
+            text = axes.annotate(
+                label, place, xytext=(0, 0), textcoords="offset points", fontsize=8, color="#444444"
+            )
+            text.set_bbox({"facecolor": "white", "alpha": 0.7, "linewidth": 0, "pad": 0.5})
+            costs = [
+                _cost(_put(text, number), taken, frame) + number for number in range(len(_PLACES))
+            ]
+            taken.append(_put(text, costs.index(min(costs))))
+
+
+def _put(text: Any, number: int) -> Box:
+    """Move a label to one of its places, and give its pixels there."""
+    right, up, horizontal, vertical = _PLACES[number]
+    text.xyann = (right, up)
+    text.set(horizontalalignment=horizontal, verticalalignment=vertical)
+    x0, y0, x1, y1 = text.get_window_extent().extents
+    return x0, y0, x1, y1
+
+
+def _cost(box: Box, taken: Sequence[Box], frame: Box) -> float:
+    """Give how much of others a label hides, and how much of it is outside, square pixels."""
+    outside = _shared(box, box) - _shared(box, frame)
+    return outside + sum(_shared(box, other) for other in taken)
+
+
+def _shared(one: Box, other: Box) -> float:
+    """Give the area that two boxes share, square pixels."""
+    width = min(one[2], other[2]) - max(one[0], other[0])
+    height = min(one[3], other[3]) - max(one[1], other[1])
+    return max(0.0, width) * max(0.0, height)
 
 
 def _check(panels: Sequence[Panel], columns: int, *, size: tuple[int, int]) -> None:
@@ -181,6 +275,12 @@ def _check_series(series: Series, panel: Panel) -> None:
             f"series {series.name!r} must have as many x as y, and at least one; "
             f"found {len(series.x)} and {len(series.y)}."
         )
+    for name, number in (("labels", len(series.labels)), ("points aside", len(series.aside))):
+        if number not in (0, len(series.x)):
+            raise InvalidArgumentError(
+                f"series {series.name!r} must have {name} for all points or none; "
+                f"found {number} for {len(series.x)}."
+            )
     for axis, is_log, values in (("x", panel.log_x, series.x), ("y", panel.log_y, series.y)):
         bad = [number for number, value in enumerate(values) if value <= 0] if is_log else []
         if bad:

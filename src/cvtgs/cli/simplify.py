@@ -11,6 +11,7 @@ from cvtgs.cli.display import (
     progress_bars,
     stage_seconds,
 )
+from cvtgs.cli.goals import Goals, add_goal_options
 from cvtgs.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     size = parser.add_mutually_exclusive_group(required=True)
     size.add_argument("--rho", type=float, metavar="R", help="ratio of Gaussians to keep, (0, 1]")
     size.add_argument("--count", type=int, metavar="M", help="number of Gaussians to keep")
+    add_goal_options(parser, size)
     parser.add_argument(
         "--preset",
         metavar="NAME",
@@ -98,6 +100,7 @@ def run(options: argparse.Namespace) -> None:
     from cvtgs.mergenet import load_checkpoint  # noqa: PLC0415
     from cvtgs.simplify import Simplifier, target_count  # noqa: PLC0415
 
+    goals = Goals(options)
     checkpoint = None if options.ckpt == "none" else options.ckpt
     preset = options.preset
     if checkpoint not in (None, "auto") and preset is None and options.config is None:
@@ -110,10 +113,18 @@ def run(options: argparse.Namespace) -> None:
     if options.report is not None:
         check_output(options.report, overwrite=options.overwrite)
     with progress_bars(quiet=options.quiet) as listener:
-        simplifier = Simplifier(checkpoint, config=config, device=options.device, listener=listener)
         scene = load(options.input)
         cameras = None if options.cameras is None else load_cameras(options.cameras)
-        small, report = simplifier.run(scene, options.rho, count=options.count, cameras=cameras)
+        chosen = goals.preset(scene, listener)
+        if chosen is not None:
+            config = SimplifyConfig.compose(preset=chosen, settings=settings)
+        simplifier = Simplifier(
+            checkpoint,
+            config=config,
+            device=options.device,
+            listener=goals.stage_listener(listener),
+        )
+        small, report = goals.run(simplifier, scene, cameras=cameras, listener=listener)
         save(small, options.output, overwrite=options.overwrite)
     if options.report is not None:
         with atomic_output(options.report, overwrite=options.overwrite) as file:
@@ -125,6 +136,8 @@ def run(options: argparse.Namespace) -> None:
             f"{stage_seconds(report.stages)}"
         )
         _print_details(report)
+        for sentence in goals.said:
+            print(sentence)
 
 
 def _print_details(report: "SimplifyReport") -> None:

@@ -21,7 +21,9 @@ MOST_BYTES = 7_500_000
 _TRIES = ((84, 1.0), (72, 1.0), (55, 1.0), (55, 0.7), (45, 0.5), (35, 0.35), (30, 0.25))
 
 
-def comparison_page(comparison: Comparison, *, most_bytes: int = MOST_BYTES) -> str:
+def comparison_page(
+    comparison: Comparison, *, foreword: str = "", most_bytes: int = MOST_BYTES
+) -> str:
     """Write the page.
 
     It has a divider between the full and a simplified scene, a chooser of scene and view, counts,
@@ -30,6 +32,7 @@ def comparison_page(comparison: Comparison, *, most_bytes: int = MOST_BYTES) -> 
 
     Args:
         comparison: Pictures and scores, at least one simplified scene.
+        foreword: HTML that stands above the pictures.
         most_bytes: The page's size; pictures lose quality, then pixels, until it is kept, as far
             as a quarter of their width goes.
 
@@ -48,13 +51,13 @@ def comparison_page(comparison: Comparison, *, most_bytes: int = MOST_BYTES) -> 
     """
     page = ""
     for quality, factor in _TRIES:
-        page = _page(comparison, quality, factor)
+        page = _page(comparison, quality, factor, foreword=foreword)
         if len(page) <= most_bytes:
             break
     return page
 
 
-def _page(comparison: Comparison, quality: int, factor: float) -> str:
+def _page(comparison: Comparison, quality: int, factor: float, *, foreword: str) -> str:
     title = html.escape(f"{comparison.evaluation.reference}: before and after")
     parts = {
         "TITLE": title,
@@ -62,6 +65,8 @@ def _page(comparison: Comparison, quality: int, factor: float) -> str:
         "GRADIENT": css_gradient(),
         "ERROR_SCALE": f"{ERROR_SCALE:g}",
         "SCRIPT": _part("page.js"),
+        "SHEET": "" if foreword else " The same pictures are in sheet.png, next to it.",
+        "FOREWORD": foreword,
         "DATA": _for_script(_data(comparison, quality, factor)),
     }
     page = _part("page.html")

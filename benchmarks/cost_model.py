@@ -1,0 +1,131 @@
+"""How well seconds are predicted: the cost model of ``--time-budget`` against what happens.
+
+``python -m benchmarks.cost_model`` simplifies generated scenes that the calibration has not seen,
+other kinds, seeds and sizes, by every preset to choose from, each run in a process of its own, and
+prints predicted against measured seconds of all stages as Markdown. Of several runs the fastest
+counts, as in the calibration: other programs only ever make a run slower. On a machine that is
+busy all the time, ``--clock undisturbed`` leaves out what other programs took, stage by stage.
+"""
+
+import argparse
+import statistics
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+
+import cvtgs
+from benchmarks.processes import machine
+from cvtgs.goals import CostModel, Work, cost_model
+from cvtgs.goals.calibrate import CANDIDATES, undisturbed_seconds
+from cvtgs.report import StageCost
+from cvtgs.tradeoff.runs import Task, run_task
+
+SCENES = (
+    ("object", 50_000, 2),
+    ("landscape", 150_000, 0),
+    ("haze", 300_000, 3),
+    ("courtyard", 1_000_000, 1),
+)
+RATIOS = (0.1, 0.01)
+SEED = 11
+CLOCKS: Mapping[str, Callable[[StageCost], float]] = {
+    "wall": attrgetter("seconds"),
+    "undisturbed": undisturbed_seconds,
+}
+LIMIT = 0.3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """Predicted and measured seconds of one preset on one scene."""
+
+    scene: str
+    preset: str
+    rho: float
+    predicted: float
+    measured: float
+
+    @property
+    def error(self) -> float:
+        """Give the error as a share of what was measured."""
+        return self.predicted / self.measured - 1
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("files", nargs="*", type=Path, help="PLYs; generated scenes if none")
+    parser.add_argument("--rho", type=float, nargs="+", default=list(RATIOS))
+    parser.add_argument("--presets", nargs="+", choices=CANDIDATES, default=list(CANDIDATES))
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--most", type=int, default=1_000_000, help="largest generated scene")
+    parser.add_argument("--clock", choices=CLOCKS, default="wall", help="whose seconds")
+    parser.add_argument("--recalibrate", action="store_true", help="not what is remembered")
+    options = parser.parse_args(arguments)
+    model = cost_model(recalibrate=options.recalibrate)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        files = options.files or generated(folder, options.most)
+        rows = [row for file in files for row in measured(file, folder, model, options)]
+    print(f"{machine()}; {options.clock} seconds, the fastest of {options.runs} runs\n")
+    print(report(rows))
+
+
+def generated(folder: Path, most: int) -> list[Path]:
+    """Write the scenes."""
+    paths = []
+    for kind, count, degree in SCENES:
+        if count <= most:
+            path = folder / f"{kind}_{count // 1000}k_sh{degree}.ply"
+            cvtgs.save(cvtgs.synthetic.scene(kind, count, sh_degree=degree, seed=SEED), path)
+            paths.append(path)
+    return paths
+
+
+def measured(file: Path, folder: Path, model: CostModel, options: argparse.Namespace) -> list[Row]:
+    """Run every preset and ratio on one file."""
+    scene = cvtgs.load(file)
+    rows = []
+    for rho in options.rho:
+        work = Work.of(scene, cvtgs.target_count(len(scene), rho))
+        for preset in options.presets:
+            task = Task(preset=preset, rho=rho)
+            runs = [run_task(file, task, folder).report.stages for _ in range(options.runs)]
+            seconds = [sum(map(CLOCKS[options.clock], stages)) for stages in runs]
+            rows.append(
+                Row(
+                    scene=file.stem,
+                    preset=preset,
+                    rho=rho,
+                    predicted=model.seconds(preset, work),
+                    measured=min(seconds),
+                )
+            )
+    return rows
+
+
+def report(rows: Sequence[Row]) -> str:
+    """Give the table and its summary."""
+    lines = [
+        "| scene | rho | preset | predicted s | measured s | error |",
+        "|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {row.scene} | {row.rho:g} | {row.preset} | {row.predicted:.2f} | {row.measured:.2f} "
+        f"| {row.error:+.0%} |"
+        for row in rows
+    ]
+    within = sum(abs(row.error) <= LIMIT for row in rows)
+    worst = max(rows, key=lambda row: abs(row.error))
+    median = statistics.median(abs(row.error) for row in rows)
+    lines += [
+        "",
+        f"{within} of {len(rows)} predictions are within {LIMIT:.0%}; the median error is "
+        f"{median:.0%}, the largest {worst.error:+.0%} ({worst.preset} on {worst.scene}).",
+    ]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,208 @@
+"""Goals of ``cvtgs simplify``: a time to keep, or a quality to reach."""
+
+import argparse
+import math
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from cvtgs.errors import GoalError, InvalidArgumentError
+from cvtgs.progress import ProgressListener, silent
+
+if TYPE_CHECKING:
+    from cvtgs.cameras import Cameras
+    from cvtgs.scene import GaussianScene
+    from cvtgs.simplify import Simplified, Simplifier
+
+STARTED = time.perf_counter()
+"""When this process was young: a time budget counts from here."""
+
+UNITS = {"s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+
+
+def add_goal_options(
+    parser: argparse.ArgumentParser, size: "argparse._MutuallyExclusiveGroup"
+) -> None:
+    """Describe the options.
+
+    Args:
+        parser: Where to add those of the time.
+        size: Where to add those of the quality, which take the place of a ratio or a count.
+    """
+    size.add_argument(
+        "--target-psnr",
+        type=float,
+        metavar="DB",
+        help="keep as few Gaussians as reach this PSNR over views that are held out",
+    )
+    size.add_argument(
+        "--target-ssim", type=float, metavar="S", help="the same for SSIM, for example 0.9"
+    )
+    parser.add_argument(
+        "--time-budget",
+        metavar="TIME",
+        help="instead of --preset: the best one that is done in this time, for example 20s or 2m; "
+        "the first use measures this machine, which takes some 20 s and is not counted",
+    )
+    parser.add_argument(
+        "--recalibrate", action="store_true", help="measure this machine anew for --time-budget"
+    )
+
+
+class Goals:
+    """What the options of one call ask for, and what came of it.
+
+    Args:
+        options: The parsed options.
+
+    Raises:
+        InvalidArgumentError: A goal is out of range, or does not go with another option.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self._options = options
+        self.has_target = options.target_psnr is not None or options.target_ssim is not None
+        self.seconds = None if options.time_budget is None else seconds_of(options.time_budget)
+        self.said: list[str] = []
+        if self.has_target:
+            from cvtgs.goals.goal import check_target  # noqa: PLC0415 (only for those who ask)
+
+            check_target(options.target_psnr, ssim=options.target_ssim)
+        if self.seconds is not None:
+            self._check_budget()
+        elif options.recalibrate:
+            raise InvalidArgumentError("--recalibrate goes with --time-budget.")
+
+    def _check_budget(self) -> None:
+        options = self._options
+        others = {
+            "--preset": options.preset is not None,
+            "--config": options.config is not None,
+            "--ckpt": options.ckpt not in ("auto", "none"),
+            "--refine": options.refine is not None or options.refine_steps is not None,
+            "--target-psnr and --target-ssim": self.has_target,
+        }
+        wrong = [name for name, is_given in others.items() if is_given]
+        if wrong:
+            raise InvalidArgumentError(
+                f"--time-budget chooses the preset and cannot go with {', '.join(wrong)}."
+            )
+
+    def stage_listener(self, listener: ProgressListener) -> ProgressListener:
+        """Give what hears of the stages: nobody if they run again and again.
+
+        Args:
+            listener: Told about a single run.
+
+        Returns:
+            The listener.
+        """
+        return silent if self.has_target else listener
+
+    def preset(self, scene: "GaussianScene", listener: ProgressListener) -> str | None:
+        """Choose the preset that fits into the time, if a time is given.
+
+        Args:
+            scene: The scene that was read.
+            listener: Told about the measurements.
+
+        Returns:
+            Its name, or None.
+
+        Raises:
+            GoalError: None fits.
+        """
+        if self.seconds is None:
+            return None
+        from cvtgs.goals import Work, choose_preset, cost_model  # noqa: PLC0415
+        from cvtgs.goals.remember import is_known  # noqa: PLC0415
+        from cvtgs.simplify import target_count  # noqa: PLC0415
+
+        options, spent = self._options, time.perf_counter() - STARTED
+        left = self.seconds - spent
+        if left <= 0:
+            raise GoalError(
+                f"no preset fits into {self.seconds:g} s: starting and reading took {spent:.1f} s."
+            )
+        target = target_count(len(scene), options.rho, count=options.count)
+        again = options.recalibrate or not is_known(options.device)
+        if again and not options.quiet:
+            print("cvtgs: measuring this machine once, some 20 s", file=sys.stderr)
+        model = cost_model(options.device, recalibrate=again, listener=listener)
+        choice = choose_preset(Work.of(scene, target), left, model=model)
+        self.said.append(
+            f"Preset {choice.preset}, the best that fits into {self.seconds:g} s: expected to take "
+            f"{choice.seconds:.1f} s after {spent:.1f} s of starting and reading."
+        )
+        return choice.preset
+
+    def run(
+        self,
+        simplifier: "Simplifier",
+        scene: "GaussianScene",
+        *,
+        cameras: "Cameras | None" = None,
+        listener: ProgressListener = silent,
+    ) -> "Simplified":
+        """Simplify to the ratio or count that is asked for, or to the quality.
+
+        Args:
+            simplifier: Makes small scenes.
+            scene: The scene.
+            cameras: From where presets that look at the scene do so.
+            listener: Told about the search.
+
+        Returns:
+            The scene and the report.
+
+        Raises:
+            GoalError: The quality cannot be reached.
+        """
+        options = self._options
+        if not self.has_target:
+            return simplifier.run(scene, options.rho, count=options.count, cameras=cameras)
+        from cvtgs.goals import find_count  # noqa: PLC0415
+        from cvtgs.simplify import Simplified  # noqa: PLC0415
+
+        found = find_count(
+            scene,
+            psnr=options.target_psnr,
+            ssim=options.target_ssim,
+            simplifier=simplifier,
+            cameras=cameras,
+            listener=listener,
+        )
+        self.said.append(
+            f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f} over views that were held out; "
+            f"found in {len(found.tried)} tries."
+        )
+        return Simplified(found.scene, found.report)
+
+
+def seconds_of(text: str) -> float:
+    """Read a time.
+
+    Args:
+        text: A number with or without a unit: s, m, min or h.
+
+    Returns:
+        Seconds.
+
+    Raises:
+        InvalidArgumentError: It is no time, or not above 0.
+
+    Example:
+        >>> seconds_of("20"), seconds_of("1.5m")
+        (20.0, 90.0)
+    """
+    number = text.strip().rstrip("abcdefghijklmnopqrstuvwxyz")
+    unit = text.strip()[len(number) :] or "s"
+    try:
+        seconds = float(number) * UNITS[unit]
+    except (ValueError, KeyError):
+        seconds = math.nan
+    if not 0 < seconds < math.inf:
+        raise InvalidArgumentError(
+            f"--time-budget must be a time above 0, for example 20s or 2m; found {text!r}."
+        )
+    return seconds

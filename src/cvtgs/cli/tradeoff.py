@@ -1,0 +1,124 @@
+"""``cvtgs tradeoff``: what more time buys, preset by preset."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cvtgs.cli.display import progress_bars
+from cvtgs.cli.looking import (
+    add_looking_options,
+    background_color,
+    check_looking_options,
+    chosen_cameras,
+)
+from cvtgs.errors import InvalidArgumentError
+
+if TYPE_CHECKING:
+    from cvtgs.tradeoff import Tradeoff
+
+SIZE = 640
+MOST_CAMERAS = 8
+
+
+def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Describe the command.
+
+    Args:
+        commands: Where to add it.
+    """
+    parser = commands.add_parser(
+        "tradeoff",
+        help="run all presets on a scene and show seconds against quality",
+        description="Simplify IN by every preset, each run in a process of its own, score the "
+        "results against IN, print a table, and write tradeoff.csv, tradeoff.json, tradeoff.png "
+        "and index.html, one file that needs no network. Of given cameras, 8 are used unless "
+        "--views says otherwise.",
+    )
+    parser.add_argument("input", metavar="IN", type=Path, help="the full scene (.ply)")
+    parser.add_argument(
+        "--rho", default="0.1,0.01,0.001", metavar="R,R", help="ratios (default 0.1,0.01,0.001)"
+    )
+    parser.add_argument("--presets", metavar="NAME,NAME", help="which presets (default: all)")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="DIR", help="directory to write to"
+    )
+    parser.add_argument("--save", action="store_true", help="keep the small scenes there, too")
+    parser.add_argument(
+        "--lpips",
+        default="auto",
+        choices=("auto", "vgg", "alex", "off"),
+        help="which LPIPS to measure (default: VGG or Alex if there are weights)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace existing files")
+    add_looking_options(parser, size=SIZE)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the command.
+
+    Args:
+        options: The parsed options.
+    """
+    from cvtgs.evaluate import EvaluationSettings  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.tradeoff import measure_tradeoff, write_tradeoff  # noqa: PLC0415
+    from cvtgs.tradeoff.files import check_tradeoff_files  # noqa: PLC0415
+    from cvtgs.tradeoff.runs import tasks_of  # noqa: PLC0415
+
+    check_looking_options(options)
+    presets = None if options.presets is None else _words(options.presets)
+    ratios = _ratios(options.rho)
+    kept = tuple(task.file_name for task in tasks_of(presets, ratios) if options.save)
+    check_tradeoff_files(options.output, more=kept, overwrite=options.overwrite)
+    with progress_bars(quiet=options.quiet) as listener:
+        measured = measure_tradeoff(
+            options.input,
+            presets=presets,
+            ratios=ratios,
+            cameras=lambda scene: chosen_cameras(options, scene, most=MOST_CAMERAS),
+            settings=EvaluationSettings(
+                background=background_color(options), lpips=options.lpips, backend=options.backend
+            ),
+            device=options.device,
+            folder=options.output if options.save else None,
+            listener=listener,
+        )
+        paths, note = write_tradeoff(
+            measured, options.output, overwrite=options.overwrite, listener=listener
+        )
+    if not options.quiet:
+        _print_tables(measured.tradeoff)
+        names = ", ".join(path.name for path in paths)
+        print(f"Wrote {names}. Open {paths[-1]} in a browser.")
+        if note:
+            print(f"Without a plot: {note}")
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def _ratios(text: str) -> list[float]:
+    try:
+        return [float(word) for word in _words(text)]
+    except ValueError:
+        raise InvalidArgumentError(
+            f"--rho must be numbers with commas, for example 0.1,0.01; found {text!r}."
+        ) from None
+
+
+def _print_tables(tradeoff: "Tradeoff") -> None:
+    from cvtgs.tradeoff.table import MARK_MEANS, cells, heading, how_measured  # noqa: PLC0415
+
+    for rho in tradeoff.ratios:
+        print(heading(tradeoff, rho))
+        columns = [cells(tradeoff, result) for result in tradeoff.results if result.rho == rho]
+        left = max(len(name) for name in columns[0])
+        widths = [max(map(len, column.values())) for column in columns]
+        for name in columns[0]:
+            words = (
+                f"{column[name]:>{width}}" for column, width in zip(columns, widths, strict=True)
+            )
+            print(f"  {name:{left}}  {'  '.join(words)}".rstrip())
+    print(MARK_MEANS)
+    print(how_measured(tradeoff))

@@ -1,0 +1,121 @@
+"""CostModel: what a simplification costs, before it is done."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import pydantic
+
+from cvtgs.config import SimplifyConfig
+from cvtgs.errors import ConfigError
+from cvtgs.goals.fit import fit_rates
+from cvtgs.goals.work import REFINE, Work
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measurement:
+    """What one simplification cost.
+
+    Attributes:
+        work: Its size.
+        config: Its configuration.
+        seconds: Wall-clock seconds by stage.
+    """
+
+    work: Work
+    config: SimplifyConfig
+    seconds: Mapping[str, float]
+
+
+class CostModel(pydantic.BaseModel):
+    """What presets cost on one machine: seconds = sum of rates times amounts, stage by stage.
+
+    Attributes:
+        rates: Seconds per unit, by preset, stage and feature.
+        starts: Seconds that the first simplification of a process takes on top, by preset:
+            libraries are loaded.
+    """
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    rates: dict[str, dict[str, dict[str, pydantic.NonNegativeFloat]]]
+    starts: dict[str, pydantic.NonNegativeFloat] = {}
+
+    @classmethod
+    def fit(
+        cls,
+        measured: Mapping[str, Sequence[Measurement]],
+        starts: Mapping[str, float] | None = None,
+    ) -> Self:
+        """Fit the rates to measurements.
+
+        Args:
+            measured: Measurements of simplifications of different sizes, by preset.
+            starts: Seconds that the first simplification of a process takes on top.
+
+        Returns:
+            The model.
+        """
+        rates = {preset: _fit(some) for preset, some in measured.items()}
+        return cls(rates=rates, starts=dict(starts or {}))
+
+    @property
+    def presets(self) -> tuple[str, ...]:
+        """The presets that it knows."""
+        return tuple(self.rates)
+
+    def stage_seconds(self, preset: str, work: Work) -> dict[str, float]:
+        """Predict what each stage costs.
+
+        Args:
+            preset: Name of the preset.
+            work: Size of the simplification.
+
+        Returns:
+            Wall-clock seconds by stage.
+
+        Raises:
+            ConfigError: The preset was not measured.
+        """
+        if preset not in self.rates:
+            raise ConfigError(
+                f"preset must be one of {', '.join(self.rates)}, whose cost was measured; "
+                f"found {preset!r}."
+            )
+        config = SimplifyConfig.from_preset(preset)
+        seconds = {}
+        for stage, rates in self.rates[preset].items():
+            amounts = work.features(stage, config)
+            seconds[stage] = sum(rate * amounts[name] for name, rate in rates.items())
+        limit = config.refine.seconds
+        if REFINE in seconds and limit:
+            seconds[REFINE] = min(seconds[REFINE], limit) if config.refine.steps else limit
+        return seconds
+
+    def seconds(self, preset: str, work: Work) -> float:
+        """Predict what a simplification costs.
+
+        Args:
+            preset: Name of the preset.
+            work: Size of the simplification.
+
+        Returns:
+            Wall-clock seconds of the first simplification of a process, from the scene in memory
+            to the small scene in memory.
+
+        Raises:
+            ConfigError: The preset was not measured.
+        """
+        stages = self.stage_seconds(preset, work)
+        return self.starts.get(preset, 0.0) + sum(stages.values())
+
+
+def _fit(measured: Sequence[Measurement]) -> dict[str, dict[str, float]]:
+    stages = dict.fromkeys(stage for one in measured for stage in one.seconds)
+    return {
+        stage: fit_rates(
+            [one.work.features(stage, one.config) for one in measured],
+            [one.seconds.get(stage, 0.0) for one in measured],
+        )
+        for stage in stages
+    }

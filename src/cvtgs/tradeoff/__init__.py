@@ -1,0 +1,16 @@
+"""What more time buys: every preset on one scene, seconds against quality."""
+
+from cvtgs.tradeoff.files import write_tradeoff
+from cvtgs.tradeoff.measure import Measured, measure_tradeoff
+from cvtgs.tradeoff.pareto import on_front
+from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult
+
+__all__ = [
+    "Failure",
+    "Measured",
+    "Tradeoff",
+    "TradeoffResult",
+    "measure_tradeoff",
+    "on_front",
+    "write_tradeoff",
+]

@@ -1,0 +1,194 @@
+"""The public entry: a scene in, what every preset costs and gives on it out."""
+
+import os
+import platform
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from cvtgs.cameras import Cameras
+from cvtgs.devices import device_name, resolve_device
+from cvtgs.errors import RunError
+from cvtgs.evaluate import Comparison, EvaluationSettings, SceneScores, compare
+from cvtgs.io import load
+from cvtgs.progress import ProgressListener, silent
+from cvtgs.scene import GaussianScene
+from cvtgs.tradeoff.pareto import on_front
+from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult
+from cvtgs.tradeoff.runs import Run, run_tasks, start_seconds, tasks_of
+from cvtgs.views import automatic_views
+
+RATIOS = (0.1, 0.01, 0.001)
+
+CameraChoice = Callable[[GaussianScene], Cameras]
+"""Says from where to look at a scene."""
+
+
+class Measured(NamedTuple):
+    """What was measured, and what it looks like.
+
+    Attributes:
+        tradeoff: Costs and scores.
+        comparison: Pictures of the full scene and of all results.
+    """
+
+    tradeoff: Tradeoff
+    comparison: Comparison
+
+
+def measure_tradeoff(
+    source: str | os.PathLike[str],
+    *,
+    presets: Sequence[str] | None = None,
+    ratios: Sequence[float] = RATIOS,
+    cameras: CameraChoice = automatic_views,
+    settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
+    device: str = "auto",
+    folder: str | os.PathLike[str] | None = None,
+    listener: ProgressListener = silent,
+) -> Measured:
+    """Simplify a file by several presets, and say what each costs and gives.
+
+    Every run is a process of its own, ``cvtgs simplify``, so that seconds and memory are those
+    that users see. Then all results are looked at from the same views. A run that fails is
+    warned about and listed; the others go on.
+
+    Memory: here, what :func:`cvtgs.evaluate.compare` needs; the processes need theirs one after
+    the other.
+
+    Args:
+        source: The full scene.
+        presets: Names; None for all, from the fastest to the best.
+        ratios: Ratios of Gaussians to keep, each in (0, 1].
+        cameras: From where to look at it.
+        settings: Background, which LPIPS, and what renders.
+        device: Where to compute: ``auto``, ``cpu`` or ``cuda``.
+        folder: Keep the results there, as ``fast_0.01.ply``, replacing what has that name; None
+            keeps none.
+        listener: Told about each run and picture.
+
+    Returns:
+        Costs, scores and pictures.
+
+    Raises:
+        CvtgsError: The scene cannot be read, or a preset or ratio is none.
+        RunError: All runs failed.
+
+    Example:
+        >>> import tempfile
+        >>> from cvtgs.io import save
+        >>> from cvtgs.synthetic import scene as make
+        >>> def look(scene):
+        ...     return automatic_views(scene, 2, width=32, height=24)
+        >>> with tempfile.TemporaryDirectory() as name:
+        ...     path = Path(name) / "full.ply"
+        ...     save(make("object", 500, sh_degree=0), path)
+        ...     found = measure_tradeoff(path, presets=["standard"], ratios=[0.1], cameras=look)
+        >>> [(result.name, result.count) for result in found.tradeoff.results]
+        [('standard 0.1', 50)]
+    """
+    tasks = tasks_of(presets, ratios)
+    where = resolve_device(device) or torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    full = load(source).to(where)
+    views = cameras(full)
+    with _folder(folder) as place:
+        start = start_seconds()
+        done = list(run_tasks(source, tasks, place, device=device, listener=listener))
+        runs = [one for one in done if isinstance(one, Run)]
+        failures = tuple(one for one in done if isinstance(one, Failure))
+        _tell(failures, none_left=not runs)
+        sizes = {run.task.name: run.path.stat().st_size for run in runs}
+        name = Path(source).name
+        comparison = compare(
+            full,
+            {run.task.name: load(run.path).to(where) for run in runs},
+            views,
+            reference_name=name,
+            sizes=sizes | {name: Path(source).stat().st_size},
+            settings=settings,
+            listener=listener,
+        )
+    results = [
+        _result(run, scores, sizes[run.task.name])
+        for run, scores in zip(runs, comparison.evaluation.scenes, strict=True)
+    ]
+    tradeoff = Tradeoff(
+        source=name,
+        source_count=len(full),
+        source_bytes=comparison.sizes[name],
+        start_seconds=start,
+        machine=_machine(where),
+        evaluation=comparison.evaluation,
+        results=tuple(with_fronts(results)),
+        failures=failures,
+    )
+    return Measured(tradeoff, comparison)
+
+
+@contextmanager
+def _folder(wanted: str | os.PathLike[str] | None) -> Iterator[Path]:
+    if wanted is not None:
+        yield Path(wanted)
+        return
+    with tempfile.TemporaryDirectory(prefix="cvtgs-") as name:
+        yield Path(name)
+
+
+def _tell(failures: Sequence[Failure], *, none_left: bool) -> None:
+    if failures and none_left:
+        raise RunError(f"every run failed; {failures[0].name}: {failures[0].reason}")
+    for failure in failures:
+        warnings.warn(f"{failure.name} failed: {failure.reason}", UserWarning, stacklevel=3)
+
+
+def _result(run: Run, scores: SceneScores, size: int) -> TradeoffResult:
+    return TradeoffResult(
+        name=run.task.name,
+        preset=run.task.preset,
+        rho=run.task.rho,
+        count=scores.count,
+        bytes=size,
+        seconds=run.cost.wall_seconds,
+        peak_memory_bytes=run.cost.peak_memory_bytes,
+        psnr=scores.psnr.mean,
+        ssim=scores.ssim.mean,
+        lpips=None if scores.lpips is None else scores.lpips.mean,
+        report=run.report,
+    )
+
+
+def with_fronts(results: Sequence[TradeoffResult]) -> Iterator[TradeoffResult]:
+    """Mark the results that no other of the same ratio beats in seconds and a metric.
+
+    Args:
+        results: Results of one or several ratios.
+
+    Yields:
+        The same results, in that order, with :attr:`TradeoffResult.fronts`.
+    """
+    fronts: dict[str, list[str]] = {result.name: [] for result in results}
+    for rho in dict.fromkeys(result.rho for result in results):
+        same = [result for result in results if result.rho == rho]
+        seconds = [result.seconds for result in same]
+        for metric, gains in (
+            ("psnr", [result.psnr for result in same]),
+            ("ssim", [result.ssim for result in same]),
+            ("lpips", [-result.lpips for result in same if result.lpips is not None]),
+        ):
+            if len(gains) == len(same):
+                for result, best in zip(same, on_front(seconds, gains), strict=True):
+                    fronts[result.name] += [metric] * best
+    for result in results:
+        yield result.model_copy(update={"fronts": tuple(fronts[result.name])})
+
+
+def _machine(device: torch.device) -> str:
+    return (
+        f"{device_name(device)}, {os.cpu_count()} cores, Python {platform.python_version()}, "
+        f"torch {torch.__version__}"
+    )

@@ -1,0 +1,80 @@
+"""``cvtgs tradeoff``: presets in processes of their own, tables and files."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+import cvtgs
+from cvtgs.cli.main import main
+
+LOOK = ["--views", "2", "--size", "48", "--lpips", "off"]
+
+
+@pytest.fixture
+def source(tmp_path) -> Path:
+    path = tmp_path / "in.ply"
+    cvtgs.save(cvtgs.synthetic.scene("object", 400, sh_degree=0, seed=3), path)
+    return path
+
+
+def test_table_and_files(source, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    words = ["tradeoff", str(source), "--presets", "draft,standard", "--rho", "0.1", *LOOK]
+    assert main([*words, "-o", str(tmp_path / "out"), "--save"]) == 0
+    printed = capsys.readouterr()
+    assert "rho 0.1: 40 of 400 Gaussians" in printed.out
+    for row in ("preset", "tessellate, s", "all, s", "PSNR, dB", "SSIM", "memory"):
+        assert row in printed.out
+    assert f"Open {tmp_path / 'out' / 'index.html'} in a browser." in printed.out
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    files = ["index.html", "tradeoff.csv", "tradeoff.json", "tradeoff.png"]
+    assert names == sorted([*files, "draft_0.1.ply", "standard_0.1.ply"])
+    found = json.loads((tmp_path / "out" / "tradeoff.json").read_text())
+    assert [one["count"] for one in found["results"]] == [40, 40]
+    assert all(one["report"]["stages"] for one in found["results"])
+    assert main([*words, "-o", str(tmp_path / "out")]) == 1
+    assert "--overwrite" in capsys.readouterr().err
+
+
+def test_a_run_that_fails_is_told_and_the_others_go_on(source, tmp_path, capsys, monkeypatch):
+    from cvtgs.tradeoff import runs  # noqa: PLC0415 (to be changed here)
+
+    real = runs.run_process
+
+    def fails_once(command):
+        if "draft" in command:
+            raise cvtgs.errors.RunError("the disk is full.")
+        return real(command)
+
+    monkeypatch.setattr(runs, "run_process", fails_once)
+    words = ["tradeoff", str(source), "--rho", "0.1", *LOOK, "-o", str(tmp_path / "out")]
+    assert main([*words, "--presets", "draft,fast", "--quiet"]) == 0
+    assert capsys.readouterr().err == "cvtgs: warning: draft 0.1 failed: the disk is full.\n"
+    found = json.loads((tmp_path / "out" / "tradeoff.json").read_text())
+    assert found["failures"] == [{"name": "draft 0.1", "reason": "the disk is full."}]
+    assert main([*words, "--presets", "draft", "--overwrite"]) == 1
+    error = "cvtgs: error: every run failed; draft 0.1: the disk is full.\n"
+    assert capsys.readouterr().err == error
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--rho", "0.1,many"], "--rho must be numbers with commas, for example 0.1,0.01; found"),
+        (["--rho", "2"], "rho must be above 0 and at most 1; found 2.0."),
+        (["--presets", "best"], "preset must be one of "),
+        (["--views", "0"], "--views must be at least 1, found 0."),
+    ],
+)
+def test_bad_arguments_get_one_sentence(source, tmp_path, capsys, words, text):
+    assert main(["tradeoff", str(source), "-o", str(tmp_path / "out"), *words]) == 1
+    errors = capsys.readouterr().err
+    assert errors.startswith(f"cvtgs: error: {text}")
+    assert errors.count("\n") == 1
+    assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
+
+
+def test_a_missing_scene_is_found_before_the_runs(tmp_path, capsys):
+    assert main(["tradeoff", str(tmp_path / "no.ply"), "-o", str(tmp_path / "out")]) == 1
+    assert "no.ply: " in capsys.readouterr().err

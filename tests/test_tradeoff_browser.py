@@ -1,0 +1,58 @@
+"""The page of a tradeoff in a real browser."""
+
+import re
+
+import pytest
+
+import cvtgs
+from cvtgs.evaluate import EvaluationSettings
+from cvtgs.tradeoff import measure_tradeoff, write_tradeoff
+from cvtgs.views import automatic_views
+from test_page_browser import BROWSER, BROWSERS, attribute, browse, dom
+
+pytestmark = pytest.mark.skipif(
+    BROWSER is None, reason=f"needs one of {', '.join(BROWSERS)} on the PATH"
+)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    pytest.importorskip("matplotlib")
+    folder = tmp_path_factory.mktemp("tradeoff")
+    cvtgs.save(cvtgs.synthetic.scene("object", 500, sh_degree=0, seed=0), folder / "full.ply")
+    measured = measure_tradeoff(
+        folder / "full.ply",
+        presets=["draft", "fast"],
+        ratios=[0.1],
+        cameras=lambda scene: automatic_views(scene, 2, width=64, height=48),
+        settings=EvaluationSettings(lpips="off"),
+    )
+    return write_tradeoff(measured, folder).paths[-1]
+
+
+def test_plot_table_and_slider_are_there(page):
+    html = dom(page)
+    assert attribute(html, "ready") == "yes"
+    table = re.search(r'<table id="tradeoff">.*?</table>', html, re.DOTALL).group(0)
+    assert "rho 0.1: 50 of 500 Gaussians" in table
+    assert "<th>draft</th>" in table
+    assert 'class="chart" src="data:image/png;base64,' in html
+    assert "50 Gaussians" in html
+
+
+def test_it_fits_a_phone(page):
+    """The wide table scrolls inside its own box."""
+    holder = page.parent / "phone.html"
+    holder.write_text(
+        f'<iframe id="phone" src="{page.name}" style="width:390px;height:800px;border:0"></iframe>'
+        "<script>setTimeout(() => { const page = phone.contentDocument.documentElement;"
+        "document.documentElement.dataset.layout = page.dataset.layout + ' ' + "
+        "page.scrollWidth; }, 1500)</script>",
+        encoding="utf-8",
+    )
+    html = browse(holder, "", "--allow-file-access-from-files", "--dump-dom")
+    assert attribute(html, "layout") == "390/390 390"
+
+
+def test_it_asks_for_nothing(page):
+    assert not re.search(r"https?://", page.read_text(encoding="utf-8"))
