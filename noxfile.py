@@ -9,7 +9,18 @@ import nox
 
 nox.options.sessions = ["lint", "tests", "readme"]
 nox.options.error_on_missing_interpreters = True
-CONSTRAINTS = ("-c", "constraints.txt")
+CONSTRAINTS = ("-c", str(Path("constraints.txt").resolve()))
+WHEEL_TESTS = (
+    "tests/test_public_names.py",
+    "tests/test_typing.py",
+    "tests/test_examples.py",
+    "tests/test_cli_*.py",
+    "tests/test_io_*.py",
+    "tests/test_simplify_*.py",
+    "tests/test_mergenet_*.py",
+    "tests/test_evaluate_compare.py",
+)
+"""What tells whether anything is missing in the wheel: data files, names, types, commands."""
 
 
 @nox.session
@@ -49,6 +60,44 @@ def readme(session: nox.Session) -> None:
         for command in commands:
             if "nox" not in command:
                 session.run("bash", "-euc", command, external=True)
+
+
+@nox.session
+def docs(session: nox.Session) -> None:
+    """Build the documentation; warnings are errors, and nothing is fetched while it builds."""
+    session.install(*CONSTRAINTS, ".[docs]")
+    words = session.posargs or ["docs/_build/html"]
+    settings = {"OMP_WAIT_POLICY": "PASSIVE", "PYDEVD_DISABLE_FILE_VALIDATION": "1"}
+    for drawing in ("cells", "reference", "widening"):
+        picture = Path(session.create_tmp()) / f"{drawing}.png"
+        session.run("python", "-m", f"docs.drawings.{drawing}", str(picture), env=settings)
+    session.run("sphinx-build", "-n", "-W", "--keep-going", "-E", "docs", *words, env=settings)
+
+
+@nox.session
+def wheel(session: nox.Session) -> None:
+    """Build sdist and wheel, and test what the wheel installs, in a folder without src.
+
+    Give ``tests`` to run all of them.
+    """
+    session.install(*CONSTRAINTS, "hatchling")
+    folder = Path(session.create_tmp()).resolve()
+    shutil.rmtree(folder / "dist", ignore_errors=True)
+    session.run("hatchling", "build", "-t", "sdist", "-d", str(folder / "dist"))
+    (sdist,) = (folder / "dist").glob("*.tar.gz")
+    shutil.unpack_archive(sdist, folder / "dist", filter="data")
+    clone = folder / "dist" / sdist.name.removesuffix(".tar.gz")
+    with session.chdir(clone):
+        session.run("hatchling", "build", "-t", "wheel", "-d", str(folder / "dist"))
+    (built,) = (folder / "dist").glob("*.whl")
+    session.install(*CONSTRAINTS, "--force-reinstall", "--no-deps", str(built))
+    session.install(*CONSTRAINTS, f"cvtgs[test] @ {built.as_uri()}")
+    shutil.rmtree(clone / "src")
+    with session.chdir(clone):
+        session.run("cvtgs", "doctor", "--device", "cpu")
+        patterns = session.posargs or WHEEL_TESTS
+        words = [str(path) for pattern in patterns for path in sorted(Path().glob(pattern))]
+        session.run("pytest", *words, "--ignore=tests/test_house.py")
 
 
 @nox.session

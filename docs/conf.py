@@ -1,0 +1,79 @@
+"""Sphinx configuration; ``nox -s docs`` builds the pages into ``docs/_build/html``.
+
+Nothing is fetched: formulas become MathML, and types of other packages link to their documentation
+by a table (``_extensions/external_types.py``).
+"""
+
+import re
+import sys
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+import cvtgs
+
+sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
+
+project = "cvtgs"
+author = "the cvtgs authors"
+copyright = "the cvtgs authors, Apache-2.0"
+version = release = cvtgs.__version__
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "commands",
+    "constants",
+    "every_name",
+    "external_types",
+    "house_style",
+    "mathml",
+    "models",
+]
+exclude_patterns = ["_build", "_extensions", "drawings"]
+
+html_theme = "furo"
+html_title = f"cvtgs {release}"
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
+html_math_renderer = "mathml"
+html_copy_source = False
+html_show_sphinx = False
+
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]
+myst_heading_anchors = 3
+myst_links_external_new_tab = False
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
+nb_execution_show_tb = True
+
+nitpicky = True
+python_maximum_signature_line_length = 88
+python_use_unqualified_type_names = True
+add_module_names = False
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+autodoc_class_signature = "mixed"
+autodoc_inherit_docstrings = False
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+napoleon_attr_annotations = False
+
+
+def leave_out_missing_pages(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Drop lines of a table of contents that end in `` ?``, if there is no such page."""
+    folder = (Path(app.srcdir) / docname).parent
+
+    def keep_or_drop(line: re.Match[str]) -> str:
+        return f"{line[1]}\n" if (folder / f"{line[1]}.md").is_file() else ""
+
+    source[0] = re.sub(r"^(\S+) \?\n", keep_or_drop, source[0], flags=re.MULTILINE)
+
+
+def setup(app: Sphinx) -> None:
+    """Listen to sources."""
+    app.connect("source-read", leave_out_missing_pages)

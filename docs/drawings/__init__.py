@@ -1,0 +1,1 @@
+"""The drawings of the documentation; ``python -m docs.drawings.cells OUT.png`` makes one."""

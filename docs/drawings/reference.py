@@ -1,0 +1,55 @@
+"""Reference against MergeNet: ``python -m docs.drawings.reference docs/images/reference.png``.
+
+A generated courtyard of 100,000 Gaussians with 5,000 of them: by the moments of CVT-GS, by those of
+the preset ``standard``, and with the network of that preset; below, how far each is from the full.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+
+import cvtgs
+from benchmarks.picture import camera
+from cvtgs.evaluate import psnr
+from docs.drawings.saving import figure, save_small
+
+COUNT, RHO, CROP = 100_000, 0.05, (slice(70, 430), slice(40, 440))
+
+
+def main() -> None:
+    """Draw."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("output", type=Path)
+    options = parser.parse_args()
+    scene = cvtgs.synthetic.demo_scene(COUNT, seed=0)
+    scenes = {
+        "full": scene,
+        "moments as in CVT-GS": cvtgs.Simplifier(None, config="paper").simplify(scene, RHO),
+        "reference of standard": cvtgs.Simplifier(None).simplify(scene, RHO),
+        "with MergeNet": cvtgs.Simplifier().simplify(scene, RHO),
+    }
+    with torch.no_grad():
+        pictures = {
+            name: cvtgs.render(one, camera()).rgb[0][CROP].clamp(0, 1)
+            for name, one in scenes.items()
+        }
+    canvas, panels = figure(2, 4, width=9.0, height=4.6)
+    full = pictures["full"]
+    for axes, (name, picture) in zip(panels[0], pictures.items(), strict=True):
+        axes.imshow(picture)
+        axes.set_title(f"{name}\n{len(scenes[name]):,} Gaussians", fontsize=10)
+    panels[1, 0].set_axis_off()
+    for axes, picture in list(zip(panels[1], pictures.values(), strict=True))[1:]:
+        shown = axes.imshow((picture - full).abs().mean(dim=2), vmin=0, vmax=0.3, cmap="gray")
+        axes.set_xlabel(f"{psnr(picture[None], full[None]).item():.2f} dB")
+    below = panels[1, 0].inset_axes((0.1, 0.6, 0.8, 0.07))
+    bar = canvas.colorbar(shown, cax=below, orientation="horizontal")
+    bar.set_label("mean absolute difference")
+    for axes in panels.flat:
+        axes.set(xticks=[], yticks=[])
+    save_small(canvas, options.output)
+
+
+if __name__ == "__main__":
+    main()

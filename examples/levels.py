@@ -1,0 +1,30 @@
+"""Make the levels of a viewer in one go: little more time than the finest alone.
+
+python examples/levels.py scene.ply levels --rho 0.25 0.05 0.01 --suffix .spz
+"""
+
+import argparse
+from pathlib import Path
+
+import cvtgs
+
+
+def main() -> None:
+    """Read, make all levels, write each."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("input", type=Path)
+    parser.add_argument("output", type=Path, help="folder for level0, level1, ...")
+    parser.add_argument("--rho", type=float, nargs="+", default=[0.25, 0.05, 0.01])
+    parser.add_argument("--suffix", default=".ply")
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    levels = cvtgs.Simplifier().levels(cvtgs.load(options.input), options.rho)
+    for number, level in enumerate(levels):
+        path = options.output / f"level{number}{options.suffix}"
+        cvtgs.save(level.scene, path)
+        # A viewer may switch to a coarser level where this error is below a pixel.
+        print(f"{path}: {len(level.scene):,} Gaussians, error {level.geometric_error:.3g} units")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""See what more time buys on a scene of yours: seconds against PSNR, preset by preset.
+
+python examples/tradeoff.py scene.ply page --rho 0.01 --presets draft standard high
+"""
+
+import argparse
+from functools import partial
+from pathlib import Path
+
+from cvtgs.evaluate import EvaluationSettings
+from cvtgs.tradeoff import measure_tradeoff, write_tradeoff
+from cvtgs.views import automatic_views
+
+
+def main() -> None:
+    """Measure, print, and write a table, a plot and a page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("input", type=Path)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--rho", type=float, nargs="+", default=[0.01])
+    parser.add_argument("--presets", nargs="+", default=["draft", "fast", "standard"])
+    parser.add_argument("--size", type=int, default=480, help="side of the pictures, pixels")
+    options = parser.parse_args()
+    measured = measure_tradeoff(
+        options.input,
+        presets=options.presets,
+        ratios=options.rho,
+        cameras=partial(automatic_views, count=4, width=options.size, height=options.size),
+        settings=EvaluationSettings(lpips="off"),
+    )
+    for result in measured.tradeoff.results:
+        print(f"{result.preset:<10} {result.seconds:6.2f} s {result.psnr:6.2f} dB")
+    write_tradeoff(measured, options.output, overwrite=True)
+
+
+if __name__ == "__main__":
+    main()
