@@ -24,7 +24,7 @@ CHOICES: Mapping[str, Mapping[str, str]] = {
     "weight power 0.5": powers("0.5"),
     "weight power 0.8": powers("0.8"),
     "weight power 1 everywhere": powers("1"),
-    "unbounded not told": {"cvt.unbounded": "off"},
+    "unbounded not told": {"effects.unbounded": "off"},
     "seeds only, no Lloyd": {"cvt.iterations": "0"},
     "20 Lloyd iterations over all": {"cvt.iterations": "20", "cvt.samples_per_site": "0"},
     "paper's filter": {"filter.max_mass_share": "1"},

@@ -201,13 +201,19 @@ def mean_or_none(values: Sequence[float | None]) -> float | None:
 def markdown(table: Table, ratios: Sequence[float], *, means_only: bool = False) -> str:
     """Give a Markdown table: the mean first, then scene by scene."""
     heads = [f"{name} at {rho:g}" for rho in ratios for name in ("PSNR", "SSIM", "LPIPS")]
-    lines = [f"| scene | variant | {' | '.join(heads)} |", "|---" * (len(heads) + 2) + "|"]
     shown = {MEAN: means(table)} if means_only else {MEAN: means(table), **table}
-    for scene, rows in shown.items():
-        for variant, row in rows.items():
-            cells = [cell for quality in row for cell in cells_of(quality)]
-            lines.append(f"| {scene} | {variant} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+    lines = [
+        [scene, variant, *(cell for quality in row for cell in cells_of(quality))]
+        for scene, rows in shown.items()
+        for variant, row in rows.items()
+    ]
+    return markdown_rows(["scene", "variant", *heads], lines)
+
+
+def markdown_rows(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Lay out a Markdown table."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
 def cells_of(quality: Quality) -> tuple[str, str, str]:

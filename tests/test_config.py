@@ -31,7 +31,7 @@ def test_paper_is_cvt_gs():
     assert paper.filter == FilterConfig(min_opacity=0.1, max_mass_share=1.0, max_flyaway_share=0.0)
     assert paper.cvt.area_power == paper.merge.area_power == 0.0
     assert not paper.cvt.perspective
-    assert (paper.cvt.color, paper.cvt.unbounded, paper.cvt.iterations) == (0.0, "off", 5)
+    assert (paper.cvt.color, paper.effects.unbounded, paper.cvt.iterations) == (0.0, "off", 5)
     assert (paper.cvt.seeding, paper.cvt.samples_per_site) == ("weighted", 0)
     assert (paper.merge.opacity, paper.merge.widening) == ("union", 0.0)
 
@@ -93,7 +93,9 @@ def test_settings_win_over_preset_and_preset_over_file(tmp_path):
     [
         ("cvt.color", "0.25", 0.25),
         ("cvt.seeding", "weighted", "weighted"),
-        ("cvt.unbounded", "on", "on"),
+        ("effects.unbounded", "on", "on"),
+        ("effects.sh", "1", 1),
+        ("effects.sh", "off", 0),
         ("merge.widening", "0", 0.0),
         ("filter.max_mass_share", "1e-3", 1e-3),
     ],
@@ -169,7 +171,7 @@ def test_an_unknown_preset_by_name_is_an_error():
     [
         ({"cvt.speed": "1"}, "cvt.speed: is not a known setting."),
         ({"speed": "1"}, "speed: is not a known setting."),
-        ({"a.b.c": "1"}, "a.b: is not a known setting."),
+        ({"a.b.c": "1"}, "a: is not a known setting."),
         ({"seed": "2", "seed.x": "1"}, "seed.x: is not a known setting."),
     ],
 )
@@ -197,3 +199,12 @@ def test_a_file_that_is_not_there_or_not_toml_is_an_error(tmp_path):
     assert compose_error(file=missing) == f"{missing}: cannot be read: No such file or directory."
     for path in (broken, binary):
         assert compose_error(file=path).startswith(f"{path}: is not a TOML file: ")
+
+
+def test_settings_reach_sections_within_sections():
+    config = SimplifyConfig.compose(settings={"refine.rates.sh0": "0.5", "refine.steps": "3"})
+    assert (config.refine.rates.sh0, config.refine.steps) == (0.5, 3)
+    with pytest.raises(ConfigError, match=r"refine\.rates\.colour: is not a known setting"):
+        SimplifyConfig.compose(settings={"refine.rates.colour": "1"})
+    with pytest.raises(ConfigError, match=r"refine\.steps\.most: is not a known setting"):
+        SimplifyConfig.compose(settings={"refine.steps": "3", "refine.steps.most": "1"})

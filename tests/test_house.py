@@ -18,14 +18,14 @@ FILES = sorted(SOURCE.rglob("*.py"))
 # does; `devices` (names of devices) and `cameras` (data) stand as low as their imports allow.
 LEVELS = [
     {"errors", "progress"},
-    {"math", "devices", "plots"},
+    {"math", "devices", "plots", "counts", "boxes"},
     {"config", "scene", "cameras"},
     {"effects"},
     {"report", "io", "filters", "cvt", "cells", "synthetic", "render", "losses"},
     {"mergenet", "views"},
     {"stages", "refine"},
     {"simplify", "info", "evaluate"},
-    {"goals", "tradeoff"},
+    {"goals", "tradeoff", "levels", "blocks"},
     {"train"},
     {"cli"},
     {"__main__"},
@@ -46,8 +46,9 @@ OWNERS = {
     "zstandard": "io/spz/zstd.py",
     "safetensors": "io/tensors.py",
     "matplotlib": "plots.py",
+    "distributed": "blocks/distributed.py",
 }
-HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "matplotlib")
+HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "matplotlib", "distributed")
 
 
 def relative(path: Path) -> str:

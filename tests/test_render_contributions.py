@@ -87,7 +87,9 @@ def test_cells_go_where_pictures_show_something():
     scene = ball_and_core()
     settings = {"merge.network": "false", "cvt.hidden_share": "1"}
     blind = SimplifyConfig.compose(settings=settings)
-    seeing = SimplifyConfig.compose(settings=settings | {"visibility.views": "6"})
+    seeing = SimplifyConfig.compose(
+        settings=settings | {"visibility.views": "6", "visibility.mass_share": "0.1"}
+    )
     inside = []
     for config in (blind, seeing):
         small, report = Simplifier(config=config, device="cpu").run(scene, 0.1)

@@ -50,7 +50,7 @@ def test_comments_layout_and_extras_are_kept(preset):
     assert small.extras["label"].dtype == torch.int64
     assert set(small.extras["label"].tolist()) <= {0, 1, 2}
     assert bool(((small.extras["heat"] >= 0) & (small.extras["heat"] <= 1)).all())
-    assert result.report.plan.antialiasing.active
+    assert result.report.plan.mip.active
     assert result.report.plan.extras.active
 
 

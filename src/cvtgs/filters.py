@@ -39,6 +39,26 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
     return {name: mask for name, mask in masks.items() if bool(mask.any())}
 
 
+def valid_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
+    """Tell which rows renderers can draw.
+
+    Args:
+        scene: Any scene.
+
+    Returns:
+        Mask of the valid rows.
+
+    Example:
+        >>> from cvtgs.synthetic import scene
+        >>> bool(valid_rows(scene("object", 10, sh_degree=0, seed=0)).all())
+        True
+    """
+    valid = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
+    for mask in invalid_rows(scene).values():
+        valid &= ~mask
+    return valid
+
+
 def visible_rows(
     opacities: Float[Tensor, "n"],
     masses: Float[Tensor, "n"],

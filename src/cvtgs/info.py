@@ -5,12 +5,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.effects import EffectPlan, plan_effects
+from cvtgs.config import SimplifyConfig
+from cvtgs.effects import EffectPlan, limited
 from cvtgs.errors import InvalidSceneError
 from cvtgs.filters import invalid_rows
 from cvtgs.math import activations
-from cvtgs.math.frames import robust_frame
 from cvtgs.scene import GaussianScene
+from cvtgs.stages.outlook import look_at_scene
 
 FAINT = 0.1
 """Opacities below this are counted as faint: the filter of CVT-GS would drop them."""
@@ -65,11 +66,12 @@ class SceneInfo(pydantic.BaseModel):
 HEAVIEST = (0.001, 0.01, 0.1, 0.5)
 
 
-def describe(scene: GaussianScene) -> SceneInfo:
+def describe(scene: GaussianScene, config: SimplifyConfig | None = None) -> SceneInfo:
     """Collect facts about a scene.
 
     Args:
         scene: Any scene.
+        config: For which simplification to plan; None for the default one.
 
     Returns:
         The facts.
@@ -89,7 +91,10 @@ def describe(scene: GaussianScene) -> SceneInfo:
     if len(scene) == int(bad.sum()):
         raise InvalidSceneError(f"none of the {len(scene)} Gaussians is valid.")
     valid = scene.select(~bad) if invalid else scene
-    frame, masses, opacities = robust_frame(valid.means), valid.masses, valid.opacities
+    config = config or SimplifyConfig()
+    outlook = look_at_scene(limited(valid, config.effects), config, with_light=False)
+    frame, opacities = outlook.frame, valid.opacities
+    masses = outlook.areas * opacities
     faint = opacities < FAINT
     total = masses.sum()
     return SceneInfo(
@@ -109,7 +114,7 @@ def describe(scene: GaussianScene) -> SceneInfo:
         antialiased=scene.antialiased,
         comments=scene.comments,
         extra_columns=tuple(scene.extras),
-        plan=plan_effects(valid, masses, frame),
+        plan=outlook.plan,
     )
 
 

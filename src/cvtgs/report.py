@@ -81,6 +81,9 @@ class SimplifyReport(_Record):
         shortfall: Why ``output_count`` is below ``target_count``, else empty.
         filtered_count: Faint Gaussians that were left out of the tessellation.
         filtered_mass_share: Their share of the mass.
+        kept_count: Protected Gaussians, which were kept as they are.
+        blocks: Blocks of space that were simplified one by one; 1 for the scene in one piece.
+        resumed_blocks: Those of them that were done already when this run started.
         single_member_cells: Cells of one Gaussian, which was kept as it is.
         largest_cell: Members of the largest cell.
         refilled_cells: Cells that were empty after Lloyd and took a Gaussian from another.
@@ -107,6 +110,9 @@ class SimplifyReport(_Record):
     shortfall: str = ""
     filtered_count: int = 0
     filtered_mass_share: float = 0.0
+    kept_count: int = 0
+    blocks: int = 1
+    resumed_blocks: int = 0
     single_member_cells: int = 0
     largest_cell: int = 0
     refilled_cells: int = 0

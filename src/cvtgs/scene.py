@@ -16,6 +16,9 @@ from cvtgs.math import activations, covariances, spherical_harmonics
 ANTIALIASED_TAG = "SplatRenderMode: mip"
 """The comment of scenes that were trained with anti-aliasing (Mip-Splatting)."""
 
+FLAT_LOG_SCALE = -20.0
+"""Third log-scale of Gaussians that have two scales (2DGS): two billionths of a unit."""
+
 _CHUNK = 1 << 16
 
 _SHAPES: dict[str, tuple[int | None, ...]] = {
@@ -33,7 +36,7 @@ class GaussianScene:
     """A 3D Gaussian Splatting scene of ``n`` Gaussians, as files and optimisers store it.
 
     Values are not checked, only shapes, dtypes and devices: a scene may hold the NaN rows of the
-    file that it came from. :func:`cvtgs.filters.valid_rows` tells which rows are usable.
+    file that it came from. :func:`cvtgs.filters.invalid_rows` tells which rows are not usable.
 
     Attributes:
         means: ``(n, 3)`` centres, scene units.

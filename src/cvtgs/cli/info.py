@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cvtgs.cli.display import READABLE, file_size
+from cvtgs.cli.effects import add_effects_option, effect_settings, load_needed
 
 if TYPE_CHECKING:
+    from cvtgs.effects import Effect
     from cvtgs.info import SceneInfo
 
 
@@ -21,6 +23,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     parser.add_argument("input", metavar="IN", type=Path, help=f"scene to read ({READABLE})")
     parser.add_argument("--json", action="store_true", help="print JSON")
+    add_effects_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -30,10 +33,11 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: The parsed options.
     """
-    from cvtgs.info import describe  # noqa: PLC0415 (keeps --help fast)
-    from cvtgs.io import load  # noqa: PLC0415
+    from cvtgs.config import SimplifyConfig  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.info import describe  # noqa: PLC0415
 
-    facts = describe(load(options.input))
+    config = SimplifyConfig.compose(settings=effect_settings(options.effects))
+    facts = describe(load_needed(options.input, config), config)
     if options.json:
         print(facts.model_dump_json(indent=2))
     else:
@@ -63,10 +67,17 @@ def _rows(facts: "SceneInfo", path: Path) -> list[tuple[str, str]]:
         ("comments", "; ".join(facts.comments) or "none"),
         ("extra columns", ", ".join(facts.extra_columns) or "none"),
     ]
-    for name, effect in facts.plan:
-        state = "on " if effect.active else "off"
-        rows.append((name.replace("_", " "), f"{state} {effect.figure:.3g} ({effect.meaning})"))
-    return rows
+    return rows + [(name, _evidence(effect)) for name, effect in facts.plan]
+
+
+def _evidence(effect: "Effect") -> str:
+    from cvtgs.effects import BandsEffect  # noqa: PLC0415 (keeps --help fast)
+
+    state, figures = "on " if effect.active else "off", f"{effect.figure:.3g}"
+    if isinstance(effect, BandsEffect) and effect.bands:
+        state += f" up to degree {effect.degree}" if effect.active else ""
+        figures = ", ".join(f"{loss:.3g}" for loss in effect.bands)
+    return f"{state} {figures} ({effect.meaning}{'; forced' if effect.forced else ''})"
 
 
 def _labelled(shares: tuple[float, ...], values: tuple[float, ...], form: str) -> str:

@@ -7,9 +7,10 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "draft": {"cvt": {"iterations": 0}, "merge": {"network": False}},
     "fast": {"merge": {"network": False}},
     "standard": {},
-    "high": {"visibility": {"views": 24}, "refine": {"steps": 60}},
-    "max": {"visibility": {"views": 24}, "refine": {"steps": 500}},
+    "high": {"visibility": {"views": 24}, "refine": {"steps": 100}},
+    "max": {"visibility": {"views": 24}, "refine": {"steps": 600}},
     "paper": {
+        "effects": {"unbounded": "off", "duplicates": "off"},
         "filter": {"max_mass_share": 1.0, "max_flyaway_share": 0.0},
         "cvt": {
             "area_power": 0.0,
@@ -18,7 +19,6 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
             "hidden_share": 1.0,
             "weight_floor": 0.0,
             "color": 0.0,
-            "unbounded": "off",
             "seeding": "weighted",
             "iterations": 5,
             "tolerance": 0.0,

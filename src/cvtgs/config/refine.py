@@ -44,7 +44,7 @@ class RefineConfig(Section):
         image: Weight of the logarithm of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) + 0.2
             gradient``.
         size: Longer side of the pictures, pixels.
-        batch: Views that are found together: half automatic ones, a quarter from anywhere around,
+        batch: Views that are found together: a quarter automatic ones, half from anywhere around,
             a quarter from anywhere near, within the scene too.
         steps_per_picture: Steps for every new picture of the full scene; the others look again at
             one that is there.

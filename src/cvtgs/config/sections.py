@@ -7,6 +7,43 @@ import pydantic
 from cvtgs.config.base import Section
 
 Share = Annotated[float, pydantic.Field(ge=0.0, le=1.0)]
+Choice = Literal["auto", "on", "off"]
+Less = Literal["auto", "off"]
+
+
+def _degree_of_text(value: object) -> object:
+    """Read what files and command lines hold: numbers as text, on for all bands, off for none."""
+    names = {"on": 3, "off": 0, **{str(degree): degree for degree in range(4)}}
+    return names.get(value, value) if isinstance(value, str) else value
+
+
+Degree = Annotated[Literal["auto", 0, 1, 2, 3], pydantic.BeforeValidator(_degree_of_text)]
+
+
+class EffectsConfig(Section):
+    """Which effects are computed: ``auto`` leaves it to the scene (:class:`cvtgs.EffectPlan`).
+
+    Attributes:
+        sh: Degree up to which colour depends on the direction of view; ``on`` for all, ``off``
+            for 0. Bands above come out as zeros.
+        mip: Whether pictures of a scene that is tagged so are taken with the compensation of
+            Mip-Splatting. The tag stays in any case.
+        unbounded: Whether far positions are pulled in, if there are any.
+        haze: Whether faint Gaussians are kept by their mass; off leaves all of them out.
+        flat: Whether a scene of Gaussians with two scales (2DGS) stays one.
+        duplicates: Whether Gaussians that lie exactly on others, if any do, share one search.
+        extras: Whether columns beyond the standard ones are carried along.
+        visibility: Whether pictures are taken where the preset asks for them.
+    """
+
+    sh: Degree = "auto"
+    mip: Choice = "auto"
+    unbounded: Choice = "auto"
+    haze: Choice = "auto"
+    flat: Less = "auto"
+    duplicates: Choice = "auto"
+    extras: Less = "auto"
+    visibility: Less = "auto"
 
 
 class FilterConfig(Section):
@@ -42,7 +79,6 @@ class TessellationConfig(Section):
             alone.
         color_power: The length grows with the number of cells to this power; with few cells,
             colour counts more.
-        unbounded: Whether far positions are pulled in; ``auto`` decides by the scene.
         seeding: Deterministic strata of equal weight, or weighted random draws.
         iterations: Lloyd iterations, at most.
         tolerance: Lloyd stops when an iteration lowers the energy by less than this share.
@@ -57,7 +93,6 @@ class TessellationConfig(Section):
     weight_floor: float = pydantic.Field(default=1e-3, ge=0.0)
     color: float = pydantic.Field(default=0.05, ge=0.0)
     color_power: float = pydantic.Field(default=-0.25, ge=-1.0, le=1.0)
-    unbounded: Literal["auto", "on", "off"] = "auto"
     seeding: Literal["stratified", "weighted"] = "stratified"
     iterations: int = pydantic.Field(default=4, ge=0)
     tolerance: float = pydantic.Field(default=1e-3, ge=0.0)
@@ -69,8 +104,8 @@ class VisibilityConfig(Section):
     """Whether small pictures of the scene tell which Gaussians are seen.
 
     Attributes:
-        views: Pictures; half from automatic views, half from anywhere around. 0 takes none: what
-            a Gaussian paints is then told by its size, opacity and place alone.
+        views: Pictures, from :func:`cvtgs.views.mixed_views`. 0 takes none: what a Gaussian
+            paints is then told by its size, opacity and place alone.
         size: Side of the pictures, pixels.
         mass_share: Share of the weight that still comes from size, opacity and place, for all
             that no picture shows.
@@ -78,7 +113,7 @@ class VisibilityConfig(Section):
 
     views: int = pydantic.Field(default=0, ge=0)
     size: int = pydantic.Field(default=256, ge=16)
-    mass_share: Share = 0.2
+    mass_share: Share = 0.5
 
 
 class MergeConfig(Section):

@@ -10,6 +10,7 @@ from cvtgs.config.base import Section, explain, read_toml
 from cvtgs.config.presets import PRESETS
 from cvtgs.config.refine import RefineConfig
 from cvtgs.config.sections import (
+    EffectsConfig,
     FilterConfig,
     MergeConfig,
     TessellationConfig,
@@ -24,6 +25,7 @@ class SimplifyConfig(Section):
     Attributes:
         preset: Name of the preset that the values started from.
         seed: Seed of whatever is drawn at random.
+        effects: What is computed whatever the scene calls for, or not at all.
         filter: Which Gaussians are left out.
         visibility: Whether pictures tell what is seen.
         cvt: How Gaussians are grouped.
@@ -37,6 +39,7 @@ class SimplifyConfig(Section):
 
     preset: str = "standard"
     seed: int = pydantic.Field(default=0, ge=0)
+    effects: EffectsConfig = EffectsConfig()
     filter: FilterConfig = FilterConfig()
     visibility: VisibilityConfig = VisibilityConfig()
     cvt: TessellationConfig = TessellationConfig()
@@ -48,7 +51,7 @@ class SimplifyConfig(Section):
         """Give a preset.
 
         Args:
-            name: One of :data:`PRESETS`.
+            name: One of :data:`cvtgs.config.PRESETS`.
 
         Returns:
             The configuration.
@@ -121,10 +124,12 @@ class SimplifyConfig(Section):
         if preset is not None:
             values["preset"] = preset
         for key, text in (settings or {}).items():
-            section, _, name = key.rpartition(".")
-            target = values.setdefault(section, {}) if section else values
-            if not isinstance(target, dict):
-                raise ConfigError(f"{key}: is not a known setting.")
+            *sections, name = key.split(".")
+            target = values
+            for section in sections:
+                target = target.setdefault(section, {})
+                if not isinstance(target, dict):
+                    raise ConfigError(f"{key}: is not a known setting.")
             target[name] = text
         try:
             return cls.from_mapping(values)

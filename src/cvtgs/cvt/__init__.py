@@ -7,16 +7,20 @@ from cvtgs.cvt.nearest import nearest_backend
 from cvtgs.cvt.nearest_scipy import nearest_scipy
 from cvtgs.cvt.nearest_torch import nearest_torch
 from cvtgs.cvt.neighbors import nearest_neighbors
-from cvtgs.cvt.openness import openness
+from cvtgs.cvt.openness import add_depths, depth_sums, light_at, light_of, openness
 from cvtgs.cvt.seeding import stratified_seeds, weighted_seeds
 from cvtgs.cvt.tessellate import Tessellation, fill_empty_cells, tessellate
 
 __all__ = [
     "LloydResult",
     "Tessellation",
+    "add_depths",
+    "depth_sums",
     "embed",
     "falloff",
     "fill_empty_cells",
+    "light_at",
+    "light_of",
     "lloyd",
     "nearest_backend",
     "nearest_neighbors",

@@ -48,9 +48,54 @@ def openness(
         >>> openness(torch.zeros(1, 3), torch.ones(1, dtype=torch.float64), frame).tolist()
         [1.0]
     """
-    size = 2 * HALF_GRID
+    sums = depth_sums(means.device)
+    places = add_depths(sums, means, masses, frame)
+    light = light_of(sums)
+    del sums
+    return torch.cat([light[place.long()] for place in places.split(CHUNK)]).double()
+
+
+def depth_sums(device: torch.device) -> Int[Tensor, "voxels"]:
+    """Give an empty grid of optical depths, for :func:`add_depths`.
+
+    Args:
+        device: Where to.
+
+    Returns:
+        Zeros, in whole numbers: parts of a scene add up to the same grid in any order.
+
+    Example:
+        >>> int(depth_sums(torch.device("cpu")).sum())
+        0
+    """
+    return torch.zeros((2 * HALF_GRID) ** 3 + 1, dtype=torch.int64, device=device)
+
+
+def add_depths(
+    sums: Int[Tensor, "voxels"],
+    means: Float[Tensor, "n 3"],
+    masses: Float[Tensor, "n"],
+    frame: RobustFrame,
+) -> Int[Tensor, "n"]:
+    """Add the optical depths of some Gaussians to a grid, in place.
+
+    Args:
+        sums: The grid.
+        means: Positions, scene units.
+        masses: Opacity times mean projected area, squared scene units.
+        frame: Centre and radius of the scene.
+
+    Returns:
+        The voxel of each Gaussian, int32.
+
+    Example:
+        >>> sums = depth_sums(torch.device("cpu"))
+        >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
+        >>> place = add_depths(sums, torch.zeros(1, 3), torch.ones(1).double(), frame)
+        >>> light_of(sums)[place.long()].tolist()
+        [1.0]
+    """
     places = torch.empty(len(means), dtype=torch.int32, device=means.device)
-    sums = torch.zeros(size**3 + 1, dtype=torch.int64, device=means.device)
     for start in range(0, len(means), CHUNK):
         part = slice(start, start + CHUNK)
         place, shrinkage = _places(means[part], frame)
@@ -59,10 +104,47 @@ def openness(
         # Whole numbers add up to the same sum in any order, so every device gives the same.
         whole = (depths.clamp_max(MAX_DEPTH) * FIXED_POINT).round().to(torch.int64)
         sums.index_add_(0, place, whole)
+    return places
+
+
+def light_of(sums: Int[Tensor, "voxels"]) -> Float[Tensor, "voxels"]:
+    """Give the light in every voxel of a finished grid.
+
+    Args:
+        sums: What :func:`add_depths` has added up.
+
+    Returns:
+        Numbers from 0 to 1 in float32; the last is that of everything beyond the grid, 1.
+
+    Example:
+        >>> float(light_of(depth_sums(torch.device("cpu"))).amin())
+        1.0
+    """
+    size = 2 * HALF_GRID
     grid = (sums[:-1].to(torch.float32) / FIXED_POINT).reshape(size, size, size)
-    del sums
-    light = torch.nn.functional.pad(_light(grid).flatten(), (0, 1), value=1.0)
-    return torch.cat([light[place.long()] for place in places.split(CHUNK)]).double()
+    return torch.nn.functional.pad(_light(grid).flatten(), (0, 1), value=1.0)
+
+
+def light_at(
+    light: Float[Tensor, "voxels"], means: Float[Tensor, "n 3"], frame: RobustFrame
+) -> Float[Tensor, "n"]:
+    """Look up how freely Gaussians can be seen.
+
+    Args:
+        light: What :func:`light_of` gives.
+        means: Positions, scene units.
+        frame: Centre and radius of the scene.
+
+    Returns:
+        What :func:`openness` gives for the whole scene.
+
+    Example:
+        >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
+        >>> light_at(light_of(depth_sums(torch.device("cpu"))), torch.zeros(1, 3), frame).tolist()
+        [1.0]
+    """
+    parts = [light[_places(part, frame)[0]] for part in means.split(CHUNK)]
+    return torch.cat([light[:0], *parts]).double()
 
 
 def _places(

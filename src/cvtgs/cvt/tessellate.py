@@ -10,6 +10,7 @@ from torch import Tensor
 from cvtgs.config import TessellationConfig
 from cvtgs.cvt.lloyd import lloyd
 from cvtgs.cvt.nearest import nearest_backend
+from cvtgs.cvt.places import once_per_place
 from cvtgs.cvt.seeding import stratified_seeds, weighted_seeds
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.segments import segment_argmax, sort_by_label
@@ -46,6 +47,7 @@ def tessellate(
     *,
     config: TessellationConfig,
     seed: int = 0,
+    has_duplicates: bool = False,
     on_iteration: Callable[[int], None] = lambda done: None,
 ) -> Tessellation:
     """Group points into a weighted centroidal Voronoi tessellation (Du et al. 1999).
@@ -57,6 +59,8 @@ def tessellate(
         count: Number of cells, 1 to n.
         config: Seeding, iterations and backend.
         seed: Seed of weighted seeding.
+        has_duplicates: Whether it pays to search for equal points only once; the result is the
+            same.
         on_iteration: Told how many Lloyd moves are done.
 
     Returns:
@@ -76,6 +80,8 @@ def tessellate(
             f"count must be between 1 and the number of points, {len(points)}; found {count}."
         )
     backend, nearest = nearest_backend(config.backend, points.device)
+    if has_duplicates:
+        nearest = once_per_place(nearest)
     if config.seeding == "weighted":
         seeds = weighted_seeds(weights, count, torch.Generator().manual_seed(seed))
     else:

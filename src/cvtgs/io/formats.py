@@ -10,7 +10,12 @@ from typing import BinaryIO, TypeVar
 
 import torch
 
-from cvtgs.errors import DeviceError, DroppedDataWarning, FileFormatError
+from cvtgs.errors import (
+    DeviceError,
+    DroppedDataWarning,
+    FileFormatError,
+    InvalidArgumentError,
+)
 from cvtgs.io.atomic import atomic_output, check_output
 from cvtgs.io.checkpoints import read_checkpoint
 from cvtgs.io.compressed_ply import (
@@ -25,6 +30,7 @@ from cvtgs.io.ply import read_ply, write_ply
 from cvtgs.io.sog import SOG_HOLDS, read_sog, write_sog
 from cvtgs.io.splat import SPLAT_HOLDS, read_splat, write_splat
 from cvtgs.io.spz import SPZ_HOLDS, read_spz, write_spz
+from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 
 Read = Callable[[Path], GaussianScene]
@@ -63,7 +69,13 @@ _OUTPUTS: Mapping[str, _Output] = MappingProxyType(
 )
 
 
-def load(path: str | os.PathLike[str], *, device: str | torch.device = "cpu") -> GaussianScene:
+def load(
+    path: str | os.PathLike[str],
+    *,
+    device: str | torch.device = "cpu",
+    sh_degree: int | None = None,
+    extras: bool = True,
+) -> GaussianScene:
     """Read a scene from a file or the folder of a trained model.
 
     PLY files of any encoding, property order and number type are read, with SH degree 0 to 3.
@@ -75,6 +87,9 @@ def load(path: str | os.PathLike[str], *, device: str | torch.device = "cpu") ->
             ``.ckpt`` of nerfstudio's Splatfacto, ``.pt`` of gsplat's trainer. Of a folder, the
             scene that :func:`cvtgs.io.scene_file` finds.
         device: Where the tensors are to be.
+        sh_degree: SH bands above this degree are zeros, whatever the file holds; None for all. Of
+            plain PLY files their columns are not even copied.
+        extras: Whether columns beyond the standard ones are carried.
 
     Returns:
         The scene: float32, or float64 if the file has double coordinates.
@@ -85,6 +100,7 @@ def load(path: str | os.PathLike[str], *, device: str | torch.device = "cpu") ->
         FileFormatError: The format is unknown, or the file is not what its format promises.
         MissingDependencyError: Reading this file needs an optional package.
         DeviceError: The device is not there.
+        InvalidArgumentError: There is no such SH degree.
 
     Example:
         >>> import tempfile
@@ -99,13 +115,16 @@ def load(path: str | os.PathLike[str], *, device: str | torch.device = "cpu") ->
         GaussianScene(2 Gaussians, SH degree 0, float32, cpu)
     """
     _check_device(device)
+    _check_degree(sh_degree)
     source = scene_file(path)
     if not os.path.isfile(source):  # noqa: PTH113 (Path.is_file raises without permission)
         return read_ply(source)  # says what is wrong, whatever the suffix
     read = _by_name(source, _READERS)
     if read is read_ply and is_compressed_ply(source):
         read = read_compressed_ply
-    return read(source).to(device)
+    if read is read_ply:
+        return read_ply(source, sh_degree=sh_degree, extras=extras).to(device)
+    return _reduced(read(source), sh_degree, extras=extras).to(device)
 
 
 def save(scene: GaussianScene, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -196,6 +215,21 @@ def check_save(path: str | os.PathLike[str], overwrite: bool = False) -> None:
     """
     _by_name(Path(path), _OUTPUTS)
     check_output(path, overwrite)
+
+
+def _check_degree(sh_degree: int | None) -> None:
+    if sh_degree is not None and not 0 <= sh_degree < len(REST_COUNTS):
+        raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {sh_degree!r}.")
+
+
+def _reduced(scene: GaussianScene, sh_degree: int | None, *, extras: bool) -> GaussianScene:
+    if not extras and scene.extras:
+        scene = scene.with_tensors({}, {})
+    if sh_degree is None or sh_degree >= scene.sh_degree:
+        return scene
+    rest = scene.shN.clone()
+    rest[:, REST_COUNTS[sh_degree] :] = 0.0
+    return scene.with_tensors({"shN": rest}, scene.extras)
 
 
 def _by_name(path: Path, formats: Mapping[str, Entry]) -> Entry:

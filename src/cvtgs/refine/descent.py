@@ -36,6 +36,7 @@ def descend(
     *,
     budget: Budget,
     config: RefineConfig,
+    frozen: int = 0,
     tell: Callable[[float], None],
 ) -> Descent:
     """Move the Gaussians of a scene towards pictures of the full one, one picture per step.
@@ -46,6 +47,7 @@ def descend(
         heldout: Pictures that decide.
         budget: When to stop.
         config: Learning rates, loss, checks and patience.
+        frozen: So many of the first Gaussians do not move.
         tell: Told the gain so far, dB, after every step.
 
     Returns:
@@ -54,7 +56,8 @@ def descend(
     budget.begin()
     best, before = small, score(small, heldout)
     budget.end("check")
-    after, waited, variables = before, 0, Variables(small, config.rates, damping=config.damping)
+    variables = Variables(small, config.rates, damping=config.damping, frozen=frozen)
+    after, waited = before, 0
     stopped = "perfect" if before >= BEST_PSNR else budget.spent()
     while not stopped:
         factor = config.last_rate ** budget.share()

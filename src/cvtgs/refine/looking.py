@@ -12,15 +12,12 @@ from cvtgs.config import RefineConfig
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.losses.ssim import SSIM_WINDOW
 from cvtgs.scene import GaussianScene
-from cvtgs.views import automatic_views, views_from_anywhere
+from cvtgs.views import mixed_views
 
 HELDOUT_SEED = 101
 """Added to the seed: held-out views are others than those of evaluations, and those learnt from."""
 
 LEARNING_SEED = 211
-
-NEAR = (0.2, 1.4)
-"""Distances of near views, robust radii: without them, what is seen from close by is spoiled."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,7 +34,7 @@ class Outlook:
 
 
 def own_outlook(full: GaussianScene, *, config: RefineConfig, seed: int) -> Outlook:
-    """Find views of a scene: half automatic ones, half from anywhere around.
+    """Find views of a scene: a quarter automatic ones, the others from anywhere.
 
     Args:
         full: The scene, with valid rows.
@@ -49,12 +46,7 @@ def own_outlook(full: GaussianScene, *, config: RefineConfig, seed: int) -> Outl
     """
 
     def batch(number: int, seed: int) -> list[Cameras]:
-        size = config.size
-        around = views_from_anywhere(full, number // 4, size=size, seed=seed)
-        near = views_from_anywhere(full, number // 4, size=size, seed=seed + 1, reach=NEAR)
-        left = number - 2 * (number // 4)
-        usual = automatic_views(full, left, width=size, height=size, seed=seed)
-        return [*_each(usual), *_each(around), *_each(near)]
+        return _each(mixed_views(full, number, size=config.size, seed=seed))
 
     def endless() -> Iterator[Cameras]:
         for number in count():

@@ -47,6 +47,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     config: RefineConfig | None = None,
     seed: int = 0,
     device: str | torch.device = "auto",
+    frozen: int = 0,
     listener: ProgressListener = silent,
 ) -> Refined:
     """Fine-tune a simplified scene until pictures of it look more like those of the full one.
@@ -74,6 +75,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         seed: Which views, in which order.
         device: Where to compute: ``auto`` stays where the small scene is, but takes CUDA for
             scenes on the CPU if there is one. The result is where the small scene was.
+        frozen: So many of the first Gaussians stay as they are, bit for bit.
         listener: Told about every step, with the gain so far as its note.
 
     Returns:
@@ -108,7 +110,9 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         outlook = _outlook(theirs, cameras, config=config, seed=seed)
         heldout = tuple(take_picture(theirs, camera) for camera in outlook.heldout)
         album = Album(theirs, outlook.learning, config=config, seed=seed)
-        descent = descend(ours, album, heldout, budget=budget, config=config, tell=tell)
+        descent = descend(
+            ours, album, heldout, budget=budget, config=config, frozen=frozen, tell=tell
+        )
     report = RefineReport(
         steps=budget.steps,
         pictures=album.taken,

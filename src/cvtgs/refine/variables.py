@@ -27,14 +27,19 @@ class Variables:
         scene: The simplified scene; it is not changed.
         rates: Learning rates at the start.
         damping: Share of the usual gradient below which a Gaussian moves less.
+        frozen: So many of the first Gaussians do not move.
     """
 
-    def __init__(self, scene: GaussianScene, rates: Rates, *, damping: float = 0.0) -> None:
+    def __init__(
+        self, scene: GaussianScene, rates: Rates, *, damping: float = 0.0, frozen: int = 0
+    ) -> None:
         self._damping = damping
         self._usual: dict[str, float] = {}
         self._scene = scene
         self._start = _started(scene)
         self._units = _units(scene)
+        for unit in self._units.values():
+            unit[:frozen] = 0.0
         self._changes = {
             name: torch.zeros_like(tensor, requires_grad=True)
             for name, tensor in self._start.items()

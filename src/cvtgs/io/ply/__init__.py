@@ -1,7 +1,8 @@
 """PLY files of 3DGS scenes, as INRIA's code and its successors write them."""
 
-from cvtgs.io.ply.properties import FLAT_LOG_SCALE
 from cvtgs.io.ply.read import read_ply
+from cvtgs.io.ply.rows import PlyRows, join_plys, open_rows
 from cvtgs.io.ply.write import write_ply
+from cvtgs.scene import FLAT_LOG_SCALE
 
-__all__ = ["FLAT_LOG_SCALE", "read_ply", "write_ply"]
+__all__ = ["FLAT_LOG_SCALE", "PlyRows", "join_plys", "open_rows", "read_ply", "write_ply"]

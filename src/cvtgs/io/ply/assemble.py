@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.io.ply.properties import (
-    FLAT_LOG_SCALE,
     NORMALS,
     SCALARS,
     Layout,
@@ -18,11 +17,18 @@ from cvtgs.io.ply.properties import (
     rest_count_of,
     standard_slots,
 )
-from cvtgs.scene import GaussianScene
+from cvtgs.math.spherical_harmonics import REST_COUNTS
+from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 
 
 def assemble(
-    chunks: Iterable[NDArray[Any]], *, count: int, layout: Layout, comments: tuple[str, ...]
+    chunks: Iterable[NDArray[Any]],
+    *,
+    count: int,
+    layout: Layout,
+    comments: tuple[str, ...],
+    sh_degree: int | None = None,
+    with_extras: bool = True,
 ) -> GaussianScene:
     """Copy rows into a new scene, chunk by chunk.
 
@@ -34,6 +40,8 @@ def assemble(
         layout: Names and types of the scalar properties, all standard ones of an SH degree
             among them (``scale_2`` may be missing).
         comments: Comment lines of the file.
+        sh_degree: SH bands above are not copied; their zeros take no memory until written to.
+        with_extras: Whether columns beyond the standard ones are copied.
 
     Returns:
         The scene; all-zero normals are in its layout only, other unknown columns are extras.
@@ -43,20 +51,24 @@ def assemble(
     extras = {
         name: torch.empty(count, dtype=SCALARS[kind].dtype)
         for name, kind in layout
-        if not is_standard(name) and name not in NORMALS
+        if with_extras and not is_standard(name) and name not in NORMALS
     }
-    columns = {**_standard_columns(tensors, types), **{k: v.numpy() for k, v in extras.items()}}
+    if sh_degree is not None and REST_COUNTS[sh_degree] < tensors["shN"].shape[1]:
+        # Zeros of numpy take no memory until they are written to, those of torch do.
+        zeros = np.zeros(tensors["shN"].shape, tensors["shN"].numpy().dtype)
+        tensors["shN"] = torch.from_numpy(zeros)
+    standard = _standard_columns(tensors, types, sh_degree)
+    columns = {**standard, **{name: column.numpy() for name, column in extras.items()}}
+    normal_names = tuple(name for name in NORMALS if with_extras and name in types)
     if "scale_2" not in types:
         tensors["log_scales"][:, 2] = FLAT_LOG_SCALE
     normals: dict[str, Tensor] = {}
     start = 0
     for rows in chunks:
         stop = start + len(rows)
-        if not normals and any(rows[name].any() for name in NORMALS if name in types):
+        if not normals and any(rows[name].any() for name in normal_names):
             normals = {
-                name: torch.zeros(count, dtype=SCALARS[types[name]].dtype)
-                for name in NORMALS
-                if name in types
+                name: torch.zeros(count, dtype=SCALARS[types[name]].dtype) for name in normal_names
             }
             columns.update({name: normal.numpy() for name, normal in normals.items()})
         with np.errstate(over="ignore", invalid="ignore"):
@@ -84,9 +96,18 @@ def _empty_tensors(count: int, rest_count: int, dtype: torch.dtype) -> dict[str,
     return {name: torch.empty(shape, dtype=dtype) for name, shape in shapes.items()}
 
 
-def _standard_columns(tensors: dict[str, Tensor], types: dict[str, str]) -> dict[str, NDArray[Any]]:
-    """Give a writable view of every standard column that the file has, in file order."""
+def _standard_columns(
+    tensors: dict[str, Tensor], types: dict[str, str], sh_degree: int | None
+) -> dict[str, NDArray[Any]]:
+    """Give a writable view of every standard column that is to be read, in file order."""
     slots = standard_slots(tensors["shN"].shape[1])
+    if sh_degree is not None:
+        read = REST_COUNTS[sh_degree]
+        slots = {
+            name: slot
+            for name, slot in slots.items()
+            if slot.tensor != "shN" or slot.index[0] < read
+        }
     return {
         name: tensors[slots[name].tensor].numpy()[slots[name].rows]
         for name in types

@@ -12,9 +12,6 @@ from cvtgs.math.spherical_harmonics import REST_COUNTS
 Layout = tuple[tuple[str, str], ...]
 """Property names and PLY types of a vertex element, in order."""
 
-FLAT_LOG_SCALE = -20.0
-"""Third log-scale of Gaussians from files without ``scale_2`` (2DGS): two billionths of a unit."""
-
 NORMALS = ("nx", "ny", "nz")
 """Columns that 3DGS files carry for viewers of point clouds, almost always zero."""
 
@@ -160,6 +157,22 @@ def rest_count_of(names: Iterable[str]) -> int | None:
     """
     total = sum(rest_index(name) is not None for name in names)
     return total // 3 if total in {3 * count for count in REST_COUNTS} else None
+
+
+def lacks_third_scale(layout: Layout) -> bool:
+    """Tell whether the Gaussians of a file have two scales: surfels of 2DGS (Huang et al. 2024).
+
+    Args:
+        layout: Property names and canonical types; empty for a scene that was made in memory.
+
+    Returns:
+        Whether there is no place for a third one.
+
+    Example:
+        >>> lacks_third_scale((("scale_0", "float"), ("scale_1", "float"))), lacks_third_scale(())
+        (True, False)
+    """
+    return bool(layout) and "scale_2" not in dict(layout)
 
 
 def dtype_of(layout: Layout) -> torch.dtype:

@@ -14,7 +14,7 @@ from cvtgs.io.ply.vertices import check_size, find_vertices, layout_of
 from cvtgs.scene import GaussianScene
 
 
-def read_ply(path: Path) -> GaussianScene:
+def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -> GaussianScene:
     """Read a scene from a PLY file of any encoding, property order and number type.
 
     The common layout (binary little endian, vertices first) is memory-mapped, the rest goes
@@ -22,6 +22,8 @@ def read_ply(path: Path) -> GaussianScene:
 
     Args:
         path: The file.
+        sh_degree: Columns of SH bands above are not copied and come as zeros; None for all.
+        extras: Whether columns beyond the standard ones are copied.
 
     Returns:
         The scene, on the CPU. Values are returned as they are, NaN and infinity too.
@@ -34,7 +36,7 @@ def read_ply(path: Path) -> GaussianScene:
     try:
         _check_regular(path)
         with path.open("rb") as file:
-            return _read(file, str(path))
+            return _read(file, str(path), sh_degree=sh_degree, extras=extras)
     except FileNotFoundError as error:
         raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
     except InputError:
@@ -53,7 +55,7 @@ def _check_regular(path: Path) -> None:
         raise InputError(f"{path}: must be a regular file, found a device or a pipe.")
 
 
-def _read(file: BinaryIO, path: str) -> GaussianScene:
+def _read(file: BinaryIO, path: str, *, sh_degree: int | None, extras: bool) -> GaussianScene:
     header = read_header(file, path)
     vertex = find_vertices(header, path)
     check_size(header, vertex, path=path, size=os.fstat(file.fileno()).st_size)
@@ -61,7 +63,14 @@ def _read(file: BinaryIO, path: str) -> GaussianScene:
         chunks = fast.read_chunks(file, header)
     else:
         chunks = generic.read_chunks(file, header, vertex=vertex, path=path)
-    scene = assemble(chunks, count=vertex.count, layout=layout_of(vertex), comments=header.comments)
+    scene = assemble(
+        chunks,
+        count=vertex.count,
+        layout=layout_of(vertex),
+        comments=header.comments,
+        sh_degree=sh_degree,
+        with_extras=extras,
+    )
     _warn_of_dropped(header, vertex, path)
     return scene
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError
 from cvtgs.io.ply.output_layout import output_layout
-from cvtgs.io.ply.properties import FLAT_LOG_SCALE, SCALARS, Layout, standard_slots
-from cvtgs.scene import GaussianScene
+from cvtgs.io.ply.properties import SCALARS, Layout, standard_slots
+from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 
 CHUNK_BYTES = 1 << 20
 """How much is gathered before it is written."""

@@ -1,0 +1,130 @@
+"""What accuracy costs in time: every preset, and every choice of ``standard`` switched alone.
+
+``python -m benchmarks.accuracy_and_time --png FILE`` takes the same scenes and judges as
+``benchmarks.quality``, prints the tables of ``docs/accuracy-and-time.md`` and draws its plot.
+Seconds are processor seconds of ``Simplifier.run``, without start, reading and writing: the mean
+over the scenes.
+"""
+
+import time
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import mean
+
+import cvtgs
+from benchmarks.choices import CHOICES
+from benchmarks.scoring import (
+    Quality,
+    Simplify,
+    configuration,
+    markdown_rows,
+    means,
+    measure,
+    scoring_parser,
+)
+from cvtgs.plots import Panel, Series, line_chart
+from cvtgs.tradeoff.chart import ticks
+
+PRESETS: Mapping[str, Mapping[str, str]] = {name: {"preset": name} for name in cvtgs.PRESETS}
+
+SWITCHES: Mapping[str, Mapping[str, str]] = {
+    **{name: settings for name, settings in CHOICES.items() if name != "paper"},
+    "no network": {"merge.network": "false"},
+    "16 views tell what is seen": {"visibility.views": "16"},
+    "100 steps of refinement": {"refine.steps": "100"},
+}
+
+
+class Stopwatch:
+    """Simplifies, and keeps the processor seconds of every ratio."""
+
+    def __init__(self, config: cvtgs.SimplifyConfig) -> None:
+        self._simplifier = cvtgs.Simplifier(config=config)
+        self._spent: dict[float, list[float]] = defaultdict(list)
+
+    def __call__(self, scene: cvtgs.GaussianScene, rho: float) -> cvtgs.GaussianScene:
+        """Simplify, and remember what it took."""
+        start = time.process_time()
+        small = self._simplifier.simplify(scene, rho)
+        self._spent[rho].append(time.process_time() - start)
+        return small
+
+    def seconds(self, rho: float) -> float:
+        """Give the mean over the scenes."""
+        return mean(self._spent[rho])
+
+
+def table(
+    watches: Mapping[str, Stopwatch],
+    scores: Mapping[str, Sequence[Quality]],
+    ratios: Sequence[float],
+) -> str:
+    """Give a Markdown table: seconds, PSNR and SSIM of every row at every ratio."""
+    heads = [f"{name} at {rho:g}" for rho in ratios for name in ("seconds", "PSNR", "SSIM")]
+    rows = [
+        [
+            name,
+            *(
+                cell
+                for rho, quality in zip(ratios, scores[name], strict=True)
+                for cell in (
+                    f"{watches[name].seconds(rho):.2f}",
+                    f"{quality.psnr:.2f}",
+                    f"{quality.ssim:.4f}",
+                )
+            ),
+        ]
+        for name in watches
+    ]
+    return markdown_rows(["", *heads], rows)
+
+
+def chart(
+    watches: Mapping[str, Stopwatch],
+    scores: Mapping[str, Sequence[Quality]],
+    ratios: Sequence[float],
+) -> bytes:
+    """Draw PSNR and SSIM over seconds, one line per ratio, points by preset."""
+    seconds = [watch.seconds(rho) for watch in watches.values() for rho in ratios]
+    marks = ticks(min(seconds), max(seconds))
+    panels = []
+    for label, metric in (("PSNR, dB", "psnr"), ("SSIM", "ssim")):
+        series = [
+            Series(
+                name=f"rho {rho:g}",
+                x=[watches[name].seconds(rho) for name in watches],
+                y=[getattr(scores[name][number], metric) for name in watches],
+                labels=list(watches),
+                markers=True,
+            )
+            for number, rho in enumerate(ratios)
+        ]
+        panels.append(
+            Panel(
+                series=series,
+                x_label="processor seconds",
+                y_label=label,
+                x_ticks=marks,
+                log_x=True,
+            )
+        )
+    return line_chart(panels, width=1200, height=500)
+
+
+def main() -> None:
+    parser = scoring_parser(__doc__)
+    parser.add_argument("--png", type=Path, help="draw the presets there")
+    options = parser.parse_args()
+    for title, rows in (("Presets", PRESETS), ("One choice at a time", SWITCHES)):
+        watches = {name: Stopwatch(configuration(options, row)) for name, row in rows.items()}
+        simplifiers: dict[str, Simplify] = dict(watches)
+        *_, found = measure(simplifiers, options)
+        scores = means(found)
+        print(f"## {title}\n\n{table(watches, scores, options.rho)}", flush=True)
+        if rows is PRESETS and options.png is not None:
+            options.png.write_bytes(chart(watches, scores, options.rho))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,240 @@
+"""What each effect costs and saves: scenes that call for it and scenes that do not.
+
+``python -m benchmarks.effects -o docs/effects.md`` renews the tables of that page. Every effect is
+planned, forced on and forced off, each in fresh processes; of their runs the fastest counts.
+"""
+
+import argparse
+import json
+import resource
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+import cvtgs
+from benchmarks.processes import machine, run_python
+from cvtgs import GaussianScene, Simplifier, SimplifyConfig
+from cvtgs.effects import BAND_LOSS, figures
+from cvtgs.evaluate import psnr
+from cvtgs.math.frames import robust_frame
+from cvtgs.scene import ANTIALIASED_TAG, FLAT_LOG_SCALE
+from cvtgs.synthetic import scene as make
+from cvtgs.views import automatic_views
+
+MARKS = "<!-- tables: python -m benchmarks.effects -->", "<!-- end of tables -->"
+
+LOOK = {"visibility": {"views": 8}}
+
+
+class Case(NamedTuple):
+    """One effect: a scene that calls for it, one that does not, and what else is set."""
+
+    calls: Callable[[int], GaussianScene]
+    does_not: Callable[[int], GaussianScene]
+    on: str = "on"
+    off: str = "off"
+    settings: Mapping[str, Any] = {}
+
+
+def generated(kind: str, degree: int = 0) -> Callable[[int], GaussianScene]:
+    return lambda count: make(kind, count, sh_degree=degree, seed=0)
+
+
+def without_bands(count: int) -> GaussianScene:
+    scene = make("courtyard", count, sh_degree=3, seed=0)
+    return scene.with_tensors({"shN": torch.zeros_like(scene.shN)}, {})
+
+
+def tagged(count: int) -> GaussianScene:
+    return GaussianScene(**make("thin", count, sh_degree=0).tensors(), comments=(ANTIALIASED_TAG,))
+
+
+def surfels(count: int) -> GaussianScene:
+    """A scene of Gaussians with two scales, which is written without a third."""
+    scene = make("object", count, sh_degree=0)
+    log_scales = scene.log_scales.clone()
+    log_scales[torch.arange(count), log_scales.argmin(dim=1)] = FLAT_LOG_SCALE
+    order = torch.sort(log_scales, dim=1, descending=True)
+    quats = cvtgs.math.quaternions.from_matrices(_right_handed(scene.quats, order.indices))
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1"]
+    names += [f"rot_{i}" for i in range(4)]
+    tensors = {**scene.tensors(), "log_scales": order.values, "quats": quats}
+    return GaussianScene(**tensors, layout=tuple((name, "float") for name in names))
+
+
+def _right_handed(quats: torch.Tensor, order: torch.Tensor) -> torch.Tensor:
+    """Bring axes into another order; the third is turned round where that makes a mirror."""
+    matrices = cvtgs.math.quaternions.to_matrices(cvtgs.math.quaternions.normalize(quats))
+    axes = matrices.gather(2, order[:, None, :].expand(-1, 3, -1))
+    axes[:, :, 2] *= torch.linalg.det(axes)[:, None]
+    return axes
+
+
+def repeated(count: int) -> GaussianScene:
+    return make("courtyard", count // 4, sh_degree=0).select(torch.arange(count // 4).repeat(4))
+
+
+def with_columns(count: int) -> GaussianScene:
+    columns = {f"column_{i}": torch.rand(count) for i in range(8)}
+    return make("courtyard", count, sh_degree=0).with_tensors({}, columns)
+
+
+CASES: Mapping[str, Case] = {
+    "sh": Case(generated("courtyard", 3), without_bands),
+    "mip": Case(tagged, generated("thin"), settings=LOOK),
+    "unbounded": Case(generated("landscape"), generated("object")),
+    "haze": Case(generated("haze"), generated("room")),
+    "flat": Case(surfels, generated("object"), on="auto"),
+    "duplicates": Case(repeated, generated("courtyard")),
+    "extras": Case(with_columns, generated("courtyard"), on="auto"),
+    "visibility": Case(generated("room"), generated("room"), on="auto", settings=LOOK),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("-o", "--output", type=Path, help="page whose tables are renewed")
+    parser.add_argument("--effect", nargs="+", default=list(CASES), choices=list(CASES))
+    parser.add_argument("--count", type=int, default=100_000)
+    parser.add_argument("--rho", type=float, default=0.05)
+    parser.add_argument("--runs", type=int, default=3, help="runs in each process")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--child", nargs=4, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        print(json.dumps(run_child(*options.child, options)))
+        return
+    text = "\n".join([effect_table(options), figure_table(options.count)])
+    if options.output is None:
+        print(text)
+    else:
+        renew(options.output, text)
+
+
+def renew(page: Path, text: str) -> None:
+    """Put text between the marks of a page."""
+    before, rest = page.read_text(encoding="utf-8").split(MARKS[0])
+    after = rest.split(MARKS[1])[1]
+    page.write_text(f"{before}{MARKS[0]}\n\n{text}\n{MARKS[1]}{after}", encoding="utf-8")
+
+
+def effect_table(options: argparse.Namespace) -> str:
+    lines = [
+        f"{machine()}, torch {torch.__version__}; {options.count:,} Gaussians to {options.rho:g}; "
+        "user seconds with reading, the least of "
+        f"{options.processes} processes with {options.runs} runs each; "
+        "dB against the full scene in four automatic views.\n",
+        "| effect | scene calls for it | planned | s: planned, on, off | MB: planned, on, off "
+        "| dB: planned, on, off | largest change by forcing on |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        for name in options.effect:
+            case = CASES[name]
+            for calls, scene in ((True, case.calls), (False, case.does_not)):
+                path = Path(folder) / f"{name}_{calls}.ply"
+                cvtgs.save(scene(options.count), path)
+                settings = case.settings if calls or name != "visibility" else {}
+                lines.append(row(name, path, options, settings=settings))
+                print(lines[-1], flush=True)
+    return "\n".join(lines) + "\n"
+
+
+def row(name: str, path: Path, options: argparse.Namespace, *, settings: Mapping[str, Any]) -> str:
+    choices = ("auto", CASES[name].on, CASES[name].off)
+    found: dict[str, dict[str, Any]] = {}
+    for _ in range(options.processes):  # in turns, so that a busy minute hits all of them
+        for choice in dict.fromkeys(choices):
+            words = ["--child", name, str(path), choice, json.dumps(dict(settings))]
+            words += ["--rho", str(options.rho), "--runs", str(options.runs)]
+            new = json.loads(run_python("-m", "benchmarks.effects", *words).output)
+            old = found.setdefault(choice, new)
+            old["seconds"] = min(old["seconds"], new["seconds"])
+            old["peak"] = min(old["peak"], new["peak"])
+    full = cvtgs.load(path)
+    small = {choice: cvtgs.load(path.with_suffix(f".{choice}.ply")) for choice in found}
+    scores = scores_of(full, small)
+    change = max(
+        float((tensor - small[choices[1]].tensors()[key]).abs().amax()) if tensor.numel() else 0.0
+        for key, tensor in small["auto"].tensors().items()
+    )
+    return " | ".join(
+        [
+            f"| {name}",
+            "yes" if "True" in path.stem else "no",
+            "on" if found["auto"]["active"] else "off",
+            " ".join(f"{found[choice]['seconds']:.2f}" for choice in choices),
+            " ".join(f"{found[choice]['peak'] / 1e6:.0f}" for choice in choices),
+            " ".join(f"{scores[choice]:.2f}" for choice in choices),
+            f"{change:.1g} |",
+        ]
+    )
+
+
+@torch.no_grad()
+def scores_of(full: GaussianScene, small: Mapping[str, GaussianScene]) -> dict[str, float]:
+    cameras = automatic_views(full, 4, width=400, height=300)
+    truth = cvtgs.render(full, cameras).rgb.clamp(0, 1)
+    return {
+        choice: float(psnr(cvtgs.render(scene, cameras).rgb.clamp(0, 1), truth).mean())
+        for choice, scene in small.items()
+    }
+
+
+def run_child(
+    name: str, path: str, choice: str, settings: str, options: argparse.Namespace
+) -> dict[str, Any]:
+    """Read and simplify some times in this process, and write what comes out."""
+    values = {**json.loads(settings), "effects": {name: choice}}
+    config = SimplifyConfig.from_mapping(values)
+    choices = config.effects
+    degree = None if choices.sh == "auto" else choices.sh
+    simplifier, seconds = Simplifier(config=config, device="cpu"), []
+    for _ in range(options.runs):
+        start = resource.getrusage(resource.RUSAGE_SELF).ru_utime
+        scene = cvtgs.load(path, sh_degree=degree, extras=choices.extras != "off")
+        small, report = simplifier.run(scene, options.rho)
+        seconds.append(resource.getrusage(resource.RUSAGE_SELF).ru_utime - start)
+    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a third scale that its file has no place for
+        cvtgs.save(small, Path(path).with_suffix(f".{choice}.ply"), overwrite=True)
+    active = getattr(report.plan, name).active
+    return {"seconds": min(seconds), "peak": peak, "active": active}
+
+
+def figure_table(count: int) -> str:
+    """What it costs to decide, against a whole simplification of the same scene."""
+    scene = without_bands(count)
+    frame, masses, opacities = robust_frame(scene.means), scene.masses, scene.opacities
+    parts: Mapping[str, Callable[[], object]] = {
+        "sh": lambda: figures.band_losses(scene, enough=BAND_LOSS),
+        "unbounded": lambda: figures.far_share(scene.means, masses, frame),
+        "haze": lambda: figures.faint_share(opacities, masses, below=0.1),
+        "duplicates": lambda: figures.duplicate_share(scene.means, scene.sh0),
+    }
+    simplifier = Simplifier(device="cpu")
+    whole = fastest(lambda: simplifier.simplify(scene, 0.05), runs=3)
+    lines = ["| deciding on | ms | share of a run |", "|---|---|---|"]
+    for name, part in parts.items():
+        seconds = fastest(part, runs=9)
+        lines.append(f"| {name} | {1e3 * seconds:.1f} | {seconds / whole:.2%} |")
+    return "\n".join(lines) + "\n"
+
+
+def fastest(part: Callable[[], object], *, runs: int) -> float:
+    seconds = []
+    for _ in range(runs):
+        start = time.process_time()
+        part()
+        seconds.append(time.process_time() - start)
+    return min(seconds)
+
+
+if __name__ == "__main__":
+    main()

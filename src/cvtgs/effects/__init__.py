@@ -1,0 +1,38 @@
+"""What a scene calls for; what it does not call for is not computed."""
+
+from cvtgs.effects.figures import (
+    UNBOUNDED_DISTANCE,
+    band_losses,
+    duplicate_share,
+    far_share,
+)
+from cvtgs.effects.limits import limited, pictured, restored, trimmed
+from cvtgs.effects.plan import (
+    BAND_LOSS,
+    DUPLICATE_SHARE,
+    UNBOUNDED_SHARE,
+    BandsEffect,
+    Effect,
+    EffectPlan,
+    plan_effects,
+    with_haze,
+)
+
+__all__ = [
+    "BAND_LOSS",
+    "DUPLICATE_SHARE",
+    "UNBOUNDED_DISTANCE",
+    "UNBOUNDED_SHARE",
+    "BandsEffect",
+    "Effect",
+    "EffectPlan",
+    "band_losses",
+    "duplicate_share",
+    "far_share",
+    "limited",
+    "pictured",
+    "plan_effects",
+    "restored",
+    "trimmed",
+    "with_haze",
+]

@@ -1,0 +1,158 @@
+"""Rows of a PLY file that is too large to be read at once, and files put together from others."""
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cvtgs.errors import FileFormatError, InputError, InputNotFoundError
+from cvtgs.io.ply import fast
+from cvtgs.io.ply.assemble import assemble
+from cvtgs.io.ply.header import read_header
+from cvtgs.io.ply.properties import SCALARS, Layout
+from cvtgs.io.ply.vertices import check_size, find_vertices, layout_of
+from cvtgs.scene import GaussianScene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlyRows:
+    """The rows of a binary little endian PLY file, read when they are asked for.
+
+    Attributes:
+        path: The file.
+        count: Number of rows.
+        names: Names and numpy types of the columns.
+        layout: Names and PLY types, as a scene remembers them.
+        comments: Comment lines of the file.
+        offset: Where the first row starts, in bytes.
+    """
+
+    path: str
+    count: int
+    names: tuple[tuple[str, str], ...]
+    layout: Layout
+    comments: tuple[str, ...]
+    offset: int
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """The type of a row."""
+        return np.dtype(list(self.names))
+
+    def read(self, start: int, stop: int, step: int = 1) -> NDArray[Any]:
+        """Map some rows.
+
+        Args:
+            start: First row.
+            stop: Row after the last one.
+            step: Every how many rows.
+
+        Returns:
+            A structured array; pages are read when they are looked at.
+        """
+        place = self.offset + start * self.dtype.itemsize
+        rows = np.memmap(self.path, self.dtype, "r", place, (stop - start,)).view(np.ndarray)
+        return rows[::step]
+
+    def scene(self, rows: NDArray[Any]) -> GaussianScene:
+        """Make a scene of rows.
+
+        Args:
+            rows: Structured array with at least the columns of the file.
+
+        Returns:
+            A scene as :func:`cvtgs.load` makes it.
+        """
+        return assemble([rows], count=len(rows), layout=self.layout, comments=self.comments)
+
+
+def open_rows(path: str | os.PathLike[str]) -> PlyRows:
+    """Look at a PLY file without reading its rows.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its rows.
+
+    Raises:
+        InputNotFoundError: There is no such file.
+        InputError: It cannot be opened.
+        FileFormatError: It is no binary little endian PLY of a 3DGS scene, with vertices first.
+    """
+    name = os.fspath(path)
+    try:
+        with Path(path).open("rb") as file:
+            header = read_header(file, name)
+            size = os.fstat(file.fileno()).st_size
+    except FileNotFoundError as error:
+        raise InputNotFoundError(f"{name}: the file to read must exist, found none.") from error
+    except InputError:
+        raise
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise InputError(f"{name}: the file must be readable, found: {reason}.") from error
+    vertex = find_vertices(header, name)
+    check_size(header, vertex, path=name, size=size)
+    if not fast.can_read(header):
+        raise FileFormatError(
+            f"{name}: only binary little endian PLY files with vertices first can be read in "
+            f"parts; write one with cvtgs convert."
+        )
+    return PlyRows(
+        path=name,
+        count=vertex.count,
+        names=tuple((prop.name, "<" + SCALARS[prop.type].code) for prop in vertex.properties),
+        layout=layout_of(vertex),
+        comments=header.comments,
+        offset=header.data_offset,
+    )
+
+
+def join_plys(
+    paths: Sequence[str | os.PathLike[str]],
+    file: BinaryIO,
+    *,
+    before: Sequence[NDArray[Any]] = (),
+) -> int:
+    """Put the rows of PLY files behind one another; memory is one buffer.
+
+    Args:
+        paths: Files that :func:`cvtgs.save` has written, with the same columns and comments; at
+            least one.
+        file: Where to, open for writing.
+        before: Rows that come first, with these columns and perhaps others.
+
+    Returns:
+        Number of rows.
+
+    Raises:
+        FileFormatError: The files differ in their columns.
+    """
+    parts = [open_rows(path) for path in paths]
+    first, total = parts[0], sum(part.count for part in parts) + sum(map(len, before))
+    for part in parts:
+        if part.names != first.names:
+            raise FileFormatError(f"{part.path}: must have the columns of {first.path}.")
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment {comment}".rstrip() for comment in first.comments]
+    lines += [f"element vertex {total}"]
+    lines += [f"property {kind} {name}" for name, kind in first.layout]
+    file.write("\n".join([*lines, "end_header", ""]).encode())
+    for table in before:
+        for start in range(0, len(table), 1 << 14):
+            rows = table[start : start + (1 << 14)]
+            block = np.zeros(len(rows), first.dtype)
+            for name, _ in first.names:
+                block[name] = rows[name]
+            file.write(block.tobytes())
+    for part in parts:
+        with Path(part.path).open("rb") as content:
+            content.seek(part.offset)
+            shutil.copyfileobj(content, file, 1 << 20)
+    return total

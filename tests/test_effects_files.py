@@ -1,0 +1,128 @@
+"""Effects on the command line, and what is not read of files."""
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs.cli.main import main
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.io.ply import assemble
+from scenes import random_scene, same_bits
+
+
+@pytest.fixture
+def source(tmp_path):
+    path = tmp_path / "in.ply"
+    columns = {"label": torch.arange(200), "nx": torch.ones(200)}
+    cvtgs.save(random_scene(200, degree=2).with_tensors({}, columns), path)
+    return path
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_bands_above_come_as_zeros(source, degree):
+    full, part = cvtgs.load(source), cvtgs.load(source, sh_degree=degree)
+    kept = min((degree + 1) ** 2 - 1, 8)
+    assert part.sh_degree == full.sh_degree == 2
+    assert part.shN[:, :kept].equal(full.shN[:, :kept])
+    assert not part.shN[:, kept:].any()
+    assert part.layout == full.layout
+    assert part.sh0.equal(full.sh0)
+
+
+def test_extra_columns_are_left_in_the_file(source):
+    assert set(cvtgs.load(source).extras) == {"label", "nx", "ny", "nz"}
+    assert not cvtgs.load(source, extras=False).extras
+
+
+def test_columns_that_are_not_needed_are_not_copied(source, monkeypatch):
+    asked = []
+
+    class Watched:
+        def __init__(self, rows):
+            self.rows = rows
+
+        def __len__(self):
+            return len(self.rows)
+
+        def __getitem__(self, name):
+            asked.append(name)
+            return self.rows[name]
+
+    original = assemble.assemble
+    monkeypatch.setattr(
+        "cvtgs.io.ply.read.assemble",
+        lambda chunks, **options: original(map(Watched, chunks), **options),
+    )
+    cvtgs.load(source, sh_degree=1, extras=False)
+    assert {"x", "f_dc_0", "f_rest_0", "f_rest_2", "f_rest_8", "rot_3"} <= set(asked)
+    assert not {"f_rest_3", "f_rest_7", "f_rest_23", "label", "nx"} & set(asked)
+
+
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".sog"])
+def test_other_formats_give_the_same(source, suffix, tmp_path):
+    path = tmp_path / f"scene{suffix}"
+    with pytest.warns(cvtgs.errors.DroppedDataWarning):
+        cvtgs.save(cvtgs.load(source), path)
+    full, part = cvtgs.load(path), cvtgs.load(path, sh_degree=1)
+    assert part.sh_degree == 2
+    assert part.shN[:, :3].equal(full.shN[:, :3])
+    assert not part.shN[:, 3:].any()
+    assert same_bits(cvtgs.load(path, sh_degree=3, extras=False), full)
+
+
+@pytest.mark.parametrize("degree", [-1, 4])
+def test_a_degree_that_no_scene_has(source, degree):
+    with pytest.raises(InvalidArgumentError, match=f"must be from 0 to 3, found {degree}"):
+        cvtgs.load(source, sh_degree=degree)
+
+
+def test_simplify_takes_effects(source, tmp_path):
+    output, report = tmp_path / "out.ply", tmp_path / "report.json"
+    words = ["simplify", str(source), str(output), "--rho", "0.2", "--report", str(report)]
+    assert main([*words, "--effects", "sh=1,mip=off, extras=off"]) == 0
+    small = cvtgs.load(output)
+    assert small.sh_degree == 2
+    assert small.shN[:, :3].any()
+    assert not small.shN[:, 3:].any()
+    assert not small.extras
+    plan = cvtgs.SimplifyReport.model_validate_json(report.read_text()).plan
+    assert (plan.sh.degree, plan.sh.forced, plan.mip.forced) == (1, True, True)
+
+
+def test_settings_win_over_effects(source, tmp_path):
+    report = tmp_path / "report.json"
+    words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.2"]
+    words += ["--effects", "sh=1", "--set", "effects.sh=2", "--report", str(report)]
+    assert main(words) == 0
+    assert cvtgs.SimplifyReport.model_validate_json(report.read_text()).plan.sh.degree == 2
+
+
+def test_info_lists_every_effect_with_its_evidence(source, capsys):
+    assert main(["info", str(source), "--effects", "haze=on"]) == 0
+    lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
+    for name in cvtgs.EffectPlan.model_fields:
+        assert lines[name].split()[1] in ("on", "off")
+        assert "on above" in lines[name] or "on at" in lines[name]
+    assert "up to degree 2" in lines["sh"]
+    assert lines["haze"].split()[1] == "on"
+    assert "forced" in lines["haze"]
+    assert "forced" not in lines["sh"]
+
+
+@pytest.mark.parametrize(
+    ("effects", "message"),
+    [
+        ("sh", "--effects needs NAME=VALUE, for example sh=1,mip=off; found 'sh'."),
+        ("sh=1,,", "--effects needs NAME=VALUE, for example sh=1,mip=off; found ''."),
+        ("fog=on", "effects.fog: is not a known setting."),
+        ("sh=4", "effects.sh: input should be 'auto', 0, 1, 2 or 3, found '4'."),
+        ("mip=maybe", "effects.mip: input should be 'auto', 'on' or 'off', found 'maybe'."),
+        ("flat=on", "effects.flat: input should be 'auto' or 'off', found 'on'."),
+    ],
+)
+@pytest.mark.parametrize("command", ["simplify", "info"])
+def test_unknown_effects_are_one_sentence(source, tmp_path, capsys, command, effects, message):
+    words = [command, str(source), "--effects", effects]
+    words += [str(tmp_path / "out.ply"), "--rho", "0.1"] if command == "simplify" else []
+    assert main(words) == 1
+    assert capsys.readouterr().err == f"cvtgs: error: {message}\n"
