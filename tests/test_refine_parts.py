@@ -13,7 +13,7 @@ from cvtgs.refine import RefineConfig
 from cvtgs.refine import budget as budget_module
 from cvtgs.refine.budget import Budget
 from cvtgs.refine.looking import given_outlook, own_outlook
-from cvtgs.refine.pictures import Album, Picture, score, take_picture
+from cvtgs.refine.pictures import Album, Picture, best_counted, scores, take_picture
 from cvtgs.refine.variables import Variables, changed_count
 from refine_cases import full_scene, quick, ring
 from scenes import random_scene, same_bits
@@ -131,13 +131,16 @@ def test_a_picture_over_a_background():
 def test_scores_by_hand():
     """A Gaussian behind the camera paints nothing: black over black, white over white."""
     blind = random_scene(1).with_tensors({"means": torch.tensor([[0.0, 0.0, -90.0]])}, {})
-    assert score(blind, (flat_picture(0.0, 0.0),)) == 60
+    assert scores(blind, (flat_picture(0.0, 0.0),)).tolist() == [60, 60]
     # Off by 0.1 over black, by 0.1 over white.
-    assert score(blind, (flat_picture(0.1, 0.2),)) == pytest.approx(20, abs=1e-4)
-    # Off by 0.1 over black (20 dB), equal over white (60 dB).
-    assert score(blind, (flat_picture(0.1, 0.1),)) == pytest.approx(40, abs=1e-4)
-    both = (flat_picture(0.0, 0.0), flat_picture(0.1, 0.2))
-    assert score(blind, both) == pytest.approx(40, abs=1e-4)
+    found = scores(blind, (flat_picture(0.1, 0.2), flat_picture(0.1, 0.1)))
+    # The second is off by 0.1 over black (20 dB), and equal over white.
+    assert found.tolist() == pytest.approx([20, 20, 20, 60], abs=1e-4)
+
+
+def test_a_view_far_better_than_the_others_does_not_decide():
+    assert best_counted(torch.tensor([20.0, 24.0, 26.0, 58.0])) == 34
+    assert best_counted(torch.tensor([55.0, 58.0])) == 60
 
 
 def test_pictures_are_taken_when_needed_and_looked_at_again():

@@ -43,7 +43,8 @@ class RefineReport(_Record):
         steps: Steps that were taken.
         pictures: Pictures of the full scene that were rendered to learn from.
         heldout: Views that were held out and decided.
-        psnr_before: PSNR of the scene that came in over the held-out views, dB, at most 60 each.
+        psnr_before: PSNR of the scene that came in over the held-out views, dB; each counts as
+            at most 10 dB more than their median.
         psnr_after: The same of the scene that came out; never less.
         gain: Their difference, dB.
         changed_count: Gaussians that are not what they were.

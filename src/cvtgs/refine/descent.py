@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from cvtgs.config import RefineConfig
 from cvtgs.losses import relative_loss
 from cvtgs.refine.budget import Budget
-from cvtgs.refine.pictures import BEST_PSNR, Album, Picture, score
+from cvtgs.refine.pictures import BEST_PSNR, Album, Picture, best_counted, scores
 from cvtgs.refine.variables import Variables
 from cvtgs.render import render
 from cvtgs.scene import GaussianScene
@@ -54,11 +54,13 @@ def descend(
         The best scene, and why it ended.
     """
     budget.begin()
-    best, before = small, score(small, heldout)
+    first = scores(small, heldout)
+    limit = best_counted(first)
+    best, before = small, float(first.clamp(max=limit).mean())
     budget.end("check")
     variables = Variables(small, config.rates, damping=config.damping, frozen=frozen)
     after, waited = before, 0
-    stopped = "perfect" if before >= BEST_PSNR else budget.spent()
+    stopped = "perfect" if float(first.amin()) >= BEST_PSNR else budget.spent()
     while not stopped:
         factor = config.last_rate ** budget.share()
         budget.begin()
@@ -67,7 +69,7 @@ def descend(
         stopped = budget.spent()
         if stopped or budget.steps % config.check_every == 0:
             found = variables.result()
-            reached = score(found, heldout)
+            reached = float(scores(found, heldout).clamp(max=limit).mean())
             budget.end("check")
             waited = 0 if reached > after else waited + 1
             best, after = (found, reached) if reached > after else (best, after)

@@ -112,15 +112,15 @@ class Album:
 
 
 @torch.no_grad()
-def score(scene: GaussianScene, pictures: tuple[Picture, ...]) -> float:
-    """Tell how near a scene comes to pictures of the full one.
+def scores(scene: GaussianScene, pictures: tuple[Picture, ...]) -> Float[Tensor, "p"]:
+    """Tell how near a scene comes to each picture of the full one.
 
     Args:
         scene: The scene.
         pictures: Pictures of the full one.
 
     Returns:
-        Mean of the PSNR of the pictures over black and over white, each at most 60 dB.
+        PSNR of every picture over black and over white, each at most 60 dB, float64.
     """
     values = []
     for picture in pictures:
@@ -129,4 +129,22 @@ def score(scene: GaussianScene, pictures: tuple[Picture, ...]) -> float:
             background = scene.means.new_full((3,), shade)
             error = found.over(background).clamp(0, 1) - picture.over(background).clamp(0, 1)
             values.append(-10 * torch.log10(error.double().square().mean()))
-    return float(torch.stack(values).clamp(max=BEST_PSNR).mean())
+    return torch.stack(values).clamp(max=BEST_PSNR)
+
+
+def best_counted(first: Float[Tensor, "p"]) -> float:
+    """Give the PSNR beyond which a picture counts no further: 10 dB above the median.
+
+    Else the one view that shows an even wall, at 50 dB, decides for all others.
+
+    Args:
+        first: PSNR of the pictures of the scene that came in.
+
+    Returns:
+        A limit, at most 60 dB.
+
+    Example:
+        >>> best_counted(torch.tensor([24.0, 25.0, 50.0]))
+        35.0
+    """
+    return min(BEST_PSNR, float(first.median()) + 10.0)

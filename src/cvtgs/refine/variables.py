@@ -93,9 +93,13 @@ class Variables:
         self._moved[rows] = True
 
     def _smallest_root(self, name: str, gradient: Tensor) -> float:
-        """Give the epsilon of Adam: a share of the running mean size of gradients."""
+        """Give the epsilon of Adam: a share of the running mean size of gradients.
+
+        The size is the mean of their absolute values: of squares, a few giants of a sky would
+        make the most, and hold all others still.
+        """
         if gradient.numel():
-            now = float(gradient.double().square().mean().sqrt())
+            now = float(gradient.double().abs().mean())
             old = self._usual.get(name, now)
             self._usual[name] = old + 0.1 * (now - old)
         return self._damping * self._usual.get(name, 0.0) + _LEAST_ROOT
