@@ -5,11 +5,11 @@ import sys
 import numpy as np
 import pytest
 import torch
-from benchmarks import ablation, scoring
-from benchmarks.grouping import grouped_simplifier, merge_groups, nearest_groups
 
 import cvtgs
 import lpips_cases
+from benchmarks import ablation, scoring
+from benchmarks.grouping import grouped_simplifier, merge_groups, nearest_groups
 from cvtgs.mergenet import load_checkpoint
 from cvtgs.stages import make_reference
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from benchmarks.baselines import BASELINES, baseline, light_gaussian, pup_3dgs
-from benchmarks.baselines.__main__ import main
 
 import cvtgs
 from baseline_cases import gaussians
+from benchmarks.baselines import BASELINES, baseline, light_gaussian, pup_3dgs
+from benchmarks.baselines.__main__ import main
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.filters import invalid_rows

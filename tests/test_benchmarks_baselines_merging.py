@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 import torch
-from benchmarks.baselines import baseline, ghap, nano_gs
 
 import cvtgs
 import oracles
 from baseline_cases import gaussians
+from benchmarks.baselines import baseline, ghap, nano_gs
 from cvtgs.filters import standardized
 from scenes import random_scene
 

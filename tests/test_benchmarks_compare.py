@@ -4,11 +4,11 @@ import sys
 
 import pytest
 import torch
-from benchmarks import compare, compare_report, scoring
-from benchmarks.baselines import BASELINES, baseline
 
 import cvtgs
 import lpips_cases
+from benchmarks import compare, compare_report, scoring
+from benchmarks.baselines import BASELINES, baseline
 
 COPY = """
 import sys

@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from benchmarks import numerics
 
+from benchmarks import numerics
 from hard_cases import CASES
 
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from benchmarks.baselines.pruning import keep_most_mass
 
 import cvtgs
+from benchmarks.baselines.pruning import keep_most_mass
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.errors import DroppedDataWarning
 from cvtgs.evaluate import EvaluationSettings, evaluate

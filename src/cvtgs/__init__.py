@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cvtgs import (
+        blocks,
+        boxes,
         cells,
         cvt,
         effects,
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
         filters,
         goals,
         io,
+        levels,
         losses,
         math,
         mergenet,
@@ -43,7 +46,7 @@ if TYPE_CHECKING:
     from cvtgs.render import Rendering, render
     from cvtgs.report import SimplifyReport
     from cvtgs.scene import GaussianScene
-    from cvtgs.simplify import Simplified, Simplifier, target_count
+    from cvtgs.simplify import Level, Simplified, Simplifier, target_count
 
 __version__ = "0.1.0"
 
@@ -65,11 +68,14 @@ _HOME = {
     "Rendering": "cvtgs.render",
     "SimplifyReport": "cvtgs.report",
     "GaussianScene": "cvtgs.scene",
+    "Level": "cvtgs.simplify",
     "Simplified": "cvtgs.simplify",
     "Simplifier": "cvtgs.simplify",
     "target_count": "cvtgs.simplify",
 }
 _MODULES = (
+    "blocks",
+    "boxes",
     "cells",
     "cvt",
     "effects",
@@ -77,6 +83,7 @@ _MODULES = (
     "filters",
     "goals",
     "io",
+    "levels",
     "losses",
     "math",
     "mergenet",
@@ -93,6 +100,7 @@ __all__ = [
     "CvtgsError",
     "EffectPlan",
     "GaussianScene",
+    "Level",
     "ProgressEvent",
     "ProgressListener",
     "Rendering",
@@ -101,6 +109,8 @@ __all__ = [
     "Simplifier",
     "SimplifyConfig",
     "SimplifyReport",
+    "blocks",
+    "boxes",
     "cells",
     "cvt",
     "describe",
@@ -111,6 +121,7 @@ __all__ = [
     "from_dict",
     "goals",
     "io",
+    "levels",
     "load",
     "load_cameras",
     "losses",

@@ -1,23 +1,29 @@
 """Simplifier: the one call that users make."""
 
 import copy
-import math
 import os
-from fractions import Fraction
-from typing import NamedTuple
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
+from cvtgs.counts import target_count
 from cvtgs.devices import resolve_device
+from cvtgs.effects import limited, pictured, restored, trimmed
 from cvtgs.errors import ConfigError, InvalidArgumentError
 from cvtgs.mergenet import SHIPPED, Checkpoint, MergeNet, load_checkpoint
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.refine import join_reports, refine
 from cvtgs.report import SimplifyReport, StageClock
 from cvtgs.scene import GaussianScene
-from cvtgs.stages import run_stages
+from cvtgs.stages import run_levels, run_protected, run_stages
+
+__all__ = ["Level", "Simplified", "Simplifier", "target_count"]
 
 
 class Simplified(NamedTuple):
@@ -30,6 +36,23 @@ class Simplified(NamedTuple):
 
     scene: GaussianScene
     report: SimplifyReport
+
+
+class Level(NamedTuple):
+    """One size of a scene, of several.
+
+    Attributes:
+        scene: The small scene.
+        report: What was done, and what it cost beyond what was there already for finer sizes.
+        geometric_error: Root mean square distance from Gaussians to those that stand for them,
+            each weighing what it paints; scene units.
+        nested: Whether every cell consists of whole cells of the finest size.
+    """
+
+    scene: GaussianScene
+    report: SimplifyReport
+    geometric_error: float
+    nested: bool
 
 
 class Simplifier:
@@ -80,6 +103,7 @@ class Simplifier:
         *,
         count: int | None = None,
         cameras: Cameras | None = None,
+        keep: Bool[Tensor, "n"] | None = None,
     ) -> GaussianScene:
         """Make a scene smaller.
 
@@ -88,6 +112,7 @@ class Simplifier:
             rho: Ratio of Gaussians to keep, in (0, 1].
             count: Number of Gaussians to keep, instead of ``rho``.
             cameras: From where presets that look at the scene do so; None finds views.
+            keep: Mask of Gaussians that are kept as they are; they count, and come first.
 
         Returns:
             A scene of exactly ``ceil(rho * N)`` (or ``count``) Gaussians; fewer only if so many
@@ -97,7 +122,7 @@ class Simplifier:
             InvalidArgumentError: Ratio or count is out of range, or both or neither are given.
             InvalidSceneError: The scene has no valid row.
         """
-        return self.run(scene, rho, count=count, cameras=cameras).scene
+        return self.run(scene, rho, count=count, cameras=cameras, keep=keep).scene
 
     def run(
         self,
@@ -106,6 +131,7 @@ class Simplifier:
         *,
         count: int | None = None,
         cameras: Cameras | None = None,
+        keep: Bool[Tensor, "n"] | None = None,
     ) -> Simplified:
         """Make a scene smaller, and report.
 
@@ -114,6 +140,7 @@ class Simplifier:
             rho: Ratio of Gaussians to keep, in (0, 1].
             count: Number of Gaussians to keep, instead of ``rho``.
             cameras: From where presets that look at the scene do so; None finds views.
+            keep: Mask of Gaussians that are kept as they are; they count, and come first.
 
         Returns:
             The scene and the report.
@@ -125,26 +152,86 @@ class Simplifier:
         target = target_count(len(scene), rho, count=count)
         device = self._device_for(scene)
         clock = StageClock(self._listener, device)
-        small, facts = run_stages(
-            scene.to(device),
+        run = run_stages if keep is None else partial(run_protected, keep=keep)
+        small, facts = run(
+            limited(scene, self.config.effects).to(device),
             target,
             self.config,
             net=self._net_for(scene, device),
             clock=clock,
             cameras=cameras,
         )
+        return self._reported(scene, small, facts | {"target_count": target}, clock, cameras)
+
+    def levels(
+        self,
+        scene: GaussianScene,
+        rhos: Sequence[float],
+        *,
+        cameras: Cameras | None = None,
+    ) -> tuple[Level, ...]:
+        """Make a scene smaller in several sizes, in little more time than the finest takes.
+
+        The finest size is what :meth:`run` gives, bit for bit. Cells of a coarser one consist of
+        whole cells of the finest, where it is at least four times as coarse.
+
+        Args:
+            scene: The scene; it is not changed.
+            rhos: Ratios of Gaussians to keep, in (0, 1], in any order.
+            cameras: From where presets that look at the scene do so; None finds views.
+
+        Returns:
+            One level per ratio, in the order of the ratios; each of exactly ``ceil(rho * N)``.
+
+        Raises:
+            InvalidArgumentError: A ratio is out of range, or there is none.
+            InvalidSceneError: The scene has no valid row.
+
+        Example:
+            >>> from cvtgs.synthetic import scene as make
+            >>> levels = Simplifier(device="cpu").levels(make("object", 1000), [0.1, 0.01])
+            >>> [len(level.scene) for level in levels]
+            [100, 10]
+        """
+        targets = {target_count(len(scene), rho) for rho in rhos}
+        if not targets:
+            raise InvalidArgumentError("levels need at least one ratio, found none.")
+        device = self._device_for(scene)
+        sizes = run_levels(
+            limited(scene, self.config.effects).to(device),
+            sorted(targets, reverse=True),
+            self.config,
+            net=self._net_for(scene, device),
+            clock=lambda: StageClock(self._listener, device),
+            cameras=cameras,
+        )
+        found = {}
+        for target, size in zip(sorted(targets, reverse=True), sizes, strict=True):
+            facts = size.facts | {"target_count": target}
+            whole = self._reported(scene, size.scene, facts, size.clock, cameras)
+            found[target] = Level(*whole, size.geometric_error, size.nested)
+        return tuple(found[target_count(len(scene), rho)] for rho in rhos)
+
+    def _reported(
+        self,
+        scene: GaussianScene,
+        small: GaussianScene,
+        facts: dict[str, Any],
+        clock: StageClock,
+        cameras: Cameras | None,
+    ) -> Simplified:
         report = SimplifyReport(
             input_count=len(scene),
             output_count=len(small),
-            target_count=target,
-            rho=target / len(scene),
-            device=str(device),
+            rho=facts["target_count"] / len(scene),
+            device=str(small.device),
             checkpoint="none" if self.checkpoint is None else self.checkpoint.name,
             config=self.config,
             stages=tuple(clock.costs),
             **facts,
         )
-        simplified = Simplified(small.to(scene.device), report)
+        whole = restored(small, scene, facts["plan"])
+        simplified = Simplified(whole.to(scene.device), report)
         if not self.config.refine.asked_for or len(small) == len(scene):
             return simplified
         return self._refined(simplified, scene, cameras)
@@ -152,16 +239,23 @@ class Simplifier:
     def _refined(
         self, simplified: Simplified, full: GaussianScene, cameras: Cameras | None
     ) -> Simplified:
+        plan, choices = simplified.report.plan, self.config.effects
+        ours, theirs = (limited(scene, choices) for scene in (simplified.scene, full))
+        if plan is not None:
+            used = pictured if simplified.report.kept_count else trimmed
+            ours, theirs = used(ours, plan), used(theirs, plan)
         refined = refine(
-            simplified.scene,
-            full,
+            ours,
+            theirs,
             cameras=cameras,
             config=self.config.refine,
             seed=self.config.seed,
             device=simplified.report.device,
+            frozen=simplified.report.kept_count,
             listener=self._listener,
         )
-        return Simplified(refined.scene, join_reports(simplified.report, refined))
+        small = refined.scene if plan is None else restored(refined.scene, full, plan)
+        return Simplified(small, join_reports(simplified.report, refined))
 
     def _net_for(self, scene: GaussianScene, device: torch.device) -> MergeNet | None:
         if self.checkpoint is None:
@@ -191,38 +285,3 @@ def _checkpoint(
         preset = "standard" if config is None else config.preset
         return load_checkpoint(preset if preset in SHIPPED else "standard")
     return load_checkpoint(ckpt)
-
-
-def target_count(total: int, rho: float | None, *, count: int | None = None) -> int:
-    """Give the number of Gaussians to keep.
-
-    ``rho`` is taken as the decimal number that was written: 0.07 of 100 Gaussians are 7, though
-    the nearest double times 100 is a little more.
-
-    Args:
-        total: Number of Gaussians, N.
-        rho: Ratio to keep, in (0, 1].
-        count: Number to keep, 1 to N, instead of ``rho``.
-
-    Returns:
-        ``ceil(rho * N)``, or ``count``.
-
-    Raises:
-        InvalidArgumentError: Ratio or count is out of range, or both or neither are given.
-
-    Example:
-        >>> target_count(250, 0.01), target_count(10, 1e-9)
-        (3, 1)
-    """
-    if (rho is None) == (count is None):
-        raise InvalidArgumentError("give either rho or count, not both and not neither.")
-    if count is not None:
-        if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= total:
-            raise InvalidArgumentError(
-                f"count must be a whole number between 1 and the {total} Gaussians of the scene; "
-                f"found {count!r}."
-            )
-        return count
-    if not 0.0 < float(rho or 0.0) <= 1.0:
-        raise InvalidArgumentError(f"rho must be above 0 and at most 1; found {rho!r}.")
-    return math.ceil(Fraction(str(float(rho or 0.0))) * total)

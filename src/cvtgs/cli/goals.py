@@ -6,6 +6,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+from cvtgs.cli.large import keep_mask
 from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.progress import ProgressListener, silent
 
@@ -64,6 +65,8 @@ class Goals:
         self.has_target = options.target_psnr is not None or options.target_ssim is not None
         self.seconds = None if options.time_budget is None else seconds_of(options.time_budget)
         self.said: list[str] = []
+        if self.has_target and options.keep is not None:
+            raise InvalidArgumentError("--keep needs --rho or --count.")
         if self.has_target:
             from cvtgs.goals.goal import check_target  # noqa: PLC0415 (only for those who ask)
 
@@ -160,7 +163,10 @@ class Goals:
         """
         options = self._options
         if not self.has_target:
-            return simplifier.run(scene, options.rho, count=options.count, cameras=cameras)
+            keep = keep_mask(options, scene)
+            return simplifier.run(
+                scene, options.rho, count=options.count, cameras=cameras, keep=keep
+            )
         from cvtgs.goals import find_count  # noqa: PLC0415
         from cvtgs.simplify import Simplified  # noqa: PLC0415
 

@@ -9,8 +9,20 @@ from collections.abc import Sequence
 from types import FrameType
 from typing import NoReturn, TextIO
 
-import cvtgs
-from cvtgs.cli import compare, convert, demo, evaluate, info, render, simplify, tradeoff, train
+from cvtgs.cli import (
+    compare,
+    convert,
+    demo,
+    doctor,
+    evaluate,
+    info,
+    levels,
+    render,
+    simplify,
+    tradeoff,
+    train,
+    versions,
+)
 from cvtgs.errors import CvtgsError
 
 INTERRUPTED = 130
@@ -92,9 +104,25 @@ def build_parser() -> argparse.ArgumentParser:
         description="Make trained 3D Gaussian Splatting scenes 10 to 1000 times smaller.",
         epilog="Start with: cvtgs demo",
     )
-    parser.add_argument("--version", action="version", version=f"cvtgs {cvtgs.__version__}")
+    parser.add_argument(
+        "--version",
+        action=versions.ShowVersions,
+        help="print the versions of cvtgs and of what it computes with",
+    )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for command in (simplify, convert, info, evaluate, render, compare, tradeoff, demo, train):
+    for command in (
+        simplify,
+        levels,
+        convert,
+        info,
+        evaluate,
+        render,
+        compare,
+        tradeoff,
+        demo,
+        doctor,
+        train,
+    ):
         command.add_parser(commands)
     return parser
 

@@ -11,7 +11,9 @@ from cvtgs.cli.display import (
     progress_bars,
     stage_seconds,
 )
+from cvtgs.cli.effects import add_effects_option, effect_settings, load_needed
 from cvtgs.cli.goals import Goals, add_goal_options
+from cvtgs.cli.large import add_large_options, run_by_blocks, works_by_blocks
 from cvtgs.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -56,6 +58,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         dest="settings",
         help="change one setting, for example cvt.iterations=10; may be repeated",
     )
+    add_effects_option(parser)
     parser.add_argument(
         "--refine",
         type=float,
@@ -73,6 +76,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         help="from where to look, for presets that look and for --refine: transforms.json, a "
         "COLMAP model, cameras.json, or a folder of these (default: automatic views)",
     )
+    add_large_options(parser)
     parser.add_argument("--report", type=Path, metavar="R.json", help="write what was done as JSON")
     parser.add_argument(
         "--device", default="auto", metavar="DEVICE", help="auto (default), cpu or cuda"
@@ -93,7 +97,6 @@ def run(options: argparse.Namespace) -> None:
         atomic_output,
         check_output,
         check_save,
-        load,
         load_cameras,
         save,
     )
@@ -105,7 +108,8 @@ def run(options: argparse.Namespace) -> None:
     preset = options.preset
     if checkpoint not in (None, "auto") and preset is None and options.config is None:
         preset = load_checkpoint(checkpoint).info.preset
-    settings = _refinement(options) | _settings(options.settings)
+    settings = _refinement(options) | effect_settings(options.effects)
+    settings |= read_settings(options.settings)
     config = SimplifyConfig.compose(file=options.config, preset=preset, settings=settings)
     if options.rho is not None:
         target_count(1, options.rho)
@@ -113,19 +117,22 @@ def run(options: argparse.Namespace) -> None:
     if options.report is not None:
         check_output(options.report, overwrite=options.overwrite)
     with progress_bars(quiet=options.quiet) as listener:
-        scene = load(options.input)
-        cameras = None if options.cameras is None else load_cameras(options.cameras)
-        chosen = goals.preset(scene, listener)
-        if chosen is not None:
-            config = SimplifyConfig.compose(preset=chosen, settings=settings)
-        simplifier = Simplifier(
-            checkpoint,
-            config=config,
-            device=options.device,
-            listener=goals.stage_listener(listener),
-        )
-        small, report = goals.run(simplifier, scene, cameras=cameras, listener=listener)
-        save(small, options.output, overwrite=options.overwrite)
+        if works_by_blocks(options, config):
+            report = run_by_blocks(options, checkpoint, config, listener)
+        else:
+            scene = load_needed(options.input, config)
+            cameras = None if options.cameras is None else load_cameras(options.cameras)
+            chosen = goals.preset(scene, listener)
+            if chosen is not None:
+                config = SimplifyConfig.compose(preset=chosen, settings=settings)
+            simplifier = Simplifier(
+                checkpoint,
+                config=config,
+                device=options.device,
+                listener=goals.stage_listener(listener),
+            )
+            small, report = goals.run(simplifier, scene, cameras=cameras, listener=listener)
+            save(small, options.output, overwrite=options.overwrite)
     if options.report is not None:
         with atomic_output(options.report, overwrite=options.overwrite) as file:
             file.write(report.to_json().encode())
@@ -141,6 +148,9 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _print_details(report: "SimplifyReport") -> None:
+    if report.blocks > 1:
+        resumed = f", {report.resumed_blocks} of them done before" if report.resumed_blocks else ""
+        print(f"In {report.blocks} blocks{resumed}.")
     if report.shortfall:
         print(f"Fewer than the {report.target_count:,} asked for: {report.shortfall}.")
     if report.refinement is not None:
@@ -159,7 +169,18 @@ def _refinement(options: argparse.Namespace) -> dict[str, str]:
     return {"refine.steps": str(steps), "refine.seconds": str(seconds)}
 
 
-def _settings(words: list[str]) -> dict[str, str]:
+def read_settings(words: list[str]) -> dict[str, str]:
+    """Read what ``--set`` was given.
+
+    Args:
+        words: Each ``KEY=VALUE``.
+
+    Returns:
+        Texts by dotted key.
+
+    Raises:
+        ConfigError: A word has no key or no equals sign.
+    """
     settings = {}
     for word in words:
         key, equals, value = word.partition("=")

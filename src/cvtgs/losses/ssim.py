@@ -15,7 +15,7 @@ SSIM_BORDER = "valid"
 def ssim_loss(
     prediction: Float[Tensor, "c h w 3"], target: Float[Tensor, "c h w 3"]
 ) -> Float[Tensor, ""]:
-    """Give 1 minus the mean structural similarity; see :func:`mean_ssim`.
+    """Give 1 minus the mean structural similarity; see :func:`cvtgs.losses.ssim.mean_ssim`.
 
     Args:
         prediction: ``(c, h, w, 3)`` rendered images, not clipped.

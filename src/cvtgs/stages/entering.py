@@ -8,6 +8,7 @@ from torch import Tensor
 
 from cvtgs import cvt, filters
 from cvtgs.config import SimplifyConfig
+from cvtgs.effects import with_haze
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError
 from cvtgs.math.activations import divide
 from cvtgs.scene import GaussianScene
@@ -67,18 +68,48 @@ def entering_rows(
         The rows that stay, in ascending order, and what the report says of the others.
     """
     opacities = scene.opacities
-    keep = filters.visible_rows(
+    plan = outlook.plan
+    if plan.visibility.active:
+        seen = outlook.seen_areas * opacities
+        outlook = outlook._replace(plan=with_haze(plan, opacities, seen, config=config))
+    keep = _without_faint(opacities, outlook, target, config)
+    keep = _without_flyaways(scene, keep, outlook, target, config)
+    facts = left_out_facts(scene, outlook, ~keep) | {"plan": outlook.plan}
+    return keep.nonzero()[:, 0], facts
+
+
+def _without_faint(
+    opacities: Tensor, outlook: Outlook, target: int, config: SimplifyConfig
+) -> Tensor:
+    """Leave out faint Gaussians: all of them, unless they are the haze of the scene."""
+    least, share = config.filter.min_opacity, config.filter.max_mass_share
+    if not outlook.plan.haze.active:
+        keep, share = opacities >= least, 1.0
+        if int(keep.sum()) >= target:
+            return keep
+    return filters.visible_rows(
         opacities,
         outlook.seen_areas * opacities,
-        min_opacity=config.filter.min_opacity,
-        max_mass_share=config.filter.max_mass_share,
+        min_opacity=least,
+        max_mass_share=share,
         at_least=target,
     )
-    keep = _without_flyaways(scene, keep, outlook, target, config)
-    masses = outlook.areas * opacities
-    left_out = divide(masses[~keep].sum(), masses.sum())
-    facts = {"filtered_count": int((~keep).sum()), "filtered_mass_share": float(left_out)}
-    return keep.nonzero()[:, 0], facts
+
+
+def left_out_facts(scene: GaussianScene, outlook: Outlook, left_out: Tensor) -> dict[str, Any]:
+    """Give what the report says of Gaussians that are left out.
+
+    Args:
+        scene: The Gaussians, with valid rows.
+        outlook: What each paints.
+        left_out: Mask of those that are left out.
+
+    Returns:
+        The facts.
+    """
+    masses = outlook.areas * scene.opacities
+    share = divide(masses[left_out].sum(), masses.sum())
+    return {"filtered_count": int(left_out.sum()), "filtered_mass_share": float(share)}
 
 
 def _without_flyaways(

@@ -1,19 +1,21 @@
 """One look at a scene before anything is done to it."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs import cvt
 from cvtgs.cameras import Cameras
-from cvtgs.config import SimplifyConfig, VisibilityConfig
-from cvtgs.effects import EffectPlan, plan_effects
+from cvtgs.config import SimplifyConfig, TessellationConfig, VisibilityConfig
+from cvtgs.effects import EffectPlan, pictured, plan_effects
+from cvtgs.io.ply.properties import lacks_third_scale
 from cvtgs.math import activations
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.render import contributions
 from cvtgs.scene import GaussianScene
-from cvtgs.views import automatic_views, views_from_anywhere
+from cvtgs.views import mixed_views
 
 
 class Outlook(NamedTuple):
@@ -33,6 +35,18 @@ class Outlook(NamedTuple):
     light: Tensor
     plan: EffectPlan
 
+    def select(self, rows: Tensor) -> Self:
+        """Keep what is known of some Gaussians.
+
+        Args:
+            rows: Row numbers.
+
+        Returns:
+            Their outlook; frame and plan are still those of the whole scene.
+        """
+        light = self.light[rows] if len(self.light) else self.light
+        return self._replace(areas=self.areas[rows], seen_areas=self.seen_areas[rows], light=light)
+
     def facts(self, scene: GaussianScene) -> dict[str, Any]:
         """Give what the report says about it."""
         return {"plan": self.plan, "mass_in": float((self.areas * scene.opacities).sum())}
@@ -51,15 +65,46 @@ def look_at_scene(scene: GaussianScene, config: SimplifyConfig, *, with_light: b
     """
     frame, areas = robust_frame(scene.means), scene.areas
     masses = areas * scene.opacities
-    plan = plan_effects(scene, masses, frame, unbounded=config.cvt.unbounded)
     hides = config.cvt.hidden_share < 1.0
     light = cvt.openness(scene.means, masses, frame) if hides or with_light else masses[:0]
-    seen = areas
-    if config.cvt.perspective:
-        seen = seen * cvt.falloff(scene.means, frame)
-    if hides:
-        seen = seen * (config.cvt.hidden_share + (1 - config.cvt.hidden_share) * light)
+    seen = as_seen(areas, scene.means, light, frame=frame, config=config.cvt)
+    plan = plan_effects(
+        scene,
+        masses,
+        seen * scene.opacities,
+        frame=frame,
+        two_scales=lacks_third_scale(scene.layout),
+        config=config,
+    )
     return Outlook(frame, areas, seen, light, plan)
+
+
+def as_seen(
+    areas: Float[Tensor, "n"],
+    means: Float[Tensor, "n 3"],
+    light: Float[Tensor, "n"],
+    *,
+    frame: RobustFrame,
+    config: TessellationConfig,
+) -> Float[Tensor, "n"]:
+    """Give areas as they look in pictures, smaller for what is far or hidden.
+
+    Args:
+        areas: Mean projected areas.
+        means: Positions.
+        light: How freely every Gaussian can be seen; not looked at if nothing counts as hidden.
+        frame: Centre and radius of the scene.
+        config: What counts.
+
+    Returns:
+        Areas, in the unit of ``areas``.
+    """
+    seen = areas
+    if config.perspective:
+        seen = seen * cvt.falloff(means, frame)
+    if config.hidden_share < 1.0:
+        seen = seen * (config.hidden_share + (1 - config.hidden_share) * light)
+    return seen
 
 
 def look_at_pictures(
@@ -82,8 +127,11 @@ def look_at_pictures(
     Returns:
         The outlook with other ``seen_areas``.
     """
-    found = _own_views(scene, config, seed) if cameras is None else [_some(cameras, config)]
-    painted = torch.stack([contributions(scene, views) for views in found]).sum(dim=0)
+    if cameras is None:
+        views = mixed_views(scene, config.views, size=config.size, seed=seed)
+    else:
+        views = _some(cameras, config)
+    painted = contributions(pictured(scene, outlook.plan), views)
     masses = (outlook.seen_areas * scene.opacities).double()
     total, all_painted = masses.sum(), painted.sum()
     if not float(all_painted) > 0.0:
@@ -96,13 +144,6 @@ def look_at_pictures(
 
 FAINTEST = 1e-6
 """Opacities below count as this where something is divided by them."""
-
-
-def _own_views(scene: GaussianScene, config: VisibilityConfig, seed: int) -> list[Cameras]:
-    size, around = config.size, config.views // 2
-    usual = automatic_views(scene, config.views - around, width=size, height=size, seed=seed)
-    anywhere = views_from_anywhere(scene, around, size=size, seed=seed)
-    return [usual, anywhere]
 
 
 def _some(cameras: Cameras, config: VisibilityConfig) -> Cameras:

@@ -1,12 +1,15 @@
 """The stages in order: check, plan, filter, tessellate, merge, network; no algorithm here."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from cvtgs import cells, cvt, filters
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
+from cvtgs.effects import restored, trimmed
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.morton import morton_order
 from cvtgs.mergenet import MergeNet, correct_cells
@@ -14,6 +17,7 @@ from cvtgs.progress import silent
 from cvtgs.report import StageClock
 from cvtgs.scene import GaussianScene
 from cvtgs.stages.entering import entering_rows, valid_scene
+from cvtgs.stages.merging import merge_groups
 from cvtgs.stages.outlook import Outlook, look_at_pictures, look_at_scene
 
 
@@ -35,6 +39,24 @@ class Reference(NamedTuple):
     light: Tensor
 
 
+class Grouping(NamedTuple):
+    """Which Gaussians form which cell, and what coarser cells can be made of.
+
+    Attributes:
+        scene: The valid Gaussians of the input.
+        outlook: What was found out about them.
+        partition: Rows of ``scene`` that make up every cell.
+        weights: ``(m,)`` what the members of every cell weigh in the tessellation, together.
+        merged: One Gaussian per cell, not yet corrected.
+    """
+
+    scene: GaussianScene
+    outlook: Outlook
+    partition: cells.Partition
+    weights: Tensor
+    merged: GaussianScene
+
+
 def run_stages(
     scene: GaussianScene,
     target: int,
@@ -43,6 +65,8 @@ def run_stages(
     net: MergeNet | None,
     clock: StageClock,
     cameras: Cameras | None = None,
+    outlook: Outlook | None = None,
+    on_grouping: Callable[[Grouping], None] | None = None,
 ) -> tuple[GaussianScene, dict[str, Any]]:
     """Run the stages.
 
@@ -53,6 +77,8 @@ def run_stages(
         net: Corrects merged Gaussians, on the same device; None for no correction.
         clock: Measures each stage.
         cameras: From where a configuration that looks at the scene does so; None finds views.
+        outlook: What is known of the scene, whose rows must all be valid; None looks at it.
+        on_grouping: Given the cells, if there are fewer than valid Gaussians.
 
     Returns:
         The small scene, and the facts that :class:`cvtgs.report.SimplifyReport` holds beyond
@@ -64,28 +90,66 @@ def run_stages(
     with clock.stage("check"):
         valid, facts = valid_scene(scene, target)
     if target >= len(valid):
-        with clock.stage("plan"):
-            facts |= look_at_scene(valid, config, with_light=False).facts(valid)
-        is_whole = target == len(scene)
-        small = filters.with_finite_opacities(valid) if is_whole else filters.standardized(valid)
-        return small, facts | {"mass_out": float(small.masses.sum())}
+        small, more = all_rows(valid, config, is_whole=target == len(scene), clock=clock)
+        return small, facts | more
     reference, more = _refer(
-        valid, target, config, with_light=net is not None, clock=clock, cameras=cameras
+        valid,
+        target,
+        config,
+        with_light=net is not None,
+        clock=clock,
+        cameras=cameras,
+        outlook=outlook,
+        on_grouping=on_grouping,
     )
-    small, facts = reference.merged, facts | more
+    small = restored(finished(reference, net, clock=clock), valid, more["plan"])
+    return small, facts | more | {"mass_out": float(small.masses.sum())}
+
+
+def all_rows(
+    valid: GaussianScene, config: SimplifyConfig, *, is_whole: bool, clock: StageClock
+) -> tuple[GaussianScene, dict[str, Any]]:
+    """Keep all Gaussians, as they are.
+
+    Args:
+        valid: The Gaussians, with valid rows.
+        config: Every choice.
+        is_whole: Whether all rows of the input were asked for: they stay as they came.
+        clock: Measures the stage.
+
+    Returns:
+        The scene, and the facts that the report holds.
+    """
+    with clock.stage("plan"):
+        facts = look_at_scene(valid, config, with_light=False).facts(valid)
+    small = filters.with_finite_opacities(valid) if is_whole else filters.standardized(valid)
+    return small, facts | {"mass_out": float(small.masses.sum())}
+
+
+def finished(reference: Reference, net: MergeNet | None, *, clock: StageClock) -> GaussianScene:
+    """Let the network correct merged Gaussians, and make them valid ones.
+
+    Args:
+        reference: What to correct.
+        net: Corrects it; None for no correction.
+        clock: Measures the stage.
+
+    Returns:
+        The small scene.
+    """
+    small = reference.merged
     if net is not None:
-        with clock.stage("network", target) as advance:
+        with clock.stage("network", len(small)) as advance:
             small = correct_cells(
                 net,
                 reference.scene,
-                reference.merged,
+                small,
                 reference.partition,
                 neighbors=reference.neighbors,
                 light=reference.light,
                 on_cells=advance,
             )
-    small = filters.standardized(small)
-    return small, facts | {"mass_out": float(small.masses.sum())}
+    return filters.standardized(small)
 
 
 def make_reference(scene: GaussianScene, target: int, config: SimplifyConfig) -> Reference:
@@ -121,12 +185,16 @@ def _refer(
     with_light: bool,
     clock: StageClock,
     cameras: Cameras | None = None,
+    outlook: Outlook | None = None,
+    on_grouping: Callable[[Grouping], None] | None = None,
 ) -> tuple[Reference, dict[str, Any]]:
     """Plan, filter, tessellate and merge."""
+    known = outlook is not None
     with clock.stage("plan"):
-        outlook = look_at_scene(valid, config, with_light=with_light)
+        outlook = outlook or look_at_scene(valid, config, with_light=with_light)
         facts = outlook.facts(valid)
-    if config.visibility.views:
+        valid = trimmed(valid, outlook.plan)
+    if outlook.plan.visibility.active and not known:
         with clock.stage("visibility"):
             outlook = look_at_pictures(
                 valid, outlook, config.visibility, cameras=cameras, seed=config.seed
@@ -134,7 +202,7 @@ def _refer(
     with clock.stage("filter"):
         rows, filter_facts = entering_rows(valid, outlook, target, config)
     with clock.stage("tessellate", config.cvt.iterations + 1) as advance:
-        rows, points = _place(valid, rows, outlook, target, config)
+        rows, points = place_rows(valid, rows, outlook, target, config)
         weights = cvt.tessellation_weights(
             valid.opacities[rows],
             outlook.seen_areas[rows],
@@ -146,25 +214,44 @@ def _refer(
             floor=config.cvt.weight_floor,
         )
         tessellation = cvt.tessellate(
-            points, weights, target, config=config.cvt, seed=config.seed, on_iteration=advance
+            points,
+            weights,
+            target,
+            config=config.cvt,
+            seed=config.seed,
+            has_duplicates=outlook.plan.duplicates.active,
+            on_iteration=advance,
         )
+        totals = torch.bincount(tessellation.labels, weights) if on_grouping else weights[:0]
         del points, weights
     with clock.stage("merge", target) as advance:
         local = cells.Partition.from_labels(tessellation.labels, target)
         partition = cells.Partition(order=rows[local.order], offsets=local.offsets)
-        merged = cells.merge_cells(valid, partition, config=config.merge, on_cells=advance)
-        widens = config.merge.widening > 0.0 or config.merge.covered_widening > 0.0
-        near = NEIGHBORS if widens or with_light else 0
-        neighbors = cvt.nearest_neighbors(merged.means, near, backend=tessellation.backend)
-        if widens:
-            merged = cells.widen_cells(
-                merged,
-                partition,
-                neighbors,
-                everywhere=config.merge.widening,
-                covered=config.merge.covered_widening,
-            )
-    facts |= filter_facts | {
+        merged, neighbors = merge_groups(
+            valid,
+            partition,
+            config.merge,
+            with_neighbors=with_light,
+            backend=tessellation.backend,
+            on_cells=advance,
+        )
+    if on_grouping is not None:
+        on_grouping(Grouping(valid, outlook, partition, totals, merged))
+    facts |= filter_facts | grouping_facts(partition, tessellation)
+    return Reference(valid, merged, partition, neighbors, outlook.light), facts
+
+
+def grouping_facts(partition: cells.Partition, tessellation: cvt.Tessellation) -> dict[str, Any]:
+    """Give what the report says about cells.
+
+    Args:
+        partition: Members of every cell.
+        tessellation: How they were found.
+
+    Returns:
+        The facts.
+    """
+    return {
         "single_member_cells": int((partition.counts == 1).sum()),
         "largest_cell": int(partition.counts.amax()),
         "refilled_cells": tessellation.refilled,
@@ -172,13 +259,23 @@ def _refer(
         "energy": tessellation.energy,
         "backend": tessellation.backend,
     }
-    return Reference(valid, merged, partition, neighbors, outlook.light), facts
 
 
-def _place(
+def place_rows(
     scene: GaussianScene, rows: Tensor, outlook: Outlook, target: int, config: SimplifyConfig
 ) -> tuple[Tensor, Tensor]:
-    """Place Gaussians in the space of the tessellation; rows and points along a Morton curve."""
+    """Place Gaussians in the space of the tessellation.
+
+    Args:
+        scene: The Gaussians.
+        rows: Which of them.
+        outlook: What is known of them.
+        target: Number of cells, which sets what colour counts.
+        config: Every choice.
+
+    Returns:
+        The rows and their points, both along a Morton curve.
+    """
     # A curve through contracted space stays fine where the bulk is, whatever flies away.
     curve = cvt.embed(scene.means[rows], frame=outlook.frame, contracted=True)
     rows = rows[morton_order(curve, ties=outlook.seen_areas[rows] * scene.opacities[rows])]
@@ -195,7 +292,3 @@ def _place(
 
 COLOR_CELLS = 10_000
 """The number of cells that ``cvt.color`` is meant for."""
-
-
-NEIGHBORS = 8
-"""Cells around a cell that may cover its ends, and that its network sees."""

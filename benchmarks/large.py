@@ -1,0 +1,131 @@
+"""Levels and blocks: what several sizes cost, and large files in bounded memory.
+
+``python -m benchmarks.large levels`` compares levels with runs of their own, in time and PSNR;
+``seams`` compares blocks with one piece; ``blocks`` simplifies a large generated file in a process
+of its own and prints its user CPU seconds and peak memory. Tables are Markdown.
+"""
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+
+import cvtgs
+from benchmarks.processes import machine, run_python
+from cvtgs.blocks import simplify_file
+from cvtgs.evaluate import EvaluationSettings
+from cvtgs.views import automatic_views
+
+KINDS = ("object", "room", "landscape", "haze", "thin", "courtyard")
+RATIOS = (0.1, 0.01, 0.001)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=("levels", "seams", "blocks", "make"))
+    parser.add_argument("files", nargs="*", type=Path, help="PLYs; generated scenes if none")
+    parser.add_argument("--count", type=int, default=200_000, help="Gaussians of generated scenes")
+    parser.add_argument("--kinds", default=",".join(KINDS), help="kinds of generated scenes")
+    parser.add_argument("--blocks", default="2,8", help="numbers of blocks to compare")
+    parser.add_argument("--memory", default="4GB")
+    parser.add_argument("--rho", type=float, default=0.01)
+    parser.add_argument("--folder", type=Path, help="where large files are written")
+    options = parser.parse_args()
+    load = os.getloadavg()[0]
+    print(f"{machine()}, torch {torch.__version__}; load {load:.1f} when this started\n")
+    {"levels": levels, "seams": seams, "blocks": blocks, "make": make}[options.what](options)
+
+
+def levels(options: argparse.Namespace) -> None:
+    """Time of three levels against the finest alone, and PSNR against runs of their own."""
+    print("| scene | finest, CPU s | levels, CPU s | ratio | PSNR, own runs | PSNR, levels |")
+    print("|---|---|---|---|---|---|")
+    torch.set_num_threads(1)  # threads that wait for one another would count as CPU time
+    simplifier = cvtgs.Simplifier(device="cpu")
+    for name, scene in scenes(options):
+        simplifier.simplify(scene.select(torch.arange(1000)), 0.1)  # loads scipy
+        start = time.process_time()
+        own = {RATIOS[0]: simplifier.simplify(scene, RATIOS[0])}
+        finest = time.process_time() - start
+        start = time.process_time()
+        found = simplifier.levels(scene, RATIOS)
+        together = time.process_time() - start
+        own |= {rho: simplifier.simplify(scene, rho) for rho in RATIOS[1:]}
+        small = {f"own {rho}": own[rho] for rho in RATIOS}
+        small |= {f"level {rho}": x.scene for rho, x in zip(RATIOS, found, strict=True)}
+        psnr = scores(scene, small)
+        words = [" / ".join(f"{psnr[f'{kind} {rho}']:.2f}" for rho in RATIOS)
+                 for kind in ("own", "level")]  # fmt: skip
+        print(
+            f"| {name}, {len(scene):,} | {finest:.2f} | {together:.2f} "
+            f"| {together / finest:.2f} | {words[0]} | {words[1]} |",
+            flush=True,
+        )
+
+
+def seams(options: argparse.Namespace) -> None:
+    """PSNR of scenes made by blocks against those made in one piece."""
+    numbers = [int(word) for word in options.blocks.split(",")]
+    print(f"| scene, rho {options.rho:g} | one piece |", *(f"{n} blocks |" for n in numbers))
+    print("|---|---|" + "---|" * len(numbers))
+    simplifier = cvtgs.Simplifier(device="cpu")
+    for name, scene in scenes(options):
+        small = {"one": simplifier.simplify(scene, options.rho)}
+        with tempfile.TemporaryDirectory() as folder:
+            path, output = Path(folder) / "in.ply", Path(folder) / "out.ply"
+            cvtgs.save(scene, path)
+            for number in numbers:
+                simplify_file(path, output, options.rho, blocks=number, overwrite=True)
+                small[str(number)] = cvtgs.load(output)
+        psnr = scores(scene, small)
+        print(f"| {name}, {len(scene):,} |", *(f"{psnr[x]:.2f} |" for x in small), flush=True)
+
+
+def blocks(options: argparse.Namespace) -> None:
+    """Whole processes on large files."""
+    print("| file | memory | user CPU s | wall s | peak MB | Gaussians | blocks |")
+    print("|---|---|---|---|---|---|---|")
+    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+        for file in options.files:
+            output, report = Path(folder) / "small.ply", Path(folder) / "report.json"
+            cost = run_python(
+                "-m", "cvtgs", "simplify", str(file), str(output), "--rho", str(options.rho),
+                "--memory", options.memory, "--report", str(report), "--overwrite", "--quiet",
+            )  # fmt: skip
+            said = json.loads(report.read_text())
+            print(
+                f"| {file.stem}, {file.stat().st_size / 1e9:.2f} GB | {options.memory} "
+                f"| {cost.user_seconds:.1f} | {cost.wall_seconds:.1f} "
+                f"| {cost.peak_bytes / 1e6:.0f} | {said['output_count']:,} | {said['blocks']} |",
+                flush=True,
+            )
+
+
+def make(options: argparse.Namespace) -> None:
+    """Write a courtyard of ``--count`` Gaussians without view-dependent colour."""
+    (file,) = options.files
+    cvtgs.save(cvtgs.synthetic.scene("courtyard", options.count, sh_degree=0, seed=0), file)
+
+
+def scenes(options: argparse.Namespace) -> list[tuple[str, cvtgs.GaussianScene]]:
+    """Give the scenes to compare on."""
+    if options.files:
+        return [(file.stem, cvtgs.load(file)) for file in options.files]
+    make_one, kinds = cvtgs.synthetic.scene, options.kinds.split(",")
+    return [(kind, make_one(kind, options.count, sh_degree=1, seed=3)) for kind in kinds]
+
+
+def scores(scene: cvtgs.GaussianScene, small: dict[str, cvtgs.GaussianScene]) -> dict[str, float]:
+    """Give mean PSNR over automatic views."""
+    cameras = automatic_views(scene, 6, width=400, height=300)
+    settings = EvaluationSettings(lpips="off")
+    found = cvtgs.evaluate(scene, small, cameras, settings=settings)
+    return {one.name: one.psnr.mean for one in found.scenes}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,221 @@
+"""The two things that processes do: sort rows into blocks, and simplify a block."""
+
+import json
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cvtgs import cvt, filters
+from cvtgs.blocks.job import Job
+from cvtgs.blocks.survey import CHUNK, Depths, Survey, add_up, raw_weights
+from cvtgs.blocks.threads import one_thread
+from cvtgs.boxes import inside
+from cvtgs.config import SimplifyConfig
+from cvtgs.effects import limited
+from cvtgs.io import atomic_output, save
+from cvtgs.io.ply.assemble import assemble
+from cvtgs.math.frames import RobustFrame
+from cvtgs.progress import silent
+from cvtgs.report import StageClock
+from cvtgs.scene import GaussianScene
+from cvtgs.stages import Outlook, run_stages
+from cvtgs.stages.outlook import as_seen
+
+SEEN, LIGHT = "cvtgs_seen", "cvtgs_light"
+"""Columns of block files beyond those of the source: area as seen, and light."""
+
+
+@one_thread()
+def look(job: Job, frame: RobustFrame, part: tuple[int, int, int]) -> Depths:
+    """Look at one part of the source.
+
+    Args:
+        job: What is to be done.
+        frame: Centre and radius of the scene.
+        part: Number, first row, row after the last one.
+
+    Returns:
+        What its rows add up to.
+    """
+    return add_up(job.source, frame, job.boxes, part[1], part[2])
+
+
+@one_thread()
+def sort_into_blocks(job: Job, part: tuple[int, int, int]) -> tuple[list[int], list[float]]:
+    """Write the rows of one part of the source into one file per block.
+
+    Doing it again writes the same files again.
+
+    Args:
+        job: What is to be done.
+        part: Number, first row, row after the last one.
+
+    Returns:
+        Rows and weight (in cells) that went into each block.
+    """
+    survey, _ = job.read_survey()
+    number, first, last = part
+    for block in range(job.blocks):
+        job.rows_path(block, number).unlink(missing_ok=True)
+    job.kept_path(number).unlink(missing_ok=True)
+    rows, shares = torch.zeros(job.blocks, dtype=torch.int64), torch.zeros(job.blocks).double()
+    for start in range(first, last, CHUNK):
+        records = job.source.read(start, min(start + CHUNK, last))
+        scene = job.source.scene(records)
+        valid = filters.valid_rows(scene)
+        protected = valid & inside(job.boxes, scene.means) if job.boxes else ~valid & valid
+        _append_kept(job, number, records, scene, protected)
+        places = (valid & ~protected).nonzero()[:, 0]
+        light, seen, places = _entering(survey, job.config, scene, places)
+        weights = raw_weights(scene.opacities[places], seen, survey.power)
+        weights = weights.clamp_min(survey.floor)
+        cells = (weights / survey.step).clamp_max(1.0) if survey.step > 0 else weights * 0 + 1
+        points = survey.frame.contract(scene.means[places])
+        blocks = survey.cuts.blocks_of(points)
+        rows += torch.bincount(blocks, minlength=job.blocks)
+        shares += torch.bincount(blocks, cells, minlength=job.blocks)
+        order = torch.sort(blocks, stable=True).indices
+        table = np.empty(len(order), _record_type(job))
+        sorted_rows = places[order].numpy()
+        for name in records.dtype.names or ():
+            table[name] = records[name][sorted_rows]
+        table[SEEN], table[LIGHT] = seen[order].numpy(), light[order].numpy()
+        _append(job, number, table, torch.bincount(blocks, minlength=job.blocks))
+    return rows.tolist(), shares.tolist()
+
+
+@one_thread()
+def simplify_block(job: Job, block: int) -> None:
+    """Simplify one block, and write it, unless that was done before.
+
+    Args:
+        job: What is to be done.
+        block: Which block.
+    """
+    survey, targets = job.read_survey()
+    target = targets[block]
+    if target == 0 or job.small_path(block).exists():
+        return
+    scene, seen, light = _read_block(job, block)
+    scene = limited(scene, job.config.effects)
+    outlook = Outlook(survey.frame, scene.areas, seen, light, survey.plan)
+    checkpoint = job.network
+    net = None if checkpoint is None else checkpoint.net.to(scene.dtype)
+    clock = StageClock(silent, scene.device)
+    config = config_of_block(job.config, share=target / sum(targets))
+    small, facts = run_stages(scene, target, config, net=net, clock=clock, outlook=outlook)
+    facts = {name: value for name, value in facts.items() if name != "plan"}
+    said = {
+        "input_count": len(scene),
+        "facts": facts,
+        "stages": [cost.model_dump() for cost in clock.costs],
+    }
+    with atomic_output(job.facts_path(block), overwrite=True) as file:
+        file.write(json.dumps(said).encode())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        save(small, job.small_path(block), overwrite=True)
+
+
+def config_of_block(config: SimplifyConfig, *, share: float) -> SimplifyConfig:
+    """Give the choices for a block, such that it is treated as a part of the whole.
+
+    Nothing is filtered any more, and colour counts as in the tessellation of the whole.
+
+    Args:
+        config: The choices for the whole.
+        share: Share of the block in the Gaussians to keep.
+
+    Returns:
+        The choices for the block.
+
+    Example:
+        >>> config_of_block(SimplifyConfig(), share=1.0).cvt == SimplifyConfig().cvt
+        True
+    """
+    cells = config.cvt
+    color = cells.color * share**-cells.color_power
+    return config.model_copy(
+        update={
+            "filter": config.filter.model_copy(
+                update={"min_opacity": 0.0, "max_flyaway_share": 0.0}
+            ),
+            "cvt": cells.model_copy(update={"color": color}),
+        }
+    )
+
+
+def _entering(
+    survey: Survey, config: SimplifyConfig, scene: GaussianScene, rows: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Give light, area as seen and row of the Gaussians that are not left out."""
+    means, opacities = scene.means[rows], scene.opacities[rows]
+    areas = scene.select(rows).areas
+    light = cvt.light_at(survey.light, means, survey.frame)
+    seen = as_seen(areas, means, light, frame=survey.frame, config=config.cvt)
+    enters = opacities >= survey.faintest
+    if survey.lightest >= 0.0:
+        far = survey.frame.distances(means) > filters.FLYAWAY_RADII
+        mass = areas * opacities * cvt.falloff(means, survey.frame)
+        enters &= ~(far & (mass <= survey.lightest))
+    return light[enters], seen[enters], rows[enters]
+
+
+def _record_type(job: Job) -> np.dtype[Any]:
+    return np.dtype([*job.source.names, (SEEN, "<f8"), (LIGHT, "<f4")])
+
+
+def _append(job: Job, number: int, table: NDArray[Any], counts: Tensor) -> None:
+    start = 0
+    for block, count in enumerate(counts.tolist()):
+        if count:
+            with job.rows_path(block, number).open("ab") as file:
+                file.write(table[start : start + count].tobytes())
+        start += count
+
+
+def _append_kept(
+    job: Job, number: int, records: NDArray[Any], scene: GaussianScene, protected: Tensor
+) -> None:
+    if not bool(protected.any()):
+        return
+    kept = records[protected.numpy()]
+    logits = filters.with_finite_opacities(scene.select(protected)).logit_opacities
+    kept["opacity"] = logits.numpy()
+    with job.kept_path(number).open("ab") as file:
+        file.write(kept.tobytes())
+
+
+def _read_block(job: Job, block: int) -> tuple[GaussianScene, Tensor, Tensor]:
+    """Read a block; what is mapped is let go of piece by piece."""
+    kind = _record_type(job)
+    paths = [job.rows_path(block, number) for number, _, _ in job.ranges()]
+    counts = [path.stat().st_size // kind.itemsize if path.exists() else 0 for path in paths]
+    total, done = sum(counts), 0
+    seen = torch.empty(total, dtype=torch.float64)
+    light = torch.empty(total, dtype=torch.float64)
+
+    def pieces() -> Iterator[NDArray[Any]]:
+        nonlocal done
+        for path, count in zip(paths, counts, strict=True):
+            for rows in _mapped(path, kind, count):
+                seen[done : done + len(rows)] = torch.from_numpy(rows[SEEN].copy())
+                light[done : done + len(rows)] = torch.from_numpy(rows[LIGHT].copy())
+                done += len(rows)
+                yield rows
+
+    source = job.source
+    scene = assemble(pieces(), count=total, layout=source.layout, comments=source.comments)
+    return scene, seen, light
+
+
+def _mapped(path: Path, kind: np.dtype[Any], count: int) -> Iterator[NDArray[Any]]:
+    for start in range(0, count, 1 << 14):
+        shape = (min(1 << 14, count - start),)
+        yield np.memmap(path, kind, "r", start * kind.itemsize, shape).view(np.ndarray)

@@ -1,0 +1,107 @@
+"""Boxes: regions of a scene, by the centres of Gaussians."""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import pydantic
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from cvtgs.errors import InputError, InputNotFoundError, InvalidArgumentError
+
+Corner = tuple[float, float, float]
+
+
+class Box(pydantic.BaseModel):
+    """A box along the axes; its faces belong to it.
+
+    Attributes:
+        min: Least coordinates, scene units.
+        max: Largest coordinates, none below those of ``min``.
+
+    Example:
+        >>> Box(min=(0, 0, 0), max=(1, 1, 1)).max
+        (1.0, 1.0, 1.0)
+    """
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    min: Corner
+    max: Corner
+
+    @pydantic.model_validator(mode="after")
+    def _in_order(self) -> "Box":
+        if any(low > high for low, high in zip(self.min, self.max, strict=True)):
+            raise ValueError("min must not be above max")
+        return self
+
+
+def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
+    """Read boxes from a JSON file.
+
+    Args:
+        path: A file that holds ``{"min": [x, y, z], "max": [x, y, z]}``, or a list of these.
+
+    Returns:
+        The boxes, at least one.
+
+    Raises:
+        InputNotFoundError: There is no such file.
+        InputError: It cannot be read.
+        InvalidArgumentError: It holds something else.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder) / "box.json"
+        ...     _ = file.write_text('{"min": [0, 0, 0], "max": [1, 2, 3]}')
+        ...     read_boxes(file)
+        (Box(min=(0.0, 0.0, 0.0), max=(1.0, 2.0, 3.0)),)
+    """
+    try:
+        values = json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
+    except ValueError as error:
+        raise InvalidArgumentError(f"{path}: must be JSON, found none: {error}.") from None
+    listed = values if isinstance(values, list) else [values]
+    try:
+        boxes = tuple(Box.model_validate(value) for value in listed)
+    except pydantic.ValidationError as error:
+        problem = error.errors()[0]
+        where = ".".join(str(part) for part in problem["loc"])
+        raise InvalidArgumentError(
+            f'{path}: must hold boxes like {{"min": [x, y, z], "max": [x, y, z]}}; '
+            f"{where + ': ' if where else ''}{problem['msg'].lower()}."
+        ) from None
+    if not boxes:
+        raise InvalidArgumentError(f"{path}: must hold at least one box, found none.")
+    return boxes
+
+
+def inside(boxes: Sequence[Box], means: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    """Tell which centres lie in a box.
+
+    Args:
+        boxes: The boxes.
+        means: Positions, scene units.
+
+    Returns:
+        A mask.
+
+    Example:
+        >>> box = Box(min=(0, 0, 0), max=(1, 1, 1))
+        >>> inside([box], torch.tensor([[0.5, 0.5, 1.0], [2.0, 0, 0]])).tolist()
+        [True, False]
+    """
+    found = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+    for box in boxes:
+        low, high = (means.new_tensor(corner) for corner in (box.min, box.max))
+        found |= ((means >= low) & (means <= high)).all(dim=1)
+    return found

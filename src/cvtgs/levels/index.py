@@ -1,0 +1,131 @@
+"""LevelsIndex: what a viewer needs to choose among the levels of a scene."""
+
+from typing import Self
+
+import pydantic
+import torch
+
+from cvtgs.evaluate import SceneScores
+from cvtgs.scene import GaussianScene
+from cvtgs.simplify import Level
+
+Corner = tuple[float, float, float]
+
+
+class _Record(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+
+
+class LevelEntry(_Record):
+    """One level.
+
+    Attributes:
+        file: Name of the file, in the folder of the index.
+        rho: Ratio of Gaussians that was asked for.
+        count: Its Gaussians.
+        bytes: Size of the file.
+        geometric_error: Root mean square distance from the Gaussians of the full scene to those
+            that stand for them, each weighing what it paints; scene units. 0 if all are there.
+        box_min: Least coordinates of the centres, scene units.
+        box_max: Largest coordinates of the centres.
+        nested: Whether each of its cells consists of whole cells of the finest level.
+        seconds: Wall-clock seconds beyond what finer levels had done already.
+        psnr: Mean PSNR against the full scene, dB; None if it was not measured.
+        ssim: The same for SSIM.
+        lpips: The same for LPIPS.
+    """
+
+    file: str
+    rho: float
+    count: int
+    bytes: int
+    geometric_error: float
+    box_min: Corner
+    box_max: Corner
+    nested: bool
+    seconds: float
+    psnr: float | None = None
+    ssim: float | None = None
+    lpips: float | None = None
+
+    @classmethod
+    def of(
+        cls, level: Level, rho: float, *, file: str, size: int, scores: SceneScores | None
+    ) -> Self:
+        """Describe a level.
+
+        Args:
+            level: The level.
+            rho: Ratio that was asked for.
+            file: Name of its file.
+            size: Bytes of its file.
+            scores: How it looks; None if nobody looked.
+
+        Returns:
+            The entry.
+        """
+        lowest, highest = bounding_box(level.scene)
+        return cls(
+            file=file,
+            rho=rho,
+            count=len(level.scene),
+            bytes=size,
+            geometric_error=level.geometric_error,
+            box_min=lowest,
+            box_max=highest,
+            nested=level.nested,
+            seconds=level.report.seconds,
+            psnr=scores.psnr.mean if scores else None,
+            ssim=scores.ssim.mean if scores else None,
+            lpips=scores.lpips.mean if scores and scores.lpips else None,
+        )
+
+
+class LevelsIndex(_Record):
+    """All levels of a scene, as ``levels.json`` holds them.
+
+    Attributes:
+        version: Version of this format.
+        source: Name of the file of the full scene.
+        source_count: Its Gaussians.
+        views: Views that the scores are means over; 0 if nobody looked.
+        levels: The levels, the finest first.
+    """
+
+    version: int = 1
+    source: str
+    source_count: int
+    views: int = 0
+    levels: tuple[LevelEntry, ...]
+
+    def to_json(self) -> str:
+        """Give the index as indented JSON.
+
+        Returns:
+            JSON text that ends with a line break.
+        """
+        return self.model_dump_json(indent=2) + "\n"
+
+
+def bounding_box(scene: GaussianScene) -> tuple[Corner, Corner]:
+    """Give the box of the centres.
+
+    Args:
+        scene: At least one Gaussian.
+
+    Returns:
+        The least and the largest coordinates.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> low, high = bounding_box(make("object", 100, sh_degree=0, seed=0))
+        >>> all(a <= b for a, b in zip(low, high, strict=True))
+        True
+    """
+    low, high = torch.aminmax(scene.means, dim=0)
+    return _corner(low), _corner(high)
+
+
+def _corner(point: torch.Tensor) -> Corner:
+    x, y, z = point.tolist()
+    return x, y, z

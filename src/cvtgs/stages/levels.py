@@ -1,0 +1,210 @@
+"""Several sizes of one scene: coarser cells are made of the cells of the finest size."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs import cells, cvt
+from cvtgs.cameras import Cameras
+from cvtgs.config import SimplifyConfig
+from cvtgs.effects import restored
+from cvtgs.math.segments import segment_ids
+from cvtgs.mergenet import MergeNet
+from cvtgs.report import StageClock
+from cvtgs.scene import GaussianScene
+from cvtgs.stages.entering import left_out_facts, valid_scene
+from cvtgs.stages.merging import merge_groups
+from cvtgs.stages.outlook import Outlook, look_at_pictures, look_at_scene
+from cvtgs.stages.run import (
+    Grouping,
+    Reference,
+    all_rows,
+    finished,
+    grouping_facts,
+    place_rows,
+    run_stages,
+)
+
+NESTED_FROM = 4
+"""A cell is made of cells only where there are, on average, at least so many of them in it."""
+
+
+CHUNK = 1 << 18
+"""Gaussians whose distance is measured together, to bound memory."""
+
+
+class Sized(NamedTuple):
+    """One size of a scene.
+
+    Attributes:
+        scene: The Gaussians that are left.
+        facts: What the report holds beyond counts and costs.
+        clock: What it cost.
+        geometric_error: Root mean square distance from Gaussians to those that stand for them,
+            each weighing what it does in the tessellation; scene units.
+        nested: Whether its cells are made of cells of the finest size.
+    """
+
+    scene: GaussianScene
+    facts: dict[str, Any]
+    clock: StageClock
+    geometric_error: float
+    nested: bool
+
+
+def run_levels(
+    scene: GaussianScene,
+    targets: Sequence[int],
+    config: SimplifyConfig,
+    *,
+    net: MergeNet | None,
+    clock: Callable[[], StageClock],
+    cameras: Cameras | None = None,
+    on_grouping: Callable[[Grouping], None] = lambda grouping: None,
+) -> list[Sized]:
+    """Run the stages for several sizes, and share what they have in common.
+
+    The scene is checked and looked at once. The finest size is that of :func:`run_stages`, bit
+    for bit. A coarser one groups the cells of the finest, which are few, and merges all Gaussians
+    in them, so its cells are made of whole finest ones. A size with more than a quarter of the
+    finest cells gets a tessellation of its own: there whole cells are too coarse to build with.
+
+    Args:
+        scene: The scene, on the device to compute on.
+        targets: Numbers of Gaussians to keep, in descending order.
+        config: Every choice.
+        net: Corrects merged Gaussians, on the same device; None for no correction.
+        clock: Gives a clock for every size.
+        cameras: From where a configuration that looks at the scene does so; None finds views.
+        on_grouping: Given the cells of every size that has fewer than valid Gaussians.
+
+    Returns:
+        Every size, in the order of the targets.
+    """
+    results: list[Sized] = []
+    finest: Grouping | None = None
+    outlook: Outlook | None = None
+    watch = clock()
+    with watch.stage("check"):
+        valid, checked = valid_scene(scene, max(targets))
+    for target in targets:
+        checked |= {} if target > len(valid) else {"shortfall": ""}
+        if target >= len(valid):
+            small, facts = all_rows(valid, config, is_whole=target == len(scene), clock=watch)
+            results.append(Sized(small, checked | facts, watch, 0.0, False))
+        else:
+            if outlook is None:
+                outlook = _outlook(valid, config, net, watch=watch, cameras=cameras)
+            nested = finest is not None and NESTED_FROM * target <= len(finest.partition)
+            groupings: list[Grouping] = []
+            if finest is not None and nested:
+                small, facts = _made_of(
+                    finest,
+                    target,
+                    config,
+                    original=valid,
+                    net=net,
+                    clock=watch,
+                    on_grouping=groupings.append,
+                )
+            else:
+                small, facts = run_stages(
+                    valid,
+                    target,
+                    config,
+                    net=net,
+                    clock=watch,
+                    outlook=outlook,
+                    on_grouping=groupings.append,
+                )
+            on_grouping(groupings[0])
+            finest = finest or groupings[0]
+            error = _distance(groupings[0], small, masses=outlook.seen_areas * valid.opacities)
+            results.append(Sized(small, checked | facts, watch, error, nested))
+        watch = clock()
+    return results
+
+
+def _distance(grouping: Grouping, small: GaussianScene, *, masses: Float[Tensor, "n"]) -> float:
+    """Give the root mean square distance from Gaussians to what stands for them."""
+    partition, squares, total = grouping.partition, 0.0, 0.0
+    ids = segment_ids(partition.offsets)
+    for rows, cell in zip(partition.order.split(CHUNK), ids.split(CHUNK), strict=True):
+        shifts = grouping.scene.means[rows].double() - small.means[cell].double()
+        squares += float((masses[rows] * shifts.square().sum(dim=1)).sum())
+        total += float(masses[rows].sum())
+    return math.sqrt(squares / total) if total > 0.0 else 0.0
+
+
+def _outlook(
+    valid: GaussianScene,
+    config: SimplifyConfig,
+    net: MergeNet | None,
+    *,
+    watch: StageClock,
+    cameras: Cameras | None,
+) -> Outlook:
+    with watch.stage("plan"):
+        outlook = look_at_scene(valid, config, with_light=net is not None)
+    if not outlook.plan.visibility.active:
+        return outlook
+    with watch.stage("visibility"):
+        return look_at_pictures(
+            valid, outlook, config.visibility, cameras=cameras, seed=config.seed
+        )
+
+
+def _made_of(
+    finest: Grouping,
+    target: int,
+    config: SimplifyConfig,
+    *,
+    original: GaussianScene,
+    net: MergeNet | None,
+    clock: StageClock,
+    on_grouping: Callable[[Grouping], None],
+) -> tuple[GaussianScene, dict[str, Any]]:
+    """Group the finest cells, and merge what is in them."""
+    valid, outlook, fine = finest.scene, finest.outlook, finest.merged
+    with clock.stage("tessellate", config.cvt.iterations + 1) as advance:
+        everything = torch.arange(len(fine), device=fine.device)
+        around = outlook._replace(seen_areas=finest.weights)
+        rows, points = place_rows(fine, everything, around, target, config)
+        tessellation = cvt.tessellate(
+            points,
+            finest.weights[rows],
+            target,
+            config=config.cvt,
+            seed=config.seed,
+            on_iteration=advance,
+        )
+        partition = _composed(finest.partition, rows, tessellation.labels, target)
+    with clock.stage("merge", target) as advance:
+        merged, neighbors = merge_groups(
+            valid,
+            partition,
+            config.merge,
+            with_neighbors=net is not None,
+            backend=tessellation.backend,
+            on_cells=advance,
+        )
+    on_grouping(Grouping(valid, outlook, partition, finest.weights, merged))
+    reference = Reference(valid, merged, partition, neighbors, outlook.light)
+    small = restored(finished(reference, net, clock=clock), original, outlook.plan)
+    left_out = torch.ones(len(valid), dtype=torch.bool, device=valid.device)
+    left_out[partition.order] = False
+    facts = outlook.facts(valid) | grouping_facts(partition, tessellation)
+    facts |= left_out_facts(valid, outlook, left_out)
+    return small, facts | {"mass_out": float(small.masses.sum())}
+
+
+def _composed(fine: cells.Partition, rows: Tensor, labels: Tensor, count: int) -> cells.Partition:
+    """Give the members of cells that consist of fine cells."""
+    coarse = torch.empty_like(labels)
+    coarse[rows] = labels
+    local = cells.Partition.from_labels(torch.repeat_interleave(coarse, fine.counts), count)
+    return cells.Partition(order=fine.order[local.order], offsets=local.offsets)

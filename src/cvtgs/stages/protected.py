@@ -1,0 +1,138 @@
+"""Protected Gaussians stay as they are; the stages run on the rest."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from cvtgs import filters
+from cvtgs.cameras import Cameras
+from cvtgs.config import SimplifyConfig
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.mergenet import MergeNet
+from cvtgs.report import StageClock
+from cvtgs.scene import GaussianScene
+from cvtgs.stages.entering import valid_scene
+from cvtgs.stages.outlook import look_at_pictures, look_at_scene
+from cvtgs.stages.run import run_stages
+
+
+def run_protected(
+    scene: GaussianScene,
+    target: int,
+    config: SimplifyConfig,
+    *,
+    keep: Bool[Tensor, "n"],
+    net: MergeNet | None,
+    clock: StageClock,
+    cameras: Cameras | None = None,
+) -> tuple[GaussianScene, dict[str, Any]]:
+    """Run the stages on the Gaussians that are not protected.
+
+    What hides and crowds them is judged by the whole scene.
+
+    Args:
+        scene: The scene, on the device to compute on.
+        target: Number of Gaussians to keep, the protected ones among them.
+        config: Every choice.
+        keep: Mask of the protected Gaussians.
+        net: Corrects merged Gaussians, on the same device; None for no correction.
+        clock: Measures each stage.
+        cameras: From where a configuration that looks at the scene does so; None finds views.
+
+    Returns:
+        The small scene, in which the protected Gaussians come first, as they were and in their
+        order, but for infinite opacity logits; and the facts that the report holds.
+
+    Raises:
+        InvalidArgumentError: The mask does not fit, or leaves nothing of the target for the rest.
+        InvalidSceneError: The scene has no valid row.
+    """
+    check_mask(keep, scene)
+    with clock.stage("check"):
+        valid, checked = valid_scene(scene, target)
+        keep = keep.to(scene.device)
+        kept = keep if valid is scene else keep[filters.valid_rows(scene)]
+        check_room(int(kept.sum()), target=target, total=len(valid))
+    if target >= len(valid) or not bool(kept.any()):
+        small, facts = run_stages(valid, target, config, net=net, clock=clock, cameras=cameras)
+        order = torch.sort((~kept).to(torch.uint8), stable=True).indices
+        whole = target >= len(valid)
+        small = filters.with_finite_opacities(valid).select(order) if whole else small
+        return small, facts | checked
+    with clock.stage("plan"):
+        outlook = look_at_scene(valid, config, with_light=net is not None)
+    if outlook.plan.visibility.active:
+        with clock.stage("visibility"):
+            outlook = look_at_pictures(
+                valid, outlook, config.visibility, cameras=cameras, seed=config.seed
+            )
+    rest, protected = (~kept).nonzero()[:, 0], filters.with_finite_opacities(valid.select(kept))
+    small, facts = run_stages(
+        valid.select(rest),
+        target - len(protected),
+        config,
+        net=net,
+        clock=clock,
+        outlook=outlook.select(rest),
+    )
+    joined = join_scenes(protected, small)
+    facts |= outlook.facts(valid) | checked | {"kept_count": len(protected)}
+    return joined, facts | {"mass_out": float(joined.masses.sum())}
+
+
+def check_mask(keep: Tensor, scene: GaussianScene) -> None:
+    """Refuse what is not a mask of the Gaussians of a scene.
+
+    Args:
+        keep: The mask.
+        scene: The scene.
+
+    Raises:
+        InvalidArgumentError: It has another shape or dtype.
+    """
+    if not isinstance(keep, Tensor) or keep.dtype != torch.bool or keep.shape != (len(scene),):
+        shape = f"{keep.dtype} {tuple(keep.shape)}" if isinstance(keep, Tensor) else repr(keep)
+        raise InvalidArgumentError(
+            f"keep must be a boolean tensor of shape ({len(scene)},), found {shape[:80]}."
+        )
+
+
+def check_room(kept: int, *, target: int, total: int) -> None:
+    """Check that protected Gaussians leave something of the target for the rest.
+
+    Args:
+        kept: Number of protected Gaussians.
+        target: Number of Gaussians to keep.
+        total: Number of valid Gaussians.
+
+    Raises:
+        InvalidArgumentError: The target cannot be met.
+
+    Example:
+        >>> check_room(9, target=10, total=100)
+    """
+    needed = kept + (1 if kept < total else 0)
+    if kept and min(target, total) < needed:
+        raise InvalidArgumentError(
+            f"{kept} Gaussians are to be kept as they are, so at least {needed} of the {total} "
+            f"must be left (rho {needed / total:.4g} or more); asked for {target}."
+        )
+
+
+def join_scenes(first: GaussianScene, second: GaussianScene) -> GaussianScene:
+    """Put the Gaussians of two scenes of one kind behind one another.
+
+    Args:
+        first: A scene; its comments and layout stay.
+        second: A scene of the same SH degree, dtype and extra columns.
+
+    Returns:
+        All Gaussians.
+    """
+    others = second.tensors()
+    return first.with_tensors(
+        {name: torch.cat([values, others[name]]) for name, values in first.tensors().items()},
+        {name: torch.cat([v, second.extras[name]]) for name, v in first.extras.items()},
+    )

@@ -1,0 +1,116 @@
+"""Protected regions: kept bit for bit, counted, and an error where that cannot be."""
+
+import json
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.boxes import Box, inside, read_boxes
+from cvtgs.cli.main import main
+from cvtgs.errors import InputNotFoundError, InvalidArgumentError
+from scenes import random_scene, same_bits
+
+EACH = pytest.mark.parametrize("preset", ["standard", "paper", "draft"])
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return random_scene(400, degree=1)
+
+
+@EACH
+@pytest.mark.parametrize("kept", [0, 1, 39, 40])
+def test_kept_rows_come_first_and_are_the_same_bits(scene, preset, kept):
+    keep = torch.zeros(400, dtype=torch.bool)
+    keep[torch.randperm(400, generator=torch.Generator().manual_seed(1))[:kept]] = True
+    small, report = Simplifier(config=preset, device="cpu").run(scene, count=41, keep=keep)
+    assert len(small) == report.output_count == 41
+    assert report.kept_count == kept
+    assert same_bits(small.select(torch.arange(kept)), scene.select(keep))
+
+
+def test_without_kept_rows_the_result_is_that_without_a_mask(scene):
+    simplifier = Simplifier(device="cpu")
+    nothing = torch.zeros(400, dtype=torch.bool)
+    assert same_bits(simplifier.simplify(scene, 0.1, keep=nothing), simplifier.simplify(scene, 0.1))
+
+
+def test_the_rest_must_get_something(scene):
+    keep = torch.arange(400) < 40
+    with pytest.raises(InvalidArgumentError, match=r"so at least 41 of the 400 must be left"):
+        Simplifier(device="cpu").simplify(scene, 0.1, keep=keep)
+
+
+def test_all_rows_stay_all_rows(scene):
+    keep = torch.arange(400) >= 390
+    small = Simplifier(device="cpu").simplify(scene, 1.0, keep=keep)
+    assert same_bits(small.select(torch.arange(10)), scene.select(keep))
+    assert len(small) == 400
+
+
+@pytest.mark.parametrize("mask", [torch.ones(3, dtype=torch.bool), torch.ones(400), [True] * 400])
+def test_masks_that_do_not_fit_are_refused(scene, mask):
+    with pytest.raises(InvalidArgumentError, match=r"keep must be a boolean tensor of shape"):
+        Simplifier(device="cpu").simplify(scene, 0.1, keep=mask)
+
+
+def test_invalid_rows_are_never_kept(scene):
+    means = scene.means.clone()
+    means[0] = torch.nan
+    keep = torch.arange(400) < 5
+    with pytest.warns(UserWarning, match="dropped 1 of 400"):
+        small, report = Simplifier(device="cpu").run(
+            scene.with_tensors({"means": means}, {}), 0.1, keep=keep
+        )
+    assert (len(small), report.kept_count) == (40, 4)
+    assert same_bits(small.select(torch.arange(4)), scene.select(torch.arange(1, 5)))
+
+
+def test_refinement_leaves_kept_rows_alone(scene):
+    keep = torch.arange(400) < 30
+    config = SimplifyConfig.from_mapping({"refine": {"steps": 2, "size": 32, "heldout": 2}})
+    small = Simplifier(config=config, device="cpu").simplify(scene, 0.2, keep=keep)
+    assert same_bits(small.select(torch.arange(30)), scene.select(keep))
+
+
+def test_boxes_have_faces():
+    box = Box(min=(0, 0, 0), max=(1, 1, 1))
+    points = torch.tensor([[0.0, 0, 0], [1, 1, 1], [1.0001, 0, 0], [-1, 0, 0]])
+    assert inside([box], points).tolist() == [True, True, False, False]
+    assert inside([], points).tolist() == [False] * 4
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("nothing", "must be JSON"),
+        ("[]", "at least one box"),
+        ('{"min": [0, 0, 0]}', "max: field required"),
+        ('{"min": [0, 0, 2], "max": [1, 1, 1]}', "min must not be above max"),
+        ('{"min": [0, 0], "max": [1, 1, 1]}', "min.2"),
+        ('{"min": [0, 0, NaN], "max": [1, 1, 1]}', "finite"),
+    ],
+)
+def test_bad_box_files_say_what_is_wrong(tmp_path, text, problem):
+    path = tmp_path / "box.json"
+    path.write_text(text)
+    with pytest.raises(InvalidArgumentError, match=problem):
+        read_boxes(path)
+    with pytest.raises(InputNotFoundError):
+        read_boxes(tmp_path / "none.json")
+
+
+def test_command(scene, tmp_path):
+    cvtgs.save(scene, tmp_path / "in.ply")
+    box = {"min": [0.5, -9, -9], "max": [9, 9, 9]}
+    (tmp_path / "box.json").write_text(json.dumps([box, box]))
+    words = ["simplify", str(tmp_path / "in.ply"), str(tmp_path / "out.ply"), "--quiet"]
+    words += ["--keep", str(tmp_path / "box.json")]
+    assert main([*words, "--rho", "0.5"]) == 0
+    kept = scene.select(scene.means[:, 0] >= 0.5)
+    small = cvtgs.load(tmp_path / "out.ply")
+    assert len(small) == 200
+    assert same_bits(small.select(torch.arange(len(kept))), kept)
+    assert main([*words, "--rho", "0.01", "--overwrite"]) == 1

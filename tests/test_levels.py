@@ -1,0 +1,125 @@
+"""Several sizes of one scene: exact counts, the finest as if it were alone, nested cells, files."""
+
+import json
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs import Simplifier
+from cvtgs.cli.main import main
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
+from cvtgs.levels import LevelsIndex, level_names, write_levels
+from cvtgs.report import StageClock
+from cvtgs.stages.levels import run_levels
+from scenes import random_scene, same_bits
+
+RHOS = [0.2, 0.04, 0.004]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return cvtgs.synthetic.scene("object", 3000, sh_degree=1, seed=2)
+
+
+@pytest.fixture(scope="module")
+def simplifier():
+    return Simplifier(device="cpu")
+
+
+@pytest.mark.parametrize("rhos", [RHOS, RHOS[::-1], [0.04, 1.0, 0.2], [0.1, 0.09, 0.1], [0.5]])
+def test_counts_are_exact_and_in_the_order_of_the_ratios(scene, simplifier, rhos):
+    levels = simplifier.levels(scene, rhos)
+    assert [len(level.scene) for level in levels] == [cvtgs.target_count(3000, r) for r in rhos]
+    for level, rho in zip(levels, rhos, strict=True):
+        assert level.report.output_count == level.report.target_count == len(level.scene)
+        assert level.report.rho == pytest.approx(rho)
+        assert level.report.shortfall == ""
+        assert len(cvtgs.filters.invalid_rows(level.scene)) == 0
+
+
+@pytest.mark.parametrize("config", ["standard", "paper", "draft"])
+def test_the_finest_is_that_of_a_run_of_its_own(scene, config):
+    simplifier = Simplifier(config=config, device="cpu")
+    assert same_bits(simplifier.levels(scene, RHOS)[0].scene, simplifier.simplify(scene, RHOS[0]))
+
+
+def test_sizes_that_are_close_get_tessellations_of_their_own(scene, simplifier):
+    levels = simplifier.levels(scene, [0.2, 0.1, 0.05])
+    assert [level.nested for level in levels] == [False, False, True]
+    assert same_bits(levels[1].scene, simplifier.simplify(scene, 0.1))
+
+
+def test_errors_grow_and_all_rows_have_none(scene, simplifier):
+    errors = [level.geometric_error for level in simplifier.levels(scene, [1.0, *RHOS])]
+    assert errors[0] == 0.0
+    assert errors == sorted(errors)
+    assert len(set(errors)) == 4
+
+
+def test_coarse_cells_consist_of_whole_fine_ones(scene):
+    found = []
+    config = cvtgs.SimplifyConfig()
+
+    def clock():
+        return StageClock(lambda event: None, scene.device)
+
+    sizes = run_levels(scene, [600, 60], config, net=None, clock=clock, on_grouping=found.append)
+    fine, coarse = (grouping.partition for grouping in found)
+    label = torch.full((len(scene),), -1)
+    label[coarse.order] = torch.repeat_interleave(coarse.counts)
+    for _, cell in fine.chunks(1):
+        assert len(set(label[cell.order].tolist())) == len(cell)
+    assert [size.nested for size in sizes] == [False, True]
+
+
+def test_invalid_rows_are_counted_once_in_every_report(simplifier):
+    scene = random_scene(200)
+    means = scene.means.clone()
+    means[3] = torch.nan
+    with pytest.warns(DroppedDataWarning, match="dropped 1 of 200") as warned:
+        levels = simplifier.levels(scene.with_tensors({"means": means}, {}), [1.0, 0.5, 0.05])
+    assert len(warned) == 1
+    assert [len(level.scene) for level in levels] == [199, 100, 10]
+    assert [level.report.invalid_count for level in levels] == [1, 1, 1]
+    assert [bool(level.report.shortfall) for level in levels] == [True, False, False]
+
+
+def test_no_ratio_and_bad_ratios_are_refused(scene, simplifier):
+    with pytest.raises(InvalidArgumentError, match="at least one ratio"):
+        simplifier.levels(scene, [])
+    with pytest.raises(InvalidArgumentError, match="rho must be above 0"):
+        simplifier.levels(scene, [0.1, 2.0])
+
+
+def test_the_index_says_what_lies_there(scene, simplifier, tmp_path):
+    folder = tmp_path / "levels"
+    index = write_levels(
+        simplifier.levels(scene, RHOS), folder, rhos=RHOS, source="scene.ply", suffix=".ply"
+    )
+    read = LevelsIndex.model_validate_json((folder / "levels.json").read_text())
+    assert read == index
+    assert [level.file for level in read.levels] == list(level_names(RHOS))
+    for level in read.levels:
+        small = cvtgs.load(folder / level.file)
+        assert level.count == len(small)
+        assert level.bytes == (folder / level.file).stat().st_size
+        assert level.box_min == tuple(small.means.amin(dim=0).tolist())
+        assert level.psnr is None
+    with pytest.raises(OutputExistsError):
+        write_levels(simplifier.levels(scene, RHOS), folder, rhos=RHOS, source="scene.ply")
+
+
+def test_command(scene, tmp_path, capsys):
+    cvtgs.save(scene, tmp_path / "in.ply")
+    words = ["levels", str(tmp_path / "in.ply"), "-o", str(tmp_path / "out"), "--rho", "0.1,0.01"]
+    assert main([*words, "--views", "2", "--size", "32"]) == 0
+    said = json.loads((tmp_path / "out" / "levels.json").read_text())
+    assert [level["count"] for level in said["levels"]] == [300, 30]
+    assert said["views"] == 2
+    assert said["levels"][0]["psnr"] > said["levels"][1]["psnr"]
+    assert "rho_0.01.ply" in capsys.readouterr().out
+    assert main([*words, "--no-scores"]) == 1
+    assert "must not exist yet" in capsys.readouterr().err
+    assert main([*words, "--no-scores", "--overwrite", "--quiet"]) == 0
+    assert main([*words[:-1], "0.1,x"]) == 1
