@@ -26,6 +26,7 @@ def options(*words: str) -> argparse.Namespace:
     for name in ("--preset", "--config"):
         parser.add_argument(name)
     parser.add_argument("--ckpt", default="auto")
+    parser.add_argument("--keep")
     parser.add_argument("--refine", type=float)
     parser.add_argument("--refine-steps", type=int)
     parser.add_argument("--device", default="cpu")

@@ -112,7 +112,7 @@ def test_turns_that_keep_the_axes(quat, degree, ckpt):
 @pytest.mark.parametrize("quat", [(0.9, 0.1, -0.3, 0.2), (0.1, 0.7, 0.2, -0.6)])
 def test_any_turn_without_colour_and_contraction(quat, ckpt):
     """Colour and contraction are measured in robust radii about the median, which knows axes."""
-    config = SimplifyConfig.from_mapping({"cvt": {"color": 0.0, "unbounded": "off"}})
+    config = SimplifyConfig.from_mapping({"cvt": {"color": 0.0}, "effects": {"unbounded": "off"}})
     scene = dominated_scene(31, 301, 3)
     motion = {"quat": quat, "shift": (1.0, 2.0, 3.0), "scale": 10.0}
     assert_same_gaussians(
