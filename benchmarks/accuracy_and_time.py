@@ -90,16 +90,19 @@ def chart(
     marks = ticks(min(seconds), max(seconds))
     panels = []
     for label, metric in (("PSNR, dB", "psnr"), ("SSIM", "ssim")):
-        series = [
-            Series(
-                name=f"rho {rho:g}",
-                x=[watches[name].seconds(rho) for name in watches],
-                y=[getattr(scores[name][number], metric) for name in watches],
-                labels=list(watches),
-                markers=True,
+        series = []
+        for number, rho in enumerate(ratios):
+            names = sorted(watches, key=lambda name: watches[name].seconds(rho))
+            series.append(
+                Series(
+                    name=f"rho {rho:g}",
+                    x=[watches[name].seconds(rho) for name in names],
+                    y=[getattr(scores[name][number], metric) for name in names],
+                    labels=names,
+                    aside=[name == "paper" for name in names],
+                    markers=True,
+                )
             )
-            for number, rho in enumerate(ratios)
-        ]
         panels.append(
             Panel(
                 series=series,
