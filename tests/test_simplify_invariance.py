@@ -182,6 +182,7 @@ def test_same_bits_in_other_processes():
     for hash_seed in ("1", "2"):
         environment = {
             **os.environ,
+            "OMP_NUM_THREADS": str(torch.get_num_threads()),  # others may have set it before
             "PYTHONHASHSEED": hash_seed,
             "PYTHONPATH": os.pathsep.join([here, *sys.path]),
         }
