@@ -9,10 +9,10 @@ import cvtgs
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.blocks import block_count, read_bytes, simplify_file
 from cvtgs.blocks.cuts import cut_space
-from cvtgs.blocks.threads import one_thread
 from cvtgs.boxes import Box
 from cvtgs.cli.main import main
 from cvtgs.counts import shared_out
+from cvtgs.devices import one_thread
 from cvtgs.errors import ConfigError, FileFormatError, InvalidArgumentError
 from cvtgs.evaluate import EvaluationSettings
 from cvtgs.io.ply import open_rows

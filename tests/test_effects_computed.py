@@ -200,7 +200,7 @@ def test_columns_only_where_there_are_some():
 
 
 def test_no_picture_is_taken_unless_the_preset_asks(monkeypatch):
-    monkeypatch.setattr(run, "look_at_pictures", refuse)
+    monkeypatch.setattr(outlook, "look_at_pictures", refuse)
     scene = random_scene(100)
     run_with(scene)
     run_with(scene, visibility={"views": 4}, effects={"visibility": "off"})

@@ -114,6 +114,33 @@ class Cameras:
         factors = self.Ks.new_tensor([width / self.width, height / self.height, 1.0])
         return replace(self, Ks=self.Ks * factors[:, None], width=width, height=height)
 
+    def fitted(self, side: int, *, least: int = 1) -> Self:
+        """Give cameras that see the same in pictures of a certain longer side.
+
+        Args:
+            side: Pixels of the longer side.
+            least: Pixels that no side falls below.
+
+        Returns:
+            Cameras with scaled intrinsics.
+        """
+        factor = side / max(self.width, self.height)
+        return self.resized(
+            max(least, round(factor * self.width)), max(least, round(factor * self.height))
+        )
+
+    def spread(self, count: int) -> Self:
+        """Take cameras spread evenly over their order.
+
+        Args:
+            count: How many, at least 1; all if there are no more.
+
+        Returns:
+            Those cameras.
+        """
+        count = min(count, len(self))
+        return self.select(torch.tensor([(k * len(self)) // count for k in range(count)]))
+
 
 def look_at(
     eyes: Float[Tensor, "c 3"], targets: Float[Tensor, "c 3"], up: Float[Tensor, "3"]

@@ -18,7 +18,6 @@ from cvtgs.effects import limited, pictured, restored, trimmed
 from cvtgs.errors import ConfigError, InvalidArgumentError
 from cvtgs.mergenet import SHIPPED, Checkpoint, MergeNet, load_checkpoint
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.refine import join_reports, refine
 from cvtgs.report import SimplifyReport, StageClock
 from cvtgs.scene import GaussianScene
 from cvtgs.stages import run_levels, run_protected, run_stages
@@ -239,6 +238,8 @@ class Simplifier:
     def _refined(
         self, simplified: Simplified, full: GaussianScene, cameras: Cameras | None
     ) -> Simplified:
+        from cvtgs.refine import join_reports, refine  # noqa: PLC0415 (most never need it)
+
         plan, choices = simplified.report.plan, self.config.effects
         ours, theirs = (limited(scene, choices) for scene in (simplified.scene, full))
         if plan is not None:

@@ -12,11 +12,11 @@ from cvtgs.blocks.finish import join_blocks, report_of
 from cvtgs.blocks.job import Job
 from cvtgs.blocks.memory import available_memory, block_count
 from cvtgs.blocks.survey import survey, take_sample, total
-from cvtgs.blocks.threads import one_thread
 from cvtgs.blocks.work import look, simplify_block, sort_into_blocks
 from cvtgs.boxes import Box
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, target_count
+from cvtgs.devices import one_thread
 from cvtgs.errors import ConfigError, InvalidArgumentError, InvalidSceneError
 from cvtgs.io import check_save
 from cvtgs.io.ply import open_rows

@@ -14,9 +14,9 @@ from torch import Tensor
 from cvtgs import cvt, filters
 from cvtgs.blocks.job import Job
 from cvtgs.blocks.survey import CHUNK, Depths, Survey, add_up, raw_weights
-from cvtgs.blocks.threads import one_thread
 from cvtgs.boxes import inside
 from cvtgs.config import SimplifyConfig
+from cvtgs.devices import one_thread
 from cvtgs.effects import limited
 from cvtgs.io import atomic_output, save
 from cvtgs.io.ply.assemble import assemble

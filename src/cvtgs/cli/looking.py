@@ -218,11 +218,12 @@ def chosen_cameras(
 
     size = options.size or options.default_size
     if options.cameras is not None:
-        cameras = _spread(load_cameras(options.cameras, split=options.split), options.views or most)
-        return cameras if options.size is None else _resized(cameras, size)
+        cameras = load_cameras(options.cameras, split=options.split)
+        cameras = cameras.spread(options.views or most or len(cameras))
+        return cameras if options.size is None else cameras.fitted(size)
     beside = _cameras_of_model(options)
     if beside is not None:
-        return _resized(_spread(load_cameras(beside), options.views or AUTOMATIC_VIEWS), size)
+        return load_cameras(beside).spread(options.views or AUTOMATIC_VIEWS).fitted(size)
     height = max(1, round(0.75 * size))
     return automatic_views(scene, options.views or AUTOMATIC_VIEWS, width=size, height=height)
 
@@ -232,19 +233,3 @@ def _cameras_of_model(options: argparse.Namespace) -> Path | None:
     path = getattr(options, "reference", None) or getattr(options, "input", None)
     beside = path / "cameras.json" if path is not None else None
     return beside if beside is not None and beside.is_file() else None
-
-
-def _resized(cameras: "Cameras", size: int) -> "Cameras":
-    """Give the longer side of the pictures a size."""
-    factor = size / max(cameras.width, cameras.height)
-    sides = (max(1, round(factor * side)) for side in (cameras.width, cameras.height))
-    return cameras.resized(*sides)
-
-
-def _spread(cameras: "Cameras", count: int | None) -> "Cameras":
-    """Take cameras spread evenly over their order."""
-    import torch  # noqa: PLC0415 (keeps --help fast)
-
-    if count is None or count >= len(cameras):
-        return cameras
-    return cameras.select(torch.tensor([(k * len(cameras)) // count for k in range(count)]))

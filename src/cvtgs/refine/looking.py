@@ -78,11 +78,8 @@ def given_outlook(cameras: Cameras, *, config: RefineConfig, seed: int) -> Outlo
             f"a refinement needs at least 2 cameras, one of them to be held out; found "
             f"{len(cameras)}."
         )
-    factor = min(1.0, config.size / max(cameras.width, cameras.height))
-    width, height = (
-        max(SSIM_WINDOW, round(factor * side)) for side in (cameras.width, cameras.height)
-    )
-    views = _each(cameras.resized(width, height))
+    side = min(config.size, max(cameras.width, cameras.height))
+    views = _each(cameras.fitted(side, least=SSIM_WINDOW))
     number = max(1, min(config.heldout, len(views) // 8))
     held = {(2 * k + 1) * len(views) // (2 * number) for k in range(number)}
     others = [view for row, view in enumerate(views) if row not in held]

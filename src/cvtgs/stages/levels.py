@@ -18,7 +18,7 @@ from cvtgs.report import StageClock
 from cvtgs.scene import GaussianScene
 from cvtgs.stages.entering import left_out_facts, valid_scene
 from cvtgs.stages.merging import merge_groups
-from cvtgs.stages.outlook import Outlook, look_at_pictures, look_at_scene
+from cvtgs.stages.outlook import Outlook, look
 from cvtgs.stages.run import (
     Grouping,
     Reference,
@@ -98,7 +98,9 @@ def run_levels(
             results.append(Sized(small, checked | facts, watch, 0.0, False))
         else:
             if outlook is None:
-                outlook = _outlook(valid, config, net, watch=watch, cameras=cameras)
+                outlook = look(
+                    valid, config, with_light=net is not None, clock=watch, cameras=cameras
+                )
             nested = finest is not None and NESTED_FROM * target <= len(finest.partition)
             groupings: list[Grouping] = []
             if finest is not None and nested:
@@ -138,24 +140,6 @@ def _distance(grouping: Grouping, small: GaussianScene, *, masses: Float[Tensor,
         squares += float((masses[rows] * shifts.square().sum(dim=1)).sum())
         total += float(masses[rows].sum())
     return math.sqrt(squares / total) if total > 0.0 else 0.0
-
-
-def _outlook(
-    valid: GaussianScene,
-    config: SimplifyConfig,
-    net: MergeNet | None,
-    *,
-    watch: StageClock,
-    cameras: Cameras | None,
-) -> Outlook:
-    with watch.stage("plan"):
-        outlook = look_at_scene(valid, config, with_light=net is not None)
-    if not outlook.plan.visibility.active:
-        return outlook
-    with watch.stage("visibility"):
-        return look_at_pictures(
-            valid, outlook, config.visibility, cameras=cameras, seed=config.seed
-        )
 
 
 def _made_of(

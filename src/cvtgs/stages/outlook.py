@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple, Self
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -14,6 +13,7 @@ from cvtgs.io.ply.properties import lacks_third_scale
 from cvtgs.math import activations
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.render import contributions
+from cvtgs.report import StageClock
 from cvtgs.scene import GaussianScene
 from cvtgs.views import mixed_views
 
@@ -50,6 +50,36 @@ class Outlook(NamedTuple):
     def facts(self, scene: GaussianScene) -> dict[str, Any]:
         """Give what the report says about it."""
         return {"plan": self.plan, "mass_in": float((self.areas * scene.opacities).sum())}
+
+
+def look(
+    valid: GaussianScene,
+    config: SimplifyConfig,
+    *,
+    with_light: bool,
+    clock: StageClock,
+    cameras: Cameras | None,
+) -> Outlook:
+    """Look at a scene, and at pictures of it where the configuration asks for them.
+
+    Args:
+        valid: The Gaussians, with valid rows.
+        config: Every choice.
+        with_light: Whether a network will ask how freely Gaussians can be seen.
+        clock: Measures the stages.
+        cameras: From where to look; None finds views.
+
+    Returns:
+        What was found.
+    """
+    with clock.stage("plan"):
+        outlook = look_at_scene(valid, config, with_light=with_light)
+    if not outlook.plan.visibility.active:
+        return outlook
+    with clock.stage("visibility"):
+        return look_at_pictures(
+            valid, outlook, config.visibility, cameras=cameras, seed=config.seed
+        )
 
 
 def look_at_scene(scene: GaussianScene, config: SimplifyConfig, *, with_light: bool) -> Outlook:
@@ -130,7 +160,8 @@ def look_at_pictures(
     if cameras is None:
         views = mixed_views(scene, config.views, size=config.size, seed=seed)
     else:
-        views = _some(cameras, config)
+        longer = max(cameras.width, cameras.height)
+        views = cameras.spread(config.views).fitted(min(config.size, longer))
     painted = contributions(pictured(scene, outlook.plan), views)
     masses = (outlook.seen_areas * scene.opacities).double()
     total, all_painted = masses.sum(), painted.sum()
@@ -144,12 +175,3 @@ def look_at_pictures(
 
 FAINTEST = 1e-6
 """Opacities below count as this where something is divided by them."""
-
-
-def _some(cameras: Cameras, config: VisibilityConfig) -> Cameras:
-    """Take cameras spread over their order, with small pictures."""
-    count = min(config.views, len(cameras))
-    rows = torch.tensor([(k * len(cameras)) // count for k in range(count)])
-    factor = min(1.0, config.size / max(cameras.width, cameras.height))
-    width, height = (max(1, round(factor * side)) for side in (cameras.width, cameras.height))
-    return cameras.select(rows).resized(width, height)

@@ -14,7 +14,7 @@ from cvtgs.mergenet import MergeNet
 from cvtgs.report import StageClock
 from cvtgs.scene import GaussianScene
 from cvtgs.stages.entering import valid_scene
-from cvtgs.stages.outlook import look_at_pictures, look_at_scene
+from cvtgs.stages.outlook import look
 from cvtgs.stages.run import run_stages
 
 
@@ -61,13 +61,7 @@ def run_protected(
         whole = target >= len(valid)
         small = filters.with_finite_opacities(valid).select(order) if whole else small
         return small, facts | checked
-    with clock.stage("plan"):
-        outlook = look_at_scene(valid, config, with_light=net is not None)
-    if outlook.plan.visibility.active:
-        with clock.stage("visibility"):
-            outlook = look_at_pictures(
-                valid, outlook, config.visibility, cameras=cameras, seed=config.seed
-            )
+    outlook = look(valid, config, with_light=net is not None, clock=clock, cameras=cameras)
     rest, protected = (~kept).nonzero()[:, 0], filters.with_finite_opacities(valid.select(kept))
     small, facts = run_stages(
         valid.select(rest),

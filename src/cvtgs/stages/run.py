@@ -18,7 +18,7 @@ from cvtgs.report import StageClock
 from cvtgs.scene import GaussianScene
 from cvtgs.stages.entering import entering_rows, valid_scene
 from cvtgs.stages.merging import merge_groups
-from cvtgs.stages.outlook import Outlook, look_at_pictures, look_at_scene
+from cvtgs.stages.outlook import Outlook, look, look_at_scene
 
 
 class Reference(NamedTuple):
@@ -189,16 +189,10 @@ def _refer(
     on_grouping: Callable[[Grouping], None] | None = None,
 ) -> tuple[Reference, dict[str, Any]]:
     """Plan, filter, tessellate and merge."""
-    known = outlook is not None
-    with clock.stage("plan"):
-        outlook = outlook or look_at_scene(valid, config, with_light=with_light)
-        facts = outlook.facts(valid)
-        valid = trimmed(valid, outlook.plan)
-    if outlook.plan.visibility.active and not known:
-        with clock.stage("visibility"):
-            outlook = look_at_pictures(
-                valid, outlook, config.visibility, cameras=cameras, seed=config.seed
-            )
+    if outlook is None:
+        outlook = look(valid, config, with_light=with_light, clock=clock, cameras=cameras)
+    facts = outlook.facts(valid)
+    valid = trimmed(valid, outlook.plan)
     with clock.stage("filter"):
         rows, filter_facts = entering_rows(valid, outlook, target, config)
     with clock.stage("tessellate", config.cvt.iterations + 1) as advance:

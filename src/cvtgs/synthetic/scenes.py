@@ -5,6 +5,7 @@ from contextlib import contextmanager
 
 import torch
 
+from cvtgs.devices import one_thread
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.scene import GaussianScene
 from cvtgs.synthetic.assemble import assemble
@@ -92,12 +93,10 @@ def _settings() -> Iterator[None]:
 
     The chunks are too small to be shared; threads that wait for each other only burn time.
     """
-    threads, dtype = torch.get_num_threads(), torch.get_default_dtype()
-    torch.set_num_threads(1)
+    dtype = torch.get_default_dtype()
     torch.set_default_dtype(torch.float32)
     try:
-        with torch.device("cpu"):
+        with one_thread(), torch.device("cpu"):
             yield
     finally:
         torch.set_default_dtype(dtype)
-        torch.set_num_threads(threads)

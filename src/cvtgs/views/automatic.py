@@ -1,8 +1,6 @@
 """Automatic views: from where to look at a scene of which nothing is known."""
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
@@ -10,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
+from cvtgs.devices import one_thread
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.scene import GaussianScene
 from cvtgs.views.probes import probe
@@ -79,22 +78,11 @@ def automatic_views(
         if value < 1:
             raise InvalidArgumentError(f"{name} must be at least 1, found {value}.")
     size, turn = (width, height), 0.5 + seed * _GOLDEN
-    with _one_thread():
+    with one_thread():
         known = survey(scene)
         stands = _stands(known, count, size=size, turn=turn)
         cameras = _best(known, stands)
     return replace(cameras, names=cameras.view_names)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Make torch use one thread: pieces this small only wait for one another on several."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _stands(known: Survey, count: int, *, size: tuple[int, int], turn: float) -> Stands:
