@@ -187,19 +187,7 @@ def test_georeferenced_scenes_are_no_worse_by_cameras_in_float64(preset):
     assert found[0] >= found[1] + 3, found
 
 
-@pytest.mark.parametrize(
-    "preset",
-    [
-        "standard",
-        pytest.param(
-            "paper",
-            marks=pytest.mark.xfail(
-                reason="its network has never seen such contrasts, and may grow Gaussians by e^1.5",
-                strict=True,
-            ),
-        ),
-    ],
-)
+@presets
 def test_huge_colours_hide_no_worse(preset):
     """Clipped colours are chance; what hides the background is not."""
     scene = valid_case(CASES["huge_colours"], torch.float32, 200)
