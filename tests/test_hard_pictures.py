@@ -44,7 +44,6 @@ CHANCE = {
     "giants": "every giant is everywhere: the order in depth decides",
     "coincident": "at one depth, the order of the rows decides what hides what",
     "two_clusters": "seen whole, each ball is less than a pixel",
-    "georeferenced": "cameras are float32, which steps by 0.5 there; see below",
     "huge_colours": "all colours are clipped: chance; see below",
 }
 
