@@ -105,7 +105,7 @@ def merge_groups(
     """
     backend, _ = cvt.nearest_backend(config.cvt.backend, reference.scene.device)
     small = cells.merge_cells(reference.scene, partition, config=config.merge)
-    if config.merge.lone_members and not reference.scene.antialiased:
+    if config.merge.lone_members:
         areas = reference.scene.areas
         small, partition = cells.keep_lone_members(reference.scene, small, partition, areas=areas)
     neighbors = cvt.nearest_neighbors(small.means, NEIGHBORS, backend=backend)

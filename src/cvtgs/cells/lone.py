@@ -11,9 +11,6 @@ from cvtgs.math import activations, covariances
 from cvtgs.math.segments import segment_argmax, segment_ids, segment_sum
 from cvtgs.scene import GaussianScene
 
-VEIL = 0.7
-"""What moments show of a cell, as a share of what their mass promises: they have one colour."""
-
 
 def keep_lone_members(
     scene: GaussianScene,
@@ -22,13 +19,13 @@ def keep_lone_members(
     *,
     areas: Float[Tensor, "n"],
 ) -> tuple[GaussianScene, Partition]:
-    """Let one member stand for its cell where the others hardly touch it, or hardly show.
+    """Let one member stand for its cell where the members hardly touch.
 
     Members that lie apart (points, needles, thin haze) have moments that are far wider than all of
     them together: a faint veil, of which a picture shows less than of any member. In a picture, a
     Gaussian of opacity a and area A removes about ``a^2 A`` of the squared error if it is a
-    member, and ``0.7 M^2 / A`` if it spreads the mass M of the cell over its area. So the member
-    of largest ``a^2 A`` stays, bit for bit, where that is more. This is our own rule, not part of
+    member, and ``M^2 / A`` if it spreads the mass M of the cell over its area. So the member of
+    largest ``a^2 A`` stays, bit for bit, where that is more. This is our own rule, not part of
     CVT-GS.
 
     Args:
@@ -60,7 +57,7 @@ def keep_lone_members(
     best = segment_argmax(opacities * masses, offsets)
     together = segment_sum(masses, offsets)
     wide = torch.exp(covariances.log_mean_projected_area(merged.log_scales.double()))
-    lone = (masses[best] ** 2 * wide > VEIL * together**2 * own[best]) & (partition.counts > 1)
+    lone = (masses[best] ** 2 * wide > together**2 * own[best]) & (partition.counts > 1)
     if not bool(lone.any()):
         return merged, partition
     kept = ~lone.index_select(0, segment_ids(offsets))

@@ -125,7 +125,7 @@ class MergeConfig(Section):
         opacity: ``saturating`` conserves mass, ``1 - exp(-tau)``; ``union`` is the opacity of
             members that lie exactly behind one another, ``1 - prod(1 - a)``.
         lone_members: Whether a cell whose members hardly touch keeps the one that shows most of it,
-            instead of their moments; not in antialiased scenes, where small ones are faint.
+            instead of their moments.
         widening: How much wider than its moments an opaque cell of many members becomes, along
             every axis.
         covered_widening: How much more it becomes so along an axis on which other cells paint at

@@ -182,7 +182,7 @@ def _made_of(
     small = restored(finished(reference, net, clock=clock), original, outlook.plan)
     left_out = torch.ones(len(valid), dtype=torch.bool, device=valid.device)
     left_out[partition.order] = False
-    facts = outlook.facts(valid) | grouping_facts(partition, tessellation)
+    facts = outlook.facts(valid) | grouping_facts(partition, tessellation, shown=shown)
     facts |= left_out_facts(valid, outlook, left_out)
     return small, facts | {"mass_out": float(small.masses.sum())}
 

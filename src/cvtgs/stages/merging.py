@@ -38,7 +38,7 @@ def merge_groups(
         cells of each; k is 0 if nobody asks.
     """
     merged = cells.merge_cells(valid, partition, config=config, on_cells=on_cells)
-    if config.lone_members and not valid.antialiased:
+    if config.lone_members:
         merged, partition = cells.keep_lone_members(valid, merged, partition, areas=areas)
     widens = config.widening > 0.0 or config.covered_widening > 0.0
     near = NEIGHBORS if widens or with_neighbors else 0

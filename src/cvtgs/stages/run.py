@@ -232,22 +232,25 @@ def _refer(
         )
     if on_grouping is not None:
         on_grouping(Grouping(valid, outlook, partition, totals, merged))
-    facts |= filter_facts | grouping_facts(partition, tessellation)
+    facts |= filter_facts | grouping_facts(partition, tessellation, shown=shown)
     return Reference(valid, merged, shown, neighbors, outlook.light), facts
 
 
-def grouping_facts(partition: cells.Partition, tessellation: cvt.Tessellation) -> dict[str, Any]:
+def grouping_facts(
+    partition: cells.Partition, tessellation: cvt.Tessellation, *, shown: cells.Partition
+) -> dict[str, Any]:
     """Give what the report says about cells.
 
     Args:
         partition: Members of every cell.
         tessellation: How they were found.
+        shown: The members that the Gaussian of every cell stands for.
 
     Returns:
         The facts.
     """
     return {
-        "single_member_cells": int((partition.counts == 1).sum()),
+        "single_member_cells": int((shown.counts == 1).sum()),
         "largest_cell": int(partition.counts.amax()),
         "refilled_cells": tessellation.refilled,
         "energies": tessellation.energies,
