@@ -31,6 +31,7 @@ CHOICES: Mapping[str, Mapping[str, str]] = {
     "no filter": {"filter.max_mass_share": "0"},
     "members weigh by opacity": {"merge.area_power": "0"},
     "paper's opacity": {"merge.opacity": "union"},
+    "moments of all members": {"merge.lone_members": "false"},
     "no widening": {"merge.widening": "0", "merge.covered_widening": "0"},
     "widening without neighbours": {"merge.widening": "0.3", "merge.covered_widening": "0"},
     "paper": {"preset": "paper"},

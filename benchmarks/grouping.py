@@ -80,7 +80,9 @@ def grouped_simplifier(
 
     def simplify(scene: cvtgs.GaussianScene, rho: float) -> cvtgs.GaussianScene:
         count = cvtgs.target_count(len(scene), rho)
-        reference = make_reference(scene, count, config)
+        all_members = config.merge.model_copy(update={"lone_members": False})
+        whole = config.model_copy(update={"merge": all_members})
+        reference = make_reference(scene, count, whole)
         rows = reference.partition.order.sort().values  # those that passed the filter
         labels = nearest_groups(reference.scene.means[rows], count, seed=config.seed)
         local = cells.Partition.from_labels(labels, count)
@@ -103,7 +105,11 @@ def merge_groups(
     """
     backend, _ = cvt.nearest_backend(config.cvt.backend, reference.scene.device)
     small = cells.merge_cells(reference.scene, partition, config=config.merge)
+    if config.merge.lone_members:
+        areas = reference.scene.areas
+        small, partition = cells.keep_lone_members(reference.scene, small, partition, areas=areas)
     neighbors = cvt.nearest_neighbors(small.means, NEIGHBORS, backend=backend)
+    small = cells.settle_frames(small, partition, neighbors)
     if config.merge.widening > 0 or config.merge.covered_widening > 0:
         small = cells.widen_cells(
             small,

@@ -47,7 +47,7 @@ class Kernel:
         ]
 
     def contrast(self, other: "Kernel") -> float:
-        return min(math.sqrt(float(np.mean((self.color - other.color) ** 2))), 2.0)
+        return min(math.sqrt(float(np.mean((self.color - other.color) ** 2))), 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -192,6 +192,39 @@ def test_errors_in_a_file_name_the_file(tmp_path):
     assert compose_error(file=path) == f"{path}: cvt.speed: is not a known setting."
 
 
+ENDLESS = {
+    "a key": ("x" * 1_000_000 + " = 1", "xxx...: is not a known setting."),
+    "a key of many lines": ('"' + 9999 * "a\\n" + '" = 1', "...: is not a known setting."),
+    "a section": ("[" + ".".join(3000 * "x") + "]", "x: is not a known setting."),
+    "a value": (f'seed = "{"x" * 1_000_000}"', "xxx...."),
+    "a list": (f"seed = [{'1, ' * 100_000}]", ", 1,...."),
+    "a number": ("seed = " + "9" * 5000, "to increase the limit."),
+    "a hexadecimal number": ("seed = 0x" + "f" * 9000, "found a number of thousands of digits."),
+    "a preset": (f'preset = "{"x" * 1_000_000}"', "xxx...."),
+    "a list as preset": (f"preset = [{'1, ' * 100_000}]", ", 1,...."),
+    "a key twice": (f"a = {{{2 * ('x' * 100_000 + ' = 1, ')}}}", "xxx...."),
+    "brackets": ("seed = " + 3000 * "[" + 3000 * "]", "its values are nested too deeply."),
+    "keys": ("\n".join(f"k{i} = 1" for i in range(2000)), "; and 1,996 more."),
+}
+
+
+@pytest.mark.parametrize(("text", "end"), ENDLESS.values(), ids=ENDLESS)
+def test_sentences_about_endless_files_are_short(tmp_path, text, end):
+    path = tmp_path / "config.toml"
+    path.write_text(text, encoding="utf-8")
+    message = compose_error(file=path)
+    assert message.startswith(f"{path}: ")
+    assert message.endswith(end)
+    assert "\n" not in message
+    assert len(message) < len(str(path)) + 400
+
+
+def test_sentences_about_endless_settings_are_short():
+    long = "x" * 1_000_000
+    messages = [compose_error(settings={key: long}) for key in (long, "seed", "seed." + long)]
+    assert all(len(message) < 400 for message in messages)
+
+
 def test_a_file_that_is_not_there_or_not_toml_is_an_error(tmp_path):
     missing, broken, binary = (tmp_path / name for name in ("a.toml", "b.toml", "c.toml"))
     broken.write_text("cvt = [", encoding="utf-8")

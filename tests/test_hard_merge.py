@@ -184,11 +184,8 @@ def test_gradients_through_network_and_pictures_are_finite(make, device, dtype):
     assert moves or not seen
 
 
-@pytest.mark.xfail(
-    strict=True, reason="the network corrects along axes that equal eigenvalues leave open"
-)
 def test_corrected_cells_of_equal_eigenvalues_move_with_the_scene():
-    """An open bug of cells and mergenet: see "equal eigenvalues" in docs/numerics.md."""
+    """Neighbours decide about axes that equal eigenvalues leave open."""
     scene = CASES["isotropic_cells"](COUNT, torch.float64)
     labels = torch.arange(COUNT) // 6
     turn = {"quat": (0.9, 0.1, -0.3, 0.2)}

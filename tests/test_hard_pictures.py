@@ -44,7 +44,6 @@ CHANCE = {
     "giants": "every giant is everywhere: the order in depth decides",
     "coincident": "at one depth, the order of the rows decides what hides what",
     "two_clusters": "seen whole, each ball is less than a pixel",
-    "georeferenced": "cameras are float32, which steps by 0.5 there; see below",
     "huge_colours": "all colours are clipped: chance; see below",
 }
 
@@ -168,6 +167,20 @@ def test_what_is_thinner_than_a_pixel_is_shown_right_without_dilation(name):
     assert found[0] >= found[1] - 0.1, found
 
 
+@pytest.mark.parametrize(("name", "gap"), [("needles", 0.5), ("points", 0.1)])
+def test_what_is_thinner_than_a_pixel_is_hardly_worse_than_pruned(name, gap):
+    """Members that hardly touch stand for their cells; moments lose 1.6 to 2.3 dB to pruning.
+
+    Pruning keeps the largest of all, a cell its own largest: that is the rest. ``paper`` keeps the
+    moments.
+    """
+    scene = valid_case(CASES[name], torch.float32, 200)
+    ours = simplifier("standard").simplify(scene, 0.2)
+    cameras = automatic_views(scene, 4, width=48, height=48)
+    found = scores(scene, {"ours": ours, "pruned": keep_most_mass(scene, 40)}, cameras)
+    assert found[0] >= found[1] - gap, found
+
+
 @presets
 def test_each_of_two_clusters_is_no_worse_than_pruned(preset):
     """Seen from nearby, one of them at a time."""
@@ -187,19 +200,7 @@ def test_georeferenced_scenes_are_no_worse_by_cameras_in_float64(preset):
     assert found[0] >= found[1] + 3, found
 
 
-@pytest.mark.parametrize(
-    "preset",
-    [
-        "standard",
-        pytest.param(
-            "paper",
-            marks=pytest.mark.xfail(
-                reason="its network has never seen such contrasts, and may grow Gaussians by e^1.5",
-                strict=True,
-            ),
-        ),
-    ],
-)
+@presets
 def test_huge_colours_hide_no_worse(preset):
     """Clipped colours are chance; what hides the background is not."""
     scene = valid_case(CASES["huge_colours"], torch.float32, 200)

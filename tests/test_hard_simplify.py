@@ -5,8 +5,7 @@ What cannot hold to 1e-4, and why (docs/numerics.md says more):
 - Turns move the axes that the Morton curve, the median and the light know, so seeds are others and
   cells are others, as good: here the energy is compared, in test_hard_merge.py given cells.
 - In ``isotropic_cells`` points lie just between two sites, so rounding decides which cell they
-  join; and in cells of equal eigenvalues (``EVEN``), or of two points far apart, any frame is
-  right, and the network corrects along the axes of one. There moments are compared, or pictures.
+  join. There pictures are compared.
 - Where a handful of Gaussians holds all the distance (``LUCK``), one seed more or less among them
   decides the energy.
 - Denormal coordinates have no digits that could survive another unit.
@@ -36,14 +35,6 @@ from hard_scenes import (
 from scenes import assert_same_gaussians, moved
 
 COUNT = 60
-EVEN = (
-    "points",
-    "giants",
-    "points_amid_giants",
-    "denormals",
-    "far_flyaways",
-    "crowd_beside_loners",
-)
 LUCK = ("flyaways", "far_flyaways", "two_clusters", "crowd_beside_loners")
 
 
@@ -118,7 +109,7 @@ def test_the_unit_changes_nothing(make, scale, preset):
         pytest.skip("points between two sites: see test_even_cells_give_the_same_picture")
     scene = case(make)
     count = max(1, len(scene) // 5)
-    run = moments_only(preset) if make.__name__ in EVEN else simplifier(preset)
+    run = simplifier(preset)
     assert_same_gaussians(
         run.simplify(moved(scene, scale=scale), count=count),
         moved(run.simplify(scene, count=count), scale=scale),
@@ -134,7 +125,7 @@ def test_a_shift_changes_nothing(make, preset):
     scene = case(make)
     extent = float((scene.means - scene.means.median(dim=0).values).abs().median()) or 1.0
     shift, count = (2 * extent, -extent, 0.3 * extent), max(1, len(scene) // 5)
-    run = moments_only(preset) if make.__name__ in EVEN else simplifier(preset)
+    run = simplifier(preset)
     assert_same_gaussians(
         run.simplify(moved(scene, shift=shift), count=count),
         moved(run.simplify(scene, count=count), shift=shift),

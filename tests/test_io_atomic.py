@@ -11,7 +11,7 @@ from typing import NoReturn
 import pytest
 
 from cvtgs.errors import FileFormatError, OutputError, OutputExistsError
-from cvtgs.io import atomic_output, check_output, check_save
+from cvtgs.io import atomic, atomic_output, check_output, check_save
 
 
 def write(path: Path, data: bytes = b"new", *, overwrite: bool = False) -> None:
@@ -83,13 +83,26 @@ def test_symbolic_links_stay_links(tmp_path: Path) -> None:
     assert list((tmp_path / "real").iterdir()) == [target]
 
 
-def test_without_hard_links_the_result_is_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*args: object) -> NoReturn:
-        raise PermissionError(errno.EPERM, "Operation not permitted")
+def refuse(*args: object) -> NoReturn:
+    raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
 
-    monkeypatch.setattr(Path, "hardlink_to", refuse)
+
+@pytest.fixture(params=["rename", "claim"])
+def last_resort(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is left without hard links: a rename that never replaces, or not even that."""
+    if request.param == "claim":
+        monkeypatch.setattr(atomic, "_rename", refuse)
+
+
+@pytest.mark.usefixtures("last_resort")
+@pytest.mark.parametrize("number", [errno.EPERM, errno.EOPNOTSUPP, errno.EMLINK])
+def test_without_hard_links_the_result_is_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def fail(*args: object, **options: object) -> NoReturn:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "link", fail)
     path = tmp_path / "a.bin"
     write(path)
     assert path.read_bytes() == b"new"
@@ -97,6 +110,42 @@ def test_without_hard_links_the_result_is_the_same(
         write_while_another_does(tmp_path / "b.bin")
     assert (tmp_path / "b.bin").read_bytes() == b"theirs"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.bin", "b.bin"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the rename of Linux")
+def test_without_hard_links_no_empty_file_takes_the_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "link", refuse)
+    monkeypatch.setattr(atomic, "_claim", refuse)
+    write(tmp_path / "a.bin")
+    assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"new"]
+
+
+@pytest.mark.parametrize("error", [OSError(errno.EIO, "bad"), KeyboardInterrupt()])
+@pytest.mark.parametrize("theirs", [None, b"theirs"])
+def test_a_claimed_name_is_given_back(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    error: BaseException,
+    theirs: bytes | None,
+) -> None:
+    """But not where another file has taken it meanwhile."""
+    path = tmp_path / "a.bin"
+
+    def fail(self: Path, target: Path) -> NoReturn:
+        assert path.read_bytes() == b""
+        if theirs is not None:
+            path.unlink()
+            path.write_bytes(theirs)
+        raise error
+
+    monkeypatch.setattr(os, "link", refuse)
+    monkeypatch.setattr(atomic, "_rename", refuse)
+    monkeypatch.setattr(Path, "replace", fail)
+    with pytest.raises((OutputError, KeyboardInterrupt)):
+        write(path)
+    assert [p.read_bytes() for p in tmp_path.iterdir()] == ([theirs] if theirs else [])
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit, OutputError])

@@ -52,7 +52,7 @@ def test_a_known_point_is_at_the_expected_pixel(write, tmp_path) -> None:
     cameras = load_cameras(tmp_path)
     assert (cameras.width, cameras.height) == SIZE
     assert cameras.names == NAMES
-    assert cameras.viewmats.dtype == cameras.Ks.dtype == torch.float32
+    assert cameras.viewmats.dtype == cameras.Ks.dtype == torch.float64
     np.testing.assert_allclose(pixels(cameras), expected_pixels(), atol=1e-3)
     np.testing.assert_allclose(cameras.centers, CENTERS, atol=1e-5)
     rotations = cameras.viewmats[:, :3, :3].double()
@@ -213,7 +213,7 @@ def test_rounded_rotations_are_set_right(tmp_path) -> None:
         frame["transform_matrix"] = np.round(frame["transform_matrix"], 3).tolist()
     cameras = load_cameras(write_json(tmp_path / "transforms.json", document))
     rotations = cameras.viewmats[:, :3, :3]
-    wanted = torch.eye(3).expand_as(rotations)
+    wanted = torch.eye(3, dtype=rotations.dtype).expand_as(rotations)
     torch.testing.assert_close(rotations @ rotations.mT, wanted, atol=1e-6, rtol=0)
     np.testing.assert_allclose(pixels(cameras), expected_pixels(), atol=0.2)
 

@@ -167,6 +167,12 @@ def test_what_gsplat_is_asked(monkeypatch, degree, comments):
     assert asked["rasterize_mode"] == ("antialiased" if comments else "classic")
     assert (asked["near_plane"], asked["eps2d"], asked["packed"]) == (0.01, 0.3, False)
     assert torch.equal(asked["scales"], scene.scales.float())
+    rotation, shift = asked["viewmats"][0, :3, :3].double(), asked["viewmats"][0, :3, 3].double()
+    wanted = scene.means @ CAMERAS.viewmats[0, :3, :3].double().T
+    wanted = wanted + CAMERAS.viewmats[0, :3, 3].double()
+    torch.testing.assert_close(
+        asked["means"].double() @ rotation.T + shift, wanted, rtol=0, atol=1e-5
+    )
     assert all(t.dtype == torch.float32 for t in asked.values() if isinstance(t, torch.Tensor))
 
 

@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 
 import cvtgs
+from cvtgs.evaluate import psnr
 from cvtgs.math import quaternions
 from cvtgs.render import render
 from cvtgs.synthetic import KINDS
-from cvtgs.views import automatic_views
+from cvtgs.views import automatic_views, mixed_views, views_from_anywhere
 from cvtgs.views.automatic import _stands
 from cvtgs.views.probes import probe
 from cvtgs.views.survey import survey
@@ -56,7 +57,7 @@ def with_flyaways(scene: cvtgs.GaussianScene, count: int = 40) -> cvtgs.Gaussian
 
 
 def ups(cameras: cvtgs.Cameras) -> Tensor:
-    return -cameras.viewmats[:, 1, :3]
+    return -cameras.viewmats[:, 1, :3].float()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -98,7 +99,7 @@ def test_a_camera_inside_of_a_floater_moves():
     first = automatic_views(scene, 4, width=32, height=24)
     blocked = with_rows(
         scene,
-        means=first.centers[:1],
+        means=first.centers[:1].float(),
         log_scales=torch.full((1, 3), math.log(0.4)),
         logit_opacities=torch.tensor([6.0]),
     )
@@ -114,9 +115,9 @@ def test_a_wall_before_the_camera_makes_it_move():
     scene = generated("object")
     first = automatic_views(scene, 1, width=32, height=24)
     grid = torch.linspace(-0.6, 0.6, 13)
-    right, down, ahead = first.viewmats[0, :3, :3]
+    right, down, ahead = first.viewmats[0, :3, :3].float()
     spots = torch.cartesian_prod(grid, grid)
-    wall = first.centers + 0.8 * ahead + spots[:, :1] * right + spots[:, 1:] * down
+    wall = first.centers.float() + 0.8 * ahead + spots[:, :1] * right + spots[:, 1:] * down
     walled = with_rows(
         scene,
         means=wall,
@@ -144,7 +145,8 @@ def test_the_scene_is_in_the_middle_of_upright_pictures():
     scene = turned(generated("object"), (0.9, 0.2, 0.1, 0.3))
     cameras = automatic_views(scene, 4, width=64, height=64)
     center = scene.means.median(dim=0).values
-    local = cameras.viewmats[:, :3, :3] @ center + cameras.viewmats[:, :3, 3]
+    viewmats = cameras.viewmats.float()
+    local = viewmats[:, :3, :3] @ center + viewmats[:, :3, 3]
     assert (local[:, :2].abs() < 0.2 * local[:, 2:]).all()
     matrix = quaternions.to_matrices(quaternions.normalize(torch.tensor([[0.9, 0.2, 0.1, 0.3]])))[0]
     assert (ups(cameras) @ (matrix @ torch.tensor([0.0, -1, 0])) > 0.7).all()
@@ -177,10 +179,32 @@ def test_infinite_opacities_and_bad_rows_are_no_obstacle():
     assert bool(torch.isfinite(automatic_views(damaged, 2, width=32, height=24).viewmats).all())
 
 
-def test_double_precision_scenes_have_views():
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["32", "64"])
+@pytest.mark.parametrize(
+    "choose",
+    [
+        lambda scene: automatic_views(scene, 3, width=64, height=48),
+        lambda scene: views_from_anywhere(scene, 3, size=64, seed=0),
+        lambda scene: mixed_views(scene, 4, size=64),
+    ],
+    ids=["automatic", "anywhere", "mixed"],
+)
+def test_views_of_a_georeferenced_scene_are_those_of_the_scene_at_the_origin(dtype, choose):
+    """At 6e6 float32 steps by 0.5: the scene is a kilometre large, and keeps these steps."""
     scene = generated("object", 2000)
-    double = scene.with_tensors({k: v.double() for k, v in scene.tensors().items()}, {})
-    assert automatic_views(double, 2, width=32, height=24).viewmats.dtype == torch.float32
+    shift = torch.tensor([6e6, -5e5, 3e6], dtype=torch.float64)
+    tensors = {name: values.to(dtype) for name, values in scene.tensors().items()}
+    tensors["log_scales"] = tensors["log_scales"] + math.log(1e3)
+    means = (1e3 * scene.means.double() + shift).to(dtype)
+    far = scene.with_tensors(tensors | {"means": means}, {})
+    near = far.with_tensors({"means": (means.double() - shift).to(dtype)}, {})
+    there, here = choose(far), choose(near)
+    assert there.viewmats.dtype == there.Ks.dtype == torch.float64
+    torch.testing.assert_close(there.centers - shift, here.centers, rtol=0, atol=1e-5)
+    for backend in ("torch", "numba"):
+        one, other = (render(*pair, backend=backend).rgb for pair in ((far, there), (near, here)))
+        assert float(one.std()) > 0.05
+        assert float(psnr(one.clamp(0, 1), other.clamp(0, 1)).amin()) > 60
 
 
 def test_bad_arguments():

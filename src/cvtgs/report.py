@@ -85,7 +85,7 @@ class SimplifyReport(_Record):
         kept_count: Protected Gaussians, which were kept as they are.
         blocks: Blocks of space that were simplified one by one; 1 for the scene in one piece.
         resumed_blocks: Those of them that were done already when this run started.
-        single_member_cells: Cells of one Gaussian, which was kept as it is.
+        single_member_cells: Cells of one Gaussian, or shown by one of theirs: it is kept as it is.
         largest_cell: Members of the largest cell.
         refilled_cells: Cells that were empty after Lloyd and took a Gaussian from another.
         mass_in: Opacity times mean projected area of the input, squared scene units.

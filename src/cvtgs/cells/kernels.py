@@ -19,6 +19,9 @@ LARGEST_PLACE = 1e4
 LARGEST_LOG = 80.0
 """Places and scales are limited so that no product of them leaves float32."""
 
+LARGEST_CONTRAST = 1.0
+"""That of black and white: networks have hardly seen more, and take it for reasons to grow."""
+
 
 class Kernels(NamedTuple):
     """Some Gaussians, activated, in the dtype of the scene."""
@@ -149,9 +152,9 @@ def contrasts_of(some: Kernels, others: Kernels) -> Float[Tensor, "n"]:
         others: As many others.
 
     Returns:
-        Root of the mean square over the channels, at most 2.
+        Root of the mean square over the channels, at most 1.
     """
-    return (some.colors - others.colors).square().mean(dim=1).sqrt().clamp_max(2.0)
+    return (some.colors - others.colors).square().mean(dim=1).sqrt().clamp_max(LARGEST_CONTRAST)
 
 
 def extents_in(frames: Kernels, others: Kernels) -> Float[Tensor, "n 3"]:

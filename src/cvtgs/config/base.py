@@ -8,6 +8,9 @@ import pydantic
 
 from cvtgs.errors import ConfigError
 
+MOST_PROBLEMS = 4
+"""A sentence about some settings names no more problems."""
+
 
 class Section(pydantic.BaseModel):
     """Some settings: frozen, unknown keys and numbers that are not finite are errors."""
@@ -33,8 +36,12 @@ def read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: is not a TOML file: {error}.") from None
+    except RecursionError:
+        raise ConfigError(
+            f"{path}: is not a TOML file: its values are nested too deeply."
+        ) from None
+    except ValueError as error:  # not TOML, not UTF-8, or a number of thousands of digits
+        raise ConfigError(f"{path}: is not a TOML file: {shortened(str(error), 200)}.") from None
 
 
 def explain(error: pydantic.ValidationError) -> str:
@@ -44,13 +51,67 @@ def explain(error: pydantic.ValidationError) -> str:
         error: What pydantic found.
 
     Returns:
-        Every problem, with key and value.
+        The first problems, with key and value, none at any length.
     """
-    problems = []
-    for problem in error.errors():
-        key = ".".join(str(part) for part in problem["loc"])
+    problems, count = [], error.error_count()
+    for problem in error.errors(include_url=False, include_context=False)[:MOST_PROBLEMS]:
+        key = named(".".join(str(part) for part in problem["loc"]))
         if problem["type"] == "extra_forbidden":
             problems.append(f"{key}: is not a known setting")
         else:
-            problems.append(f"{key}: {problem['msg'].lower()}, found {problem['input']!r}")
+            problems.append(f"{key}: {problem['msg'].lower()}, found {shown(problem['input'])}")
+    if count > MOST_PROBLEMS:
+        problems.append(f"and {count - MOST_PROBLEMS:,} more")
     return "; ".join(problems) + "."
+
+
+def named(key: str) -> str:
+    """Give a key as texts show it: short, in one line.
+
+    Args:
+        key: Any text, dots included.
+
+    Returns:
+        The key itself if it is one.
+
+    Example:
+        >>> named("cvt.color"), len(named("x" * 1000))
+        ('cvt.color', 80)
+    """
+    return shortened(key, 80) if key.isprintable() else shortened(repr(key), 80)
+
+
+def shown(value: object) -> str:
+    """Give a value as texts show it: as Python would, but short.
+
+    Args:
+        value: What a file or a caller gave.
+
+    Returns:
+        At most 120 characters.
+
+    Example:
+        >>> shown("many"), len(shown("x" * 1000)), len(shown(list(range(1000))))
+        ("'many'", 120, 120)
+    """
+    try:
+        return shortened(repr(value), 120)
+    except ValueError:  # Python writes no number of thousands of digits
+        return "a number of thousands of digits"
+
+
+def shortened(text: str, length: int) -> str:
+    """Cut a text that is too long.
+
+    Args:
+        text: Any text.
+        length: Characters to keep, the dots that stand for the rest included.
+
+    Returns:
+        The text.
+
+    Example:
+        >>> shortened("a long text", 8)
+        'a lon...'
+    """
+    return text if len(text) <= length else f"{text[: length - 3]}..."

@@ -124,6 +124,8 @@ class MergeConfig(Section):
             the opacity alone, 1 the mass.
         opacity: ``saturating`` conserves mass, ``1 - exp(-tau)``; ``union`` is the opacity of
             members that lie exactly behind one another, ``1 - prod(1 - a)``.
+        lone_members: Whether a cell whose members hardly touch keeps the one that shows most of it,
+            instead of their moments.
         widening: How much wider than its moments an opaque cell of many members becomes, along
             every axis.
         covered_widening: How much more it becomes so along an axis on which other cells paint at
@@ -133,6 +135,7 @@ class MergeConfig(Section):
 
     area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)
     opacity: Literal["saturating", "union"] = "saturating"
+    lone_members: bool = True
     widening: float = pydantic.Field(default=0.1, ge=0.0, le=2.0)
     covered_widening: float = pydantic.Field(default=0.4, ge=0.0, le=2.0)
     network: bool = True

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import pydantic
 
-from cvtgs.config.base import Section, explain, read_toml
+from cvtgs.config.base import Section, explain, named, read_toml, shown
 from cvtgs.config.presets import PRESETS
 from cvtgs.config.refine import RefineConfig
 from cvtgs.config.sections import (
@@ -38,7 +38,7 @@ class SimplifyConfig(Section):
     """
 
     preset: str = "standard"
-    seed: int = pydantic.Field(default=0, ge=0)
+    seed: int = pydantic.Field(default=0, ge=0, lt=1 << 63)
     effects: EffectsConfig = EffectsConfig()
     filter: FilterConfig = FilterConfig()
     visibility: VisibilityConfig = VisibilityConfig()
@@ -60,7 +60,7 @@ class SimplifyConfig(Section):
             ConfigError: There is no such preset.
         """
         if name not in PRESETS:
-            raise ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {name!r}.")
+            raise ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {shown(name)}.")
         return cls.from_mapping({"preset": name})
 
     @classmethod
@@ -78,7 +78,7 @@ class SimplifyConfig(Section):
         """
         name = values.get("preset", "standard")
         if not isinstance(name, str) or name not in PRESETS:
-            raise ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {name!r}.")
+            raise ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {shown(name)}.")
         try:
             return cls.model_validate(_merged(PRESETS[name], values))
         except pydantic.ValidationError as error:
@@ -129,7 +129,7 @@ class SimplifyConfig(Section):
             for section in sections:
                 target = target.setdefault(section, {})
                 if not isinstance(target, dict):
-                    raise ConfigError(f"{key}: is not a known setting.")
+                    raise ConfigError(f"{named(key)}: is not a known setting.")
             target[name] = text
         try:
             return cls.from_mapping(values)

@@ -1,5 +1,6 @@
 """Write a file completely or not at all."""
 
+import ctypes
 import errno
 import os
 import secrets
@@ -10,6 +11,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 from cvtgs.errors import CvtgsError, OutputError, OutputExistsError
+
+_HERE, _NO_REPLACE = -100, 1
+"""AT_FDCWD and RENAME_NOREPLACE of Linux."""
 
 _DISK_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 
@@ -114,17 +118,56 @@ def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
         temporary.replace(target)
         return
-    try:
-        target.hardlink_to(temporary)  # fails if the name is taken, unlike a rename
-    except FileExistsError:
-        raise
-    except (OSError, NotImplementedError):  # no hard links here: take the name, then replace
-        target.open("xb").close()
+    for take in (_link, _rename):
         try:
-            temporary.replace(target)
-        except BaseException:
-            target.unlink(missing_ok=True)
+            take(temporary, target)
+        except FileExistsError:
             raise
+        except (OSError, NotImplementedError):  # this system or this disk cannot
+            continue
+        return
+    _claim(temporary, target)
+
+
+def _link(temporary: Path, target: Path) -> None:
+    """Take the name unless it is taken: unlike a rename, a link never replaces."""
+    target.hardlink_to(temporary)
+
+
+def _rename(temporary: Path, target: Path) -> None:
+    """Take the name unless it is taken, where there are no hard links (FAT, some shares)."""
+    if os.name == "nt":
+        temporary.rename(target)  # there it never replaces
+        return
+    libc = ctypes.CDLL(None, use_errno=True)
+    if not hasattr(libc, "renameat2"):
+        raise NotImplementedError
+    names = (os.fsencode(temporary), os.fsencode(target))
+    if libc.renameat2(_HERE, names[0], _HERE, names[1], ctypes.c_uint(_NO_REPLACE)):
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number), os.fspath(target))
+
+
+def _claim(temporary: Path, target: Path) -> None:
+    """Take the name with an empty file, then replace that: only a kill in between leaves it."""
+    own = None
+    try:
+        with target.open("xb") as file:
+            own = os.fstat(file.fileno())
+        temporary.replace(target)
+    except BaseException:
+        if own is not None and _is(target, own):
+            target.unlink()
+        raise
+
+
+def _is(path: Path, empty: os.stat_result) -> bool:
+    """Tell whether a path is still the empty file that we made."""
+    try:
+        found = path.stat()
+    except OSError:
+        return False
+    return os.path.samestat(found, empty) and found.st_size == 0
 
 
 def _concerns(error: OSError, temporary: Path) -> bool:

@@ -63,7 +63,7 @@ def decompose(
     values, axes = values.flip(-1), axes.flip(-1)
     values = torch.maximum(values, EIGENVALUE_FLOOR * values[:, :1].clamp_min(EIGENVALUE_FLOOR))
     scales = values.sqrt() * size.sqrt()[:, None]
-    return scales, quaternions.from_matrices(_canonical_axes(axes))
+    return scales, quaternions.from_matrices(canonical_axes(axes))
 
 
 def mean_projected_area(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
@@ -108,8 +108,20 @@ def log_mean_projected_area(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, "
     return 2 * largest + positive_log(mean) / AREA_EXPONENT + math.log(math.pi)
 
 
-def _canonical_axes(axes: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
-    """Fix the signs of eigenvectors (columns) and make the frame right-handed."""
+def canonical_axes(axes: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
+    """Fix the signs of eigenvectors and make the frame right-handed.
+
+    Args:
+        axes: Axes as columns, at right angles.
+
+    Returns:
+        Rotations: each of the first two axes points along the positive side of its largest
+        component.
+
+    Example:
+        >>> canonical_axes(-torch.eye(3)[None])[0].diagonal().tolist()
+        [1.0, 1.0, 1.0]
+    """
     first_two = axes[:, :, :2]
     dominant = first_two.abs().argmax(dim=1, keepdim=True)
     negative = torch.gather(first_two, 1, dominant) < 0

@@ -100,13 +100,14 @@ def _paint(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tuple[Tens
         colors = torch.cat([scene.sh0, rest], dim=1)
     else:
         colors = evaluate(scene.sh0, rest, scene.means)
+    means, viewmats = _about_cameras(scene, cameras)
     layers, alpha, _ = _gsplat().rasterization(
-        means=scene.means.float(),
+        means=means.float(),
         quats=scene.quats.float(),
         scales=scene.scales.float(),
         opacities=scene.opacities.float(),
         colors=colors.float(),
-        viewmats=cameras.viewmats.float(),
+        viewmats=viewmats.float(),
         Ks=cameras.Ks.float(),
         width=cameras.width,
         height=cameras.height,
@@ -118,6 +119,17 @@ def _paint(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tuple[Tens
         rasterize_mode="antialiased" if scene.antialiased else "classic",
     )
     return layers, alpha
+
+
+def _about_cameras(scene: GaussianScene, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """Give means and view matrices about the middle of the cameras, in float64.
+
+    Far from the origin float32, in which gsplat works, holds neither.
+    """
+    viewmats = cameras.viewmats.double().clone()
+    middle = cameras.centers.double().mean(dim=0)
+    viewmats[:, :3, 3] += viewmats[:, :3, :3] @ middle
+    return scene.means.double() - middle, viewmats
 
 
 def _gsplat() -> Any:

@@ -56,7 +56,7 @@ def project(scene: GaussianScene, view: View, sh_degree: int) -> Splats:
         What is in view, by depth; equal depths keep the order of the scene.
     """
     rows = _candidates(scene, view)
-    offsets = scene.means.index_select(0, rows) - scene.means.new_tensor(view.center)
+    offsets = _offsets(scene.means.index_select(0, rows), view)
     rotation = scene.means.new_tensor(view.rotation)
     local = offsets @ rotation.T
     axes = _picture_axes(scene, rows, local, view)
@@ -111,11 +111,17 @@ def half_sizes(
     return (reach / steep + reach * shear * shear / flat).sqrt(), (reach / flat).sqrt()
 
 
+def _offsets(means: Float[Tensor, "n 3"], view: View) -> Float[Tensor, "n 3"]:
+    """Give ways from the camera; far from the origin float32 holds them, but not the camera."""
+    center = torch.tensor(view.center, dtype=torch.float64, device=means.device)
+    return (means.double() - center).to(means.dtype)
+
+
 @torch.no_grad()
 def _candidates(scene: GaussianScene, view: View) -> Tensor:
     """Leave out what cannot be in the picture, by a ball around each Gaussian."""
     rotation = scene.means.new_tensor(view.rotation)
-    x, y, z = ((scene.means - scene.means.new_tensor(view.center)) @ rotation.T).unbind(1)
+    x, y, z = (_offsets(scene.means, view) @ rotation.T).unbind(1)
     steepest = sum(max(abs(low), abs(high)) ** 2 for low, high in view.slopes)
     stretch = rotation.norm() * max(view.focal) * (1 + steepest) ** 0.5 / z
     deviation = stretch * scene.log_scales.amax(dim=1).exp()

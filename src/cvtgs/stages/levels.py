@@ -168,20 +168,21 @@ def _made_of(
         )
         partition = _composed(finest.partition, rows, tessellation.labels, target)
     with clock.stage("merge", target) as advance:
-        merged, neighbors = merge_groups(
+        merged, shown, neighbors = merge_groups(
             valid,
             partition,
             config.merge,
+            areas=outlook.areas,
             with_neighbors=net is not None,
             backend=tessellation.backend,
             on_cells=advance,
         )
     on_grouping(Grouping(valid, outlook, partition, finest.weights, merged))
-    reference = Reference(valid, merged, partition, neighbors, outlook.light)
+    reference = Reference(valid, merged, shown, neighbors, outlook.light)
     small = restored(finished(reference, net, clock=clock), original, outlook.plan)
     left_out = torch.ones(len(valid), dtype=torch.bool, device=valid.device)
     left_out[partition.order] = False
-    facts = outlook.facts(valid) | grouping_facts(partition, tessellation)
+    facts = outlook.facts(valid) | grouping_facts(partition, tessellation, shown=shown)
     facts |= left_out_facts(valid, outlook, left_out)
     return small, facts | {"mass_out": float(small.masses.sum())}
 

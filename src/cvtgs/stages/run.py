@@ -27,7 +27,7 @@ class Reference(NamedTuple):
     Attributes:
         scene: The valid Gaussians of the input.
         merged: One Gaussian per cell.
-        partition: Rows of ``scene`` that make up every cell.
+        partition: Rows of ``scene`` that every one of these stands for.
         neighbors: ``(m, k)`` nearest other cells of every cell.
         light: ``(n,)`` how freely every Gaussian of ``scene`` can be seen, 0 to 1.
     """
@@ -221,32 +221,36 @@ def _refer(
     with clock.stage("merge", target) as advance:
         local = cells.Partition.from_labels(tessellation.labels, target)
         partition = cells.Partition(order=rows[local.order], offsets=local.offsets)
-        merged, neighbors = merge_groups(
+        merged, shown, neighbors = merge_groups(
             valid,
             partition,
             config.merge,
+            areas=outlook.areas,
             with_neighbors=with_light,
             backend=tessellation.backend,
             on_cells=advance,
         )
     if on_grouping is not None:
         on_grouping(Grouping(valid, outlook, partition, totals, merged))
-    facts |= filter_facts | grouping_facts(partition, tessellation)
-    return Reference(valid, merged, partition, neighbors, outlook.light), facts
+    facts |= filter_facts | grouping_facts(partition, tessellation, shown=shown)
+    return Reference(valid, merged, shown, neighbors, outlook.light), facts
 
 
-def grouping_facts(partition: cells.Partition, tessellation: cvt.Tessellation) -> dict[str, Any]:
+def grouping_facts(
+    partition: cells.Partition, tessellation: cvt.Tessellation, *, shown: cells.Partition
+) -> dict[str, Any]:
     """Give what the report says about cells.
 
     Args:
         partition: Members of every cell.
         tessellation: How they were found.
+        shown: The members that the Gaussian of every cell stands for.
 
     Returns:
         The facts.
     """
     return {
-        "single_member_cells": int((partition.counts == 1).sum()),
+        "single_member_cells": int((shown.counts == 1).sum()),
         "largest_cell": int(partition.counts.amax()),
         "refilled_cells": tessellation.refilled,
         "energies": tessellation.energies,

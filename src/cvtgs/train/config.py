@@ -113,7 +113,7 @@ class TrainConfig(Section):
     kind: Literal["scene", "local"] = "scene"
     preset: Literal["standard", "paper"] = "standard"
     start: Path | None = None
-    seed: int = pydantic.Field(default=0, ge=0)
+    seed: int = pydantic.Field(default=0, ge=0, lt=1 << 63)
     steps: Count = 6000
     learning_rate: float = pydantic.Field(default=5e-3, gt=0.0)
     width: Count = 48

@@ -29,7 +29,7 @@ def views_from_anywhere(
         reach: Smallest and largest distance, robust radii.
 
     Returns:
-        Cameras in any direction around the middle of the opaque Gaussians, which look
+        Cameras, float64, in any direction around the middle of the opaque Gaussians, which look
         at places up to a quarter of a radius from it, over 50 degrees.
 
     Example:
@@ -44,14 +44,15 @@ def views_from_anywhere(
     nearest, farthest = reach
     steps = torch.rand(count, 1, generator=generator)
     distances = frame.radius * (nearest + (farthest - nearest) * steps)
-    center = frame.center.float().cpu()
+    center = frame.center.cpu()
     targets = center + 0.25 * frame.radius * (torch.rand(count, 3, generator=generator) - 0.5)
-    up = torch.randn(3, generator=generator)
+    up = torch.randn(3, generator=generator).double()
     focal = 0.5 * size / math.tan(math.radians(25))
     intrinsics = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
+    eyes = center + distances.double() * directions.double()
     return Cameras(
-        viewmats=look_at(center + distances * directions, targets, up),
-        Ks=intrinsics.repeat(count, 1, 1),
+        viewmats=look_at(eyes, targets, up),
+        Ks=intrinsics.double().repeat(count, 1, 1),
         width=size,
         height=size,
     )

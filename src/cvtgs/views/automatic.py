@@ -63,7 +63,7 @@ def automatic_views(
         seed: Turns the cameras around the scene: another seed, other views.
 
     Returns:
-        The cameras, float32 on the CPU, named ``view 1`` and so on.
+        The cameras, float64 on the CPU, named ``view 1`` and so on.
 
     Raises:
         InvalidArgumentError: Count or size is below 1.

@@ -81,11 +81,11 @@ def probe(known: Survey, cameras: Cameras, *, reach: Float[Tensor, "c"], inside:
 def _swallowed(known: Survey, cameras: Cameras) -> Bool[Tensor, "c"]:
     """Tell which cameras are inside of a Gaussian that hides something."""
     sample = known.sample.select(known.sample.opacities > _HIDING)
-    eyes = cameras.centers.to(sample.means)
+    means = sample.means.double()
     largest = sample.scales.amax(dim=1)
     found = []
-    for eye in eyes:
-        offsets = eye - sample.means
+    for eye in cameras.centers.to(means):
+        offsets = (eye - means).to(sample.dtype)
         near = torch.linalg.vector_norm(offsets, dim=1) < _WITHIN * largest
         frames = quaternions.to_matrices(quaternions.normalize(sample.quats[near]))
         local = (frames.transpose(1, 2) @ offsets[near][:, :, None])[:, :, 0]

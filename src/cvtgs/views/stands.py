@@ -170,8 +170,8 @@ def _cameras(
     focal = 0.5 * min(size) / math.tan(math.radians(0.5 * field))
     intrinsics = [[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]]
     return Cameras(
-        viewmats=look_at(eyes, eyes + directions, up).float(),
-        Ks=torch.tensor(intrinsics).repeat(len(eyes), 1, 1),
+        viewmats=look_at(eyes, eyes + directions, up),
+        Ks=torch.tensor(intrinsics, dtype=eyes.dtype).repeat(len(eyes), 1, 1),
         width=width,
         height=height,
     )

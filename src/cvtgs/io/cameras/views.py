@@ -134,7 +134,7 @@ def to_cameras(views: Sequence[View], path: str) -> Cameras:
         path: Where they came from, for the warning.
 
     Returns:
-        The cameras, float32 on the CPU, in the same order.
+        The cameras, float64 on the CPU, in the same order.
     """
     sizes = Counter((view.lens.width, view.lens.height) for view in views)
     (width, height), _ = sizes.most_common(1)[0]
@@ -142,8 +142,8 @@ def to_cameras(views: Sequence[View], path: str) -> Cameras:
     viewmats = np.stack([view.viewmat for view in views])
     intrinsics = np.stack([_intrinsics(view.lens, width=width, height=height) for view in views])
     return Cameras(
-        viewmats=torch.from_numpy(viewmats).float(),
-        Ks=torch.from_numpy(intrinsics).float(),
+        viewmats=torch.from_numpy(viewmats),
+        Ks=torch.from_numpy(intrinsics),
         width=width,
         height=height,
         names=tuple(view.name for view in views),

@@ -1,0 +1,56 @@
+"""Points and needles against mass pruning: cells that keep a member, and cells that do not.
+
+``python -m benchmarks.thin_scenes`` prints PSNR and SSIM of pictures without the compensation of
+Mip-Splatting, by automatic views, for scenes of ``tests/hard_cases.py``.
+"""
+
+import argparse
+import math
+
+import torch
+
+import cvtgs
+from benchmarks.baselines.pruning import keep_most_mass
+from benchmarks.numerics import catalogue
+from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.evaluate import EvaluationSettings, evaluate
+from cvtgs.views import automatic_views
+
+MOMENTS = {"merge.lone_members": "false"}
+VARIANTS = {"standard": {}, "moments only": MOMENTS, "paper": {"preset": "paper"}}
+VARIANTS["paper, with members"] = {"preset": "paper", "merge.lone_members": "true"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--case", nargs="+", default=["points", "needles"])
+    parser.add_argument("--count", type=int, default=4000)
+    parser.add_argument("--rho", type=float, nargs="+", default=[0.2, 0.02])
+    parser.add_argument("--size", type=int, default=400, help="side of the pictures")
+    parser.add_argument("--views", type=int, default=8)
+    options = parser.parse_args()
+    print("| case | rho | " + " | ".join([*VARIANTS, "mass pruning"]) + " |")
+    print("|---" * (len(VARIANTS) + 3) + "|")
+    for name in options.case:
+        scene = catalogue()[name](options.count, torch.float32)
+        size = options.size
+        cameras = automatic_views(scene, options.views, width=size, height=size)
+        for rho in options.rho:
+            count = math.floor(rho * len(scene))
+            small = {text: simplified(scene, count, how) for text, how in VARIANTS.items()}
+            small["mass pruning"] = keep_most_mass(scene, count)
+            settings = EvaluationSettings(lpips="off")
+            scores = evaluate(scene, small, cameras, settings=settings).scenes
+            cells = (f"{score.psnr.mean:.2f} dB / {score.ssim.mean:.3f}" for score in scores)
+            print(f"| {name} | {rho:g} | " + " | ".join(cells) + " |")
+
+
+def simplified(
+    scene: cvtgs.GaussianScene, count: int, settings: dict[str, str]
+) -> cvtgs.GaussianScene:
+    config = SimplifyConfig.compose(settings=settings)
+    return Simplifier(config=config, device="cpu").simplify(scene, count=count)
+
+
+if __name__ == "__main__":
+    main()
