@@ -143,13 +143,9 @@ def looking_device(options: argparse.Namespace) -> "torch.device":
     Raises:
         DeviceError: There is no such device.
     """
-    import torch  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.devices import chosen_device  # noqa: PLC0415 (keeps --help fast)
 
-    from cvtgs.devices import resolve_device  # noqa: PLC0415
-
-    return resolve_device(options.device) or torch.device(
-        "cuda" if torch.cuda.is_available() else "cpu"
-    )
+    return chosen_device(options.device)
 
 
 def check_looking_options(options: argparse.Namespace) -> None:
