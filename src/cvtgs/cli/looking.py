@@ -45,6 +45,15 @@ def add_scoring_options(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument("reference", metavar="REF", type=Path, help=f"the full scene ({READABLE})")
     parser.add_argument("small", metavar="SMALL", type=Path, nargs="+", help="simplified scenes")
+    add_lpips_option(parser)
+
+
+def add_lpips_option(parser: argparse.ArgumentParser) -> None:
+    """Let the user choose which LPIPS to measure.
+
+    Args:
+        parser: Where to add it.
+    """
     parser.add_argument(
         "--lpips",
         default="auto",

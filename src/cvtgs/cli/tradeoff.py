@@ -8,6 +8,7 @@ from cvtgs.cli.display import READABLE, progress_bars
 from cvtgs.cli.lists import ratios_of, words_of
 from cvtgs.cli.looking import (
     add_looking_options,
+    add_lpips_option,
     background_color,
     check_looking_options,
     chosen_cameras,
@@ -43,12 +44,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "-o", "--output", type=Path, required=True, metavar="DIR", help="directory to write to"
     )
     parser.add_argument("--save", action="store_true", help="keep the small scenes there, too")
-    parser.add_argument(
-        "--lpips",
-        default="auto",
-        choices=("auto", "vgg", "alex", "off"),
-        help="which LPIPS to measure (default: VGG or Alex if there are weights)",
-    )
+    add_lpips_option(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace existing files")
     add_looking_options(parser, size=SIZE)
     parser.set_defaults(run=run)
