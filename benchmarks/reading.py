@@ -13,7 +13,7 @@ from unittest import mock
 
 import cvtgs
 from benchmarks.processes import Cost, machine, run_python, spread
-from benchmarks.speed import generated_scenes
+from benchmarks.speed import SCENES, generated_scenes
 from cvtgs.io.ply import fast
 
 READERS = ("mapped", "plyfile")
@@ -32,7 +32,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         print(f"{machine()}, {options.runs} runs\n")
         print("| file | reader | CPU s | peak above bare / file |\n|---|---|---|---|")
-        for file in options.files or generated_scenes(Path(folder)):
+        for file in options.files or generated_scenes(Path(folder), SCENES):
             for reader in READERS:
                 costs = [read_once(file, reader) for _ in range(options.runs)]
                 peak = statistics.median(cost.peak_bytes for cost in costs)

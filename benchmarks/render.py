@@ -19,6 +19,7 @@ import torch
 
 import cvtgs
 from benchmarks.processes import machine, run_python, spread
+from benchmarks.speed import generated_scenes
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.render import BackendName, render
 
@@ -37,7 +38,7 @@ def main() -> None:
         print(json.dumps(costs(options)))
         return
     with tempfile.TemporaryDirectory() as folder:
-        files = options.files or generated_scenes(Path(folder))
+        files = options.files or generated_scenes(Path(folder), SCENES)
         print(f"{machine()}, torch {torch.__version__}, {options.device};")
         print(f"{options.size} x {options.size} pixels, {options.views} views\n")
         print("| scene | backend | first s | forward s | forward and backward s | peak MB |")
@@ -45,15 +46,6 @@ def main() -> None:
         for file in files:
             for backend in backends(options.device):
                 print(row(file, backend, options), flush=True)
-
-
-def generated_scenes(folder: Path) -> list[Path]:
-    files = []
-    for kind, count, degree in SCENES:
-        path = folder / f"{kind}_{count // 1000}k_sh{degree}.ply"
-        cvtgs.save(cvtgs.synthetic.scene(kind, count, sh_degree=degree, seed=0), path)
-        files.append(path)
-    return files
 
 
 def backends(device: str) -> list[str]:

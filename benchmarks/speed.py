@@ -8,6 +8,7 @@ import argparse
 import json
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -32,15 +33,15 @@ def main() -> None:
         print(json.dumps(stage_costs(options.files[0], options.rho, options.preset)))
         return
     with tempfile.TemporaryDirectory() as folder:
-        files = options.files or generated_scenes(Path(folder))
+        files = options.files or generated_scenes(Path(folder), SCENES)
         print(f"{machine()}, torch {torch.__version__}; rho {options.rho:g}, {options.runs} runs\n")
         measure_processes(files, Path(folder), options)
         measure_stages(files, options)
 
 
-def generated_scenes(folder: Path) -> list[Path]:
+def generated_scenes(folder: Path, scenes: Sequence[tuple[str, int, int]]) -> list[Path]:
     files = []
-    for kind, count, degree in SCENES:
+    for kind, count, degree in scenes:
         path = folder / f"{kind}_{count // 1000}k_sh{degree}.ply"
         cvtgs.save(cvtgs.synthetic.scene(kind, count, sh_degree=degree, seed=0), path)
         files.append(path)

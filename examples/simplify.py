@@ -17,6 +17,7 @@ def main() -> None:
     parser.add_argument("--rho", type=float, default=0.01)
     parser.add_argument("--preset", default="standard", choices=list(cvtgs.PRESETS))
     options = parser.parse_args()
+    cvtgs.io.check_save(options.output)  # before the work
     simplifier = cvtgs.Simplifier(config=options.preset, listener=tell)
     small, report = simplifier.run(cvtgs.load(options.input), options.rho)
     cvtgs.save(small, options.output)

@@ -28,6 +28,20 @@ def straight(width=9, height=7, focal=20.0, *, dtype=torch.float64):
     )
 
 
+def one_camera(width: int, height: int) -> Cameras:
+    """Look along z from five units away."""
+    eye = torch.tensor([[0.0, 0.0, -5.0]], dtype=torch.float64)
+    up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    focal = 1.5 * width
+    matrix = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
+    return Cameras(
+        viewmats=look_at(eye, torch.zeros_like(eye), up),
+        Ks=torch.tensor([matrix], dtype=torch.float64),
+        width=width,
+        height=height,
+    )
+
+
 def around(count=2, width=37, height=29, focal=40.0):
     """Cameras around the origin, their principal points off the middle."""
     turns = torch.arange(count, dtype=torch.float64) * 2.1 + 0.3

@@ -114,3 +114,11 @@ def assert_same_gaussians(
     assert float(worst.amax()) < tolerance
     torch.testing.assert_close(a.opacities, b.opacities, rtol=tolerance, atol=tolerance)
     torch.testing.assert_close(a.sh, b.sh, rtol=tolerance, atol=tolerance)
+
+
+def assert_standard(scene: GaussianScene) -> None:
+    for name, tensor in scene.tensors().items():
+        assert bool(tensor.isfinite().all()), name
+    norms = torch.linalg.vector_norm(scene.quats.double(), dim=1)
+    assert float((norms - 1).abs().amax()) < 1e-5
+    assert bool(((scene.opacities > 0) & (scene.opacities < 1)).all())

@@ -11,9 +11,10 @@ import cvtgs
 from baseline_cases import gaussians
 from benchmarks.baselines import BASELINES, baseline, light_gaussian, pup_3dgs
 from benchmarks.baselines.__main__ import main
-from cvtgs.cameras import Cameras, look_at
+from cvtgs.cameras import Cameras
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.filters import invalid_rows
+from render_cases import one_camera
 from scenes import random_scene
 
 COVERED = "opacity pruning", "mass pruning", "GHAP", "NanoGS"  # the others need pictures
@@ -24,20 +25,6 @@ def _few_small_views(monkeypatch):
     for module in (light_gaussian, pup_3dgs):
         monkeypatch.setattr(module, "VIEWS", 3)
         monkeypatch.setattr(module, "SIZE", 32)
-
-
-def one_camera(width: int, height: int) -> Cameras:
-    """Look along z from five units away."""
-    eye = torch.tensor([[0.0, 0.0, -5.0]], dtype=torch.float64)
-    up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
-    focal = 1.5 * width
-    matrix = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
-    return Cameras(
-        viewmats=look_at(eye, torch.zeros_like(eye), up),
-        Ks=torch.tensor([matrix], dtype=torch.float64),
-        width=width,
-        height=height,
-    )
 
 
 def kept_places(small: cvtgs.GaussianScene) -> list[float]:

@@ -214,8 +214,7 @@ def test_command(source, tmp_path, capsys, monkeypatch):
     assert (report["output_count"], report["blocks"]) == (60, 7)
     assert main([*words, "--memory", "7MB"]) == 0
     assert "blocks" not in capsys.readouterr().out
-    for module in ("memory", "run"):
-        monkeypatch.setattr(f"cvtgs.blocks.{module}.available_memory", lambda: 3_000_000)
+    monkeypatch.setattr("cvtgs.blocks.memory.available_memory", lambda: 3_000_000)
     assert main(words) == 0
     assert "In 5 blocks." in capsys.readouterr().out
     assert main([*words, "--memory", "2MB", "--preset", "max"]) == 1

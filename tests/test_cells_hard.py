@@ -6,7 +6,7 @@ import torch
 from cvtgs import GaussianScene
 from cvtgs.cells import Partition, merge_cells, normalized_weights
 from cvtgs.config import SimplifyConfig
-from scenes import covariances_of, moved, random_scene
+from scenes import assert_standard, covariances_of, moved, random_scene
 
 CONFIGS = {name: SimplifyConfig.from_preset(name).merge for name in ("standard", "paper")}
 each_config = pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
@@ -21,14 +21,6 @@ def merged(scene: GaussianScene, labels: torch.Tensor, config) -> GaussianScene:
 
 def pairs(count: int) -> torch.Tensor:
     return torch.arange(count) // 2
-
-
-def assert_standard(scene: GaussianScene) -> None:
-    for name, tensor in scene.tensors().items():
-        assert bool(tensor.isfinite().all()), name
-    norms = torch.linalg.vector_norm(scene.quats.double(), dim=1)
-    assert float((norms - 1).abs().amax()) < 1e-5
-    assert bool(((scene.opacities > 0) & (scene.opacities < 1)).all())
 
 
 def changed(scene: GaussianScene, **tensors: torch.Tensor) -> GaussianScene:

@@ -61,7 +61,10 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(source, tmp_path, capsys,
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--rho", "0.1,many"], "--rho must be numbers with commas, for example 0.1,0.01; found"),
+        (
+            ["--rho", "0.1,many"],
+            "--rho must be different numbers with commas, ",
+        ),
         (["--rho", "2"], "rho must be above 0 and at most 1; found 2.0."),
         (["--presets", "best"], "preset must be one of "),
         (["--views", "0"], "--views must be at least 1, found 0."),

@@ -20,6 +20,18 @@ def test_file_not_found(tmp_path: Path) -> None:
     assert isinstance(caught.value, FileNotFoundError)
 
 
+@pytest.mark.parametrize("end", ["ply", "compressed.ply", "spz", "splat", "sog", "ckpt", "pt"])
+def test_a_pointer_of_git_lfs_is_not_the_file(tmp_path: Path, end: str) -> None:
+    path = tmp_path / f"scene.{end}"
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    assert str(caught.value) == (
+        f"{path}: must be the file itself, found a pointer of Git LFS to it; get the file with: "
+        f"git lfs pull."
+    )
+
+
 @pytest.mark.parametrize("name", ["folder", "folder.ply"])
 def test_a_directory_is_no_file(tmp_path: Path, name: str) -> None:
     path = tmp_path / name

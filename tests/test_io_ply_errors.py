@@ -61,6 +61,19 @@ HEADER_CASES: Mapping[str, tuple[bytes, str]] = {
         b"\x89PNG\r\n\x1a\n....",
         "a PLY file must start with the line 'ply', found b'\\x89PNG\\r\\n\\x1a\\n'.",
     ),
+    "gzip": (
+        b"\x1f\x8b\x08\x00",
+        "a PLY file must start with the line 'ply', found a gzip file; unpack it first.",
+    ),
+    "zip": (
+        b"PK\x03\x04\x14",
+        "a PLY file must start with the line 'ply', found a zip archive; unpack it first.",
+    ),
+    "web page": (
+        b"<!DOCTYPE html>",
+        "a PLY file must start with the line 'ply', found a web page; a download that failed "
+        "leaves one.",
+    ),
     "plywood": (b"plywood", "a PLY file must start with the line 'ply', found b'plywood'."),
     "no end": (
         GOOD[:200],
@@ -132,6 +145,11 @@ VERTEX_CASES: Mapping[str, tuple[bytes, str]] = {
     ),
     "one missing": (without("opacity"), NEEDED + "opacity."),
     "many missing": (without("y", "rot_0", "f_dc_2"), NEEDED + "y, f_dc_2, rot_0."),
+    "point cloud": (
+        ply_bytes([(name, "float") for name in "xyz"], [[1.0, 2.0, 3.0]]),
+        NEEDED + "f_dc_0, f_dc_1, f_dc_2, opacity, scale_0, scale_1, rot_0, rot_1, rot_2, rot_3; "
+        "a point cloud or a mesh must be trained to a scene first.",
+    ),
     "list": (
         with_list("scale_1"),
         "property 'scale_1' of 'vertex' must be a number, found a list.",

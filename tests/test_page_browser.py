@@ -48,6 +48,20 @@ def page(tmp_path_factory):
     return folder / "index.html", comparison.evaluation
 
 
+def layout_on_a_phone(path: Path) -> str:
+    """A window cannot be as narrow as a phone, a frame can."""
+    holder = path.parent / "phone.html"
+    holder.write_text(
+        f'<iframe id="phone" src="{path.name}" style="width:390px;height:800px;border:0"></iframe>'
+        "<script>setTimeout(() => { const page = phone.contentDocument.documentElement;"
+        "document.documentElement.dataset.layout = page.dataset.layout + ' ' + "
+        "page.scrollWidth; }, 1500)</script>",
+        encoding="utf-8",
+    )
+    html = browse(holder, "", "--allow-file-access-from-files", "--dump-dom")
+    return attribute(html, "layout")
+
+
 def browse(path: Path, hash_: str, *arguments: str) -> str:
     command = [
         str(BROWSER),
@@ -119,18 +133,8 @@ def test_numbers_out_of_range_are_clamped(page):
 
 
 def test_the_page_fits_a_phone(page):
-    """A window cannot be as narrow as a phone, a frame can."""
     path, _ = page
-    holder = path.parent / "phone.html"
-    holder.write_text(
-        f'<iframe id="phone" src="{path.name}" style="width:390px;height:800px;border:0"></iframe>'
-        "<script>setTimeout(() => { const page = phone.contentDocument.documentElement;"
-        "document.documentElement.dataset.layout = page.dataset.layout + ' ' + "
-        "page.scrollWidth; }, 1500)</script>",
-        encoding="utf-8",
-    )
-    html = browse(holder, "", "--allow-file-access-from-files", "--dump-dom")
-    assert attribute(html, "layout") == "390/390 390"
+    assert layout_on_a_phone(path) == "390/390 390"
 
 
 def test_the_page_asks_for_nothing(page):

@@ -9,21 +9,8 @@ from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.render import contributions
 from cvtgs.views import automatic_views
+from render_cases import one_camera
 from scenes import random_scene
-
-
-def one_camera(width: int, height: int) -> Cameras:
-    """Look along z from five units away."""
-    eye = torch.tensor([[0.0, 0.0, -5.0]], dtype=torch.float64)
-    up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
-    focal = 1.5 * width
-    matrix = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
-    return Cameras(
-        viewmats=look_at(eye, torch.zeros_like(eye), up),
-        Ks=torch.tensor([matrix], dtype=torch.float64),
-        width=width,
-        height=height,
-    )
 
 
 @pytest.mark.parametrize("backend", ["torch", "numba"])

@@ -7,19 +7,11 @@ import torch
 
 from cvtgs import GaussianScene, ProgressEvent, Simplifier, SimplifyConfig
 from cvtgs.errors import CvtgsError, DeviceError
-from scenes import random_scene, same_bits
+from scenes import assert_standard, random_scene, same_bits
 
 each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])
 STAGES = ["check", "plan", "filter", "tessellate", "merge", "network"]
 INF = float("inf")
-
-
-def assert_standard(scene: GaussianScene) -> None:
-    for name, tensor in scene.tensors().items():
-        assert bool(tensor.isfinite().all()), name
-    norms = torch.linalg.vector_norm(scene.quats.double(), dim=1)
-    assert float((norms - 1).abs().amax()) < 1e-5
-    assert bool(((scene.opacities > 0) & (scene.opacities < 1)).all())
 
 
 @each_preset

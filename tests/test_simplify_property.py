@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from cvtgs import GaussianScene, Simplifier
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError
-from scenes import REST_COUNTS, random_scene
+from scenes import REST_COUNTS, assert_standard, random_scene
 
 NAN, INF = float("nan"), float("inf")
 PLACES = [0.0, 1.0, 1.0, -1.0, 1e-30, 1e-3, 1e6, -1e6, 6e6 + 0.01, 1e30, -3e38, 3e38, NAN, INF]
@@ -57,14 +57,6 @@ def valid_mask(scene: GaussianScene) -> torch.Tensor:
         & scene.quats.any(dim=1)
         & ~scene.logit_opacities.isnan()
     )
-
-
-def assert_standard(small: GaussianScene) -> None:
-    for name, values in small.tensors().items():
-        assert bool(values.isfinite().all()), name
-    norms = torch.linalg.vector_norm(small.quats.double(), dim=1)
-    assert float((norms - 1).abs().amax()) < 1e-5
-    assert bool(((small.opacities > 0) & (small.opacities < 1)).all())
 
 
 each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])

@@ -8,7 +8,7 @@ import cvtgs
 from cvtgs.evaluate import EvaluationSettings
 from cvtgs.tradeoff import measure_tradeoff, write_tradeoff
 from cvtgs.views import automatic_views
-from test_page_browser import BROWSER, BROWSERS, attribute, browse, dom
+from test_page_browser import BROWSER, BROWSERS, attribute, dom, layout_on_a_phone
 
 pytestmark = pytest.mark.skipif(
     BROWSER is None, reason=f"needs one of {', '.join(BROWSERS)} on the PATH"
@@ -42,16 +42,7 @@ def test_plot_table_and_slider_are_there(page):
 
 def test_it_fits_a_phone(page):
     """The wide table scrolls inside its own box."""
-    holder = page.parent / "phone.html"
-    holder.write_text(
-        f'<iframe id="phone" src="{page.name}" style="width:390px;height:800px;border:0"></iframe>'
-        "<script>setTimeout(() => { const page = phone.contentDocument.documentElement;"
-        "document.documentElement.dataset.layout = page.dataset.layout + ' ' + "
-        "page.scrollWidth; }, 1500)</script>",
-        encoding="utf-8",
-    )
-    html = browse(holder, "", "--allow-file-access-from-files", "--dump-dom")
-    assert attribute(html, "layout") == "390/390 390"
+    assert layout_on_a_phone(page) == "390/390 390"
 
 
 def test_it_asks_for_nothing(page):

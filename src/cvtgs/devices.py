@@ -11,7 +11,7 @@ from cvtgs.errors import DeviceError
 
 
 def resolve_device(device: str | torch.device) -> torch.device | None:
-    """Turn the name of a device into a device that is there.
+    """Turn a name that may be ``auto`` into a device that is there.
 
     Args:
         device: ``auto``, ``cpu``, ``cuda``, or any torch device.
@@ -26,8 +26,25 @@ def resolve_device(device: str | torch.device) -> torch.device | None:
         >>> resolve_device("cpu")
         device(type='cpu')
     """
-    if device == "auto":
-        return None
+    return None if device == "auto" else usable_device(device)
+
+
+def usable_device(device: str | torch.device) -> torch.device:
+    """Turn the name of a device into a device that is there.
+
+    Args:
+        device: ``cpu``, ``cuda``, or any torch device.
+
+    Returns:
+        The device.
+
+    Raises:
+        DeviceError: There is no such device.
+
+    Example:
+        >>> usable_device("cpu")
+        device(type='cpu')
+    """
     try:
         resolved = torch.device(device)
         torch.empty(0, device=resolved)
@@ -35,6 +52,29 @@ def resolve_device(device: str | torch.device) -> torch.device | None:
         reason = str(error).split("\n")[0].rstrip(".")
         raise DeviceError(f"device {str(device)!r} cannot be used here: {reason}.") from None
     return resolved
+
+
+def chosen_device(device: str | torch.device, home: str | torch.device = "cpu") -> torch.device:
+    """Choose where to compute.
+
+    Args:
+        device: ``auto``, ``cpu``, ``cuda``, or any torch device.
+        home: Where the data are.
+
+    Returns:
+        The device; for ``auto`` CUDA if the data are on the CPU and there is one, else ``home``.
+
+    Raises:
+        DeviceError: There is no such device.
+
+    Example:
+        >>> chosen_device("auto", "meta")
+        device(type='meta')
+    """
+    resolved, home = resolve_device(device), torch.device(home)
+    if resolved is not None:
+        return resolved
+    return torch.device("cuda") if home.type == "cpu" and torch.cuda.is_available() else home
 
 
 def device_name(device: torch.device) -> str:

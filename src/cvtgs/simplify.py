@@ -13,7 +13,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import target_count
-from cvtgs.devices import resolve_device
+from cvtgs.devices import chosen_device, resolve_device
 from cvtgs.effects import limited, pictured, restored, trimmed
 from cvtgs.errors import ConfigError, InvalidArgumentError
 from cvtgs.mergenet import SHIPPED, Checkpoint, MergeNet, load_checkpoint
@@ -265,10 +265,7 @@ class Simplifier:
         return net.to(device=device, dtype=scene.dtype)
 
     def _device_for(self, scene: GaussianScene) -> torch.device:
-        if self._device is not None:
-            return self._device
-        moves = scene.device.type == "cpu" and torch.cuda.is_available()
-        return torch.device("cuda") if moves else scene.device
+        return chosen_device(self._device or "auto", scene.device)
 
 
 def _checkpoint(

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cvtgs.cli.display import file_size, progress_bars
+from cvtgs.cli.display import PRESET_NAMES, file_size, progress_bars
 
 if TYPE_CHECKING:
     from cvtgs.evaluate import SceneScores
@@ -38,7 +38,9 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--count", type=int, default=200_000, metavar="N", help="Gaussians to generate (200000)"
     )
-    parser.add_argument("--preset", default="standard", metavar="NAME", help="standard or paper")
+    parser.add_argument(
+        "--preset", default="standard", metavar="NAME", help=f"{PRESET_NAMES} (standard)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the generated scene")
     parser.add_argument(
         "--device", default="auto", metavar="DEVICE", help="auto (default), cpu or cuda"

@@ -18,6 +18,9 @@ READABLE = ".ply, .spz, .splat, .sog, .ckpt, .pt or the folder of a trained mode
 WRITABLE = ".ply, .compressed.ply, .spz, .splat or .sog"
 """What ``cvtgs.save`` writes, for help texts."""
 
+PRESET_NAMES = "from the fastest to the best: draft, fast, standard, high, max; or paper"
+"""The presets, for help texts."""
+
 
 def size_text(count: int) -> str:
     """Give a number of bytes in decimal units.

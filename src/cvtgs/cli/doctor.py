@@ -45,9 +45,7 @@ def run(options: argparse.Namespace) -> None:
     Raises:
         DeviceError: The default path does not work.
     """
-    import torch  # noqa: PLC0415 (keeps --help fast)
-
-    from cvtgs.devices import device_name, resolve_device  # noqa: PLC0415
+    from cvtgs.devices import chosen_device, device_name, resolve_device  # noqa: PLC0415
 
     print("\n".join(version_lines()))
     device = resolve_device(options.device)
@@ -56,7 +54,7 @@ def run(options: argparse.Namespace) -> None:
         for name in RENDERERS:
             print(f"  pictures by {name:<7} {_renderer(name, one)}")
         print(f"  nearest site by  {_search(one)}")
-    default = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    default = chosen_device(options.device)
     print(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one picture")
     try:
         for line in _small_run(default):
@@ -118,10 +116,12 @@ def _small_run(device: "torch.device") -> list[str]:
     if len(small) != report.target_count or not 0.0 < lit < 1.0:
         raise DeviceError(f"{len(small):,} Gaussians and a mean colour of {lit:.3g} came out")
     made, simplified, found, shown = (after - before for before, after in pairwise(times))
+    compiles = picture.backend == "numba"
+    note = "   the first pictures with numba compile for some ten seconds" if compiles else ""
     return [
         f"generate  {made:6.2f} s",
         f"simplify  {simplified:6.2f} s   search by {report.backend}, "
         f"checkpoint {report.checkpoint}",
-        f"views     {found:6.2f} s   the first pictures with numba compile for some ten seconds",
+        f"views     {found:6.2f} s{note}",
         f"render    {shown:6.2f} s   {SIDE} x {SIDE} pixels by {picture.backend}",
     ]

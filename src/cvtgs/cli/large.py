@@ -59,7 +59,7 @@ def keep_mask(options: argparse.Namespace, scene: "GaussianScene") -> "Tensor | 
     return inside(read_boxes(options.keep), scene.means)
 
 
-def works_by_blocks(options: argparse.Namespace, config: "SimplifyConfig") -> bool:
+def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int | None:
     """Decide whether a scene is simplified block by block.
 
     Args:
@@ -67,8 +67,8 @@ def works_by_blocks(options: argparse.Namespace, config: "SimplifyConfig") -> bo
         config: Every choice.
 
     Returns:
-        Whether it was asked for or, if nothing was, the scene does not fit into free memory and
-        can be read in parts.
+        Bytes that one process may use, if blocks were asked for or, if nothing was, the scene does
+        not fit into free memory and can be read in parts; None for the scene in one piece.
 
     Raises:
         InvalidArgumentError: Blocks were asked for along with what needs the scene in one piece.
@@ -81,30 +81,30 @@ def works_by_blocks(options: argparse.Namespace, config: "SimplifyConfig") -> bo
 
     goals = ("target_psnr", "target_ssim", "time_budget", "cameras")
     given = [name for name in goals if getattr(options, name, None) is not None]
+    memory = available_memory() if options.memory is None else read_bytes(options.memory)
     if options.memory is None and options.scheduler is None:
         try:
-            fits = block_count(open_rows(options.input), available_memory()) == 1
-            if not fits and not given:
-                check_config(config)
+            if given or block_count(open_rows(options.input), memory) == 1:
+                return None
+            check_config(config)
         except (InputError, FileFormatError, ConfigError):
-            return False
-        return not fits and not given
-    memory = None if options.memory is None else read_bytes(options.memory)
-    if options.scheduler is None and memory is not None:
-        source = open_rows(options.input)
-        if block_count(source, memory) == 1:
-            return False
+            return None
+        return memory
+    if options.scheduler is None and block_count(open_rows(options.input), memory) == 1:
+        return None
     if given:
         words = ", ".join("--" + name.replace("_", "-") for name in given)
         raise InvalidArgumentError(f"blocks cannot go with {words}, which need the whole scene.")
     check_config(config)
-    return True
+    return memory
 
 
 def run_by_blocks(
     options: argparse.Namespace,
     checkpoint: str | None,
     config: "SimplifyConfig",
+    *,
+    memory: int,
     listener: ProgressListener,
 ) -> "SimplifyReport":
     """Simplify a file block by block, here or on a cluster.
@@ -113,12 +113,13 @@ def run_by_blocks(
         options: The parsed options.
         checkpoint: The network.
         config: Every choice.
+        memory: Bytes that one process may use.
         listener: Told about progress.
 
     Returns:
         The report.
     """
-    from cvtgs.blocks import read_bytes, simplify_file  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.blocks import simplify_file  # noqa: PLC0415 (keeps --help fast)
     from cvtgs.blocks.distributed import connect, workers_of  # noqa: PLC0415
     from cvtgs.blocks.run import this_process  # noqa: PLC0415
     from cvtgs.boxes import read_boxes  # noqa: PLC0415
@@ -131,7 +132,7 @@ def run_by_blocks(
             options.output,
             options.rho,
             count=options.count,
-            memory=None if options.memory is None else read_bytes(options.memory),
+            memory=memory,
             boxes=() if options.keep is None else read_boxes(options.keep),
             simplifier=Simplifier(checkpoint, config=config, device="cpu"),
             workers=this_process if client is None else workers_of(client),

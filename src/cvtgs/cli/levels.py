@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cvtgs.cli.display import READABLE, progress_bars, size_text
+from cvtgs.cli.lists import ratios_of
 from cvtgs.cli.looking import (
     add_looking_options,
     background_color,
@@ -13,7 +14,6 @@ from cvtgs.cli.looking import (
     looking_device,
 )
 from cvtgs.cli.simplify import read_settings
-from cvtgs.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -77,7 +77,7 @@ def run(options: argparse.Namespace) -> None:
     from cvtgs.simplify import Simplifier  # noqa: PLC0415
 
     check_looking_options(options)
-    rhos = _ratios(options.rho)
+    rhos = sorted(ratios_of(options.rho), reverse=True)
     for rho in rhos:
         target_count(1, rho)
     names = level_names(rhos, options.suffix)
@@ -103,18 +103,6 @@ def run(options: argparse.Namespace) -> None:
         )
     if not options.quiet:
         _print_index(index)
-
-
-def _ratios(text: str) -> list[float]:
-    try:
-        rhos = [float(word) for word in text.split(",") if word.strip()]
-    except ValueError:
-        rhos = []
-    if not rhos or len(set(rhos)) < len(rhos):
-        raise InvalidArgumentError(
-            f"--rho must be different numbers with commas, for example 0.1,0.01; found {text!r}."
-        )
-    return sorted(rhos, reverse=True)
 
 
 def _scores(

@@ -45,6 +45,15 @@ def add_scoring_options(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument("reference", metavar="REF", type=Path, help=f"the full scene ({READABLE})")
     parser.add_argument("small", metavar="SMALL", type=Path, nargs="+", help="simplified scenes")
+    add_lpips_option(parser)
+
+
+def add_lpips_option(parser: argparse.ArgumentParser) -> None:
+    """Let the user choose which LPIPS to measure.
+
+    Args:
+        parser: Where to add it.
+    """
     parser.add_argument(
         "--lpips",
         default="auto",
@@ -143,13 +152,9 @@ def looking_device(options: argparse.Namespace) -> "torch.device":
     Raises:
         DeviceError: There is no such device.
     """
-    import torch  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.devices import chosen_device  # noqa: PLC0415 (keeps --help fast)
 
-    from cvtgs.devices import resolve_device  # noqa: PLC0415
-
-    return resolve_device(options.device) or torch.device(
-        "cuda" if torch.cuda.is_available() else "cpu"
-    )
+    return chosen_device(options.device)
 
 
 def check_looking_options(options: argparse.Namespace) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cvtgs.cli.display import (
+    PRESET_NAMES,
     READABLE,
     WRITABLE,
     file_size,
@@ -13,7 +14,7 @@ from cvtgs.cli.display import (
 )
 from cvtgs.cli.effects import add_effects_option, effect_settings, load_needed
 from cvtgs.cli.goals import Goals, add_goal_options
-from cvtgs.cli.large import add_large_options, run_by_blocks, works_by_blocks
+from cvtgs.cli.large import add_large_options, block_memory, run_by_blocks
 from cvtgs.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "--preset",
         metavar="NAME",
-        help="from the fastest to the best: draft, fast, standard (default), high, max; or paper",
+        help=f"{PRESET_NAMES} (default standard)",
     )
     parser.add_argument(
         "--ckpt",
@@ -117,8 +118,9 @@ def run(options: argparse.Namespace) -> None:
     if options.report is not None:
         check_output(options.report, overwrite=options.overwrite)
     with progress_bars(quiet=options.quiet) as listener:
-        if works_by_blocks(options, config):
-            report = run_by_blocks(options, checkpoint, config, listener)
+        memory = block_memory(options, config)
+        if memory is not None:
+            report = run_by_blocks(options, checkpoint, config, memory=memory, listener=listener)
         else:
             scene = load_needed(options.input, config)
             cameras = None if options.cameras is None else load_cameras(options.cameras)

@@ -4,14 +4,15 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cvtgs.cli.display import progress_bars
+from cvtgs.cli.display import READABLE, progress_bars
+from cvtgs.cli.lists import ratios_of, words_of
 from cvtgs.cli.looking import (
     add_looking_options,
+    add_lpips_option,
     background_color,
     check_looking_options,
     chosen_cameras,
 )
-from cvtgs.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
     from cvtgs.tradeoff import Tradeoff
@@ -34,7 +35,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "and index.html, one file that needs no network. Of given cameras, 8 are used unless "
         "--views says otherwise.",
     )
-    parser.add_argument("input", metavar="IN", type=Path, help="the full scene (.ply)")
+    parser.add_argument("input", metavar="IN", type=Path, help=f"the full scene ({READABLE})")
     parser.add_argument(
         "--rho", default="0.1,0.01,0.001", metavar="R,R", help="ratios (default 0.1,0.01,0.001)"
     )
@@ -43,12 +44,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "-o", "--output", type=Path, required=True, metavar="DIR", help="directory to write to"
     )
     parser.add_argument("--save", action="store_true", help="keep the small scenes there, too")
-    parser.add_argument(
-        "--lpips",
-        default="auto",
-        choices=("auto", "vgg", "alex", "off"),
-        help="which LPIPS to measure (default: VGG or Alex if there are weights)",
-    )
+    add_lpips_option(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace existing files")
     add_looking_options(parser, size=SIZE)
     parser.set_defaults(run=run)
@@ -66,8 +62,8 @@ def run(options: argparse.Namespace) -> None:
     from cvtgs.tradeoff.runs import tasks_of  # noqa: PLC0415
 
     check_looking_options(options)
-    presets = None if options.presets is None else _words(options.presets)
-    ratios = _ratios(options.rho)
+    presets = None if options.presets is None else words_of(options.presets)
+    ratios = ratios_of(options.rho)
     kept = tuple(task.file_name for task in tasks_of(presets, ratios) if options.save)
     check_tradeoff_files(options.output, more=kept, overwrite=options.overwrite)
     with progress_bars(quiet=options.quiet) as listener:
@@ -92,19 +88,6 @@ def run(options: argparse.Namespace) -> None:
         print(f"Wrote {names}. Open {paths[-1]} in a browser.")
         if note:
             print(f"Without a plot: {note}")
-
-
-def _words(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
-
-
-def _ratios(text: str) -> list[float]:
-    try:
-        return [float(word) for word in _words(text)]
-    except ValueError:
-        raise InvalidArgumentError(
-            f"--rho must be numbers with commas, for example 0.1,0.01; found {text!r}."
-        ) from None
 
 
 def _print_tables(tradeoff: "Tradeoff") -> None:

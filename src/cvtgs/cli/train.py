@@ -54,9 +54,7 @@ def run(options: argparse.Namespace) -> None:
     Args:
         options: The parsed options.
     """
-    import torch  # noqa: PLC0415 (keeps --help fast)
-
-    from cvtgs.devices import resolve_device  # noqa: PLC0415
+    from cvtgs.devices import chosen_device  # noqa: PLC0415
     from cvtgs.io import check_output  # noqa: PLC0415
     from cvtgs.train import TrainConfig, TrainFiles, train  # noqa: PLC0415
 
@@ -66,8 +64,7 @@ def run(options: argparse.Namespace) -> None:
     files = TrainFiles.beside(options.output, options.cache)
     goes_on = options.resume and files.state.is_file()
     check_output(options.output, overwrite=options.overwrite or goes_on)
-    fastest = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    device = resolve_device(options.device) or fastest
+    device = chosen_device(options.device)
     with progress_bars(quiet=options.quiet) as listener:
         history = train(
             config,

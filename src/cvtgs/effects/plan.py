@@ -180,14 +180,11 @@ def _mip(scene: GaussianScene, config: SimplifyConfig) -> Effect:
 
 
 def _unbounded(share: float, config: SimplifyConfig) -> Effect:
-    choice = config.effects.unbounded
-    least = UNBOUNDED_SHARE if choice == "auto" else 0.0
-    return Effect(
-        active=share > least and choice != "off",
-        figure=share,
-        meaning=f"share of mass beyond {UNBOUNDED_DISTANCE:g} robust radii, "
-        f"on above {UNBOUNDED_SHARE:g}",
-        forced=choice != "auto",
+    return _shared(
+        share,
+        config.effects.unbounded,
+        least=UNBOUNDED_SHARE,
+        meaning=f"share of mass beyond {UNBOUNDED_DISTANCE:g} robust radii",
     )
 
 
@@ -213,13 +210,20 @@ def _flat(two_scales: bool, config: SimplifyConfig) -> Effect:
 
 
 def _duplicates(share: float, config: SimplifyConfig) -> Effect:
-    choice = config.effects.duplicates
-    least = DUPLICATE_SHARE if choice == "auto" else 0.0
+    return _shared(
+        share,
+        config.effects.duplicates,
+        least=DUPLICATE_SHARE,
+        meaning="share of Gaussians exactly where others of their colour are",
+    )
+
+
+def _shared(share: float, choice: str, *, least: float, meaning: str) -> Effect:
+    """Decide on what needs a share above ``least``, or any share if it is forced on."""
     return Effect(
-        active=share > least and choice != "off",
+        active=share > (least if choice == "auto" else 0.0) and choice != "off",
         figure=share,
-        meaning="share of Gaussians exactly where others of their colour are, "
-        f"on above {DUPLICATE_SHARE:g}",
+        meaning=f"{meaning}, on above {least:g}",
         forced=choice != "auto",
     )
 

@@ -15,7 +15,7 @@ import torch
 
 import cvtgs
 from cvtgs.config import PRESETS, SimplifyConfig
-from cvtgs.devices import device_name, resolve_device
+from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import OutputError
 from cvtgs.goals.calibrate import CANDIDATES, calibrate, measured_seconds
 from cvtgs.goals.cost_model import CostModel
@@ -78,7 +78,7 @@ def cost_model(
         >>> model.presets
         ('standard',)
     """
-    where = _where(device)
+    where = chosen_device(device)
     key = machine_key(where)
     path = _path(key, folder)
     known = None if recalibrate else _recall(path, key)
@@ -102,7 +102,7 @@ def is_known(device: str | torch.device = "auto", *, folder: Path | None = None)
     Raises:
         DeviceError: There is no such device.
     """
-    key = machine_key(_where(device))
+    key = machine_key(chosen_device(device))
     return _recall(_path(key, folder), key) is not None
 
 
@@ -149,10 +149,6 @@ def cache_folder() -> Path:
         return Path(named) / "cvtgs"
     home = Path(os.path.expanduser("~"))  # noqa: PTH111 (Path.home() fails where there is none)
     return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "cvtgs"
-
-
-def _where(device: str | torch.device) -> torch.device:
-    return resolve_device(device) or torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def _path(key: dict[str, str], folder: Path | None) -> Path:

@@ -10,6 +10,9 @@ from typing import Any, BinaryIO
 
 from cvtgs.errors import CvtgsError, FileFormatError, InputError, InputNotFoundError
 
+_POINTER = b"version https://git-lfs."
+"""How the few lines start that a clone without Git LFS has in place of a large file."""
+
 
 @contextmanager
 def open_input(path: Path) -> Iterator[BinaryIO]:
@@ -24,6 +27,7 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
     Raises:
         InputNotFoundError: There is no such file.
         InputError: It cannot be opened or read.
+        FileFormatError: It only points to a file of Git LFS.
 
     Example:
         >>> import tempfile
@@ -39,6 +43,11 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
             kind = "directory" if stat.S_ISDIR(mode) else "device or a pipe"
             raise InputError(f"{path}: must be a regular file, found a {kind}.")
         with path.open("rb") as file:
+            if file.peek(len(_POINTER)).startswith(_POINTER):
+                raise FileFormatError(
+                    f"{path}: must be the file itself, found a pointer of Git LFS to it; get the "
+                    "file with: git lfs pull."
+                )
             yield file
     except FileNotFoundError as error:
         if isinstance(error, CvtgsError):

@@ -10,12 +10,8 @@ from typing import BinaryIO, TypeVar
 
 import torch
 
-from cvtgs.errors import (
-    DeviceError,
-    DroppedDataWarning,
-    FileFormatError,
-    InvalidArgumentError,
-)
+from cvtgs.devices import usable_device
+from cvtgs.errors import DroppedDataWarning, FileFormatError, InvalidArgumentError
 from cvtgs.io.atomic import atomic_output, check_output
 from cvtgs.io.checkpoints import read_checkpoint
 from cvtgs.io.compressed_ply import (
@@ -114,7 +110,7 @@ def load(
         ...     load(Path(folder) / "two.ply")
         GaussianScene(2 Gaussians, SH degree 0, float32, cpu)
     """
-    _check_device(device)
+    usable_device(device)
     _check_degree(sh_degree)
     source = scene_file(path)
     if not os.path.isfile(source):  # noqa: PTH113 (Path.is_file raises without permission)
@@ -242,13 +238,3 @@ def _by_name(path: Path, formats: Mapping[str, Entry]) -> Entry:
         f"{path}: the file name must end in {', '.join(ends)} or {last}, "
         f"found {f'the suffix {path.suffix!r}' if path.suffix else 'no suffix'}."
     )
-
-
-def _check_device(device: str | torch.device) -> None:
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0].rstrip(".")
-        raise DeviceError(
-            f"the device must be one of this machine, {device!s} is not: {reason}."
-        ) from error

@@ -6,7 +6,7 @@ import torch
 
 from cvtgs.cameras import Cameras
 from cvtgs.config import RefineConfig
-from cvtgs.devices import resolve_device
+from cvtgs.devices import chosen_device
 from cvtgs.errors import InvalidSceneError
 from cvtgs.filters import invalid_rows
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
@@ -97,7 +97,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     if seconds is None and steps is None:
         seconds, steps = config.seconds or None, config.steps or None
     check_budget(seconds, steps=steps)
-    place = _device_for(small, device)
+    place = chosen_device(device, small.device)
     ours, theirs = _prepared(small, full, place)
     limit = DEFAULT_STEPS if seconds is None and steps is None else steps
     budget, clock = Budget(seconds, steps=limit), StageClock(listener, place)
@@ -144,14 +144,6 @@ def join_reports(report: SimplifyReport, refined: Refined) -> SimplifyReport:
             "mass_out": float(refined.scene.masses.sum()),
         }
     )
-
-
-def _device_for(small: GaussianScene, device: str | torch.device) -> torch.device:
-    resolved = resolve_device(device)
-    if resolved is not None:
-        return resolved
-    moves = small.device.type == "cpu" and torch.cuda.is_available()
-    return torch.device("cuda") if moves else small.device
 
 
 def _prepared(

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 
 from cvtgs.cameras import Cameras
-from cvtgs.devices import device_name, resolve_device
+from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import RunError
 from cvtgs.evaluate import Comparison, EvaluationSettings, SceneScores, compare
 from cvtgs.io import load
@@ -93,7 +93,7 @@ def measure_tradeoff(
         [('standard 0.1', 50)]
     """
     tasks = tasks_of(presets, ratios)
-    where = resolve_device(device) or torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    where = chosen_device(device)
     full = load(source).to(where)
     views = cameras(full)
     with _folder(folder) as place:

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import BinaryIO, Literal, NoReturn, get_args
 
 import numpy as np
@@ -14,6 +15,13 @@ Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
 MAX_HEADER_BYTES = 1 << 20
 """Longer headers are refused; a 3DGS header has about two thousand bytes."""
 
+_STRANGERS = MappingProxyType(
+    {
+        b"\x1f\x8b": "a gzip file; unpack it first",
+        b"PK\x03\x04": "a zip archive; unpack it first",
+        b"<": "a web page; a download that failed leaves one",
+    }
+)
 _MAX_COUNT_DIGITS = 18
 _MAX_NAME_LETTERS = 200
 
@@ -149,6 +157,14 @@ def read_header(file: BinaryIO, path: str) -> Header:
     )
 
 
+def _start_of(block: bytes) -> str:
+    """Say what a file is that is no PLY file, as far as its first bytes tell."""
+    for start, found in _STRANGERS.items():
+        if block.startswith(start):
+            return found
+    return repr(block[:8])
+
+
 def _header_lines(block: bytes, path: str) -> tuple[list[str], int]:
     """Give the lines between ``ply`` and ``end_header``, and where the data starts."""
     if not block:
@@ -156,7 +172,7 @@ def _header_lines(block: bytes, path: str) -> tuple[list[str], int]:
     first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", block)
     if not first:
         raise FileFormatError(
-            f"{path}: a PLY file must start with the line 'ply', found {block[:8]!r}."
+            f"{path}: a PLY file must start with the line 'ply', found {_start_of(block)}."
         )
     old_mac = first[1] == b"\r"
     newline, blanks = (b"\r", rb"[ \t]*") if old_mac else (b"\n", rb"[ \t]*\r?")

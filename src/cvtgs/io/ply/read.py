@@ -1,12 +1,12 @@
 """Read a 3DGS scene from a PLY file."""
 
 import os
-import stat
 import warnings
 from pathlib import Path
 from typing import BinaryIO
 
-from cvtgs.errors import DroppedDataWarning, InputError, InputNotFoundError
+from cvtgs.errors import DroppedDataWarning
+from cvtgs.io.files import open_input
 from cvtgs.io.ply import fast, generic
 from cvtgs.io.ply.assemble import assemble
 from cvtgs.io.ply.header import Element, Header, read_header
@@ -33,26 +33,8 @@ def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -
         InputError: It cannot be opened or read.
         FileFormatError: It is not a PLY file of a 3DGS scene, or damaged.
     """
-    try:
-        _check_regular(path)
-        with path.open("rb") as file:
-            return _read(file, str(path), sh_degree=sh_degree, extras=extras)
-    except FileNotFoundError as error:
-        raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
-    except InputError:
-        raise
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
-
-
-def _check_regular(path: Path) -> None:
-    """Refuse what cannot be mapped, before it is opened: opening a pipe would wait for ever."""
-    mode = path.stat().st_mode
-    if stat.S_ISDIR(mode):
-        raise InputError(f"{path}: must be a file, found a directory.")
-    if not stat.S_ISREG(mode):
-        raise InputError(f"{path}: must be a regular file, found a device or a pipe.")
+    with open_input(path) as file:
+        return _read(file, str(path), sh_degree=sh_degree, extras=extras)
 
 
 def _read(file: BinaryIO, path: str, *, sh_degree: int | None, extras: bool) -> GaussianScene:

@@ -10,7 +10,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from cvtgs.errors import FileFormatError, InputError, InputNotFoundError
+from cvtgs.errors import FileFormatError
+from cvtgs.io.files import open_input
 from cvtgs.io.ply import fast
 from cvtgs.io.ply.assemble import assemble
 from cvtgs.io.ply.header import read_header
@@ -86,17 +87,9 @@ def open_rows(path: str | os.PathLike[str]) -> PlyRows:
         FileFormatError: It is no binary little endian PLY of a 3DGS scene, with vertices first.
     """
     name = os.fspath(path)
-    try:
-        with Path(path).open("rb") as file:
-            header = read_header(file, name)
-            size = os.fstat(file.fileno()).st_size
-    except FileNotFoundError as error:
-        raise InputNotFoundError(f"{name}: the file to read must exist, found none.") from error
-    except InputError:
-        raise
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise InputError(f"{name}: the file must be readable, found: {reason}.") from error
+    with open_input(Path(path)) as file:
+        header = read_header(file, name)
+        size = os.fstat(file.fileno()).st_size
     vertex = find_vertices(header, name)
     check_size(header, vertex, path=name, size=size)
     if not fast.can_read(header):

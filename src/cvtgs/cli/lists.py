@@ -1,0 +1,46 @@
+"""Options that take several words: ``0.1,0.01`` and ``draft,fast``."""
+
+from cvtgs.errors import InvalidArgumentError
+
+
+def words_of(text: str) -> list[str]:
+    """Read words with commas between them.
+
+    Args:
+        text: The words.
+
+    Returns:
+        Each of them.
+
+    Example:
+        >>> words_of("draft, fast,")
+        ['draft', 'fast']
+    """
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def ratios_of(text: str) -> list[float]:
+    """Read ratios of Gaussians to keep with commas between them.
+
+    Args:
+        text: What ``--rho`` was given.
+
+    Returns:
+        The ratios, in that order; whether they are in range is not looked at.
+
+    Raises:
+        InvalidArgumentError: They are not numbers, there is none, or one is there twice.
+
+    Example:
+        >>> ratios_of("0.01, 0.1")
+        [0.01, 0.1]
+    """
+    try:
+        ratios = [float(word) for word in words_of(text)]
+    except ValueError:
+        ratios = []
+    if not ratios or len(set(ratios)) < len(ratios):
+        raise InvalidArgumentError(
+            f"--rho must be different numbers with commas, for example 0.1,0.01; found {text!r}."
+        )
+    return ratios
