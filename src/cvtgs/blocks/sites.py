@@ -8,15 +8,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cvtgs import cvt
 from cvtgs.blocks.borders import Across, Nearest, bounds_of, nearest_anywhere
 from cvtgs.blocks.job import Job
 from cvtgs.blocks.rows import CELL, cut_pieces, read_rows, record_type
 from cvtgs.blocks.survey import raw_weights
+from cvtgs.cvt.lloyd import centroids, weighted_sums
+from cvtgs.cvt.tessellate import fill_empty_cells, first_seeds, sampled, search_of
 from cvtgs.devices import one_thread
 from cvtgs.io import atomic_output
 from cvtgs.io.tensors import map_tensors, save_tensors
-from cvtgs.stages import Outlook, place_rows
+from cvtgs.stages.outlook import Outlook
+from cvtgs.stages.placing import places_of, rows_along_curve
 
 
 @one_thread()
@@ -29,11 +31,11 @@ def place(job: Job, block: int) -> None:
     """
     if job.sites_path(0, block).exists():
         return
-    _, points, weights = _points(job, block)
+    order, points, weights = _points(job, block)
     choices, target = job.config.cvt, job.read_survey()[1][block]
-    seeds = cvt.first_seeds(weights, target, config=choices, seed=job.config.seed)
-    sample, shares = cvt.sampled(points, weights, choices.samples_per_site * target)
-    save_tensors(job.sample_path(block), {"points": sample, "weights": shares}, {})
+    seeds = first_seeds(weights, target, config=choices, seed=job.config.seed)
+    sample, shares = sampled(points, weights, choices.samples_per_site * target)
+    save_tensors(job.sample_path(block), {"order": order, "points": sample, "weights": shares}, {})
     _save_sites(job, 0, block, points[seeds].double())
 
 
@@ -56,7 +58,7 @@ def settle(job: Job, turn: int, block: int) -> float:
     points, weights = tensors["points"], tensors["weights"]
     count, found = _search(job, turn, block, points)
     labels, strangers = _numbered(found, count)
-    totals, sums = cvt.weighted_sums(points, weights, labels, count + len(strangers))
+    totals, sums = weighted_sums(points, weights, labels, count + len(strangers))
     energy = (weights * found.squared).sum()
     result = {"totals": totals, "sums": sums, "strangers": strangers, "energy": energy}
     save_tensors(path, result, {})
@@ -70,20 +72,23 @@ def move(job: Job, turn: int) -> None:
         job: What is to be done; every block must have been settled.
         turn: Which move of Lloyd, from 0.
     """
+    left = [block for block in job.busy() if not job.sites_path(turn + 1, block).exists()]
     border: dict[str, list[Tensor]] = {name: [] for name in ("strangers", "totals", "sums")}
+    if not left:
+        return
     for block in job.busy():
         tensors, _ = map_tensors(job.sums_path(turn, block))
         for name, values in border.items():
             values.append(tensors[name][len(tensors[name]) - len(tensors["strangers"]) :])
     strangers, totals, sums = (torch.cat(parts) for parts in border.values())
-    for block in job.busy():
+    for block in left:
         tensors, _ = map_tensors(job.sums_path(turn, block))
         sites = map_tensors(job.sites_path(turn, block))[0]["sites"]
         here = (strangers[:, 0] == block).nonzero()[:, 0]
         numbers = strangers[here, 1]
         total = tensors["totals"][: len(sites)].index_add(0, numbers, totals[here])
         summed = tensors["sums"][: len(sites)].index_add(0, numbers, sums[here])
-        _save_sites(job, turn + 1, block, cvt.centroids(total, summed, sites))
+        _save_sites(job, turn + 1, block, centroids(total, summed, sites))
 
 
 @one_thread()
@@ -99,33 +104,37 @@ def assign(job: Job, turn: int, block: int) -> None:
     """
     if job.labels_path(block).exists():
         return
-    order, points, weights = _points(job, block)
+    order = map_tensors(job.sample_path(block))[0]["order"]
+    order, points, weights = _points(job, block, order)
     count, found = _search(job, turn, block, points)
     found, refilled = _without_empty(found, count, weights)
     energy = (weights * found.squared).sum()
-    owners, labels = torch.empty_like(order), torch.empty_like(order)
-    owners[order], labels[order] = found.blocks, found.labels
+    rows = order.long()
+    owners, labels = torch.empty_like(rows), torch.empty_like(rows)
+    owners[rows], labels[rows] = found.blocks, found.labels
     sent = _send(job, block, owners, labels)
     labels = torch.where(owners < 0, labels, -1).int()
     result = {"labels": labels, "sent": sent, "energy": energy, "refilled": torch.tensor(refilled)}
     save_tensors(job.labels_path(block), result, {})
 
 
-def _points(job: Job, block: int) -> tuple[Tensor, Tensor, Tensor]:
+def _points(job: Job, block: int, order: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
     """Give the Gaussians of a block along a curve: rows, places in the tessellation, weights."""
     survey, targets = job.read_survey()
     scene, seen, light = read_rows(job, block, is_slim=True)
     outlook = Outlook(survey.frame, seen, seen, light, survey.plan)
-    rows = torch.arange(len(scene))
-    rows, points = place_rows(scene, rows, outlook, sum(targets), job.config)
+    if order is None:
+        order = rows_along_curve(scene, torch.arange(len(scene)), outlook).int()
+    rows = order.long()
+    points = places_of(scene, rows, outlook, sum(targets), job.config)
     weights = raw_weights(scene.opacities[rows], seen[rows], survey.power)
-    return rows, points, (weights / survey.unit).clamp_min(job.config.cvt.weight_floor)
+    return order, points, (weights / survey.unit).clamp_min(job.config.cvt.weight_floor)
 
 
 def _search(job: Job, turn: int, block: int, points: Tensor) -> tuple[int, Nearest]:
     """Give the number of sites of a block, and the nearest site of every point."""
     survey, _ = job.read_survey()
-    _, nearest = cvt.search_of(
+    _, nearest = search_of(
         job.config.cvt, points.device, has_duplicates=survey.plan.duplicates.active
     )
     sites = map_tensors(job.sites_path(turn, block))[0]["sites"]
@@ -176,7 +185,7 @@ def _without_empty(found: Nearest, count: int, weights: Tensor) -> tuple[Nearest
     away = found.blocks >= 0
     labels = torch.where(away, count, found.labels)
     total = count + int(away.any())
-    labels, squared, refilled = cvt.fill_empty_cells(labels, weights, found.squared, total)
+    labels, squared, refilled = fill_empty_cells(labels, weights, found.squared, total)
     stays = labels < count
     blocks = torch.where(stays, -1, found.blocks)
     return Nearest(blocks, torch.where(stays, labels, found.labels), squared), refilled

@@ -3,7 +3,6 @@
 from cvtgs.stages.levels import Sized, run_levels
 from cvtgs.stages.merging import NEIGHBORS
 from cvtgs.stages.outlook import Outlook
-from cvtgs.stages.placing import place_rows
 from cvtgs.stages.protected import check_room, join_scenes, run_protected
 from cvtgs.stages.run import Grouping, Reference, make_reference, run_stages
 
@@ -16,7 +15,6 @@ __all__ = [
     "check_room",
     "join_scenes",
     "make_reference",
-    "place_rows",
     "run_levels",
     "run_protected",
     "run_stages",
