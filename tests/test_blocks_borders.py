@@ -8,7 +8,7 @@ from cvtgs import Simplifier, cells, cvt, filters
 from cvtgs.blocks import simplify_file
 from cvtgs.blocks.borders import Across, Reach, bounds_of, halo, nearest_anywhere
 from cvtgs.blocks.job import Job
-from cvtgs.blocks.merging import _members
+from cvtgs.blocks.merging import read_cells
 from cvtgs.cvt.neighbors import nearest_several
 from cvtgs.evaluate import EvaluationSettings
 from cvtgs.io.ply import open_rows
@@ -213,7 +213,7 @@ def test_width_is_that_of_one_piece(job):
 
 
 def test_the_network_corrects_as_in_one_piece(job):
-    members = [_members(job, block) for block in job.busy()]
+    members = [read_cells(job, block) for block in job.busy()]
     scene, light = members[0].scene, torch.cat([one.light for one in members])
     for one in members[1:]:
         scene = join_scenes(scene, one.scene)

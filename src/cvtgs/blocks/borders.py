@@ -72,9 +72,10 @@ class Reach:
         Returns:
             Their reach.
         """
-        runs = torch.stack([bounds_of(part) for part in points.split(RUN)])
-        farthest = torch.stack([part.amax() for part in squared.split(RUN)])
-        return cls(points=points, squared=squared, runs=runs, farthest=farthest)
+        lows = torch.stack([_of_runs(-column) for column in points.unbind(1)], dim=1)
+        highs = torch.stack([_of_runs(column) for column in points.unbind(1)], dim=1)
+        runs = torch.stack([-lows, highs], dim=1).double()
+        return cls(points=points, squared=squared, runs=runs, farthest=_of_runs(squared))
 
     def rows(self, bounds: Float[Tensor, "2 d"]) -> Int[Tensor, "k"]:
         """Give the points to which something in a box may matter.
@@ -99,6 +100,14 @@ class Reach:
         places = self.points[rows].double()
         gaps = torch.maximum(places - high, low - places).clamp_min(0.0)
         return rows[gaps.square().sum(dim=1) < self.squared[rows]]
+
+
+def _of_runs(values: Float[Tensor, "n"]) -> Float[Tensor, "r"]:
+    """Give the largest value of every run."""
+    missing = -len(values) % RUN
+    padded = torch.cat([values, values[-1:].expand(missing)])
+    largest: Tensor = padded.unflatten(0, (-1, RUN)).amax(dim=1)
+    return largest
 
 
 class Nearest(NamedTuple):

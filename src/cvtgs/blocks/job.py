@@ -173,7 +173,7 @@ class Job:
         try:
             manifest = json.loads(self.path("manifest.json").read_text(encoding="utf-8"))
             self.read_survey()
-        except (OSError, ValueError, KeyError, InputNotFoundError, FileFormatError):
+        except (OSError, ValueError, KeyError, TypeError, InputNotFoundError, FileFormatError):
             return False
         return isinstance(manifest, dict) and manifest.get("key") == key
 

@@ -66,7 +66,7 @@ def merge(job: Job, block: int) -> None:
     """
     if job.merged_path(block).exists():
         return
-    _, scene, _, partition = _members(job, block)
+    _, scene, _, partition = read_cells(job, block)
     merged = cells.merge_cells(scene, partition, config=job.config.merge)
     own = {"sizes": partition.counts, "bounds": bounds_of(merged.means)}
     tensors = merged.tensors() | add_prefix(EXTRA, merged.extras) | own
@@ -118,7 +118,7 @@ def finish(job: Job, block: int) -> None:
     if job.small_path(block).exists():
         return
     survey, _ = job.read_survey()
-    original, scene, light, partition = _members(job, block)
+    original, scene, light, partition = read_cells(job, block)
     own, _ = map_tensors(job.wide_path(block))
     around = _around(job, block, own["strangers"], job.wide_path)
     small, checkpoint = around.scene, job.network
@@ -163,7 +163,16 @@ def save_block(job: Job, block: int, small: GaussianScene, said: dict[str, Any])
         save(small, job.small_path(block), overwrite=True)
 
 
-def _members(job: Job, block: int) -> Block:
+def read_cells(job: Job, block: int) -> Block:
+    """Read the Gaussians in the cells of a block.
+
+    Args:
+        job: What is to be done; every block must have been assigned.
+        block: Which block.
+
+    Returns:
+        Gaussians and cells.
+    """
     survey, targets = job.read_survey()
     rows, labels = read_members(job, block)
     original = limited(rows.scene, job.config.effects)
