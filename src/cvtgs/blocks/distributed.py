@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cvtgs.blocks.run import Item, Result, simplify_file
+from cvtgs.blocks.run import simplify_file
+from cvtgs.blocks.turns import Item, Result
 from cvtgs.errors import MissingDependencyError, RunError
 from cvtgs.report import SimplifyReport
 

@@ -23,7 +23,7 @@ from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.math.frames import RobustFrame
 from cvtgs.mergenet import Checkpoint, load_checkpoint, save_checkpoint
 
-_NUMBERS = ("faintest", "lightest", "floor", "step", "power", "mass", "rows", "kept")
+_NUMBERS = ("faintest", "lightest", "unit", "floor", "step", "power", "mass", "rows", "kept")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,6 +69,38 @@ class Job:
     def facts_path(self, block: int) -> Path:
         """Give the file that says what was done to a block."""
         return self.path(f"small_{block:05d}.json")
+
+    def sample_path(self, block: int) -> Path:
+        """Give the file with the Gaussians of a block that Lloyd looks at."""
+        return self.path(f"sample_{block:05d}")
+
+    def sites_path(self, turn: int, block: int) -> Path:
+        """Give the file with the sites of a block after some moves."""
+        return self.path(f"sites_{turn:02d}_{block:05d}")
+
+    def sums_path(self, turn: int, block: int) -> Path:
+        """Give the file with what the Gaussians of a block add to sites, its own and others."""
+        return self.path(f"sums_{turn:02d}_{block:05d}")
+
+    def labels_path(self, block: int) -> Path:
+        """Give the file with the cell of every Gaussian of a block, and how many went where."""
+        return self.path(f"labels_{block:05d}")
+
+    def sent_path(self, block: int) -> Path:
+        """Give the file with the rows of a block that went into cells of others."""
+        return self.path(f"sent_{block:05d}")
+
+    def merged_path(self, block: int) -> Path:
+        """Give the file with the merged Gaussians of a block."""
+        return self.path(f"merged_{block:05d}")
+
+    def wide_path(self, block: int) -> Path:
+        """Give the file with the same ones widened, and with the neighbours of each."""
+        return self.path(f"wide_{block:05d}")
+
+    def busy(self) -> list[int]:
+        """Give the blocks that keep something."""
+        return [block for block, target in enumerate(self.read_survey()[1]) if target]
 
     def ranges(self) -> list[tuple[int, int, int]]:
         """Give the parts of the source: number, first row, row after the last one."""
@@ -141,7 +173,7 @@ class Job:
         try:
             manifest = json.loads(self.path("manifest.json").read_text(encoding="utf-8"))
             self.read_survey()
-        except (OSError, ValueError, KeyError, InputNotFoundError, FileFormatError):
+        except (OSError, ValueError, KeyError, TypeError, InputNotFoundError, FileFormatError):
             return False
         return isinstance(manifest, dict) and manifest.get("key") == key
 

@@ -2,17 +2,18 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Protocol, TypeVar
 
 import torch
 
 from cvtgs.blocks.finish import join_blocks, report_of
 from cvtgs.blocks.job import Job
 from cvtgs.blocks.memory import available_memory, block_count
+from cvtgs.blocks.merging import finish
 from cvtgs.blocks.survey import survey, take_sample, total
-from cvtgs.blocks.work import look, simplify_block, sort_into_blocks
+from cvtgs.blocks.turns import Workers, do_all, group_blocks, this_process, told
+from cvtgs.blocks.work import look, simplify_whole, sort_into_blocks
 from cvtgs.boxes import Box
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, target_count
@@ -26,38 +27,8 @@ from cvtgs.report import SimplifyReport, StageClock
 from cvtgs.simplify import Simplifier
 from cvtgs.stages import check_room
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
-
 RANGE_ROWS = 1 << 26
 """Rows of the file that one process looks at in one go."""
-
-
-class Workers(Protocol):
-    """Whatever calls a function for every item; results come in the order of the items."""
-
-    def __call__(
-        self, function: Callable[[Item], Result], items: Sequence[Item]
-    ) -> Iterable[Result]:
-        """Call the function for every item."""
-        ...
-
-
-def this_process(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
-    """Call a function for one item after the other, here.
-
-    Args:
-        function: What to call.
-        items: For what.
-
-    Yields:
-        The results.
-
-    Example:
-        >>> list(this_process(abs, [-1, 2]))
-        [1, 2]
-    """
-    yield from map(function, items)
 
 
 def simplify_file(  # noqa: PLR0913 (options by name)
@@ -141,12 +112,14 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         with one_thread():
             _cut(job, workers, clock)
         job.declare_cut(key)
-    found, targets = job.read_survey()
-    busy = [block for block in range(job.blocks) if targets[block]]
+    found, _ = job.read_survey()
+    busy = job.busy()
     resumed = sum(job.small_path(block).exists() for block in busy)
+    if job.blocks > 1:
+        group_blocks(job, workers, clock)
+    last = finish if job.blocks > 1 else simplify_whole
     with clock.stage("blocks", len(busy)) as advance:
-        for done, _ in enumerate(workers(partial(simplify_block, job), busy), start=1):
-            advance(done)
+        do_all(workers, partial(last, job), busy, advance)
     with clock.stage("join"):
         join_blocks(job, busy, output, overwrite=overwrite)
     report = report_of(job, found, busy, simplifier=simplifier, clock=clock, resumed=resumed)
@@ -179,7 +152,7 @@ def _cut(job: Job, workers: Workers, clock: StageClock) -> None:
         if len(sample) == 0:
             raise InvalidSceneError(f"{job.source.path}: found no valid Gaussian.")
         frame = robust_frame(sample.means)
-        depths = total(_told(workers(partial(look, job, frame), ranges), advance))
+        depths = total(told(workers(partial(look, job, frame), ranges), advance))
         check_room(depths.kept, target=job.target, total=depths.valid)
         if depths.kept == depths.valid:
             raise InvalidArgumentError(
@@ -218,13 +191,7 @@ def _sorted(
     advance: Callable[[int], None],
 ) -> tuple[list[int], list[float]]:
     counts, shares = [0] * job.blocks, [0.0] * job.blocks
-    for rows, cells in _told(workers(partial(sort_into_blocks, job), ranges), advance):
+    for rows, cells in told(workers(partial(sort_into_blocks, job), ranges), advance):
         counts = [a + b for a, b in zip(counts, rows, strict=True)]
         shares = [a + b for a, b in zip(shares, cells, strict=True)]
     return counts, shares
-
-
-def _told(results: Iterable[Result], advance: Callable[[int], None]) -> Iterator[Result]:
-    for done, result in enumerate(results, start=1):
-        yield result
-        advance(done)

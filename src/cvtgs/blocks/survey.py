@@ -54,7 +54,8 @@ class Survey(NamedTuple):
         light: Light per voxel; empty if nobody asks.
         faintest: Gaussians of lower opacity are left out.
         lightest: So are those beyond 100 radii whose mass, as seen, is not above this.
-        floor: Least weight in the tessellation.
+        unit: Mean weight in the tessellation, before there is a least one.
+        floor: Least weight.
         step: Weight of one cell; what weighs more counts as one cell.
         power: Power of the area in the weight.
         cuts: The blocks, in contracted space.
@@ -68,6 +69,7 @@ class Survey(NamedTuple):
     light: Float[Tensor, "voxels"]
     faintest: float
     lightest: float
+    unit: float
     floor: float
     step: float
     power: float
@@ -202,7 +204,8 @@ def survey(
     if outlook.plan.unbounded.active:
         power = config.cvt.unbounded_area_power
     weights = raw_weights(small.opacities, outlook.seen_areas, power)[entering]
-    floor = float(weights.mean()) * config.cvt.weight_floor
+    unit = float(weights.mean()) or 1.0
+    floor = unit * config.cvt.weight_floor
     weights = weights.clamp_min(floor)
     step = _step(weights, target / stands_for)
     shares = (weights / step).clamp_max(1.0) if step > 0 else torch.ones_like(weights)
@@ -214,6 +217,7 @@ def survey(
         light=light,
         faintest=faintest,
         lightest=lightest,
+        unit=unit,
         floor=floor,
         step=step,
         power=power,

@@ -1,9 +1,5 @@
-"""The two things that processes do: sort rows into blocks, and simplify a block."""
+"""What processes do with the source: look at it, sort its rows into blocks; and a single block."""
 
-import json
-import warnings
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,22 +9,19 @@ from torch import Tensor
 
 from cvtgs import cvt, filters
 from cvtgs.blocks.job import Job
+from cvtgs.blocks.merging import save_block
+from cvtgs.blocks.rows import LIGHT, SEEN, read_rows, record_type
 from cvtgs.blocks.survey import CHUNK, Depths, Survey, add_up, raw_weights
 from cvtgs.boxes import inside
 from cvtgs.config import SimplifyConfig
 from cvtgs.devices import one_thread
 from cvtgs.effects import limited
-from cvtgs.io import atomic_output, save
-from cvtgs.io.ply.assemble import assemble
 from cvtgs.math.frames import RobustFrame
 from cvtgs.progress import silent
 from cvtgs.report import StageClock
 from cvtgs.scene import GaussianScene
 from cvtgs.stages import Outlook, run_stages
 from cvtgs.stages.outlook import as_seen
-
-SEEN, LIGHT = "cvtgs_seen", "cvtgs_light"
-"""Columns of block files beyond those of the source: area as seen, and light."""
 
 
 @one_thread()
@@ -81,7 +74,7 @@ def sort_into_blocks(job: Job, part: tuple[int, int, int]) -> tuple[list[int], l
         rows += torch.bincount(blocks, minlength=job.blocks)
         shares += torch.bincount(blocks, cells, minlength=job.blocks)
         order = torch.sort(blocks, stable=True).indices
-        table = np.empty(len(order), _record_type(job))
+        table = np.empty(len(order), record_type(job))
         sorted_rows = places[order].numpy()
         for name in records.dtype.names or ():
             table[name] = records[name][sorted_rows]
@@ -91,64 +84,42 @@ def sort_into_blocks(job: Job, part: tuple[int, int, int]) -> tuple[list[int], l
 
 
 @one_thread()
-def simplify_block(job: Job, block: int) -> None:
-    """Simplify one block, and write it, unless that was done before.
+def simplify_whole(job: Job, block: int) -> None:
+    """Simplify the only block of a job, and write it, unless that was done before.
 
     Args:
         job: What is to be done.
         block: Which block.
     """
     survey, targets = job.read_survey()
-    target = targets[block]
-    if target == 0 or job.small_path(block).exists():
+    if job.small_path(block).exists():
         return
-    scene, seen, light = _read_block(job, block)
+    scene, seen, light = read_rows(job, block)
     scene = limited(scene, job.config.effects)
     outlook = Outlook(survey.frame, scene.areas, seen, light, survey.plan)
     checkpoint = job.network
     net = None if checkpoint is None else checkpoint.net.to(scene.dtype)
-    clock = StageClock(silent, scene.device)
-    config = config_of_block(job.config, share=target / sum(targets))
-    small, facts = run_stages(scene, target, config, net=net, clock=clock, outlook=outlook)
+    clock, config = StageClock(silent, scene.device), without_filter(job.config)
+    small, facts = run_stages(scene, targets[block], config, net=net, clock=clock, outlook=outlook)
     facts = {name: value for name, value in facts.items() if name != "plan"}
-    said = {
-        "input_count": len(scene),
-        "facts": facts,
-        "stages": [cost.model_dump() for cost in clock.costs],
-    }
-    with atomic_output(job.facts_path(block), overwrite=True) as file:
-        file.write(json.dumps(said).encode())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        save(small, job.small_path(block), overwrite=True)
+    save_block(job, block, small, {"input_count": len(scene), "facts": facts})
 
 
-def config_of_block(config: SimplifyConfig, *, share: float) -> SimplifyConfig:
-    """Give the choices for a block, such that it is treated as a part of the whole.
-
-    Nothing is filtered any more, and colour counts as in the tessellation of the whole.
+def without_filter(config: SimplifyConfig) -> SimplifyConfig:
+    """Give the choices for Gaussians of which none is to be left out any more.
 
     Args:
-        config: The choices for the whole.
-        share: Share of the block in the Gaussians to keep.
+        config: The choices for the file.
 
     Returns:
-        The choices for the block.
+        The choices for what has entered.
 
     Example:
-        >>> config_of_block(SimplifyConfig(), share=1.0).cvt == SimplifyConfig().cvt
-        True
+        >>> without_filter(SimplifyConfig()).filter.min_opacity
+        0.0
     """
-    cells = config.cvt
-    color = cells.color * share**-cells.color_power
-    return config.model_copy(
-        update={
-            "filter": config.filter.model_copy(
-                update={"min_opacity": 0.0, "max_flyaway_share": 0.0}
-            ),
-            "cvt": cells.model_copy(update={"color": color}),
-        }
-    )
+    nothing = {"min_opacity": 0.0, "max_flyaway_share": 0.0}
+    return config.model_copy(update={"filter": config.filter.model_copy(update=nothing)})
 
 
 def _entering(
@@ -165,10 +136,6 @@ def _entering(
         mass = areas * opacities * cvt.falloff(means, survey.frame)
         enters &= ~(far & (mass <= survey.lightest))
     return light[enters], seen[enters], rows[enters]
-
-
-def _record_type(job: Job) -> np.dtype[Any]:
-    return np.dtype([*job.source.names, (SEEN, "<f8"), (LIGHT, "<f4")])
 
 
 def _append(job: Job, number: int, table: NDArray[Any], counts: Tensor) -> None:
@@ -190,32 +157,3 @@ def _append_kept(
     kept["opacity"] = logits.numpy()
     with job.kept_path(number).open("ab") as file:
         file.write(kept.tobytes())
-
-
-def _read_block(job: Job, block: int) -> tuple[GaussianScene, Tensor, Tensor]:
-    """Read a block; what is mapped is let go of piece by piece."""
-    kind = _record_type(job)
-    paths = [job.rows_path(block, number) for number, _, _ in job.ranges()]
-    counts = [path.stat().st_size // kind.itemsize if path.exists() else 0 for path in paths]
-    total, done = sum(counts), 0
-    seen = torch.empty(total, dtype=torch.float64)
-    light = torch.empty(total, dtype=torch.float64)
-
-    def pieces() -> Iterator[NDArray[Any]]:
-        nonlocal done
-        for path, count in zip(paths, counts, strict=True):
-            for rows in _mapped(path, kind, count):
-                seen[done : done + len(rows)] = torch.from_numpy(rows[SEEN].copy())
-                light[done : done + len(rows)] = torch.from_numpy(rows[LIGHT].copy())
-                done += len(rows)
-                yield rows
-
-    source = job.source
-    scene = assemble(pieces(), count=total, layout=source.layout, comments=source.comments)
-    return scene, seen, light
-
-
-def _mapped(path: Path, kind: np.dtype[Any], count: int) -> Iterator[NDArray[Any]]:
-    for start in range(0, count, 1 << 14):
-        shape = (min(1 << 14, count - start),)
-        yield np.memmap(path, kind, "r", start * kind.itemsize, shape).view(np.ndarray)

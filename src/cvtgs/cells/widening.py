@@ -39,9 +39,9 @@ def widen_cells(
     standard deviations on either side. This is our own rule, not part of CVT-GS.
 
     Args:
-        merged: One Gaussian per cell.
+        merged: One Gaussian per cell, those of the partition first; others that follow only cover.
         partition: Members of the cells; cells of one member are not widened.
-        neighbors: The nearest other cells of every cell.
+        neighbors: The nearest other cells of every cell of the partition.
         everywhere: Growth of an opaque cell of 100 members along every axis.
         covered: Growth beyond that along an axis that is covered at both ends.
 
@@ -61,7 +61,7 @@ def widen_cells(
     rows = (partition.counts > 1).nonzero()[:, 0]
     log_scales = merged.log_scales.clone()
     crowding = (partition.counts.double().log10() / 2).clamp_max(1.0)
-    strength = merged.opacities.double().square() * crowding
+    strength = merged.opacities[: len(partition)].double().square() * crowding
     for part in rows.split(CHUNK):
         cover = side_cover(merged, part, neighbors[part]).amin(dim=2)
         growth = everywhere + covered * (cover / FULL_COVER).clamp_max(1.0)

@@ -95,15 +95,58 @@ def weighted_centroids(
         ... ).tolist()
         [[0.75], [7.0]]
     """
-    order, offsets = sort_by_label(labels, len(fallback))
+    totals, sums = weighted_sums(points, weights, labels, len(fallback))
+    return centroids(totals, sums, fallback)
+
+
+def weighted_sums(
+    points: Float[Tensor, "n d"],
+    weights: Float[Tensor, "n"],
+    labels: Int[Tensor, "n"],
+    count: int,
+) -> tuple[Float[Tensor, "m"], Float[Tensor, "m d"]]:
+    """Add up the points of every label.
+
+    Args:
+        points: Positions.
+        weights: Weights, at least 0.
+        labels: Label of every point, 0 to m - 1.
+        count: Number of labels, m.
+
+    Returns:
+        Sums of weights, and of weights times positions, in float64.
+
+    Example:
+        >>> totals, sums = weighted_sums(
+        ...     torch.tensor([[0.0], [1.0]]), torch.tensor([1.0, 3.0]), torch.tensor([0, 0]), 2
+        ... )
+        >>> totals.tolist(), sums.tolist()
+        ([4.0, 0.0], [[3.0], [0.0]])
+    """
+    order, offsets = sort_by_label(labels, count)
     weights = weights[order].double()
-    totals = segment_sum(weights, offsets)
+    axes = [segment_sum(column[order].double() * weights, offsets) for column in points.unbind(1)]
+    return segment_sum(weights, offsets), torch.stack(axes, dim=1)
+
+
+def centroids(
+    totals: Float[Tensor, "m"], sums: Float[Tensor, "m d"], fallback: Float[Tensor, "m d"]
+) -> Float[Tensor, "m d"]:
+    """Divide sums of points by their weight.
+
+    Args:
+        totals: Weights, at least 0.
+        sums: Weights times positions.
+        fallback: Result where there is no weight.
+
+    Returns:
+        Weighted means.
+
+    Example:
+        >>> centroids(torch.tensor([4.0, 0.0]), torch.tensor([[3.0], [0.0]]), torch.ones(2, 1))
+        tensor([[0.7500],
+                [1.0000]])
+    """
     filled = totals > 0
-    divisors = totals.where(filled, 1.0)
-    axes = [
-        torch.where(
-            filled, segment_sum(column[order].double() * weights, offsets) / divisors, other
-        )
-        for column, other in zip(points.unbind(1), fallback.unbind(1), strict=True)
-    ]
-    return torch.stack(axes, dim=1)
+    means = sums / totals.where(filled, 1.0)[:, None]
+    return torch.where(filled[:, None], means, fallback)

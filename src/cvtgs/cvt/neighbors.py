@@ -72,3 +72,36 @@ def _nearest_by_comparison(sites: Float[Tensor, "m d"], count: int) -> Int[Tenso
             for part in sites.split(step)
         ]
     )
+
+
+def nearest_several(
+    points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int, *, backend: str
+) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
+    """Find the nearest sites of every point.
+
+    Args:
+        points: Positions, none of them a site.
+        sites: Positions, at least one.
+        count: How many sites each point gets; fewer if there are not so many.
+        backend: ``scipy`` or ``torch``, as :func:`nearest_neighbors` takes it.
+
+    Returns:
+        Row numbers of sites, k = min(count, m), the nearest first, and distances in float64.
+
+    Example:
+        >>> nearest_several(torch.zeros(1, 1), torch.tensor([[2.0], [1.0]]), 1, backend="scipy")
+        (tensor([[1]]), tensor([[1.]], dtype=torch.float64))
+    """
+    among = min(count, len(sites))
+    if backend == "scipy":
+        places = np.asarray(points, dtype=np.float64)
+        distances, rows = build_tree(sites).query(places, k=[*range(1, among + 1)])
+        return torch.from_numpy(rows.astype(np.int64)), torch.from_numpy(distances)
+    step = max(1, MAX_ENTRIES // len(sites))
+    found = [
+        torch.cdist(part, sites.double(), compute_mode="donot_use_mm_for_euclid_dist").topk(
+            among, dim=1, largest=False
+        )
+        for part in points.double().split(step)
+    ]
+    return torch.cat([one.indices for one in found]), torch.cat([one.values for one in found])

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cvtgs.config import TessellationConfig
 from cvtgs.cvt.lloyd import lloyd
-from cvtgs.cvt.nearest import nearest_backend
+from cvtgs.cvt.nearest import NearestSite, nearest_backend
 from cvtgs.cvt.places import once_per_place
 from cvtgs.cvt.seeding import stratified_seeds, weighted_seeds
 from cvtgs.errors import InvalidArgumentError
@@ -79,14 +79,9 @@ def tessellate(
         raise InvalidArgumentError(
             f"count must be between 1 and the number of points, {len(points)}; found {count}."
         )
-    backend, nearest = nearest_backend(config.backend, points.device)
-    if has_duplicates:
-        nearest = once_per_place(nearest)
-    if config.seeding == "weighted":
-        seeds = weighted_seeds(weights, count, torch.Generator().manual_seed(seed))
-    else:
-        seeds, _ = stratified_seeds(weights, count)
-    sample, sample_weights = _sample(points, weights, config.samples_per_site * count)
+    backend, nearest = search_of(config, points.device, has_duplicates=has_duplicates)
+    seeds = first_seeds(weights, count, config=config, seed=seed)
+    sample, sample_weights = sampled(points, weights, config.samples_per_site * count)
     settled = lloyd(
         sample,
         sample_weights,
@@ -109,8 +104,55 @@ def tessellate(
     )
 
 
-def _sample(points: Tensor, weights: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Take fewer points, which stand for all by weight, if that saves at least half of them."""
+def search_of(
+    config: TessellationConfig, device: torch.device, *, has_duplicates: bool
+) -> tuple[str, NearestSite]:
+    """Choose what searches the nearest site.
+
+    Args:
+        config: The backend.
+        device: Where the points are.
+        has_duplicates: Whether it pays to search for equal points only once.
+
+    Returns:
+        The name of the backend and the function.
+    """
+    backend, nearest = nearest_backend(config.backend, device)
+    return backend, once_per_place(nearest) if has_duplicates else nearest
+
+
+def first_seeds(
+    weights: Float[Tensor, "n"], count: int, *, config: TessellationConfig, seed: int
+) -> Int[Tensor, "m"]:
+    """Choose the points at which sites start.
+
+    Args:
+        weights: Weights of points along a space-filling curve, at least 0.
+        count: Number of sites, at most n.
+        config: How they are chosen.
+        seed: Seed of weighted seeding.
+
+    Returns:
+        Row numbers, ascending.
+    """
+    if config.seeding == "weighted":
+        return weighted_seeds(weights, count, torch.Generator().manual_seed(seed))
+    return stratified_seeds(weights, count)[0]
+
+
+def sampled(
+    points: Float[Tensor, "n d"], weights: Float[Tensor, "n"], size: int
+) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k"]]:
+    """Take fewer points, which stand for all by weight, if that saves at least half of them.
+
+    Args:
+        points: Positions along a space-filling curve.
+        weights: Their weights.
+        size: How many are enough; 0 takes all.
+
+    Returns:
+        Points, and what they weigh now.
+    """
     enough = max(size, MIN_SAMPLES)
     if size == 0 or enough >= len(points) // 2:
         return points, weights

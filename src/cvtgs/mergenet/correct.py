@@ -25,6 +25,7 @@ def correct_cells(
     *,
     neighbors: Int[Tensor, "m k"],
     light: Float[Tensor, "n"],
+    sizes: Int[Tensor, "m_all"] | None = None,
     on_cells: Callable[[int], None] = lambda done: None,
 ) -> GaussianScene:
     """Correct every merged Gaussian that stands for several.
@@ -32,10 +33,12 @@ def correct_cells(
     Args:
         net: The network, on the device of the scene.
         scene: The Gaussians, with valid rows.
-        merged: One Gaussian per cell.
+        merged: One Gaussian per cell, those of the partition first; others that follow are only
+            seen by their neighbours.
         partition: Members of the cells; cells of one member are not looked at.
-        neighbors: The nearest other cells of every cell.
+        neighbors: The nearest other cells of every cell of the partition.
         light: How freely every Gaussian can be seen, 0 to 1.
+        sizes: Number of members of every cell in ``merged``; None if all are in the partition.
         on_cells: Told how many cells are done.
 
     Returns:
@@ -57,9 +60,10 @@ def correct_cells(
         >>> bool((corrected.means == merged.means).all())
         True
     """
-    sizes, near = partition.counts, neighbors.shape[1]
-    cells = (sizes > 1).nonzero()[:, 0]
-    several = partition.select(sizes > 1)
+    counts, near = partition.counts, neighbors.shape[1]
+    sizes = counts if sizes is None else sizes
+    cells = (counts > 1).nonzero()[:, 0]
+    several = partition.select(counts > 1)
     done = len(partition) - len(cells)
     tensors = {name: values.clone() for name, values in merged.tensors().items()}
     filled = [name for name, values in tensors.items() if values.numel()]  # not SH of degree 0

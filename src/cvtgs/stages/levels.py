@@ -19,13 +19,13 @@ from cvtgs.scene import GaussianScene
 from cvtgs.stages.entering import left_out_facts, valid_scene
 from cvtgs.stages.merging import merge_groups
 from cvtgs.stages.outlook import Outlook, look
+from cvtgs.stages.placing import place_rows
 from cvtgs.stages.run import (
     Grouping,
     Reference,
     all_rows,
     finished,
     grouping_facts,
-    place_rows,
     run_stages,
 )
 

@@ -11,7 +11,6 @@ from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
 from cvtgs.effects import restored, trimmed
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.math.morton import morton_order
 from cvtgs.mergenet import MergeNet, correct_cells
 from cvtgs.progress import silent
 from cvtgs.report import StageClock
@@ -19,6 +18,7 @@ from cvtgs.scene import GaussianScene
 from cvtgs.stages.entering import entering_rows, valid_scene
 from cvtgs.stages.merging import merge_groups
 from cvtgs.stages.outlook import Outlook, look, look_at_scene
+from cvtgs.stages.placing import place_rows
 
 
 class Reference(NamedTuple):
@@ -257,36 +257,3 @@ def grouping_facts(
         "energy": tessellation.energy,
         "backend": tessellation.backend,
     }
-
-
-def place_rows(
-    scene: GaussianScene, rows: Tensor, outlook: Outlook, target: int, config: SimplifyConfig
-) -> tuple[Tensor, Tensor]:
-    """Place Gaussians in the space of the tessellation.
-
-    Args:
-        scene: The Gaussians.
-        rows: Which of them.
-        outlook: What is known of them.
-        target: Number of cells, which sets what colour counts.
-        config: Every choice.
-
-    Returns:
-        The rows and their points, both along a Morton curve.
-    """
-    # A curve through contracted space stays fine where the bulk is, whatever flies away.
-    curve = cvt.embed(scene.means[rows], frame=outlook.frame, contracted=True)
-    rows = rows[morton_order(curve, ties=outlook.seen_areas[rows] * scene.opacities[rows])]
-    del curve
-    points = cvt.embed(
-        scene.means[rows],
-        scene.sh0[rows],
-        frame=outlook.frame,
-        contracted=outlook.plan.unbounded.active,
-        color=config.cvt.color * (target / COLOR_CELLS) ** config.cvt.color_power,
-    )
-    return rows, points
-
-
-COLOR_CELLS = 10_000
-"""The number of cells that ``cvt.color`` is meant for."""
