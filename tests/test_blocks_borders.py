@@ -15,6 +15,7 @@ from cvtgs.io.ply import open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import correct_cells
 from cvtgs.stages import join_scenes
+from cvtgs.stages.merging import shape_cells
 from cvtgs.views import automatic_views
 from scenes import same_bits
 
@@ -170,10 +171,10 @@ def test_gaussians_go_to_cells_of_other_blocks(job):
     survey, _ = job.read_survey()
     sizes = of_all(job, job.merged_path, "sizes")
     assert (len(sizes), int(sizes.amin())) == (TARGET, 1)
+    members = sum(int(read_cells(job, block).partition.counts.sum()) for block in job.busy())
     rows = sum(job.rows_path(block, 0).stat().st_size for block in job.busy())
-    record = rows // (int(sizes.sum()))
-    assert rows == record * int(sizes.sum())  # every Gaussian is in one cell
-    assert int(sizes.sum()) <= survey.rows
+    assert rows % members == 0  # every Gaussian is in one cell
+    assert members <= survey.rows
 
 
 def test_cells_have_the_neighbours_of_one_piece(job):
@@ -195,19 +196,14 @@ def test_cells_have_the_neighbours_of_one_piece(job):
     assert crossed > TARGET // 5
 
 
-def test_width_is_that_of_one_piece(job):
+def test_axes_and_width_are_those_of_one_piece(job):
     merged, wide = scene_of_all(job, job.merged_path), scene_of_all(job, job.wide_path)
     sizes = of_all(job, job.merged_path, "sizes")
     partition = cells.Partition.from_labels(
         torch.repeat_interleave(torch.arange(TARGET), sizes), TARGET
     )
-    wanted = cells.widen_cells(
-        merged,
-        partition,
-        cvt.nearest_neighbors(merged.means, 8, backend="scipy"),
-        everywhere=job.config.merge.widening,
-        covered=job.config.merge.covered_widening,
-    )
+    neighbors = cvt.nearest_neighbors(merged.means, 8, backend="scipy")
+    wanted = shape_cells(merged, partition, neighbors, job.config.merge)
     assert bool((wide.log_scales != merged.log_scales).any())
     assert same_bits(wide, wanted)
 
@@ -219,15 +215,24 @@ def test_the_network_corrects_as_in_one_piece(job):
         scene = join_scenes(scene, one.scene)
     counts = torch.cat([one.partition.counts for one in members])
     firsts = torch.tensor([0, *[len(one.scene) for one in members]]).cumsum(0)
-    pairs = zip(members, firsts, strict=False)
+    pairs = list(zip(members, firsts[:-1], strict=True))
     order = torch.cat([one.partition.order + first for one, first in pairs])
     partition = cells.Partition(
         order=order, offsets=torch.nn.functional.pad(counts.cumsum(0), (1, 0))
     )
+    lone = [map_tensors(job.merged_path(block))[0]["lone"] for block in job.busy()]
+    lone = torch.cat(
+        [
+            torch.where(rows < 0, -1, rows + first)
+            for rows, (_, first) in zip(lone, pairs, strict=True)
+        ]
+    )
+    shown = partition.narrowed(lone)
+    assert int((lone >= 0).sum()) > 0
     wide = scene_of_all(job, job.wide_path)
     neighbors = cvt.nearest_neighbors(wide.means, 8, backend="scipy")
     wanted = filters.standardized(
-        correct_cells(job.network.net, scene, wide, partition, neighbors=neighbors, light=light)
+        correct_cells(job.network.net, scene, wide, shown, neighbors=neighbors, light=light)
     )
     small = [cvtgs.load(job.small_path(block)) for block in job.busy()]
     assert bool((wide.means != wanted.means).any())

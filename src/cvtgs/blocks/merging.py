@@ -20,7 +20,7 @@ from cvtgs.io import atomic_output, save
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.mergenet import correct_cells
 from cvtgs.scene import GaussianScene
-from cvtgs.stages import NEIGHBORS
+from cvtgs.stages.merging import merge_members, neighbors_asked, shape_cells
 
 EXTRA = "extra/"
 """Columns beyond the standard ones are stored under this."""
@@ -67,8 +67,13 @@ def merge(job: Job, block: int) -> None:
     if job.merged_path(block).exists():
         return
     _, scene, _, partition = read_cells(job, block)
-    merged = cells.merge_cells(scene, partition, config=job.config.merge)
-    own = {"sizes": partition.counts, "bounds": bounds_of(merged.means)}
+    merged, shown = merge_members(scene, partition, job.config.merge, areas=scene.areas)
+    first = shown.order[shown.offsets[:-1]]
+    own = {
+        "sizes": shown.counts,
+        "lone": torch.where(shown.counts < partition.counts, first, -1),
+        "bounds": bounds_of(merged.means),
+    }
     tensors = merged.tensors() | add_prefix(EXTRA, merged.extras) | own
     save_tensors(job.merged_path(block), tensors, {})
 
@@ -84,26 +89,19 @@ def widen(job: Job, block: int) -> None:
     path = job.wide_path(block)
     if path.exists():
         return
-    choices, own = job.config.merge, map_tensors(job.merged_path(block))[0]
-    widens = choices.widening > 0.0 or choices.covered_widening > 0.0
-    near = NEIGHBORS if widens or job.has_network else 0
+    own, _ = map_tensors(job.merged_path(block))
+    near = neighbors_asked(job.config.merge, with_network=job.has_network)
     backend, _ = cvt.nearest_backend(job.config.cvt.backend, own["means"].device)
     others = neighbors_of(job, block, job.merged_path, name="means")
     strangers = halo(own["means"], others, count=near, backend=backend)
     around = _around(job, block, strangers, job.merged_path)
     neighbors = cvt.nearest_neighbors(around.scene.means, near, backend=backend)[: around.own]
-    wide = around.scene
-    if widens:
-        # It is asked how many members there are, not which.
-        offsets = torch.nn.functional.pad(own["sizes"].cumsum(0), (1, 0))
-        wide = cells.widen_cells(
-            wide,
-            cells.Partition(order=own["sizes"][:0], offsets=offsets),
-            neighbors,
-            everywhere=choices.widening,
-            covered=choices.covered_widening,
-        )
-    tensors = own | {"log_scales": wide.log_scales[: around.own]}
+    # It is asked how many members there are, not which.
+    offsets = torch.nn.functional.pad(own["sizes"].cumsum(0), (1, 0))
+    shown = cells.Partition(order=own["sizes"][:0], offsets=offsets)
+    wide = shape_cells(around.scene, shown, neighbors, job.config.merge)
+    shapes = {"quats": wide.quats, "log_scales": wide.log_scales}
+    tensors = own | {name: values[: around.own] for name, values in shapes.items()}
     save_tensors(path, tensors | {"neighbors": neighbors, "strangers": strangers}, {})
 
 
@@ -120,6 +118,7 @@ def finish(job: Job, block: int) -> None:
     survey, _ = job.read_survey()
     original, scene, light, partition = read_cells(job, block)
     own, _ = map_tensors(job.wide_path(block))
+    shown = partition.narrowed(own["lone"])
     around = _around(job, block, own["strangers"], job.wide_path)
     small, checkpoint = around.scene, job.network
     if checkpoint is not None:
@@ -127,7 +126,7 @@ def finish(job: Job, block: int) -> None:
             checkpoint.net.to(scene.dtype),
             scene,
             small,
-            partition,
+            shown,
             neighbors=own["neighbors"],
             light=light,
             sizes=around.sizes,
@@ -137,7 +136,7 @@ def finish(job: Job, block: int) -> None:
     small = restored(filters.standardized(small), original, survey.plan)
     labels, _ = map_tensors(job.labels_path(block))
     facts = {
-        "single_member_cells": int((partition.counts == 1).sum()),
+        "single_member_cells": int((shown.counts == 1).sum()),
         "largest_cell": int(partition.counts.amax()),
         "refilled_cells": int(labels["refilled"]),
         "energy": float(labels["energy"]),

@@ -27,9 +27,10 @@ def settle_frames(
     surround with the symmetry of a cube stay open. This is our own rule, not part of CVT-GS.
 
     Args:
-        merged: One Gaussian per cell, as its moments give it: scales descend.
+        merged: One Gaussian per cell, as its moments give it: scales descend; those of the
+            partition first, others that follow are there as neighbours.
         partition: Members of the cells; cells of one member keep their axes.
-        neighbors: The nearest other cells of every cell.
+        neighbors: The nearest other cells of every cell of the partition.
 
     Returns:
         The scene; itself if there is nothing to turn.
@@ -41,7 +42,7 @@ def settle_frames(
         >>> settle_frames(scene, cells, torch.tensor([[1], [0]])) is scene
         True
     """
-    differences = merged.log_scales.diff(dim=1).abs()
+    differences = merged.log_scales[: len(partition)].diff(dim=1).abs()
     is_open = (2 * differences < OPEN).any(dim=1) & (partition.counts > 1)
     rows = is_open.nonzero()[:, 0]
     if len(rows) == 0 or neighbors.shape[1] == 0:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from cvtgs.cells.partition import Partition
 from cvtgs.math import activations, covariances
-from cvtgs.math.segments import segment_argmax, segment_ids, segment_sum
+from cvtgs.math.segments import segment_argmax, segment_sum
 from cvtgs.scene import GaussianScene
 
 
@@ -60,14 +60,12 @@ def keep_lone_members(
     lone = (masses[best] ** 2 * wide > together**2 * own[best]) & (partition.counts > 1)
     if not bool(lone.any()):
         return merged, partition
-    kept = ~lone.index_select(0, segment_ids(offsets))
-    kept[best[lone]] = True
-    counts = torch.where(lone, 1, partition.counts)
-    fewer = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
-    heads, cells = scene.select(order[best[lone]]), lone.nonzero()[:, 0]
+    kept = order[best]
+    heads, cells = scene.select(kept[lone]), lone.nonzero()[:, 0]
     tensors = _with_rows(merged.tensors(), cells, heads.tensors())
     extras = _with_rows(merged.extras, cells, heads.extras)
-    return merged.with_tensors(tensors, extras), Partition(order=order[kept], offsets=fewer)
+    shown = partition.narrowed(torch.where(lone, kept, -1))
+    return merged.with_tensors(tensors, extras), shown
 
 
 def _with_rows(

@@ -78,6 +78,25 @@ class Partition:
         offsets = torch.nn.functional.pad(counts[cells].cumsum(0), (1, 0))
         return type(self)(order=self.order[members], offsets=offsets)
 
+    def narrowed(self, lone: Int[Tensor, "m"]) -> Self:
+        """Leave one member in some cells.
+
+        Args:
+            lone: The row number of the member that stays; -1 leaves a cell as it is.
+
+        Returns:
+            The partition of the same cells.
+
+        Example:
+            >>> whole = Partition.from_labels(torch.tensor([1, 0, 1]), 2)
+            >>> whole.narrowed(torch.tensor([-1, 2])).order.tolist()
+            [1, 2]
+        """
+        only = torch.repeat_interleave(lone, self.counts)
+        counts = torch.where(lone < 0, self.counts, 1)
+        offsets = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
+        return type(self)(order=self.order[(only < 0) | (only == self.order)], offsets=offsets)
+
     def cut(self, run: slice) -> Self:
         """Keep some consecutive cells.
 

@@ -121,7 +121,7 @@ def run_by_blocks(
     """
     from cvtgs.blocks import simplify_file  # noqa: PLC0415 (keeps --help fast)
     from cvtgs.blocks.distributed import connect, workers_of  # noqa: PLC0415
-    from cvtgs.blocks.run import this_process  # noqa: PLC0415
+    from cvtgs.blocks.turns import this_process  # noqa: PLC0415
     from cvtgs.boxes import read_boxes  # noqa: PLC0415
     from cvtgs.simplify import Simplifier  # noqa: PLC0415
 

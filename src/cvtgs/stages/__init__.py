@@ -1,13 +1,11 @@
 """The stages in order; what each does lies elsewhere."""
 
 from cvtgs.stages.levels import Sized, run_levels
-from cvtgs.stages.merging import NEIGHBORS
 from cvtgs.stages.outlook import Outlook
 from cvtgs.stages.protected import check_room, join_scenes, run_protected
 from cvtgs.stages.run import Grouping, Reference, make_reference, run_stages
 
 __all__ = [
-    "NEIGHBORS",
     "Grouping",
     "Outlook",
     "Reference",
