@@ -139,3 +139,8 @@ def test_a_target_is_searched_and_said(scene):
     assert len(small) == report.output_count < 300
     assert goals.said[0].startswith("PSNR ")
     assert "over views that were held out; found in" in goals.said[0]
+
+
+def test_protected_regions_need_a_size():
+    with pytest.raises(InvalidArgumentError, match=r"--keep needs --rho or --count\."):
+        Goals(options("--target-psnr", "30", "--keep", "box.json"))

@@ -9,22 +9,27 @@ import pytest
 import torch
 
 import cvtgs
+from cvtgs.errors import InputError, InvalidArgumentError
 from cvtgs.evaluate import (
     Evaluation,
     EvaluationSettings,
     compare,
     evaluate,
     load_photographs,
+    lpips,
     psnr,
     ssim,
     write_exhibition,
 )
 from cvtgs.evaluate.error_maps import ERROR_SCALE, error_map
-from cvtgs.evaluate.images import encode
+from cvtgs.evaluate.images import encode, read_image
+from cvtgs.evaluate.judge import Judge
+from cvtgs.evaluate.labels import megabytes
 from cvtgs.evaluate.page import comparison_page
 from cvtgs.evaluate.sheet import contact_sheet, error_sheet
 from cvtgs.render import render
 from cvtgs.views import automatic_views
+from lpips_cases import random_images, random_weights
 
 OFF = EvaluationSettings(lpips="off")
 
@@ -228,3 +233,29 @@ def test_files_are_replaced_only_when_asked(comparison, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(cvtgs.errors.OutputError, match="cannot be made"):
         write_exhibition(comparison, tmp_path / "file" / "page")
+
+
+def test_lpips_is_a_third_number_where_there_are_weights():
+    weights = random_weights("alex")
+    picture, truth = (images[0] for images in random_images(64, 64))
+    found = Judge(weights=weights).compare(picture, truth)
+    wanted = lpips(picture[None], truth[None], network="alex", weights=weights)
+    assert found == [*Judge(weights=None).compare(picture, truth), float(wanted)]
+
+
+def test_cameras_without_names_have_no_photographs(tmp_path):
+    camera = cvtgs.Cameras(viewmats=torch.eye(4)[None], Ks=torch.eye(3)[None], width=4, height=3)
+    with pytest.raises(InvalidArgumentError, match="matched by the names of the cameras"):
+        load_photographs(tmp_path, camera)
+
+
+def test_a_photograph_that_cannot_be_opened_is_an_error(tmp_path):
+    with pytest.raises(InputError, match="the file must be readable, found: is a directory"):
+        read_image(tmp_path, (4, 3), (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("count", "text"), [(999, "999 B"), (250_000_000, "250 MB"), (5 * 10**12, "5000 GB")]
+)
+def test_bytes_in_words(count, text):
+    assert megabytes(count) == text

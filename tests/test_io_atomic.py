@@ -111,6 +111,16 @@ def test_without_hard_links_the_result_is_the_same(
     assert (tmp_path / "b.bin").read_bytes() == b"theirs"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.bin", "b.bin"]
 
+    monkeypatch.setattr(Path, "replace", refuse)
+    with pytest.raises(OutputError):
+        write(tmp_path / "c.bin")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.bin", "b.bin"]
+
+
+def test_a_name_that_no_file_can_have(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="file name too long"):
+        check_output(tmp_path / ("n" * 300))
+
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the rename of Linux")
 def test_without_hard_links_no_empty_file_takes_the_name(

@@ -146,11 +146,12 @@ def test_image_sizes_that_are_not_there(tmp_path) -> None:
         f"{path}: frame 0: 'w' and 'h' must be given here or for the whole file, or the image "
         f"must be there; found neither them nor {tmp_path / 'r_0'}."
     )
-    (tmp_path / "r_0.png").write_bytes(b"\xff\xd8\xff" + bytes(100))
-    assert text_of(path) == (
-        f"{tmp_path / 'r_0.png'}: must be a PNG file, since its size is not among the cameras; "
-        f"found another format. Give 'w' and 'h' in the file of the cameras."
-    )
+    for content in (b"\xff\xd8\xff" + bytes(100), b"\x89PNG"):
+        (tmp_path / "r_0.png").write_bytes(content)
+        assert text_of(path) == (
+            f"{tmp_path / 'r_0.png'}: must be a PNG file, since its size is not among the cameras; "
+            f"found another format. Give 'w' and 'h' in the file of the cameras."
+        )
 
 
 INRIA: Mapping[str, tuple[Callable[[Any], None], str]] = {

@@ -101,6 +101,9 @@ def test_other_checkpoints(tmp_path: Path) -> None:
     torch.save([1, 2], path)
     with pytest.raises(FileFormatError, match="found neither"):
         load(path)
+    torch.save({"splats": {"other": torch.zeros(2, 3)}}, path)
+    with pytest.raises(FileFormatError, match="found 'splats'"):
+        load(path)
     torch.save({"splats": {"means": torch.zeros(2, 3)}}, path)
     with pytest.raises(FileFormatError, match="found none named quats, scales, opacities, sh0"):
         load(path)

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -96,3 +97,15 @@ def test_commands_take_the_folder_and_its_cameras(
     assert main(["evaluate", *words, "--views", "1"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["views"], found["width"], found["height"]) == (["00000"], 32, 24)
+
+
+def test_a_folder_that_may_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(folder: Path) -> Iterator[Path]:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("cvtgs.io.folders._scenes", refuse)
+    with pytest.raises(InputError) as caught:
+        scene_file(tmp_path)
+    assert (
+        str(caught.value) == f"{tmp_path}: the folder must be readable, found: permission denied."
+    )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from cvtgs import GaussianScene, load, save
@@ -126,6 +126,7 @@ def test_axes_of_the_file_are_half_a_turn_away(tmp_path: Path) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(count=st.integers(1, 40), seed=st.integers(0, 1000), degree=st.integers(0, 3))
+@example(count=14, seed=347, degree=0)  # two largest components alike: the other one is left out
 def test_round_trip(
     tmp_path_factory: pytest.TempPathFactory, count: int, seed: int, degree: int
 ) -> None:
@@ -139,8 +140,11 @@ def test_round_trip(
     assert_as_oracle(read_spz(path, axes="RDF"), read_gzip_spz(path.read_bytes()))
     save(again, path, overwrite=True)
     for name, tensor in load(path).tensors().items():
-        bound = 2e-3 if name == "quats" else 1e-5
-        torch.testing.assert_close(tensor, again.tensors()[name], rtol=0, atol=bound)
+        wanted, bound = again.tensors()[name], 1e-5
+        if name == "quats":  # q and -q are one rotation
+            wanted = wanted * (tensor * wanted).sum(dim=1, keepdim=True).sign()
+            bound = 2e-3
+        torch.testing.assert_close(tensor, wanted, rtol=0, atol=bound)
 
 
 @pytest.mark.parametrize(

@@ -215,3 +215,9 @@ def test_importing_losses_is_light() -> None:
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
     )
     assert result.stdout == "[]\n"
+
+
+def test_a_weight_of_0_leaves_a_term_out() -> None:
+    first, second = torch.rand(1, 12, 13, 3), torch.rand(1, 12, 13, 3)
+    loss = image_loss(first, second, ssim_weight=0.0, gradient_weight=0.0)
+    assert float(loss) == float(l1_loss(first, second))

@@ -68,6 +68,13 @@ def test_more_series_than_colours_and_fewer_panels_than_places():
     assert line_chart([panel] * 3, columns=2, share_y=True, height=900)
 
 
+@needs_matplotlib
+def test_a_place_without_a_panel_stays_empty():
+    picture = pixels(line_chart([Panel(series=[LOSS])] * 3, columns=2, width=400, height=400))
+    assert (picture[:200, 200:] != 255).any()
+    assert (picture[220:, 220:] == 255).all()
+
+
 def test_a_missing_package_is_one_clear_error(monkeypatch):
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)

@@ -21,7 +21,7 @@ from cvtgs.tradeoff.chart import ticks, tradeoff_chart
 from cvtgs.tradeoff.foreword import foreword
 from cvtgs.tradeoff.measure import with_fronts
 from cvtgs.tradeoff.processes import run_process
-from cvtgs.tradeoff.runs import tasks_of
+from cvtgs.tradeoff.runs import WARNING, _pass_on, tasks_of
 from cvtgs.tradeoff.table import cells, heading, how_measured
 from cvtgs.views import automatic_views
 
@@ -149,7 +149,17 @@ def test_words_of_the_table():
     }
     assert heading(made, 0.01) == "rho 0.01: 50 of 500 Gaussians"
     assert "1 views of 64 x 48 pixels" in how_measured(made)
-    assert "LPIPS" not in how_measured(made)
+    assert how_measured(made).endswith(" on abacus.")
+    network = made.evaluation.model_copy(update={"lpips_network": "vgg", "lpips_note": ""})
+    named = made.model_copy(update={"evaluation": network})
+    assert how_measured(named).endswith(" on abacus. LPIPS with the network vgg.")
+
+
+def test_warnings_of_processes_are_passed_on_once():
+    errors = f"{WARNING}dropped 3 rows.\nsome noise\n{WARNING}dropped 3 rows.\n"
+    with pytest.warns(UserWarning, match=r"^dropped 3 rows\.$") as caught:
+        _pass_on(errors, set())
+    assert len(caught) == 1
 
 
 def test_the_page_part_is_escaped_and_names_failures():
@@ -250,7 +260,9 @@ def test_tasks_are_checked():
 def test_an_interrupt_ends_the_process_too(tmp_path):
     note = tmp_path / "pid"
     inner = f"import os, pathlib, time; pathlib.Path({str(note)!r}).write_text(str(os.getpid()))"
-    outer = "import sys; from cvtgs.tradeoff.processes import run_process; run_process("
+    outer = "import signal, sys; from cvtgs.tradeoff.processes import run_process;"
+    outer += "signal.signal(signal.SIGINT, signal.default_int_handler);"  # ignored in background
+    outer += "run_process("
     outer += f"[sys.executable, '-c', {inner + '; time.sleep(120)'!r}])"
     with subprocess.Popen([sys.executable, "-c", outer], stderr=subprocess.PIPE) as process:
         pid = wait_for(lambda: note.exists() and note.read_text())

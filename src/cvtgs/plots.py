@@ -115,11 +115,12 @@ def line_chart(
     figure = _figure(width / DPI, height / DPI)
     styles = _styles(panels)
     rows, across = math.ceil(len(panels) / columns), min(columns, len(panels))
-    grid = figure.subplots(rows, across, squeeze=False, sharey="row" if share_y else False).flat
+    places = figure.subplots(rows, across, squeeze=False, sharey="row" if share_y else False)
+    grid = list(places.flat)
     lines: dict[str, Any] = {}
     for panel, axes in zip(panels, grid, strict=False):
         lines |= _draw(axes, panel, styles)
-    for axes in list(grid)[len(panels) :]:
+    for axes in grid[len(panels) :]:
         axes.set_visible(False)
     if len(lines) > 1:
         figure.legend(

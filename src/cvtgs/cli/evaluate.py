@@ -102,10 +102,8 @@ def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
     if evaluation.photographs:
         print("against photographs:")
         _print_table(evaluation.photographs, sizes)
-    if evaluation.lpips_network:
-        print(f"LPIPS with the network {evaluation.lpips_network}.")
-    elif evaluation.lpips_note and evaluation.lpips_note != "not asked for":
-        print(f"LPIPS was not measured: {evaluation.lpips_note}.")
+    if evaluation.lpips_sentence:
+        print(evaluation.lpips_sentence)
 
 
 def _print_table(scenes: "tuple[SceneScores, ...]", sizes: dict[str, int]) -> None:

@@ -11,7 +11,7 @@ from cvtgs.evaluate.lpips_distance import lpips
 from cvtgs.evaluate.lpips_network import NETWORKS, LpipsNetwork
 from cvtgs.evaluate.lpips_weights import LpipsWeights, load_lpips
 from cvtgs.evaluate.metrics import psnr, ssim
-from cvtgs.evaluate.scores import SceneScores, Score
+from cvtgs.evaluate.scores import NOT_ASKED_FOR, SceneScores, Score
 
 LpipsChoice = Literal["auto", "vgg", "alex", "off"]
 """``auto``: VGG where its weights are, else Alex, else none."""
@@ -91,7 +91,7 @@ def make_judge(choice: LpipsChoice, size: tuple[int, int]) -> Judge:
         'not asked for'
     """
     if choice == "off":
-        return Judge(weights=None, note="not asked for")
+        return Judge(weights=None, note=NOT_ASKED_FOR)
     if choice in ("vgg", "alex"):
         return Judge(weights=load_lpips(choice))
     if choice != "auto":

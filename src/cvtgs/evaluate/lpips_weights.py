@@ -13,13 +13,13 @@ from torch import Tensor
 
 from cvtgs.errors import (
     FileFormatError,
-    InputError,
     InputNotFoundError,
     InvalidArgumentError,
     MissingDependencyError,
 )
 from cvtgs.evaluate.lpips_network import LPIPS_NETWORKS, NETWORKS, LpipsNetwork
 from cvtgs.evaluate.lpips_package import package_files
+from cvtgs.io.files import open_input
 
 LPIPS_VARIABLE = "CVTGS_LPIPS_WEIGHTS"
 """Environment variable with the path of a weights file, or of a folder of them."""
@@ -127,14 +127,8 @@ def _installed(network: LpipsNetwork) -> tuple[Path, ...]:
 
 def _read(path: Path) -> dict[str, Tensor]:
     """Read a state dict and give its tensors torchvision's names."""
-    try:
-        with path.open("rb") as file:
-            state = _unpickled(file, path)
-    except FileNotFoundError as error:
-        raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
+    with open_input(path) as file:
+        state = _unpickled(file, path)
     if not isinstance(state, Mapping):
         raise FileFormatError(
             f"{path}: must hold a state dict, found an object of type {type(state).__name__}."

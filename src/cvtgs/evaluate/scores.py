@@ -8,6 +8,9 @@ import pydantic
 
 from cvtgs.evaluate.lpips_network import LpipsNetwork
 
+NOT_ASKED_FOR = "not asked for"
+"""Why LPIPS is missing where that is no news."""
+
 
 class _Record(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
@@ -86,6 +89,15 @@ class Evaluation(_Record):
     lpips_note: str = ""
     scenes: tuple[SceneScores, ...]
     photographs: tuple[SceneScores, ...] = ()
+
+    @property
+    def lpips_sentence(self) -> str:
+        """Which network LPIPS has, or why it is missing; empty if nobody asked for it."""
+        if self.lpips_network:
+            return f"LPIPS with the network {self.lpips_network}."
+        if self.lpips_note and self.lpips_note != NOT_ASKED_FOR:
+            return f"LPIPS was not measured: {self.lpips_note}."
+        return ""
 
     def to_json(self) -> str:
         """Give the evaluation as indented JSON; infinite numbers are the string ``Infinity``.

@@ -49,13 +49,11 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
                     "file with: git lfs pull."
                 )
             yield file
+    except CvtgsError:
+        raise
     except FileNotFoundError as error:
-        if isinstance(error, CvtgsError):
-            raise
         raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
     except OSError as error:
-        if isinstance(error, CvtgsError):
-            raise
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
 

@@ -85,7 +85,7 @@ def load(
         device: Where the tensors are to be.
         sh_degree: SH bands above this degree are zeros, whatever the file holds; None for all. Of
             plain PLY files their columns are not even copied.
-        extras: Whether columns beyond the standard ones are carried.
+        extras: Whether columns beyond the standard ones are carried; only plain PLY files have any.
 
     Returns:
         The scene: float32, or float64 if the file has double coordinates.
@@ -120,7 +120,7 @@ def load(
         read = read_compressed_ply
     if read is read_ply:
         return read_ply(source, sh_degree=sh_degree, extras=extras).to(device)
-    return _reduced(read(source), sh_degree, extras=extras).to(device)
+    return _reduced(read(source), sh_degree).to(device)
 
 
 def save(scene: GaussianScene, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -218,9 +218,7 @@ def _check_degree(sh_degree: int | None) -> None:
         raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {sh_degree!r}.")
 
 
-def _reduced(scene: GaussianScene, sh_degree: int | None, *, extras: bool) -> GaussianScene:
-    if not extras and scene.extras:
-        scene = scene.with_tensors({}, {})
+def _reduced(scene: GaussianScene, sh_degree: int | None) -> GaussianScene:
     if sh_degree is None or sh_degree >= scene.sh_degree:
         return scene
     rest = scene.shN.clone()

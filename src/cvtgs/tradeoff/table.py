@@ -62,15 +62,11 @@ def how_measured(tradeoff: Tradeoff) -> str:
         A few sentences.
     """
     seen = tradeoff.evaluation
-    text = (
+    return (
         f"{len(seen.views)} views of {seen.width} x {seen.height} pixels, rendered by "
-        f"{seen.backend}. Every run is a process of its own on {tradeoff.machine}."
-    )
-    if seen.lpips_network:
-        text += f" LPIPS with the network {seen.lpips_network}."
-    elif seen.lpips_note and seen.lpips_note != "not asked for":
-        text += f" LPIPS was not measured: {seen.lpips_note}."
-    return text
+        f"{seen.backend}. Every run is a process of its own on {tradeoff.machine}. "
+        f"{seen.lpips_sentence}"
+    ).rstrip()
 
 
 def _seconds(value: float | None) -> str:
