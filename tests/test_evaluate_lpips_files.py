@@ -100,8 +100,8 @@ def test_without_weights(monkeypatch) -> None:
     with pytest.raises(MissingDependencyError) as error:
         lpips(first, second)
     assert str(error.value) == (
-        "LPIPS needs weights: pass weights= or set CVTGS_LPIPS_WEIGHTS to a file, or install the "
-        "extra with: pip install 'cvtgs[lpips]'; found neither."
+        "LPIPS needs weights: set CVTGS_LPIPS_WEIGHTS to a file of them, or in Python pass "
+        "weights=, or install the extra with: pip install 'cvtgs[lpips]'; found none."
     )
 
 

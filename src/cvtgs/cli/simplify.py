@@ -158,8 +158,9 @@ def _print_details(report: "SimplifyReport") -> None:
     if report.refinement is not None:
         gained = report.refinement
         print(
-            f"Refined in {gained.steps:,} steps: {gained.gain:+.2f} dB on views that were held "
-            f"out, {gained.psnr_before:.2f} -> {gained.psnr_after:.2f}."
+            f"Refined in {gained.steps:,} {'step' if gained.steps == 1 else 'steps'}: "
+            f"{gained.gain:+.2f} dB on views that were held out, "
+            f"{gained.psnr_before:.2f} -> {gained.psnr_after:.2f}."
         )
 
 

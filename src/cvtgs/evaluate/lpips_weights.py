@@ -113,8 +113,8 @@ def _installed(network: LpipsNetwork) -> tuple[Path, ...]:
     files = package_files(network)
     if files is None:
         raise MissingDependencyError(
-            f"LPIPS needs weights: pass weights= or set {LPIPS_VARIABLE} to a file, or install "
-            f"the extra with: pip install 'cvtgs[lpips]'; found neither."
+            f"LPIPS needs weights: set {LPIPS_VARIABLE} to a file of them, or in Python pass "
+            f"weights=, or install the extra with: pip install 'cvtgs[lpips]'; found none."
         )
     for file in files:
         if not file.is_file():
