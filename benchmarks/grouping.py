@@ -9,9 +9,13 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 import cvtgs
-from cvtgs import cells, cvt, filters
-from cvtgs.mergenet import MergeNet, correct_cells
-from cvtgs.stages import NEIGHBORS, Reference, make_reference
+from cvtgs import cells, cvt
+from cvtgs.mergenet import MergeNet
+from cvtgs.progress import silent
+from cvtgs.report import StageClock
+from cvtgs.stages import Reference, make_reference
+from cvtgs.stages.merging import merge_groups
+from cvtgs.stages.run import finished
 
 
 def nearest_groups(points: Float[Tensor, "n d"], count: int, *, seed: int) -> Int[Tensor, "n"]:
@@ -23,8 +27,8 @@ def nearest_groups(points: Float[Tensor, "n d"], count: int, *, seed: int) -> In
     iterations: groups are of nearly equal size, and late ones are not compact, since they find
     their surroundings taken. Memory: two k-d trees, some ``150 n`` bytes.
 
-    The issue calls the paper's alternative "k-NN grouping" and its text was not at hand: this is
-    our reading of the name.
+    "k-NN grouping" is what the alternative to the tessellation is called; this is our reading of
+    the name.
 
     Args:
         points: Positions.
@@ -87,12 +91,12 @@ def grouped_simplifier(
         labels = nearest_groups(reference.scene.means[rows], count, seed=config.seed)
         local = cells.Partition.from_labels(labels, count)
         partition = cells.Partition(order=rows[local.order], offsets=local.offsets)
-        return merge_groups(reference, partition, config, net=net)
+        return regroup(reference, partition, config, net=net)
 
     return simplify
 
 
-def merge_groups(
+def regroup(
     reference: Reference,
     partition: cells.Partition,
     config: cvtgs.SimplifyConfig,
@@ -103,23 +107,15 @@ def merge_groups(
 
     With the partition of the reference itself this gives what ``Simplifier`` gives.
     """
-    backend, _ = cvt.nearest_backend(config.cvt.backend, reference.scene.device)
-    small = cells.merge_cells(reference.scene, partition, config=config.merge)
-    if config.merge.lone_members:
-        areas = reference.scene.areas
-        small, partition = cells.keep_lone_members(reference.scene, small, partition, areas=areas)
-    neighbors = cvt.nearest_neighbors(small.means, NEIGHBORS, backend=backend)
-    small = cells.settle_frames(small, partition, neighbors)
-    if config.merge.widening > 0 or config.merge.covered_widening > 0:
-        small = cells.widen_cells(
-            small,
-            partition,
-            neighbors,
-            everywhere=config.merge.widening,
-            covered=config.merge.covered_widening,
-        )
-    if net is not None:
-        small = correct_cells(
-            net, reference.scene, small, partition, neighbors=neighbors, light=reference.light
-        )
-    return filters.standardized(small)
+    scene = reference.scene
+    merged, shown, neighbors = merge_groups(
+        scene,
+        partition,
+        config.merge,
+        areas=scene.areas,
+        with_neighbors=net is not None,
+        backend=cvt.nearest_backend(config.cvt.backend, scene.device)[0],
+        on_cells=lambda _: None,
+    )
+    regrouped = Reference(scene, merged, shown, neighbors, reference.light)
+    return finished(regrouped, net, clock=StageClock(silent, scene.device))

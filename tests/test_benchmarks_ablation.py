@@ -9,7 +9,7 @@ import torch
 import cvtgs
 import lpips_cases
 from benchmarks import ablation, scoring
-from benchmarks.grouping import grouped_simplifier, merge_groups, nearest_groups
+from benchmarks.grouping import grouped_simplifier, nearest_groups, regroup
 from cvtgs.mergenet import load_checkpoint
 from cvtgs.stages import make_reference
 
@@ -89,7 +89,7 @@ def test_coincident_points_are_grouped_too():
 def test_groups_are_merged_as_the_stages_merge_cells(scene, preset):
     config, net = cvtgs.SimplifyConfig.from_preset(preset), load_checkpoint(preset).net
     reference = make_reference(scene, 100, config)
-    small = merge_groups(reference, reference.partition, config, net=net)
+    small = regroup(reference, reference.partition, config, net=net)
     wanted = cvtgs.Simplifier(preset, device="cpu").simplify(scene, count=100)
     for name, values in wanted.tensors().items():
         assert torch.equal(getattr(small, name), values), name
