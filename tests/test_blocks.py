@@ -7,13 +7,13 @@ import torch
 
 import cvtgs
 from cvtgs import Simplifier, SimplifyConfig
-from cvtgs.blocks import block_count, read_bytes, simplify_file
+from cvtgs.blocks import block_count, memory, read_bytes, simplify_file
 from cvtgs.blocks.cuts import cut_space
 from cvtgs.boxes import Box
 from cvtgs.cli.main import main
 from cvtgs.counts import shared_out
 from cvtgs.devices import one_thread
-from cvtgs.errors import ConfigError, FileFormatError, InvalidArgumentError
+from cvtgs.errors import ConfigError, FileFormatError, InvalidArgumentError, InvalidSceneError
 from cvtgs.evaluate import EvaluationSettings
 from cvtgs.io.ply import open_rows
 from cvtgs.views import automatic_views
@@ -154,6 +154,30 @@ def test_invalid_rows_and_flyaways_do_not_disturb(tmp_path):
     assert not cvtgs.filters.invalid_rows(cvtgs.load(tmp_path / "out.ply"))
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_fewer_gaussians_than_blocks(source, tmp_path, count):
+    report = simplify_file(source, tmp_path / "out.ply", count=count, blocks=8)
+    assert (report.output_count, len(cvtgs.load(tmp_path / "out.ply"))) == (count, count)
+
+
+def test_a_filter_that_is_too_strict_gives_way(tmp_path):
+    """Nine tenths of the Gaussians are faint, and more are asked for than are not."""
+    scene = random_scene(600, seed=5)
+    logits = torch.where(torch.arange(600) % 10 == 0, 4.0, -8.0)
+    cvtgs.save(scene.with_tensors({"logit_opacities": logits}, {}), tmp_path / "in.ply")
+    report = simplify_file(tmp_path / "in.ply", tmp_path / "out.ply", 0.9, blocks=3)
+    assert (report.output_count, report.shortfall) == (540, "")
+
+
+def test_files_without_a_valid_row_are_refused(tmp_path):
+    scene = random_scene(20)
+    nothing = scene.with_tensors({"means": torch.full_like(scene.means, torch.nan)}, {})
+    cvtgs.save(nothing, tmp_path / "in.ply")
+    with pytest.raises(InvalidSceneError, match="found no valid Gaussian"):
+        simplify_file(tmp_path / "in.ply", tmp_path / "out.ply", 0.5, blocks=2)
+    assert not (tmp_path / "out.ply").exists()
+
+
 def test_extra_columns_and_other_formats(tmp_path):
     scene = random_scene(500, degree=0)
     extra = {"id": torch.arange(500, dtype=torch.int32), "heat": torch.rand(500)}
@@ -195,6 +219,17 @@ def test_amounts_of_memory(text, wanted):
 def test_bad_amounts_of_memory(text):
     with pytest.raises(InvalidArgumentError, match="memory must be"):
         read_bytes(text)
+
+
+def test_free_memory_is_known_where_linux_does_not_tell(monkeypatch):
+    def refuse(*_, **__):
+        raise OSError
+
+    told = memory.available_memory()
+    monkeypatch.setattr(memory.Path, "read_text", refuse)
+    assert memory.available_memory() >= told  # all of it, where nobody says what is free
+    monkeypatch.setattr(memory.os, "sysconf", refuse)
+    assert memory.available_memory() == 1 << 62
 
 
 def test_less_memory_makes_more_blocks(source):

@@ -218,3 +218,19 @@ def test_bad_arguments():
     bad = scene.with_tensors({"means": torch.full((10, 3), math.nan)}, {})
     with pytest.raises(cvtgs.errors.InvalidSceneError, match="none of 10 is valid"):
         automatic_views(bad)
+
+
+def test_large_scenes_are_thinned_and_look_the_same(monkeypatch):
+    """What stays is wider, so that it paints as much: a picture of it, and its views, say so."""
+    scene = cvtgs.synthetic.scene("courtyard", 6000, sh_degree=0, seed=3)
+    whole = survey(scene)
+    monkeypatch.setattr("cvtgs.views.survey.MOST_GAUSSIANS", 3000)
+    monkeypatch.setattr("cvtgs.views.survey._HEAVIEST", 500)
+    thinned = survey(scene)
+    assert len(whole.sample) == 6000
+    assert 2000 < len(thinned.sample) <= 3000
+    torch.testing.assert_close(
+        thinned.sample.masses.sum(), whole.sample.masses.sum(), rtol=0.1, atol=0.0
+    )
+    assert float(thinned.up @ whole.up) > 0.99
+    assert abs(thinned.radius / whole.radius - 1) < 0.05
