@@ -118,7 +118,7 @@ def scores(net: MergeNet, case: Case, views: Views) -> tuple[float, float]:
     Returns:
         PSNR before and after, the mean over the views.
     """
-    grey = views.cameras.Ks.new_full((3,), 0.5)
+    grey = case.reference.merged.means.new_full((3,), 0.5)
     target = views.over(grey)
     before, after = case.reference.merged, case.corrected(net(case.descriptors))
     found = [
