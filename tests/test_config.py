@@ -72,7 +72,7 @@ def test_a_partial_file_takes_the_rest_from_its_preset(tmp_path):
     path.write_text('preset = "paper"\n[merge]\nwidening = 0.5\n', encoding="utf-8")
     config = SimplifyConfig.from_toml(path)
     assert config.merge == MergeConfig(
-        area_power=0.0, opacity="union", widening=0.5, covered_widening=0.0
+        area_power=0.0, opacity="union", lone_members=False, widening=0.5, covered_widening=0.0
     )
     assert config.cvt == SimplifyConfig.from_preset("paper").cvt
 

@@ -111,10 +111,16 @@ def test_without_hard_links_the_result_is_the_same(
     assert (tmp_path / "b.bin").read_bytes() == b"theirs"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.bin", "b.bin"]
 
+
+def test_where_nothing_can_be_renamed_nothing_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "link", refuse)
+    monkeypatch.setattr(atomic, "_rename", refuse)
     monkeypatch.setattr(Path, "replace", refuse)
     with pytest.raises(OutputError):
         write(tmp_path / "c.bin")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.bin", "b.bin"]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_name_that_no_file_can_have(tmp_path: Path) -> None:
