@@ -60,7 +60,7 @@ def cost_model(
     Args:
         device: Where presets compute.
         recalibrate: Whether to measure anew in any case.
-        calibration: Measures; None for the real one, which takes some 15 seconds.
+        calibration: Measures; None for the real one, which takes up to a minute.
         folder: Where to remember; None for ``cvtgs`` in the user's cache folder.
         listener: Told about the measurements.
 
