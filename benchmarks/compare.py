@@ -31,6 +31,7 @@ from benchmarks.baselines import BASELINES
 from benchmarks.compare_report import Result, chart, failures, markdown, wrong_counts
 from benchmarks.processes import Cost, machine, run
 from benchmarks.scoring import SIZE, VIEWS, Scorer, make_scorer, scenes, scoring_parser
+from cvtgs.errors import MissingDependencyError
 from cvtgs.io import atomic_output
 
 NO_NETWORK = "standard, no network"
@@ -63,7 +64,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         text = report(table, options)
         if options.output is not None:
             write(options.output / "compare.md", text.encode())
-            plot = chart(table, options.rho, clock=options.clock)
+            try:
+                plot = chart(table, options.rho, clock=options.clock)
+            except MissingDependencyError as error:
+                print(f"without a plot: {error}", file=sys.stderr)
+                continue
             if plot is not None:
                 write(options.output / "compare.png", plot)
     print(text)

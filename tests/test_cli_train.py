@@ -7,6 +7,7 @@ import pytest
 
 import cvtgs
 from cvtgs.cli.main import main
+from cvtgs.errors import MissingDependencyError
 from cvtgs.mergenet import load_checkpoint, save_checkpoint
 from cvtgs.train import History, Validation
 from cvtgs.train import loop as train_loop
@@ -71,6 +72,19 @@ def test_everything_is_beside_the_checkpoint(made):
     }
     assert (made / "net.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert load_checkpoint(made / "net.safetensors").info.preset == "standard"
+
+
+def test_without_matplotlib_the_summary_says_so(again, tmp_path, capsys, monkeypatch):
+    def curves(history: History) -> bytes:
+        raise MissingDependencyError("charts need matplotlib")
+
+    monkeypatch.setattr(History, "curves", curves)
+    assert main(again) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == (
+        f"{tmp_path / 'net.safetensors'}, no picture of its curves: that needs "
+        "pip install 'cvtgs[plots]'"
+    )
 
 
 def test_a_line_per_validation_and_a_summary(again, made, tmp_path, capsys):

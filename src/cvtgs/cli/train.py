@@ -11,6 +11,8 @@ from cvtgs.errors import OutputError
 if TYPE_CHECKING:
     from cvtgs.train import History, TrainConfig
 
+WITHOUT_CURVES = "no picture of its curves: that needs pip install 'cvtgs[plots]'"
+
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Describe the command.
@@ -77,7 +79,8 @@ def run(options: argparse.Namespace) -> None:
     best = history.best()
     if best is not None and not options.quiet:
         print(f"best at step {best.step}: {best.score:+.2f} dB on scenes it never learned from")
-        print(f"{files.checkpoint}, curves in {files.curves}")
+        drawn = f"curves in {files.curves}" if files.curves.is_file() else WITHOUT_CURVES
+        print(f"{files.checkpoint}, {drawn}")
 
 
 def _with_scenes(config: "TrainConfig", folders: list[Path]) -> "TrainConfig":

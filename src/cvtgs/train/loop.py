@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 import cvtgs
-from cvtgs.errors import ConfigError, OutputError, TrainingError
+from cvtgs.errors import ConfigError, MissingDependencyError, OutputError, TrainingError
 from cvtgs.io import atomic_output
 from cvtgs.mergenet import Architecture, CheckpointInfo, MergeNet, load_checkpoint, save_checkpoint
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
@@ -38,7 +38,7 @@ class TrainFiles:
     Attributes:
         checkpoint: The best network so far.
         state: All that is needed to go on.
-        curves: A picture of the history.
+        curves: A picture of the history; there is none without matplotlib.
         cache: Folder of prepared scenes.
     """
 
@@ -102,7 +102,6 @@ def train(
         CheckpointError: The start, or the state to resume, cannot be used.
         TrainingError: The loss is not finite; the text says where, and which file is good.
         OutputError: A file cannot be written.
-        MissingDependencyError: matplotlib, which draws the curves, is missing.
 
     Example:
         >>> import tempfile
@@ -256,8 +255,12 @@ def _validate(
         with atomic_output(files.checkpoint, overwrite=True) as file:
             file.write(save_checkpoint(state.mean_net, _description(state, config)))
     state.save(files.state, config)
+    try:
+        curves = history.curves()
+    except MissingDependencyError:
+        return  # hours of training are not lost for a picture
     with atomic_output(files.curves, overwrite=True) as file:
-        file.write(history.curves())
+        file.write(curves)
 
 
 def _description(state: TrainState, config: TrainConfig) -> CheckpointInfo:
