@@ -92,13 +92,3 @@ def valid_rows(scene: GaussianScene) -> Tensor:
         & scene.quats.any(dim=1)
         & ~scene.logit_opacities.isnan()
     )
-
-
-def assert_standard(scene: GaussianScene) -> None:
-    """Everything finite, unit quaternions, opacities strictly between 0 and 1."""
-    for name, values in scene.tensors().items():
-        assert bool(values.isfinite().all()), name
-    norms = torch.linalg.vector_norm(scene.quats.double(), dim=1)
-    assert bool(((norms - 1).abs() < 1e-5).all())
-    opacities = torch.sigmoid(scene.logit_opacities)
-    assert bool(((opacities > 0) & (opacities < 1)).all())

@@ -13,7 +13,6 @@ from cvtgs.filters import flyaway_rows, invalid_rows, standardized, visible_rows
 from cvtgs.math.frames import robust_frame
 from hard_cases import CASES, each_case
 from hard_scenes import (
-    assert_standard,
     ball,
     changed,
     devices,
@@ -21,7 +20,7 @@ from hard_scenes import (
     simplifier,
     valid_rows,
 )
-from scenes import same_bits
+from scenes import assert_standard, same_bits
 
 COUNT = 60
 

@@ -9,7 +9,8 @@ from cvtgs import Simplifier
 from cvtgs.cells import Partition, merge_cells
 from cvtgs.config import SimplifyConfig
 from hard_cases import CASES
-from hard_scenes import assert_standard, ball, simplifier
+from hard_scenes import ball, simplifier
+from scenes import assert_standard
 
 LARGE = 100_000
 

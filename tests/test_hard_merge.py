@@ -10,10 +10,10 @@ from cvtgs import render
 from cvtgs.cells import Partition, merge_cells
 from cvtgs.config import SimplifyConfig
 from hard_cases import CASES, each_case
-from hard_scenes import assert_standard, devices, dtypes, presets, simplifier, valid_rows
+from hard_scenes import devices, dtypes, presets, simplifier, valid_rows
 from mergenet_cases import Case, case_of, features_of, lively_net
 from render_cases import around
-from scenes import assert_same_gaussians, covariances_of, moved, oracle_rows
+from scenes import assert_same_gaussians, assert_standard, covariances_of, moved, oracle_rows
 
 COUNT = 60
 EPSILON = {torch.float32: 1.2e-7, torch.float64: 2.3e-16}

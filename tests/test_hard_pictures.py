@@ -17,7 +17,6 @@ from cvtgs.render import render
 from cvtgs.views import automatic_views
 from hard_cases import CASES, each_case
 from hard_scenes import (
-    assert_standard,
     ball,
     coarsen_light,
     devices,
@@ -28,7 +27,7 @@ from hard_scenes import (
 )
 from refine_cases import quick
 from render_cases import backends
-from scenes import same_bits
+from scenes import assert_standard, same_bits
 
 COUNT = 60
 BLANK = {

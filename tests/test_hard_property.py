@@ -12,9 +12,9 @@ from cvtgs.errors import DroppedDataWarning, InvalidSceneError
 from cvtgs.filters import invalid_rows
 from cvtgs.render import render
 from hard_cases import CASES
-from hard_scenes import assert_standard, coarsen_light, presets, simplifier, valid_rows
+from hard_scenes import coarsen_light, presets, simplifier, valid_rows
 from render_cases import around
-from scenes import assert_same_gaussians
+from scenes import assert_same_gaussians, assert_standard
 
 SETTINGS = hypothesis.settings(
     max_examples=60,

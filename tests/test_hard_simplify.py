@@ -23,7 +23,6 @@ from cvtgs.errors import DroppedDataWarning
 from cvtgs.views import automatic_views
 from hard_cases import CASES, each_case
 from hard_scenes import (
-    assert_standard,
     changed,
     coarsen_light,
     devices,
@@ -32,7 +31,7 @@ from hard_scenes import (
     simplifier,
     valid_rows,
 )
-from scenes import assert_same_gaussians, moved
+from scenes import assert_same_gaussians, assert_standard, moved
 
 COUNT = 60
 LUCK = ("flyaways", "far_flyaways", "two_clusters", "crowd_beside_loners")

@@ -37,14 +37,40 @@ def nearest_neighbors(
     with_self = min(count + 1, len(sites))
     if backend == "scipy":
         apart = _apart(sites)
-        _, found = build_tree(apart).query(np.asarray(apart), k=[*range(1, with_self + 1)])
-        rows = torch.from_numpy(found.astype(np.int64))
+        rows, _ = _by_tree(apart, apart, with_self)
     else:
-        rows = _nearest_by_comparison(sites.double(), with_self)
+        rows, _ = _by_comparison(sites.double(), sites.double(), with_self)
     # Among coincident sites the site itself may be anywhere, even missing: then the last one goes.
     is_self = rows == torch.arange(len(sites), device=sites.device)[:, None]
     others = torch.sort(is_self.to(torch.uint8), dim=1, stable=True).indices[:, : with_self - 1]
     return rows.gather(1, others)
+
+
+def nearest_several(
+    points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int, *, backend: str
+) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
+    """Find the nearest sites of every point.
+
+    Args:
+        points: Positions.
+        sites: Positions, at least one.
+        count: How many sites each point gets; fewer if there are not so many.
+        backend: ``scipy`` or ``torch``, as :func:`nearest_neighbors` takes it.
+
+    Returns:
+        Row numbers of sites, k = min(count, m), the nearest first, and distances in float64; those
+        to coincident sites may be larger by a billionth of the extent of all.
+
+    Example:
+        >>> nearest_several(torch.zeros(1, 1), torch.tensor([[2.0], [1.0]]), 1, backend="scipy")
+        (tensor([[1]]), tensor([[1.]], dtype=torch.float64))
+    """
+    among = min(count, len(sites))
+    if backend == "scipy":
+        apart = _apart(sites)
+        more = apart.shape[1] - points.shape[1]
+        return _by_tree(torch.nn.functional.pad(points.double(), (0, more)), apart, among)
+    return _by_comparison(points.double(), sites.double(), among)
 
 
 def _apart(sites: Float[Tensor, "m d"]) -> Float[Tensor, "m e"]:
@@ -62,46 +88,21 @@ def _apart(sites: Float[Tensor, "m d"]) -> Float[Tensor, "m e"]:
     return torch.cat([places, shifts[:, None]], dim=1)
 
 
-def _nearest_by_comparison(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m k"]:
-    step = max(1, MAX_ENTRIES // len(sites))
-    return torch.cat(
-        [
-            torch.cdist(part, sites, compute_mode="donot_use_mm_for_euclid_dist")
-            .topk(count, dim=1, largest=False)
-            .indices
-            for part in sites.split(step)
-        ]
-    )
-
-
-def nearest_several(
-    points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int, *, backend: str
+def _by_tree(
+    points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
-    """Find the nearest sites of every point.
+    distances, rows = build_tree(sites).query(np.asarray(points), k=[*range(1, count + 1)])
+    return torch.from_numpy(rows.astype(np.int64)), torch.from_numpy(distances)
 
-    Args:
-        points: Positions, none of them a site.
-        sites: Positions, at least one.
-        count: How many sites each point gets; fewer if there are not so many.
-        backend: ``scipy`` or ``torch``, as :func:`nearest_neighbors` takes it.
 
-    Returns:
-        Row numbers of sites, k = min(count, m), the nearest first, and distances in float64.
-
-    Example:
-        >>> nearest_several(torch.zeros(1, 1), torch.tensor([[2.0], [1.0]]), 1, backend="scipy")
-        (tensor([[1]]), tensor([[1.]], dtype=torch.float64))
-    """
-    among = min(count, len(sites))
-    if backend == "scipy":
-        places = np.asarray(points, dtype=np.float64)
-        distances, rows = build_tree(sites).query(places, k=[*range(1, among + 1)])
-        return torch.from_numpy(rows.astype(np.int64)), torch.from_numpy(distances)
+def _by_comparison(
+    points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int
+) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
     step = max(1, MAX_ENTRIES // len(sites))
     found = [
-        torch.cdist(part, sites.double(), compute_mode="donot_use_mm_for_euclid_dist").topk(
-            among, dim=1, largest=False
+        torch.cdist(part, sites, compute_mode="donot_use_mm_for_euclid_dist").topk(
+            count, dim=1, largest=False
         )
-        for part in points.double().split(step)
+        for part in points.split(step)
     ]
     return torch.cat([one.indices for one in found]), torch.cat([one.values for one in found])

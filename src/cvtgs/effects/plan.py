@@ -170,12 +170,10 @@ def _bands(scene: GaussianScene, config: SimplifyConfig) -> BandsEffect:
 
 
 def _mip(scene: GaussianScene, config: SimplifyConfig) -> Effect:
-    choice = config.effects.mip
-    return Effect(
-        active=scene.antialiased and choice != "off",
-        figure=float(scene.antialiased),
-        meaning="1 if the comment SplatRenderMode: mip is there, on at 1",
-        forced=choice != "auto",
+    return _tagged(
+        scene.antialiased,
+        config.effects.mip,
+        meaning="1 if the comment SplatRenderMode: mip is there",
     )
 
 
@@ -200,12 +198,8 @@ def _haze(share: float, config: SimplifyConfig) -> Effect:
 
 
 def _flat(two_scales: bool, config: SimplifyConfig) -> Effect:
-    choice = config.effects.flat
-    return Effect(
-        active=two_scales and choice != "off",
-        figure=float(two_scales),
-        meaning="1 if the file has two scales per Gaussian, on at 1",
-        forced=choice != "auto",
+    return _tagged(
+        two_scales, config.effects.flat, meaning="1 if the file has two scales per Gaussian"
     )
 
 
@@ -215,6 +209,16 @@ def _duplicates(share: float, config: SimplifyConfig) -> Effect:
         config.effects.duplicates,
         least=DUPLICATE_SHARE,
         meaning="share of Gaussians exactly where others of their colour are",
+    )
+
+
+def _tagged(is_there: bool, choice: str, *, meaning: str) -> Effect:
+    """Decide on what a file says or does not, which cannot be forced on."""
+    return Effect(
+        active=is_there and choice != "off",
+        figure=float(is_there),
+        meaning=f"{meaning}, on at 1",
+        forced=choice != "auto",
     )
 
 
