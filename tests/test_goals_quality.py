@@ -13,6 +13,7 @@ from cvtgs.goals.bisect import CLOSE, smallest_enough
 from cvtgs.goals.judge import HELDOUT_SEED, Judge
 from cvtgs.progress import silent
 from cvtgs.views import automatic_views
+from scenes import same_bits
 
 
 def search(values, wanted: float, most: int) -> list[tuple[int, float]]:
@@ -110,6 +111,23 @@ def test_the_full_scene_is_rendered_once(full, views, simplifier, monkeypatch):
     monkeypatch.setattr(judge, "render", counting)
     find_count(full, psnr=22.0, simplifier=simplifier, heldout=views)
     assert sizes.count(len(full)) == len(views)
+
+
+def test_the_scene_is_looked_at_once(full, views, simplifier, monkeypatch):
+    from cvtgs.stages import prepared  # noqa: PLC0415 (to be changed here)
+
+    looks = []
+
+    def counting(scene, *arguments, **choices):
+        looks.append(len(scene))
+        return look(scene, *arguments, **choices)
+
+    look = prepared.look
+    monkeypatch.setattr(prepared, "look", counting)
+    found = find_count(full, psnr=22.0, simplifier=simplifier, heldout=views)
+    assert looks == [len(full)]
+    assert len(found.tried) > 2
+    assert same_bits(found.scene, simplifier.simplify(full, count=len(found.scene)))
 
 
 def test_a_goal_that_nothing_reaches(full, views, simplifier):

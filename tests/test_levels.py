@@ -11,7 +11,7 @@ from cvtgs.cli.main import main
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
 from cvtgs.levels import LevelsIndex, level_names, write_levels
 from cvtgs.report import StageClock
-from cvtgs.stages.levels import run_levels
+from cvtgs.stages import PreparedScene, run_levels
 from scenes import random_scene, same_bits
 
 RHOS = [0.2, 0.04, 0.004]
@@ -64,7 +64,8 @@ def test_coarse_cells_consist_of_whole_fine_ones(scene):
     def clock():
         return StageClock(lambda event: None, scene.device)
 
-    sizes = run_levels(scene, [600, 60], config, net=None, clock=clock, on_grouping=found.append)
+    prepared = PreparedScene(scene, config, net=None)
+    sizes = run_levels(prepared, [600, 60], clock=clock, on_grouping=found.append)
     fine, coarse = (grouping.partition for grouping in found)
     label = torch.full((len(scene),), -1)
     label[coarse.order] = torch.repeat_interleave(coarse.counts)

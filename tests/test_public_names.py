@@ -17,6 +17,7 @@ NAMES = {
     "EffectPlan",
     "GaussianScene",
     "Level",
+    "Prepared",
     "ProgressEvent",
     "ProgressListener",
     "Rendering",

@@ -19,7 +19,7 @@ from cvtgs.mergenet import (
     save_checkpoint,
 )
 from cvtgs.report import StageClock
-from cvtgs.stages import make_reference, run_stages
+from cvtgs.stages import PreparedScene, make_reference
 from mergenet_cases import lively_net
 from scenes import random_scene, same_bits
 
@@ -136,7 +136,7 @@ def test_the_reference_is_what_the_network_is_given(lively):
     net = load_checkpoint(lively).net
     reference = make_reference(scene, 30, config)
     clock = StageClock(lambda event: None, torch.device("cpu"))
-    small, _ = run_stages(scene, 30, config, net=net, clock=clock)
+    small, _ = PreparedScene(scene, config, net=net).run(30, clock=clock)
     by_hand = correct_cells(
         net,
         reference.scene,

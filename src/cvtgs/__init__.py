@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from cvtgs.render import Rendering, render
     from cvtgs.report import SimplifyReport
     from cvtgs.scene import GaussianScene
-    from cvtgs.simplify import Level, Simplified, Simplifier, target_count
+    from cvtgs.simplify import Level, Prepared, Simplified, Simplifier, target_count
 
 __version__ = "0.1.0"
 
@@ -69,6 +69,7 @@ _HOME = {
     "SimplifyReport": "cvtgs.report",
     "GaussianScene": "cvtgs.scene",
     "Level": "cvtgs.simplify",
+    "Prepared": "cvtgs.simplify",
     "Simplified": "cvtgs.simplify",
     "Simplifier": "cvtgs.simplify",
     "target_count": "cvtgs.simplify",
@@ -101,6 +102,7 @@ __all__ = [
     "EffectPlan",
     "GaussianScene",
     "Level",
+    "Prepared",
     "ProgressEvent",
     "ProgressListener",
     "Rendering",

@@ -1,14 +1,13 @@
 """The smallest number of Gaussians that looks as good as asked."""
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import islice
 from typing import NamedTuple
 
 from cvtgs.cameras import Cameras
-from cvtgs.errors import DroppedDataWarning, GoalError
+from cvtgs.errors import GoalError
 from cvtgs.goals.bisect import smallest_enough
 from cvtgs.goals.goal import Goal, check_target
 from cvtgs.goals.judge import Judge, Quality
@@ -71,8 +70,9 @@ def find_count(
     """Find the smallest number of Gaussians that reaches a quality, to 3 %.
 
     Quality is measured over eight automatic views that no preset looks at. The full scene is
-    rendered once; a search takes six to ten simplifications. Where quality does not rise with
-    every Gaussian, a smaller number than the one that is found may do by chance.
+    rendered, checked and looked at once; a search takes six to ten simplifications. Where
+    quality does not rise with every Gaussian, a smaller number than the one that is found may
+    do by chance.
 
     Memory: that of a simplification, one small scene, and ``12 c h w`` bytes of pictures.
 
@@ -104,10 +104,10 @@ def find_count(
     """
     goal = check_target(psnr, ssim=ssim)
     judge = Judge(scene, heldout, listener=listener)
-    maker = simplifier or Simplifier()
+    prepared = (simplifier or Simplifier()).prepare(scene, cameras=cameras)
 
     def make(count: int) -> Simplified:
-        return maker.run(scene, count=count, cameras=cameras)
+        return prepared.run(count=count)
 
     search = _Search(make, judge, goal, total=len(scene))
     most = max(1, math.floor(MOST_SHARE * len(scene)))
@@ -132,10 +132,7 @@ class _Search:
 
     def reach(self, count: int) -> float:
         """Try a number of Gaussians."""
-        with warnings.catch_warnings():
-            if self._tried:  # the first try has said it
-                warnings.simplefilter("ignore", DroppedDataWarning)
-            made = self._make(count)
+        made = self._make(count)
         quality = self._judge.score(made.scene)
         self._tried.append(Tried(count=count, psnr=quality.psnr, ssim=quality.ssim))
         value = self._goal.of(quality)

@@ -15,12 +15,11 @@ from cvtgs.scene import GaussianScene
 from cvtgs.stages.outlook import Outlook
 
 
-def valid_scene(scene: GaussianScene, target: int) -> tuple[GaussianScene, dict[str, Any]]:
+def check_rows(scene: GaussianScene) -> tuple[GaussianScene, dict[str, Any]]:
     """Drop rows with NaN, infinite or zero values where there must be none, and warn.
 
     Args:
         scene: The Gaussians.
-        target: Number of Gaussians to keep.
 
     Returns:
         The valid rows, and what the report says of the others.
@@ -48,9 +47,7 @@ def valid_scene(scene: GaussianScene, target: int) -> tuple[GaussianScene, dict[
         DroppedDataWarning,
         stacklevel=2,
     )
-    shortfall = f"only {left} of {len(scene)} Gaussians are valid" if left < target else ""
-    facts = {"invalid_rows": reasons, "invalid_count": count, "shortfall": shortfall}
-    return scene.select(~dropped), facts
+    return scene.select(~dropped), {"invalid_rows": reasons, "invalid_count": count}
 
 
 def entering_rows(

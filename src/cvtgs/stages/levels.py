@@ -9,24 +9,21 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs import cells, cvt
-from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
 from cvtgs.effects import restored
 from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import MergeNet
 from cvtgs.report import StageClock
 from cvtgs.scene import GaussianScene
-from cvtgs.stages.entering import left_out_facts, valid_scene
+from cvtgs.stages.entering import left_out_facts
 from cvtgs.stages.merging import merge_groups
-from cvtgs.stages.outlook import Outlook, look
 from cvtgs.stages.placing import place_rows
+from cvtgs.stages.prepared import PreparedScene
 from cvtgs.stages.run import (
     Grouping,
     Reference,
-    all_rows,
     finished,
     grouping_facts,
-    run_stages,
 )
 
 NESTED_FROM = 4
@@ -57,29 +54,23 @@ class Sized(NamedTuple):
 
 
 def run_levels(
-    scene: GaussianScene,
+    prepared: PreparedScene,
     targets: Sequence[int],
-    config: SimplifyConfig,
     *,
-    net: MergeNet | None,
     clock: Callable[[], StageClock],
-    cameras: Cameras | None = None,
     on_grouping: Callable[[Grouping], None] = lambda grouping: None,
 ) -> list[Sized]:
     """Run the stages for several sizes, and share what they have in common.
 
-    The scene is checked and looked at once. The finest size is that of :func:`run_stages`, bit
-    for bit. A coarser one groups the cells of the finest, which are few, and merges all Gaussians
-    in them, so its cells are made of whole finest ones. A size with more than a quarter of the
-    finest cells gets a tessellation of its own: there whole cells are too coarse to build with.
+    The finest size is that of a run of its own, bit for bit. A coarser one groups the cells of
+    the finest, which are few, and merges all Gaussians in them, so its cells are made of whole
+    finest ones. A size with more than a quarter of the finest cells gets a tessellation of its
+    own: there whole cells are too coarse to build with.
 
     Args:
-        scene: The scene, on the device to compute on.
+        prepared: The scene, and how to run the stages on it.
         targets: Numbers of Gaussians to keep, in descending order.
-        config: Every choice.
-        net: Corrects merged Gaussians, on the same device; None for no correction.
         clock: Gives a clock for every size.
-        cameras: From where a configuration that looks at the scene does so; None finds views.
         on_grouping: Given the cells of every size that has fewer than valid Gaussians.
 
     Returns:
@@ -87,47 +78,30 @@ def run_levels(
     """
     results: list[Sized] = []
     finest: Grouping | None = None
-    outlook: Outlook | None = None
-    watch = clock()
-    with watch.stage("check"):
-        valid, checked = valid_scene(scene, max(targets))
     for target in targets:
-        checked |= {} if target > len(valid) else {"shortfall": ""}
-        if target >= len(valid):
-            small, facts = all_rows(valid, config, is_whole=target == len(scene), clock=watch)
-            results.append(Sized(small, checked | facts, watch, 0.0, False))
-        else:
-            if outlook is None:
-                outlook = look(
-                    valid, config, with_light=net is not None, clock=watch, cameras=cameras
-                )
-            nested = finest is not None and NESTED_FROM * target <= len(finest.partition)
-            groupings: list[Grouping] = []
-            if finest is not None and nested:
-                small, facts = _made_of(
-                    finest,
-                    target,
-                    config,
-                    original=valid,
-                    net=net,
-                    clock=watch,
-                    on_grouping=groupings.append,
-                )
-            else:
-                small, facts = run_stages(
-                    valid,
-                    target,
-                    config,
-                    net=net,
-                    clock=watch,
-                    outlook=outlook,
-                    on_grouping=groupings.append,
-                )
-            on_grouping(groupings[0])
-            finest = finest or groupings[0]
-            error = _distance(groupings[0], small, masses=outlook.seen_areas * valid.opacities)
-            results.append(Sized(small, checked | facts, watch, error, nested))
         watch = clock()
+        valid, found = prepared.valid(watch), list[Grouping]()
+        nested = finest is not None and NESTED_FROM * target <= len(finest.partition)
+        if finest is not None and nested:
+            small, facts = _made_of(
+                finest,
+                target,
+                prepared.config,
+                original=valid,
+                net=prepared.net,
+                clock=watch,
+                on_grouping=found.append,
+            )
+            facts |= prepared.facts(target)
+        else:
+            small, facts = prepared.run(target, clock=watch, on_grouping=found.append)
+        error = 0.0
+        for grouping in found:
+            on_grouping(grouping)
+            finest = finest or grouping
+            masses = grouping.outlook.seen_areas * valid.opacities
+            error = _distance(grouping, small, masses=masses)
+        results.append(Sized(small, facts, watch, error, nested))
     return results
 
 

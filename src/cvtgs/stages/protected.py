@@ -7,39 +7,29 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from cvtgs import filters
-from cvtgs.cameras import Cameras
-from cvtgs.config import SimplifyConfig
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.mergenet import MergeNet
 from cvtgs.report import StageClock
 from cvtgs.scene import GaussianScene
-from cvtgs.stages.entering import valid_scene
-from cvtgs.stages.outlook import look
+from cvtgs.stages.prepared import PreparedScene
 from cvtgs.stages.run import run_stages
 
 
 def run_protected(
-    scene: GaussianScene,
+    prepared: PreparedScene,
     target: int,
-    config: SimplifyConfig,
     *,
     keep: Bool[Tensor, "n"],
-    net: MergeNet | None,
     clock: StageClock,
-    cameras: Cameras | None = None,
 ) -> tuple[GaussianScene, dict[str, Any]]:
     """Run the stages on the Gaussians that are not protected.
 
     What hides and crowds them is judged by the whole scene.
 
     Args:
-        scene: The scene, on the device to compute on.
+        prepared: The scene, and how to run the stages on it.
         target: Number of Gaussians to keep, the protected ones among them.
-        config: Every choice.
         keep: Mask of the protected Gaussians.
-        net: Corrects merged Gaussians, on the same device; None for no correction.
         clock: Measures each stage.
-        cameras: From where a configuration that looks at the scene does so; None finds views.
 
     Returns:
         The small scene, in which the protected Gaussians come first, as they were and in their
@@ -49,30 +39,29 @@ def run_protected(
         InvalidArgumentError: The mask does not fit, or leaves nothing of the target for the rest.
         InvalidSceneError: The scene has no valid row.
     """
+    scene = prepared.scene
     check_mask(keep, scene)
-    with clock.stage("check"):
-        valid, checked = valid_scene(scene, target)
-        keep = keep.to(scene.device)
-        kept = keep if valid is scene else keep[filters.valid_rows(scene)]
-        check_room(int(kept.sum()), target=target, total=len(valid))
+    valid, keep = prepared.valid(clock), keep.to(scene.device)
+    kept = keep if valid is scene else keep[filters.valid_rows(scene)]
+    check_room(int(kept.sum()), target=target, total=len(valid))
     if target >= len(valid) or not bool(kept.any()):
-        small, facts = run_stages(valid, target, config, net=net, clock=clock, cameras=cameras)
+        small, facts = prepared.run(target, clock=clock)
         order = torch.sort((~kept).to(torch.uint8), stable=True).indices
         whole = target >= len(valid)
         small = filters.with_finite_opacities(valid).select(order) if whole else small
-        return small, facts | checked
-    outlook = look(valid, config, with_light=net is not None, clock=clock, cameras=cameras)
+        return small, facts
+    outlook = prepared.outlook(clock)
     rest, protected = (~kept).nonzero()[:, 0], filters.with_finite_opacities(valid.select(kept))
     small, facts = run_stages(
         valid.select(rest),
         target - len(protected),
-        config,
-        net=net,
+        prepared.config,
+        net=prepared.net,
         clock=clock,
         outlook=outlook.select(rest),
     )
     joined = join_scenes(protected, small)
-    facts |= outlook.facts(valid) | checked | {"kept_count": len(protected)}
+    facts |= outlook.facts(valid) | prepared.facts(target) | {"kept_count": len(protected)}
     return joined, facts | {"mass_out": float(joined.masses.sum())}
 
 

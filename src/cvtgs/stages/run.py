@@ -1,4 +1,4 @@
-"""The stages in order: check, plan, filter, tessellate, merge, network; no algorithm here."""
+"""The stages in order: filter, tessellate, merge, network; no algorithm here."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from cvtgs import cells, cvt, filters
-from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
 from cvtgs.effects import restored, trimmed
 from cvtgs.errors import InvalidArgumentError
@@ -15,7 +14,7 @@ from cvtgs.mergenet import MergeNet, correct_cells
 from cvtgs.progress import silent
 from cvtgs.report import StageClock
 from cvtgs.scene import GaussianScene
-from cvtgs.stages.entering import entering_rows, valid_scene
+from cvtgs.stages.entering import check_rows, entering_rows
 from cvtgs.stages.merging import merge_groups
 from cvtgs.stages.outlook import Outlook, look, look_at_scene
 from cvtgs.stages.placing import place_rows
@@ -62,48 +61,39 @@ def run_stages(
     target: int,
     config: SimplifyConfig,
     *,
+    outlook: Outlook,
     net: MergeNet | None,
     clock: StageClock,
-    cameras: Cameras | None = None,
-    outlook: Outlook | None = None,
     on_grouping: Callable[[Grouping], None] | None = None,
 ) -> tuple[GaussianScene, dict[str, Any]]:
-    """Run the stages.
+    """Run the stages that follow a look at the scene.
 
     Args:
-        scene: The scene, on the device to compute on.
+        scene: The Gaussians, with valid rows, on the device to compute on.
         target: Number of Gaussians to keep.
         config: Every choice.
+        outlook: What is known of the scene.
         net: Corrects merged Gaussians, on the same device; None for no correction.
         clock: Measures each stage.
-        cameras: From where a configuration that looks at the scene does so; None finds views.
-        outlook: What is known of the scene, whose rows must all be valid; None looks at it.
-        on_grouping: Given the cells, if there are fewer than valid Gaussians.
+        on_grouping: Given the cells, if there are fewer than Gaussians.
 
     Returns:
         The small scene, and the facts that :class:`cvtgs.report.SimplifyReport` holds beyond
         counts and costs.
-
-    Raises:
-        InvalidSceneError: The scene has no valid row.
     """
-    with clock.stage("check"):
-        valid, facts = valid_scene(scene, target)
-    if target >= len(valid):
-        small, more = all_rows(valid, config, is_whole=target == len(scene), clock=clock)
-        return small, facts | more
-    reference, more = _refer(
-        valid,
+    if target >= len(scene):
+        return all_rows(scene, config, is_whole=target == len(scene), clock=clock)
+    reference, facts = _refer(
+        scene,
         target,
         config,
-        with_light=net is not None,
-        clock=clock,
-        cameras=cameras,
         outlook=outlook,
+        with_neighbors=net is not None,
+        clock=clock,
         on_grouping=on_grouping,
     )
-    small = restored(finished(reference, net, clock=clock), valid, more["plan"])
-    return small, facts | more | {"mass_out": float(small.masses.sum())}
+    small = restored(finished(reference, net, clock=clock), scene, facts["plan"])
+    return small, facts | {"mass_out": float(small.masses.sum())}
 
 
 def all_rows(
@@ -167,13 +157,14 @@ def make_reference(scene: GaussianScene, target: int, config: SimplifyConfig) ->
         InvalidArgumentError: There are no more valid Gaussians than ``target``.
         InvalidSceneError: The scene has no valid row.
     """
-    valid, _ = valid_scene(scene, target)
+    valid, _ = check_rows(scene)
     if target >= len(valid):
         raise InvalidArgumentError(
             f"target must be below the {len(valid)} valid Gaussians, found {target}."
         )
     clock = StageClock(silent, scene.device)
-    reference, _ = _refer(valid, target, config, with_light=True, clock=clock)
+    outlook = look(valid, config, with_light=True, clock=clock, cameras=None)
+    reference, _ = _refer(valid, target, config, outlook=outlook, with_neighbors=True, clock=clock)
     return reference._replace(merged=filters.standardized(reference.merged))
 
 
@@ -182,15 +173,12 @@ def _refer(
     target: int,
     config: SimplifyConfig,
     *,
-    with_light: bool,
+    outlook: Outlook,
+    with_neighbors: bool,
     clock: StageClock,
-    cameras: Cameras | None = None,
-    outlook: Outlook | None = None,
     on_grouping: Callable[[Grouping], None] | None = None,
 ) -> tuple[Reference, dict[str, Any]]:
-    """Plan, filter, tessellate and merge."""
-    if outlook is None:
-        outlook = look(valid, config, with_light=with_light, clock=clock, cameras=cameras)
+    """Filter, tessellate and merge."""
     facts = outlook.facts(valid)
     valid = trimmed(valid, outlook.plan)
     with clock.stage("filter"):
@@ -226,7 +214,7 @@ def _refer(
             partition,
             config.merge,
             areas=outlook.areas,
-            with_neighbors=with_light,
+            with_neighbors=with_neighbors,
             backend=tessellation.backend,
             on_cells=advance,
         )

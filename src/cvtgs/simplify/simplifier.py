@@ -3,8 +3,7 @@
 import copy
 import os
 from collections.abc import Sequence
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -20,38 +19,9 @@ from cvtgs.mergenet import SHIPPED, Checkpoint, MergeNet, load_checkpoint
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport, StageClock
 from cvtgs.scene import GaussianScene
-from cvtgs.stages import run_levels, run_protected, run_stages
-
-__all__ = ["Level", "Simplified", "Simplifier", "target_count"]
-
-
-class Simplified(NamedTuple):
-    """A small scene, and how it came about.
-
-    Attributes:
-        scene: The small scene.
-        report: Counts, mass, energies, and the cost of every stage.
-    """
-
-    scene: GaussianScene
-    report: SimplifyReport
-
-
-class Level(NamedTuple):
-    """One size of a scene, of several.
-
-    Attributes:
-        scene: The small scene.
-        report: What was done, and what it cost beyond what was there already for finer sizes.
-        geometric_error: Root mean square distance from Gaussians to those that stand for them,
-            each weighing what it paints; scene units.
-        nested: Whether every cell consists of whole cells of the finest size.
-    """
-
-    scene: GaussianScene
-    report: SimplifyReport
-    geometric_error: float
-    nested: bool
+from cvtgs.simplify.prepared import Prepared
+from cvtgs.simplify.results import Level, Simplified
+from cvtgs.stages import PreparedScene, run_levels
 
 
 class Simplifier:
@@ -148,19 +118,36 @@ class Simplifier:
             InvalidArgumentError: Ratio or count is out of range, or both or neither are given.
             InvalidSceneError: The scene has no valid row.
         """
-        target = target_count(len(scene), rho, count=count)
-        device = self._device_for(scene)
-        clock = StageClock(self._listener, device)
-        run = run_stages if keep is None else partial(run_protected, keep=keep)
-        small, facts = run(
-            limited(scene, self.config.effects).to(device),
-            target,
-            self.config,
-            net=self._net_for(scene, device),
-            clock=clock,
-            cameras=cameras,
+        return self.prepare(scene, cameras=cameras).run(rho, count=count, keep=keep)
+
+    def prepare(self, scene: GaussianScene, *, cameras: Cameras | None = None) -> Prepared:
+        """Get ready to make a scene smaller again and again, for a slider or a search.
+
+        What does not depend on the number of Gaussians is done in the first run only.
+
+        Args:
+            scene: The scene; it is not changed, and must not be while this is used.
+            cameras: From where presets that look at the scene do so; None finds views.
+
+        Returns:
+            What runs.
+
+        Example:
+            >>> from cvtgs.synthetic import scene as make
+            >>> prepared = Simplifier(device="cpu").prepare(make("object", 1000))
+            >>> [len(prepared.run(count=count).scene) for count in (10, 20)]
+            [10, 20]
+        """
+
+        def reported(small: GaussianScene, facts: dict[str, Any], clock: StageClock) -> Simplified:
+            return self._reported(scene, small, facts, clock, cameras)
+
+        return Prepared(
+            scene,
+            self._stages(scene, cameras),
+            clock=lambda: self._clock(scene),
+            reported=reported,
         )
-        return self._reported(scene, small, facts | {"target_count": target}, clock, cameras)
 
     def levels(
         self,
@@ -195,14 +182,10 @@ class Simplifier:
         targets = {target_count(len(scene), rho) for rho in rhos}
         if not targets:
             raise InvalidArgumentError("levels need at least one ratio, found none.")
-        device = self._device_for(scene)
         sizes = run_levels(
-            limited(scene, self.config.effects).to(device),
+            self._stages(scene, cameras),
             sorted(targets, reverse=True),
-            self.config,
-            net=self._net_for(scene, device),
-            clock=lambda: StageClock(self._listener, device),
-            cameras=cameras,
+            clock=lambda: self._clock(scene),
         )
         found = {}
         for target, size in zip(sorted(targets, reverse=True), sizes, strict=True):
@@ -210,6 +193,15 @@ class Simplifier:
             whole = self._reported(scene, size.scene, facts, size.clock, cameras)
             found[target] = Level(*whole, size.geometric_error, size.nested)
         return tuple(found[target_count(len(scene), rho)] for rho in rhos)
+
+    def _stages(self, scene: GaussianScene, cameras: Cameras | None) -> PreparedScene:
+        device = self._device_for(scene)
+        ours = limited(scene, self.config.effects).to(device)
+        net = self._net_for(scene, device)
+        return PreparedScene(ours, self.config, net=net, cameras=cameras)
+
+    def _clock(self, scene: GaussianScene) -> StageClock:
+        return StageClock(self._listener, self._device_for(scene))
 
     def _reported(
         self,

@@ -1,0 +1,72 @@
+"""One look at a scene, any number of sizes: the bits of single runs, and nothing done twice."""
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
+from scenes import random_scene, same_bits
+
+SHARED = {"check", "plan", "visibility"}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return cvtgs.synthetic.scene("room", 1500, sh_degree=1, seed=3)
+
+
+def stages(report):
+    return {cost.stage for cost in report.stages}
+
+
+@pytest.mark.parametrize("preset", ["standard", "draft", "paper", "high"])
+def test_every_run_gives_the_bits_of_a_run_of_its_own(scene, preset):
+    quick = {"visibility.views": 4, "visibility.size": 32, "refine.steps": 2, "refine.size": 32}
+    settings = {key: str(value) for key, value in quick.items()} if preset == "high" else {}
+    config = SimplifyConfig.compose(preset=preset, settings=settings)
+    simplifier = Simplifier(config=config, device="cpu")
+    prepared = simplifier.prepare(scene)
+    for count in (30, 150, 30):
+        assert same_bits(prepared.run(count=count).scene, simplifier.simplify(scene, count=count))
+
+
+def test_what_is_shared_is_done_in_the_first_run_only(scene):
+    simplifier = Simplifier(config=SimplifyConfig(visibility={"views": 2, "size": 16}))
+    prepared = simplifier.prepare(scene)
+    first, second = (stages(prepared.run(0.1).report) for _ in range(2))
+    assert first >= SHARED
+    assert second == first - SHARED
+
+
+def test_protected_gaussians_may_differ_from_run_to_run(scene):
+    simplifier = Simplifier(device="cpu")
+    prepared = simplifier.prepare(scene)
+    for row in (3, 1400):
+        keep = torch.arange(len(scene)) == row
+        small = prepared.run(count=20, keep=keep).scene
+        assert same_bits(small, simplifier.simplify(scene, count=20, keep=keep))
+        assert torch.equal(small.means[0], scene.means[row])
+
+
+def test_all_rows_and_invalid_ones():
+    scene = random_scene(50)
+    means = scene.means.clone()
+    means[7] = torch.inf
+    bad = scene.with_tensors({"means": means}, {})
+    prepared = Simplifier(device="cpu").prepare(bad)
+    with pytest.warns(DroppedDataWarning) as heard:
+        reports = [prepared.run(count=count).report for count in (50, 10, 49)]
+    assert len(heard) == 1
+    assert [report.output_count for report in reports] == [49, 10, 49]
+    assert [report.invalid_count for report in reports] == [1, 1, 1]
+    assert [report.shortfall for report in reports] == [
+        "only 49 of 50 Gaussians are valid",
+        "",
+        "",
+    ]
+
+
+def test_a_size_is_refused_before_anything_is_done(scene):
+    with pytest.raises(InvalidArgumentError):
+        Simplifier(device="cpu").prepare(scene).run(count=0)
