@@ -180,6 +180,10 @@ DAMAGED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
         lambda m: m.update(count=10_000_000),
         "must have a pixel for each of 10,000,000 Gaussians, found",
     ),
+    "shape": (
+        lambda m: (m.update(version=1), m["means"].update(shape=["many", 3])),
+        "'shape' must be a list that starts with the number of Gaussians, found",
+    ),
     "no means": (lambda m: m.pop("means"), "'means': must be a JSON object, found None."),
     "ranges": (lambda m: m["means"].update(mins=[0, 1]), "'mins' must be 3 finite numbers, found"),
     "codebook": (lambda m: m["scales"].update(codebook=[]), "'codebook' must be 1 finite numbers"),
@@ -250,6 +254,12 @@ def test_bombs_are_not_unpacked(tmp_path: Path) -> None:
         load(path)
     folder = tmp_path / "sog"
     meta = unpacked(folder)
+    image = (folder / "scales.webp").read_bytes()
+    with (folder / "scales.webp").open("wb") as file:
+        file.truncate(1 << 40)  # takes no room on the disk
+    with pytest.raises(FileFormatError, match=r"scales\.webp must have at most 394,016 bytes"):
+        load(meta)
+    (folder / "scales.webp").write_bytes(image)
     (folder / "quats.webp").write_bytes(encode_webp(np.zeros((4096, 4096, 4), np.uint8)))
     with pytest.raises(FileFormatError, match="must have at most 65,696 pixels, found 4096 x 4096"):
         load(meta)

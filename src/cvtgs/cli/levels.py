@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cvtgs.cli.display import READABLE, progress_bars, size_text
-from cvtgs.cli.lists import ratios_of
+from cvtgs.cli.lists import add_ratios_option, ratios_of
 from cvtgs.cli.looking import (
     add_looking_options,
     background_color,
@@ -44,9 +44,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="DIR", help="directory to write to"
     )
-    parser.add_argument(
-        "--rho", default="0.1,0.01,0.001", metavar="R,R", help="ratios (default 0.1,0.01,0.001)"
-    )
+    add_ratios_option(parser)
     parser.add_argument(
         "--suffix", default=".ply", metavar="END", help="format of the files (default .ply)"
     )

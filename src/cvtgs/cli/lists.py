@@ -1,6 +1,18 @@
 """Options that take several words: ``0.1,0.01`` and ``draft,fast``."""
 
+import argparse
+
 from cvtgs.errors import InvalidArgumentError
+
+
+def add_ratios_option(parser: argparse.ArgumentParser) -> None:
+    """Describe the option that :func:`ratios_of` reads.
+
+    Args:
+        parser: Where to add it.
+    """
+    ratios = "0.1,0.01,0.001"
+    parser.add_argument("--rho", default=ratios, metavar="R,R", help=f"ratios (default {ratios})")
 
 
 def words_of(text: str) -> list[str]:

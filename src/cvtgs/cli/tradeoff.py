@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cvtgs.cli.display import READABLE, progress_bars
-from cvtgs.cli.lists import ratios_of, words_of
+from cvtgs.cli.lists import add_ratios_option, ratios_of, words_of
 from cvtgs.cli.looking import (
     add_looking_options,
     add_lpips_option,
@@ -36,9 +36,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "--views says otherwise.",
     )
     parser.add_argument("input", metavar="IN", type=Path, help=f"the full scene ({READABLE})")
-    parser.add_argument(
-        "--rho", default="0.1,0.01,0.001", metavar="R,R", help="ratios (default 0.1,0.01,0.001)"
-    )
+    add_ratios_option(parser)
     parser.add_argument("--presets", metavar="NAME,NAME", help="which presets (default: all)")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="DIR", help="directory to write to"

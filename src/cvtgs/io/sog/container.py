@@ -1,12 +1,13 @@
 """Where the files of a SOG lie: in a zip, or beside ``meta.json``."""
 
+import os
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path, PurePosixPath
 
 from cvtgs.errors import FileFormatError
-from cvtgs.io.files import open_input, read_bytes
+from cvtgs.io.files import open_input
 
 META = "meta.json"
 _MOST_META_BYTES = 1 << 24
@@ -43,10 +44,11 @@ def read_meta(read: Reader) -> bytes:
 def _beside(path: Path) -> Iterator[Reader]:
     def read(name: str, most: int) -> bytes:
         _check_name(name, path)
-        content = read_bytes(path.with_name(name))
-        if len(content) > most:
-            raise _too_long(f"{path.with_name(name)}", most, len(content))
-        return content
+        with open_input(path.with_name(name)) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > most:
+                raise _too_long(f"{path.with_name(name)}", most, size)
+            return file.read()
 
     yield read
 
