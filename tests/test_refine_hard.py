@@ -137,7 +137,8 @@ def test_infinite_logits():
 def test_an_empty_background_stays_empty():
     full = full_scene(1500, degree=0)
     small = small_scene(full, 0.05)
-    refined = refine(small, full, steps=60, config=quick(size=48, heldout=12)).scene
+    config = quick(size=48, heldout=12, patience=100)
+    refined = refine(small, full, steps=120, config=config).scene
     views = cvtgs.views.automatic_views(full, 4, width=48, height=48, seed=3)
     wanted, before, after = (cvtgs.render(scene, views).alpha for scene in (full, small, refined))
     assert (after - wanted).square().mean() < (before - wanted).square().mean()

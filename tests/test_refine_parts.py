@@ -169,17 +169,23 @@ def test_backgrounds_are_drawn():
     assert 0 <= float(first.amin()) <= float(first.amax()) <= 1
 
 
-def test_a_first_step_has_the_length_of_the_rate():
+def test_a_step_has_the_length_of_the_rate_once_gradients_have_agreed():
     scene = random_scene(4, degree=0)
     variables = Variables(scene, Rates(sh0=0.25, means=0.5))
-    now = variables.scene()
-    variables.step(now.sh0[:, 0, 0].sum() - 3 * now.means[1, 2], factor=0.5)
-    found = variables.result()
-    moved = scene.sh0.clone()
+
+    def step():
+        now = variables.scene()
+        variables.step(now.sh0[:, 0, 0].sum() - 3 * now.means[1, 2], factor=0.5)
+        return variables.result()
+
+    for _ in range(80):
+        before = step()
+    found = step()
+    moved = before.sh0.clone()
     moved[:, 0, 0] -= 0.125
-    torch.testing.assert_close(found.sh0, moved)
+    torch.testing.assert_close(found.sh0, moved, rtol=1e-3, atol=1e-4)
     unit = scene.scales[1].mean().item()
-    assert (found.means - scene.means)[1, 2].item() == pytest.approx(0.25 * unit, rel=1e-4)
+    assert (found.means - before.means)[1, 2].item() == pytest.approx(0.25 * unit, rel=2e-3)
     torch.testing.assert_close(found.log_scales, scene.log_scales)
 
 
@@ -210,7 +216,7 @@ def test_a_row_with_one_bad_gradient_is_left_alone():
 
 def test_rows_that_left_what_can_be_drawn_come_back():
     scene = random_scene(3)
-    variables = Variables(scene, Rates(log_scales=1000.0))
+    variables = Variables(scene, Rates(log_scales=1e6))
     variables.step(-variables.scene().log_scales[1].sum(), factor=1.0)
     assert same_bits(variables.result(), scene)
 

@@ -11,7 +11,7 @@ Count = Annotated[int, pydantic.Field(ge=1)]
 
 
 class Rates(Section):
-    """The first step of every parameter; 0 leaves it as it is.
+    """The first steps of every parameter where all pictures agree; 0 leaves it as it is.
 
     Attributes:
         means: Positions, in mean standard deviations of each Gaussian.
@@ -22,12 +22,12 @@ class Rates(Section):
         shN: Colours that depend on the direction.
     """
 
-    means: Rate = 0.01
-    quats: Rate = 0.004
-    log_scales: Rate = 0.005
-    logit_opacities: Rate = 0.05
-    sh0: Rate = 0.02
-    shN: Rate = 0.005  # noqa: N815 (the name that scenes give it)
+    means: Rate = 0.06
+    quats: Rate = 0.024
+    log_scales: Rate = 0.03
+    logit_opacities: Rate = 0.3
+    sh0: Rate = 0.12
+    shN: Rate = 0.03  # noqa: N815 (the name that scenes give it)
 
 
 class RefineConfig(Section):
@@ -37,9 +37,8 @@ class RefineConfig(Section):
         steps: Steps, at most; 0 leaves it to ``seconds``.
         seconds: Wall-clock seconds, at most; 0 leaves it to ``steps``. With both 0, a
             simplification is not refined.
-        rates: Learning rates at the start.
+        rates: Steps at the start.
         last_rate: Share of them at the end; in between they fall exponentially.
-        damping: Gaussians whose gradients are below this share of the usual size move less.
         squared: Weight of the logarithm of the squared error.
         image: Weight of the logarithm of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) + 0.2
             gradient``.
@@ -55,14 +54,13 @@ class RefineConfig(Section):
 
     Example:
         >>> RefineConfig(size=128).rates.means
-        0.01
+        0.06
     """
 
     steps: int = pydantic.Field(default=0, ge=0)
     seconds: float = pydantic.Field(default=0.0, ge=0.0)
     rates: Rates = Rates()
     last_rate: float = pydantic.Field(default=0.1, gt=0.0, le=1.0)
-    damping: Rate = 0.1
     squared: Rate = 0.5
     image: Rate = 0.5
     size: int = pydantic.Field(default=256, ge=16)

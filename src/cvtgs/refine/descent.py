@@ -58,7 +58,7 @@ def descend(
     limit = best_counted(first)
     best, before = small, float(first.clamp(max=limit).mean())
     budget.end("check")
-    variables = Variables(small, config.rates, damping=config.damping, frozen=frozen)
+    variables = Variables(small, config.rates, frozen=frozen)
     after, waited = before, 0
     stopped = "perfect" if float(first.amin()) >= BEST_PSNR else budget.spent()
     while not stopped:

@@ -8,33 +8,25 @@ from cvtgs.cvt import openness
 from cvtgs.filters import invalid_rows, standardized, with_finite_opacities
 from cvtgs.math import quaternions
 from cvtgs.math.frames import robust_frame
+from cvtgs.refine.optimizer import CarefulAdam
 from cvtgs.scene import GaussianScene
-
-_BETAS = (0.9, 0.99)
-_LEAST_ROOT = 1e-15
 
 
 class Variables:
     """A scene as a start plus changes, and the optimiser of the changes.
 
-    A step moves the Gaussians alone that a picture shows (Adam of Kingma and Ba 2015, as
-    ``SparseAdam`` does it): all others have no gradient, keep their momentum for later, and stay
-    as they are. Adam moves a Gaussian that hardly shows as far as any other. Here it moves less,
-    by its openness and by ``damping``, for it may be all that is seen from elsewhere. Memory:
-    five times the scene.
+    A step moves the Gaussians alone that a picture shows: all others have no gradient, keep their
+    momentum for later, and stay as they are. A Gaussian moves only as far as pictures agree
+    (:class:`CarefulAdam`), and less where it is enclosed, for it may be all that is seen from
+    elsewhere. Memory: five times the scene.
 
     Args:
         scene: The simplified scene; it is not changed.
         rates: Learning rates at the start.
-        damping: Share of the usual gradient below which a Gaussian moves less.
         frozen: So many of the first Gaussians do not move.
     """
 
-    def __init__(
-        self, scene: GaussianScene, rates: Rates, *, damping: float = 0.0, frozen: int = 0
-    ) -> None:
-        self._damping = damping
-        self._usual: dict[str, float] = {}
+    def __init__(self, scene: GaussianScene, rates: Rates, *, frozen: int = 0) -> None:
         self._scene = scene
         self._start = _started(scene)
         self._units = _units(scene)
@@ -49,11 +41,8 @@ class Variables:
             for name, rate in rates.model_dump().items()
             if rate > 0 and self._start[name].numel()
         }
+        self._optimizers = {name: CarefulAdam(self._changes[name].detach()) for name in self._rates}
         self._moved = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
-        groups = [
-            {"params": [self._changes[name]], "lr": rate} for name, rate in self._rates.items()
-        ]
-        self._optimizer = torch.optim.SparseAdam(groups, betas=_BETAS) if groups else None
 
     def scene(self) -> GaussianScene:
         """Give the scene, differentiable in the changes.
@@ -74,35 +63,14 @@ class Variables:
             loss: What to make small, from :meth:`scene`.
             factor: Share of the learning rates.
         """
-        if not self._rates or self._optimizer is None or not loss.requires_grad:
+        if not self._rates or not loss.requires_grad:
             return
-        names = list(self._rates)
-        changes = [self._changes[name] for name in names]
+        changes = [self._changes[name] for name in self._rates]
         gradients = torch.autograd.grad(loss, changes, materialize_grads=True)
         rows = _rows_to_move(gradients)
-        for group, change, gradient in zip(
-            self._optimizer.param_groups, changes, gradients, strict=True
-        ):
-            name = names.pop(0)
-            group["lr"] = factor * self._rates[name]
-            group["eps"] = self._smallest_root(name, gradient[rows])
-            change.grad = torch.sparse_coo_tensor(
-                rows[None], gradient[rows], change.shape, is_coalesced=True, check_invariants=True
-            )
-        self._optimizer.step()
+        for (name, rate), gradient in zip(self._rates.items(), gradients, strict=True):
+            self._optimizers[name].step(rows, gradient[rows], rate=factor * rate)
         self._moved[rows] = True
-
-    def _smallest_root(self, name: str, gradient: Tensor) -> float:
-        """Give the epsilon of Adam: a share of the running mean size of gradients.
-
-        The size is the mean of their absolute values: of squares, a few giants of a sky would
-        make the most, and hold all others still.
-        """
-        if gradient.numel():
-            now = float(gradient.double().abs().mean())
-            old = self._usual.get(name, now)
-            self._usual[name] = old + 0.1 * (now - old)
-        return self._damping * self._usual.get(name, 0.0) + _LEAST_ROOT
 
     @torch.no_grad()
     def result(self) -> GaussianScene:
