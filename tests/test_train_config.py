@@ -68,6 +68,7 @@ def test_the_recipes_are_of_the_preset_that_they_are_called(recipe):
 def test_there_are_recipes():
     assert {path.stem for path in RECIPES.glob("*.toml")} == {
         "standard",
+        "standard-low",
         "paper",
         "paper-local",
     }
