@@ -160,6 +160,22 @@ def test_fewer_gaussians_than_blocks(source, tmp_path, count):
     assert (report.output_count, len(cvtgs.load(tmp_path / "out.ply"))) == (count, count)
 
 
+def test_blocks_that_keep_nothing_are_not_left_out(tmp_path):
+    """Protected Gaussians take so many of the target that four of six blocks get none."""
+    scene = random_scene(500, degree=0)
+    scene = scene.with_tensors({"logit_opacities": torch.full((500,), 2.0)}, {})
+    cvtgs.save(scene, tmp_path / "in.ply")
+    box = Box(min=(-9.0, -9.0, 0.5), max=(9.0, 9.0, 9.0))
+    kept = int((scene.means[:, 2] >= 0.5).sum())
+    report = simplify_file(
+        tmp_path / "in.ply", tmp_path / "out.ply", count=kept + 2, blocks=6, boxes=[box]
+    )
+    assert (report.kept_count, report.output_count, report.blocks) == (kept, kept + 2, 6)
+    assert report.filtered_count == 0
+    assert report.largest_cell >= (500 - kept) / 2
+    assert report.energy > 0
+
+
 def test_a_filter_that_is_too_strict_gives_way(tmp_path):
     """Nine tenths of the Gaussians are faint, and more are asked for than are not."""
     scene = random_scene(600, seed=5)

@@ -137,14 +137,18 @@ def nearest_anywhere(
 
     Args:
         points: Positions in one block.
-        sites: The sites of this block.
+        sites: The sites of this block; if there is none, there must be others.
         others: The other blocks; of equally near sites the own one is taken, then the first.
         nearest: Search of the nearest site.
 
     Returns:
         What was found.
     """
-    labels, squared = nearest(points, sites)
+    if len(sites):
+        labels, squared = nearest(points, sites)
+    else:
+        squared = torch.full_like(points[:, 0], torch.inf, dtype=torch.float64)
+        labels = torch.full_like(squared, -1, dtype=torch.int64)
     blocks, reach = torch.full_like(labels, -1), Reach.of(points, squared)
     labels, squared = labels.clone(), squared.clone()
     for other in others:

@@ -15,6 +15,7 @@ from cvtgs.blocks.survey import Survey
 from cvtgs.errors import DroppedDataWarning
 from cvtgs.io import atomic_output, load, save
 from cvtgs.io.ply import join_plys
+from cvtgs.io.tensors import map_tensors
 from cvtgs.report import SimplifyReport, StageClock
 from cvtgs.simplify import Simplifier
 from cvtgs.stages import join_scenes
@@ -43,6 +44,12 @@ def join_blocks(
     for scene in scenes[1:]:
         joined = join_scenes(joined, scene)
     save(joined, output, overwrite=overwrite)
+
+
+def _energy_of_light(job: Job, busy: Sequence[int]) -> float:
+    """Give the energy of the Gaussians of blocks that keep nothing."""
+    light = [block for block in job.filled() if block not in busy]
+    return sum(float(map_tensors(job.labels_path(block))[0]["energy"]) for block in light)
 
 
 def _kept(job: Job) -> list[NDArray[Any]]:
@@ -100,7 +107,7 @@ def report_of(
         refilled_cells=sum(one.get("refilled_cells", 0) for one in facts),
         mass_in=found.mass,
         mass_out=sum(one["mass_out"] for one in facts) + kept_mass,
-        energy=sum(one.get("energy", 0.0) for one in facts),
+        energy=sum(one.get("energy", 0.0) for one in facts) + _energy_of_light(job, busy),
         backend=next((one["backend"] for one in facts if "backend" in one), "none"),
         checkpoint="none" if simplifier.checkpoint is None else simplifier.checkpoint.name,
         plan=found.plan,

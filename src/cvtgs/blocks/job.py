@@ -102,6 +102,15 @@ class Job:
         """Give the blocks that keep something."""
         return [block for block, target in enumerate(self.read_survey()[1]) if target]
 
+    def filled(self) -> list[int]:
+        """Give the blocks that have rows; some may be too light to keep anything."""
+        numbers = [number for number, _, _ in self.ranges()]
+        return [
+            block
+            for block, target in enumerate(self.read_survey()[1])
+            if target or any(self.rows_path(block, number).exists() for number in numbers)
+        ]
+
     def ranges(self) -> list[tuple[int, int, int]]:
         """Give the parts of the source: number, first row, row after the last one."""
         total, step = self.source.count, self.range_rows

@@ -115,7 +115,7 @@ def _cut_files(job: Job, block: int) -> list[tuple[Path, int]]:
 def _arrivals(job: Job, block: int) -> Iterator[NDArray[Any]]:
     """Give the rows that other blocks have sent."""
     kind = record_type(job, with_cell=True)
-    for other in job.busy():
+    for other in job.filled():
         if other == block:
             continue
         sent = map_tensors(job.labels_path(other))[0]["sent"]

@@ -25,6 +25,8 @@ from cvtgs.stages.placing import places_of, rows_along_curve
 def place(job: Job, block: int) -> None:
     """Choose the first sites of a block, and the Gaussians that Lloyd looks at.
 
+    A block that is too light to keep anything gets neither; its Gaussians go to other blocks.
+
     Args:
         job: What is to be done.
         block: Which block.
@@ -33,6 +35,9 @@ def place(job: Job, block: int) -> None:
         return
     order, points, weights = _points(job, block)
     choices, target = job.config.cvt, job.read_survey()[1][block]
+    if target == 0:
+        save_tensors(job.sample_path(block), {"order": order}, {})
+        return
     seeds = first_seeds(weights, target, config=choices, seed=job.config.seed)
     sample, shares = sampled(points, weights, choices.samples_per_site * target)
     save_tensors(job.sample_path(block), {"order": order, "points": sample, "weights": shares}, {})
@@ -51,6 +56,8 @@ def settle(job: Job, turn: int, block: int) -> float:
     Returns:
         The energy of these Gaussians before the move.
     """
+    if job.read_survey()[1][block] == 0:
+        return 0.0
     path = job.sums_path(turn, block)
     if path.exists():
         return float(map_tensors(path)[0]["energy"])
@@ -133,11 +140,13 @@ def _points(job: Job, block: int, order: Tensor | None = None) -> tuple[Tensor, 
 
 def _search(job: Job, turn: int, block: int, points: Tensor) -> tuple[int, Nearest]:
     """Give the number of sites of a block, and the nearest site of every point."""
-    survey, _ = job.read_survey()
+    survey, targets = job.read_survey()
     _, nearest = search_of(
         job.config.cvt, points.device, has_duplicates=survey.plan.duplicates.active
     )
-    sites = map_tensors(job.sites_path(turn, block))[0]["sites"]
+    sites = points[:0].double()
+    if targets[block]:
+        sites = map_tensors(job.sites_path(turn, block))[0]["sites"]
     others = neighbors_of(job, block, lambda other: job.sites_path(turn, other), name="sites")
     return len(sites), nearest_anywhere(points, sites, others, nearest=nearest)
 

@@ -87,11 +87,11 @@ def group_blocks(job: Job, workers: Workers, clock: StageClock) -> None:
         workers: Who does it.
         clock: Measures the stages.
     """
-    busy, iterations = job.busy(), job.config.cvt.iterations
-    with clock.stage("tessellate", (iterations + 2) * len(busy)) as advance:
+    blocks, iterations = job.filled(), job.config.cvt.iterations
+    with clock.stage("tessellate", (iterations + 2) * len(blocks)) as advance:
 
         def do(step: Callable[[int], Result], nth: int) -> list[Result]:
-            return do_all(workers, step, busy, lambda done: advance(nth * len(busy) + done))
+            return do_all(workers, step, blocks, lambda done: advance(nth * len(blocks) + done))
 
         do(partial(place, job), 0)
         moves, energy, least = 0, math.inf, 1.0 - job.config.cvt.tolerance
@@ -102,6 +102,7 @@ def group_blocks(job: Job, workers: Workers, clock: StageClock) -> None:
             move(job, turn)
             moves = turn + 1
         do(partial(assign, job, moves), iterations + 1)
+    busy = job.busy()
     for name, step in (("merge", merge), ("widen", widen)):
         with clock.stage(name, len(busy)) as advance:
             do_all(workers, partial(step, job), busy, advance)
