@@ -16,8 +16,9 @@ from cvtgs.stages import PreparedScene, run_protected
 class Prepared:
     """A scene and a way to simplify it; what does not depend on the count is done only once.
 
-    :meth:`cvtgs.Simplifier.prepare` makes these. Every run gives the bits of
-    :meth:`cvtgs.Simplifier.run`; the report of the first one has the stages that are shared.
+    :meth:`cvtgs.simplify.Simplifier.prepare` makes these. Every run gives the bits of
+    :meth:`cvtgs.simplify.Simplifier.run`; the report of the first one has the stages that are
+    shared.
 
     Args:
         scene: The scene as it came.
