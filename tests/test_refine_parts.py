@@ -230,7 +230,7 @@ def test_a_loss_that_depends_on_nothing():
 
 
 @pytest.mark.parametrize(
-    "values", [{"size": 8}, {"last_rate": 0.0}, {"rates": {"sh0": -1}}, {"colour": 1}]
+    "values", [{"size": 8}, {"half_after": 0}, {"rates": {"sh0": -1}}, {"colour": 1}]
 )
 def test_settings_that_cannot_be(values):
     with pytest.raises(pydantic.ValidationError):

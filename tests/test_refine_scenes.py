@@ -72,14 +72,14 @@ def test_never_worse():
     """Steps so long that every scene but the first is nonsense."""
     full = full_scene()
     small = small_scene(full)
-    refined = refine(small, full, steps=20, config=quick(rates=WILD, last_rate=1.0))
+    refined = refine(small, full, steps=20, config=quick(rates=WILD, half_after=10**9))
     assert refined.scene is small
     assert (refined.report.gain, refined.report.changed_count) == (0, 0)
 
 
 def test_it_stops_when_held_out_views_do_not_improve():
     full = full_scene()
-    config = quick(rates=WILD, last_rate=1.0, patience=3, check_every=2)
+    config = quick(rates=WILD, half_after=10**9, patience=3, check_every=2)
     report = refine(small_scene(full), full, steps=500, config=config).report
     assert (report.steps, report.stopped) == (6, "patience")
 

@@ -22,12 +22,12 @@ class Rates(Section):
         shN: Colours that depend on the direction.
     """
 
-    means: Rate = 0.06
-    quats: Rate = 0.024
-    log_scales: Rate = 0.03
-    logit_opacities: Rate = 0.3
-    sh0: Rate = 0.12
-    shN: Rate = 0.03  # noqa: N815 (the name that scenes give it)
+    means: Rate = 0.035
+    quats: Rate = 0.014
+    log_scales: Rate = 0.0175
+    logit_opacities: Rate = 0.175
+    sh0: Rate = 0.07
+    shN: Rate = 0.0175  # noqa: N815 (the name that scenes give it)
 
 
 class RefineConfig(Section):
@@ -38,7 +38,7 @@ class RefineConfig(Section):
         seconds: Wall-clock seconds, at most; 0 leaves it to ``steps``. With both 0, a
             simplification is not refined.
         rates: Steps at the start.
-        last_rate: Share of them at the end; in between they fall exponentially.
+        half_after: Steps after which they are half as long; after n times as many, 1 / (n + 1).
         squared: Weight of the logarithm of the squared error.
         image: Weight of the logarithm of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) + 0.2
             gradient``.
@@ -54,13 +54,13 @@ class RefineConfig(Section):
 
     Example:
         >>> RefineConfig(size=128).rates.means
-        0.06
+        0.035
     """
 
     steps: int = pydantic.Field(default=0, ge=0)
     seconds: float = pydantic.Field(default=0.0, ge=0.0)
     rates: Rates = Rates()
-    last_rate: float = pydantic.Field(default=0.1, gt=0.0, le=1.0)
+    half_after: Count = 27
     squared: Rate = 0.5
     image: Rate = 0.5
     size: int = pydantic.Field(default=256, ge=16)

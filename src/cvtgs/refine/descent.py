@@ -62,7 +62,7 @@ def descend(
     after, waited = before, 0
     stopped = "perfect" if float(first.amin()) >= BEST_PSNR else budget.spent()
     while not stopped:
-        factor = config.last_rate ** budget.share()
+        factor = 1 / (1 + budget.steps / config.half_after)
         budget.begin()
         _step(variables, album, config=config, factor=factor)
         budget.end("step")
