@@ -67,6 +67,6 @@ def test_all_rows_and_invalid_ones():
     ]
 
 
-def test_a_size_is_refused_before_anything_is_done(scene):
+def test_a_size_out_of_range_is_refused(scene):
     with pytest.raises(InvalidArgumentError):
         Simplifier(device="cpu").prepare(scene).run(count=0)

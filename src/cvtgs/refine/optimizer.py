@@ -62,9 +62,12 @@ class CarefulAdam:
         self._count[rows], self._mean[rows], self._square[rows] = count, mean, square
         beside = (-1, *[1] * (gradients.ndim - 1))
         spread = square / (1 - keep_square**count).reshape(beside)
-        others = tuple(range(1, gradients.ndim))
-        agreeing = mean.double().square().sum(dim=others) if others else mean.double().square()
-        everything = agreeing + (spread.double().sum(dim=others) if others else spread)
+        agreeing = _row_sums(mean.double().square())
+        everything = agreeing + _row_sums(spread.double())
         share = divide(agreeing, everything).nan_to_num(0.0)  # squares that overflow
         share = share.to(mean.dtype).reshape(beside)
         self._parameter[rows] -= 2 * rate * share * mean / (spread.sqrt() + _LEAST_ROOT)
+
+
+def _row_sums(values: Float[Tensor, "k *d"]) -> Float[Tensor, "k"]:
+    return values.flatten(1).sum(dim=1) if values.ndim > 1 else values

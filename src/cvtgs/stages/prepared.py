@@ -23,11 +23,6 @@ class PreparedScene:
         config: Every choice.
         net: Corrects merged Gaussians, on the same device; None for no correction.
         cameras: From where a configuration that looks at the scene does so; None finds views.
-
-    Attributes:
-        scene: As above.
-        config: As above.
-        net: As above.
     """
 
     def __init__(
