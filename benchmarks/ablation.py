@@ -77,8 +77,12 @@ def row(preset: str, part: str) -> str:
 def report(table: Table, options: argparse.Namespace) -> str:
     """Say what was measured, then how it came out."""
     pictures = f"cvtgs' own renderer, {VIEWS} automatic views of {SIZE} x {SIZE} pixels"
+    scenes = "FILES" if options.files else f"--count {options.count}"
     nets = ", ".join(f"{name} {described(name)}" for name in PRESETS)
     return (
+        "# Ablation\n\n"
+        f"`python -m benchmarks.ablation {scenes} -o FOLDER` makes this table (with "
+        "`--lpips WEIGHTS` for LPIPS).\n\n"
         f"Scenes: {', '.join(table)}. "
         f"Judge: {'the command of --scorer' if options.scorer else pictures}. "
         f"cvtgs {cvtgs.__version__}, checkpoints: {nets}.\n\n"

@@ -164,7 +164,7 @@ def in_float64(scene: GaussianScene) -> GaussianScene:
 
 def grouped(scene: GaussianScene, target: int) -> tuple[Tensor, float]:
     """Group by position alone; labels in the order of the rows, and the energy."""
-    points = embed(scene.means, frame=robust_frame(scene.means), contracted=True)
+    points = embed(scene.means, frame=robust_frame(scene.means), contraction=1.0)
     order = morton_order(points, ties=scene.masses)
     weights = torch.ones(len(scene), dtype=torch.float64)
     found = tessellate(points[order], weights, target, config=SimplifyConfig().cvt)

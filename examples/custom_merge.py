@@ -41,7 +41,7 @@ def merge_within(
     config, frame = SimplifyConfig.from_preset("standard"), robust_frame(scene.means)
     order = morton_order(frame.contract(scene.means))
     scene, labels = scene.select(order), labels[order]
-    places = cvtgs.cvt.embed(scene.means, scene.sh0, frame=frame, contracted=False, color=0.05)
+    places = cvtgs.cvt.embed(scene.means, scene.sh0, frame=frame, color=0.05)
     points = torch.cat([places, APART * labels[:, None].to(places.dtype)], dim=1)
     count = cvtgs.target_count(len(scene), rho)
     cells = cvtgs.cvt.tessellate(points, scene.masses, count, config=config.cvt)

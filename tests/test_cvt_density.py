@@ -26,9 +26,9 @@ def test_weights_have_mean_one():
 
 def test_embedding_of_known_points():
     means, sh0 = torch.tensor([[3.0, 0, 0], [1, 8, 0]]), torch.zeros(2, 1, 3)
-    plain = embed(means, sh0, frame=FRAME, color=0.0, contracted=False)
+    plain = embed(means, sh0, frame=FRAME, color=0.0)
     assert plain.tolist() == [[1.0, 0, 0], [0, 4, 0]]
-    pulled = embed(means, sh0, frame=FRAME, color=0.0, contracted=True)
+    pulled = embed(means, sh0, frame=FRAME, color=0.0, contraction=1.0)
     assert pulled.tolist() == [[1.0, 0, 0], [0, pytest.approx(1 + math.log(4)), 0]]
 
 
@@ -36,18 +36,18 @@ def test_embedding_of_known_points():
 @pytest.mark.parametrize(("color", "d"), [(0.0, 3), (0.05, 6)])
 def test_embedding_has_six_coordinates_with_colour(color, d, dtype):
     means, sh0 = torch.zeros(4, 3, dtype=dtype), torch.ones(4, 1, 3, dtype=dtype)
-    points = embed(means, sh0, frame=FRAME, color=color, contracted=True)
+    points = embed(means, sh0, frame=FRAME, color=color, contraction=1.0)
     assert points.shape == (4, d)
     assert points.dtype == dtype
 
 
-@pytest.mark.parametrize("contracted", [True, False])
-def test_embedding_in_chunks_gives_the_same(monkeypatch, contracted):
+@pytest.mark.parametrize("contraction", [0.0, 0.5, 1.0])
+def test_embedding_in_chunks_gives_the_same(monkeypatch, contraction):
     g = torch.Generator().manual_seed(0)
     means, sh0 = torch.randn(100, 3, generator=g), torch.randn(100, 1, 3, generator=g)
-    whole = embed(means, sh0, frame=FRAME, color=0.1, contracted=contracted)
+    whole = embed(means, sh0, frame=FRAME, color=0.1, contraction=contraction)
     monkeypatch.setitem(embed.__globals__, "CHUNK", 7)
-    assert torch.equal(embed(means, sh0, frame=FRAME, color=0.1, contracted=contracted), whole)
+    assert torch.equal(embed(means, sh0, frame=FRAME, color=0.1, contraction=contraction), whole)
 
 
 def test_detail_far_from_the_origin_survives():
@@ -55,7 +55,7 @@ def test_detail_far_from_the_origin_survives():
     local = 1e-2 * torch.randn(50, 3, generator=g, dtype=torch.float64)
     sh0 = torch.zeros(50, 1, 3, dtype=torch.float64)
     near, far = (
-        embed(means, sh0, frame=robust_frame(means), contracted=True)
+        embed(means, sh0, frame=robust_frame(means), contraction=1.0)
         for means in (local, local + 6e6)
     )
     torch.testing.assert_close(near, far, rtol=0, atol=1e-6)
@@ -64,14 +64,14 @@ def test_detail_far_from_the_origin_survives():
 def test_colour_is_scaled():
     sh0 = torch.zeros(2, 1, 3, dtype=torch.float64)
     sh0[1, 0] = torch.tensor([1.0, -1.0, 0.5])
-    points = embed(torch.zeros(2, 3).double(), sh0, frame=FRAME, color=0.1, contracted=False)
+    points = embed(torch.zeros(2, 3).double(), sh0, frame=FRAME, color=0.1)
     wanted = 0.1 * 0.28209479177387814 * torch.tensor([1.0, -1.0, 0.5], dtype=torch.float64)
     torch.testing.assert_close(points[1, 3:] - points[0, 3:], wanted)
 
 
 def test_extreme_colours_do_not_tear_points_apart():
     sh0 = torch.tensor([[[1e4, -1e4, 0.0]], [[-1e30, 1e30, 0.0]]])
-    points = embed(torch.zeros(2, 3), sh0, frame=FRAME, color=0.05, contracted=False)
+    points = embed(torch.zeros(2, 3), sh0, frame=FRAME, color=0.05)
     assert float((points[0] - points[1]).abs().amax()) < 0.2
 
 
@@ -102,11 +102,11 @@ def test_flyaways_weigh_nothing_from_the_middle():
     assert bool(factors.isfinite().all())
 
 
-@pytest.mark.parametrize("contracted", [True, False])
-def test_flyaways_do_not_overflow(contracted):
+@pytest.mark.parametrize("contraction", [0.0, 0.5, 1.0])
+def test_flyaways_do_not_overflow(contraction):
     means = torch.tensor([[3e38, -3e38, 0.0], [1e-10, 0, 0], [0, 0, 0]])
     frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1e-10)
-    points = embed(means, frame=frame, contracted=contracted)
+    points = embed(means, frame=frame, contraction=contraction)
     assert bool(points.isfinite().all())
     assert points[1:].tolist() == [[1.0, 0, 0], [0, 0, 0]]
     assert float(points[0, 0]) > 1.4

@@ -119,7 +119,7 @@ def test_a_scene_of_one_colour_keeps_its_bands():
         ((0.0, 1.0, 0.0), 2),
         ((0.0, 0.0, 1.0), 3),
         ((1.0, 1.0, 1.0), 3),
-        ((1e-6, 1e-6, 1e-6), 0),
+        ((1e-7, 1e-7, 1e-7), 0),
     ],
 )
 def test_degree_by_the_energy_of_the_bands(sizes, degree):
@@ -150,6 +150,21 @@ def test_a_sky_makes_a_scene_unbounded(far):
     plan = plan_of(with_sky(far * UNBOUNDED_SHARE))
     assert plan.unbounded.active is (far > 1)
     assert plan.unbounded.figure == pytest.approx(far * UNBOUNDED_SHARE, rel=0.02)
+    assert plan.unbounded.strength == (far > 1)
+
+
+@pytest.mark.parametrize("share", [0.06, 0.075, 0.09])
+def test_between_bounded_and_unbounded_are_degrees(share):
+    effect = plan_of(with_sky(share)).unbounded
+    assert effect.active
+    assert effect.strength == pytest.approx((effect.figure - 0.05) / 0.05)
+    assert 0.05 < effect.strength < 0.95
+
+
+def test_little_that_is_far_is_not_pulled_in():
+    effect = plan_of(with_sky(0.03), unbounded="on").unbounded
+    assert effect.active
+    assert effect.strength == 0.0
 
 
 def test_an_object_is_bounded():

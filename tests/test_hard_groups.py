@@ -53,8 +53,8 @@ def test_space_and_weights_are_finite(make, device, dtype):
         assert bool(((light >= 0) & (light <= 1)).all())
     far = falloff(scene.means, frame)
     assert bool(((far >= 0) & (far <= 1)).all())
-    for contracted in (False, True):
-        points = embed(scene.means, scene.sh0, frame=frame, contracted=contracted, color=0.05)
+    for contraction in (0.0, 0.5, 1.0):
+        points = embed(scene.means, scene.sh0, frame=frame, contraction=contraction, color=0.05)
         assert bool(points.isfinite().all())
     for power in (0.0, 0.8, 1.0):
         weights = tessellation_weights(
@@ -71,7 +71,7 @@ def test_space_and_weights_are_finite(make, device, dtype):
 def test_every_cell_gets_a_member_and_lloyd_never_loses(make, device, dtype, preset):
     scene = valid_scene(make, dtype, device)
     frame = robust_frame(scene.means)
-    points = embed(scene.means, frame=frame, contracted=False)
+    points = embed(scene.means, frame=frame)
     order = morton_order(points)
     points, weights = points[order], scene.masses[order]
     weights = weights if float(weights.amax()) > 0 else torch.ones_like(weights)
@@ -93,7 +93,7 @@ def test_every_cell_gets_a_member_and_lloyd_never_loses(make, device, dtype, pre
 @each_case
 def test_the_nearest_site_is_the_nearest(make, dtype, search):
     scene = valid_scene(make, dtype)
-    points = embed(scene.means, frame=robust_frame(scene.means), contracted=False)
+    points = embed(scene.means, frame=robust_frame(scene.means))
     sites = points[::3]
     labels, squared = search(points, sites)
     every = squared_distances(points, sites)
@@ -107,7 +107,7 @@ def test_the_nearest_site_is_the_nearest(make, dtype, search):
 @each_case
 def test_neighbours_are_the_nearest_others(make, dtype, backend):
     scene = valid_scene(make, dtype)
-    sites = embed(scene.means, frame=robust_frame(scene.means), contracted=False)
+    sites = embed(scene.means, frame=robust_frame(scene.means))
     found = nearest_neighbors(sites, 8, backend=backend)
     assert found.shape == (len(sites), min(8, len(sites) - 1))
     assert not bool((found == torch.arange(len(sites))[:, None]).any())

@@ -77,6 +77,14 @@ def test_contraction_keeps_directions_and_order_and_shrinks():
     torch.testing.assert_close(contracted / lengths[:, None], directions)
 
 
+def test_contraction_by_degrees_shrinks_the_logarithm_of_the_distance():
+    points = torch.tensor([[0.0, 20.0, 0.0], [0.3, 0.1, 0.0]])
+    assert UNIT.contract(points, 0.0).equal(points.double())
+    whole, half = UNIT.contract(points)[0, 1], UNIT.contract(points, 0.5)[0, 1]
+    torch.testing.assert_close(half.square(), 20.0 * whole)
+    assert UNIT.contract(points, 0.5)[1].equal(points[1].double())
+
+
 def test_contraction_is_finite_for_float32_flyaways():
     points = torch.tensor([[1e30, -1e30, 0.0], [3e38, 0.0, 0.0]])
     lengths = torch.linalg.vector_norm(UNIT.contract(points), dim=1)

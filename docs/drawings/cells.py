@@ -33,7 +33,7 @@ def main() -> None:
     frame = robust_frame(scene.means)
     order = morton_order(frame.contract(scene.means))
     # By position alone and uncontracted, so that straight borders are what the method sees.
-    points = cvtgs.cvt.embed(scene.means[order], frame=frame, contracted=False)
+    points = cvtgs.cvt.embed(scene.means[order], frame=frame)
     seen = scene.areas[order] * cvtgs.cvt.falloff(scene.means[order], frame)
     weights = cvtgs.cvt.tessellation_weights(
         scene.opacities[order], seen, area_power=1.0, floor=config.weight_floor

@@ -200,9 +200,7 @@ def survey(
         entering, _ = entering_rows(small, outlook, least, no_flyaways)
         faintest = min(float(small.opacities[entering].amin()), config.filter.min_opacity)
         lightest = _lightest_flyaway(depths, config.filter.max_flyaway_share)
-    power = config.cvt.area_power
-    if outlook.plan.unbounded.active:
-        power = config.cvt.unbounded_area_power
+    power = outlook.area_power(config.cvt)
     weights = raw_weights(small.opacities, outlook.seen_areas, power)[entering]
     unit = float(weights.mean()) or 1.0
     floor = unit * config.cvt.weight_floor

@@ -12,7 +12,7 @@ def embed(
     sh0: Float[Tensor, "n 1 3"] | None = None,
     *,
     frame: RobustFrame,
-    contracted: bool,
+    contraction: float = 0.0,
     color: float = 0.0,
 ) -> Float[Tensor, "n d"]:
     """Place Gaussians in the space of the tessellation.
@@ -21,7 +21,7 @@ def embed(
         means: Positions, scene units.
         sh0: Constant SH band; None leaves colour out.
         frame: Centre and radius of the scene.
-        contracted: Whether positions beyond the robust radius are pulled in.
+        contraction: How much positions beyond the robust radius are pulled in, from 0 to 1.
         color: Length of one unit of colour in robust radii; 0 leaves colour out.
 
     Returns:
@@ -30,7 +30,7 @@ def embed(
     Example:
         >>> import torch
         >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=2.0)
-        >>> embed(torch.ones(1, 3), frame=frame, contracted=False).tolist()
+        >>> embed(torch.ones(1, 3), frame=frame).tolist()
         [[0.5, 0.5, 0.5]]
     """
     colored = sh0 is not None and color > 0.0
@@ -38,7 +38,7 @@ def embed(
     for start in range(0, len(means), CHUNK):
         part = slice(start, start + CHUNK)
         local = means[part]
-        place = frame.contract(local) if contracted else frame.normalize(local)
+        place = frame.contract(local, contraction) if contraction else frame.normalize(local)
         points[part, :3] = place.clamp_(-FARTHEST, FARTHEST)
         if sh0 is not None and colored:
             rgb = (SH_C0 * sh0[part, 0].double()).clamp(-0.5, 0.5 + COLOR_HEADROOM)

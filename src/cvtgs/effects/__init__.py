@@ -10,10 +10,12 @@ from cvtgs.effects.limits import limited, pictured, restored, trimmed
 from cvtgs.effects.plan import (
     BAND_LOSS,
     DUPLICATE_SHARE,
+    FULLY_UNBOUNDED_SHARE,
     UNBOUNDED_SHARE,
     BandsEffect,
     Effect,
     EffectPlan,
+    GradedEffect,
     plan_effects,
     with_haze,
 )
@@ -21,11 +23,13 @@ from cvtgs.effects.plan import (
 __all__ = [
     "BAND_LOSS",
     "DUPLICATE_SHARE",
+    "FULLY_UNBOUNDED_SHARE",
     "UNBOUNDED_DISTANCE",
     "UNBOUNDED_SHARE",
     "BandsEffect",
     "Effect",
     "EffectPlan",
+    "GradedEffect",
     "band_losses",
     "duplicate_share",
     "far_share",

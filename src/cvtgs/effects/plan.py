@@ -15,11 +15,14 @@ from cvtgs.effects.figures import (
 from cvtgs.math.frames import RobustFrame
 from cvtgs.scene import GaussianScene
 
-BAND_LOSS = 1e-4
+BAND_LOSS = 1e-5
 """Bands of the spherical harmonics that together change no colour by more are left out."""
 
 UNBOUNDED_SHARE = 0.05
 """A scene with more than this share of its mass far away is unbounded."""
+
+FULLY_UNBOUNDED_SHARE = 0.1
+"""From this share on it is so fully; in between, by degrees: no scene lies on an edge."""
 
 DUPLICATE_SHARE = 0.01
 """With more than this share of duplicates, it pays to search for each place only once."""
@@ -55,6 +58,16 @@ class BandsEffect(Effect):
     bands: tuple[float, ...]
 
 
+class GradedEffect(Effect):
+    """An effect that sets in by degrees.
+
+    Attributes:
+        strength: From 0, which changes nothing, to 1.
+    """
+
+    strength: float
+
+
 class EffectPlan(pydantic.BaseModel):
     """What a scene calls for. The names are those of :class:`cvtgs.config.EffectsConfig`.
 
@@ -75,7 +88,7 @@ class EffectPlan(pydantic.BaseModel):
 
     sh: BandsEffect
     mip: Effect
-    unbounded: Effect
+    unbounded: GradedEffect
     haze: Effect
     flat: Effect
     duplicates: Effect
@@ -177,13 +190,16 @@ def _mip(scene: GaussianScene, config: SimplifyConfig) -> Effect:
     )
 
 
-def _unbounded(share: float, config: SimplifyConfig) -> Effect:
-    return _shared(
+def _unbounded(share: float, config: SimplifyConfig) -> GradedEffect:
+    effect = _shared(
         share,
         config.effects.unbounded,
         least=UNBOUNDED_SHARE,
         meaning=f"share of mass beyond {UNBOUNDED_DISTANCE:g} robust radii",
     )
+    above = (share - UNBOUNDED_SHARE) / (FULLY_UNBOUNDED_SHARE - UNBOUNDED_SHARE)
+    strength = min(1.0, max(0.0, above)) if effect.active else 0.0
+    return GradedEffect(**effect.model_dump(), strength=strength)
 
 
 def _haze(share: float, config: SimplifyConfig) -> Effect:

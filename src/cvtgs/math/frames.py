@@ -51,7 +51,7 @@ class RobustFrame:
         ]
         return torch.cat(parts)
 
-    def contract(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    def contract(self, points: Float[Tensor, "n 3"], strength: float = 1.0) -> Float[Tensor, "n 3"]:
         """Express points in radii and pull in those beyond the first radius, logarithmically.
 
         A point at distance d > 1 goes to distance ``1 + log(d)`` in the same direction. Seen
@@ -60,13 +60,15 @@ class RobustFrame:
 
         Args:
             points: Finite positions, scene units.
+            strength: From 0, which pulls nothing in, to 1. Between them the logarithm of the
+                distance shrinks by that share.
 
         Returns:
-            Positions in float64; a flyaway of 1e30 radii lies at 70.
+            Positions in float64; with strength 1 a flyaway of 1e30 radii lies at 70.
         """
         local = self.normalize(points)
         distance: Tensor = torch.linalg.vector_norm(local, dim=1, keepdim=True).clamp_min(1.0)
-        return local * ((1.0 + torch.log(distance)) / distance)
+        return local * ((1.0 + torch.log(distance)) / distance) ** strength
 
 
 def robust_frame(points: Float[Tensor, "n 3"]) -> RobustFrame:

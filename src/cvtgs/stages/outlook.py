@@ -47,6 +47,11 @@ class Outlook(NamedTuple):
         light = self.light[rows] if len(self.light) else self.light
         return self._replace(areas=self.areas[rows], seen_areas=self.seen_areas[rows], light=light)
 
+    def area_power(self, config: TessellationConfig) -> float:
+        """Give the power of the area in the weight: the more unbounded, the flatter."""
+        strength = self.plan.unbounded.strength
+        return (1 - strength) * config.area_power + strength * config.unbounded_area_power
+
     def facts(self, scene: GaussianScene) -> dict[str, Any]:
         """Give what the report says about it."""
         return {"plan": self.plan, "mass_in": float((self.areas * scene.opacities).sum())}

@@ -40,7 +40,7 @@ def rows_along_curve(scene: GaussianScene, rows: Tensor, outlook: Outlook) -> Te
         The rows in their order.
     """
     # A curve through contracted space stays fine where the bulk is, whatever flies away.
-    curve = cvt.embed(scene.means[rows], frame=outlook.frame, contracted=True)
+    curve = cvt.embed(scene.means[rows], frame=outlook.frame, contraction=1.0)
     return rows[morton_order(curve, ties=outlook.seen_areas[rows] * scene.opacities[rows])]
 
 
@@ -63,7 +63,7 @@ def places_of(
         scene.means[rows],
         scene.sh0[rows],
         frame=outlook.frame,
-        contracted=outlook.plan.unbounded.active,
+        contraction=outlook.plan.unbounded.strength,
         color=config.cvt.color * (target / COLOR_CELLS) ** config.cvt.color_power,
     )
 

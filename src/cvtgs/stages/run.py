@@ -188,11 +188,7 @@ def _refer(
         weights = cvt.tessellation_weights(
             valid.opacities[rows],
             outlook.seen_areas[rows],
-            area_power=(
-                config.cvt.unbounded_area_power
-                if outlook.plan.unbounded.active
-                else config.cvt.area_power
-            ),
+            area_power=outlook.area_power(config.cvt),
             floor=config.cvt.weight_floor,
         )
         tessellation = cvt.tessellate(
