@@ -171,7 +171,7 @@ def test_backgrounds_are_drawn():
 
 def test_a_step_has_the_length_of_the_rate_once_gradients_have_agreed():
     scene = random_scene(4, degree=0)
-    variables = Variables(scene, Rates(sh0=0.25, means=0.5))
+    variables = Variables(scene, Rates(sh0=0.25, means=0.5), freedom=torch.ones(len(scene)))
 
     def step():
         now = variables.scene()
@@ -191,7 +191,7 @@ def test_a_step_has_the_length_of_the_rate_once_gradients_have_agreed():
 
 def test_rows_without_a_gradient_keep_their_bits_and_their_momentum():
     scene = random_scene(5)
-    variables = Variables(scene, Rates())
+    variables = Variables(scene, Rates(), freedom=torch.ones(len(scene)))
     variables.step(variables.scene().sh0[0].sum(), factor=1.0)
     before = variables.result()
     variables.step(variables.scene().sh0[1].sum(), factor=1.0)
@@ -204,7 +204,7 @@ def test_rows_without_a_gradient_keep_their_bits_and_their_momentum():
 
 def test_a_row_with_one_bad_gradient_is_left_alone():
     scene = random_scene(3)
-    variables = Variables(scene, Rates())
+    variables = Variables(scene, Rates(), freedom=torch.ones(len(scene)))
     now = variables.scene()
     weights = torch.tensor([[1.0, 1, 1], [1, math.nan, 1], [math.inf, 1, 1]])
     variables.step((now.means * weights).sum() + now.sh0.sum(), factor=1.0)
@@ -216,14 +216,14 @@ def test_a_row_with_one_bad_gradient_is_left_alone():
 
 def test_rows_that_left_what_can_be_drawn_come_back():
     scene = random_scene(3)
-    variables = Variables(scene, Rates(log_scales=1e6))
+    variables = Variables(scene, Rates(log_scales=1e6), freedom=torch.ones(len(scene)))
     variables.step(-variables.scene().log_scales[1].sum(), factor=1.0)
     assert same_bits(variables.result(), scene)
 
 
 def test_a_loss_that_depends_on_nothing():
     scene = random_scene(3)
-    variables = Variables(scene, Rates())
+    variables = Variables(scene, Rates(), freedom=torch.ones(len(scene)))
     variables.step(torch.tensor(1.0), factor=1.0)
     variables.step(variables.scene().sh0.sum() * 0, factor=1.0)
     assert same_bits(variables.result(), scene)

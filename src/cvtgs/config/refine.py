@@ -22,12 +22,12 @@ class Rates(Section):
         shN: Colours that depend on the direction.
     """
 
-    means: Rate = 0.035
-    quats: Rate = 0.014
-    log_scales: Rate = 0.0175
-    logit_opacities: Rate = 0.175
-    sh0: Rate = 0.07
-    shN: Rate = 0.0175  # noqa: N815 (the name that scenes give it)
+    means: Rate = 0.05
+    quats: Rate = 0.02
+    log_scales: Rate = 0.025
+    logit_opacities: Rate = 0.25
+    sh0: Rate = 0.1
+    shN: Rate = 0.025  # noqa: N815 (the name that scenes give it)
 
 
 class RefineConfig(Section):

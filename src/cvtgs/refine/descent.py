@@ -3,6 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from jaxtyping import Float
+from torch import Tensor
+
 from cvtgs.config import RefineConfig
 from cvtgs.losses import relative_loss
 from cvtgs.refine.budget import Budget
@@ -36,7 +39,7 @@ def descend(
     *,
     budget: Budget,
     config: RefineConfig,
-    frozen: int = 0,
+    freedom: Float[Tensor, "n"],
     tell: Callable[[float], None],
 ) -> Descent:
     """Move the Gaussians of a scene towards pictures of the full one, one picture per step.
@@ -47,7 +50,7 @@ def descend(
         heldout: Pictures that decide.
         budget: When to stop.
         config: Learning rates, loss, checks and patience.
-        frozen: So many of the first Gaussians do not move.
+        freedom: Share of the rates by which each Gaussian moves.
         tell: Told the gain so far, dB, after every step.
 
     Returns:
@@ -58,7 +61,7 @@ def descend(
     limit = best_counted(first)
     best, before = small, float(first.clamp(max=limit).mean())
     budget.end("check")
-    variables = Variables(small, config.rates, frozen=frozen)
+    variables = Variables(small, config.rates, freedom=freedom)
     after, waited = before, 0
     stopped = "perfect" if float(first.amin()) >= BEST_PSNR else budget.spent()
     while not stopped:

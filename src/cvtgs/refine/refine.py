@@ -12,6 +12,7 @@ from cvtgs.filters import invalid_rows
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.refine.budget import Budget, check_budget
 from cvtgs.refine.descent import Descent, descend
+from cvtgs.refine.freedom import freedom
 from cvtgs.refine.looking import Outlook, given_outlook, own_outlook
 from cvtgs.refine.pictures import Album, take_picture
 from cvtgs.refine.variables import changed_count
@@ -110,8 +111,10 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         outlook = _outlook(theirs, cameras, config=config, seed=seed)
         heldout = tuple(take_picture(theirs, camera) for camera in outlook.heldout)
         album = Album(theirs, outlook.learning, config=config, seed=seed)
+        free = freedom(ours, theirs)
+        free[:frozen] = 0.0
         descent = descend(
-            ours, album, heldout, budget=budget, config=config, frozen=frozen, tell=tell
+            ours, album, heldout, budget=budget, config=config, freedom=free, tell=tell
         )
     report = RefineReport(
         steps=budget.steps,

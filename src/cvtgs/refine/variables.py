@@ -1,13 +1,12 @@
 """What a refinement changes: the six tensors of a scene, row by row."""
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.config import Rates
-from cvtgs.cvt import openness
 from cvtgs.filters import invalid_rows, standardized, with_finite_opacities
 from cvtgs.math import quaternions
-from cvtgs.math.frames import robust_frame
 from cvtgs.refine.optimizer import CarefulAdam
 from cvtgs.scene import GaussianScene
 
@@ -17,21 +16,18 @@ class Variables:
 
     A step moves the Gaussians alone that a picture shows: all others have no gradient, keep their
     momentum for later, and stay as they are. A Gaussian moves only as far as pictures agree
-    (:class:`CarefulAdam`), and less where it is enclosed, for it may be all that is seen from
-    elsewhere. Memory: five times the scene.
+    (:class:`CarefulAdam`), and as it is free to. Memory: five times the scene.
 
     Args:
         scene: The simplified scene; it is not changed.
         rates: Learning rates at the start.
-        frozen: So many of the first Gaussians do not move.
+        freedom: Share of the rates by which each Gaussian moves, 0 to 1.
     """
 
-    def __init__(self, scene: GaussianScene, rates: Rates, *, frozen: int = 0) -> None:
+    def __init__(self, scene: GaussianScene, rates: Rates, *, freedom: Float[Tensor, "n"]) -> None:
         self._scene = scene
         self._start = _started(scene)
-        self._units = _units(scene)
-        for unit in self._units.values():
-            unit[:frozen] = 0.0
+        self._units = _units(scene, freedom)
         self._changes = {
             name: torch.zeros_like(tensor, requires_grad=True)
             for name, tensor in self._start.items()
@@ -121,21 +117,11 @@ def _started(scene: GaussianScene) -> dict[str, Tensor]:
     return start | {"quats": quaternions.normalize(start["quats"])}
 
 
-def _units(scene: GaussianScene) -> dict[str, Tensor]:
-    """Give the length of one unit of change of every Gaussian.
-
-    What is enclosed moves less, by :func:`cvtgs.cvt.openness`; places are measured in the mean
-    standard deviation. Rows that no renderer can draw do not move.
-    """
-    valid = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
-    for mask in invalid_rows(scene).values():
-        valid &= ~mask
-    some = scene.select(valid)
-    light = torch.zeros_like(scene.logit_opacities)
-    light[valid] = openness(some.means, some.masses, robust_frame(some.means)).to(scene.dtype)
-    widths = torch.where(valid, torch.exp(scene.log_scales).mean(dim=1), 0.0)
-    units = {name: _beside(light, tensor) for name, tensor in scene.tensors().items()}
-    return units | {"means": (light * widths)[:, None]}
+def _units(scene: GaussianScene, freedom: Float[Tensor, "n"]) -> dict[str, Tensor]:
+    """Give the length of one unit of change; places are measured in the mean standard deviation."""
+    widths = torch.where(freedom > 0, torch.exp(scene.log_scales).mean(dim=1), 0.0)
+    units = {name: _beside(freedom, tensor) for name, tensor in scene.tensors().items()}
+    return units | {"means": (freedom * widths)[:, None]}
 
 
 def _rows_to_move(gradients: tuple[Tensor, ...]) -> Tensor:
