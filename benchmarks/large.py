@@ -12,6 +12,7 @@ import os
 import tempfile
 import time
 from pathlib import Path
+from statistics import mean
 
 import torch
 
@@ -36,35 +37,45 @@ def main() -> None:
     parser.add_argument("--memory", default="4GB")
     parser.add_argument("--rho", type=float, default=0.01)
     parser.add_argument("--folder", type=Path, help="where large files are written")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     load = os.getloadavg()[0]
     print(f"{machine()}, torch {torch.__version__}; load {load:.1f} when this started\n")
     {"levels": levels, "seams": seams, "blocks": blocks, "make": make}[options.what](options)
 
 
 def levels(options: argparse.Namespace) -> None:
-    """Time of three levels against the finest alone, and PSNR against runs of their own."""
-    print("| scene | finest, CPU s | levels, CPU s | ratio | PSNR, own runs | PSNR, levels |")
+    """Time of three levels against the finest alone, and PSNR against runs of their own.
+
+    PSNR is the mean over several counts, as for seams.
+    """
+    print("| scene | finest, CPU s | levels, CPU s | ratio | PSNR, own runs | levels gain |")
     print("|---|---|---|---|---|---|")
     torch.set_num_threads(1)  # threads that wait for one another would count as CPU time
     simplifier = cvtgs.Simplifier(device="cpu")
     for name, scene in scenes(options):
         simplifier.simplify(scene.select(torch.arange(1000)), 0.1)  # loads scipy
-        start = time.process_time()
-        own = {RATIOS[0]: simplifier.simplify(scene, RATIOS[0])}
-        finest = time.process_time() - start
-        start = time.process_time()
-        found = simplifier.levels(scene, RATIOS)
-        together = time.process_time() - start
-        own |= {rho: simplifier.simplify(scene, rho) for rho in RATIOS[1:]}
-        small = {f"own {rho}": own[rho] for rho in RATIOS}
-        small |= {f"level {rho}": x.scene for rho, x in zip(RATIOS, found, strict=True)}
+        small, finest, together = {}, 0.0, 0.0
+        for share in SHARES:
+            ratios = [share * rho for rho in RATIOS]
+            start = time.process_time()
+            own = [simplifier.simplify(scene, ratios[0])]
+            finest += time.process_time() - start
+            start = time.process_time()
+            found = simplifier.levels(scene, ratios)
+            together += time.process_time() - start
+            own += [simplifier.simplify(scene, rho) for rho in ratios[1:]]
+            small |= {f"own {rho} {share}": x for rho, x in zip(RATIOS, own, strict=True)}
+            small |= {f"level {rho} {share}": x.scene for rho, x in zip(RATIOS, found, strict=True)}
         psnr = scores(scene, small)
-        words = [" / ".join(f"{psnr[f'{kind} {rho}']:.2f}" for rho in RATIOS)
-                 for kind in ("own", "level")]  # fmt: skip
+        means = {
+            kind: [mean(psnr[f"{kind} {rho} {share}"] for share in SHARES) for rho in RATIOS]
+            for kind in ("own", "level")
+        }
+        pairs = zip(means["level"], means["own"], strict=True)
         print(
-            f"| {name}, {len(scene):,} | {finest:.2f} | {together:.2f} "
-            f"| {together / finest:.2f} | {words[0]} | {words[1]} |",
+            f"| {name}, {len(scene):,} | {finest / len(SHARES):.2f} | {together / len(SHARES):.2f} "
+            f"| {together / finest:.2f} | {' / '.join(f'{value:.2f}' for value in means['own'])} "
+            f"| {' / '.join(f'{level - alone:+.2f}' for level, alone in pairs)} |",
             flush=True,
         )
 
@@ -87,8 +98,8 @@ def seams(options: argparse.Namespace) -> None:
                 simplify_file(path, output, rho, blocks=number, overwrite=True)
                 small[f"{number} {share}"] = cvtgs.load(output)
         psnr = scores(scene, small)
-        means = [sum(psnr[f"{n} {share}"] for share in SHARES) / len(SHARES) for n in numbers]
-        words = [f"{means[0]:.2f} |", *(f"{mean - means[0]:+.2f} |" for mean in means[1:])]
+        means = [mean(psnr[f"{n} {share}"] for share in SHARES) for n in numbers]
+        words = [f"{means[0]:.2f} |", *(f"{value - means[0]:+.2f} |" for value in means[1:])]
         print(f"| {name}, {len(scene):,} |", *words, flush=True)
 
 
