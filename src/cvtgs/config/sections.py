@@ -112,8 +112,8 @@ class VisibilityConfig(Section):
     """
 
     views: int = pydantic.Field(default=0, ge=0)
-    size: int = pydantic.Field(default=256, ge=16)
-    mass_share: Share = 0.5
+    size: int = pydantic.Field(default=128, ge=16)
+    mass_share: Share = 0.7
 
 
 class MergeConfig(Section):
