@@ -99,7 +99,12 @@ def test_given_cameras_decide_what_is_seen():
         height=32,
     )
     config = SimplifyConfig.compose(
-        settings={"merge.network": "false", "visibility.views": "4", "filter.min_opacity": "0"}
+        settings={
+            "merge.network": "false",
+            "visibility.views": "4",
+            "visibility.mass_share": "0.5",
+            "filter.min_opacity": "0",
+        }
     )
     simplifier = Simplifier(config=config, device="cpu")
     small = simplifier.simplify(scene, 0.1, cameras=cameras)
