@@ -56,7 +56,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     One picture of the full scene per step, over a random background; Adam moves the Gaussians
     that the picture shows. Views that are held out decide: the best scene by their PSNR is
     returned, which is the one that came in if none is better. Number of Gaussians, SH degree,
-    comments, layout and extra columns stay; Gaussians that no picture shows stay bit for bit.
+    comments, layout and extra columns stay. Gaussians that no picture shows stay bit for bit, as do
+    those that stand for themselves alone.
 
     The same scenes, steps, configuration and seed give the same bits on a CPU; with ``seconds``
     the clock decides how many steps there are. The time includes everything, also the compilation
