@@ -59,12 +59,12 @@ def test_what_cannot_be_drawn_does_not_move():
 
 def test_a_refinement_leaves_exact_ones_alone_and_moves_merged_ones():
     full = full_scene(500)
-    small = discolored(small_scene(full, 0.3), 0.2)
+    small = discolored(small_scene(full, 0.1), 0.5)
     exact = (small.means[:, None] == full.means).all(dim=2).any(dim=1)
-    sh0 = torch.where(exact[:, None, None], small.sh0 - 0.2, small.sh0)
+    sh0 = torch.where(exact[:, None, None], small.sh0 - 0.5, small.sh0)
     small = small.with_tensors({"sh0": sh0}, {})
     free = freedom(small, full) > 0
-    scene, report = refine(small, full, steps=20, config=quick())
+    scene, report = refine(small, full, steps=40, config=quick())
     assert 0 < int((~free).sum()) < len(small)
     assert same_bits(scene.select(~free), small.select(~free))
     assert report.changed_count > 0

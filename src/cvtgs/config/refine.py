@@ -22,12 +22,12 @@ class Rates(Section):
         shN: Colours that depend on the direction.
     """
 
-    means: Rate = 0.05
-    quats: Rate = 0.02
-    log_scales: Rate = 0.025
-    logit_opacities: Rate = 0.25
-    sh0: Rate = 0.1
-    shN: Rate = 0.025  # noqa: N815 (the name that scenes give it)
+    means: Rate = 0.02
+    quats: Rate = 0.008
+    log_scales: Rate = 0.01
+    logit_opacities: Rate = 0.1
+    sh0: Rate = 0.04
+    shN: Rate = 0.01  # noqa: N815 (the name that scenes give it)
 
 
 class RefineConfig(Section):
@@ -54,13 +54,13 @@ class RefineConfig(Section):
 
     Example:
         >>> RefineConfig(size=128).rates.means
-        0.035
+        0.02
     """
 
     steps: int = pydantic.Field(default=0, ge=0)
     seconds: float = pydantic.Field(default=0.0, ge=0.0)
     rates: Rates = Rates()
-    half_after: Count = 27
+    half_after: Count = 100
     squared: Rate = 0.5
     image: Rate = 0.5
     size: int = pydantic.Field(default=256, ge=16)

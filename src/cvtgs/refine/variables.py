@@ -7,16 +7,18 @@ from torch import Tensor
 from cvtgs.config import Rates
 from cvtgs.filters import invalid_rows, standardized, with_finite_opacities
 from cvtgs.math import quaternions
-from cvtgs.refine.optimizer import CarefulAdam
 from cvtgs.scene import GaussianScene
+
+_BETAS = (0.9, 0.99)
+_LEAST_ROOT = 1e-15
 
 
 class Variables:
     """A scene as a start plus changes, and the optimiser of the changes.
 
-    A step moves the Gaussians alone that a picture shows: all others have no gradient, keep their
-    momentum for later, and stay as they are. A Gaussian moves only as far as pictures agree
-    (:class:`CarefulAdam`), and as it is free to. Memory: five times the scene.
+    A step of Adam (Kingma and Ba 2015, as ``SparseAdam`` does it) moves the Gaussians alone that a
+    picture shows, as far as they are free to: all others have no gradient, keep their momentum for
+    later, and stay as they are. Memory: five times the scene.
 
     Args:
         scene: The simplified scene; it is not changed.
@@ -37,8 +39,13 @@ class Variables:
             for name, rate in rates.model_dump().items()
             if rate > 0 and self._start[name].numel()
         }
-        self._optimizers = {name: CarefulAdam(self._changes[name].detach()) for name in self._rates}
         self._moved = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
+        groups = [
+            {"params": [self._changes[name]], "lr": rate} for name, rate in self._rates.items()
+        ]
+        self._optimizer = (
+            torch.optim.SparseAdam(groups, betas=_BETAS, eps=_LEAST_ROOT) if groups else None
+        )
 
     def scene(self) -> GaussianScene:
         """Give the scene, differentiable in the changes.
@@ -59,13 +66,19 @@ class Variables:
             loss: What to make small, from :meth:`scene`.
             factor: Share of the learning rates.
         """
-        if not self._rates or not loss.requires_grad:
+        if self._optimizer is None or not loss.requires_grad:
             return
         changes = [self._changes[name] for name in self._rates]
         gradients = torch.autograd.grad(loss, changes, materialize_grads=True)
         rows = _rows_to_move(gradients)
-        for (name, rate), gradient in zip(self._rates.items(), gradients, strict=True):
-            self._optimizers[name].step(rows, gradient[rows], rate=factor * rate)
+        for group, rate, change, gradient in zip(
+            self._optimizer.param_groups, self._rates.values(), changes, gradients, strict=True
+        ):
+            group["lr"] = factor * rate
+            change.grad = torch.sparse_coo_tensor(
+                rows[None], gradient[rows], change.shape, is_coalesced=True, check_invariants=True
+            )
+        self._optimizer.step()
         self._moved[rows] = True
 
     @torch.no_grad()
