@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cvt import nearest_backend, openness
-from cvtgs.filters import invalid_rows
+from cvtgs.filters import valid_rows
 from cvtgs.math.activations import divide
 from cvtgs.math.frames import robust_frame
 from cvtgs.scene import GaussianScene
@@ -34,9 +34,7 @@ def freedom(small: GaussianScene, full: GaussianScene) -> Float[Tensor, "n"]:
         >>> freedom(scene, scene).tolist() == [0.0] * 100
         True
     """
-    valid = torch.ones(len(small), dtype=torch.bool, device=small.device)
-    for mask in invalid_rows(small).values():
-        valid &= ~mask
+    valid = valid_rows(small)
     some = small.select(valid)
     light = openness(some.means, some.masses, robust_frame(some.means))
     factors = torch.zeros_like(small.logit_opacities)

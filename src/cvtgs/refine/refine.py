@@ -8,7 +8,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.config import RefineConfig
 from cvtgs.devices import chosen_device
 from cvtgs.errors import InvalidSceneError
-from cvtgs.filters import invalid_rows
+from cvtgs.filters import valid_rows
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.refine.budget import Budget, check_budget
 from cvtgs.refine.descent import Descent, descend
@@ -155,22 +155,15 @@ def _prepared(
 ) -> tuple[GaussianScene, GaussianScene]:
     """Bring both scenes to one device and dtype, and leave out what of the full one is invalid."""
     for name, scene in (("simplified", small), ("full", full)):
-        if not bool(_valid(scene).any()):
+        if not bool(valid_rows(scene).any()):
             raise InvalidSceneError(
                 f"a refinement needs valid Gaussians in both scenes; none of the {len(scene)} of "
                 f"the {name} scene is valid."
             )
-    valid = _valid(full)
+    valid = valid_rows(full)
     whole = full if bool(valid.all()) else full.select(valid)
     tensors = {name: tensor.to(device, small.dtype) for name, tensor in whole.tensors().items()}
     return small.to(device), whole.with_tensors(tensors, {})
-
-
-def _valid(scene: GaussianScene) -> torch.Tensor:
-    valid = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
-    for mask in invalid_rows(scene).values():
-        valid &= ~mask
-    return valid
 
 
 def _outlook(

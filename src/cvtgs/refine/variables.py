@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.config import Rates
-from cvtgs.filters import invalid_rows, standardized, with_finite_opacities
+from cvtgs.filters import standardized, valid_rows, with_finite_opacities
 from cvtgs.math import quaternions
 from cvtgs.scene import GaussianScene
 
@@ -90,9 +90,7 @@ class Variables:
             those of the start, bit for bit; all others have unit quaternions and finite opacities.
         """
         now = standardized(self.scene())
-        moved = self._moved.clone()
-        for mask in invalid_rows(now).values():
-            moved &= ~mask
+        moved = self._moved & valid_rows(now)
         tensors = {
             name: torch.where(_beside(moved, old), now.tensors()[name], old)
             for name, old in self._scene.tensors().items()

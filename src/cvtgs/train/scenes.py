@@ -10,7 +10,7 @@ import torch
 
 from cvtgs import synthetic
 from cvtgs.errors import ConfigError
-from cvtgs.filters import invalid_rows
+from cvtgs.filters import valid_rows
 from cvtgs.io import load
 from cvtgs.math import covariances, quaternions
 from cvtgs.math.activations import positive_log
@@ -114,10 +114,8 @@ def _from_files(
 
 def _load_valid(path: Path) -> GaussianScene:
     scene = load(path)
-    invalid = invalid_rows(scene)
-    if not invalid:
-        return scene
-    return scene.select(~torch.stack(list(invalid.values())).any(dim=0))
+    valid = valid_rows(scene)
+    return scene if bool(valid.all()) else scene.select(valid)
 
 
 def _block_of(source: Source, count: int, seed: int) -> GaussianScene:

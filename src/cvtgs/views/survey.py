@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.errors import InvalidSceneError
-from cvtgs.filters import invalid_rows, with_finite_opacities
+from cvtgs.filters import valid_rows, with_finite_opacities
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.scene import GaussianScene
 from cvtgs.views.orientation import find_up
@@ -96,14 +96,12 @@ def survey(scene: GaussianScene) -> Survey:
 
 
 def _valid(scene: GaussianScene) -> GaussianScene:
-    bad = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
-    for mask in invalid_rows(scene).values():
-        bad |= mask
-    if len(scene) == int(bad.sum()):
+    valid = valid_rows(scene)
+    if not bool(valid.any()):
         raise InvalidSceneError(
             f"automatic views need a scene with valid Gaussians; none of {len(scene)} is valid."
         )
-    return scene.select(~bad) if bool(bad.any()) else scene
+    return scene if bool(valid.all()) else scene.select(valid)
 
 
 def _visible_places(scene: GaussianScene) -> Float[Tensor, "k 3"]:
