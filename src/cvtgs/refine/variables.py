@@ -75,8 +75,13 @@ class Variables:
             self._optimizer.param_groups, self._rates.values(), changes, gradients, strict=True
         ):
             group["lr"] = factor * rate
+            largest = 0.5 * torch.finfo(gradient.dtype).max ** 0.5  # else its square overflows
             change.grad = torch.sparse_coo_tensor(
-                rows[None], gradient[rows], change.shape, is_coalesced=True, check_invariants=True
+                rows[None],
+                gradient[rows].clamp(-largest, largest),
+                change.shape,
+                is_coalesced=True,
+                check_invariants=True,
             )
         self._optimizer.step()
         self._moved[rows] = True
