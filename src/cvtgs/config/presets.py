@@ -7,7 +7,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "draft": {"cvt": {"iterations": 0}, "merge": {"network": False}},
     "fast": {"merge": {"network": False}},
     "standard": {},
-    "high": {"visibility": {"views": 64}, "refine": {"steps": 100, "half_after": 30}},
+    "high": {"visibility": {"views": 64}, "refine": {"steps": 200, "half_after": 60}},
     "max": {"visibility": {"views": 64}, "refine": {"steps": 600}},
     "paper": {
         "effects": {"unbounded": "off", "duplicates": "off"},

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from cvtgs.config import PRESETS, Section, SimplifyConfig
+from cvtgs.config import PRESETS, RefineConfig, Section, SimplifyConfig
 from cvtgs.goals.cost_model import CostModel, Measurement
 from cvtgs.goals.work import Work
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
@@ -218,7 +218,8 @@ def _cut(preset: str, short: Mapping[str, int]) -> SimplifyConfig:
     if config.visibility.views:
         changes["visibility"] = config.visibility.model_copy(update={"views": short["views"]})
     if config.refine.asked_for:
-        update = {"seconds": 0.0, **{name: short[name] for name in ("steps", "batch", "heldout")}}
+        update = {name: short[name] for name in ("steps", "batch", "heldout")} | {"seconds": 0}
+        update["half_after"] = RefineConfig().half_after  # it costs nothing
         changes["refine"] = config.refine.model_copy(update=update)
     return config.model_copy(update=changes)
 

@@ -9,7 +9,7 @@ from cvtgs.filters import standardized, valid_rows, with_finite_opacities
 from cvtgs.math import quaternions
 from cvtgs.scene import GaussianScene
 
-_BETAS = (0.9, 0.99)
+_BETAS = (0.6, 0.99)
 _LEAST_ROOT = 1e-15
 
 
