@@ -7,8 +7,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "draft": {"cvt": {"iterations": 0}, "merge": {"network": False}},
     "fast": {"merge": {"network": False}},
     "standard": {},
-    "high": {"visibility": {"views": 64}, "refine": {"steps": 200, "half_after": 60}},
-    "max": {"visibility": {"views": 64}, "refine": {"steps": 600}},
+    "high": {"visibility": {"views": 64}, "refine": {"steps": 200, "half_after": 60, "size": 400}},
+    "max": {"visibility": {"views": 64}, "refine": {"steps": 600, "size": 400}},
     "paper": {
         "effects": {"unbounded": "off", "duplicates": "off"},
         "filter": {"max_mass_share": 1.0, "max_flyaway_share": 0.0},

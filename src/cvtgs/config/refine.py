@@ -63,7 +63,7 @@ class RefineConfig(Section):
     half_after: Count = 100
     squared: Rate = 0.5
     image: Rate = 0.5
-    size: int = pydantic.Field(default=400, ge=16)
+    size: int = pydantic.Field(default=256, ge=16)
     batch: int = pydantic.Field(default=32, ge=4)
     steps_per_picture: Count = 1
     pictures: Count = 128
