@@ -22,14 +22,13 @@ HEIGHTS = ((90, 1.5), (60, 1.2), (35, 1.6), (20, 1.2), (20, 2.8), (10, 2.2), (-1
            (-60, 1.5))  # fmt: skip
 """Degrees above the plane of x and z, and distance in robust radii."""
 
-SIZE = 256
-
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("variants", nargs="+", help="FILES.ply, then presets with settings")
     parser.add_argument("--rho", type=float, default=0.1)
     parser.add_argument("--views", type=int, default=12, help="at each height")
+    parser.add_argument("--size", type=int, default=256, help="of the pictures, pixels")
     parser.add_argument("--count", type=int, default=60_000, help="size of generated scenes")
     options = parser.parse_intermixed_args()
     files = [Path(word) for word in options.variants if word.endswith(".ply")]
@@ -39,7 +38,8 @@ def main() -> None:
     print("|---|---|---|" + "---|" * len(HEIGHTS))
     for name, scene in scenes(files, options.count):
         cameras = [
-            views_at(scene, *place, options.views, seed=k) for k, place in enumerate(HEIGHTS)
+            views_at(scene, *place, options.views, size=options.size, seed=k)
+            for k, place in enumerate(HEIGHTS)
         ]
         base = scores(scene, "standard", cameras, options.rho)
         print(f"| {name} | standard |", *(f"{value:.2f} |" for value in [base.mean(), *base]))
@@ -50,22 +50,22 @@ def main() -> None:
 
 
 def views_at(
-    scene: cvtgs.GaussianScene, height: float, far: float, count: int, *, seed: int
+    scene: cvtgs.GaussianScene, height: float, far: float, count: int, *, size: int, seed: int
 ) -> Cameras:
     """Look at the middle of a scene from random directions at one height and distance."""
     frame = robust_frame(scene.means[scene.opacities > 0.1])
     turns = 2 * math.pi * torch.rand(count, generator=torch.Generator().manual_seed(seed)).double()
     rise = torch.full_like(turns, math.radians(height))
     ways = torch.stack([rise.cos() * turns.cos(), rise.sin(), rise.cos() * turns.sin()], dim=1)
-    focal = 0.5 * SIZE / math.tan(math.radians(25))
-    intrinsics = torch.tensor([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]]).double()
+    focal = 0.5 * size / math.tan(math.radians(25))
+    intrinsics = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]).double()
     eyes = frame.center + far * frame.radius * ways
     up = torch.tensor([0.0, 1.0, 0.0]).double()
     return Cameras(
         viewmats=look_at(eyes, frame.center.expand_as(eyes), up),
         Ks=intrinsics.repeat(count, 1, 1),
-        width=SIZE,
-        height=SIZE,
+        width=size,
+        height=size,
     )
 
 

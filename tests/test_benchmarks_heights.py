@@ -9,8 +9,8 @@ from benchmarks import heights
 def test_every_variant_is_compared_with_standard_at_every_height(tmp_path, monkeypatch, capsys):
     file = tmp_path / "thing.ply"
     cvtgs.save(cvtgs.synthetic.scene("object", 300, sh_degree=0, seed=0), file)
-    monkeypatch.setattr(heights, "SIZE", 24)
-    given = [str(file), "--rho", "0.1", "--views", "2", "standard", "standard merge.widening=2"]
+    given = [str(file), "--rho", "0.1", "--views", "2", "--size", "24", "standard"]
+    given.append("standard merge.widening=2")
     monkeypatch.setattr(sys, "argv", ["heights", *given])
     heights.main()
     head, _, *rows = [
