@@ -1,6 +1,7 @@
 """The parts of refinement: budget, views, pictures, variables."""
 
 import math
+import weakref
 from itertools import chain
 
 import pydantic
@@ -12,7 +13,7 @@ from cvtgs.config import Rates
 from cvtgs.refine import RefineConfig
 from cvtgs.refine import budget as budget_module
 from cvtgs.refine.budget import Budget
-from cvtgs.refine.looking import given_outlook, own_outlook
+from cvtgs.refine.looking import Outlook, given_outlook, own_outlook
 from cvtgs.refine.pictures import Album, Picture, best_counted, scores, take_picture
 from cvtgs.refine.variables import Variables, changed_count
 from refine_cases import full_scene, quick, ring
@@ -143,11 +144,17 @@ def test_a_view_far_better_than_the_others_does_not_decide():
     assert best_counted(torch.tensor([55.0, 58.0])) == 60
 
 
-def test_pictures_are_taken_when_needed_and_looked_at_again():
-    full = full_scene(50)
+def three_views(*, endless: bool = False) -> Outlook:
     cameras = ring(3)
-    singles = iter([cameras.select(torch.tensor([row])) for row in range(3)])
-    album = Album(full, singles, config=quick(steps_per_picture=3, pictures=2), seed=0)
+    singles = [cameras.select(torch.tensor([row])) for row in range(3)]
+    return Outlook(heldout=(), learning=iter(singles), endless=endless)
+
+
+@pytest.mark.parametrize("endless", [False, True])
+def test_pictures_are_taken_when_needed_and_looked_at_again(endless):
+    full = full_scene(50)
+    config = quick(steps_per_picture=3, pictures=2)
+    album = Album(full, three_views(endless=endless), config=config, seed=0)
     taken, drawn = [], []
     for _ in range(12):
         drawn.append(album.draw())
@@ -160,9 +167,16 @@ def test_pictures_are_taken_when_needed_and_looked_at_again():
     torch.testing.assert_close(drawn[0].rgb.float(), exact.rgb, rtol=1e-3, atol=1e-3)
 
 
+def test_pictures_that_are_never_looked_at_again_are_not_kept():
+    album = Album(full_scene(50), three_views(endless=True), config=quick(pictures=9), seed=0)
+    first, second = weakref.ref(album.draw().rgb), album.draw()
+    assert first() is None
+    assert second.rgb.shape == (1, 24, 32, 3)
+
+
 def test_backgrounds_are_drawn():
     full = full_scene(50)
-    albums = [Album(full, iter(()), config=quick(), seed=seed) for seed in (0, 0, 1)]
+    albums = [Album(full, three_views(), config=quick(), seed=seed) for seed in (0, 0, 1)]
     first, again, other = (album.draw_color() for album in albums)
     assert torch.equal(first, again)
     assert not torch.equal(first, other)

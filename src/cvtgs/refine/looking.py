@@ -3,7 +3,7 @@
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import chain, count
+from itertools import count
 
 import torch
 
@@ -26,11 +26,13 @@ class Outlook:
 
     Attributes:
         heldout: Cameras of one size that decide.
-        learning: Single cameras to learn from, endless or not.
+        learning: Single cameras to learn from.
+        endless: Whether there are always more of them.
     """
 
     heldout: tuple[Cameras, ...]
     learning: Iterator[Cameras]
+    endless: bool
 
 
 def own_outlook(full: GaussianScene, *, config: RefineConfig, seed: int) -> Outlook:
@@ -55,7 +57,9 @@ def own_outlook(full: GaussianScene, *, config: RefineConfig, seed: int) -> Outl
             yield from views
 
     return Outlook(
-        heldout=tuple(batch(config.heldout, seed + HELDOUT_SEED)), learning=iter(endless())
+        heldout=tuple(batch(config.heldout, seed + HELDOUT_SEED)),
+        learning=endless(),
+        endless=True,
     )
 
 
@@ -84,7 +88,9 @@ def given_outlook(cameras: Cameras, *, config: RefineConfig, seed: int) -> Outlo
     held = {(2 * k + 1) * len(views) // (2 * number) for k in range(number)}
     others = [view for row, view in enumerate(views) if row not in held]
     random.Random(seed).shuffle(others)
-    return Outlook(heldout=tuple(views[row] for row in sorted(held)), learning=chain(others))
+    return Outlook(
+        heldout=tuple(views[row] for row in sorted(held)), learning=iter(others), endless=False
+    )
 
 
 def _each(cameras: Cameras) -> list[Cameras]:

@@ -1,7 +1,6 @@
 """Pictures of the full scene: some to learn from, rendered when needed, and some that decide."""
 
 import random
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.config import RefineConfig
+from cvtgs.refine.looking import Outlook
 from cvtgs.render import render
 from cvtgs.scene import GaussianScene
 
@@ -62,21 +62,24 @@ def take_picture(full: GaussianScene, camera: Cameras) -> Picture:
 class Album:
     """Pictures to learn from: a new one now and then, else one that is there.
 
-    Memory: 8 bytes per pixel of at most ``config.pictures`` pictures.
+    Memory: 8 bytes per pixel of at most ``config.pictures`` pictures; of one, if every step has a
+    new one.
 
     Args:
         full: The full scene.
-        cameras: Where new pictures are taken from, endless or not; at least one.
+        outlook: Where new pictures are taken from, at least one.
         config: How often, and how many are kept.
         seed: Which of them are looked at again.
     """
 
     def __init__(
-        self, full: GaussianScene, cameras: Iterator[Cameras], *, config: RefineConfig, seed: int
+        self, full: GaussianScene, outlook: Outlook, *, config: RefineConfig, seed: int
     ) -> None:
+        always_new = outlook.endless and config.steps_per_picture == 1
         self._full = full
-        self._cameras = cameras
-        self._config = config
+        self._cameras = outlook.learning
+        self._steps_per_picture = config.steps_per_picture
+        self._most = 1 if always_new else config.pictures
         self._dice = random.Random(seed)
         self._kept: list[Picture] = []
         self._drawn = 0
@@ -88,12 +91,12 @@ class Album:
         Returns:
             A new one for every ``steps_per_picture``, if there are cameras left, else an old one.
         """
-        is_turn = self._drawn % self._config.steps_per_picture == 0
+        is_turn = self._drawn % self._steps_per_picture == 0
         self._drawn += 1
         camera = next(self._cameras, None) if is_turn else None
         if camera is None:
             return self._dice.choice(self._kept)
-        if len(self._kept) == self._config.pictures:
+        if len(self._kept) == self._most:
             self._kept.pop(self._dice.randrange(len(self._kept)))
         picture = take_picture(self._full, camera)
         self._kept.append(

@@ -63,8 +63,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     the clock decides how many steps there are. The time includes everything, also the compilation
     of numba's code, some ten seconds, when it is used for the first time on a machine.
 
-    Memory: ten times the small scene, pictures of at most ``8 * size ** 2 * pictures`` bytes, and
-    what rendering the full scene takes.
+    Memory: ten times the small scene, what rendering the full scene takes, and the pictures that
+    are looked at again, at most ``8 * size ** 2 * pictures`` bytes: those of given cameras.
 
     Args:
         small: The simplified scene; it is not changed.
@@ -111,7 +111,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     with clock.stage(STAGE, budget.total):
         outlook = _outlook(theirs, cameras, config=config, seed=seed)
         heldout = tuple(take_picture(theirs, camera) for camera in outlook.heldout)
-        album = Album(theirs, outlook.learning, config=config, seed=seed)
+        album = Album(theirs, outlook, config=config, seed=seed)
         free = freedom(ours, theirs)
         free[:frozen] = 0.0
         descent = descend(
