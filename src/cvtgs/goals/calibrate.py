@@ -51,8 +51,8 @@ CANDIDATES = tuple(name for name in PRESETS if name != "paper")
 """Presets to choose from; ``paper`` is there to compare with."""
 
 SHORT = (
-    {"views": 3, "steps": 4, "batch": 4, "heldout": 2},
-    {"views": 6, "steps": 12, "batch": 6, "heldout": 2},
+    {"views": 3, "steps": 4, "batch": 4, "heldout": 4},
+    {"views": 6, "steps": 16, "batch": 16, "heldout": 4},
 )
 """Pictures and refinements are cut to so many, in turn: what they cost grows with their number."""
 
