@@ -100,7 +100,7 @@ def test_what_does_not_go_together(words, text):
 def test_without_goals_nothing_changes(scene):
     goals = Goals(options("--rho", "0.1"))
     heard = []
-    assert goals.preset(scene, silent) is None
+    assert goals.preset(scene, {}, silent) is None
     assert goals.stage_listener(heard.append) == heard.append
     small, report = goals.run(cvtgs.Simplifier(config="draft", device="cpu"), scene)
     assert len(small) == report.output_count == 30
@@ -110,17 +110,43 @@ def test_without_goals_nothing_changes(scene):
 @pytest.mark.usefixtures("measured")
 def test_a_budget_chooses_a_preset_and_says_so(scene):
     goals = Goals(options("--rho", "0.1", "--time-budget", "5s"))
-    assert goals.preset(scene, silent) == "high"
+    assert goals.preset(scene, {}, silent) == "high"
     assert goals.said[0].startswith("Preset high, the best that fits into 5 s: expected to take 3")
+
+
+@pytest.mark.parametrize(
+    ("words", "settings", "preset"),
+    [
+        ([], {}, "fast"),
+        ([], {"merge.network": "false"}, "standard"),
+        (["--ckpt", "none"], {}, "standard"),
+        (["--ckpt", "none"], {"refine.seconds": "2"}, "standard"),
+        (["--ckpt", "none"], {"refine.seconds": "200"}, None),
+    ],
+)
+def test_a_budget_knows_what_else_is_set(scene, monkeypatch, words, settings, preset):
+    nothing = {"check": {"in": 0.0}}
+    slow = {"network": {"once": 9.0}, "refine": {"once": 0.0}}
+    rates = {"fast": nothing, "standard": nothing | slow}
+    model = CostModel(rates=rates)
+    monkeypatch.setattr(cvtgs.goals, "cost_model", lambda *_, **__: model)
+    monkeypatch.setattr("cvtgs.goals.remember.is_known", lambda device: True)
+    monkeypatch.setattr("cvtgs.cli.goals.time.perf_counter", lambda: STARTED)
+    goals = Goals(options("--rho", "0.1", "--time-budget", "5s", *words))
+    if preset is None:
+        with pytest.raises(GoalError, match="takes about 2e\\+02 s"):
+            goals.preset(scene, settings, silent)
+    else:
+        assert goals.preset(scene, settings, silent) == preset
 
 
 def test_the_machine_is_measured_once_or_when_asked(scene, measured, capsys):
     words = ["--rho", "0.1", "--time-budget", "5s"]
-    Goals(options(*words)).preset(scene, silent)
+    Goals(options(*words)).preset(scene, {}, silent)
     assert capsys.readouterr().err == "cvtgs: measuring this machine once, up to a minute\n"
-    Goals(options(*words)).preset(scene, silent)
+    Goals(options(*words)).preset(scene, {}, silent)
     assert capsys.readouterr().err == ""
-    Goals(options(*words, "--recalibrate", "--quiet")).preset(scene, silent)
+    Goals(options(*words, "--recalibrate", "--quiet")).preset(scene, {}, silent)
     assert capsys.readouterr().err == ""
     assert measured == [True, False, True]
 
@@ -129,7 +155,7 @@ def test_the_machine_is_measured_once_or_when_asked(scene, measured, capsys):
 def test_a_budget_that_is_too_short(scene, monkeypatch):
     monkeypatch.setattr("cvtgs.cli.goals.STARTED", STARTED - 60)
     with pytest.raises(GoalError, match=r"fits into 5 s: starting and reading took 60\.0 s\."):
-        Goals(options("--count", "10", "--time-budget", "5s")).preset(scene, silent)
+        Goals(options("--count", "10", "--time-budget", "5s")).preset(scene, {}, silent)
 
 
 def test_a_target_is_searched_and_said(scene):

@@ -32,7 +32,8 @@ def made_up(config, scene, count) -> dict[str, float]:
     if config.visibility.views:
         seconds["visibility"] = 1e-6 * config.visibility.views * len(scene)
     if config.refine.asked_for:
-        seconds["refine"] = Work(count=len(scene), target=count).features("refine", config)["looks"]
+        work = Work(count=len(scene), target=count)
+        seconds["refine"] = work.features("refine", config)["look_pixels"]
     return seconds
 
 
@@ -68,9 +69,47 @@ def test_few_pictures_stand_for_many(model):
     work = Work(count=100_000, target=1000)
     stages = model.stage_seconds("high", work)
     assert stages["visibility"] == pytest.approx(0.1 * high.visibility.views, rel=0.01)
-    looks = work.features("refine", high)["looks"]
-    assert stages["refine"] == pytest.approx(looks, rel=0.01)
+    pixels = work.features("refine", high)["look_pixels"]
+    assert stages["refine"] == pytest.approx(pixels, rel=0.01)
     assert model.seconds("max", work) > model.seconds("high", work)
+
+
+def test_settings_count(model):
+    """Stages that are left out cost nothing, those asked for cost what they cost elsewhere."""
+    work = Work(count=100_000, target=1000)
+
+    def stages(preset: str, **settings: str) -> dict[str, float]:
+        texts = {name.replace("_", "."): text for name, text in settings.items()}
+        config = cvtgs.SimplifyConfig.compose(preset=preset, settings=texts)
+        return model.stage_seconds(preset, work, config=config)
+
+    high = model.stage_seconds("high", work)
+    assert "refine" not in stages("high", refine_steps="0")
+    for setting in ({"visibility_views": "0"}, {"effects_visibility": "off"}):
+        assert set(high) - set(stages("high", **setting)) == {"visibility"}
+    few = stages("high", refine_steps=str(high_steps() // 2))
+    assert 0.4 < few["refine"] / high["refine"] < 0.6
+    assert 0.2 < stages("high", refine_size="200")["refine"] / high["refine"] < 0.3
+    added = stages("standard", refine_steps=str(high_steps()), refine_size="400")
+    assert set(added) - set(model.stage_seconds("standard", work)) == {"refine"}
+    assert added["refine"] == pytest.approx(high["refine"], rel=0.01)
+    assert stages("draft", refine_seconds="7")["refine"] == 7.0
+
+
+def test_a_setting_makes_room_for_a_better_preset(model):
+    work = Work(count=1_000_000, target=10_000)
+    budget = 1.3 * model.seconds("high", work) - 1
+    assert choose_preset(work, budget, model=model).preset == "standard"
+    fewer = {"refine.steps": str(high_steps() // 2)}
+    choice = choose_preset(work, budget, settings=fewer, model=model)
+    assert choice.preset == CANDIDATES[-1]
+    assert choice.seconds < budget / 1.3
+    with pytest.raises(ConfigError, match="refine"):
+        choose_preset(work, budget, settings={"refine.steps": "-1"}, model=model)
+
+
+def high_steps() -> int:
+    return cvtgs.SimplifyConfig.from_preset("high").refine.steps
 
 
 def test_calibration_takes_few_pictures_and_steps():

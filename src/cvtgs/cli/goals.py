@@ -4,6 +4,7 @@ import argparse
 import math
 import sys
 import time
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from cvtgs.cli.large import keep_mask
@@ -102,11 +103,14 @@ class Goals:
         """
         return silent if self.has_target else listener
 
-    def preset(self, scene: "GaussianScene", listener: ProgressListener) -> str | None:
+    def preset(
+        self, scene: "GaussianScene", settings: Mapping[str, str], listener: ProgressListener
+    ) -> str | None:
         """Choose the preset that fits into the time, if a time is given.
 
         Args:
             scene: The scene that was read.
+            settings: What is changed of the preset.
             listener: Told about the measurements.
 
         Returns:
@@ -132,7 +136,9 @@ class Goals:
         if again and not options.quiet:
             print("cvtgs: measuring this machine once, up to a minute", file=sys.stderr)
         model = cost_model(options.device, recalibrate=again, listener=listener)
-        choice = choose_preset(Work.of(scene, target), left, model=model)
+        if options.ckpt == "none":
+            settings = {**settings, "merge.network": "false"}
+        choice = choose_preset(Work.of(scene, target), left, settings=settings, model=model)
         self.said.append(
             f"Preset {choice.preset}, the best that fits into {self.seconds:g} s: expected to take "
             f"{choice.seconds:.1f} s after {spent:.1f} s of starting and reading."

@@ -124,7 +124,7 @@ def run(options: argparse.Namespace) -> None:
         else:
             scene = load_needed(options.input, config)
             cameras = None if options.cameras is None else load_cameras(options.cameras)
-            chosen = goals.preset(scene, listener)
+            chosen = goals.preset(scene, settings, listener)
             if chosen is not None:
                 config = SimplifyConfig.compose(preset=chosen, settings=settings)
             simplifier = Simplifier(

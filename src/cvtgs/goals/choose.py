@@ -1,8 +1,10 @@
 """The best preset that fits into a time."""
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
+from cvtgs.config import SimplifyConfig
 from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.goals.cost_model import CostModel
 from cvtgs.goals.remember import cost_model
@@ -32,6 +34,7 @@ def choose_preset(
     *,
     rho: float | None = None,
     count: int | None = None,
+    settings: Mapping[str, str] | None = None,
     model: CostModel | None = None,
 ) -> Choice:
     """Choose the best preset whose simplification ends in time.
@@ -45,6 +48,8 @@ def choose_preset(
         seconds: Wall-clock seconds from the scene in memory to the small scene in memory.
         rho: Ratio of Gaussians to keep, in (0, 1].
         count: Number of Gaussians to keep, instead of ``rho``.
+        settings: What is changed of every preset, texts by dotted key, for example
+            ``{"visibility.views": "0"}``.
         model: What presets cost; None for :func:`cvtgs.goals.cost_model`, which measures it once
             on this machine.
 
@@ -54,6 +59,7 @@ def choose_preset(
     Raises:
         GoalError: Not even the fastest fits; the text says how long it takes.
         InvalidArgumentError: Seconds, ratio or count are out of range.
+        ConfigError: A setting is unknown or out of range.
 
     Example:
         >>> rates = {"standard": {"check": {"in": 4e-6, "in_values": 0.0}}}
@@ -68,7 +74,12 @@ def choose_preset(
     elif rho is not None or count is not None:
         raise InvalidArgumentError("a size knows its target: give neither rho nor count with it.")
     known = cost_model() if model is None else model
-    costs = {name: known.seconds(name, work) for name in known.presets}
+    costs = {
+        name: known.seconds(
+            name, work, config=SimplifyConfig.compose(preset=name, settings=settings)
+        )
+        for name in known.presets
+    }
     fitting = [name for name, cost in costs.items() if MARGIN * cost <= seconds]
     if not fitting:
         fastest = min(costs, key=lambda name: costs[name])

@@ -9,7 +9,7 @@ import pydantic
 from cvtgs.config import SimplifyConfig
 from cvtgs.errors import ConfigError
 from cvtgs.goals.fit import fit_rates
-from cvtgs.goals.work import REFINE, Work
+from cvtgs.goals.work import NETWORK, REFINE, VISIBILITY, Work
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,12 +64,18 @@ class CostModel(pydantic.BaseModel):
         """The presets that it knows."""
         return tuple(self.rates)
 
-    def stage_seconds(self, preset: str, work: Work) -> dict[str, float]:
+    def stage_seconds(
+        self, preset: str, work: Work, *, config: SimplifyConfig | None = None
+    ) -> dict[str, float]:
         """Predict what each stage costs.
+
+        A stage that the preset has not, but the configuration asks for, costs what it costs in
+        the best preset that has it.
 
         Args:
             preset: Name of the preset.
             work: Size of the simplification.
+            config: The preset with other settings changed; None for the preset as it is.
 
         Returns:
             Wall-clock seconds by stage.
@@ -82,22 +88,26 @@ class CostModel(pydantic.BaseModel):
                 f"preset must be one of {', '.join(self.rates)}, whose cost was measured; "
                 f"found {preset!r}."
             )
-        config = SimplifyConfig.from_preset(preset)
+        config = config or SimplifyConfig.from_preset(preset)
+        known = {stage: rates for name in self.rates for stage, rates in self.rates[name].items()}
+        optional = _optional_stages(config)
         seconds = {}
-        for stage, rates in self.rates[preset].items():
-            amounts = work.features(stage, config)
-            seconds[stage] = sum(rate * amounts[name] for name, rate in rates.items())
+        for stage, rates in (known | self.rates[preset]).items():
+            if optional.get(stage, stage in self.rates[preset]):
+                amounts = work.features(stage, config)
+                seconds[stage] = sum(rate * amounts[name] for name, rate in rates.items())
         limit = config.refine.seconds
         if REFINE in seconds and limit:
             seconds[REFINE] = min(seconds[REFINE], limit) if config.refine.steps else limit
         return seconds
 
-    def seconds(self, preset: str, work: Work) -> float:
+    def seconds(self, preset: str, work: Work, *, config: SimplifyConfig | None = None) -> float:
         """Predict what a simplification costs.
 
         Args:
             preset: Name of the preset.
             work: Size of the simplification.
+            config: The preset with other settings changed; None for the preset as it is.
 
         Returns:
             Wall-clock seconds of the first simplification of a process, from the scene in memory
@@ -106,8 +116,14 @@ class CostModel(pydantic.BaseModel):
         Raises:
             ConfigError: The preset was not measured.
         """
-        stages = self.stage_seconds(preset, work)
+        stages = self.stage_seconds(preset, work, config=config)
         return self.starts.get(preset, 0.0) + sum(stages.values())
+
+
+def _optional_stages(config: SimplifyConfig) -> dict[str, bool]:
+    """Say which of the stages that not every simplification has a configuration asks for."""
+    looks = config.visibility.views > 0 and config.effects.visibility != "off"
+    return {VISIBILITY: looks, NETWORK: config.merge.network, REFINE: config.refine.asked_for}
 
 
 def _fit(measured: Sequence[Measurement]) -> dict[str, dict[str, float]]:

@@ -23,7 +23,7 @@ from cvtgs.io import atomic_output
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.render.backends import choose_backend
 
-VERSION: Literal[1] = 1
+VERSION: Literal[2] = 2
 """Of the file; raised when features change, so that older files are measured anew."""
 
 STALE_SECONDS = 90 * 24 * 3600.0
@@ -37,7 +37,7 @@ class _Record(pydantic.BaseModel):
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    version: Literal[1]
+    version: Literal[2]
     key: dict[str, str]
     made: float
     model: CostModel

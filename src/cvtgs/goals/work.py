@@ -9,7 +9,7 @@ from cvtgs.config import RefineConfig, SimplifyConfig
 from cvtgs.cvt.tessellate import MIN_SAMPLES
 from cvtgs.scene import GaussianScene
 
-REFINE = "refine"
+VISIBILITY, NETWORK, REFINE = "visibility", "network", "refine"
 
 FEATURES: Mapping[str, tuple[str, ...]] = {
     "check": ("in", "in_values"),
@@ -17,9 +17,9 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     "filter": ("in",),
     "tessellate": ("once", "in", "search"),
     "merge": ("once", "in", "in_values", "out", "out_values"),
-    "visibility": ("once", "views", "views_in"),
-    REFINE: ("once", "places", "pictures_in", "looks", "looks_out"),
-    "network": ("once", "in", "in_values", "out", "out_values"),
+    VISIBILITY: ("once", "view_pixels", "views_in"),
+    REFINE: ("once", "places", "pictures_in", "look_pixels", "looks_out"),
+    NETWORK: ("once", "in", "in_values", "out", "out_values"),
 }
 """What the seconds of a stage grow with."""
 
@@ -82,7 +82,7 @@ class Work:
             "in_values": float(self.count * self.colors),
             "out": float(self.target),
             "out_values": float(self.target * self.colors),
-            "views": float(config.visibility.views),
+            "view_pixels": float(config.visibility.views * config.visibility.size**2),
             "views_in": float(config.visibility.views * self.count),
             **self._refinement(config.refine),
             "search": searched * math.log2(self.target + 2),
@@ -99,6 +99,6 @@ class Work:
         return {
             "places": float(places),
             "pictures_in": pictures * self.count,
-            "looks": looks,
+            "look_pixels": looks * config.size**2,
             "looks_out": looks * self.target,
         }
