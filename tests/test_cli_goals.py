@@ -126,7 +126,7 @@ def test_a_budget_chooses_a_preset_and_says_so(scene):
 )
 def test_a_budget_knows_what_else_is_set(scene, monkeypatch, words, settings, preset):
     nothing = {"check": {"in": 0.0}}
-    slow = {"network": {"once": 9.0}, "refine": {"once": 0.0}}
+    slow = {"network": {"once": 9.0}, "refine": {"look_pixels": 0.0}}
     rates = {"fast": nothing, "standard": nothing | slow}
     model = CostModel(rates=rates)
     monkeypatch.setattr(cvtgs.goals, "cost_model", lambda *_, **__: model)
@@ -143,7 +143,7 @@ def test_a_budget_knows_what_else_is_set(scene, monkeypatch, words, settings, pr
 def test_the_machine_is_measured_once_or_when_asked(scene, measured, capsys):
     words = ["--rho", "0.1", "--time-budget", "5s"]
     Goals(options(*words)).preset(scene, {}, silent)
-    assert capsys.readouterr().err == "cvtgs: measuring this machine once, up to a minute\n"
+    assert capsys.readouterr().err == "cvtgs: measuring this machine once, about a minute\n"
     Goals(options(*words)).preset(scene, {}, silent)
     assert capsys.readouterr().err == ""
     Goals(options(*words, "--recalibrate", "--quiet")).preset(scene, {}, silent)

@@ -44,7 +44,7 @@ def add_goal_options(
         "--time-budget",
         metavar="TIME",
         help="instead of --preset: the best one that is done in this time, for example 20s or 2m; "
-        "the first use measures this machine, which takes up to a minute and is not counted",
+        "the first use measures this machine, which takes about a minute and is not counted",
     )
     parser.add_argument(
         "--recalibrate", action="store_true", help="measure this machine anew for --time-budget"
@@ -134,7 +134,7 @@ class Goals:
         target = target_count(len(scene), options.rho, count=options.count)
         again = options.recalibrate or not is_known(options.device)
         if again and not options.quiet:
-            print("cvtgs: measuring this machine once, up to a minute", file=sys.stderr)
+            print("cvtgs: measuring this machine once, about a minute", file=sys.stderr)
         model = cost_model(options.device, recalibrate=again, listener=listener)
         if options.ckpt == "none":
             settings = {**settings, "merge.network": "false"}

@@ -7,6 +7,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +22,9 @@ from cvtgs.goals.calibrate import CANDIDATES, calibrate, measured_seconds
 from cvtgs.goals.cost_model import CostModel
 from cvtgs.io import atomic_output
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.render.backends import choose_backend
+
+RENDERERS = ("gsplat", "numba")
+"""Packages that render faster than torch; importing one to ask takes longer than many a run."""
 
 VERSION: Literal[2] = 2
 """Of the file; raised when features change, so that older files are measured anew."""
@@ -60,7 +63,7 @@ def cost_model(
     Args:
         device: Where presets compute.
         recalibrate: Whether to measure anew in any case.
-        calibration: Measures; None for the real one, which takes up to a minute.
+        calibration: Measures; None for the real one, which takes about a minute.
         folder: Where to remember; None for ``cvtgs`` in the user's cache folder.
         listener: Told about the measurements.
 
@@ -129,7 +132,7 @@ def machine_key(device: torch.device) -> dict[str, str]:
         "python": platform.python_version(),
         "torch": torch.__version__,
         "cvtgs": cvtgs.__version__,
-        "renderer": choose_backend("auto", device)[0],
+        "renderers": ", ".join(name for name in RENDERERS if find_spec(name)),
         "presets": _digest(presets),
     }
 

@@ -18,13 +18,16 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     "tessellate": ("once", "in", "search"),
     "merge": ("once", "in", "in_values", "out", "out_values"),
     VISIBILITY: ("once", "view_pixels", "views_in"),
-    REFINE: ("once", "places", "pictures_in", "look_pixels", "looks_out"),
+    REFINE: ("pictures_in", "look_pixels", "looks_out"),
     NETWORK: ("once", "in", "in_values", "out", "out_values"),
 }
 """What the seconds of a stage grow with."""
 
-SHARE_OF_A_STEP = 0.3
+SHARE_OF_A_STEP = 0.2
 """A picture without gradients costs this share of a step."""
+
+STEPS_OF_A_BATCH = 2.0
+"""To find views, however many at once, costs as much as so many steps."""
 
 OTHER_FEATURES = ("once", "in", "out")
 """The same for stages that are not named there."""
@@ -90,14 +93,14 @@ class Work:
         return {name: amounts[name] for name in FEATURES.get(stage, OTHER_FEATURES)}
 
     def _refinement(self, config: RefineConfig) -> dict[str, float]:
-        """Give the places that are found, the pictures from there, and looks at the small scene."""
+        """Give the pictures of the full scene, and the looks at the small one."""
         learnt_from = math.ceil(config.steps / config.steps_per_picture)
         pictures = config.heldout + learnt_from
-        places = config.heldout + config.batch * math.ceil(learnt_from / config.batch)
         checks = 1 + math.ceil(config.steps / config.check_every)
+        batches = 1 + math.ceil(learnt_from / config.batch)
         looks = config.steps + SHARE_OF_A_STEP * config.heldout * checks
+        looks += STEPS_OF_A_BATCH * batches
         return {
-            "places": float(places),
             "pictures_in": pictures * self.count,
             "look_pixels": looks * config.size**2,
             "looks_out": looks * self.target,
