@@ -174,6 +174,8 @@ def test_the_page_part_is_escaped_and_names_failures():
 def test_round_numbers_on_the_axis():
     assert ticks(0.9, 1.1) == [0.7, 1.0, 2.0]
     assert ticks(2.0, 20.0) == [2.0, 3.0, 5.0, 7.0, 10.0, 20.0]
+    assert ticks(0.06, 150.0)[:5] == [0.05, 0.1, 0.2, 0.5, 1.0]
+    assert ticks(0.06, 900.0) == [0.01, 0.1, 1.0, 10.0, 100.0, 1000.0]
 
 
 def test_the_chart_is_a_png():

@@ -8,6 +8,10 @@ from cvtgs.tradeoff.results import Tradeoff, TradeoffResult
 
 WIDTH, HEIGHT = 1200, 560
 
+DIGITS = ((1, 2, 3, 5, 7), (1, 2, 5), (1,))
+MOST_TICKS = 12
+"""More numbers run into each other."""
+
 METRICS = (("psnr", "PSNR", "PSNR, dB"), ("ssim", "SSIM", "SSIM"))
 
 
@@ -59,7 +63,7 @@ def _value(result: TradeoffResult, metric: str) -> float:
 
 
 def ticks(low: float, high: float) -> Sequence[float]:
-    """Give round numbers for a logarithmic axis: 1, 2, 3, 5, 7 and their tenfolds.
+    """Give round numbers for a logarithmic axis: 1, 2, 3, 5, 7 and their tenfolds, or fewer.
 
     Args:
         low: Smallest value, above 0.
@@ -72,9 +76,16 @@ def ticks(low: float, high: float) -> Sequence[float]:
         >>> ticks(1.5, 12.0)
         [1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0]
     """
-    low, high = max(low, 1e-3), max(high, 1e-3)
+    for digits in DIGITS:
+        found = _round_numbers(max(low, 1e-3), max(high, 1e-3), digits)
+        if len(found) <= MOST_TICKS:
+            break
+    return found
+
+
+def _round_numbers(low: float, high: float, digits: Sequence[int]) -> Sequence[float]:
     decades = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)
-    steps = [float(f"{digit}e{decade}") for decade in decades for digit in (1, 2, 3, 5, 7)]
+    steps = [float(f"{digit}e{decade}") for decade in decades for digit in digits]
     first = max((step for step in steps if step <= low), default=steps[0])
     last = min((step for step in steps if step >= high), default=steps[-1])
     return [step for step in steps if first <= step <= last]
