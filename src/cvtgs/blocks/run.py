@@ -136,7 +136,7 @@ def check_config(config: SimplifyConfig) -> None:
     Raises:
         ConfigError: The configuration takes pictures of the scene, or refines the result.
     """
-    if (config.visibility.views and config.effects.visibility != "off") or config.refine.asked_for:
+    if config.looks or config.refine.asked_for:
         raise ConfigError(
             "blocks need a preset that takes no pictures of the scene (draft, fast, standard, "
             f"paper) and no refinement; found {config.preset!r} with {config.visibility.views} "

@@ -46,6 +46,11 @@ class SimplifyConfig(Section):
     merge: MergeConfig = MergeConfig()
     refine: RefineConfig = RefineConfig()
 
+    @property
+    def looks(self) -> bool:
+        """Whether pictures of the scene tell what is seen."""
+        return self.visibility.views > 0 and self.effects.visibility != "off"
+
     @classmethod
     def from_preset(cls, name: str) -> Self:
         """Give a preset.

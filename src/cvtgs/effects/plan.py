@@ -258,10 +258,9 @@ def _extras(scene: GaussianScene, config: SimplifyConfig) -> Effect:
 
 
 def _visibility(config: SimplifyConfig) -> Effect:
-    choice, views = config.effects.visibility, config.visibility.views
     return Effect(
-        active=views > 0 and choice != "off",
-        figure=views,
+        active=config.looks,
+        figure=config.visibility.views,
         meaning="pictures that the preset asks for, on above 0",
-        forced=choice != "auto",
+        forced=config.effects.visibility != "auto",
     )

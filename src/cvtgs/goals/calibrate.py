@@ -215,7 +215,7 @@ def _cut(preset: str, short: Mapping[str, int]) -> SimplifyConfig:
     """Give a preset that takes only a few pictures and steps, if it takes any."""
     config = SimplifyConfig.from_preset(preset)
     changes: dict[str, Section] = {}
-    if config.visibility.views:
+    if config.looks:
         changes["visibility"] = config.visibility.model_copy(update={"views": short["views"]})
     if config.refine.asked_for:
         update = {name: short[name] for name in ("steps", "batch", "heldout")} | {"seconds": 0}
@@ -233,4 +233,4 @@ def _starts(presets: Sequence[str], loading: Mapping[str, float]) -> dict[str, f
 
 def _takes_pictures(preset: str) -> bool:
     config = SimplifyConfig.from_preset(preset)
-    return config.refine.asked_for or config.visibility.views > 0
+    return config.looks or config.refine.asked_for

@@ -122,8 +122,11 @@ class CostModel(pydantic.BaseModel):
 
 def _optional_stages(config: SimplifyConfig) -> dict[str, bool]:
     """Say which of the stages that not every simplification has a configuration asks for."""
-    looks = config.visibility.views > 0 and config.effects.visibility != "off"
-    return {VISIBILITY: looks, NETWORK: config.merge.network, REFINE: config.refine.asked_for}
+    return {
+        VISIBILITY: config.looks,
+        NETWORK: config.merge.network,
+        REFINE: config.refine.asked_for,
+    }
 
 
 def _fit(measured: Sequence[Measurement]) -> dict[str, dict[str, float]]:
