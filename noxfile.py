@@ -14,11 +14,11 @@ WHEEL_TESTS = (
     "tests/test_public_names.py",
     "tests/test_typing.py",
     "tests/test_examples.py",
-    "tests/test_cli_*.py",
-    "tests/test_io_*.py",
-    "tests/test_simplify_*.py",
-    "tests/test_mergenet_*.py",
-    "tests/test_evaluate_compare.py",
+    "tests/cli/test_*.py",
+    "tests/io/test_*.py",
+    "tests/simplify/test_*.py",
+    "tests/mergenet/test_*.py",
+    "tests/evaluate/test_compare.py",
 )
 """What tells whether anything is missing in the wheel: data files, names, types, commands."""
 
@@ -68,9 +68,9 @@ def docs(session: nox.Session) -> None:
     session.install(*CONSTRAINTS, ".[docs]")
     words = session.posargs or ["docs/_build/html"]
     settings = {"OMP_WAIT_POLICY": "PASSIVE", "PYDEVD_DISABLE_FILE_VALIDATION": "1"}
-    for drawing in ("cells", "reference", "widening"):
-        picture = Path(session.create_tmp()) / f"{drawing}.png"
-        session.run("python", "-m", f"docs.drawings.{drawing}", str(picture), env=settings)
+    for drawing in ("cells", "reference", "inflation"):
+        image = Path(session.create_tmp()) / f"{drawing}.png"
+        session.run("python", "-m", f"docs.drawings.{drawing}", str(image), env=settings)
     session.run("sphinx-build", "-n", "-W", "--keep-going", "-E", "docs", *words, env=settings)
 
 
@@ -119,4 +119,4 @@ def fuzz(session: nox.Session) -> None:
 def browser(session: nox.Session) -> None:
     """Load the comparison page in a real headless browser (Debian package chromium)."""
     session.install(*CONSTRAINTS, "-e", ".[test]")
-    session.run("pytest", "tests/test_page_browser.py", *session.posargs)
+    session.run("pytest", "tests/evaluate/test_page_browser.py", *session.posargs)

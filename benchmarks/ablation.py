@@ -6,9 +6,9 @@ Markdown; the folder gets that and a chart of the means, anew after every scene.
 are those of ``benchmarks.quality``: name files, give ``--lpips WEIGHTS`` or ``--scorer COMMAND``.
 
 - w/o CVT: k-NN groups (``benchmarks.grouping``) instead of the tessellation; filter, merge,
-  widening and network stay.
+  inflation and network stay.
 - w/o filter: every valid Gaussian enters the tessellation.
-- w/o MergeNet: merged by moments (and widening) alone.
+- w/o MergeNet: merged by moments (and inflation) alone.
 - full: ``Simplifier("paper")`` and ``Simplifier("standard")``.
 """
 
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def variants(options: argparse.Namespace) -> dict[str, Simplify]:
-    """Give every row of the table: both presets, each in full and without each part."""
+    """Return every row of the table: both presets, each in full and without each part."""
     rows: dict[str, Simplify] = {}
     for preset in PRESETS:
         config = configuration(options, {"preset": preset})
@@ -75,8 +75,8 @@ def row(preset: str, part: str) -> str:
 
 
 def report(table: Table, options: argparse.Namespace) -> str:
-    """Say what was measured, then how it came out."""
-    pictures = f"cvtgs' own renderer, {VIEWS} automatic views of {SIZE} x {SIZE} pixels"
+    """Report what was measured, then how it came out."""
+    images = f"cvtgs' own renderer, {VIEWS} automatic views of {SIZE} x {SIZE} pixels"
     scenes = "FILES" if options.files else f"--count {options.count}"
     nets = ", ".join(f"{name} {described(name)}" for name in PRESETS)
     return (
@@ -84,7 +84,7 @@ def report(table: Table, options: argparse.Namespace) -> str:
         f"`python -m benchmarks.ablation {scenes} -o FOLDER` makes this table (with "
         "`--lpips WEIGHTS` for LPIPS).\n\n"
         f"Scenes: {', '.join(table)}. "
-        f"Judge: {'the command of --scorer' if options.scorer else pictures}. "
+        f"Judge: {'the command of --scorer' if options.scorer else images}. "
         f"cvtgs {cvtgs.__version__}, checkpoints: {nets}.\n\n"
         f"{markdown(table, options.rho, means_only=options.means)}"
     )

@@ -51,7 +51,7 @@ class Stopwatch:
         return small
 
     def seconds(self, rho: float) -> float:
-        """Give the mean over the scenes."""
+        """Return the mean over the scenes."""
         return mean(self._spent[rho])
 
 
@@ -60,7 +60,7 @@ def table(
     scores: Mapping[str, Sequence[Quality]],
     ratios: Sequence[float],
 ) -> str:
-    """Give a Markdown table: seconds, PSNR and SSIM of every row at every ratio."""
+    """Return a Markdown table: seconds, PSNR and SSIM of every row at every ratio."""
     heads = [f"{name} at {rho:g}" for rho in ratios for name in ("seconds", "PSNR", "SSIM")]
     rows = [
         [

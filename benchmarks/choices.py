@@ -31,9 +31,9 @@ CHOICES: Mapping[str, Mapping[str, str]] = {
     "no filter": {"filter.max_mass_share": "0"},
     "members weigh by opacity": {"merge.area_power": "0"},
     "paper's opacity": {"merge.opacity": "union"},
-    "moments of all members": {"merge.lone_members": "false"},
-    "no widening": {"merge.widening": "0", "merge.covered_widening": "0"},
-    "widening without neighbours": {"merge.widening": "0.3", "merge.covered_widening": "0"},
+    "moments of all members": {"merge.representatives": "false"},
+    "no inflation": {"merge.inflation": "0", "merge.covered_inflation": "0"},
+    "inflation without neighbours": {"merge.inflation": "0.3", "merge.covered_inflation": "0"},
     "paper": {"preset": "paper"},
 }
 

@@ -91,7 +91,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def own_methods(settings: Sequence[str]) -> dict[str, list[str]]:
-    """Give the commands of cvtgs itself, by name."""
+    """Return the commands of cvtgs itself, by name."""
     command = [sys.executable, "-m", "cvtgs", "simplify", "{IN}", "{OUT}", "--count", "{COUNT}"]
     command += ["--overwrite", "--quiet"]
     command += [part for setting in settings for part in ("--set", setting)]
@@ -102,7 +102,7 @@ def own_methods(settings: Sequence[str]) -> dict[str, list[str]]:
 
 
 def commands_of(options: argparse.Namespace) -> dict[str, list[str]]:
-    """Give every method's command, with places to fill in, by name."""
+    """Return every method's command, with places to fill in, by name."""
     run_baseline = [sys.executable, "-m", "benchmarks.baselines"]
     methods = own_methods(options.set) | {
         name: [*run_baseline, name, "{IN}", "{OUT}", "--count", "{COUNT}"] for name in BASELINES
@@ -146,7 +146,7 @@ def measure(commands: Mapping[str, list[str]], options: argparse.Namespace) -> I
 def sources(
     options: argparse.Namespace, folder: Path
 ) -> Iterator[tuple[str, cvtgs.GaussianScene, Path]]:
-    """Give name, scene and file of every scene; generated ones are written to the folder."""
+    """Return name, scene and file of every scene; generated ones are written to the folder."""
     for number, (name, scene) in enumerate(scenes(options.files, options.count)):
         path = options.files[number] if options.files else folder / "full.ply"
         if not options.files:
@@ -208,7 +208,7 @@ def judged(
 
 
 def report(table: Table, options: argparse.Namespace) -> str:
-    """Say what was measured, the table, and what is not as it should be."""
+    """Report what was measured, the table, and what is not as it should be."""
     own = f"cvtgs' own renderer, {VIEWS} automatic views of {SIZE} x {SIZE} pixels"
     judge = "the command of --scorer" if options.scorer else own
     clock = "wall-clock" if options.clock == "wall" else "user CPU"

@@ -30,7 +30,7 @@ class Result:
     wanted: int
 
     def seconds(self, clock: Clock) -> float:
-        """Give the time on a clock."""
+        """Return the time on a clock."""
         return self.wall_seconds if clock == "wall" else self.cpu_seconds
 
 
@@ -47,7 +47,7 @@ METRICS: Mapping[str, tuple[Callable[[Result], float | None], str]] = {
 def markdown(
     table: Table, ratios: Sequence[float], *, means_only: bool = False, clock: Clock = "wall"
 ) -> str:
-    """Give a Markdown table: the mean first, then scene by scene.
+    """Return a Markdown table: the mean first, then scene by scene.
 
     A mean is over all scenes; a dash stands where a run failed or nothing was measured. There are
     no columns for LPIPS if nobody measured it.
@@ -73,7 +73,7 @@ def markdown(
 
 
 def cell(values: Sequence[float | None], form: str) -> str:
-    """Give the text of a mean, or a dash if a value is missing."""
+    """Return the text of a mean, or a dash if a value is missing."""
     known = [value for value in values if value is not None]
     return f"{mean(known):{form}}" if len(known) == len(values) else "-"
 

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import cvtgs
 from benchmarks.processes import machine
-from cvtgs.goals import CostModel, Work, cost_model
-from cvtgs.goals.calibrate import CANDIDATES, undisturbed_seconds
+from cvtgs.budget import CostModel, Work, cost_model
+from cvtgs.budget.calibrate import CANDIDATES, undisturbed_seconds
 from cvtgs.report import StageCost
 from cvtgs.tradeoff.runs import Task, run_task
 
@@ -49,7 +49,7 @@ class Row:
 
     @property
     def error(self) -> float:
-        """Give the error as a share of what was measured."""
+        """Return the error as a share of what was measured."""
         return self.predicted / self.measured - 1
 
 
@@ -106,7 +106,7 @@ def measured(file: Path, folder: Path, model: CostModel, options: argparse.Names
 
 
 def report(rows: Sequence[Row]) -> str:
-    """Give the table and its summary."""
+    """Return the table and its summary."""
     lines = [
         "| scene | rho | preset | predicted s | measured s | error |",
         "|---|---|---|---|---|---|",

@@ -1,7 +1,7 @@
 """What each format costs: bytes, seconds, and quality after a round trip.
 
 ``python -m benchmarks.formats`` prints Markdown tables. Seconds are those of one process that has
-imported everything; pictures are rendered by cvtgs from automatic views.
+imported everything; images are rendered by cvtgs from automatic views.
 """
 
 import argparse
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def measured(scene: cvtgs.GaussianScene, end: str, runs: int) -> str:
-    """Give the row of a format."""
+    """Return the row of a format."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"a.{end}"
         write = [seconds(lambda: cvtgs.save(scene, path, overwrite=True)) for _ in range(runs)]

@@ -84,7 +84,7 @@ def grouped_simplifier(
 
     def simplify(scene: cvtgs.GaussianScene, rho: float) -> cvtgs.GaussianScene:
         count = cvtgs.target_count(len(scene), rho)
-        all_members = config.merge.model_copy(update={"lone_members": False})
+        all_members = config.merge.model_copy(update={"representatives": False})
         whole = config.model_copy(update={"merge": all_members})
         reference = make_reference(scene, count, whole)
         rows = reference.partition.order.sort().values  # those that passed the filter

@@ -28,7 +28,7 @@ def main() -> None:
     parser.add_argument("variants", nargs="+", help="FILES.ply, then presets with settings")
     parser.add_argument("--rho", type=float, default=0.1)
     parser.add_argument("--views", type=int, default=12, help="at each height")
-    parser.add_argument("--size", type=int, default=256, help="of the pictures, pixels")
+    parser.add_argument("--size", type=int, default=256, help="of the images, pixels")
     parser.add_argument("--count", type=int, default=60_000, help="size of generated scenes")
     options = parser.parse_intermixed_args()
     files = [Path(word) for word in options.variants if word.endswith(".ply")]
@@ -70,7 +70,7 @@ def views_at(
 
 
 def scores(scene: cvtgs.GaussianScene, variant: str, cameras: list[Cameras], rho: float) -> Tensor:
-    """Give the mean PSNR at every height."""
+    """Return the mean PSNR at every height."""
     preset, *words = variant.split()
     settings = dict(word.split("=", 1) for word in words)
     config = cvtgs.SimplifyConfig.compose(preset=preset, settings=settings)

@@ -18,8 +18,8 @@ import torch
 
 import cvtgs
 from benchmarks.processes import machine, run_python
-from cvtgs.blocks import simplify_file
 from cvtgs.evaluate import EvaluationSettings
+from cvtgs.outofcore import simplify_file
 from cvtgs.views import automatic_views
 
 KINDS = ("object", "room", "landscape", "haze", "thin", "courtyard")
@@ -130,7 +130,7 @@ def make(options: argparse.Namespace) -> None:
 
 
 def scenes(options: argparse.Namespace) -> list[tuple[str, cvtgs.GaussianScene]]:
-    """Give the scenes to compare on."""
+    """Return the scenes to compare on."""
     if options.files:
         return [(file.stem, cvtgs.load(file)) for file in options.files]
     make_one, kinds = cvtgs.synthetic.scene, options.kinds.split(",")
@@ -138,7 +138,7 @@ def scenes(options: argparse.Namespace) -> list[tuple[str, cvtgs.GaussianScene]]
 
 
 def scores(scene: cvtgs.GaussianScene, small: dict[str, cvtgs.GaussianScene]) -> dict[str, float]:
-    """Give mean PSNR over automatic views."""
+    """Return mean PSNR over automatic views."""
     cameras = automatic_views(scene, 6, width=400, height=300)
     settings = EvaluationSettings(lpips="off")
     found = cvtgs.evaluate(scene, small, cameras, settings=settings)

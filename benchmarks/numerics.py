@@ -44,7 +44,7 @@ class Figures(NamedTuple):
     opacities: float
     colors: float
     network: float
-    pictures: float
+    images: float
 
 
 def main() -> None:
@@ -67,7 +67,7 @@ def main() -> None:
 
 
 def catalogue() -> Cases:
-    """Give the hard cases of the tests."""
+    """Return the hard cases of the tests."""
     sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
     from hard_cases import CASES  # noqa: PLC0415 (found there only)
 
@@ -149,7 +149,7 @@ def figures(make: Callable[[int, torch.dtype], GaussianScene], count: int) -> Fi
         opacities=worst((second.opacities.double() - first.opacities).abs()),
         colors=worst((second.sh - first.sh).abs() / (1 + first.sh.abs().amax())),
         network=worst((approximate - corrected).abs()),
-        pictures=picture_error(first, second),
+        images=image_error(first, second),
     )
 
 
@@ -193,7 +193,7 @@ def corrected_scales(
     return small.log_scales.double()
 
 
-def picture_error(first: GaussianScene, second: GaussianScene) -> float:
+def image_error(first: GaussianScene, second: GaussianScene) -> float:
     cameras = automatic_views(second, 2, width=64, height=64)
     ours, theirs = (cvtgs.render(scene, cameras).rgb.double() for scene in (first, second))
     return worst((ours.clamp(0, 1) - theirs.clamp(0, 1)).abs())

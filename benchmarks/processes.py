@@ -50,7 +50,7 @@ def run(command: Sequence[str]) -> Cost:
 
 
 def spread(values: Sequence[float]) -> str:
-    """Give median, smallest and largest."""
+    """Return median, smallest and largest."""
     return f"{statistics.median(values):.2f} ({min(values):.2f}-{max(values):.2f})"
 
 

@@ -1,7 +1,7 @@
 """Time and memory of rendering: forward, and forward and backward, by each backend.
 
 ``python -m benchmarks.render`` prints a Markdown table. Each backend runs in a process of its
-own; its first pictures, which may compile, are timed apart.
+own; its first images, which may compile, are timed apart.
 """
 
 import argparse
@@ -102,16 +102,16 @@ def orbit(scene: cvtgs.GaussianScene, count: int, size: int) -> Cameras:
 def seconds(
     scene: cvtgs.GaussianScene, cameras: Cameras, backend: BackendName, *, backward: bool
 ) -> float:
-    """Time one picture."""
+    """Time one image."""
     tensors = {
         name: tensor.clone().requires_grad_(backward) for name, tensor in scene.tensors().items()
     }
     leaves = scene.with_tensors(tensors, scene.extras)
     synchronize(scene.device)
     start = time.perf_counter()
-    picture = render(leaves, cameras, backend=backend).rgb
+    image = render(leaves, cameras, backend=backend).rgb
     if backward:
-        picture.square().mean().backward()
+        image.square().mean().backward()
     synchronize(scene.device)
     return time.perf_counter() - start
 

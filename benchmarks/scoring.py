@@ -30,7 +30,7 @@ MEAN = "mean"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quality:
-    """How close the pictures of a small scene come to those of the full one.
+    """How close the images of a small scene come to those of the full one.
 
     Attributes:
         psnr: dB.
@@ -78,7 +78,7 @@ def configuration(options: argparse.Namespace, settings: Mapping[str, str]) -> c
 def variants_of(
     options: argparse.Namespace, table: Mapping[str, Mapping[str, str]]
 ) -> dict[str, Simplify]:
-    """Give a simplifier for every row of settings."""
+    """Return a simplifier for every row of settings."""
     return {
         name: cvtgs.Simplifier(config=configuration(options, settings)).simplify
         for name, settings in table.items()
@@ -98,7 +98,7 @@ def measure(variants: Mapping[str, Simplify], options: argparse.Namespace) -> It
 
 
 def scenes(files: Sequence[Path], count: int) -> Iterator[tuple[str, cvtgs.GaussianScene]]:
-    """Give the scenes of the files, or one generated scene of each kind, with their names."""
+    """Return the scenes of the files, or one generated scene of each kind, with their names."""
     stems = Counter(file.stem for file in files)
     for file in files:
         yield file.stem if stems[file.stem] == 1 else str(file), cvtgs.load(file)
@@ -129,12 +129,12 @@ def own_scorer(weights: LpipsWeights | None) -> Scorer:
         distances: dict[str, list[float]] = {name: [] for name in (FULL, *named)}
         truth: list[Tensor] = []
 
-        def look(view: int, name: str, picture: Tensor) -> None:
+        def look(view: int, name: str, image: Tensor) -> None:
             if weights is None:
                 return
             if name == FULL:
-                truth[:] = [picture[None]]
-            found = lpips(picture[None], truth[0], network=weights.network, weights=weights)
+                truth[:] = [image[None]]
+            found = lpips(image[None], truth[0], network=weights.network, weights=weights)
             distances[name].append(float(found))
 
         found = evaluate(
@@ -143,7 +143,7 @@ def own_scorer(weights: LpipsWeights | None) -> Scorer:
             automatic_views(full, VIEWS, width=SIZE, height=SIZE),
             reference_name=FULL,
             settings=EvaluationSettings(lpips="off"),
-            on_picture=look,
+            on_image=look,
         )
         return [
             Quality(
@@ -199,7 +199,7 @@ def mean_or_none(values: Sequence[float | None]) -> float | None:
 
 
 def markdown(table: Table, ratios: Sequence[float], *, means_only: bool = False) -> str:
-    """Give a Markdown table: the mean first, then scene by scene."""
+    """Return a Markdown table: the mean first, then scene by scene."""
     heads = [f"{name} at {rho:g}" for rho in ratios for name in ("PSNR", "SSIM", "LPIPS")]
     shown = {MEAN: means(table)} if means_only else {MEAN: means(table), **table}
     lines = [
@@ -217,6 +217,6 @@ def markdown_rows(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def cells_of(quality: Quality) -> tuple[str, str, str]:
-    """Give the text of three columns; a dash for what was not measured."""
+    """Return the text of three columns; a dash for what was not measured."""
     distance = "-" if quality.lpips is None else f"{quality.lpips:.4f}"
     return f"{quality.psnr:.2f}", f"{quality.ssim:.4f}", distance

@@ -1,6 +1,6 @@
 """Points and needles against mass pruning: cells that keep a member, and cells that do not.
 
-``python -m benchmarks.thin_scenes`` prints PSNR and SSIM of pictures without the compensation of
+``python -m benchmarks.thin_scenes`` prints PSNR and SSIM of images without the compensation of
 Mip-Splatting, by automatic views, for scenes of ``tests/hard_cases.py``.
 """
 
@@ -16,9 +16,9 @@ from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.evaluate import EvaluationSettings, evaluate
 from cvtgs.views import automatic_views
 
-MOMENTS = {"merge.lone_members": "false"}
+MOMENTS = {"merge.representatives": "false"}
 VARIANTS = {"standard": {}, "moments only": MOMENTS, "paper": {"preset": "paper"}}
-VARIANTS["paper, with members"] = {"preset": "paper", "merge.lone_members": "true"}
+VARIANTS["paper, with members"] = {"preset": "paper", "merge.representatives": "true"}
 
 
 def main() -> None:
@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("--case", nargs="+", default=["points", "needles"])
     parser.add_argument("--count", type=int, default=4000)
     parser.add_argument("--rho", type=float, nargs="+", default=[0.2, 0.02])
-    parser.add_argument("--size", type=int, default=400, help="side of the pictures")
+    parser.add_argument("--size", type=int, default=400, help="side of the images")
     parser.add_argument("--views", type=int, default=8)
     options = parser.parse_args()
     print("| case | rho | " + " | ".join([*VARIANTS, "mass pruning"]) + " |")

@@ -17,7 +17,7 @@ def main() -> None:
     parser.add_argument("output", type=Path, help="folder for index.html")
     parser.add_argument("--rho", type=float, default=0.01)
     parser.add_argument("--presets", nargs="+", default=["draft", "standard"])
-    parser.add_argument("--size", type=int, default=480, help="side of the pictures, pixels")
+    parser.add_argument("--size", type=int, default=480, help="side of the images, pixels")
     options = parser.parse_args()
     scene = cvtgs.load(options.input)
     small = {

@@ -2,7 +2,7 @@
 
 python examples/gsplat_loop.py --steps 50
 
-With CUDA and gsplat the pictures come from gsplat.rasterization; elsewhere from cvtgs.render.
+With CUDA and gsplat the images come from gsplat.rasterization; elsewhere from cvtgs.render.
 """
 
 import argparse
@@ -17,12 +17,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=20_000)
     parser.add_argument("--steps", type=int, default=50)
-    parser.add_argument("--size", type=int, default=128, help="side of the pictures, pixels")
+    parser.add_argument("--size", type=int, default=128, help="side of the images, pixels")
     options = parser.parse_args()
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     trained = cvtgs.synthetic.scene("object", options.count, sh_degree=1, seed=0).to(device)
     views = cvtgs.views.automatic_views(trained, 4, width=options.size, height=options.size)
-    targets = picture(cvtgs.to_dict(trained), views)  # photographs, in a loop of your own
+    targets = image(cvtgs.to_dict(trained), views)  # photographs, in a loop of your own
 
     scene = cvtgs.from_dict(cvtgs.to_dict(trained))  # of a model: cvtgs.from_dict(model.splats)
     small = cvtgs.to_dict(cvtgs.Simplifier().simplify(scene, 0.1))
@@ -32,7 +32,7 @@ def main() -> None:
     optimizer = torch.optim.Adam(groups, eps=1e-15)
     for step in range(options.steps):
         view = step % len(views)
-        shown = picture(splats, views.select(torch.tensor([view])))[0]
+        shown = image(splats, views.select(torch.tensor([view])))[0]
         loss = (shown - targets[view]).abs().mean()
         optimizer.zero_grad()
         loss.backward()
@@ -41,7 +41,7 @@ def main() -> None:
             print(f"step {step}: loss {loss.item():.5f}")
 
 
-def picture(splats: dict[str, torch.Tensor], views: cvtgs.Cameras) -> torch.Tensor:
+def image(splats: dict[str, torch.Tensor], views: cvtgs.Cameras) -> torch.Tensor:
     """Render the parameters of a model, differentiably: by gsplat where it works."""
     names = {"scales": "log_scales", "opacities": "logit_opacities"}
     scene = cvtgs.GaussianScene(**{names.get(key, key): values for key, values in splats.items()})

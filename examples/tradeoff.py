@@ -19,7 +19,7 @@ def main() -> None:
     parser.add_argument("output", type=Path)
     parser.add_argument("--rho", type=float, nargs="+", default=[0.01])
     parser.add_argument("--presets", nargs="+", default=["draft", "fast", "standard"])
-    parser.add_argument("--size", type=int, default=480, help="side of the pictures, pixels")
+    parser.add_argument("--size", type=int, default=480, help="side of the images, pixels")
     options = parser.parse_args()
     measured = measure_tradeoff(
         options.input,

@@ -6,7 +6,7 @@ from cvtgs import GaussianScene
 
 
 def gaussians(means, *, opacities, scales, colors=None, dtype=torch.float64) -> GaussianScene:
-    """Give axis-parallel Gaussians; colours are SH coefficients, gray if None."""
+    """Return axis-parallel Gaussians; colours are SH coefficients, gray if None."""
     n = len(means)
     alpha = torch.tensor(opacities, dtype=dtype)
     shades = torch.zeros(n, 3) if colors is None else torch.tensor(colors)

@@ -18,7 +18,7 @@ import cvtgs
 from cvtgs import synthetic
 from cvtgs.boxes import Box
 from cvtgs.config import SimplifyConfig
-from cvtgs.blocks import simplify_file
+from cvtgs.outofcore import simplify_file
 
 FILE = Path(__file__).with_name("digests.json")
 KINDS = {"object": 3, "room": 1, "landscape": 2, "haze": 3, "thin": 0, "courtyard": 2}
@@ -132,7 +132,7 @@ def columns(scene: cvtgs.GaussianScene) -> list[torch.Tensor]:
 
 
 def measure(name: str) -> dict[str, object]:
-    """Give digest and rough figures of what a case gives."""
+    """Return digest and rough figures of what a case gives."""
     scenes = list(CASES[name]())
     return {
         "digest": digest(tensor for scene in scenes for tensor in columns(scene)),
@@ -146,7 +146,7 @@ def measure(name: str) -> dict[str, object]:
 
 
 def canary() -> str:
-    """Give the digest of a few operations that processors and libraries may round differently."""
+    """Return the digest of a few operations that processors and libraries may round differently."""
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(64, 3, 3, generator=generator)
     y = torch.randn(5000, generator=generator)

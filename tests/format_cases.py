@@ -16,7 +16,7 @@ DATA = Path(__file__).parent / "data" / "formats"
 
 
 def storable_scene(count: int, *, seed: int = 0, degree: int = 3) -> GaussianScene:
-    """Give a scene that no format cuts off, whatever the degree it holds."""
+    """Return a scene that no format cuts off, whatever the degree it holds."""
     scene = random_scene(count, seed=seed, degree=degree)
     tensors = {"sh0": scene.sh0.clamp(-1.7, 1.7), "shN": scene.shN.clamp(-0.9, 0.9)}
     return replace(scene.with_tensors(tensors, {}), comments=(ANTIALIASED_TAG,))
@@ -32,7 +32,7 @@ def refusal(path: Path) -> str | None:
 
 
 def nearest_rows(scene: GaussianScene, other: GaussianScene) -> GaussianScene:
-    """Give the rows of another scene in the order of this one, by the nearest centres."""
+    """Return the rows of another scene in the order of this one, by the nearest centres."""
     rows = torch.cdist(scene.means.double(), other.means.double()).argmin(dim=1)
     assert len(rows.unique()) == len(scene) == len(other)
     return other.select(rows)
@@ -61,7 +61,7 @@ def assert_as_oracle(scene: GaussianScene, splats: list[Splat], tolerance: float
 
 
 def angles(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """Give the angle between rotations, radians."""
+    """Return the angle between rotations, radians."""
     large = (q.double() / q.double().abs().amax(dim=1, keepdim=True) for q in (first, second))
     ours, theirs = (torch.nn.functional.normalize(q, dim=1) for q in large)
     sign = torch.where((ours * theirs).sum(1, keepdim=True) < 0, -1.0, 1.0)

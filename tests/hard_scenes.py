@@ -84,7 +84,7 @@ def measured_in(scene: GaussianScene, exponent: float) -> GaussianScene:
 
 
 def valid_rows(scene: GaussianScene) -> Tensor:
-    """Tell row by row what a renderer can draw: finite, a rotation, a scale that float32 holds."""
+    """Return which rows a renderer can draw: finite, a rotation, a scale that float32 holds."""
     rows = torch.cat([scene.means, scene.quats, scene.log_scales, scene.sh.flatten(1)], dim=1)
     return (
         rows.isfinite().all(dim=1)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 import mergenet_oracle as oracle
 from cvtgs import GaussianScene
-from cvtgs.cells import Descriptors, Partition, describe_cells, merge_cells, settle_frames
+from cvtgs.cells import Descriptors, Partition, align_axes, describe_cells, merge_cells
 from cvtgs.config import MergeConfig
 from cvtgs.cvt import nearest_neighbors
 from cvtgs.mergenet import Architecture, MergeNet, Residuals, compose, correct_cells
@@ -96,7 +96,7 @@ def case_of(
     if light is None:
         light = torch.rand(len(scene), generator=torch.Generator().manual_seed(5))
     neighbors = nearest_neighbors(merged.means, near, backend="torch")
-    merged = settle_frames(merged, part, neighbors)
+    merged = align_axes(merged, part, neighbors)
     return Case(scene, merged, part, neighbors, light.double())
 
 

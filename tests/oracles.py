@@ -167,7 +167,7 @@ def side_cover(
     return cover
 
 
-def widening(
+def inflation(
     opacity: float, members: int, cover: float, *, everywhere: float, covered: float
 ) -> float:
     """Factor on one scale of a merged Gaussian, ``cover`` being that of its barer side."""

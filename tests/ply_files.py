@@ -25,7 +25,7 @@ def gaussian_properties(rest: int = 0, *, kind: str = "float", normals: bool = T
 
 
 def gaussian_rows(properties: Properties, count: int) -> list[list[float]]:
-    """Give rows whose value in column j of row i is 0.25 i + j, and 0 for normals."""
+    """Return rows whose value in column j of row i is 0.25 i + j, and 0 for normals."""
     return [
         [
             0.0 if name in ("nx", "ny", "nz") else 0.25 * i + j
@@ -55,7 +55,7 @@ def encode_row(properties: Properties, row: Row, encoding: str) -> bytes:
 
 
 def element_header(name: str, properties: Properties, count: int) -> list[str]:
-    """Give the header lines of one element."""
+    """Return the header lines of one element."""
     return [f"element {name} {count}", *(f"property {kind} {prop}" for prop, kind in properties)]
 
 
@@ -92,6 +92,6 @@ def write_ply_file(
 
 
 def parse_header(data: bytes) -> tuple[list[str], int]:
-    """Give the header lines of a file that cvtgs wrote, and where its data starts."""
+    """Return the header lines of a file that cvtgs wrote, and where its data starts."""
     end = data.index(b"end_header\n") + len(b"end_header\n")
     return data[:end].decode().splitlines(), end

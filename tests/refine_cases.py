@@ -11,7 +11,7 @@ from cvtgs.refine import RefineConfig
 
 
 def quick(**changes: Any) -> RefineConfig:
-    """Small pictures, few views."""
+    """Small images, few views."""
     values: dict[str, Any] = {"size": 32, "heldout": 4, "batch": 8, "check_every": 5}
     return RefineConfig(**(values | changes))
 

@@ -70,7 +70,7 @@ def scene_of(*rows, dtype=torch.float64, comments=()):
     )  # fmt: skip
 
 
-def oracle_pictures(scene, cameras):
+def oracle_images(scene, cameras):
     gaussians = [
         oracle.Gaussian(
             mean=scene.means[row].tolist(),
@@ -81,7 +81,7 @@ def oracle_pictures(scene, cameras):
         )
         for row in range(len(scene))
     ]
-    pictures = [
+    images = [
         oracle.render(
             gaussians,
             oracle.Camera(
@@ -94,12 +94,12 @@ def oracle_pictures(scene, cameras):
         )
         for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True)
     ]
-    return tuple(torch.from_numpy(np.stack(layer)) for layer in zip(*pictures, strict=True))
+    return tuple(torch.from_numpy(np.stack(layer)) for layer in zip(*images, strict=True))
 
 
 def assert_oracle(scene, cameras, backend, *, atol):
     """Compare all three layers; depth only where it is not a quotient of tiny numbers."""
-    rgb, alpha, depth = oracle_pictures(scene, cameras)
+    rgb, alpha, depth = oracle_images(scene, cameras)
     found = render(scene, cameras, backend=backend, depth=True)
     torch.testing.assert_close(found.rgb.double(), rgb, rtol=0, atol=atol)
     torch.testing.assert_close(found.alpha.double(), alpha, rtol=0, atol=atol)

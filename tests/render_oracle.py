@@ -92,7 +92,7 @@ def project(g: Gaussian, camera: Camera, *, antialiased: bool) -> Splat | None:
 def render(
     gaussians: Sequence[Gaussian], camera: Camera, *, antialiased: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give colours on black, alpha, and mean depth (0 where nothing is)."""
+    """Return colours on black, alpha, and mean depth (0 where nothing is)."""
     splats = [project(g, camera, antialiased=antialiased) for g in gaussians]
     seen = sorted((s for s in splats if s is not None), key=lambda s: s.depth)
     rgb = np.zeros((camera.height, camera.width, 3))

@@ -65,7 +65,7 @@ def moved(
 
 
 def oracle_rows(scene: GaussianScene, rows: Sequence[int]) -> list[oracles.Gaussian]:
-    """Give some Gaussians to the oracles."""
+    """Return some Gaussians to the oracles."""
     return [
         oracles.gaussian(
             scene.means[row].tolist(),
@@ -79,7 +79,7 @@ def oracle_rows(scene: GaussianScene, rows: Sequence[int]) -> list[oracles.Gauss
 
 
 def covariances_of(scene: GaussianScene) -> Tensor:
-    """Give ``(n, 3, 3)`` covariances, which do not depend on how axes are named."""
+    """Return ``(n, 3, 3)`` covariances, which do not depend on how axes are named."""
     matrices = [
         oracles.covariance(log_scales, quat)
         for log_scales, quat in zip(scene.log_scales.tolist(), scene.quats.tolist(), strict=True)
@@ -88,7 +88,7 @@ def covariances_of(scene: GaussianScene) -> Tensor:
 
 
 def same_bits(first: GaussianScene, second: GaussianScene) -> bool:
-    """Tell whether all tensors, extras included, are equal bit for bit."""
+    """Return whether all tensors, extras included, are equal bit for bit."""
     ours = {**first.tensors(), **first.extras}
     theirs = {**second.tensors(), **second.extras}
     return ours.keys() == theirs.keys() and all(

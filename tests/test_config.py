@@ -33,7 +33,7 @@ def test_paper_is_cvt_gs():
     assert not paper.cvt.perspective
     assert (paper.cvt.color, paper.effects.unbounded, paper.cvt.iterations) == (0.0, "off", 5)
     assert (paper.cvt.seeding, paper.cvt.samples_per_site) == ("weighted", 0)
-    assert (paper.merge.opacity, paper.merge.widening) == ("union", 0.0)
+    assert (paper.merge.opacity, paper.merge.inflation) == ("union", 0.0)
 
 
 def test_standard_is_mass_everywhere():
@@ -60,7 +60,7 @@ def test_values_win_over_their_preset():
 @pytest.mark.parametrize("name", PRESETS)
 def test_toml_round_trip(name, tmp_path):
     config = SimplifyConfig.from_mapping(
-        {"preset": name, "seed": 7, "merge": {"widening": 0.125}, "cvt": {"backend": "torch"}}
+        {"preset": name, "seed": 7, "merge": {"inflation": 0.125}, "cvt": {"backend": "torch"}}
     )
     path = tmp_path / "config.toml"
     path.write_text(config.to_toml(), encoding="utf-8")
@@ -69,10 +69,10 @@ def test_toml_round_trip(name, tmp_path):
 
 def test_a_partial_file_takes_the_rest_from_its_preset(tmp_path):
     path = tmp_path / "config.toml"
-    path.write_text('preset = "paper"\n[merge]\nwidening = 0.5\n', encoding="utf-8")
+    path.write_text('preset = "paper"\n[merge]\ninflation = 0.5\n', encoding="utf-8")
     config = SimplifyConfig.from_toml(path)
     assert config.merge == MergeConfig(
-        area_power=0.0, opacity="union", lone_members=False, widening=0.5, covered_widening=0.0
+        area_power=0.0, opacity="union", representatives=False, inflation=0.5, covered_inflation=0.0
     )
     assert config.cvt == SimplifyConfig.from_preset("paper").cvt
 
@@ -96,7 +96,7 @@ def test_settings_win_over_preset_and_preset_over_file(tmp_path):
         ("effects.unbounded", "on", "on"),
         ("effects.sh", "1", 1),
         ("effects.sh", "off", 0),
-        ("merge.widening", "0", 0.0),
+        ("merge.inflation", "0", 0.0),
         ("filter.max_mass_share", "1e-3", 1e-3),
     ],
 )

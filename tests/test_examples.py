@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 import torch
-
-import cvtgs
 from test_io_checkpoints import splatfacto
 from test_io_folders import inria_model
+
+import cvtgs
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

@@ -25,7 +25,7 @@ LEVELS = [
     {"mergenet", "views"},
     {"stages", "refine"},
     {"simplify", "info", "evaluate"},
-    {"goals", "tradeoff", "levels", "blocks"},
+    {"budget", "tradeoff", "levels", "outofcore"},
     {"train"},
     {"cli"},
     {"__main__"},
@@ -35,7 +35,7 @@ RANKS = {name: rank for rank, level in enumerate(LEVELS) for name in level}
 # Packages that any file may import, and the only places that may import others.
 EVERYWHERE = {"torch", "numpy", "jaxtyping", "pydantic"}
 OWNERS = {
-    "scipy": ("cvt/nearest_scipy.py", "goals/fit.py"),
+    "scipy": ("cvt/nearest_scipy.py", "budget/fit.py"),
     "plyfile": "io/ply/generic.py",
     "tomli_w": "config/simplify.py",
     "rich": "cli/",
@@ -46,7 +46,7 @@ OWNERS = {
     "zstandard": "io/spz/zstd.py",
     "safetensors": "io/tensors.py",
     "matplotlib": "plots.py",
-    "distributed": "blocks/distributed.py",
+    "distributed": "outofcore/distributed.py",
 }
 HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "matplotlib", "distributed")
 
@@ -64,7 +64,7 @@ def is_for_types(node: ast.AST) -> bool:
 
 
 def imports_in(node: ast.AST) -> Iterator[str]:
-    """Give the dotted names that run-time imports name, wherever in the file they are."""
+    """Return the dotted names that run-time imports name, wherever in the file they are."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.Import):
             yield from (alias.name for alias in child.names)
@@ -87,7 +87,7 @@ def broken_ranks(path: Path, text: str) -> list[str]:
 
 
 def strangers_in(path: Path, text: str) -> list[str]:
-    """Give the packages from elsewhere that a file imports and does not own."""
+    """Return the packages from elsewhere that a file imports and does not own."""
     packages = {name.split(".")[0] for name in imports_in(ast.parse(text))}
     foreign = packages - set(sys.stdlib_module_names) - EVERYWHERE - {"cvtgs"}
     return sorted(

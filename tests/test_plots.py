@@ -23,9 +23,9 @@ def pixels(png: bytes) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
 
 
-def shows(picture: np.ndarray, color: str) -> bool:
+def shows(image: np.ndarray, color: str) -> bool:
     wanted = [int(color[start : start + 2], 16) for start in (1, 3, 5)]
-    return bool((picture == wanted).all(axis=-1).any())
+    return bool((image == wanted).all(axis=-1).any())
 
 
 @needs_matplotlib
@@ -70,9 +70,9 @@ def test_more_series_than_colours_and_fewer_panels_than_places():
 
 @needs_matplotlib
 def test_a_place_without_a_panel_stays_empty():
-    picture = pixels(line_chart([Panel(series=[LOSS])] * 3, columns=2, width=400, height=400))
-    assert (picture[:200, 200:] != 255).any()
-    assert (picture[220:, 220:] == 255).all()
+    image = pixels(line_chart([Panel(series=[LOSS])] * 3, columns=2, width=400, height=400))
+    assert (image[:200, 200:] != 255).any()
+    assert (image[220:, 220:] == 255).all()
 
 
 def test_a_missing_package_is_one_clear_error(monkeypatch):

@@ -51,7 +51,7 @@ def tiny_data(folder: Path, **changes: Any) -> DataConfig:
 
 
 def tiny_config(data: DataConfig, **changes: Any) -> TrainConfig:
-    """A training of a second: a small network, pictures of 32 pixels, few cells."""
+    """A training of a second: a small network, images of 32 pixels, few cells."""
     values: dict[str, Any] = {
         "data": data,
         "steps": 6,
@@ -126,7 +126,7 @@ def bits_of_views(views: Views) -> dict[str, Any]:
     cameras = views.cameras
     return {
         "cameras": (bits(cameras.viewmats), bits(cameras.Ks), cameras.width, cameras.height),
-        "pictures": (bits(views.rgb), bits(views.alpha)),
+        "images": (bits(views.rgb), bits(views.alpha)),
     }
 
 

@@ -15,7 +15,7 @@ class Simplify(Protocol):
     """What every baseline is."""
 
     def __call__(self, scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScene:
-        """Give exactly ``count`` valid standard Gaussians."""
+        """Return exactly ``count`` valid standard Gaussians."""
         ...
 
 
@@ -31,7 +31,7 @@ BASELINES: Mapping[str, str] = {
 
 
 def baseline(name: str) -> Simplify:
-    """Give a baseline by its name."""
+    """Return a baseline by its name."""
     module, _, function = BASELINES[name].partition(".")
     found: Simplify = getattr(import_module(f"benchmarks.baselines.{module}"), function)
     return found

@@ -109,7 +109,7 @@ def divergences(
     centers: Float[Tensor, "m 3"],
     spreads: Float[Tensor, "m 3 3"],
 ) -> Float[Tensor, "n m"]:
-    """Give ``KL(N_i || N_c)`` of all pairs, in nats.
+    """Return ``KL(N_i || N_c)`` of all pairs, in nats.
 
     ``(tr(S_c^-1 S_i) + (x_i - x_c)^T S_c^-1 (x_i - x_c) - 3 + log det S_c - log det S_i) / 2``.
     """
@@ -122,7 +122,7 @@ def divergences(
 
 
 def filled(labels: Int[Tensor, "n"], costs: Float[Tensor, "n m"], count: int) -> Int[Tensor, "n"]:
-    """Give every empty cluster the worst served member of those that have company."""
+    """Return every empty cluster the worst served member of those that have company."""
     labels = labels.clone()
     sizes = labels.bincount(minlength=count)
     for empty in (sizes == 0).nonzero()[:, 0].tolist():

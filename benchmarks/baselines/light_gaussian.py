@@ -10,7 +10,7 @@ with T the transmittance in front of it, V_j its volume, and ``gamma(V) = V_norm
 Where ours differs:
 
 - A hit counts with the alpha that is blended there, ``opacity * G(pixel)``, instead of the bare
-  opacity: what is summed is the contribution to the picture, and no threshold decides what a hit
+  opacity: what is summed is the contribution to the image, and no threshold decides what a hit
   is.
 - V_max90, "the 90 % largest of all sorted Gaussians", is read as the 90 % quantile: only the
   largest tenth is clipped, which is what the clipping is there for (excessive floaters).
@@ -43,7 +43,7 @@ def simplify(scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScen
 
 
 def volume_factor(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Give ``gamma``: the volume over the 90 % quantile of all, at most 1, to the power 0.1.
+    """Return ``gamma``: the volume over the 90 % quantile of all, at most 1, to the power 0.1.
 
     In logarithms, so that no volume under- or overflows. ``4 pi / 3`` cancels.
     """

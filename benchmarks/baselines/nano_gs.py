@@ -65,7 +65,7 @@ def visible(scene: GaussianScene, at_least: int) -> GaussianScene:
 
 
 def neighbor_edges(means: Float[Tensor, "n 3"]) -> Int[Tensor, "e 2"]:
-    """Give the edges to the nearest neighbours, each once, the smaller row first."""
+    """Return the edges to the nearest neighbours, each once, the smaller row first."""
     places = means.double().numpy()
     near = min(NEIGHBORS + 1, len(places))
     found = torch.from_numpy(KDTree(places).query(places, k=near)[1])
@@ -76,7 +76,7 @@ def neighbor_edges(means: Float[Tensor, "n 3"]) -> Int[Tensor, "e 2"]:
 
 
 def edge_costs(scene: GaussianScene, edges: Int[Tensor, "e 2"]) -> Float[Tensor, "e"]:
-    """Give what merging the two ends of each edge costs. Memory: some 1 kB per edge of a chunk."""
+    """Return what merging the two ends of each edge costs. About 1 kB per edge of a chunk."""
     shapes, log_weights = covariances_of(scene), log_masses(scene)
     log_dets = torch.logdet(shapes)
     costs = []
@@ -90,7 +90,7 @@ def edge_costs(scene: GaussianScene, edges: Int[Tensor, "e 2"]) -> Float[Tensor,
 
 
 def log_masses(scene: GaussianScene) -> Float[Tensor, "n"]:
-    """Give the logarithm of opacity times volume, up to a constant."""
+    """Return the logarithm of opacity times volume, up to a constant."""
     return scene.opacities.double().log() + scene.log_scales.double().sum(dim=1)
 
 

@@ -1,4 +1,4 @@
-"""Pruning without pictures: keep the M Gaussians of most opacity, or of most mass.
+"""Pruning without images: keep the M Gaussians of most opacity, or of most mass.
 
 The simplest baselines of every paper; no source is needed. Mass is opacity times mean projected
 area of the one-sigma ellipsoid (Cauchy 1832: a quarter of its surface), which is what a Gaussian

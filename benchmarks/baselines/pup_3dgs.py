@@ -60,7 +60,7 @@ def projected_fisher(
     *,
     backend: BackendName = "auto",
 ) -> Float[Tensor, "n 6 6"]:
-    """Average ``h h^T`` over probes, with h the gradient of the picture times the probe.
+    """Average ``h h^T`` over probes, with h the gradient of the image times the probe.
 
     Args:
         scene: The Gaussians.
@@ -76,11 +76,11 @@ def projected_fisher(
     means = scene.means.detach().clone().requires_grad_()
     log_scales = scene.log_scales.detach().clone().requires_grad_()
     moving = scene.with_tensors({"means": means, "log_scales": log_scales}, {})
-    picture = render(moving, camera, backend=backend).rgb[0]
+    image = render(moving, camera, backend=backend).rgb[0]
     per_log = torch.exp(-scene.log_scales.double())  # d log s / d s
     total = torch.zeros(len(scene), 6, 6, dtype=torch.float64, device=scene.device)
     for probe in probes:
-        number = (picture * probe.to(picture)).sum()
+        number = (image * probe.to(image)).sum()
         by_mean, by_log = torch.autograd.grad(number, (means, log_scales), retain_graph=True)
         h = torch.cat([by_mean.double(), by_log.double() * per_log], dim=1)
         total += h[:, :, None] * h[:, None, :]
@@ -88,7 +88,7 @@ def projected_fisher(
 
 
 def sensitivity(fisher: Float[Tensor, "n 6 6"]) -> Float[Tensor, "n"]:
-    """Give ``log det``; minus infinity where the matrix is singular.
+    """Return ``log det``; minus infinity where the matrix is singular.
 
     Each matrix is scaled to a unit diagonal first, so that units do not matter for the arithmetic.
     """

@@ -12,7 +12,7 @@ from cvtgs.scene import GaussianScene
 
 
 def usable(scene: GaussianScene, count: int) -> GaussianScene:
-    """Give the valid rows as standard Gaussians, of which ``count`` can be kept.
+    """Return the valid rows as standard Gaussians, of which ``count`` can be kept.
 
     Invalid rows, extra columns and the layout of the file are left out; opacities are brought
     inside (0, 1) and quaternions to unit length. The comments stay, and the mip tag with them.

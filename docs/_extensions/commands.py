@@ -36,7 +36,7 @@ class Commands(SphinxDirective):
 
 
 def lines_of(parser: argparse.ArgumentParser) -> Iterator[str]:
-    """Give the description, the usage, and what every argument means."""
+    """Return the description, the usage, and what every argument means."""
     parser.formatter_class = lambda prog: argparse.HelpFormatter(prog, width=88)
     yield from (escaped(parser.description or ""), "", ".. code-block:: text", "")
     yield from (f"   {line}" for line in parser.format_usage().removeprefix("usage: ").splitlines())
@@ -56,7 +56,7 @@ def lines_of(parser: argparse.ArgumentParser) -> Iterator[str]:
 
 
 def signature(action: argparse.Action) -> str:
-    """Give an argument as it is typed: every spelling, with the word that stands for its value."""
+    """Return an argument as it is typed: every spelling, and the word for its value."""
     if not action.option_strings:
         return str(action.metavar or action.dest)
     word = "" if action.nargs == 0 else f" {action.metavar or action.dest.upper()}"

@@ -34,7 +34,7 @@ class Constants(SphinxDirective):
 
 
 def is_constant(value: object) -> bool:
-    """Tell constants and aliases of types from what autodoc documents."""
+    """Return constants and aliases of types from what autodoc documents."""
     return not isinstance(value, type | FunctionType | ModuleType) and not hasattr(
         value, "__wrapped__"
     )

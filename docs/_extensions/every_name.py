@@ -16,7 +16,7 @@ logger = logging.getLogger(__name__)
 
 
 def public_names() -> Iterator[tuple[str, set[str]]]:
-    """Give the names of the front page and of all packages on it, and what else they are called."""
+    """Return all public names, and what else they are called."""
     packages = [f"cvtgs.{name}" for name in (*cvtgs._MODULES, *cvtgs._CALLABLE)]
     pairs = [(home, name) for name, home in cvtgs._HOME.items()]
     pairs += [

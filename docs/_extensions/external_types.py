@@ -51,7 +51,7 @@ ALIASES = {
 
 
 def page_of(target: str) -> str | None:
-    """Give the page of a type of another package, or of the standard library."""
+    """Return the page of a type of another package, or of the standard library."""
     target = ALIASES.get(target, target)
     if target in PAGES:
         return PAGES[target]

@@ -29,7 +29,7 @@ class Kept:
     def restore(
         self, app: Sphinx, what: str, name: str, obj: object, options: Any, lines: list[str]
     ) -> None:  # fmt: skip
-        """Give the lines as they were."""
+        """Return the lines as they were."""
         if what in WITHOUT_SECTIONS and not any(line.endswith("Raises:") for line in self.lines):
             lines[:] = self.lines
 

@@ -14,7 +14,7 @@ BOUNDS = {"ge": "at least {}", "gt": "above {}", "le": "at most {}", "lt": "belo
 
 
 def facts(field: FieldInfo) -> str:
-    """Say what a field holds, for example ``float``, default ``0.1``, at least 0."""
+    """Report what a field holds, for example ``float``, default ``0.1``, at least 0."""
     kind = stringify_annotation(field.annotation, "smart").replace("~", "")
     parts = [f"``{re.sub(r'[a-z_]+[.](?=[A-Za-z])', '', kind)}``"]
     default = field.default
@@ -54,7 +54,7 @@ def without_signature(
 
 
 def is_model(obj: object) -> TypeGuard[type[pydantic.BaseModel]]:
-    """Tell whether something is a class of pydantic."""
+    """Return whether something is a class of pydantic."""
     return isinstance(obj, type) and issubclass(obj, pydantic.BaseModel)
 
 

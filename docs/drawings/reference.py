@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 import cvtgs
-from benchmarks.picture import camera
+from benchmarks.before_after import camera
 from cvtgs.evaluate import psnr
 from docs.drawings.saving import figure, save_small
 
@@ -30,19 +30,19 @@ def main() -> None:
         "with MergeNet": cvtgs.Simplifier().simplify(scene, RHO),
     }
     with torch.no_grad():
-        pictures = {
+        images = {
             name: cvtgs.render(one, camera()).rgb[0][CROP].clamp(0, 1)
             for name, one in scenes.items()
         }
     canvas, panels = figure(2, 4, width=9.0, height=4.6)
-    full = pictures["full"]
-    for axes, (name, picture) in zip(panels[0], pictures.items(), strict=True):
-        axes.imshow(picture)
+    full = images["full"]
+    for axes, (name, image) in zip(panels[0], images.items(), strict=True):
+        axes.imshow(image)
         axes.set_title(f"{name}\n{len(scenes[name]):,} Gaussians", fontsize=10)
     panels[1, 0].set_axis_off()
-    for axes, picture in list(zip(panels[1], pictures.values(), strict=True))[1:]:
-        shown = axes.imshow((picture - full).abs().mean(dim=2), vmin=0, vmax=0.3, cmap="gray")
-        axes.set_xlabel(f"{psnr(picture[None], full[None]).item():.2f} dB")
+    for axes, image in list(zip(panels[1], images.values(), strict=True))[1:]:
+        shown = axes.imshow((image - full).abs().mean(dim=2), vmin=0, vmax=0.3, cmap="gray")
+        axes.set_xlabel(f"{psnr(image[None], full[None]).item():.2f} dB")
     below = panels[1, 0].inset_axes((0.1, 0.6, 0.8, 0.07))
     bar = canvas.colorbar(shown, cax=below, orientation="horizontal")
     bar.set_label("mean absolute difference")

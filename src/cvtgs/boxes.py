@@ -86,7 +86,7 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
 
 
 def inside(boxes: Sequence[Box], means: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Tell which centres lie in a box.
+    """Return which centres lie in a box.
 
     Args:
         boxes: The boxes.

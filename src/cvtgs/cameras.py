@@ -1,4 +1,4 @@
-"""Cameras: from where pictures of a scene are taken."""
+"""Cameras: from where images of a scene are taken."""
 
 from dataclasses import dataclass, replace
 from typing import Self
@@ -64,7 +64,7 @@ class Cameras:
             )
 
     def __len__(self) -> int:
-        """Give the number of cameras."""
+        """Return the number of cameras."""
         return len(self.viewmats)
 
     @property
@@ -102,7 +102,7 @@ class Cameras:
         return replace(self, viewmats=self.viewmats.to(device), Ks=self.Ks.to(device))
 
     def resized(self, width: int, height: int) -> Self:
-        """Give cameras that see the same in pictures of another size.
+        """Return cameras that see the same in images of another size.
 
         Args:
             width: Pixels per row.
@@ -115,7 +115,7 @@ class Cameras:
         return replace(self, Ks=self.Ks * factors[:, None], width=width, height=height)
 
     def fitted(self, side: int, *, least: int = 1) -> Self:
-        """Give cameras that see the same in pictures of a certain longer side.
+        """Return cameras that see the same in images of a certain longer side.
 
         Args:
             side: Pixels of the longer side.
@@ -149,8 +149,8 @@ def look_at(
 
     Args:
         eyes: Positions of the cameras.
-        targets: What each camera has in the middle of its picture; not its own position.
-        up: Direction that is up in the pictures; need not be of unit length.
+        targets: What each camera has in the middle of its image; not its own position.
+        up: Direction that is up in the images; need not be of unit length.
 
     Returns:
         World-to-camera matrices with OpenCV axes. A camera that looks along ``up`` gets some

@@ -8,7 +8,7 @@ from cvtgs.errors import InvalidArgumentError
 
 
 def target_count(total: int, rho: float | None, *, count: int | None = None) -> int:
-    """Give the number of Gaussians to keep.
+    """Return the number of Gaussians to keep.
 
     ``rho`` is taken as the decimal number that was written: 0.07 of 100 Gaussians are 7, though
     the nearest double times 100 is a little more.

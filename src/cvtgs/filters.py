@@ -40,7 +40,7 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
 
 
 def valid_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
-    """Tell which rows renderers can draw.
+    """Return which rows renderers can draw.
 
     Args:
         scene: Any scene.
@@ -193,7 +193,7 @@ MAX_LOG_SCALE = math.log(torch.finfo(torch.float32).max)
 
 
 def _finite(values: Tensor) -> Tensor:
-    """Tell the rows without NaN or infinity, without an array of booleans per value.
+    """Return the rows without NaN or infinity, without an array of booleans per value.
 
     A finite number times 0 is 0, any other is NaN, and a sum with a NaN is NaN.
     """

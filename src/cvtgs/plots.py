@@ -155,7 +155,7 @@ def _figure(width: float, height: float) -> Any:
 
 
 def _styles(panels: Sequence[Panel]) -> dict[str, dict[str, str]]:
-    """Give every name a look of its own, in the order of appearance."""
+    """Return every name a look of its own, in the order of appearance."""
     names = dict.fromkeys(series.name for panel in panels for series in panel.series)
     most = len(COLORS) * len(STYLES) * len(MARKERS)
     if len(names) > most:
@@ -241,13 +241,13 @@ def _put(text: Any, number: int) -> Box:
 
 
 def _cost(box: Box, taken: Sequence[Box], frame: Box) -> float:
-    """Give how much of others a label hides, and how much of it is outside, square pixels."""
+    """Return how much of others a label hides, and how much of it is outside, square pixels."""
     outside = _shared(box, box) - _shared(box, frame)
     return outside + sum(_shared(box, other) for other in taken)
 
 
 def _shared(one: Box, other: Box) -> float:
-    """Give the area that two boxes share, square pixels."""
+    """Return the area that two boxes share, square pixels."""
     width = min(one[2], other[2]) - max(one[0], other[0])
     height = min(one[3], other[3]) - max(one[1], other[1])
     return max(0.0, width) * max(0.0, height)

@@ -41,7 +41,7 @@ class RefineReport(_Record):
 
     Attributes:
         steps: Steps that were taken.
-        pictures: Pictures of the full scene that were rendered to learn from.
+        images: Images of the full scene that were rendered to learn from.
         heldout: Views that were held out and decided.
         psnr_before: PSNR of the scene that came in over the held-out views, dB; each counts as
             at most 10 dB more than their median.
@@ -56,7 +56,7 @@ class RefineReport(_Record):
     """
 
     steps: int
-    pictures: int
+    images: int
     heldout: int
     psnr_before: float
     psnr_after: float
@@ -135,7 +135,7 @@ class SimplifyReport(_Record):
         return sum(stage.seconds for stage in self.stages)
 
     def to_json(self) -> str:
-        """Give the report as indented JSON.
+        """Return the report as indented JSON.
 
         Returns:
             JSON text that ends with a line break.
@@ -192,7 +192,7 @@ class StageClock:
 
 
 def peak_memory_bytes() -> int:
-    """Give the largest resident size of this process so far.
+    """Return the largest resident size of this process so far.
 
     Returns:
         Bytes; 0 where the system does not tell (Windows).

@@ -78,7 +78,7 @@ class GaussianScene:
         object.__setattr__(self, "extras", MappingProxyType(dict(self.extras)))
 
     def __len__(self) -> int:
-        """Give the number of Gaussians."""
+        """Return the number of Gaussians."""
         return int(self.means.shape[0])
 
     @property
@@ -131,7 +131,7 @@ class GaussianScene:
         return self.means.dtype
 
     def tensors(self) -> dict[str, Tensor]:
-        """Give the six standard tensors by name.
+        """Return the six standard tensors by name.
 
         Returns:
             A new dictionary: means, quats, log_scales, logit_opacities, sh0, shN.
@@ -155,7 +155,7 @@ class GaussianScene:
         )
 
     def with_tensors(self, tensors: Mapping[str, Tensor], extras: Mapping[str, Tensor]) -> Self:
-        """Give a scene of other Gaussians with the comments and the layout of this one.
+        """Return a scene of other Gaussians with the comments and the layout of this one.
 
         Args:
             tensors: Some or all of the six standard tensors by name.
@@ -194,7 +194,7 @@ class GaussianScene:
         return partial(type(self), **values), ()
 
     def __repr__(self) -> str:
-        """Say count, degree, dtype and device, not the values."""
+        """Report count, degree, dtype and device, not the values."""
         return (
             f"GaussianScene({len(self):,} Gaussians, SH degree {self.sh_degree}, "
             f"{str(self.dtype).removeprefix('torch.')}, {self.device})"

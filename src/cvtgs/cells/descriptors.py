@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.cells.activated import activate_rows
+from cvtgs.cells.context import NeighborContext, neighbor_context
 from cvtgs.cells.features import FARTHEST, cell_features, member_features, see_members
-from cvtgs.cells.kernels import kernels_of
 from cvtgs.cells.partition import Partition
-from cvtgs.cells.surroundings import Surroundings, look_around
 from cvtgs.scene import GaussianScene
 
 MEMBER_FEATURES = 19
@@ -50,7 +50,7 @@ class Descriptors:
     pair_places: Float[Tensor, "m k 3"]
 
     def __len__(self) -> int:
-        """Give the number of cells."""
+        """Return the number of cells."""
         return len(self.cells)
 
     def to(self, target: torch.device | torch.dtype) -> Self:
@@ -99,7 +99,7 @@ def describe_cells(
         neighbors: The nearest other cells of each of them.
         sizes: Number of members of every cell, of all cells.
         light: How freely every Gaussian of the scene can be seen, 0 to 1
-            (:func:`cvtgs.cvt.openness`).
+            (:func:`cvtgs.cvt.ambient_visibility`).
 
     Returns:
         The descriptors, in the dtype of the scene.
@@ -118,25 +118,15 @@ def describe_cells(
         >>> tuple(seen.members.shape), tuple(seen.pairs.shape), tuple(seen.cells.shape)
         ((5, 19), (2, 1, 18), (2, 19))
     """
-    around = look_around(merged, cells=cells, neighbors=neighbors, sizes=sizes)
+    around = neighbor_context(merged, cells=cells, neighbors=neighbors, sizes=sizes)
     return describe_members(scene, part, around=around, light=light)
 
 
 def describe_members(
-    scene: GaussianScene, part: Partition, *, around: Surroundings, light: Float[Tensor, "n_all"]
+    scene: GaussianScene, part: Partition, *, around: NeighborContext, light: Float[Tensor, "n_all"]
 ) -> Descriptors:
-    """Describe some cells whose surroundings are known, as :func:`describe_cells` does.
-
-    Args:
-        scene: The Gaussians.
-        part: Members of the cells to describe.
-        around: The surroundings of these cells.
-        light: How freely every Gaussian of the scene can be seen, 0 to 1.
-
-    Returns:
-        The descriptors, in the dtype of the scene.
-    """
-    members = kernels_of(scene, part.order)
+    """Describe some cells whose surroundings are known, as :func:`describe_cells` does."""
+    members = activate_rows(scene, part.order)
     lights = light.index_select(0, part.order).to(scene.dtype)
     seen = see_members(members, around.own, part.offsets, lights)
     return Descriptors(

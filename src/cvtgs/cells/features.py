@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cells.kernels import Kernels, contrasts_of, extents_in, places_in, take
+from cvtgs.cells.activated import ActivatedGaussians, contrasts_of, extents_in, places_in, take
 from cvtgs.math import activations
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
 
@@ -34,19 +34,12 @@ class SeenMembers(NamedTuple):
 
 
 def see_members(
-    members: Kernels, own: Kernels, offsets: Int[Tensor, "m_plus_1"], lights: Float[Tensor, "n"]
+    members: ActivatedGaussians,
+    own: ActivatedGaussians,
+    offsets: Int[Tensor, "m_plus_1"],
+    lights: Float[Tensor, "n"],
 ) -> SeenMembers:
-    """Express members by what their cell became.
-
-    Args:
-        members: Members of some cells, those of one cell next to one another.
-        own: What each of these cells became.
-        offsets: Where each cell starts, and the end of the last one.
-        lights: ``(n,)`` how freely the members can be seen, 0 to 1.
-
-    Returns:
-        What is told about members and cells.
-    """
+    """Express members by what their cell became."""
     ids = segment_ids(offsets)
     cell = own.take(ids)
     opacities = members.opacities
@@ -84,15 +77,7 @@ def see_members(
 
 
 def member_features(seen: SeenMembers, bare: Float[Tensor, "m 3"]) -> Float[Tensor, "n d"]:
-    """Describe members: place, extent, side, share, opacity, area, contrast and light.
-
-    Args:
-        seen: The members as their cell sees them.
-        bare: How much barer the positive than the negative side of each axis is.
-
-    Returns:
-        One row per member.
-    """
+    """Describe members: place, extent, side, share, opacity, area, contrast and light."""
     ids, places = seen.ids, seen.places
     share = activations.positive_log(seen.weights * seen.counts.index_select(0, ids)).clamp(-14, 14)
     towards_light = (take(seen.slope, ids) * places).sum(dim=1)
@@ -112,22 +97,12 @@ def member_features(seen: SeenMembers, bare: Float[Tensor, "m 3"]) -> Float[Tens
 
 
 def cell_features(
-    own: Kernels,
+    own: ActivatedGaussians,
     seen: SeenMembers,
     sides: Float[Tensor, "m 3 2"],
     pair_places: Float[Tensor, "m k 3"],
 ) -> Float[Tensor, "m c"]:
-    """Describe cells: cover of the sides, share of inner extent, size, opacity, shape and light.
-
-    Args:
-        own: What each of the cells became.
-        seen: The members as their cell sees them.
-        sides: How opaquely neighbours paint at the ends of every axis.
-        pair_places: Where neighbours are, in standard deviations.
-
-    Returns:
-        One row per cell.
-    """
+    """Describe cells: cover of the sides, share of inner extent, size, opacity, shape and light."""
     painted = activations.positive_log(seen.painted)
     shape = own.log_scales
     distances = pair_places.square().sum(dim=2).sqrt()
@@ -166,17 +141,17 @@ def side_by_side(*features: Tensor) -> Tensor:
 
 
 def distances(places: Tensor) -> tuple[Tensor, Tensor]:
-    """Give distances along every axis and as a whole, compressed."""
+    """Return distances along every axis and as a whole, compressed."""
     return torch.log1p(places.abs().clamp_max(FARTHEST)), length(places)
 
 
 def length(places: Tensor) -> Tensor:
-    """Give distances, compressed."""
+    """Return distances, compressed."""
     lengths = places.square().sum(dim=1).sqrt()
     return torch.log1p(lengths.clamp_max(FARTHEST))
 
 
 def facing(places: Tensor, bare: Tensor) -> tuple[Tensor, Tensor]:
-    """Tell whether places lie on the bare or on the covered side, by axis and as a whole."""
+    """Return whether places lie on the bare or on the covered side, by axis and as a whole."""
     by_axis = 0.5 * bare * places
     return by_axis, by_axis.sum(dim=1)

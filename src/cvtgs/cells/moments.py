@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cells.kernels import take
+from cvtgs.cells.activated import take
 from cvtgs.math import activations, quaternions
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
 
@@ -34,7 +34,7 @@ class Members:
     offsets: Int[Tensor, "m_plus_1"]
 
     def weights(self, area_power: float) -> Float[Tensor, "n"]:
-        """Give what each member weighs in the means of its cell.
+        """Return what each member weighs in the means of its cell.
 
         Args:
             area_power: The weight is the opacity times the area to this power: 0 as in CVT-GS,

@@ -56,7 +56,7 @@ class Partition:
         return cls(order=order, offsets=offsets)
 
     def __len__(self) -> int:
-        """Give the number of cells."""
+        """Return the number of cells."""
         return len(self.offsets) - 1
 
     @property

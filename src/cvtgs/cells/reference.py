@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.cells.kernels import gather
+from cvtgs.cells.activated import gather
 from cvtgs.cells.moments import Members, mean_and_covariance, weighted_mean
 from cvtgs.cells.partition import Partition
 from cvtgs.config import MergeConfig
@@ -125,7 +125,7 @@ def merged_depth(
     *,
     rule: Literal["saturating", "union"],
 ) -> Float[Tensor, "m"]:
-    """Give the optical depth of the Gaussian that stands for a cell.
+    """Return the optical depth of the Gaussian that stands for a cell.
 
     Args:
         members: Members of the cells.

@@ -19,16 +19,12 @@ MOST_CAMERAS = 8
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command.
-
-    Args:
-        commands: Where to add it.
-    """
+    """Describe the command."""
     parser = commands.add_parser(
         "compare",
         help="make a page that shows the full scene and simplified ones side by side",
         description="Write index.html, one file that needs no network, with a divider between "
-        "REF and each SMALL; sheet.png, all pictures with their scores; and errors.png, where "
+        "REF and each SMALL; sheet.png, all images with their scores; and errors.png, where "
         "they differ. Of given cameras, 8 are used unless --views says otherwise.",
     )
     add_scoring_options(parser)
@@ -41,17 +37,13 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: The parsed options.
-    """
+    """Run the command."""
     from cvtgs.evaluate import (  # noqa: PLC0415 (keeps --help fast)
         EvaluationSettings,
         compare,
         write_exhibition,
     )
-    from cvtgs.evaluate.exhibition import check_exhibition  # noqa: PLC0415
+    from cvtgs.evaluate.comparison_files import check_exhibition  # noqa: PLC0415
 
     check_looking_options(options)
     check_exhibition(options.output, overwrite=options.overwrite)

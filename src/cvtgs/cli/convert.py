@@ -7,11 +7,7 @@ from cvtgs.cli.display import READABLE, WRITABLE, file_size
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command.
-
-    Args:
-        commands: Where to add it.
-    """
+    """Describe the command."""
     parser = commands.add_parser(
         "convert",
         help="write a scene in another format",
@@ -26,11 +22,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: The parsed options.
-    """
+    """Run the command."""
     from cvtgs.io import check_save, load, losses, save  # noqa: PLC0415 (keeps --help fast)
 
     check_save(options.output, overwrite=options.overwrite)

@@ -16,11 +16,7 @@ VIEWS, WIDTH, HEIGHT = 8, 640, 480
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command.
-
-    Args:
-        commands: Where to add it.
-    """
+    """Describe the command."""
     parser = commands.add_parser(
         "demo",
         help="try it on a generated scene; needs no files",
@@ -50,17 +46,13 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: The parsed options.
-    """
+    """Run the command."""
     from cvtgs.evaluate import (  # noqa: PLC0415 (keeps --help fast)
         EvaluationSettings,
         compare,
         write_exhibition,
     )
-    from cvtgs.evaluate.exhibition import make_folder  # noqa: PLC0415
+    from cvtgs.evaluate.comparison_files import make_folder  # noqa: PLC0415
     from cvtgs.io import save  # noqa: PLC0415
     from cvtgs.simplify import Simplifier  # noqa: PLC0415
     from cvtgs.synthetic import demo_scene  # noqa: PLC0415

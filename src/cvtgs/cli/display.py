@@ -23,18 +23,7 @@ PRESET_NAMES = "from the fastest to the best: draft, fast, standard, high, max; 
 
 
 def size_text(count: int) -> str:
-    """Give a number of bytes in decimal units.
-
-    Args:
-        count: Bytes.
-
-    Returns:
-        For example ``68.0 MB``.
-
-    Example:
-        >>> size_text(68_000_000)
-        '68.0 MB'
-    """
+    """Return a number of bytes in decimal units."""
     if count < 1000:
         return f"{count} B"
     value = count / 1000
@@ -46,38 +35,14 @@ def size_text(count: int) -> str:
 
 
 def file_size(path: Path) -> str:
-    """Give the size of a file, or of the scene in a folder.
-
-    Args:
-        path: An existing file or folder.
-
-    Returns:
-        For example ``68.0 MB``.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.NamedTemporaryFile() as file:
-        ...     file_size(Path(file.name))
-        '0 B'
-    """
+    """Return the size of a file, or of the scene in a folder."""
     from cvtgs.io import scene_size  # noqa: PLC0415 (keeps --help fast)
 
     return size_text(scene_size(path))
 
 
 def stage_seconds(stages: Sequence["StageCost"]) -> str:
-    """Give the time of all stages, and of each.
-
-    Args:
-        stages: What each stage cost.
-
-    Returns:
-        For example ``1.2 s (tessellate 1.0, merge 0.2)``.
-
-    Example:
-        >>> stage_seconds([])
-        '0.00 s'
-    """
+    """Return the time of all stages, and of each."""
     total = f"{sum(stage.seconds for stage in stages):.2f} s"
     parts = ", ".join(f"{stage.stage} {stage.seconds:.2f}" for stage in stages)
     return f"{total} ({parts})" if parts else total
@@ -85,14 +50,7 @@ def stage_seconds(stages: Sequence["StageCost"]) -> str:
 
 @contextmanager
 def progress_bars(*, quiet: bool) -> Iterator[ProgressListener]:
-    """Show a bar per stage on stderr, if that is a terminal.
-
-    Args:
-        quiet: Show nothing.
-
-    Yields:
-        The listener that moves the bars.
-    """
+    """Show a bar per stage on stderr, if that is a terminal."""
     if quiet or not sys.stderr.isatty():
         yield silent
         return

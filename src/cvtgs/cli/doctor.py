@@ -19,11 +19,7 @@ RENDERERS = ("torch", "numba", "gsplat")
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command.
-
-    Args:
-        commands: Where to add it.
-    """
+    """Describe the command."""
     parser = commands.add_parser(
         "doctor",
         help="say what works on this machine",
@@ -37,14 +33,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: The parsed options.
-
-    Raises:
-        DeviceError: The default path does not work.
-    """
+    """Run the command."""
     from cvtgs.devices import chosen_device, device_name, resolve_device  # noqa: PLC0415
 
     print("\n".join(version_lines()))
@@ -52,10 +41,10 @@ def run(options: argparse.Namespace) -> None:
     for one in _devices() if device is None else [device]:
         print(f"\n{one}: {device_name(one)}")
         for name in RENDERERS:
-            print(f"  pictures by {name:<7} {_renderer(name, one)}")
+            print(f"  images by {name:<7} {_renderer(name, one)}")
         print(f"  nearest site by  {_search(one)}")
     default = chosen_device(options.device)
-    print(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one picture")
+    print(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one image")
     try:
         for line in _small_run(default):
             print(f"  {line}")
@@ -68,7 +57,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _devices() -> "list[torch.device]":
-    """Give the CPU, and the CUDA devices that torch sees."""
+    """Return the CPU, and the CUDA devices that torch sees."""
     import torch  # noqa: PLC0415
 
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
@@ -76,7 +65,7 @@ def _devices() -> "list[torch.device]":
 
 
 def _renderer(name: str, device: "torch.device") -> str:
-    """Say whether a renderer works on a device, and if not, why."""
+    """Report whether a renderer works on a device, and if not, why."""
     from cvtgs.render import choose_backend  # noqa: PLC0415
 
     try:
@@ -110,18 +99,18 @@ def _small_run(device: "torch.device") -> list[str]:
     cameras = automatic_views(small, 1, width=SIDE, height=SIDE)
     times.append(time.perf_counter())
     with torch.no_grad():
-        picture = render(small.to(device), cameras)
-    lit = float(picture.rgb.mean())
+        image = render(small.to(device), cameras)
+    lit = float(image.rgb.mean())
     times.append(time.perf_counter())
     if len(small) != report.target_count or not 0.0 < lit < 1.0:
         raise DeviceError(f"{len(small):,} Gaussians and a mean colour of {lit:.3g} came out")
     made, simplified, found, shown = (after - before for before, after in pairwise(times))
-    compiles = picture.backend == "numba"
-    note = "   the first pictures with numba compile for some ten seconds" if compiles else ""
+    compiles = image.backend == "numba"
+    note = "   the first images with numba compile for some ten seconds" if compiles else ""
     return [
         f"generate  {made:6.2f} s",
         f"simplify  {simplified:6.2f} s   search by {report.backend}, "
         f"checkpoint {report.checkpoint}",
         f"views     {found:6.2f} s{note}",
-        f"render    {shown:6.2f} s   {SIDE} x {SIDE} pixels by {picture.backend}",
+        f"render    {shown:6.2f} s   {SIDE} x {SIDE} pixels by {image.backend}",
     ]

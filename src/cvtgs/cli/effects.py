@@ -13,11 +13,7 @@ if TYPE_CHECKING:
 
 
 def add_effects_option(parser: argparse.ArgumentParser) -> None:
-    """Describe the option.
-
-    Args:
-        parser: Where to add it.
-    """
+    """Describe the option."""
     parser.add_argument(
         "--effects",
         metavar="NAME=VALUE,...",
@@ -27,21 +23,7 @@ def add_effects_option(parser: argparse.ArgumentParser) -> None:
 
 
 def effect_settings(text: str | None) -> dict[str, str]:
-    """Turn the option into settings of the configuration.
-
-    Args:
-        text: For example ``sh=1,mip=off``; None for none.
-
-    Returns:
-        Texts by dotted key.
-
-    Raises:
-        ConfigError: A part is not a name and a value.
-
-    Example:
-        >>> effect_settings("sh=1,mip=off")
-        {'effects.sh': '1', 'effects.mip': 'off'}
-    """
+    """Turn the option into settings of the configuration."""
     settings = {}
     for word in [] if text is None else text.split(","):
         name, equals, value = (part.strip() for part in word.partition("="))
@@ -54,15 +36,7 @@ def effect_settings(text: str | None) -> dict[str, str]:
 
 
 def load_needed(path: "Path", config: "SimplifyConfig") -> "GaussianScene":
-    """Read a scene without what is switched off.
-
-    Args:
-        path: The file.
-        config: With the effects.
-
-    Returns:
-        The scene; zeros in SH bands that are off, and no extra columns if those are.
-    """
+    """Read a scene without what is switched off."""
     from cvtgs.io import load  # noqa: PLC0415 (keeps --help fast)
 
     choices = config.effects

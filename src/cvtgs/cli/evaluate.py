@@ -23,16 +23,12 @@ SIZE = 640
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command.
-
-    Args:
-        commands: Where to add it.
-    """
+    """Describe the command."""
     parser = commands.add_parser(
         "evaluate",
         help="score simplified scenes against the full one",
         description="Render REF and every SMALL from the same views and print PSNR, SSIM and, "
-        "where its weights are, LPIPS against the pictures of REF; with --images also against "
+        "where its weights are, LPIPS against the images of REF; with --images also against "
         "photographs.",
     )
     add_scoring_options(parser)
@@ -48,14 +44,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: The parsed options.
-
-    Raises:
-        InvalidArgumentError: Photographs are given without cameras.
-    """
+    """Run the command."""
     from cvtgs.evaluate import (  # noqa: PLC0415 (keeps --help fast)
         EvaluationSettings,
         evaluate,

@@ -25,12 +25,7 @@ UNITS = {"s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 def add_goal_options(
     parser: argparse.ArgumentParser, size: "argparse._MutuallyExclusiveGroup"
 ) -> None:
-    """Describe the options.
-
-    Args:
-        parser: Where to add those of the time.
-        size: Where to add those of the quality, which take the place of a ratio or a count.
-    """
+    """Describe the options."""
     size.add_argument(
         "--target-psnr",
         type=float,
@@ -52,14 +47,7 @@ def add_goal_options(
 
 
 class Goals:
-    """What the options of one call ask for, and what came of it.
-
-    Args:
-        options: The parsed options.
-
-    Raises:
-        InvalidArgumentError: A goal is out of range, or does not go with another option.
-    """
+    """What the options of one call ask for, and what came of it."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self._options = options
@@ -69,7 +57,7 @@ class Goals:
         if self.has_target and options.keep is not None:
             raise InvalidArgumentError("--keep needs --rho or --count.")
         if self.has_target:
-            from cvtgs.goals.goal import check_target  # noqa: PLC0415 (only for those who ask)
+            from cvtgs.budget.goal import check_target  # noqa: PLC0415 (only for those who ask)
 
             check_target(options.target_psnr, ssim=options.target_ssim)
         if self.seconds is not None:
@@ -93,36 +81,17 @@ class Goals:
             )
 
     def stage_listener(self, listener: ProgressListener) -> ProgressListener:
-        """Give what hears of the stages: nobody if they run again and again.
-
-        Args:
-            listener: Told about a single run.
-
-        Returns:
-            The listener.
-        """
+        """Return what hears of the stages: nobody if they run again and again."""
         return silent if self.has_target else listener
 
     def preset(
         self, scene: "GaussianScene", settings: Mapping[str, str], listener: ProgressListener
     ) -> str | None:
-        """Choose the preset that fits into the time, if a time is given.
-
-        Args:
-            scene: The scene that was read.
-            settings: What is changed of the preset.
-            listener: Told about the measurements.
-
-        Returns:
-            Its name, or None.
-
-        Raises:
-            GoalError: None fits.
-        """
+        """Choose the preset that fits into the time, if a time is given."""
         if self.seconds is None:
             return None
-        from cvtgs.goals import Work, choose_preset, cost_model  # noqa: PLC0415
-        from cvtgs.goals.remember import is_known  # noqa: PLC0415
+        from cvtgs.budget import Work, choose_preset, cost_model  # noqa: PLC0415
+        from cvtgs.budget.remember import is_known  # noqa: PLC0415
         from cvtgs.simplify import target_count  # noqa: PLC0415
 
         options, spent = self._options, time.perf_counter() - STARTED
@@ -153,27 +122,14 @@ class Goals:
         cameras: "Cameras | None" = None,
         listener: ProgressListener = silent,
     ) -> "Simplified":
-        """Simplify to the ratio or count that is asked for, or to the quality.
-
-        Args:
-            simplifier: Makes small scenes.
-            scene: The scene.
-            cameras: From where presets that look at the scene do so.
-            listener: Told about the search.
-
-        Returns:
-            The scene and the report.
-
-        Raises:
-            GoalError: The quality cannot be reached.
-        """
+        """Simplify to the ratio or count that is asked for, or to the quality."""
         options = self._options
         if not self.has_target:
             keep = keep_mask(options, scene)
             return simplifier.run(
                 scene, options.rho, count=options.count, cameras=cameras, keep=keep
             )
-        from cvtgs.goals import find_count  # noqa: PLC0415
+        from cvtgs.budget import find_count  # noqa: PLC0415
         from cvtgs.simplify import Simplified  # noqa: PLC0415
 
         found = find_count(
@@ -192,21 +148,7 @@ class Goals:
 
 
 def seconds_of(text: str) -> float:
-    """Read a time.
-
-    Args:
-        text: A number with or without a unit: s, m, min or h.
-
-    Returns:
-        Seconds.
-
-    Raises:
-        InvalidArgumentError: It is no time, or not above 0.
-
-    Example:
-        >>> seconds_of("20"), seconds_of("1.5m")
-        (20.0, 90.0)
-    """
+    """Read a time."""
     number = text.strip().rstrip("abcdefghijklmnopqrstuvwxyz")
     unit = text.strip()[len(number) :] or "s"
     try:

@@ -16,11 +16,7 @@ if TYPE_CHECKING:
 
 
 def add_large_options(parser: argparse.ArgumentParser) -> None:
-    """Describe the options.
-
-    Args:
-        parser: Where to add them.
-    """
+    """Describe the options."""
     parser.add_argument(
         "--keep",
         type=Path,
@@ -43,15 +39,7 @@ def add_large_options(parser: argparse.ArgumentParser) -> None:
 
 
 def keep_mask(options: argparse.Namespace, scene: "GaussianScene") -> "Tensor | None":
-    """Find the protected Gaussians.
-
-    Args:
-        options: The parsed options.
-        scene: The scene that was read.
-
-    Returns:
-        Their mask; None without ``--keep``.
-    """
+    """Find the protected Gaussians."""
     if options.keep is None:
         return None
     from cvtgs.boxes import inside, read_boxes  # noqa: PLC0415 (keeps --help fast)
@@ -60,24 +48,11 @@ def keep_mask(options: argparse.Namespace, scene: "GaussianScene") -> "Tensor | 
 
 
 def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int | None:
-    """Decide whether a scene is simplified block by block.
-
-    Args:
-        options: The parsed options.
-        config: Every choice.
-
-    Returns:
-        Bytes that one process may use, if blocks were asked for or, if nothing was, the scene does
-        not fit into free memory and can be read in parts; None for the scene in one piece.
-
-    Raises:
-        InvalidArgumentError: Blocks were asked for along with what needs the scene in one piece.
-        CvtgsError: The file cannot be read in parts.
-    """
-    from cvtgs.blocks.memory import available_memory, block_count, read_bytes  # noqa: PLC0415
-    from cvtgs.blocks.run import check_config  # noqa: PLC0415
+    """Decide whether a scene is simplified block by block."""
     from cvtgs.errors import ConfigError  # noqa: PLC0415
     from cvtgs.io.ply import open_rows  # noqa: PLC0415
+    from cvtgs.outofcore.memory import available_memory, block_count, read_bytes  # noqa: PLC0415
+    from cvtgs.outofcore.run import check_config  # noqa: PLC0415
 
     goals = ("target_psnr", "target_ssim", "time_budget", "cameras")
     given = [name for name in goals if getattr(options, name, None) is not None]
@@ -107,22 +82,11 @@ def run_by_blocks(
     memory: int,
     listener: ProgressListener,
 ) -> "SimplifyReport":
-    """Simplify a file block by block, here or on a cluster.
-
-    Args:
-        options: The parsed options.
-        checkpoint: The network.
-        config: Every choice.
-        memory: Bytes that one process may use.
-        listener: Told about progress.
-
-    Returns:
-        The report.
-    """
-    from cvtgs.blocks import simplify_file  # noqa: PLC0415 (keeps --help fast)
-    from cvtgs.blocks.distributed import connect, workers_of  # noqa: PLC0415
-    from cvtgs.blocks.turns import this_process  # noqa: PLC0415
+    """Simplify a file block by block, here or on a cluster."""
     from cvtgs.boxes import read_boxes  # noqa: PLC0415
+    from cvtgs.outofcore import simplify_file  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.outofcore.distributed import connect, workers_of  # noqa: PLC0415
+    from cvtgs.outofcore.turns import this_process  # noqa: PLC0415
     from cvtgs.simplify import Simplifier  # noqa: PLC0415
 
     client = None if options.scheduler is None else connect(options.scheduler)

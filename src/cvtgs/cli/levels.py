@@ -28,11 +28,7 @@ SIZE = 400
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command.
-
-    Args:
-        commands: Where to add it.
-    """
+    """Describe the command."""
     parser = commands.add_parser(
         "levels",
         help="make several sizes of a scene at once",
@@ -62,11 +58,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: The parsed options.
-    """
+    """Run the command."""
     from cvtgs.config import SimplifyConfig  # noqa: PLC0415 (keeps --help fast)
     from cvtgs.counts import target_count  # noqa: PLC0415
     from cvtgs.io import load, load_cameras  # noqa: PLC0415

@@ -6,47 +6,18 @@ from cvtgs.errors import InvalidArgumentError
 
 
 def add_ratios_option(parser: argparse.ArgumentParser) -> None:
-    """Describe the option that :func:`ratios_of` reads.
-
-    Args:
-        parser: Where to add it.
-    """
+    """Describe the option that :func:`ratios_of` reads."""
     ratios = "0.1,0.01,0.001"
     parser.add_argument("--rho", default=ratios, metavar="R,R", help=f"ratios (default {ratios})")
 
 
 def words_of(text: str) -> list[str]:
-    """Read words with commas between them.
-
-    Args:
-        text: The words.
-
-    Returns:
-        Each of them.
-
-    Example:
-        >>> words_of("draft, fast,")
-        ['draft', 'fast']
-    """
+    """Read words with commas between them."""
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
 def ratios_of(text: str) -> list[float]:
-    """Read ratios of Gaussians to keep with commas between them.
-
-    Args:
-        text: What ``--rho`` was given.
-
-    Returns:
-        The ratios, in that order; whether they are in range is not looked at.
-
-    Raises:
-        InvalidArgumentError: They are not numbers, there is none, or one is there twice.
-
-    Example:
-        >>> ratios_of("0.01, 0.1")
-        [0.01, 0.1]
-    """
+    """Read ratios of Gaussians to keep with commas between them."""
     try:
         ratios = [float(word) for word in words_of(text)]
     except ValueError:

@@ -38,22 +38,14 @@ class Scenes(NamedTuple):
 
 
 def add_scoring_options(parser: argparse.ArgumentParser) -> None:
-    """Add the scenes to compare, and which LPIPS to measure.
-
-    Args:
-        parser: Where to add them.
-    """
+    """Add the scenes to compare, and which LPIPS to measure."""
     parser.add_argument("reference", metavar="REF", type=Path, help=f"the full scene ({READABLE})")
     parser.add_argument("small", metavar="SMALL", type=Path, nargs="+", help="simplified scenes")
     add_lpips_option(parser)
 
 
 def add_lpips_option(parser: argparse.ArgumentParser) -> None:
-    """Let the user choose which LPIPS to measure.
-
-    Args:
-        parser: Where to add it.
-    """
+    """Let the user choose which LPIPS to measure."""
     parser.add_argument(
         "--lpips",
         default="auto",
@@ -63,12 +55,7 @@ def add_lpips_option(parser: argparse.ArgumentParser) -> None:
 
 
 def add_looking_options(parser: argparse.ArgumentParser, *, size: int) -> None:
-    """Describe the options.
-
-    Args:
-        parser: Where to add them.
-        size: Longer side of the pictures of automatic views, pixels.
-    """
+    """Describe the options."""
     parser.add_argument(
         "--cameras",
         type=Path,
@@ -91,7 +78,7 @@ def add_looking_options(parser: argparse.ArgumentParser, *, size: int) -> None:
         "--size",
         type=int,
         metavar="N",
-        help=f"longer side of the pictures in pixels (default {size}, or that of the cameras)",
+        help=f"longer side of the images in pixels (default {size}, or that of the cameras)",
     )
     parser.add_argument(
         "--background",
@@ -113,18 +100,7 @@ def add_looking_options(parser: argparse.ArgumentParser, *, size: int) -> None:
 
 
 def load_scenes(paths: Sequence[Path], device: "torch.device") -> Scenes:
-    """Read scenes and name them after their files.
-
-    Args:
-        paths: The files; a name that occurs twice is written with its folders.
-        device: Where the scenes are to be.
-
-    Returns:
-        The scenes in that order.
-
-    Raises:
-        InvalidArgumentError: A file is given twice.
-    """
+    """Read scenes and name them after their files."""
     from cvtgs.io import load, scene_size  # noqa: PLC0415 (keeps --help fast)
 
     names = [path.name for path in paths]
@@ -141,31 +117,14 @@ def load_scenes(paths: Sequence[Path], device: "torch.device") -> Scenes:
 
 
 def looking_device(options: argparse.Namespace) -> "torch.device":
-    """Say where to render: CUDA if there is one, unless asked otherwise.
-
-    Args:
-        options: The parsed options.
-
-    Returns:
-        The device.
-
-    Raises:
-        DeviceError: There is no such device.
-    """
+    """Report where to render: CUDA if there is one, unless asked otherwise."""
     from cvtgs.devices import chosen_device  # noqa: PLC0415 (keeps --help fast)
 
     return chosen_device(options.device)
 
 
 def check_looking_options(options: argparse.Namespace) -> None:
-    """Refuse numbers that no picture can have, before any file is read.
-
-    Args:
-        options: The parsed options.
-
-    Raises:
-        InvalidArgumentError: A number or a colour is out of range.
-    """
+    """Refuse numbers that no image can have, before any file is read."""
     for name in ("views", "size"):
         value = getattr(options, name)
         if value is not None and value < 1:
@@ -176,17 +135,7 @@ def check_looking_options(options: argparse.Namespace) -> None:
 
 
 def background_color(options: argparse.Namespace) -> Color:
-    """Read the colour behind the scenes.
-
-    Args:
-        options: The parsed options.
-
-    Returns:
-        Red, green and blue in [0, 1].
-
-    Raises:
-        InvalidArgumentError: It is no colour.
-    """
+    """Read the colour behind the scenes."""
     word = options.background.strip().lower()
     if word in _COLORS:
         return _COLORS[word]
@@ -205,19 +154,7 @@ def background_color(options: argparse.Namespace) -> Color:
 def chosen_cameras(
     options: argparse.Namespace, scene: "GaussianScene", *, most: int | None = None
 ) -> "Cameras":
-    """Read cameras, or find views of the scene.
-
-    Args:
-        options: The parsed options.
-        scene: What to look at.
-        most: Number of given cameras to take without ``--views``; None for all.
-
-    Returns:
-        The cameras.
-
-    Raises:
-        CvtgsError: The cameras cannot be read, or the scene has nothing to look at.
-    """
+    """Read cameras, or find views of the scene."""
     from cvtgs.io import load_cameras  # noqa: PLC0415
     from cvtgs.views import automatic_views  # noqa: PLC0415 (keeps --help fast)
 

@@ -30,19 +30,7 @@ TERMINATED = 143
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        arguments: The words after ``cvtgs``; those of the process if None.
-
-    Returns:
-        0 when all went well, 1 after an error (one sentence on stderr), 130 when interrupted.
-        Wrong usage exits with 2.
-
-    Example:
-        >>> main(["info", "missing.ply"])
-        1
-    """
+    """Run the command line."""
     # Idle OpenMP threads that spin burn several times the useful work; read when torch starts.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     options = build_parser().parse_args(arguments)
@@ -90,15 +78,7 @@ class _Interrupt:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Describe every command and option.
-
-    Returns:
-        The parser.
-
-    Example:
-        >>> build_parser().prog
-        'cvtgs'
-    """
+    """Describe every command and option."""
     parser = argparse.ArgumentParser(
         prog="cvtgs",
         description="Make trained 3D Gaussian Splatting scenes 10 to 1000 times smaller.",

@@ -1,4 +1,4 @@
-"""``cvtgs render``: pictures of a scene."""
+"""``cvtgs render``: images of a scene."""
 
 import argparse
 import re
@@ -18,35 +18,27 @@ SIZE = 800
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command.
-
-    Args:
-        commands: Where to add it.
-    """
+    """Describe the command."""
     parser = commands.add_parser(
         "render",
-        help="write pictures of a scene",
+        help="write images of a scene",
         description="Write one PNG per view into DIR, named after the cameras.",
     )
     parser.add_argument("input", metavar="IN", type=Path, help=f"scene to read ({READABLE})")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="DIR", help="directory to write to"
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace existing pictures")
+    parser.add_argument("--overwrite", action="store_true", help="replace existing images")
     add_looking_options(parser, size=SIZE)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: The parsed options.
-    """
+    """Run the command."""
     import torch  # noqa: PLC0415 (keeps --help fast)
 
     from cvtgs.evaluate.compare import as_bytes  # noqa: PLC0415
-    from cvtgs.evaluate.exhibition import make_folder  # noqa: PLC0415
+    from cvtgs.evaluate.comparison_files import make_folder  # noqa: PLC0415
     from cvtgs.evaluate.images import encode  # noqa: PLC0415
     from cvtgs.io import atomic_output, check_output, load  # noqa: PLC0415
     from cvtgs.progress import ProgressEvent  # noqa: PLC0415
@@ -64,32 +56,18 @@ def run(options: argparse.Namespace) -> None:
         for number, path in enumerate(paths):
             listener(ProgressEvent(stage="render", done=number, total=len(paths)))
             camera = cameras.select(torch.tensor([number]))
-            picture = render(scene, camera, backend=options.backend, background=background).rgb[0]
+            image = render(scene, camera, backend=options.backend, background=background).rgb[0]
             with atomic_output(path, overwrite=options.overwrite) as file:
-                file.write(encode(as_bytes(picture), "png"))
+                file.write(encode(as_bytes(image), "png"))
         listener(ProgressEvent(stage="render", done=len(paths), total=len(paths)))
     if not options.quiet:
         print(
-            f"{len(paths)} pictures of {cameras.width} x {cameras.height} pixels "
-            f"in {options.output}"
+            f"{len(paths)} images of {cameras.width} x {cameras.height} pixels in {options.output}"
         )
 
 
 def file_names(views: Sequence[str]) -> list[str]:
-    """Make file names of the names of views.
-
-    Args:
-        views: Names, such as the paths of photographs.
-
-    Returns:
-        One name per view, all different.
-
-    Example:
-        >>> file_names(["view 1", "images/a.JPG", "other/a.png"])
-        ['001_view_1.png', '002_a.png', '003_a.png']
-        >>> file_names(["view 1", "images/a.JPG"])
-        ['view_1.png', 'a.png']
-    """
+    """Make file names of the names of views."""
     stems = []
     for view in views:
         name = PurePosixPath(view.replace("\\", "/")).name

@@ -22,11 +22,7 @@ if TYPE_CHECKING:
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command.
-
-    Args:
-        commands: Where to add it.
-    """
+    """Describe the command."""
     parser = commands.add_parser(
         "simplify",
         help="make a scene smaller",
@@ -64,7 +60,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         "--refine",
         type=float,
         metavar="SECONDS",
-        help="fine-tune the result against pictures of IN for so long at most, while views that "
+        help="fine-tune the result against images of IN for so long at most, while views that "
         "are held out improve; 0 does not, whatever the preset",
     )
     parser.add_argument(
@@ -88,11 +84,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: The parsed options.
-    """
+    """Run the command."""
     from cvtgs.config import SimplifyConfig  # noqa: PLC0415 (keeps --help fast)
     from cvtgs.io import (  # noqa: PLC0415
         atomic_output,
@@ -165,7 +157,7 @@ def _print_details(report: "SimplifyReport") -> None:
 
 
 def _refinement(options: argparse.Namespace) -> dict[str, str]:
-    """Give the settings that the options of the refinement stand for; either replaces both."""
+    """Return the settings that the options of the refinement stand for; either replaces both."""
     if options.refine is None and options.refine_steps is None:
         return {}
     steps, seconds = options.refine_steps or 0, options.refine or 0.0
@@ -173,17 +165,7 @@ def _refinement(options: argparse.Namespace) -> dict[str, str]:
 
 
 def read_settings(words: list[str]) -> dict[str, str]:
-    """Read what ``--set`` was given.
-
-    Args:
-        words: Each ``KEY=VALUE``.
-
-    Returns:
-        Texts by dotted key.
-
-    Raises:
-        ConfigError: A word has no key or no equals sign.
-    """
+    """Read what ``--set`` was given."""
     settings = {}
     for word in words:
         key, equals, value = word.partition("=")

@@ -22,11 +22,7 @@ MOST_CAMERAS = 8
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command.
-
-    Args:
-        commands: Where to add it.
-    """
+    """Describe the command."""
     parser = commands.add_parser(
         "tradeoff",
         help="run all presets on a scene and show seconds against quality",
@@ -49,11 +45,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: The parsed options.
-    """
+    """Run the command."""
     from cvtgs.evaluate import EvaluationSettings  # noqa: PLC0415 (keeps --help fast)
     from cvtgs.tradeoff import measure_tradeoff, write_tradeoff  # noqa: PLC0415
     from cvtgs.tradeoff.files import check_tradeoff_files  # noqa: PLC0415

@@ -11,15 +11,11 @@ from cvtgs.errors import OutputError
 if TYPE_CHECKING:
     from cvtgs.train import History, TrainConfig
 
-WITHOUT_CURVES = "no picture of its curves: that needs pip install 'cvtgs[plots]'"
+WITHOUT_CURVES = "no image of its curves: that needs pip install 'cvtgs[plots]'"
 
 
 def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command.
-
-    Args:
-        commands: Where to add it.
-    """
+    """Describe the command."""
     parser = commands.add_parser(
         "train",
         help="train the network that merges Gaussians",
@@ -51,11 +47,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the command.
-
-    Args:
-        options: The parsed options.
-    """
+    """Run the command."""
     from cvtgs.devices import chosen_device  # noqa: PLC0415
     from cvtgs.io import check_output  # noqa: PLC0415
     from cvtgs.train import TrainConfig, TrainFiles, train  # noqa: PLC0415

@@ -25,45 +25,19 @@ class ShowVersions(argparse.Action):
         values: object,
         option_string: str | None = None,
     ) -> NoReturn:
-        """Print the versions and end.
-
-        Args:
-            parser: The parser of the command line.
-            namespace: What was parsed so far.
-            values: Nothing.
-            option_string: How the option was written.
-        """
+        """Print the versions and end."""
         print("\n".join(version_lines()))
         parser.exit()
 
 
 def version_lines() -> list[str]:
-    """Give a line for cvtgs, for Python, and for every package that computes.
-
-    Returns:
-        The lines, that of cvtgs first.
-
-    Example:
-        >>> [line.split()[0] for line in version_lines()][:3]
-        ['cvtgs', 'Python', 'torch']
-    """
+    """Return a line for cvtgs, for Python, and for every package that computes."""
     lines = [f"cvtgs {cvtgs.__version__}", f"Python {platform.python_version()}"]
     return lines + [f"{name} {version_of(name)}" for name in BACKENDS]
 
 
 def version_of(package: str) -> str:
-    """Give the version of a package.
-
-    Args:
-        package: Its name.
-
-    Returns:
-        The version, or ``not installed``.
-
-    Example:
-        >>> version_of("no-such-package")
-        'not installed'
-    """
+    """Return the version of a package."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

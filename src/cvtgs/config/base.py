@@ -45,7 +45,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def explain(error: pydantic.ValidationError) -> str:
-    """Say in one sentence what is wrong with some settings.
+    """Report in one sentence what is wrong with some settings.
 
     Args:
         error: What pydantic found.
@@ -66,7 +66,7 @@ def explain(error: pydantic.ValidationError) -> str:
 
 
 def named(key: str) -> str:
-    """Give a key as texts show it: short, in one line.
+    """Return a key as texts show it: short, in one line.
 
     Args:
         key: Any text, dots included.
@@ -82,7 +82,7 @@ def named(key: str) -> str:
 
 
 def shown(value: object) -> str:
-    """Give a value as texts show it: as Python would, but short.
+    """Return a value as texts show it: as Python would, but short.
 
     Args:
         value: What a file or a caller gave.

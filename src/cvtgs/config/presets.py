@@ -27,9 +27,9 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "merge": {
             "area_power": 0.0,
             "opacity": "union",
-            "lone_members": False,
-            "widening": 0.0,
-            "covered_widening": 0.0,
+            "representatives": False,
+            "inflation": 0.0,
+            "covered_inflation": 0.0,
         },
     },
 }

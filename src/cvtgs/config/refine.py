@@ -11,7 +11,7 @@ Count = Annotated[int, pydantic.Field(ge=1)]
 
 
 class Rates(Section):
-    """The first steps of every parameter where all pictures agree; 0 leaves it as it is.
+    """The first steps of every parameter where all images agree; 0 leaves it as it is.
 
     Attributes:
         means: Positions, in mean standard deviations of each Gaussian.
@@ -42,12 +42,12 @@ class RefineConfig(Section):
         squared: Weight of the logarithm of the squared error.
         image: Weight of the logarithm of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) + 0.2
             gradient``.
-        size: Longer side of the pictures, pixels.
+        size: Longer side of the images, pixels.
         batch: Views that are found together: a quarter automatic ones, half from anywhere around,
             a quarter from anywhere near, within the scene too.
-        steps_per_picture: Steps for every new picture of the full scene; the others look again at
+        steps_per_image: Steps for every new image of the full scene; the others look again at
             one that is there.
-        pictures: Pictures that are kept at most, 8 bytes per pixel each.
+        images: Images that are kept at most, 8 bytes per pixel each.
         heldout: Views that decide what is kept, and are never learnt from.
         check_every: Steps between two looks at them.
         patience: Looks without a new best after which the refinement ends.
@@ -65,13 +65,13 @@ class RefineConfig(Section):
     image: Rate = 0.5
     size: int = pydantic.Field(default=256, ge=16)
     batch: int = pydantic.Field(default=32, ge=4)
-    steps_per_picture: Count = 1
-    pictures: Count = 128
+    steps_per_image: Count = 1
+    images: Count = 128
     heldout: Count = 8
     check_every: Count = 25
     patience: Count = 8
 
     @property
-    def asked_for(self) -> bool:
+    def enabled(self) -> bool:
         """Whether there are steps or seconds to refine for."""
         return bool(self.steps or self.seconds)

@@ -26,14 +26,14 @@ class EffectsConfig(Section):
     Attributes:
         sh: Degree up to which colour depends on the direction of view; ``on`` for all, ``off``
             for 0. Bands above come out as zeros.
-        mip: Whether pictures of a scene that is tagged so are taken with the compensation of
+        mip: Whether images of a scene that is tagged so are taken with the compensation of
             Mip-Splatting. The tag stays in any case.
         unbounded: Whether far positions are pulled in, if there are any.
         haze: Whether faint Gaussians are kept by their mass; off leaves all of them out.
         flat: Whether a scene of Gaussians with two scales (2DGS) stays one.
         duplicates: Whether Gaussians that lie exactly on others, if any do, share one search.
         extras: Whether columns beyond the standard ones are carried along.
-        visibility: Whether pictures are taken where the preset asks for them.
+        visibility: Whether images are taken where the preset asks for them.
     """
 
     sh: Degree = "auto"
@@ -101,14 +101,14 @@ class TessellationConfig(Section):
 
 
 class VisibilityConfig(Section):
-    """Whether small pictures of the scene tell which Gaussians are seen.
+    """Whether small images of the scene tell which Gaussians are seen.
 
     Attributes:
-        views: Pictures, from :func:`cvtgs.views.mixed_views`. 0 takes none: what a Gaussian
+        views: Images, from :func:`cvtgs.views.mixed_views`. 0 takes none: what a Gaussian
             paints is then told by its size, opacity and place alone.
-        size: Side of the pictures, pixels.
+        size: Side of the images, pixels.
         mass_share: Share of the weight that still comes from size, opacity and place, for all
-            that no picture shows.
+            that no image shows.
     """
 
     views: int = pydantic.Field(default=0, ge=0)
@@ -124,18 +124,18 @@ class MergeConfig(Section):
             the opacity alone, 1 the mass.
         opacity: ``saturating`` conserves mass, ``1 - exp(-tau)``; ``union`` is the opacity of
             members that lie exactly behind one another, ``1 - prod(1 - a)``.
-        lone_members: Whether a cell whose members hardly touch keeps the one that shows most of it,
+        representatives: Whether a cell whose members hardly touch keeps the one that shows most,
             instead of their moments.
-        widening: How much wider than its moments an opaque cell of many members becomes, along
+        inflation: How much wider than its moments an opaque cell of many members becomes, along
             every axis.
-        covered_widening: How much more it becomes so along an axis on which other cells paint at
+        covered_inflation: How much more it becomes so along an axis on which other cells paint at
             both its ends.
         network: Whether MergeNet corrects the merged Gaussians.
     """
 
     area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)
     opacity: Literal["saturating", "union"] = "saturating"
-    lone_members: bool = True
-    widening: float = pydantic.Field(default=0.1, ge=0.0, le=2.0)
-    covered_widening: float = pydantic.Field(default=0.4, ge=0.0, le=2.0)
+    representatives: bool = True
+    inflation: float = pydantic.Field(default=0.1, ge=0.0, le=2.0)
+    covered_inflation: float = pydantic.Field(default=0.4, ge=0.0, le=2.0)
     network: bool = True

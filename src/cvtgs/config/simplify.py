@@ -27,10 +27,10 @@ class SimplifyConfig(Section):
         seed: Seed of whatever is drawn at random.
         effects: What is computed whatever the scene calls for, or not at all.
         filter: Which Gaussians are left out.
-        visibility: Whether pictures tell what is seen.
+        visibility: Whether images tell what is seen.
         cvt: How Gaussians are grouped.
         merge: How a group becomes one Gaussian.
-        refine: Whether, and how, the result is moved towards pictures of the scene.
+        refine: Whether, and how, the result is moved towards images of the scene.
 
     Example:
         >>> SimplifyConfig.from_preset("paper").filter.max_mass_share
@@ -47,13 +47,13 @@ class SimplifyConfig(Section):
     refine: RefineConfig = RefineConfig()
 
     @property
-    def looks(self) -> bool:
-        """Whether pictures of the scene tell what is seen."""
+    def uses_renders(self) -> bool:
+        """Whether images of the scene tell what is seen."""
         return self.visibility.views > 0 and self.effects.visibility != "off"
 
     @classmethod
     def from_preset(cls, name: str) -> Self:
-        """Give a preset.
+        """Return a preset.
 
         Args:
             name: One of :data:`cvtgs.config.PRESETS`.

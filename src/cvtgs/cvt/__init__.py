@@ -7,7 +7,7 @@ from cvtgs.cvt.nearest import nearest_backend
 from cvtgs.cvt.nearest_scipy import nearest_scipy
 from cvtgs.cvt.nearest_torch import nearest_torch
 from cvtgs.cvt.neighbors import nearest_neighbors
-from cvtgs.cvt.openness import add_depths, depth_sums, light_at, light_of, openness
+from cvtgs.cvt.openness import add_depths, ambient_visibility, depth_sums, light_at, light_of
 from cvtgs.cvt.seeding import stratified_seeds, weighted_seeds
 from cvtgs.cvt.tessellate import Tessellation, fill_empty_cells, tessellate
 
@@ -15,6 +15,7 @@ __all__ = [
     "LloydResult",
     "Tessellation",
     "add_depths",
+    "ambient_visibility",
     "depth_sums",
     "embed",
     "falloff",
@@ -26,7 +27,6 @@ __all__ = [
     "nearest_neighbors",
     "nearest_scipy",
     "nearest_torch",
-    "openness",
     "stratified_seeds",
     "tessellate",
     "tessellation_weights",

@@ -14,9 +14,9 @@ def tessellation_weights(
     area_power: float,
     floor: float,
 ) -> Float[Tensor, "n"]:
-    """Give the weight of every Gaussian.
+    """Return the weight of every Gaussian.
 
-    The mass (power 1) says how much of a picture a Gaussian paints. A power below 1 gives small
+    The mass (power 1) says how much of an image a Gaussian paints. A power below 1 gives small
     Gaussians, which carry fine texture, more cells at the cost of large, smooth surfaces.
 
     Args:
@@ -46,7 +46,7 @@ def tessellation_weights(
 
 
 def falloff(means: Float[Tensor, "n 3"], frame: RobustFrame) -> Float[Tensor, "n"]:
-    """Give how much smaller a far Gaussian looks from the middle of the scene.
+    """Return how much smaller a far Gaussian looks from the middle of the scene.
 
     Args:
         means: Positions, scene units.

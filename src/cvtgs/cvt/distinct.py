@@ -14,18 +14,6 @@ def runs_of_equal(
 
     Sites are sorted by a sum of their coordinates, which is the same for equal ones. Where
     different sites share a sum, some equal ones may stay apart; that costs time, not correctness.
-
-    Args:
-        sites: Finite positions.
-
-    Returns:
-        Row numbers, those of equal sites next to one another and ascending, and the rank of each
-        within its run, from 0; None if all sites are different, as they nearly always are.
-
-    Example:
-        >>> order, ranks = runs_of_equal(torch.tensor([[1.0], [0.0], [1.0]]))
-        >>> order.tolist(), ranks.tolist()
-        ([1, 0, 2], [0, 0, 1])
     """
     keys = sites.new_zeros(len(sites), dtype=torch.float64)
     for axis, column in enumerate(sites.unbind(1)):
@@ -42,18 +30,7 @@ def runs_of_equal(
 
 
 def distinct_rows(sites: Float[Tensor, "m d"]) -> Int[Tensor, "k"] | None:
-    """Give one row number for each place at which there are sites.
-
-    Args:
-        sites: Finite positions.
-
-    Returns:
-        Row numbers, the first of each run of equal sites; None if all sites are different.
-
-    Example:
-        >>> distinct_rows(torch.tensor([[1.0], [0.0], [1.0]])).tolist()
-        [0, 1]
-    """
+    """Return one row number for each place at which there are sites."""
     runs = runs_of_equal(sites)
     if runs is None:
         return None

@@ -105,24 +105,7 @@ def weighted_sums(
     labels: Int[Tensor, "n"],
     count: int,
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m d"]]:
-    """Add up the points of every label.
-
-    Args:
-        points: Positions.
-        weights: Weights, at least 0.
-        labels: Label of every point, 0 to m - 1.
-        count: Number of labels, m.
-
-    Returns:
-        Sums of weights, and of weights times positions, in float64.
-
-    Example:
-        >>> totals, sums = weighted_sums(
-        ...     torch.tensor([[0.0], [1.0]]), torch.tensor([1.0, 3.0]), torch.tensor([0, 0]), 2
-        ... )
-        >>> totals.tolist(), sums.tolist()
-        ([4.0, 0.0], [[3.0], [0.0]])
-    """
+    """Add up the points of every label."""
     order, offsets = sort_by_label(labels, count)
     weights = weights[order].double()
     axes = [segment_sum(column[order].double() * weights, offsets) for column in points.unbind(1)]
@@ -132,21 +115,7 @@ def weighted_sums(
 def centroids(
     totals: Float[Tensor, "m"], sums: Float[Tensor, "m d"], fallback: Float[Tensor, "m d"]
 ) -> Float[Tensor, "m d"]:
-    """Divide sums of points by their weight.
-
-    Args:
-        totals: Weights, at least 0.
-        sums: Weights times positions.
-        fallback: Result where there is no weight.
-
-    Returns:
-        Weighted means.
-
-    Example:
-        >>> centroids(torch.tensor([4.0, 0.0]), torch.tensor([[3.0], [0.0]]), torch.ones(2, 1))
-        tensor([[0.7500],
-                [1.0000]])
-    """
+    """Divide sums of points by their weight."""
     filled = totals > 0
     means = sums / totals.where(filled, 1.0)[:, None]
     return torch.where(filled[:, None], means, fallback)

@@ -54,18 +54,7 @@ def nearest_scipy(
 
 
 def build_tree(sites: Float[Tensor, "m d"]) -> Any:
-    """Build scipy's k-d tree.
-
-    Args:
-        sites: Positions on the CPU, at least one.
-
-    Returns:
-        A ``scipy.spatial.cKDTree`` over them, in float64.
-
-    Example:
-        >>> build_tree(torch.zeros(1, 3)).n
-        1
-    """
+    """Build scipy's k-d tree."""
     from scipy.spatial import cKDTree  # noqa: PLC0415 (heavy; `import cvtgs` stays light)
 
     return cKDTree(np.asarray(sites, dtype=np.float64))

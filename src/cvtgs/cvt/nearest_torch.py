@@ -106,7 +106,7 @@ def _box_gaps(
     first: tuple[Float[Tensor, "b d"], Float[Tensor, "b d"]],
     second: tuple[Float[Tensor, "c d"], Float[Tensor, "c d"]],
 ) -> Float[Tensor, "b c"]:
-    """Give squared distances between bounding boxes, rounded down a little."""
+    """Return squared distances between bounding boxes, rounded down a little."""
     (low, high), (other_low, other_high) = first, second
     total = torch.zeros(len(low), len(other_low), dtype=low.dtype, device=low.device)
     for axis in range(low.shape[1]):

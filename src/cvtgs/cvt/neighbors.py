@@ -49,22 +49,7 @@ def nearest_neighbors(
 def nearest_several(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int, *, backend: str
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
-    """Find the nearest sites of every point.
-
-    Args:
-        points: Positions.
-        sites: Positions, at least one.
-        count: How many sites each point gets; fewer if there are not so many.
-        backend: ``scipy`` or ``torch``, as :func:`nearest_neighbors` takes it.
-
-    Returns:
-        Row numbers of sites, k = min(count, m), the nearest first, and distances in float64; those
-        to coincident sites may be larger by a billionth of the extent of all.
-
-    Example:
-        >>> nearest_several(torch.zeros(1, 1), torch.tensor([[2.0], [1.0]]), 1, backend="scipy")
-        (tensor([[1]]), tensor([[1.]], dtype=torch.float64))
-    """
+    """Find the nearest sites of every point."""
     among = min(count, len(sites))
     if backend == "scipy":
         apart = _apart(sites)

@@ -1,4 +1,4 @@
-"""Openness: how freely a Gaussian can be seen from nearby, without rendering a picture."""
+"""Openness: how freely a Gaussian can be seen from nearby, without rendering an image."""
 
 import torch
 from jaxtyping import Float, Int
@@ -23,10 +23,10 @@ CHUNK = 1 << 16
 """Gaussians that are looked at together, to bound memory."""
 
 
-def openness(
+def ambient_visibility(
     means: Float[Tensor, "n 3"], masses: Float[Tensor, "n"], frame: RobustFrame
 ) -> Float[Tensor, "n"]:
-    """Tell how freely every Gaussian can be seen from a quarter of a robust radius around it.
+    """Return how freely every Gaussian can be seen from a quarter of a robust radius around it.
 
     What lies inside a solid, or behind a surface that nobody passes, takes a share of the cells
     and is never seen. Masses are summed over voxels, which gives the optical depth of a voxel;
@@ -45,7 +45,7 @@ def openness(
 
     Example:
         >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
-        >>> openness(torch.zeros(1, 3), torch.ones(1, dtype=torch.float64), frame).tolist()
+        >>> ambient_visibility(torch.zeros(1, 3), torch.ones(1).double(), frame).tolist()
         [1.0]
     """
     sums = depth_sums(means.device)
@@ -56,7 +56,7 @@ def openness(
 
 
 def depth_sums(device: torch.device) -> Int[Tensor, "voxels"]:
-    """Give an empty grid of optical depths, for :func:`add_depths`.
+    """Return an empty grid of optical depths, for :func:`add_depths`.
 
     Args:
         device: Where to.
@@ -108,7 +108,7 @@ def add_depths(
 
 
 def light_of(sums: Int[Tensor, "voxels"]) -> Float[Tensor, "voxels"]:
-    """Give the light in every voxel of a finished grid.
+    """Return the light in every voxel of a finished grid.
 
     Args:
         sums: What :func:`add_depths` has added up.
@@ -136,7 +136,7 @@ def light_at(
         frame: Centre and radius of the scene.
 
     Returns:
-        What :func:`openness` gives for the whole scene.
+        What :func:`ambient_visibility` gives for the whole scene.
 
     Example:
         >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
@@ -150,7 +150,7 @@ def light_at(
 def _places(
     means: Float[Tensor, "n 3"], frame: RobustFrame
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
-    """Give the voxel of each position, and how much smaller things are there when contracted."""
+    """Return the voxel of each position, and how much smaller things are there when contracted."""
     size = 2 * HALF_GRID
     voxels = (frame.contract(means) / VOXEL).floor().to(torch.int64) + HALF_GRID
     inside = ((voxels >= 0) & (voxels < size)).all(dim=1)

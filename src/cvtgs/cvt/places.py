@@ -8,20 +8,7 @@ from cvtgs.cvt.nearest import NearestSite
 
 
 def once_per_place(nearest: NearestSite) -> NearestSite:
-    """Search for each place only once, with the same answers.
-
-    Args:
-        nearest: What searches; it gives equal points equal answers.
-
-    Returns:
-        The same for points along a curve, on which equal ones follow one another.
-
-    Example:
-        >>> from cvtgs.cvt.nearest_scipy import nearest_scipy
-        >>> points, sites = torch.tensor([[0.9], [0.9], [0.1]]), torch.tensor([[0.0], [1.0]])
-        >>> once_per_place(nearest_scipy)(points, sites)[0].tolist()
-        [1, 1, 0]
-    """
+    """Search for each place only once, with the same answers."""
 
     def search(points: Tensor, sites: Tensor) -> tuple[Tensor, Tensor]:
         is_first = first_of_each(points)
@@ -33,18 +20,7 @@ def once_per_place(nearest: NearestSite) -> NearestSite:
 
 
 def first_of_each(points: Float[Tensor, "n d"]) -> Bool[Tensor, "n"]:
-    """Tell which points differ from the one before.
-
-    Args:
-        points: Positions.
-
-    Returns:
-        A mask.
-
-    Example:
-        >>> first_of_each(torch.tensor([[0.0], [0.0], [1.0]])).tolist()
-        [True, False, True]
-    """
+    """Return which points differ from the one before."""
     first = torch.ones(len(points), dtype=torch.bool, device=points.device)
     first[1:] = points[1:, 0] != points[:-1, 0]
     maybe = (~first).nonzero()[:, 0]

@@ -107,16 +107,7 @@ def tessellate(
 def search_of(
     config: TessellationConfig, device: torch.device, *, has_duplicates: bool
 ) -> tuple[str, NearestSite]:
-    """Choose what searches the nearest site.
-
-    Args:
-        config: The backend.
-        device: Where the points are.
-        has_duplicates: Whether it pays to search for equal points only once.
-
-    Returns:
-        The name of the backend and the function.
-    """
+    """Choose what searches the nearest site."""
     backend, nearest = nearest_backend(config.backend, device)
     return backend, once_per_place(nearest) if has_duplicates else nearest
 
@@ -124,17 +115,7 @@ def search_of(
 def first_seeds(
     weights: Float[Tensor, "n"], count: int, *, config: TessellationConfig, seed: int
 ) -> Int[Tensor, "m"]:
-    """Choose the points at which sites start.
-
-    Args:
-        weights: Weights of points along a space-filling curve, at least 0.
-        count: Number of sites, at most n.
-        config: How they are chosen.
-        seed: Seed of weighted seeding.
-
-    Returns:
-        Row numbers, ascending.
-    """
+    """Choose the points at which sites start."""
     if config.seeding == "weighted":
         return weighted_seeds(weights, count, torch.Generator().manual_seed(seed))
     return stratified_seeds(weights, count)[0]
@@ -143,16 +124,7 @@ def first_seeds(
 def sampled(
     points: Float[Tensor, "n d"], weights: Float[Tensor, "n"], size: int
 ) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k"]]:
-    """Take fewer points, which stand for all by weight, if that saves at least half of them.
-
-    Args:
-        points: Positions along a space-filling curve.
-        weights: Their weights.
-        size: How many are enough; 0 takes all.
-
-    Returns:
-        Points, and what they weigh now.
-    """
+    """Take fewer points, which stand for all by weight, if that saves at least half of them."""
     enough = max(size, MIN_SAMPLES)
     if size == 0 or enough >= len(points) // 2:
         return points, weights
@@ -166,7 +138,7 @@ def fill_empty_cells(
     squared: Float[Tensor, "n"],
     count: int,
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"], int]:
-    """Give every empty cell one point: those that cost most where they are.
+    """Return every empty cell one point: those that cost most where they are.
 
     Each cell keeps its cheapest point, so no cell becomes empty, and a point in a cell of its
     own costs nothing, so the energy never rises.

@@ -6,7 +6,7 @@ from cvtgs.effects.figures import (
     duplicate_share,
     far_share,
 )
-from cvtgs.effects.limits import limited, pictured, restored, trimmed
+from cvtgs.effects.limits import imaged, limited, restored, trimmed
 from cvtgs.effects.plan import (
     BAND_LOSS,
     DUPLICATE_SHARE,
@@ -33,8 +33,8 @@ __all__ = [
     "band_losses",
     "duplicate_share",
     "far_share",
+    "imaged",
     "limited",
-    "pictured",
     "plan_effects",
     "restored",
     "trimmed",

@@ -27,7 +27,7 @@ LEAST_CONTRAST = 1e-6
 
 
 def band_losses(scene: GaussianScene, *, enough: float) -> tuple[float, ...]:
-    """Give the most that leaving out a band of the spherical harmonics can change a colour.
+    """Return the most that leaving out a band of the spherical harmonics can change a colour.
 
     A pixel mixes colours with weights that add up to 1 at most, so no pixel changes by more. By
     the addition theorem (Unsöld 1927), a band of degree l with coefficients c changes a channel
@@ -65,7 +65,7 @@ def band_losses(scene: GaussianScene, *, enough: float) -> tuple[float, ...]:
 
 
 def far_share(means: Float[Tensor, "n 3"], masses: Float[Tensor, "n"], frame: RobustFrame) -> float:
-    """Give the share of mass that lies far away.
+    """Return the share of mass that lies far away.
 
     Args:
         means: Positions, scene units.
@@ -87,26 +87,13 @@ def far_share(means: Float[Tensor, "n 3"], masses: Float[Tensor, "n"], frame: Ro
 def faint_share(
     opacities: Float[Tensor, "n"], masses: Float[Tensor, "n"], *, below: float
 ) -> float:
-    """Give the share of mass that faint Gaussians hold.
-
-    Args:
-        opacities: Opacities.
-        masses: Masses.
-        below: Gaussians of less opacity are faint.
-
-    Returns:
-        A number in [0, 1].
-
-    Example:
-        >>> faint_share(torch.tensor([0.01, 0.5]), torch.tensor([1.0, 3.0]), below=0.1)
-        0.25
-    """
+    """Return the share of mass that faint Gaussians hold."""
     masses = masses.double()
     return float(activations.divide((masses * (opacities < below)).sum(), masses.sum()))
 
 
 def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) -> float:
-    """Give the share of Gaussians that lie exactly where another of the same colour does.
+    """Return the share of Gaussians that lie exactly where another of the same colour does.
 
     Large scenes are estimated from a sample by a hash of the position, which duplicates share.
 
@@ -147,7 +134,7 @@ def _largest_change(rest: Float[Tensor, "n k 3"], degree: int) -> float:
 
 
 def _contrast(scene: GaussianScene) -> float:
-    """Give the standard deviation of the constant colours of some Gaussians."""
+    """Return the standard deviation of the constant colours of some Gaussians."""
     rows = slice(None, None, max(1, len(scene) // SAMPLE))
     colors = SH_C0 * scene.sh0[rows, 0].double()
     shares = activations.opacity_from_logit(scene.logit_opacities[rows]).double()

@@ -47,7 +47,7 @@ def trimmed(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
 
     Returns:
         The scene with the other bands, which are copied if there are any, and tagged as
-        :func:`pictured` does; itself if that changes nothing.
+        :func:`imaged` does; itself if that changes nothing.
 
     Example:
         >>> from cvtgs.effects import plan_effects
@@ -59,11 +59,11 @@ def trimmed(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
         >>> trimmed(dull, plan).sh_degree
         0
     """
-    return pictured(_of_degree(scene, plan.sh.degree), plan)
+    return imaged(_of_degree(scene, plan.sh.degree), plan)
 
 
-def pictured(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
-    """Take the tag of antialiasing off a scene, if pictures of it are to be taken without.
+def imaged(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
+    """Take the tag of antialiasing off a scene, if images of it are to be taken without.
 
     Args:
         scene: Any scene.
@@ -81,7 +81,7 @@ def pictured(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
         >>> config = SimplifyConfig(effects=EffectsConfig(mip="off"))
         >>> frame = robust_frame(scene.means)
         >>> plan = plan_effects(scene, scene.masses, frame=frame, config=config)
-        >>> scene.antialiased, pictured(scene, plan).antialiased
+        >>> scene.antialiased, imaged(scene, plan).antialiased
         (True, False)
     """
     if plan.mip.active or not scene.antialiased:

@@ -73,7 +73,7 @@ class EffectPlan(pydantic.BaseModel):
 
     Attributes:
         sh: Colour depends on the direction of view: SH bands above the constant.
-        mip: Pictures of the scene are taken with the compensation of Mip-Splatting.
+        mip: Images of the scene are taken with the compensation of Mip-Splatting.
         unbounded: Part of the mass is far away: far positions are contracted, and huge, smooth
             Gaussians such as those of a sky get fewer cells.
         haze: Faint Gaussians hold mass: they are sorted, and only the faintest left out.
@@ -81,7 +81,7 @@ class EffectPlan(pydantic.BaseModel):
         duplicates: Gaussians lie exactly on others: the nearest site is searched once for each
             place.
         extras: Columns beyond the standard ones are carried along.
-        visibility: Pictures tell what each Gaussian paints.
+        visibility: Images tell what each Gaussian paints.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -110,7 +110,7 @@ def plan_effects(
     Args:
         scene: The Gaussians, with valid rows.
         masses: Opacity times mean projected area of every Gaussian.
-        seen_masses: The same as they look in pictures; None for ``masses``.
+        seen_masses: The same as they look in images; None for ``masses``.
         frame: Centre and radius of the scene.
         two_scales: Whether the file that the scene came from has no third scale (2DGS).
         config: Choices that override the decisions, and the thresholds of the filter; None for
@@ -147,12 +147,12 @@ def with_haze(
     *,
     config: SimplifyConfig,
 ) -> EffectPlan:
-    """Decide on haze anew, once pictures have told what each Gaussian paints.
+    """Decide on haze anew, once images have told what each Gaussian paints.
 
     Args:
         plan: The plan so far.
         opacities: Opacities.
-        seen_masses: Masses as they look in pictures.
+        seen_masses: Masses as they look in images.
         config: The threshold, and what overrides it.
 
     Returns:
@@ -259,8 +259,8 @@ def _extras(scene: GaussianScene, config: SimplifyConfig) -> Effect:
 
 def _visibility(config: SimplifyConfig) -> Effect:
     return Effect(
-        active=config.looks,
+        active=config.uses_renders,
         figure=config.visibility.views,
-        meaning="pictures that the preset asks for, on above 0",
+        meaning="images that the preset asks for, on above 0",
         forced=config.effects.visibility != "auto",
     )

@@ -1,8 +1,8 @@
 """How good a simplified scene looks next to the full one: views, scores, pages."""
 
 from cvtgs.evaluate.compare import Comparison, compare
+from cvtgs.evaluate.comparison_files import write_exhibition
 from cvtgs.evaluate.evaluate import evaluate
-from cvtgs.evaluate.exhibition import write_exhibition
 from cvtgs.evaluate.lpips_distance import lpips
 from cvtgs.evaluate.lpips_weights import LPIPS_VARIABLE, LpipsWeights, load_lpips
 from cvtgs.evaluate.metrics import psnr, ssim

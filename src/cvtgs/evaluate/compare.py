@@ -1,4 +1,4 @@
-"""Pictures of a full scene and of simplified ones, side by side, with their scores."""
+"""Images of a full scene and of simplified ones, side by side, with their scores."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,27 +15,27 @@ from cvtgs.evaluate.settings import EvaluationSettings
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.scene import GaussianScene
 
-Pictures = UInt8[np.ndarray, "c h w 3"]
+Images = UInt8[np.ndarray, "c h w 3"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Comparison:
-    """What people look at: pictures, scores and sizes.
+    """What people look at: images, scores and sizes.
 
     Attributes:
         evaluation: The scores.
-        full: ``(c, h, w, 3)`` pictures of the full scene, 8 bits.
+        full: ``(c, h, w, 3)`` images of the full scene, 8 bits.
         small: The same of each simplified scene, by name.
         sizes: Bytes of the files by name of the scene, the full one included; may lack some.
     """
 
     evaluation: Evaluation
-    full: Pictures
-    small: Mapping[str, Pictures]
+    full: Images
+    small: Mapping[str, Images]
     sizes: Mapping[str, int]
 
     def ratio(self, scores: SceneScores) -> float:
-        """Give how many times fewer Gaussians a simplified scene has.
+        """Return how many times fewer Gaussians a simplified scene has.
 
         Args:
             scores: Those of the simplified scene.
@@ -56,7 +56,7 @@ def compare(
     settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
     listener: ProgressListener = silent,
 ) -> Comparison:
-    """Take pictures of a full scene and of simplified ones, and score them.
+    """Take images of a full scene and of simplified ones, and score them.
 
     Memory: ``3 c h w`` bytes per scene, and what :func:`cvtgs.evaluate.evaluate` needs.
 
@@ -67,10 +67,10 @@ def compare(
         reference_name: Name of the full scene.
         sizes: Bytes of the files, by name.
         settings: Background, which LPIPS, and what renders.
-        listener: Told about each picture.
+        listener: Told about each image.
 
     Returns:
-        The pictures and the scores.
+        The images and the scores.
 
     Raises:
         InvalidArgumentError: There is no camera, or two scenes share a name.
@@ -86,10 +86,10 @@ def compare(
         (2, 24, 32, 3)
     """
     shape = (len(cameras), cameras.height, cameras.width, 3)
-    pictures = {name: np.zeros(shape, np.uint8) for name in (reference_name, *small)}
+    images = {name: np.zeros(shape, np.uint8) for name in (reference_name, *small)}
 
-    def keep(view: int, name: str, picture: Float[Tensor, "h w 3"]) -> None:
-        pictures[name][view] = as_bytes(picture)
+    def keep(view: int, name: str, image: Float[Tensor, "h w 3"]) -> None:
+        images[name][view] = as_bytes(image)
 
     evaluation = evaluate(
         reference,
@@ -98,25 +98,14 @@ def compare(
         reference_name=reference_name,
         settings=settings,
         listener=listener,
-        on_picture=keep,
+        on_image=keep,
     )
-    full = pictures.pop(reference_name)
-    return Comparison(evaluation=evaluation, full=full, small=pictures, sizes=dict(sizes or {}))
+    full = images.pop(reference_name)
+    return Comparison(evaluation=evaluation, full=full, small=images, sizes=dict(sizes or {}))
 
 
-def as_bytes(picture: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Round colours to 8 bits.
-
-    Args:
-        picture: ``(h, w, 3)`` colours, clipped to [0, 1].
-
-    Returns:
-        The rounded colours.
-
-    Example:
-        >>> as_bytes(torch.tensor([[[0.0, 0.5, 2.0]]])).tolist()
-        [[[0, 128, 255]]]
-    """
-    rounded = (picture.detach().clamp(0, 1) * 255).round().to(torch.uint8)
+def as_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Round colours to 8 bits."""
+    rounded = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8)
     array: UInt8[np.ndarray, "h w 3"] = rounded.cpu().numpy()
     return array

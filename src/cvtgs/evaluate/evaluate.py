@@ -16,20 +16,14 @@ from cvtgs.render import render
 from cvtgs.scene import GaussianScene
 
 STAGE = "evaluate"
-"""The stage of the progress events; a step is a picture."""
+"""The stage of the progress events; a step is an image."""
 
-PictureListener = Callable[[int, str, Tensor], None]
-"""Told the number of the view, the name of the scene and its picture, ``(h, w, 3)``, clipped."""
+ImageListener = Callable[[int, str, Tensor], None]
+"""Told the number of the view, the name of the scene and its image, ``(h, w, 3)``, clipped."""
 
 
-def ignore_picture(view: int, name: str, picture: Float[Tensor, "h w 3"]) -> None:
-    """Ignore a picture; the default listener.
-
-    Args:
-        view: Number of the view, from 0.
-        name: Name of the scene.
-        picture: ``(h, w, 3)`` colours in [0, 1].
-    """
+def ignore_image(view: int, name: str, image: Float[Tensor, "h w 3"]) -> None:
+    """Ignore an image; the default listener."""
 
 
 @torch.no_grad()
@@ -42,12 +36,12 @@ def evaluate(
     photographs: Float[Tensor, "c h w 3"] | None = None,
     settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
     listener: ProgressListener = silent,
-    on_picture: PictureListener = ignore_picture,
+    on_image: ImageListener = ignore_image,
 ) -> Evaluation:
-    """Score simplified scenes by pictures.
+    """Score simplified scenes by images.
 
     Every view of the full scene is rendered once, whatever the number of small ones. Memory:
-    what :func:`cvtgs.render.render` needs, and two pictures.
+    what :func:`cvtgs.render.render` needs, and two images.
 
     Args:
         reference: The full scene.
@@ -56,15 +50,15 @@ def evaluate(
         reference_name: Name of the full scene.
         photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too.
         settings: Background, which LPIPS, and what renders.
-        listener: Told about each picture.
-        on_picture: Given each picture; those of the reference come first in each view.
+        listener: Told about each image.
+        on_image: Given each image; those of the reference come first in each view.
 
     Returns:
         The scores, per view and on average.
 
     Raises:
         InvalidArgumentError: There is no camera, two scenes share a name, or the photographs
-            have another shape than the pictures.
+            have another shape than the images.
         DeviceError: The backend does not work on a scene's device.
         MissingDependencyError: The backend's package or the LPIPS asked for is missing.
 
@@ -89,14 +83,14 @@ def evaluate(
         camera = cameras.select(torch.tensor([view]))
         truth = reference.means.new_zeros(0)
         for name, scene in scenes.items():
-            picture, backend_used = _picture(scene, camera, settings)
-            on_picture(view, name, picture)
+            image, backend_used = _image(scene, camera, settings)
+            on_image(view, name, image)
             if name == reference_name:
-                truth = picture
+                truth = image
             else:
-                tallies[name].rows.append(judge.compare(picture, truth))
+                tallies[name].rows.append(judge.compare(image, truth))
             if photographs is not None:
-                taken[name].rows.append(judge.compare(picture, photographs[view]))
+                taken[name].rows.append(judge.compare(image, photographs[view]))
             done += 1
             listener(ProgressEvent(stage=STAGE, done=done, total=total))
     return Evaluation(
@@ -115,7 +109,7 @@ def evaluate(
     )
 
 
-def _picture(
+def _image(
     scene: GaussianScene, camera: Cameras, settings: EvaluationSettings
 ) -> tuple[Float[Tensor, "h w 3"], str]:
     behind = torch.tensor(settings.background) if any(settings.background) else None

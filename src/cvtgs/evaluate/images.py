@@ -13,20 +13,7 @@ Encoding = Literal["png", "webp"]
 
 
 def encode(image: UInt8[np.ndarray, "h w 3"], encoding: Encoding, *, quality: int = 82) -> bytes:
-    """Write an image to bytes.
-
-    Args:
-        image: ``(h, w, 3)`` red, green, blue.
-        encoding: ``"png"``, without loss, or ``"webp"``, with loss.
-        quality: Of WebP, 0 to 100.
-
-    Returns:
-        The content of the file.
-
-    Example:
-        >>> encode(np.zeros((2, 2, 3), np.uint8), "png")[1:4]
-        b'PNG'
-    """
+    """Write an image to bytes."""
     from PIL import Image  # noqa: PLC0415 (loads in its time)
 
     settings: dict[str, Any] = {"png": {}, "webp": {"quality": quality}}[encoding]
@@ -36,19 +23,7 @@ def encode(image: UInt8[np.ndarray, "h w 3"], encoding: Encoding, *, quality: in
 
 
 def resized(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> np.ndarray:
-    """Scale an image, smoothly in both directions.
-
-    Args:
-        image: ``(h, w, 3)`` red, green, blue.
-        size: Width and height to give it, pixels.
-
-    Returns:
-        The scaled image.
-
-    Example:
-        >>> resized(np.zeros((4, 4, 3), np.uint8), (3, 2)).shape
-        (2, 3, 3)
-    """
+    """Scale an image, smoothly in both directions."""
     from PIL import Image  # noqa: PLC0415
 
     if (image.shape[1], image.shape[0]) == size:
@@ -59,21 +34,7 @@ def resized(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> np.ndar
 def read_image(
     path: Path, size: tuple[int, int], background: tuple[float, float, float]
 ) -> Float[np.ndarray, "h w 3"]:
-    """Read a photograph at a size.
-
-    Args:
-        path: An image file that exists.
-        size: Width and height to give it, pixels.
-        background: Colour behind transparent pixels, in [0, 1].
-
-    Returns:
-        ``(h, w, 3)`` red, green, blue in [0, 1], float32. Its orientation tag is ignored, as the
-        programs that find cameras ignore it.
-
-    Raises:
-        InputError: The file cannot be read.
-        FileFormatError: It is no image, or a damaged one.
-    """
+    """Read a photograph at a size."""
     from PIL import Image, UnidentifiedImageError  # noqa: PLC0415
 
     try:
@@ -93,19 +54,7 @@ def read_image(
 
 
 def lettering(text: str, size: float) -> UInt8[np.ndarray, "h w"]:
-    """Draw a line of text.
-
-    Args:
-        text: What to write.
-        size: Height of the letters, pixels.
-
-    Returns:
-        How much of each pixel the letters cover, 0 to 255.
-
-    Example:
-        >>> bool(lettering("ab", 12).max() > 200)
-        True
-    """
+    """Draw a line of text."""
     from PIL import Image, ImageDraw, ImageFont  # noqa: PLC0415
 
     font = ImageFont.load_default(size)

@@ -1,4 +1,4 @@
-"""One pair of pictures in, the value of every metric out."""
+"""One pair of images in, the value of every metric out."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -29,19 +29,9 @@ class Judge:
     weights: LpipsWeights | None
     note: str = ""
 
-    def compare(
-        self, picture: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
-    ) -> list[float]:
-        """Give PSNR, SSIM and, with weights, LPIPS.
-
-        Args:
-            picture: What to judge.
-            truth: What it should look like.
-
-        Returns:
-            Two or three numbers.
-        """
-        one, other = picture[None], truth.to(picture)[None]
+    def compare(self, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> list[float]:
+        """Give PSNR, SSIM and, with weights, LPIPS."""
+        one, other = image[None], truth.to(image)[None]
         values = [float(psnr(one, other)), float(ssim(one, other))]
         if self.weights is not None:
             network = self.weights.network
@@ -64,7 +54,7 @@ class Tally:
     rows: list[list[float]] = field(default_factory=list)
 
     def scores(self) -> SceneScores:
-        """Give what was collected."""
+        """Return what was collected."""
         columns = [Score.of(column) for column in zip(*self.rows, strict=True)]
         distance = columns[2] if len(columns) > 2 else None
         return SceneScores(
@@ -73,23 +63,7 @@ class Tally:
 
 
 def make_judge(choice: LpipsChoice, size: tuple[int, int]) -> Judge:
-    """Read what the metrics need.
-
-    Args:
-        choice: Which LPIPS; with ``auto``, missing weights and small pictures only leave it out.
-        size: Width and height of the pictures, pixels.
-
-    Returns:
-        The judge.
-
-    Raises:
-        InvalidArgumentError: There is no such choice.
-        CvtgsError: The weights that were asked for by name cannot be had.
-
-    Example:
-        >>> make_judge("off", (64, 48)).note
-        'not asked for'
-    """
+    """Read what the metrics need."""
     if choice == "off":
         return Judge(weights=None, note=NOT_ASKED_FOR)
     if choice in ("vgg", "alex"):
@@ -100,7 +74,7 @@ def make_judge(choice: LpipsChoice, size: tuple[int, int]) -> Judge:
     names: tuple[LpipsNetwork, ...] = ("vgg", "alex")
     for network in names:
         if min(size) < NETWORKS[network].least:
-            note = f"pictures of {size[0]} x {size[1]} pixels are too small for it"
+            note = f"images of {size[0]} x {size[1]} pixels are too small for it"
             continue
         try:
             return Judge(weights=load_lpips(network))

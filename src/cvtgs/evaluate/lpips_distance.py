@@ -25,7 +25,7 @@ def lpips(
     network: LpipsNetwork = "vgg",
     weights: LpipsWeights | str | os.PathLike[str] | None = None,
 ) -> Float[Tensor, "c"]:
-    """Give the LPIPS distance, version 0.1, of each pair of images.
+    """Return the LPIPS distance, version 0.1, of each pair of images.
 
     Zhang, Isola, Efros, Shechtman, Wang 2018, equation 1: activations after five ReLUs, scaled to
     unit length over the channels, squared differences weighted by the trained heads, mean over

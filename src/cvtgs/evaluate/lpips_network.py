@@ -91,16 +91,7 @@ NETWORKS: Mapping[LpipsNetwork, Network] = MappingProxyType(
 def activations(
     images: Float[Tensor, "b 3 h w"], network: Network, tensors: Mapping[str, Tensor]
 ) -> Iterator[Float[Tensor, "b k y x"]]:
-    """Give the compared activations one by one; the one before may be forgotten meanwhile.
-
-    Args:
-        images: Normalised images, channels first.
-        network: What to compute.
-        tensors: ``features.<index>.weight`` and ``.bias``, of the images' dtype and device.
-
-    Yields:
-        The activation after each of the five tapped ReLUs.
-    """
+    """Return the compared activations one by one; the one before may be forgotten meanwhile."""
     for layer in network.convolutions:
         if layer.pool:
             images = torch.nn.functional.max_pool2d(images, layer.pool, stride=2)

@@ -14,16 +14,9 @@ _BACKBONES: dict[LpipsNetwork, str] = {
 
 
 def package_files(network: LpipsNetwork) -> tuple[Path, Path] | None:
-    """Say where the installed package has its weights, without importing it.
+    """Report where the installed package has its weights, without importing it.
 
     Importing it would load torchvision, and making its model would download the backbone.
-
-    Args:
-        network: Which network.
-
-    Returns:
-        The backbone in torch's download cache and the heads in the package, whether they are
-        there or not; None if the package is not installed.
     """
     spec = find_spec("lpips")
     if spec is None or spec.origin is None:

@@ -10,7 +10,7 @@ from cvtgs.losses.ssim import SSIM_WINDOW, mean_ssim
 
 @torch.no_grad()
 def psnr(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tensor, "c"]:
-    """Give the peak signal-to-noise ratio of each pair of images, ``10 log10(1 / mse)``.
+    """Return the peak signal-to-noise ratio of each pair of images, ``10 log10(1 / mse)``.
 
     Args:
         a: ``(c, h, w, 3)`` images, clipped to [0, 1].
@@ -33,7 +33,7 @@ def psnr(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tens
 
 @torch.no_grad()
 def ssim(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tensor, "c"]:
-    """Give the structural similarity of each pair of images.
+    """Return the structural similarity of each pair of images.
 
     :func:`cvtgs.losses.ssim.mean_ssim` of clipped images: Gaussian window of 11 x 11 pixels and
     1.5 pixels, border "valid" (only windows inside the image count), mean over places and

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from cvtgs.evaluate.compare import Comparison, Pictures
+from cvtgs.evaluate.compare import Comparison, Images
 from cvtgs.evaluate.error_maps import ERROR_SCALE, css_gradient, error_map
 from cvtgs.evaluate.images import encode, resized
 from cvtgs.evaluate.scores import SceneScores
 
 MOST_BYTES = 7_500_000
-"""Pages are kept below this: pictures are compressed harder, and then made smaller."""
+"""Pages are kept below this: images are compressed harder, and then made smaller."""
 
 _TRIES = ((84, 1.0), (72, 1.0), (55, 1.0), (55, 0.7), (45, 0.5), (35, 0.35), (30, 0.25))
 
@@ -29,25 +29,6 @@ def comparison_page(
     It has a divider between the full and a simplified scene, a chooser of scene and view, counts,
     bytes and scores, and maps of the differences. ``#view=2&small=1&split=30&error=1`` at the end
     of its address chooses what it shows first.
-
-    Args:
-        comparison: Pictures and scores, at least one simplified scene.
-        foreword: HTML that stands above the pictures.
-        most_bytes: The page's size; pictures lose quality, then pixels, until it is kept, as far
-            as a quarter of their width goes.
-
-    Returns:
-        HTML.
-
-    Example:
-        >>> from cvtgs.evaluate import compare
-        >>> from cvtgs.views import automatic_views
-        >>> from cvtgs.synthetic import scene as make
-        >>> scene = make("object", 300, sh_degree=0)
-        >>> views = automatic_views(scene, 2, width=32, height=24)
-        >>> page = comparison_page(compare(scene, {"same": scene}, views))
-        >>> page.startswith("<!DOCTYPE html>"), "https:" in page
-        (True, False)
     """
     page = ""
     for quality, factor in _TRIES:
@@ -65,7 +46,7 @@ def _page(comparison: Comparison, quality: int, factor: float, *, foreword: str)
         "GRADIENT": css_gradient(),
         "ERROR_SCALE": f"{ERROR_SCALE:g}",
         "SCRIPT": _part("page.js"),
-        "SHEET": "" if foreword else " The same pictures are in sheet.png, next to it.",
+        "SHEET": "" if foreword else " The same images are in sheet.png, next to it.",
         "FOREWORD": foreword,
         "DATA": _for_script(_data(comparison, quality, factor)),
     }
@@ -105,24 +86,24 @@ def _data(comparison: Comparison, quality: int, factor: float) -> dict[str, Any]
 def _small(
     comparison: Comparison, scores: SceneScores, quality: int, factor: float
 ) -> dict[str, Any]:
-    pictures = comparison.small[scores.name]
+    images = comparison.small[scores.name]
     return {
         **json.loads(scores.model_dump_json()),  # which writes infinity as text
         "bytes": comparison.sizes.get(scores.name),
-        "pictures": list(_addresses(pictures, quality, factor)),
-        "errors": list(_addresses(_errors(comparison.full, pictures), quality - 10, factor)),
+        "images": list(_addresses(images, quality, factor)),
+        "errors": list(_addresses(_errors(comparison.full, images), quality - 10, factor)),
     }
 
 
-def _errors(full: Pictures, small: Pictures) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+def _errors(full: Images, small: Images) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     return (error_map(one, other) for one, other in zip(full, small, strict=True))
 
 
 def _addresses(
-    pictures: Iterable[UInt8[np.ndarray, "h w 3"]], quality: int, factor: float
+    images: Iterable[UInt8[np.ndarray, "h w 3"]], quality: int, factor: float
 ) -> Iterator[str]:
-    for picture in pictures:
-        height, width, _ = picture.shape
+    for image in images:
+        height, width, _ = image.shape
         size = max(1, round(factor * width)), max(1, round(factor * height))
-        content = encode(resized(picture, size), "webp", quality=quality)
+        content = encode(resized(image, size), "webp", quality=quality)
         yield "data:image/webp;base64," + base64.b64encode(content).decode()

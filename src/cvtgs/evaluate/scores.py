@@ -45,12 +45,12 @@ class Score(_Record):
 
 
 class SceneScores(_Record):
-    """How close the pictures of one scene come to others.
+    """How close the images of one scene come to others.
 
     Attributes:
         name: Name of the scene.
         count: Its Gaussians.
-        psnr: Peak signal-to-noise ratio, dB; infinite where pictures are equal.
+        psnr: Peak signal-to-noise ratio, dB; infinite where images are equal.
         ssim: Structural similarity, at most 1.
         lpips: LPIPS distance, at least 0; None where it was not measured.
     """
@@ -74,7 +74,7 @@ class Evaluation(_Record):
         backend: What rendered.
         lpips_network: The network of LPIPS; None if it was not measured.
         lpips_note: Why it was not measured, else empty.
-        scenes: Scores of each simplified scene against pictures of the full one.
+        scenes: Scores of each simplified scene against images of the full one.
         photographs: Scores of the full and of each simplified scene against photographs; empty
             without photographs.
     """
@@ -100,7 +100,7 @@ class Evaluation(_Record):
         return ""
 
     def to_json(self) -> str:
-        """Give the evaluation as indented JSON; infinite numbers are the string ``Infinity``.
+        """Return the evaluation as indented JSON; infinite numbers are the string ``Infinity``.
 
         Returns:
             JSON text that ends with a line break.

@@ -1,4 +1,4 @@
-"""How pictures are taken and judged."""
+"""How images are taken and judged."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from cvtgs.render import BackendName
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationSettings:
-    """How pictures are taken and judged.
+    """How images are taken and judged.
 
     Attributes:
         background: Colour behind the scenes: red, green and blue in [0, 1].

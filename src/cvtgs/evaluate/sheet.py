@@ -1,4 +1,4 @@
-"""Contact sheets: all scenes and views on one picture, with what they cost and score."""
+"""Contact sheets: all scenes and views on one image, with what they cost and score."""
 
 from dataclasses import dataclass, field
 
@@ -18,24 +18,7 @@ _NAME, _TEXT = 20, 15
 
 
 def contact_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
-    """Show every view of every scene: a row per scene, the full one first, a column per view.
-
-    Args:
-        comparison: Pictures and scores.
-
-    Returns:
-        The sheet; each row has the scene's name, count, bytes and scores at its left, each small
-        picture its PSNR below.
-
-    Example:
-        >>> from cvtgs.evaluate import compare
-        >>> from cvtgs.views import automatic_views
-        >>> from cvtgs.synthetic import scene as make
-        >>> scene = make("object", 300, sh_degree=0)
-        >>> views = automatic_views(scene, 2, width=32, height=24)
-        >>> contact_sheet(compare(scene, {"same": scene}, views)).dtype
-        dtype('uint8')
-    """
+    """Show every view of every scene: a row per scene, the full one first, a column per view."""
     sheet = _Sheet.of(comparison, rows=1 + len(comparison.small), foot=0)
     sheet.headings(comparison.evaluation.views)
     sheet.row(0, full_lines(comparison), comparison.full, captions=())
@@ -48,23 +31,7 @@ def contact_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
 
 
 def error_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
-    """Show where every small picture differs from the full one, with a legend of the colours.
-
-    Args:
-        comparison: Pictures and scores.
-
-    Returns:
-        The sheet: a row per simplified scene, a column per view.
-
-    Example:
-        >>> from cvtgs.evaluate import compare
-        >>> from cvtgs.views import automatic_views
-        >>> from cvtgs.synthetic import scene as make
-        >>> scene = make("object", 300, sh_degree=0)
-        >>> views = automatic_views(scene, 2, width=32, height=24)
-        >>> error_sheet(compare(scene, {"same": scene}, views)).ndim
-        3
-    """
+    """Show where every small image differs from the full one, with a legend of the colours."""
     sheet = _Sheet.of(comparison, rows=len(comparison.small), foot=_FOOT)
     sheet.headings(comparison.evaluation.views)
     for row, scores in enumerate(comparison.evaluation.scenes):
@@ -77,14 +44,7 @@ def error_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
 
 
 def full_lines(comparison: Comparison) -> tuple[str, ...]:
-    """Give what is written beside the pictures of the full scene.
-
-    Args:
-        comparison: Pictures and scores.
-
-    Returns:
-        Its name, then count and bytes.
-    """
+    """Return what is written beside the images of the full scene."""
     evaluation = comparison.evaluation
     return (
         evaluation.reference,
@@ -94,15 +54,7 @@ def full_lines(comparison: Comparison) -> tuple[str, ...]:
 
 
 def small_lines(comparison: Comparison, scores: SceneScores) -> tuple[str, ...]:
-    """Give what is written beside the pictures of a simplified scene.
-
-    Args:
-        comparison: Pictures and scores.
-        scores: Those of the scene.
-
-    Returns:
-        Its name, then count, ratio, bytes and mean scores.
-    """
+    """Return what is written beside the images of a simplified scene."""
     distance = f"LPIPS {scores.lpips.mean:.3f}" if scores.lpips else ""
     return (
         scores.name,
@@ -145,7 +97,7 @@ class _Sheet:
         self,
         number: int,
         lines: tuple[str, ...],
-        pictures: UInt8[np.ndarray, "c h w 3"],
+        images: UInt8[np.ndarray, "c h w 3"],
         *,
         captions: tuple[str, ...],
     ) -> None:
@@ -155,9 +107,9 @@ class _Sheet:
         for place, line in enumerate(filter(None, others)):
             below = top + round(1.5 * _NAME + place * 1.45 * _TEXT)
             self._write(_MARGIN, below, line, color=_FADED)
-        for column, picture in enumerate(pictures):
+        for column, image in enumerate(images):
             left = self._left(column)
-            tile = resized(picture, self.tile)
+            tile = resized(image, self.tile)
             self.canvas[top : top + self.tile[1], left : left + self.tile[0]] = tile
         for column, caption in enumerate(captions):
             self._write(self._left(column), top + self.tile[1] + 4, caption, color=_FADED)

@@ -5,7 +5,7 @@ from cvtgs.io.cameras import load_cameras
 from cvtgs.io.dicts import from_dict, to_dict
 from cvtgs.io.folders import scene_file, scene_size
 from cvtgs.io.formats import check_save, load, losses, save
-from cvtgs.io.holds import Losses
+from cvtgs.io.limits import Losses
 
 __all__ = [
     "Losses",

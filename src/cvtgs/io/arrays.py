@@ -42,18 +42,7 @@ class Arrays:
 
 
 def arrays_of(scene: GaussianScene, *, sh_degree: int = 3) -> Arrays:
-    """Give what a compact format can hold of a scene: the rows that are numbers.
-
-    Args:
-        scene: The scene, on any device.
-        sh_degree: Highest SH band that the format holds.
-
-    Returns:
-        Its arrays without the rows that :func:`writable_rows` leaves out.
-
-    Raises:
-        InvalidSceneError: No row is left.
-    """
+    """Return what a compact format can hold of a scene: the rows that are numbers."""
     rows = writable_rows(scene)
     if not bool(rows.any()):
         raise InvalidSceneError(
@@ -77,14 +66,7 @@ def arrays_of(scene: GaussianScene, *, sh_degree: int = 3) -> Arrays:
 
 
 def writable_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
-    """Find the rows that compact formats can hold.
-
-    Args:
-        scene: The scene.
-
-    Returns:
-        A mask: finite numbers, a rotation that is not zero, and an opacity that may be infinite.
-    """
+    """Find the rows that compact formats can hold."""
     rows = ~scene.logit_opacities.isnan() & (scene.quats != 0).any(dim=1)
     for name, tensor in scene.tensors().items():
         if name != "logit_opacities" and tensor.numel():
@@ -93,15 +75,7 @@ def writable_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
 
 
 def scene_of(arrays: Arrays, *, antialiased: bool = False) -> GaussianScene:
-    """Make a scene of what a reader found.
-
-    Args:
-        arrays: The numbers; they are copied only if they are not float32.
-        antialiased: Whether the file says that the scene was trained with anti-aliasing.
-
-    Returns:
-        The scene, float32 on the CPU.
-    """
+    """Make a scene of what a reader found."""
     return GaussianScene(
         means=_tensor(arrays.means),
         quats=_tensor(arrays.quats),
@@ -118,18 +92,7 @@ def _tensor(values: Floats) -> Tensor:
 
 
 def unit_quats(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Scale quaternions to unit length; zero becomes no rotation.
-
-    Args:
-        quats: Finite quaternions, w first.
-
-    Returns:
-        Unit quaternions.
-
-    Example:
-        >>> unit_quats(np.array([[0.0, 3.0, 0.0, 4.0], [0.0, 0.0, 0.0, 0.0]])).tolist()
-        [[0.0, 0.6, 0.0, 0.8], [1.0, 0.0, 0.0, 0.0]]
-    """
+    """Scale quaternions to unit length; zero becomes no rotation."""
     largest = np.abs(quats).max(axis=1, keepdims=True)
     nothing = largest == 0
     scaled = np.where(nothing, quats.dtype.type(0), quats / np.where(nothing, 1, largest))
@@ -139,83 +102,28 @@ def unit_quats(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
 
 
 def to_bytes(values: Float[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
-    """Round to the nearest of 0 to 255.
-
-    Args:
-        values: Numbers in units of a byte.
-
-    Returns:
-        Bytes.
-
-    Example:
-        >>> to_bytes(np.array([-3.0, 7.6, 400.0])).tolist()
-        [0, 8, 255]
-    """
+    """Round to the nearest of 0 to 255."""
     whole: Bytes = np.clip(np.rint(values), 0, 255).astype(np.uint8)
     return whole
 
 
 def opacity_bytes(logits: Float[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
-    """Store opacities as bytes.
-
-    Args:
-        logits: Logits of the opacities.
-
-    Returns:
-        Opacities from 0 to 255.
-
-    Example:
-        >>> opacity_bytes(np.array([-np.inf, 0.0, 9.0], np.float32)).tolist()
-        [0, 128, 255]
-    """
+    """Store opacities as bytes."""
     return to_bytes(255 * activations.opacity_from_logit(torch.from_numpy(logits)).numpy())
 
 
 def logits_of_bytes(opacities: UInt8[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Read opacities that are bytes.
-
-    Args:
-        opacities: Opacities from 0 to 255.
-
-    Returns:
-        Finite logits: 0 is read as 1e-6, and 255 as 1 - 1e-6.
-
-    Example:
-        >>> logits_of_bytes(np.array([0, 255], np.uint8)).round(1).tolist()
-        [-13.800000190734863, 13.800000190734863]
-    """
+    """Read opacities that are bytes."""
     values = torch.from_numpy(opacities.astype(np.float32) / np.float32(255))
     logits: Floats = activations.logit_from_opacity(values).numpy()
     return logits
 
 
 def colors_of_sh0(sh0: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Give the colours of the constant SH band.
-
-    Args:
-        sh0: The coefficients.
-
-    Returns:
-        Red, green and blue; those that can be shown are in [0, 1].
-
-    Example:
-        >>> colors_of_sh0(np.zeros((1, 3), np.float32)).tolist()
-        [[0.5, 0.5, 0.5]]
-    """
+    """Return the colours of the constant SH band."""
     return np.float32(0.5) + np.float32(SH_C0) * sh0
 
 
 def sh0_of_colors(colors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Give the constant SH band of colours, the inverse of :func:`colors_of_sh0`.
-
-    Args:
-        colors: Red, green and blue.
-
-    Returns:
-        The coefficients.
-
-    Example:
-        >>> sh0_of_colors(np.full((1, 3), 0.5, np.float32)).tolist()
-        [[0.0, 0.0, 0.0]]
-    """
+    """Return the constant SH band of colours, the inverse of :func:`colors_of_sh0`."""
     return (colors - np.float32(0.5)) / np.float32(SH_C0)

@@ -112,7 +112,7 @@ def _target(path: str | os.PathLike[str]) -> Path:
 
 
 def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
-    """Give the finished file its name."""
+    """Return the finished file its name."""
     if overwrite:
         if target.exists():
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
@@ -162,7 +162,7 @@ def _claim(temporary: Path, target: Path) -> None:
 
 
 def _is(path: Path, empty: os.stat_result) -> bool:
-    """Tell whether a path is still the empty file that we made."""
+    """Return whether a path is still the empty file that we made."""
     try:
         found = path.stat()
     except OSError:
@@ -171,7 +171,7 @@ def _is(path: Path, empty: os.stat_result) -> bool:
 
 
 def _concerns(error: OSError, temporary: Path) -> bool:
-    """Tell errors of this output from those that the caller's code ran into elsewhere."""
+    """Return errors of this output from those that the caller's code ran into elsewhere."""
     if error.filename is None:
         return True
     return Path(os.fsdecode(error.filename)).parent == temporary.parent

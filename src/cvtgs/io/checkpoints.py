@@ -28,17 +28,6 @@ def read_checkpoint(path: Path) -> GaussianScene:
     ``ckpt_29999_rank0.pt`` of gsplat's examples, which holds it under ``splats``. Nothing in the
     file is executed, and only the scene is loaded, not the state of the optimiser. Splatfacto
     trains colours without SH through a sigmoid; these become ordinary colours.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The scene, on the CPU. Whether it was trained with anti-aliasing is not in the file.
-
-    Raises:
-        InputNotFoundError: There is no such file.
-        InputError: It cannot be opened or read.
-        FileFormatError: It is not a checkpoint of a scene, or damaged.
     """
     tensors, splatfacto = _scene_tensors(_unpickled(path), path)
     try:

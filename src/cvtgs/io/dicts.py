@@ -70,7 +70,7 @@ def from_dict(
 
 
 def to_dict(scene: GaussianScene) -> dict[str, Tensor]:
-    """Give a scene as the dictionary that gsplat trains.
+    """Return a scene as the dictionary that gsplat trains.
 
     Args:
         scene: The scene.
@@ -126,7 +126,7 @@ def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _prefix(mapping: Mapping[str, Any]) -> str:
-    """Give what stands before ``means``, up to a dot."""
+    """Return what stands before ``means``, up to a dot."""
     found = [key for key in mapping if key == "means" or key.endswith(".means")]
     if len(found) > 1:
         raise InvalidSceneError(

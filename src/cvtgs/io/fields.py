@@ -18,11 +18,6 @@ class Fields:
     Attributes:
         values: The object.
         where: Path and row.
-
-    Example:
-        >>> fields = Fields(values={"w": 8.0}, where="a.json: frame 0")
-        >>> fields.whole("w"), "h" in fields
-        (8, False)
     """
 
     values: Mapping[str, Any]
@@ -30,107 +25,45 @@ class Fields:
 
     @classmethod
     def of(cls, value: Any, where: str) -> "Fields":
-        """Check that a value is a JSON object.
-
-        Args:
-            value: The value.
-            where: Path and row.
-
-        Returns:
-            Its fields.
-
-        Raises:
-            FileFormatError: It is something else.
-        """
+        """Check that a value is a JSON object."""
         if not isinstance(value, dict):
             raise FileFormatError(f"{where}: must be a JSON object, found {_shown(value)}.")
         return cls(values=value, where=where)
 
     def __contains__(self, key: str) -> bool:
-        """Tell whether the key is there and not null."""
+        """Return whether the key is there and not null."""
         return self.values.get(key) is not None
 
     def number(self, key: str) -> float:
-        """Give a finite number.
-
-        Args:
-            key: Its key.
-
-        Returns:
-            The number.
-
-        Raises:
-            FileFormatError: It is missing or something else.
-        """
+        """Return a finite number."""
         value = self.values.get(key)
         if not _is_number(value):
             raise self.wrong(key, "a finite number")
         return float(value)
 
     def whole(self, key: str) -> int:
-        """Give a whole number, which may be written as 800.0.
-
-        Args:
-            key: Its key.
-
-        Returns:
-            The number.
-
-        Raises:
-            FileFormatError: It is missing or something else.
-        """
+        """Return a whole number, which may be written as 800.0."""
         value = self.values.get(key)
         if not _is_number(value) or float(value) != int(value):
             raise self.wrong(key, "a whole number")
         return int(value)
 
     def text(self, key: str) -> str:
-        """Give a text.
-
-        Args:
-            key: Its key.
-
-        Returns:
-            The text.
-
-        Raises:
-            FileFormatError: It is missing or something else.
-        """
+        """Return a text."""
         value = self.values.get(key)
         if not isinstance(value, str):
             raise self.wrong(key, "a text")
         return value
 
     def items(self, key: str) -> list[Any]:
-        """Give a list.
-
-        Args:
-            key: Its key.
-
-        Returns:
-            The list.
-
-        Raises:
-            FileFormatError: It is missing or something else.
-        """
+        """Return a list."""
         value = self.values.get(key)
         if not isinstance(value, list):
             raise self.wrong(key, "a list")
         return value
 
     def array(self, key: str, *shapes: tuple[int, ...]) -> NDArray[np.float64]:
-        """Give nested lists of finite numbers.
-
-        Args:
-            key: Their key.
-            *shapes: Shapes that are fine.
-
-        Returns:
-            The numbers.
-
-        Raises:
-            FileFormatError: They are missing or something else.
-        """
+        """Return nested lists of finite numbers."""
         value = self.values.get(key)
         for shape in shapes:
             if _has_shape(value, shape):
@@ -139,15 +72,7 @@ class Fields:
         raise self.wrong(key, f"{wanted} finite numbers")
 
     def wrong(self, key: str, required: str) -> FileFormatError:
-        """Make the error for a value that does not fit.
-
-        Args:
-            key: Its key.
-            required: What it must be.
-
-        Returns:
-            The error, to be raised.
-        """
+        """Make the error for a value that does not fit."""
         found = _shown(self.values[key]) if key in self.values else "none"
         return FileFormatError(f"{self.where}: {key!r} must be {required}, found {found}.")
 

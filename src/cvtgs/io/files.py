@@ -16,27 +16,7 @@ _POINTER = b"version https://git-lfs."
 
 @contextmanager
 def open_input(path: Path) -> Iterator[BinaryIO]:
-    """Open a regular file, and translate what the system says while it is read.
-
-    Args:
-        path: The file.
-
-    Yields:
-        The open binary file.
-
-    Raises:
-        InputNotFoundError: There is no such file.
-        InputError: It cannot be opened or read.
-        FileFormatError: It only points to a file of Git LFS.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = (Path(folder) / "a").write_bytes(b"text")
-        ...     with open_input(Path(folder) / "a") as file:
-        ...         file.read()
-        b'text'
-    """
+    """Open a regular file, and translate what the system says while it is read."""
     try:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):  # opening a pipe would wait for ever
@@ -59,70 +39,18 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read a whole file.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Its content.
-
-    Raises:
-        InputNotFoundError: There is no such file.
-        InputError: It cannot be opened or read.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = (Path(folder) / "a").write_bytes(b"text")
-        ...     read_bytes(Path(folder) / "a")
-        b'text'
-    """
+    """Read a whole file."""
     with open_input(path) as file:
         return file.read()
 
 
 def read_json(path: Path) -> Any:
-    """Parse a JSON file.
-
-    Args:
-        path: The file; UTF-8, with or without a byte order mark.
-
-    Returns:
-        What is in it.
-
-    Raises:
-        InputNotFoundError: There is no such file.
-        InputError: It cannot be opened or read.
-        FileFormatError: It is not JSON.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = (Path(folder) / "a.json").write_text("[1, 2]")
-        ...     read_json(Path(folder) / "a.json")
-        [1, 2]
-    """
+    """Parse a JSON file."""
     return parse_json(read_bytes(path), path)
 
 
 def parse_json(data: bytes, path: str | Path) -> Any:
-    """Parse JSON that is read already.
-
-    Args:
-        data: The text; UTF-8, with or without a byte order mark.
-        path: Where it stands, for error texts.
-
-    Returns:
-        What is in it.
-
-    Raises:
-        FileFormatError: It is not JSON.
-
-    Example:
-        >>> parse_json(b"[1, 2]", "a.json")
-        [1, 2]
-    """
+    """Parse JSON that is read already."""
     try:
         return json.loads(data.decode("utf-8-sig"))
     except json.JSONDecodeError as error:
@@ -139,16 +67,5 @@ def parse_json(data: bytes, path: str | Path) -> Any:
 
 
 def is_file(path: Path) -> bool:
-    """Say whether a file is there, also where its folder may not be looked into.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Whether there is a regular file that can be seen.
-
-    Example:
-        >>> is_file(Path("there is none"))
-        False
-    """
+    """Report whether a file is there, also where its folder may not be looked into."""
     return os.path.isfile(path)  # noqa: PTH113 (Path.is_file raises without permission)

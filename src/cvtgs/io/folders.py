@@ -53,7 +53,7 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
 
 
 def scene_size(path: str | os.PathLike[str]) -> int:
-    """Give the size of a scene on the disk.
+    """Return the size of a scene on the disk.
 
     Args:
         path: A file, or a folder that :func:`scene_file` finds a scene in.
@@ -83,7 +83,7 @@ def _scenes(folder: Path) -> Iterator[Path]:
 
 
 def _numbered(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
-    """Give what is numbered in a folder, the largest number first."""
+    """Return what is numbered in a folder, the largest number first."""
     if not folder.is_dir():
         return []
     matches = [(pattern.fullmatch(part.name), part) for part in folder.iterdir()]

@@ -21,7 +21,7 @@ from cvtgs.io.compressed_ply import (
     write_compressed_ply,
 )
 from cvtgs.io.folders import scene_file
-from cvtgs.io.holds import Holds, Losses, losses_of
+from cvtgs.io.limits import Holds, Losses, losses_of
 from cvtgs.io.ply import read_ply, write_ply
 from cvtgs.io.sog import SOG_HOLDS, read_sog, write_sog
 from cvtgs.io.splat import SPLAT_HOLDS, read_splat, write_splat
@@ -168,7 +168,7 @@ def save(scene: GaussianScene, path: str | os.PathLike[str], *, overwrite: bool 
 
 
 def losses(scene: GaussianScene, path: str | os.PathLike[str]) -> Losses:
-    """Say what of a scene a file would not hold, before it is written.
+    """Report what of a scene a file would not hold, before it is written.
 
     Args:
         scene: The scene.

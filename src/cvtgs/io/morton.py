@@ -8,18 +8,7 @@ from cvtgs.math.morton import morton_order
 
 
 def morton_rows(means: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
-    """Order Gaussians along a Morton curve; far ones do not coarsen it.
-
-    Args:
-        means: Finite centres.
-
-    Returns:
-        Row numbers.
-
-    Example:
-        >>> morton_rows(np.array([[5.0, 0, 0], [0, 0, 0], [1, 0, 0]], np.float32)).tolist()
-        [1, 2, 0]
-    """
+    """Order Gaussians along a Morton curve; far ones do not coarsen it."""
     middle = np.median(means, axis=0)
     away = means - middle
     radius = np.quantile(np.abs(away).max(axis=1), 0.9) or 1.0

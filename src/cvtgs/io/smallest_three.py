@@ -12,20 +12,7 @@ HALF_RANGE = np.float32(np.sqrt(0.5))
 def drop_largest(
     quats: Float[np.ndarray, "n 4"],
 ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """Leave out the largest component, after making it positive.
-
-    Args:
-        quats: Unit quaternions.
-
-    Returns:
-        Which component is left out, the first of equals, and the other three in order, in
-        [-sqrt(1/2), sqrt(1/2)].
-
-    Example:
-        >>> largest, others = drop_largest(np.array([[0.0, 0.6, 0.0, -0.8]]))
-        >>> largest.tolist(), others.tolist()
-        ([3], [[-0.0, -0.6, -0.0]])
-    """
+    """Leave out the largest component, after making it positive."""
     rows = np.arange(len(quats))
     largest = np.abs(quats).argmax(axis=1)
     signs = np.where(quats[rows, largest] < 0, -1, 1).astype(quats.dtype)
@@ -36,19 +23,7 @@ def drop_largest(
 def restore_largest(
     largest: Int[np.ndarray, "n"], others: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 4"]:
-    """Put the largest component back, the inverse of :func:`drop_largest`.
-
-    Args:
-        largest: Which component is missing, 0 to 3.
-        others: The other three in order.
-
-    Returns:
-        Quaternions, of unit length if the three allow it.
-
-    Example:
-        >>> restore_largest(np.array([0]), np.array([[0.0, 0.6, 0.0]])).tolist()
-        [[0.8, 0.0, 0.6, 0.0]]
-    """
+    """Put the largest component back, the inverse of :func:`drop_largest`."""
     quats = np.empty((len(others), 4), others.dtype)
     rows = np.arange(len(others))
     quats[rows[:, None], _OTHERS[largest]] = others

@@ -19,7 +19,7 @@ from cvtgs.io.arrays import (
     unit_quats,
 )
 from cvtgs.io.files import open_input
-from cvtgs.io.holds import Holds
+from cvtgs.io.limits import Holds
 from cvtgs.scene import GaussianScene
 
 _ROW = np.dtype(
@@ -52,18 +52,6 @@ def read_splat(path: Path) -> GaussianScene:
 
     A Gaussian is three f32 of position, three f32 of scale (not its logarithm), and bytes:
     red, green, blue, opacity, and the quaternion, w first, as ``128 + 128 q``.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The scene, of SH degree 0. Numbers are returned as they are, NaN and infinity too; a
-        scale of 0 becomes the least normal float32.
-
-    Raises:
-        InputNotFoundError: There is no such file.
-        InputError: It cannot be opened or read.
-        FileFormatError: It is empty or not a whole number of Gaussians.
     """
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -88,24 +76,7 @@ def read_splat(path: Path) -> GaussianScene:
 
 
 def write_splat(scene: GaussianScene, file: BinaryIO) -> None:
-    """Write a ``.splat`` file, in the order of the scene.
-
-    Args:
-        scene: The scene, on any device; only SH degree 0 is written.
-        file: Where to, open for writing.
-
-    Raises:
-        InvalidSceneError: No Gaussian of the scene is finite.
-        OSError: The file cannot be written.
-
-    Example:
-        >>> import io
-        >>> from cvtgs.synthetic import scene
-        >>> file = io.BytesIO()
-        >>> write_splat(scene("object", 5, sh_degree=0, seed=0), file)
-        >>> len(file.getvalue())
-        160
-    """
+    """Write a ``.splat`` file, in the order of the scene."""
     arrays = arrays_of(scene, sh_degree=0)
     for start in range(0, len(arrays.means), _CHUNK_ROWS):
         part = slice(start, start + _CHUNK_ROWS)

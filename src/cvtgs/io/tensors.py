@@ -13,21 +13,7 @@ from cvtgs.io.atomic import atomic_output
 
 
 def pack_tensors(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
-    """Give the bytes of a safetensors file; the same content gives the same bytes.
-
-    Args:
-        tensors: Tensors by name, on any device.
-        metadata: Texts by name.
-
-    Returns:
-        The bytes.
-
-    Example:
-        >>> import torch
-        >>> tensors, metadata = unpack_tensors(pack_tensors({"a": torch.ones(2)}, {"by": "me"}))
-        >>> tensors["a"].tolist(), metadata
-        ([1.0, 1.0], {'by': 'me'})
-    """
+    """Return the bytes of a safetensors file; the same content gives the same bytes."""
     from safetensors.torch import save  # noqa: PLC0415 (only those who need it load it)
 
     own = {name: values.detach().cpu().contiguous() for name, values in tensors.items()}
@@ -41,17 +27,7 @@ def pack_tensors(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> 
 
 
 def unpack_tensors(content: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read the bytes of a safetensors file.
-
-    Args:
-        content: The bytes.
-
-    Returns:
-        Tensors by name, and texts by name.
-
-    Raises:
-        FileFormatError: The bytes are no safetensors file, or damaged.
-    """
+    """Read the bytes of a safetensors file."""
     from safetensors import SafetensorError  # noqa: PLC0415
     from safetensors.torch import load  # noqa: PLC0415
 
@@ -67,33 +43,13 @@ def unpack_tensors(content: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
 def save_tensors(
     path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
 ) -> None:
-    """Write tensors to a file, completely or not at all; an existing file is replaced.
-
-    Args:
-        path: The file.
-        tensors: Tensors by name.
-        metadata: Texts by name.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write tensors to a file, completely or not at all; an existing file is replaced."""
     with atomic_output(path, overwrite=True) as file:
         file.write(pack_tensors(tensors, metadata))
 
 
 def map_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read tensors from a file without loading what is not looked at.
-
-    Args:
-        path: The file; it must not change as long as the tensors are used.
-
-    Returns:
-        Tensors by name, and texts by name.
-
-    Raises:
-        InputNotFoundError: There is no such file.
-        FileFormatError: It is no safetensors file, or damaged.
-    """
+    """Read tensors from a file without loading what is not looked at."""
     from safetensors import SafetensorError, safe_open  # noqa: PLC0415
 
     if not Path(path).is_file():
@@ -107,38 +63,12 @@ def map_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[s
 
 
 def add_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Put tensors under a common name, to store several groups in one file.
-
-    Args:
-        prefix: What all names are to start with.
-        tensors: Tensors by name.
-
-    Returns:
-        The same tensors by longer names.
-
-    Example:
-        >>> import torch
-        >>> list(add_prefix("net/", {"a": torch.ones(1)}))
-        ['net/a']
-    """
+    """Put tensors under a common name, to store several groups in one file."""
     return {prefix + name: values for name, values in tensors.items()}
 
 
 def under_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Take the tensors of one group, the inverse of :func:`add_prefix`.
-
-    Args:
-        prefix: What their names start with.
-        tensors: Tensors of all groups by name.
-
-    Returns:
-        Those of the group, by name without the prefix.
-
-    Example:
-        >>> import torch
-        >>> list(under_prefix("net/", {"net/a": torch.ones(1), "b": torch.ones(1)}))
-        ['a']
-    """
+    """Take the tensors of one group, the inverse of :func:`add_prefix`."""
     return {
         name.removeprefix(prefix): values
         for name, values in tensors.items()

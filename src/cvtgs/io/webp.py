@@ -10,19 +10,7 @@ from cvtgs.errors import FileFormatError
 
 
 def decode_webp(content: bytes, where: str, *, most_pixels: int) -> UInt8[np.ndarray, "h w 4"]:
-    """Decode an image that stores numbers in its channels.
-
-    Args:
-        content: The image file: WebP, or PNG, which is without loss too.
-        where: What it is, for error texts.
-        most_pixels: Larger images are refused before they are decoded.
-
-    Returns:
-        ``(h, w, 4)`` red, green, blue and opacity.
-
-    Raises:
-        FileFormatError: It is no such image, damaged, or too large.
-    """
+    """Decode an image that stores numbers in its channels."""
     from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 (loads in its time)
 
     try:
@@ -44,19 +32,7 @@ def decode_webp(content: bytes, where: str, *, most_pixels: int) -> UInt8[np.nda
 
 
 def encode_webp(numbers: UInt8[np.ndarray, "h w 4"]) -> bytes:
-    """Write numbers to a lossless image, those below opacity 0 too.
-
-    Args:
-        numbers: ``(h, w, 4)`` four channels.
-
-    Returns:
-        The content of the file.
-
-    Example:
-        >>> numbers = np.arange(16, dtype=np.uint8).reshape(2, 2, 4)
-        >>> bool((decode_webp(encode_webp(numbers), "it", most_pixels=4) == numbers).all())
-        True
-    """
+    """Write numbers to a lossless image, those below opacity 0 too."""
     from PIL import Image  # noqa: PLC0415
 
     file = io.BytesIO()

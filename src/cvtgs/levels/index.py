@@ -99,7 +99,7 @@ class LevelsIndex(_Record):
     levels: tuple[LevelEntry, ...]
 
     def to_json(self) -> str:
-        """Give the index as indented JSON.
+        """Return the index as indented JSON.
 
         Returns:
             JSON text that ends with a line break.
@@ -108,20 +108,7 @@ class LevelsIndex(_Record):
 
 
 def bounding_box(scene: GaussianScene) -> tuple[Corner, Corner]:
-    """Give the box of the centres.
-
-    Args:
-        scene: At least one Gaussian.
-
-    Returns:
-        The least and the largest coordinates.
-
-    Example:
-        >>> from cvtgs.synthetic import scene as make
-        >>> low, high = bounding_box(make("object", 100, sh_degree=0, seed=0))
-        >>> all(a <= b for a, b in zip(low, high, strict=True))
-        True
-    """
+    """Return the box of the centres."""
     low, high = torch.aminmax(scene.means, dim=0)
     return _corner(low), _corner(high)
 

@@ -32,18 +32,7 @@ def level_names(rhos: Sequence[float], suffix: str = ".ply") -> tuple[str, ...]:
 def check_levels(
     folder: str | os.PathLike[str], names: Sequence[str], *, overwrite: bool = False
 ) -> None:
-    """Check that levels could be written, before the long work that comes first.
-
-    Args:
-        folder: Where to; made if its parent is there.
-        names: Names of the files.
-        overwrite: Whether existing files may be replaced.
-
-    Raises:
-        OutputExistsError: A file exists and may not be replaced.
-        OutputError: The folder cannot be made, or not be written to.
-        FileFormatError: The format of a name is unknown or cannot be written.
-    """
+    """Check that levels could be written, before the long work that comes first."""
     place = Path(folder)
     if not place.exists():
         check_output(place)  # its parent is there and writable

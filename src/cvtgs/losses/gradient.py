@@ -9,7 +9,7 @@ from cvtgs.losses.pairs import check_pair
 def gradient_loss(
     prediction: Float[Tensor, "c h w 3"], target: Float[Tensor, "c h w 3"]
 ) -> Float[Tensor, ""]:
-    """Give the mean of ``|dx|`` plus the mean of ``|dy|`` of the image difference.
+    """Return the mean of ``|dx|`` plus the mean of ``|dy|`` of the image difference.
 
     The derivatives are differences of neighbouring pixels, inside the image only: ``w - 1`` of
     them in a row and ``h - 1`` in a column. A constant offset costs nothing, a shifted or

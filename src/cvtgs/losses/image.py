@@ -18,7 +18,7 @@ def image_loss(
     ssim_weight: float = 0.2,
     gradient_weight: float = 0.2,
 ) -> Float[Tensor, ""]:
-    """Give ``(1 - l) L1 + l (1 - SSIM) + l_g (|dx| + |dy|)``, the loss of CVT-GS.
+    """Return ``(1 - l) L1 + l (1 - SSIM) + l_g (|dx| + |dy|)``, the loss of CVT-GS.
 
     The first two terms are those of 3DGS (Kerbl et al. 2023, equation 7); the third is
     :func:`gradient_loss`. A term of weight 0 is not computed.

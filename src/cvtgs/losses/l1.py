@@ -9,7 +9,7 @@ from cvtgs.losses.pairs import check_pair
 def l1_loss(
     prediction: Float[Tensor, "c h w 3"], target: Float[Tensor, "c h w 3"]
 ) -> Float[Tensor, ""]:
-    """Give the mean absolute difference over images, pixels and channels.
+    """Return the mean absolute difference over images, pixels and channels.
 
     Args:
         prediction: ``(c, h, w, 3)`` rendered images.

@@ -9,20 +9,7 @@ from cvtgs.errors import InvalidArgumentError
 def check_pair(
     prediction: Float[Tensor, "c h w 3"], target: Float[Tensor, "c h w 3"], *, least: int = 1
 ) -> None:
-    """Check that two stacks of images can be compared.
-
-    Args:
-        prediction: ``(c, h, w, 3)`` images.
-        target: ``(c, h, w, 3)`` what they should be; same shape, dtype and device.
-        least: Pixels that height and width must have at least.
-
-    Raises:
-        InvalidArgumentError: Shape, dtype, device or size do not fit.
-
-    Example:
-        >>> import torch
-        >>> check_pair(torch.zeros(1, 4, 5, 3), torch.zeros(1, 4, 5, 3), least=4)
-    """
+    """Check that two stacks of images can be compared."""
     for images in (prediction, target):
         if not isinstance(images, Tensor) or not images.is_floating_point():
             raise InvalidArgumentError(

@@ -1,4 +1,4 @@
-"""A loss that makes every picture count alike, the near-perfect ones and the poor ones."""
+"""A loss that makes every image count alike, the near-perfect ones and the poor ones."""
 
 from jaxtyping import Float
 from torch import Tensor
@@ -9,7 +9,7 @@ from cvtgs.math.activations import positive_log
 
 FAINTEST_SQUARED = 1e-5
 FAINTEST_IMAGE = 1e-3
-"""What is added to errors before their logarithm, so that near-perfect pictures count less."""
+"""What is added to errors before their logarithm, so that near-perfect images count less."""
 
 
 def relative_loss(
@@ -20,7 +20,7 @@ def relative_loss(
     image_weight: float = 0.5,
     ssim_weight: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """Give ``w_s log(mse) + w_i log(image_loss) + w_d log(1 - SSIM)``.
+    """Return ``w_s log(mse) + w_i log(image_loss) + w_d log(1 - SSIM)``.
 
     It falls with the PSNR of the images by as much whether they are good or poor.
 

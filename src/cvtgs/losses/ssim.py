@@ -40,29 +40,12 @@ def ssim_loss(
 def mean_ssim(
     prediction: Float[Tensor, "c h w 3"], target: Float[Tensor, "c h w 3"]
 ) -> Float[Tensor, "c"]:
-    """Give the structural similarity (SSIM) of each image (Wang, Bovik, Sheikh, Simoncelli 2004).
+    """Return the structural similarity (SSIM) of each image (Wang, Bovik, Sheikh, Simoncelli 2004).
 
     Window 11 x 11, Gaussian of 1.5 pixels, K1 = 0.01, K2 = 0.03, range of values 1, each channel
     by itself. Border "valid", as in the paper (section III-C, equation 13): only windows inside
     the image count, so the mean is over ``(h - 10) * (w - 10)`` places. Memory: about 12 copies
     of one stack of images, and as much again for the gradient.
-
-    Args:
-        prediction: ``(c, h, w, 3)`` images in [0, 1].
-        target: ``(c, h, w, 3)`` what they should be.
-
-    Returns:
-        ``(c,)`` similarities from -1 to 1, 1 for equal images; differentiable in both.
-
-    Raises:
-        InvalidArgumentError: Shape, dtype or device do not fit, or the images are smaller than
-            the window.
-
-    Example:
-        >>> import torch
-        >>> image = torch.linspace(0, 1, 12 * 13 * 3).reshape(1, 12, 13, 3)
-        >>> round(mean_ssim(image, image).item(), 5)
-        1.0
     """
     check_pair(prediction, target, least=SSIM_WINDOW)
     from kornia.metrics import ssim  # noqa: PLC0415 (half a second)

@@ -62,7 +62,7 @@ def clamp_logits(logits: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def optical_depth_from_logit(logits: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Give the optical depth ``-log(1 - a)`` of Gaussians with opacity ``a = sigmoid(logit)``.
+    """Return the optical depth ``-log(1 - a)`` of Gaussians with opacity ``a = sigmoid(logit)``.
 
     ``-log(1 - sigmoid(x))`` is ``softplus(x)``, which loses no digits at either end.
 
@@ -80,7 +80,7 @@ def optical_depth_from_logit(logits: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]
 
 
 def opacity_from_optical_depth(depths: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Give the opacity ``1 - exp(-tau)``, the inverse of :func:`optical_depth_from_logit`.
+    """Return the opacity ``1 - exp(-tau)``, the inverse of :func:`optical_depth_from_logit`.
 
     Args:
         depths: Optical depths, at least 0.
@@ -129,7 +129,7 @@ def divide(numerator: Float[Tensor, "*n"], denominator: Float[Tensor, "*n"]) -> 
 
 
 def logit_from_optical_depth(depths: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Give the opacity logit of an optical depth, the inverse of :func:`optical_depth_from_logit`.
+    """Return the opacity logit of an optical depth (inverse of :func:`optical_depth_from_logit`).
 
     ``logit(1 - exp(-tau))`` is ``tau + log(1 - exp(-tau))``, which loses no digits at either end.
 

@@ -67,7 +67,7 @@ def decompose(
 
 
 def mean_projected_area(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Give the area of an ellipsoid's shadow, averaged over all directions.
+    """Return the area of an ellipsoid's shadow, averaged over all directions.
 
     By Cauchy's theorem it is a quarter of the surface, which Thomsen's formula (2004)
     approximates: ``pi * (((s1 s2)^p + (s1 s3)^p + (s2 s3)^p) / 3)^(1/p)``, p = 1.6075.
@@ -90,7 +90,7 @@ def mean_projected_area(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
 
 
 def log_mean_projected_area(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Give the logarithm of :func:`mean_projected_area`, for scales of any magnitude.
+    """Return the logarithm of :func:`mean_projected_area`, for scales of any magnitude.
 
     Args:
         log_scales: Natural logarithms of the semi-axes.

@@ -38,7 +38,7 @@ class RobustFrame:
         return (points.double() - self.center) / self.radius
 
     def distances(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Give distances to the centre, in radii.
+        """Return distances to the centre, in radii.
 
         Args:
             points: Finite positions, scene units.

@@ -46,7 +46,7 @@ def multiply(a: Float[Tensor, "n 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, 
 
 
 def to_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """Give the rotation matrices of unit quaternions.
+    """Return the rotation matrices of unit quaternions.
 
     Args:
         quats: Unit quaternions, w first.
@@ -71,7 +71,7 @@ def to_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
 
 
 def from_matrices(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
-    """Give unit quaternions of rotation matrices, with w at least 0.
+    """Return unit quaternions of rotation matrices, with w at least 0.
 
     Of the four ways to write a quaternion by one of its components, the one with the largest
     component is taken (Shepperd 1978), so no digits are lost near half turns.

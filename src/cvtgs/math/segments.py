@@ -110,7 +110,7 @@ def segment_max(
 
 
 def segment_ids(offsets: Int[Tensor, "m_plus_1"]) -> Int[Tensor, "n"]:
-    """Give the segment of every row.
+    """Return the segment of every row.
 
     Args:
         offsets: Where each segment starts, and the end of the last one.

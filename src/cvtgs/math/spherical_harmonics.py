@@ -32,7 +32,7 @@ REST_COUNTS = (0, 3, 8, 15)
 
 
 def degree_of(rest_count: int) -> int:
-    """Give the degree of a scene by its number of view-dependent coefficients per channel.
+    """Return the degree of a scene by its number of view-dependent coefficients per channel.
 
     Args:
         rest_count: Coefficients per channel above the constant one.

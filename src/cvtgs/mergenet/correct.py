@@ -7,8 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cells import Partition
+from cvtgs.cells.context import neighbor_context
 from cvtgs.cells.descriptors import describe_members
-from cvtgs.cells.surroundings import look_around
 from cvtgs.mergenet.compose import compose
 from cvtgs.mergenet.model import MergeNet
 from cvtgs.scene import GaussianScene
@@ -70,7 +70,7 @@ def correct_cells(
     with torch.no_grad():
         step = max(1, CHUNK_MEMBERS // max(1, near))
         for block in (slice(start, start + step) for start in range(0, len(cells), step)):
-            around = look_around(
+            around = neighbor_context(
                 merged, cells=cells[block], neighbors=neighbors[cells[block]], sizes=sizes
             )
             for run, part in several.cut(block).chunks(CHUNK_MEMBERS, cell_cost=near):

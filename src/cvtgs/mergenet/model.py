@@ -66,7 +66,7 @@ class Residuals:
     pair_colors: Float[Tensor, "m k"]
 
     def cost(self) -> Float[Tensor, ""]:
-        """Give the mean square of all changes, each in units of a large one; training pays it.
+        """Return the mean square of all changes, each in units of a large one; training pays it.
 
         Returns:
             A number, 0 for no change.
@@ -195,7 +195,7 @@ def _pool_pairs(pairs: Float[Tensor, "m k w"]) -> tuple[Tensor, Tensor]:
 def _pulls(
     gates: Float[Tensor, "n 5"], places: Float[Tensor, "n 3"], levers: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 6"]:
-    """Give where each would move its cell, and how it would turn it about each axis.
+    """Return where each would move its cell, and how it would turn it about each axis.
 
     What makes a cell turn about an axis is the product of the other two coordinates.
     """

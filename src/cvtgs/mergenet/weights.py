@@ -95,7 +95,7 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
 
 
 def save_checkpoint(net: MergeNet, info: CheckpointInfo) -> bytes:
-    """Give the bytes of a checkpoint file.
+    """Return the bytes of a checkpoint file.
 
     The same network and description give the same bytes.
 

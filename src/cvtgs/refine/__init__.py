@@ -1,4 +1,4 @@
-"""Fine-tune a simplified scene against pictures of the full one."""
+"""Fine-tune a simplified scene against images of the full one."""
 
 from cvtgs.config import RefineConfig
 from cvtgs.refine.refine import Refined, join_reports, refine

@@ -7,18 +7,7 @@ from cvtgs.errors import InvalidArgumentError
 
 
 def check_budget(seconds: float | None, *, steps: int | None) -> None:
-    """Refuse times and numbers of steps that cannot be.
-
-    Args:
-        seconds: Wall-clock seconds, or None.
-        steps: Steps, or None.
-
-    Raises:
-        InvalidArgumentError: Seconds are not a positive number, or steps no positive whole number.
-
-    Example:
-        >>> check_budget(30.0, steps=None)
-    """
+    """Refuse times and numbers of steps that cannot be."""
     if seconds is not None and not 0 < seconds < math.inf:
         raise InvalidArgumentError(
             f"the seconds to refine for must be above 0 and finite, found {seconds!r}."
@@ -31,12 +20,7 @@ def check_budget(seconds: float | None, *, steps: int | None) -> None:
 
 
 class Budget:
-    """Counts steps and seconds, and knows how long one more round may take.
-
-    Args:
-        seconds: Wall-clock seconds from now on; None if time does not matter.
-        steps: Steps at most; None if their number does not matter.
-    """
+    """Counts steps and seconds, and knows how long one more round may take."""
 
     def __init__(self, seconds: float | None, *, steps: int | None) -> None:
         self._start = time.perf_counter()
@@ -57,11 +41,7 @@ class Budget:
         return max(min(int(self.share() * self.total), self.total - 1), min(self.steps, 1))
 
     def share(self) -> float:
-        """Give how much of the budget is used up.
-
-        Returns:
-            From 0 to 1; of steps alone it does not depend on the clock.
-        """
+        """Return how much of the budget is used up."""
         of_steps = self.steps / self._steps if self._steps else 0.0
         elapsed = time.perf_counter() - self._start if self._seconds else 0.0
         return min(1.0, max(of_steps, elapsed / self._seconds if self._seconds else 0.0))
@@ -71,24 +51,17 @@ class Budget:
         self._last = time.perf_counter()
 
     def end(self, kind: str) -> None:
-        """Measure what was done since the last call.
-
-        Args:
-            kind: ``step`` or ``check``.
-        """
+        """Measure what was done since the last call."""
         now = time.perf_counter()
         self._slowest[kind] = max(self._slowest[kind], now - self._last)
         self._last = now
         self.steps += kind == "step"
 
     def spent(self) -> str:
-        """Say what is used up.
+        """Report what is used up.
 
         Time is, where one more step and one more check, as slow as the slowest so far, would not
         fit.
-
-        Returns:
-            ``steps``, ``time``, or nothing.
         """
         if self._steps is not None and self.steps >= self._steps:
             return "steps"

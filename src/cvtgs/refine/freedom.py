@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.cvt import nearest_backend, openness
+from cvtgs.cvt import ambient_visibility, nearest_backend
 from cvtgs.filters import valid_rows
 from cvtgs.math.activations import divide
 from cvtgs.math.frames import robust_frame
@@ -13,37 +13,24 @@ from cvtgs.scene import GaussianScene
 
 @torch.no_grad()
 def freedom(small: GaussianScene, full: GaussianScene) -> Float[Tensor, "n"]:
-    """Tell how far each Gaussian of a simplified scene may move, from 0 to 1.
+    """Return how far each Gaussian of a simplified scene may move, from 0 to 1.
 
-    What is enclosed moves less, by :func:`cvtgs.cvt.openness`, for it may be all that is seen from
+    What is enclosed moves less (:func:`cvtgs.cvt.ambient_visibility`): it may be all one sees from
     elsewhere. A Gaussian that is still what it was in the full scene moves by the share of the mass
     around it that is not its own: where it stands for itself alone it is right from everywhere,
-    and whatever a few pictures gain by moving it is lost in others. What no renderer can draw does
+    and whatever a few images gain by moving it is lost in others. What no renderer can draw does
     not move.
-
-    Args:
-        small: The simplified scene.
-        full: The scene that it was made from, valid rows.
-
-    Returns:
-        The factors, in the dtype of the simplified scene.
-
-    Example:
-        >>> from cvtgs.synthetic import scene as make
-        >>> scene = make("object", 100, sh_degree=0, seed=0)
-        >>> freedom(scene, scene).tolist() == [0.0] * 100
-        True
     """
     valid = valid_rows(small)
     some = small.select(valid)
-    light = openness(some.means, some.masses, robust_frame(some.means))
+    light = ambient_visibility(some.means, some.masses, robust_frame(some.means))
     factors = torch.zeros_like(small.logit_opacities)
     factors[valid] = (light * (1.0 - _own_shares(some, full))).to(small.dtype)
     return factors
 
 
 def _own_shares(small: GaussianScene, full: GaussianScene) -> Float[Tensor, "n"]:
-    """Give the share of the nearest mass that is the Gaussian's own; 0 if it has changed."""
+    """Return the share of the nearest mass that is the Gaussian's own; 0 if it has changed."""
     _, nearest = nearest_backend("auto", small.device)
     labels, _ = nearest(full.means, small.means)
     same = torch.ones_like(labels, dtype=torch.bool)

@@ -36,16 +36,7 @@ class Outlook:
 
 
 def own_outlook(full: GaussianScene, *, config: RefineConfig, seed: int) -> Outlook:
-    """Find views of a scene: a quarter automatic ones, the others from anywhere.
-
-    Args:
-        full: The scene, with valid rows.
-        config: Sizes and numbers of views.
-        seed: Which views.
-
-    Returns:
-        The held-out cameras, and endless ones to learn from, found when they are needed.
-    """
+    """Find views of a scene: a quarter automatic ones, the others from anywhere."""
 
     def batch(number: int, seed: int) -> list[Cameras]:
         return _each(mixed_views(full, number, size=config.size, seed=seed))
@@ -64,19 +55,7 @@ def own_outlook(full: GaussianScene, *, config: RefineConfig, seed: int) -> Outl
 
 
 def given_outlook(cameras: Cameras, *, config: RefineConfig, seed: int) -> Outlook:
-    """Divide given cameras into some that are held out, spread evenly, and the others.
-
-    Args:
-        cameras: At least two cameras; larger pictures are made smaller.
-        config: Size of pictures, and how many are held out at most: no more than every eighth.
-        seed: Order of the others.
-
-    Returns:
-        The cameras; those to learn from come once each.
-
-    Raises:
-        InvalidArgumentError: There are fewer than two.
-    """
+    """Divide given cameras into some that are held out, spread evenly, and the others."""
     if len(cameras) < 2:
         raise InvalidArgumentError(
             f"a refinement needs at least 2 cameras, one of them to be held out; found "

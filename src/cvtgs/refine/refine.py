@@ -11,10 +11,10 @@ from cvtgs.errors import InvalidSceneError
 from cvtgs.filters import valid_rows
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.refine.budget import Budget, check_budget
-from cvtgs.refine.descent import Descent, descend
 from cvtgs.refine.freedom import freedom
+from cvtgs.refine.images import ImageBuffer, take_image
 from cvtgs.refine.looking import Outlook, given_outlook, own_outlook
-from cvtgs.refine.pictures import Album, take_picture
+from cvtgs.refine.optimize import Descent, descend
 from cvtgs.refine.variables import changed_count
 from cvtgs.render.backends import choose_backend
 from cvtgs.report import RefineReport, SimplifyReport, StageClock
@@ -51,20 +51,20 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     frozen: int = 0,
     listener: ProgressListener = silent,
 ) -> Refined:
-    """Fine-tune a simplified scene until pictures of it look more like those of the full one.
+    """Fine-tune a simplified scene until images of it look more like those of the full one.
 
-    One picture of the full scene per step, over a random background; Adam moves the Gaussians
-    that the picture shows. Views that are held out decide: the best scene by their PSNR is
+    One image of the full scene per step, over a random background; Adam moves the Gaussians
+    that the image shows. Views that are held out decide: the best scene by their PSNR is
     returned, which is the one that came in if none is better. Number of Gaussians, SH degree,
-    comments, layout and extra columns stay. Gaussians that no picture shows stay bit for bit, as do
+    comments, layout and extra columns stay. Gaussians that no image shows stay bit for bit, as do
     those that stand for themselves alone.
 
     The same scenes, steps, configuration and seed give the same bits on a CPU; with ``seconds``
     the clock decides how many steps there are. The time includes everything, also the compilation
     of numba's code, some ten seconds, when it is used for the first time on a machine.
 
-    Memory: ten times the small scene, what rendering the full scene takes, and the pictures that
-    are looked at again, at most ``8 * size ** 2 * pictures`` bytes: those of given cameras.
+    Memory: ten times the small scene, what rendering the full scene takes, and the images that
+    are looked at again, at most ``8 * size ** 2 * images`` bytes: those of given cameras.
 
     Args:
         small: The simplified scene; it is not changed.
@@ -110,8 +110,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
 
     with clock.stage(STAGE, budget.total):
         outlook = _outlook(theirs, cameras, config=config, seed=seed)
-        heldout = tuple(take_picture(theirs, camera) for camera in outlook.heldout)
-        album = Album(theirs, outlook, config=config, seed=seed)
+        heldout = tuple(take_image(theirs, camera) for camera in outlook.heldout)
+        album = ImageBuffer(theirs, outlook, config=config, seed=seed)
         free = freedom(ours, theirs)
         free[:frozen] = 0.0
         descent = descend(
@@ -119,7 +119,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         )
     report = RefineReport(
         steps=budget.steps,
-        pictures=album.taken,
+        images=album.taken,
         heldout=len(heldout),
         **_gain(descent),
         changed_count=changed_count(ours, descent.scene),
@@ -132,7 +132,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
 
 
 def join_reports(report: SimplifyReport, refined: Refined) -> SimplifyReport:
-    """Tell in the report of a simplification what was refined afterwards.
+    """Return in the report of a simplification what was refined afterwards.
 
     Args:
         report: What the simplification did.

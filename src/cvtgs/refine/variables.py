@@ -17,13 +17,8 @@ class Variables:
     """A scene as a start plus changes, and the optimiser of the changes.
 
     A step of Adam (Kingma and Ba 2015, as ``SparseAdam`` does it) moves the Gaussians alone that a
-    picture shows, as far as they are free to: all others have no gradient, keep their momentum for
+    image shows, as far as they are free to: all others have no gradient, keep their momentum for
     later, and stay as they are. Memory: five times the scene.
-
-    Args:
-        scene: The simplified scene; it is not changed.
-        rates: Learning rates at the start.
-        freedom: Share of the rates by which each Gaussian moves, 0 to 1.
     """
 
     def __init__(self, scene: GaussianScene, rates: Rates, *, freedom: Float[Tensor, "n"]) -> None:
@@ -48,11 +43,7 @@ class Variables:
         )
 
     def scene(self) -> GaussianScene:
-        """Give the scene, differentiable in the changes.
-
-        Returns:
-            The scene as it is now.
-        """
+        """Return the scene, differentiable in the changes."""
         tensors = {
             name: start + self._changes[name] * self._units[name]
             for name, start in self._start.items()
@@ -60,12 +51,7 @@ class Variables:
         return self._scene.with_tensors(tensors, self._scene.extras)
 
     def step(self, loss: Tensor, *, factor: float) -> None:
-        """Move every Gaussian that has a finite gradient which is not zero.
-
-        Args:
-            loss: What to make small, from :meth:`scene`.
-            factor: Share of the learning rates.
-        """
+        """Move every Gaussian that has a finite gradient which is not zero."""
         if self._optimizer is None or not loss.requires_grad:
             return
         changes = [self._changes[name] for name in self._rates]
@@ -88,12 +74,7 @@ class Variables:
 
     @torch.no_grad()
     def result(self) -> GaussianScene:
-        """Give the scene as it would be saved.
-
-        Returns:
-            Gaussians that were never moved, or moved to where no renderer can draw them, are
-            those of the start, bit for bit; all others have unit quaternions and finite opacities.
-        """
+        """Return the scene as it would be saved."""
         now = standardized(self.scene())
         moved = self._moved & valid_rows(now)
         tensors = {
@@ -104,21 +85,7 @@ class Variables:
 
 
 def changed_count(before: GaussianScene, after: GaussianScene) -> int:
-    """Count the Gaussians that are not what they were.
-
-    Args:
-        before: A scene.
-        after: The same with changes.
-
-    Returns:
-        The number of rows in which a tensor differs.
-
-    Example:
-        >>> from cvtgs.synthetic import scene as make
-        >>> scene = make("object", 10, sh_degree=0, seed=0)
-        >>> changed_count(scene, scene)
-        0
-    """
+    """Count the Gaussians that are not what they were."""
     changed = torch.zeros(len(before), dtype=torch.bool, device=before.device)
     for name, old in before.tensors().items():
         new = after.tensors()[name]
@@ -128,13 +95,13 @@ def changed_count(before: GaussianScene, after: GaussianScene) -> int:
 
 
 def _started(scene: GaussianScene) -> dict[str, Tensor]:
-    """Give the tensors with finite opacities and unit quaternions, which paint the same."""
+    """Return the tensors with finite opacities and unit quaternions, which paint the same."""
     start = with_finite_opacities(scene).tensors()
     return start | {"quats": quaternions.normalize(start["quats"])}
 
 
 def _units(scene: GaussianScene, freedom: Float[Tensor, "n"]) -> dict[str, Tensor]:
-    """Give the length of one unit of change; places are measured in the mean standard deviation."""
+    """Return the length of one unit of change; positions use the mean standard deviation."""
     widths = torch.where(freedom > 0, torch.exp(scene.log_scales).mean(dim=1), 0.0)
     units = {name: _beside(freedom, tensor) for name, tensor in scene.tensors().items()}
     return units | {"means": (freedom * widths)[:, None]}

@@ -1,4 +1,4 @@
-"""Pictures of scenes by the rules of 3DGS, differentiable, on every device.
+"""Images of scenes by the rules of 3DGS, differentiable, on every device.
 
 ``torch`` is the reference backend; ``numba`` on CPUs and ``gsplat`` on CUDA are fast ones, and are
 imported only when they are chosen.

@@ -63,7 +63,7 @@ class SplatArrays(NamedTuple):
     Attributes:
         rows: ``(m,)`` which Gaussian each is.
         starts: ``(m + 1,)`` where its intersections start, if they are by splat.
-        packed: ``(m, 10)`` as :func:`cvtgs.render.painting.pack` describes.
+        packed: ``(m, 10)`` as :func:`cvtgs.render.output.pack` describes.
     """
 
     rows: Ints

@@ -9,7 +9,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError, InvalidArgumentError, MissingDependencyError
 from cvtgs.progress import ProgressListener
-from cvtgs.render.painting import Painting
+from cvtgs.render.output import RasterOutput
 from cvtgs.scene import GaussianScene
 
 BackendName = Literal["auto", "torch", "numba", "gsplat"]
@@ -30,12 +30,12 @@ class Backend(Protocol):
         *,
         sh_degree: int,
         listener: ProgressListener,
-    ) -> Painting:
-        """Render pictures on black; scene and cameras share a device."""
+    ) -> RasterOutput:
+        """Render images on black; scene and cameras share a device."""
         ...
 
     def contributions(self, scene: GaussianScene, camera: Cameras) -> Tensor:
-        """Give the pixels that every Gaussian paints of one picture."""
+        """Return the pixels that every Gaussian paints of one image."""
         ...
 
 

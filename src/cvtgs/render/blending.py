@@ -51,13 +51,6 @@ def composite(packed: Float[Tensor, "m 10"], lists: TileLists) -> Float[Tensor, 
     """Composite every tile.
 
     Memory: the result, and about ten arrays of ``CELLS`` numbers.
-
-    Args:
-        packed: Splats as :func:`cvtgs.render.painting.pack` gives them.
-        lists: Which of them touch each tile.
-
-    Returns:
-        Red, green, blue and depth, each times what it hides, and transmittance of each pixel.
     """
     result = packed.new_zeros(len(lists.starts) - 1, lists.side**2, 5)
     result[..., 4] = 1
@@ -74,21 +67,12 @@ def composite_gradient(
     result: Float[Tensor, "t q 5"],
     grad: Float[Tensor, "t q 5"],
 ) -> Float[Tensor, "m 10"]:
-    """Give the gradient of :func:`composite`, front to back over the same steps.
+    """Return the gradient of :func:`composite`, front to back over the same steps.
 
     Going forward again gives the same transmittances as before, bit for bit; what lies behind a
     splat is the whole minus what lies in front of it. (3DGS goes backward and divides.)
 
     Memory: ten numbers per intersection, and about fifteen arrays of ``CELLS`` numbers.
-
-    Args:
-        packed: Splats.
-        lists: Which of them touch each tile.
-        result: What :func:`composite` gave.
-        grad: Gradient with respect to it.
-
-    Returns:
-        Gradient with respect to the packed splats; the same bits every time.
     """
     behind = (result * grad).sum(dim=2)
     per_entry = packed.new_zeros(len(lists.splats), packed.shape[1])
@@ -169,7 +153,7 @@ def _step(packed: Tensor, lists: TileLists, tiles: Tensor, start: int, light: Te
 
 
 def _light_after(step: Step) -> Float[Tensor, "b q"]:
-    """Give the light behind a step, 0 where the pixel is finished."""
+    """Return the light behind a step, 0 where the pixel is finished."""
     return step.light[:, -1] * (1 - step.alpha[:, -1])
 
 

@@ -32,34 +32,16 @@ _SETTINGS: dict[str, Any] = {
 
 
 def serial(function: F) -> F:
-    """Compile a function when it is first called.
-
-    Args:
-        function: Loops over numpy arrays and numbers.
-
-    Returns:
-        The compiled function, which takes the same arguments.
-    """
+    """Compile a function when it is first called."""
     return cast("F", numba.njit(**_SETTINGS)(function))
 
 
 def parallel(function: F) -> F:
-    """Compile a function whose outer loop runs over :data:`prange`.
-
-    Args:
-        function: Loops over numpy arrays; no two steps of the outer loop write the same place.
-
-    Returns:
-        The compiled function, which takes the same arguments.
-    """
+    """Compile a function whose outer loop runs over :data:`prange`."""
     return cast("F", numba.njit(parallel=True, **_SETTINGS)(function))
 
 
 def use_threads(count: int) -> None:
-    """Limit the threads of compiled functions that are called from this thread.
-
-    Args:
-        count: How many, at least 1; at most as many as numba was started with are used.
-    """
+    """Limit the threads of compiled functions that are called from this thread."""
     most = vars(numba.config)["NUMBA_NUM_THREADS"]
     numba.set_num_threads(max(1, min(count, most)))

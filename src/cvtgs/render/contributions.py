@@ -1,4 +1,4 @@
-"""How much of the pictures of a scene every Gaussian paints."""
+"""How much of the images of a scene every Gaussian paints."""
 
 from collections.abc import Callable
 
@@ -9,19 +9,19 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.render.backends import BackendName, choose_backend
-from cvtgs.render.painting import Painting
+from cvtgs.render.output import RasterOutput
 from cvtgs.scene import GaussianScene
 
 
 def contributions(
     scene: GaussianScene, cameras: Cameras, *, backend: BackendName = "auto"
 ) -> Float[Tensor, "n"]:
-    """Sum what every Gaussian adds to the pixels of some pictures: ``alpha * T``.
+    """Sum what every Gaussian adds to the pixels of some images: ``alpha * T``.
 
     ``T`` is the transmittance of what lies in front (Kerbl et al. 2023, equation 3). Colours do
-    not matter. The sums of all Gaussians add up to the alpha of the pictures.
+    not matter. The sums of all Gaussians add up to the alpha of the images.
 
-    Memory: that of rendering one picture, with its gradient for backends other than ``numba``.
+    Memory: that of rendering one image, with its gradient for backends other than ``numba``.
 
     Args:
         scene: The Gaussians.
@@ -29,7 +29,7 @@ def contributions(
         backend: What renders, as in :func:`cvtgs.render.render`.
 
     Returns:
-        Pixels, float64: 0 for what no picture shows.
+        Pixels, float64: 0 for what no image shows.
 
     Raises:
         InvalidArgumentError: A camera is no pinhole camera, or there is no such backend.
@@ -54,22 +54,13 @@ def contributions(
 
 
 def contributions_by_gradient(
-    rasterize: Callable[..., Painting], scene: GaussianScene, camera: Cameras
+    rasterize: Callable[..., RasterOutput], scene: GaussianScene, camera: Cameras
 ) -> Float[Tensor, "n"]:
-    """Find contributions as the gradient of the picture's sum with respect to the colours.
-
-    Args:
-        rasterize: That of a backend.
-        scene: The Gaussians.
-        camera: One camera.
-
-    Returns:
-        Pixels, float64.
-    """
+    """Find contributions as the gradient of the image's sum with respect to the colours."""
     with torch.enable_grad():
         # Grey, where no colour is clipped, without the bands that do not matter here.
         sh0 = torch.zeros_like(scene.sh0).requires_grad_()
         gray = scene.with_tensors({"sh0": sh0, "shN": scene.shN[:, :0]}, {})
-        picture = rasterize(gray, camera, sh_degree=0).rgb
-        (gradient,) = torch.autograd.grad(picture[..., 0].sum(), sh0)
+        image = rasterize(gray, camera, sh_degree=0).rgb
+        (gradient,) = torch.autograd.grad(image[..., 0].sum(), sh0)
     return gradient[:, 0, 0].double().clamp_min(0.0) / SH_C0

@@ -16,24 +16,17 @@ from cvtgs.errors import DeviceError, MissingDependencyError
 from cvtgs.math.spherical_harmonics import REST_COUNTS, evaluate
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.render.contributions import contributions_by_gradient
-from cvtgs.render.painting import STAGE, Painting
+from cvtgs.render.output import STAGE, RasterOutput
 from cvtgs.render.rules import DILATION, NEAR_PLANE
 from cvtgs.render.views import views_of
 from cvtgs.scene import GaussianScene
 
 
 def require(device: torch.device) -> None:
-    """Check that this backend works on a device, by a tiny picture.
+    """Check that this backend works on a device, by a tiny image.
 
     gsplat imports without CUDA and without a compiler, and fails only when it is used; it may
     also compile its kernels then, which takes minutes, once. The outcome is remembered.
-
-    Args:
-        device: Where the scene is.
-
-    Raises:
-        DeviceError: It is not a CUDA device.
-        MissingDependencyError: gsplat is not installed, or does not work.
     """
     if device.type != "cuda":
         raise DeviceError(
@@ -54,19 +47,10 @@ def rasterize(
     *,
     sh_degree: int,
     listener: ProgressListener = silent,
-) -> Painting:
+) -> RasterOutput:
     """Render with gsplat, in float32, all cameras at once.
 
     Memory: gsplat's, linear in cameras times Gaussians, and in intersections.
-
-    Args:
-        scene: The Gaussians, on a CUDA device.
-        cameras: The cameras, on the same device.
-        sh_degree: Degree up to which colours depend on the direction.
-        listener: Told when the pictures are there.
-
-    Returns:
-        The pictures, differentiable in the scene's tensors, in the scene's dtype.
     """
     views_of(cameras)  # checks them
     listener(ProgressEvent(stage=STAGE, done=0, total=len(cameras)))
@@ -77,24 +61,16 @@ def rasterize(
         alpha = layers[..., :1]
     listener(ProgressEvent(stage=STAGE, done=len(cameras), total=len(cameras)))
     layers, alpha = layers.to(scene.dtype), alpha.to(scene.dtype)
-    return Painting(rgb=layers[..., :3], depth=layers[..., 3], alpha=alpha[..., 0])
+    return RasterOutput(rgb=layers[..., :3], depth=layers[..., 3], alpha=alpha[..., 0])
 
 
 def contributions(scene: GaussianScene, camera: Cameras) -> Tensor:
-    """Give the pixels that every Gaussian paints of one picture.
-
-    Args:
-        scene: The Gaussians.
-        camera: One camera, on the scene's device.
-
-    Returns:
-        ``(n,)`` pixels, float64.
-    """
+    """Return the pixels that every Gaussian paints of one image."""
     return contributions_by_gradient(rasterize, scene, camera)
 
 
 def _paint(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tuple[Tensor, Tensor]:
-    """Give colours with depths, times what they hide, and alpha."""
+    """Return colours with depths, times what they hide, and alpha."""
     rest = scene.shN[:, : REST_COUNTS[sh_degree]]
     if sh_degree:
         colors = torch.cat([scene.sh0, rest], dim=1)
@@ -122,7 +98,7 @@ def _paint(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tuple[Tens
 
 
 def _about_cameras(scene: GaussianScene, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Give means and view matrices about the middle of the cameras, in float64.
+    """Return means and view matrices about the middle of the cameras, in float64.
 
     Far from the origin float32, in which gsplat works, holds neither.
     """

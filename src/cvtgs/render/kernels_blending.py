@@ -17,7 +17,7 @@ STRIDE = 1009
 
 @serial
 def span(low: float, high: float, begin: int, end: int) -> tuple[int, int]:
-    """Give the range of pixels from ``begin`` to ``end`` whose centres lie in an interval."""
+    """Return the range of pixels from ``begin`` to ``end`` whose centres lie in an interval."""
     first = math.ceil(max(low - 0.5 - SLACK, float(begin)))
     last = math.floor(min(high - 0.5 + SLACK, end - 1.0))
     return int(first), int(last) + 1
@@ -25,14 +25,14 @@ def span(low: float, high: float, begin: int, end: int) -> tuple[int, int]:
 
 @serial
 def tile_at(step: int, count: int) -> int:
-    """Give the tile of a step; all tiles come up once."""
+    """Return the tile of a step; all tiles come up once."""
     number = np.int64(step)  # numba's parallel loops count in uint64, which % turns into floats
     return int(number * STRIDE % count if count % STRIDE else number)
 
 
 @serial
 def box_of(tile: int, side: int, size: tuple[int, int]) -> Box:
-    """Give the pixels of a tile."""
+    """Return the pixels of a tile."""
     across = (size[0] + side - 1) // side
     x, y = tile % across * side, tile // across * side
     return x, min(x + side, size[0]), y, min(y + side, size[1])
@@ -40,7 +40,7 @@ def box_of(tile: int, side: int, size: tuple[int, int]) -> Box:
 
 @parallel
 def composite_all(
-    packed: Array, tiles: TileArrays, centers: Array, picture: Array, painted: Array
+    packed: Array, tiles: TileArrays, centers: Array, image: Array, painted: Array
 ) -> None:
     """Write red, green, blue and depth, times what they hide, and transmittance of each pixel.
 
@@ -48,13 +48,13 @@ def composite_all(
     tile paints, by its place.
     """
     starts, lists, side = tiles
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     for step in prange(len(starts) - 1):
         tile = tile_at(step, len(starts) - 1)
         box = box_of(tile, side, (width, height))
         x0, x1, y0, y1 = box
         is_open = np.ones((side, side), np.bool_)
-        light = picture[y0:y1, x0:x1]
+        light = image[y0:y1, x0:x1]
         for y in range(y1 - y0):
             for x in range(x1 - x0):
                 for channel in range(4):

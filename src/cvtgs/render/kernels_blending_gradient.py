@@ -15,23 +15,23 @@ def composite_all_gradient(
     packed: Array,
     tiles: TileArrays,
     centers: Array,
-    picture: Array,
+    image: Array,
     grad: Array,
     per_place: Array,
 ) -> None:
     """Write the gradient with respect to the packed splat of every intersection."""
     starts, lists, side = tiles
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     for step in prange(len(starts) - 1):
         tile = tile_at(step, len(starts) - 1)
         box = box_of(tile, side, (width, height))
         x0, x1, y0, y1 = box
-        light = np.ones((side, side), picture.dtype)
-        behind = np.zeros((side, side), picture.dtype)
+        light = np.ones((side, side), image.dtype)
+        behind = np.zeros((side, side), image.dtype)
         for y in range(y0, y1):
             for x in range(x0, x1):
                 for channel in range(5):
-                    behind[y - y0, x - x0] += picture[y, x, channel] * grad[y, x, channel]
+                    behind[y - y0, x - x0] += image[y, x, channel] * grad[y, x, channel]
         pending = (y1 - y0) * (x1 - x0)
         state = (light, behind)
         for entry in range(starts[tile], starts[tile + 1]):

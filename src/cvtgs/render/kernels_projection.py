@@ -57,7 +57,7 @@ def rest_basis_at(x: float, y: float, z: float, degree: int, out: Array) -> None
 
 @serial
 def axes_of(rotation: Array, log_scales: Array, camera: Array, local: Array, out: Array) -> None:
-    """Write the own axes of a Gaussian in the camera (rows 0 to 2) and in the picture (3, 4)."""
+    """Write the own axes of a Gaussian in the camera (rows 0 to 2) and in the image (3, 4)."""
     x_slope = min(max(local[0] / local[2], camera[6, 0]), camera[6, 1])
     y_slope = min(max(local[1] / local[2], camera[7, 0]), camera[7, 1])
     for k in range(3):
@@ -74,7 +74,7 @@ def axes_of(rotation: Array, log_scales: Array, camera: Array, local: Array, out
 
 @serial
 def covariance_of(axes: Array) -> tuple[float, float, float, float]:
-    """Give a, b, d of the dilated covariance ``(a b; b d)``, and the bare determinant over d."""
+    """Return a, b, d of the dilated covariance ``(a b; b d)``, and the bare determinant over d."""
     a, b, d = DILATION, 0.0, DILATION
     for k in range(3):
         a += axes[3, k] * axes[3, k]
@@ -90,7 +90,7 @@ def covariance_of(axes: Array) -> tuple[float, float, float, float]:
 
 @serial
 def survival_of(axes: Array) -> float:
-    """Give the share of its opacity that an antialiased Gaussian keeps."""
+    """Return the share of its opacity that an antialiased Gaussian keeps."""
     a, _, d, bare = covariance_of(axes)
     return math.sqrt(bare / (bare + DILATION * (a + d - DILATION) / d))
 
@@ -135,7 +135,7 @@ def sigmoid(logit: float) -> float:
 
 @serial
 def splat_of(axes: Array, local: Array, camera: Array, opacity: float, out: Array) -> bool:
-    """Write all of a packed splat but its colour; tell whether it touches the picture."""
+    """Write all of a packed splat but its colour; tell whether it touches the image."""
     a, b, d, bare = covariance_of(axes)
     schur = bare + DILATION * (a + d - DILATION) / d
     x = camera[4, 0] * local[0] / local[2] + camera[5, 0]

@@ -83,7 +83,7 @@ def color_gradient(
 
 @serial
 def covariance_gradient(grad: Array, axes: Array, antialiased: bool) -> tuple[float, float, float]:
-    """Give the gradient by a, b, d of the covariance."""
+    """Return the gradient by a, b, d of the covariance."""
     a, b, d, bare = covariance_of(axes)
     schur = bare + DILATION * (a + d - DILATION) / d
     shear, flat = -b / d, 1 / d

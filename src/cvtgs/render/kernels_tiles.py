@@ -12,7 +12,7 @@ LOG_MIN_ALPHA = math.log(MIN_ALPHA)
 
 @serial
 def pixels(low: float, high: float, count: int) -> tuple[int, int]:
-    """Give the first and the last of ``count`` pixels whose centres lie in an interval."""
+    """Return the first and the last of ``count`` pixels whose centres lie in an interval."""
     slack = SLACK + 1e-6 * (high - low)
     first = math.ceil(min(max(low - 0.5 - slack, 0.0), float(count)))
     last = math.floor(min(max(high - 0.5 + slack, -1.0), count - 1.0))
@@ -23,7 +23,7 @@ def pixels(low: float, high: float, count: int) -> tuple[int, int]:
 def strip(
     splat: Array, reach: float, size: tuple[int, int], rows: tuple[int, int]
 ) -> tuple[int, int]:
-    """Give the first and the last pixel column that a splat reaches within some pixel rows."""
+    """Return the first and the last pixel column that a splat reaches within some pixel rows."""
     x, y = float(splat[0]), float(splat[1])
     steep, shear, flat = -2.0 * splat[2], float(splat[3]), -2.0 * splat[4]
     upper, lower = rows[0] + 0.5 - y, rows[1] + 0.5 - y

@@ -20,7 +20,7 @@ from cvtgs.render.kernels_blending_gradient import composite_all_gradient
 from cvtgs.render.kernels_projection import project_all
 from cvtgs.render.kernels_projection_gradient import project_all_gradient
 from cvtgs.render.kernels_tiles import count_tiles, name_tiles, sort_by_tile
-from cvtgs.render.painting import Painting, paint_each
+from cvtgs.render.output import RasterOutput, paint_each
 from cvtgs.render.views import View, views_of
 from cvtgs.scene import GaussianScene
 
@@ -29,17 +29,7 @@ SIDE = 16
 
 
 def require(device: torch.device) -> None:
-    """Check that this backend can work on a device.
-
-    Args:
-        device: Where the scene is.
-
-    Raises:
-        DeviceError: It is not the CPU.
-
-    Example:
-        >>> require(torch.device("cpu"))
-    """
+    """Check that this backend can work on a device."""
     if device.type != "cpu":
         raise DeviceError(
             f"backend 'numba' works on the CPU only, found a scene on {device}; "
@@ -53,7 +43,7 @@ def rasterize(
     *,
     sh_degree: int,
     listener: ProgressListener = silent,
-) -> Painting:
+) -> RasterOutput:
     """Render with compiled loops, on as many threads as torch uses.
 
     The first call compiles for some five seconds per dtype, and as long again in the first
@@ -62,16 +52,7 @@ def rasterize(
     loop; ``OMP_WAIT_POLICY=PASSIVE``, set before Python starts, saves that processor time.
 
     Memory: ``11 n`` numbers for n Gaussians, ``12 p`` bytes for p intersections of splats and
-    tiles, and the picture. The backward pass needs ``10 p`` numbers at a time.
-
-    Args:
-        scene: The Gaussians, on the CPU.
-        cameras: The cameras, on the CPU.
-        sh_degree: Degree up to which colours depend on the direction.
-        listener: Told about each camera.
-
-    Returns:
-        The pictures, differentiable in the scene's tensors.
+    tiles, and the image. The backward pass needs ``10 p`` numbers at a time.
     """
     use_threads(torch.get_num_threads())
     tensors = [tensor.contiguous() for tensor in scene.tensors().values()]
@@ -85,39 +66,31 @@ def rasterize(
 
 
 def contributions(scene: GaussianScene, camera: Cameras) -> Float[Tensor, "n"]:
-    """Give the pixels that every Gaussian paints of one picture, by one forward pass.
-
-    Args:
-        scene: The Gaussians, on the CPU.
-        camera: One camera, on the CPU.
-
-    Returns:
-        Pixels, float64.
-    """
+    """Return the pixels that every Gaussian paints of one image, by one forward pass."""
     use_threads(torch.get_num_threads())
     found = np.zeros(len(scene))
     arrays = {name: tensor.detach().contiguous() for name, tensor in scene.tensors().items()}
     gaussians = GaussianArrays(*(tensor.numpy() for tensor in arrays.values()))
     for view in views_of(camera):
         splats, tiles = _listed(gaussians, Setting(_numbers(view), view.size, 0, scene.antialiased))
-        picture = np.empty((view.size[1], view.size[0], 5), splats.packed.dtype)
+        image = np.empty((view.size[1], view.size[0], 5), splats.packed.dtype)
         painted = np.zeros(len(tiles.lists))
-        composite_all(splats.packed, tiles, _centers(picture), picture, painted)
+        composite_all(splats.packed, tiles, _centers(image), image, painted)
         sums = np.concatenate([[0.0], np.cumsum(painted)])[splats.starts]
         found[splats.rows] += np.diff(sums)
     return torch.from_numpy(found)
 
 
 class _Render(torch.autograd.Function):
-    """One picture. The backward pass uses the lists of the forward pass, and blends once more."""
+    """One image. The backward pass uses the lists of the forward pass, and blends once more."""
 
     @staticmethod
     def forward(ctx: Any, setting: Setting, *tensors: Tensor) -> Float[Tensor, "h w 5"]:
         gaussians = GaussianArrays(*(tensor.detach().numpy() for tensor in tensors))
         splats, tiles = _listed(gaussians, setting)
-        picture = np.empty((setting.size[1], setting.size[0], 5), splats.packed.dtype)
-        composite_all(splats.packed, tiles, _centers(picture), picture, np.empty(0))
-        result = torch.from_numpy(picture)
+        image = np.empty((setting.size[1], setting.size[0], 5), splats.packed.dtype)
+        composite_all(splats.packed, tiles, _centers(image), image, np.empty(0))
+        result = torch.from_numpy(image)
         ctx.save_for_backward(result, *tensors)
         ctx.setting, ctx.splats, ctx.tiles = setting, splats, tiles
         return result
@@ -126,12 +99,12 @@ class _Render(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         use_threads(torch.get_num_threads())
-        picture, *arrays = (tensor.detach().numpy() for tensor in ctx.saved_tensors)
+        image, *arrays = (tensor.detach().numpy() for tensor in ctx.saved_tensors)
         gaussians = GaussianArrays(*arrays)
-        per_place = np.zeros((len(ctx.tiles.lists), 10), picture.dtype)
-        of_picture = grad.contiguous().numpy()
+        per_place = np.zeros((len(ctx.tiles.lists), 10), image.dtype)
+        of_image = grad.contiguous().numpy()
         composite_all_gradient(
-            ctx.splats.packed, ctx.tiles, _centers(picture), picture, of_picture, per_place
+            ctx.splats.packed, ctx.tiles, _centers(image), image, of_image, per_place
         )
         gradients = GaussianArrays(*(np.zeros_like(array) for array in arrays))
         project_all_gradient(gaussians, ctx.setting, ctx.splats, per_place, gradients)
@@ -163,6 +136,6 @@ def _numbers(view: View) -> NDArray[np.float64]:
     return np.array([*view.rotation, view.center, *((*pair, 0.0) for pair in pairs)])
 
 
-def _centers(picture: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Give the coordinates of pixel centres, in the picture's dtype."""
-    return (np.arange(max(picture.shape[:2])) + 0.5).astype(picture.dtype)
+def _centers(image: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the coordinates of pixel centres, in the image's dtype."""
+    return (np.arange(max(image.shape[:2])) + 0.5).astype(image.dtype)

@@ -1,4 +1,4 @@
-"""Project Gaussians onto a picture, in differentiable torch operations."""
+"""Project Gaussians onto an image, in differentiable torch operations."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from cvtgs.scene import GaussianScene
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Splats:
-    """Gaussians as they lie in one picture, front to back.
+    """Gaussians as they lie in one image, front to back.
 
     With ``(u, v)`` the way from the centre to a pixel, the squared distance in standard deviations
     is ``steep (u + shear v)^2 + flat v^2``. That is the conic of 3DGS, ``A u^2 + 2 B u v + C v^2``,
@@ -42,24 +42,16 @@ def project(scene: GaussianScene, view: View, sh_degree: int) -> Splats:
 
     The covariance is ``M M^T + 0.3 I`` with ``M = J W R S``; its determinant comes from the minors
     of ``M`` (Cauchy-Binet), which needs no difference of large numbers. Gaussians behind the near
-    plane, outside the picture, too faint, or with values that are not finite, are left out.
+    plane, outside the image, too faint, or with values that are not finite, are left out.
 
     Memory with gradients: about ``(150 + 6 k) n`` numbers for n Gaussians in view with k rest
     coefficients.
-
-    Args:
-        scene: The Gaussians.
-        view: The camera.
-        sh_degree: Degree up to which colours depend on the direction.
-
-    Returns:
-        What is in view, by depth; equal depths keep the order of the scene.
     """
     rows = _candidates(scene, view)
     offsets = _offsets(scene.means.index_select(0, rows), view)
     rotation = scene.means.new_tensor(view.rotation)
     local = offsets @ rotation.T
-    axes = _picture_axes(scene, rows, local, view)
+    axes = _image_axes(scene, rows, local, view)
     ellipses, survival = _ellipses(axes)
     opacities = activations.opacity_from_logit(scene.logit_opacities.index_select(0, rows))
     if scene.antialiased:
@@ -79,18 +71,7 @@ def project(scene: GaussianScene, view: View, sh_degree: int) -> Splats:
 
 @torch.no_grad()
 def reach_of(opacities: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
-    """Tell how far Gaussians paint: the squared distance at which alpha falls to 1/255.
-
-    Args:
-        opacities: At the centre.
-
-    Returns:
-        Squared standard deviations; 0 for those that paint nothing.
-
-    Example:
-        >>> [round(reach, 2) for reach in reach_of(torch.tensor([1.0, 0.001])).tolist()]
-        [11.08, 0.0]
-    """
+    """Return how far Gaussians paint: the squared distance at which alpha falls to 1/255."""
     return (2 * activations.positive_log(opacities / MIN_ALPHA)).clamp_min(0)
 
 
@@ -98,28 +79,20 @@ def reach_of(opacities: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
 def half_sizes(
     ellipses: Float[Tensor, "m 3"], reach: Float[Tensor, "m"]
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
-    """Give half the width and height of the boxes around ellipses.
-
-    Args:
-        ellipses: Steep, shear, flat.
-        reach: Squared standard deviations.
-
-    Returns:
-        Half widths and half heights, pixels.
-    """
+    """Return half the width and height of the boxes around ellipses."""
     steep, shear, flat = ellipses.unbind(1)
     return (reach / steep + reach * shear * shear / flat).sqrt(), (reach / flat).sqrt()
 
 
 def _offsets(means: Float[Tensor, "n 3"], view: View) -> Float[Tensor, "n 3"]:
-    """Give ways from the camera; far from the origin float32 holds them, but not the camera."""
+    """Return ways from the camera; far from the origin float32 holds them, but not the camera."""
     center = torch.tensor(view.center, dtype=torch.float64, device=means.device)
     return (means.double() - center).to(means.dtype)
 
 
 @torch.no_grad()
 def _candidates(scene: GaussianScene, view: View) -> Tensor:
-    """Leave out what cannot be in the picture, by a ball around each Gaussian."""
+    """Leave out what cannot be in the image, by a ball around each Gaussian."""
     rotation = scene.means.new_tensor(view.rotation)
     x, y, z = (_offsets(scene.means, view) @ rotation.T).unbind(1)
     steepest = sum(max(abs(low), abs(high)) ** 2 for low, high in view.slopes)
@@ -140,10 +113,10 @@ def _candidates(scene: GaussianScene, view: View) -> Tensor:
     return keep.nonzero()[:, 0]
 
 
-def _picture_axes(
+def _image_axes(
     scene: GaussianScene, rows: Tensor, local: Tensor, view: View
 ) -> Float[Tensor, "m 2 3"]:
-    """Give ``M = J W R S``: the own axes of each Gaussian, to first order in the picture."""
+    """Return ``M = J W R S``: the own axes of each Gaussian, to first order in the image."""
     quats = quaternions.normalize(scene.quats.index_select(0, rows))
     turned = scene.means.new_tensor(view.rotation) @ quaternions.to_matrices(quats)
     low, high = scene.means.new_tensor(view.slopes).unbind(1)
@@ -154,7 +127,7 @@ def _picture_axes(
 
 
 def _ellipses(axes: Float[Tensor, "m 2 3"]) -> tuple[Tensor, Tensor]:
-    """Give ellipses, and what share of its opacity an antialiased Gaussian keeps.
+    """Return ellipses, and what share of its opacity an antialiased Gaussian keeps.
 
     With the covariance ``(a b; b d)``: steep is ``d / det``, shear ``-b / d``, flat ``1 / d``.
     Dividing one row of ``M`` by ``sqrt(d)`` first keeps the determinant within float32.
@@ -174,7 +147,7 @@ def _ellipses(axes: Float[Tensor, "m 2 3"]) -> tuple[Tensor, Tensor]:
 def _front_to_back(
     centers: Tensor, ellipses: Tensor, opacities: Tensor, depths: Tensor, view: View
 ) -> Tensor:
-    """Order what touches the picture by depth."""
+    """Order what touches the image by depth."""
     keep = (opacities >= MIN_ALPHA) & torch.isfinite(ellipses).all(dim=1)
     halves = half_sizes(ellipses, reach_of(opacities))
     for place, half, size in zip(centers.unbind(1), halves, view.size, strict=True):

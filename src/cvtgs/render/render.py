@@ -1,4 +1,4 @@
-"""The public entry: pictures of a scene, differentiable in everything that the scene is."""
+"""The public entry: images of a scene, differentiable in everything that the scene is."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import activations
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.render.backends import BackendName, choose_backend
-from cvtgs.render.painting import Painting
+from cvtgs.render.output import RasterOutput
 from cvtgs.scene import GaussianScene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rendering:
-    """Pictures of a scene.
+    """Images of a scene.
 
     Attributes:
         rgb: ``(c, h, w, 3)`` red, green, blue over the background; at least 0, and above 1 where
@@ -50,7 +50,7 @@ def render(
     1/255 skipped, front to back until the transmittance would fall under 1e-4. Scenes tagged
     ``SplatRenderMode: mip`` get the opacity compensation of Mip-Splatting (Yu et al. 2024). Where
     3DGS cuts a Gaussian at three standard deviations, rounded up to tiles, this ends where alpha
-    falls under 1/255, so that no picture depends on tiles.
+    falls under 1/255, so that no image depends on tiles.
 
     The result is differentiable in means, quats, log scales, opacity logits, sh0, shN and in the
     background; cameras are constants. Gaussians whose place, shape or opacity is not
@@ -59,7 +59,7 @@ def render(
     Memory: cameras are rendered one by one; each backend's ``rasterize`` states its formula.
 
     Args:
-        scene: The Gaussians; their device and dtype are those of the pictures.
+        scene: The Gaussians; their device and dtype are those of the images.
         cameras: From where to look, any dtype and device.
         backend: ``torch``, ``numba`` (CPU), ``gsplat`` (CUDA) or ``auto``, the fastest of them
             that works on the scene's device.
@@ -69,7 +69,7 @@ def render(
         listener: Told about each camera.
 
     Returns:
-        The pictures.
+        The images.
 
     Raises:
         InvalidArgumentError: A camera is no pinhole camera, the background has another shape,
@@ -130,12 +130,12 @@ def _background(
     return background.to(device=scene.device, dtype=scene.dtype).reshape(-1, 3)
 
 
-def _over(painting: Painting, background: Tensor | None) -> Float[Tensor, "c h w 3"]:
+def _over(painting: RasterOutput, background: Tensor | None) -> Float[Tensor, "c h w 3"]:
     if background is None:
         return painting.rgb.contiguous()
     through = 1 - painting.alpha
     return painting.rgb + through[..., None] * background[:, None, None]
 
 
-def _mean_depth(painting: Painting) -> Float[Tensor, "c h w"]:
+def _mean_depth(painting: RasterOutput) -> Float[Tensor, "c h w"]:
     return activations.divide(painting.depth, torch.where(painting.alpha > 0, painting.alpha, 1))

@@ -7,7 +7,7 @@ DILATION = 0.3
 """Variance that every projected Gaussian gains, squared pixels."""
 
 FRUSTUM_MARGIN = 0.3
-"""The Jacobian is taken no farther outside the picture than this share of half its size."""
+"""The Jacobian is taken no farther outside the image than this share of half its size."""
 
 MAX_ALPHA = 0.99
 """No single Gaussian hides more than this."""

@@ -1,4 +1,4 @@
-"""Which splats touch which square tiles of a picture, without a loop over splats."""
+"""Which splats touch which square tiles of an image, without a loop over splats."""
 
 from dataclasses import dataclass
 
@@ -42,14 +42,6 @@ def intersect(splats: Splats, size: tuple[int, int], side: int) -> TileLists:
     of tiles that it crosses, and the ellipse's extent within each row gives the tiles.
 
     Memory: about 60 bytes per intersection and 100 per splat.
-
-    Args:
-        splats: What is in view, front to back.
-        size: Width and height of the picture.
-        side: Pixels along a tile's edge.
-
-    Returns:
-        The lists.
     """
     width, height = size
     across, down = -(-width // side), -(-height // side)
@@ -93,7 +85,7 @@ def _strips(
 
 
 def _extent(ellipses: Tensor, reach: Tensor, upper: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
-    """Give how far ellipses go left and right between two heights, all relative to the centre.
+    """Return how far ellipses go left and right between two heights, all relative to the centre.
 
     The right edge is a concave function of the height: it is largest at the ellipse's rightmost
     point, or at the end that is nearest to it.
@@ -111,7 +103,7 @@ def _extent(ellipses: Tensor, reach: Tensor, upper: Tensor, lower: Tensor) -> tu
 
 
 def _pixels(low: Tensor, high: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Give the first and the last of ``count`` pixels whose centres lie in an interval."""
+    """Return the first and the last of ``count`` pixels whose centres lie in an interval."""
     slack = _SLACK + 1e-6 * (high - low)
     first = (low - 0.5 - slack).ceil().clamp(0, count)
     last = (high - 0.5 + slack).floor().clamp(-1, count - 1)

@@ -12,7 +12,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.render.blending import composite, composite_gradient
 from cvtgs.render.contributions import contributions_by_gradient
-from cvtgs.render.painting import Painting, pack, paint_each
+from cvtgs.render.output import RasterOutput, pack, paint_each
 from cvtgs.render.projection import project
 from cvtgs.render.tiles import TileLists, intersect
 from cvtgs.render.views import View, views_of
@@ -25,14 +25,7 @@ _TILE_ELSEWHERE = 16
 
 
 def require(device: torch.device) -> None:
-    """Check that this backend can work on a device: it can on every one.
-
-    Args:
-        device: Where the scene is.
-
-    Example:
-        >>> require(torch.device("cpu"))
-    """
+    """Check that this backend can work on a device: it can on every one."""
 
 
 def rasterize(
@@ -41,22 +34,13 @@ def rasterize(
     *,
     sh_degree: int,
     listener: ProgressListener = silent,
-) -> Painting:
+) -> RasterOutput:
     """Render with torch operations only.
 
     Memory: for p intersections of splats and tiles, ``60 p`` bytes while they are listed, and
     about ``10 * CELLS`` numbers while a batch is composited (see :mod:`cvtgs.render.blending`).
     With gradients each camera also keeps what its projection keeps, ``30 p`` bytes and the
-    picture; its backward pass needs ``10 p`` numbers at a time.
-
-    Args:
-        scene: The Gaussians.
-        cameras: The cameras, on the scene's device.
-        sh_degree: Degree up to which colours depend on the direction.
-        listener: Told about each camera.
-
-    Returns:
-        The pictures, differentiable in the scene's tensors.
+    image; its backward pass needs ``10 p`` numbers at a time.
     """
     blank = scene.means.new_zeros(0, cameras.height, cameras.width, 5)
     views = [partial(_paint, scene, view, sh_degree) for view in views_of(cameras)]
@@ -64,15 +48,7 @@ def rasterize(
 
 
 def contributions(scene: GaussianScene, camera: Cameras) -> Tensor:
-    """Give the pixels that every Gaussian paints of one picture.
-
-    Args:
-        scene: The Gaussians.
-        camera: One camera, on the scene's device.
-
-    Returns:
-        ``(n,)`` pixels, float64.
-    """
+    """Return the pixels that every Gaussian paints of one image."""
     return contributions_by_gradient(rasterize, scene, camera)
 
 

@@ -33,7 +33,7 @@ class View:
         """Bounds of x/z and of y/z, within which the Jacobian of the projection is taken.
 
         With the principal point in the middle they are 1.3 times the tangent of half the field of
-        view, as in 3DGS; elsewhere they move with the edges of the picture, as in gsplat.
+        view, as in 3DGS; elsewhere they move with the edges of the image, as in gsplat.
         """
         (x_low, x_high), (y_low, y_high) = (
             (
@@ -46,23 +46,7 @@ class View:
 
 
 def views_of(cameras: Cameras) -> list[View]:
-    """Turn cameras into views.
-
-    Args:
-        cameras: The cameras, anywhere.
-
-    Returns:
-        One view per camera.
-
-    Raises:
-        InvalidArgumentError: A camera is not a pinhole camera, or its matrix has no inverse.
-
-    Example:
-        >>> eye = torch.eye(4)[None]
-        >>> Ks = torch.tensor([[[9.0, 0, 4], [0, 9, 4], [0, 0, 1]]])
-        >>> views_of(Cameras(viewmats=eye, Ks=Ks, width=8, height=8))[0].focal
-        (9.0, 9.0)
-    """
+    """Turn cameras into views."""
     viewmats = cameras.viewmats.detach().double().cpu()
     Ks = cameras.Ks.detach().double().cpu()  # noqa: N806 (the name that gsplat gives it)
     _check(viewmats, Ks)

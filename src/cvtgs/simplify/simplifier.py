@@ -13,7 +13,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import target_count
 from cvtgs.devices import chosen_device, resolve_device
-from cvtgs.effects import limited, pictured, restored, trimmed
+from cvtgs.effects import imaged, limited, restored, trimmed
 from cvtgs.errors import ConfigError, InvalidArgumentError
 from cvtgs.mergenet import SHIPPED, Checkpoint, MergeNet, load_checkpoint
 from cvtgs.progress import ProgressListener, silent
@@ -223,7 +223,7 @@ class Simplifier:
         )
         whole = restored(small, scene, facts["plan"])
         simplified = Simplified(whole.to(scene.device), report)
-        if not self.config.refine.asked_for or len(small) == len(scene):
+        if not self.config.refine.enabled or len(small) == len(scene):
             return simplified
         return self._refined(simplified, scene, cameras)
 
@@ -235,7 +235,7 @@ class Simplifier:
         plan, choices = simplified.report.plan, self.config.effects
         ours, theirs = (limited(scene, choices) for scene in (simplified.scene, full))
         if plan is not None:
-            used = pictured if simplified.report.kept_count else trimmed
+            used = imaged if simplified.report.kept_count else trimmed
             ours, theirs = used(ours, plan), used(theirs, plan)
         refined = refine(
             ours,

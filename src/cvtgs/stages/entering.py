@@ -16,17 +16,7 @@ from cvtgs.stages.outlook import Outlook
 
 
 def check_rows(scene: GaussianScene) -> tuple[GaussianScene, dict[str, Any]]:
-    """Drop rows with NaN, infinite or zero values where there must be none, and warn.
-
-    Args:
-        scene: The Gaussians.
-
-    Returns:
-        The valid rows, and what the report says of the others.
-
-    Raises:
-        InvalidSceneError: No row is valid.
-    """
+    """Drop rows with NaN, infinite or zero values where there must be none, and warn."""
     if len(scene) == 0:
         raise InvalidSceneError("a scene needs at least one Gaussian to be simplified; found none.")
     invalid = filters.invalid_rows(scene)
@@ -53,17 +43,7 @@ def check_rows(scene: GaussianScene) -> tuple[GaussianScene, dict[str, Any]]:
 def entering_rows(
     scene: GaussianScene, outlook: Outlook, target: int, config: SimplifyConfig
 ) -> tuple[Tensor, dict[str, Any]]:
-    """Leave out faint Gaussians and flyaways, but never more than can be spared.
-
-    Args:
-        scene: The Gaussians, with valid rows.
-        outlook: What each paints.
-        target: Number of Gaussians that must be left.
-        config: Every choice.
-
-    Returns:
-        The rows that stay, in ascending order, and what the report says of the others.
-    """
+    """Leave out faint Gaussians and flyaways, but never more than can be spared."""
     opacities = scene.opacities
     plan = outlook.plan
     if plan.visibility.active:
@@ -94,16 +74,7 @@ def _without_faint(
 
 
 def left_out_facts(scene: GaussianScene, outlook: Outlook, left_out: Tensor) -> dict[str, Any]:
-    """Give what the report says of Gaussians that are left out.
-
-    Args:
-        scene: The Gaussians, with valid rows.
-        outlook: What each paints.
-        left_out: Mask of those that are left out.
-
-    Returns:
-        The facts.
-    """
+    """Return what the report says of Gaussians that are left out."""
     masses = outlook.areas * scene.opacities
     share = divide(masses[left_out].sum(), masses.sum())
     return {"filtered_count": int(left_out.sum()), "filtered_mass_share": float(share)}

@@ -66,15 +66,6 @@ def run_levels(
     the finest, which are few, and merges all Gaussians in them, so its cells are made of whole
     finest ones. A size with more than a quarter of the finest cells gets a tessellation of its
     own: there whole cells are too coarse to build with.
-
-    Args:
-        prepared: The scene, and how to run the stages on it.
-        targets: Numbers of Gaussians to keep, in descending order.
-        clock: Gives a clock for every size.
-        on_grouping: Given the cells of every size that has fewer than valid Gaussians.
-
-    Returns:
-        Every size, in the order of the targets.
     """
     results: list[Sized] = []
     finest: Grouping | None = None
@@ -106,7 +97,7 @@ def run_levels(
 
 
 def _distance(grouping: Grouping, small: GaussianScene, *, masses: Float[Tensor, "n"]) -> float:
-    """Give the root mean square distance from Gaussians to what stands for them."""
+    """Return the root mean square distance from Gaussians to what stands for them."""
     partition, squares, total = grouping.partition, 0.0, 0.0
     ids = segment_ids(partition.offsets)
     for rows, cell in zip(partition.order.split(CHUNK), ids.split(CHUNK), strict=True):
@@ -162,7 +153,7 @@ def _made_of(
 
 
 def _composed(fine: cells.Partition, rows: Tensor, labels: Tensor, count: int) -> cells.Partition:
-    """Give the members of cells that consist of fine cells."""
+    """Return the members of cells that consist of fine cells."""
     coarse = torch.empty_like(labels)
     coarse[rows] = labels
     local = cells.Partition.from_labels(torch.repeat_interleave(coarse, fine.counts), count)

@@ -23,21 +23,7 @@ def merge_groups(
     backend: str,
     on_cells: Callable[[int], None],
 ) -> tuple[GaussianScene, cells.Partition, Tensor]:
-    """Merge every cell, settle its axes, and widen what must cover its cell.
-
-    Args:
-        valid: The Gaussians, with valid rows.
-        partition: Row numbers of every cell.
-        config: How a cell becomes one Gaussian.
-        areas: Mean projected areas of the Gaussians.
-        with_neighbors: Whether a network will ask for the neighbours.
-        backend: What searches them.
-        on_cells: Told how many cells are done.
-
-    Returns:
-        One Gaussian per cell, the members that each stands for, and the ``(m, k)`` nearest other
-        cells of each; k is 0 if nobody asks.
-    """
+    """Merge every cell, settle its axes, and widen what must cover its cell."""
     merged, shown = merge_members(valid, partition, config, areas=areas, on_cells=on_cells)
     near = neighbors_asked(config, with_network=with_neighbors)
     neighbors = cvt.nearest_neighbors(merged.means, near, backend=backend)
@@ -52,35 +38,16 @@ def merge_members(
     areas: Float[Tensor, "n"],
     on_cells: Callable[[int], None] = lambda _: None,
 ) -> tuple[GaussianScene, cells.Partition]:
-    """Merge every cell, as far as it takes nothing but its members.
-
-    Args:
-        valid: The Gaussians, with valid rows.
-        partition: Row numbers of every cell.
-        config: How a cell becomes one Gaussian.
-        areas: Mean projected areas of the Gaussians.
-        on_cells: Told how many cells are done.
-
-    Returns:
-        One Gaussian per cell, and the members that each stands for.
-    """
+    """Merge every cell, as far as it takes nothing but its members."""
     merged = cells.merge_cells(valid, partition, config=config, on_cells=on_cells)
-    if not config.lone_members:
+    if not config.representatives:
         return merged, partition
-    return cells.keep_lone_members(valid, merged, partition, areas=areas)
+    return cells.keep_representatives(valid, merged, partition, areas=areas)
 
 
 def neighbors_asked(config: MergeConfig, *, with_network: bool) -> int:
-    """Give the number of neighbours that are asked for.
-
-    Args:
-        config: How a cell becomes one Gaussian.
-        with_network: Whether a network will ask for them.
-
-    Returns:
-        0 if nobody asks.
-    """
-    widens = config.widening > 0.0 or config.covered_widening > 0.0
+    """Return the number of neighbours that are asked for."""
+    widens = config.inflation > 0.0 or config.covered_inflation > 0.0
     return NEIGHBORS if widens or with_network else 0
 
 
@@ -90,25 +57,14 @@ def shape_cells(
     neighbors: Int[Tensor, "m k"],
     config: MergeConfig,
 ) -> GaussianScene:
-    """Settle the axes of merged Gaussians, and widen what must cover its cell.
-
-    Args:
-        merged: One Gaussian per cell, those of the partition first; others that follow are there
-            as neighbours.
-        shown: The members that each stands for; how many, not which, is asked.
-        neighbors: The nearest other cells of every cell of the partition.
-        config: How a cell becomes one Gaussian.
-
-    Returns:
-        The scene; Gaussians beyond the partition are as they were.
-    """
-    merged = cells.settle_frames(merged, shown, neighbors)
-    if config.widening > 0.0 or config.covered_widening > 0.0:
-        merged = cells.widen_cells(
+    """Settle the axes of merged Gaussians, and widen what must cover its cell."""
+    merged = cells.align_axes(merged, shown, neighbors)
+    if config.inflation > 0.0 or config.covered_inflation > 0.0:
+        merged = cells.inflate_cells(
             merged,
             shown,
             neighbors,
-            everywhere=config.widening,
-            covered=config.covered_widening,
+            everywhere=config.inflation,
+            covered=config.covered_inflation,
         )
     return merged

@@ -8,7 +8,7 @@ from torch import Tensor
 from cvtgs import cvt
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig, TessellationConfig, VisibilityConfig
-from cvtgs.effects import EffectPlan, pictured, plan_effects
+from cvtgs.effects import EffectPlan, imaged, plan_effects
 from cvtgs.io.ply.properties import lacks_third_scale
 from cvtgs.math import activations
 from cvtgs.math.frames import RobustFrame, robust_frame
@@ -24,7 +24,7 @@ class Outlook(NamedTuple):
     Attributes:
         frame: Centre and radius of the scene.
         areas: ``(n,)`` mean projected areas, squared scene units.
-        seen_areas: ``(n,)`` the same as they look in pictures; smaller for what is far or hidden.
+        seen_areas: ``(n,)`` the same as they look in images; smaller for what is far or hidden.
         light: ``(n,)`` how freely every Gaussian can be seen, 0 to 1; empty if nobody asks.
         plan: What the scene calls for.
     """
@@ -36,24 +36,17 @@ class Outlook(NamedTuple):
     plan: EffectPlan
 
     def select(self, rows: Tensor) -> Self:
-        """Keep what is known of some Gaussians.
-
-        Args:
-            rows: Row numbers.
-
-        Returns:
-            Their outlook; frame and plan are still those of the whole scene.
-        """
+        """Keep what is known of some Gaussians."""
         light = self.light[rows] if len(self.light) else self.light
         return self._replace(areas=self.areas[rows], seen_areas=self.seen_areas[rows], light=light)
 
     def area_power(self, config: TessellationConfig) -> float:
-        """Give the power of the area in the weight: the more unbounded, the flatter."""
+        """Return the power of the area in the weight: the more unbounded, the flatter."""
         strength = self.plan.unbounded.strength
         return (1 - strength) * config.area_power + strength * config.unbounded_area_power
 
     def facts(self, scene: GaussianScene) -> dict[str, Any]:
-        """Give what the report says about it."""
+        """Return what the report says about it."""
         return {"plan": self.plan, "mass_in": float((self.areas * scene.opacities).sum())}
 
 
@@ -65,43 +58,23 @@ def look(
     clock: StageClock,
     cameras: Cameras | None,
 ) -> Outlook:
-    """Look at a scene, and at pictures of it where the configuration asks for them.
-
-    Args:
-        valid: The Gaussians, with valid rows.
-        config: Every choice.
-        with_light: Whether a network will ask how freely Gaussians can be seen.
-        clock: Measures the stages.
-        cameras: From where to look; None finds views.
-
-    Returns:
-        What was found.
-    """
+    """Look at a scene, and at images of it where the configuration asks for them."""
     with clock.stage("plan"):
         outlook = look_at_scene(valid, config, with_light=with_light)
     if not outlook.plan.visibility.active:
         return outlook
     with clock.stage("visibility"):
-        return look_at_pictures(
-            valid, outlook, config.visibility, cameras=cameras, seed=config.seed
-        )
+        return look_at_images(valid, outlook, config.visibility, cameras=cameras, seed=config.seed)
 
 
 def look_at_scene(scene: GaussianScene, config: SimplifyConfig, *, with_light: bool) -> Outlook:
-    """Find out what a scene is like, without a picture of it.
-
-    Args:
-        scene: The Gaussians, with valid rows.
-        config: Every choice.
-        with_light: Whether a network will ask how freely Gaussians can be seen.
-
-    Returns:
-        What was found.
-    """
+    """Find out what a scene is like, without an image of it."""
     frame, areas = robust_frame(scene.means), scene.areas
     masses = areas * scene.opacities
     hides = config.cvt.hidden_share < 1.0
-    light = cvt.openness(scene.means, masses, frame) if hides or with_light else masses[:0]
+    light = (
+        cvt.ambient_visibility(scene.means, masses, frame) if hides or with_light else masses[:0]
+    )
     seen = as_seen(areas, scene.means, light, frame=frame, config=config.cvt)
     plan = plan_effects(
         scene,
@@ -122,18 +95,7 @@ def as_seen(
     frame: RobustFrame,
     config: TessellationConfig,
 ) -> Float[Tensor, "n"]:
-    """Give areas as they look in pictures, smaller for what is far or hidden.
-
-    Args:
-        areas: Mean projected areas.
-        means: Positions.
-        light: How freely every Gaussian can be seen; not looked at if nothing counts as hidden.
-        frame: Centre and radius of the scene.
-        config: What counts.
-
-    Returns:
-        Areas, in the unit of ``areas``.
-    """
+    """Return areas as they look in images, smaller for what is far or hidden."""
     seen = areas
     if config.perspective:
         seen = seen * cvt.falloff(means, frame)
@@ -142,7 +104,7 @@ def as_seen(
     return seen
 
 
-def look_at_pictures(
+def look_at_images(
     scene: GaussianScene,
     outlook: Outlook,
     config: VisibilityConfig,
@@ -150,24 +112,13 @@ def look_at_pictures(
     cameras: Cameras | None,
     seed: int,
 ) -> Outlook:
-    """Correct what every Gaussian paints by pictures of the scene.
-
-    Args:
-        scene: The Gaussians, with valid rows.
-        outlook: What is known without pictures.
-        config: How many pictures, and how far they are trusted.
-        cameras: From where to look; None finds views.
-        seed: Which views.
-
-    Returns:
-        The outlook with other ``seen_areas``.
-    """
+    """Correct what every Gaussian paints by images of the scene."""
     if cameras is None:
         views = mixed_views(scene, config.views, size=config.size, seed=seed)
     else:
         longer = max(cameras.width, cameras.height)
         views = cameras.spread(config.views).fitted(min(config.size, longer))
-    painted = contributions(pictured(scene, outlook.plan), views)
+    painted = contributions(imaged(scene, outlook.plan), views)
     masses = (outlook.seen_areas * scene.opacities).double()
     total, all_painted = masses.sum(), painted.sum()
     if not float(all_painted) > 0.0:

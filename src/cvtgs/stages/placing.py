@@ -12,33 +12,13 @@ from cvtgs.stages.outlook import Outlook
 def place_rows(
     scene: GaussianScene, rows: Tensor, outlook: Outlook, target: int, config: SimplifyConfig
 ) -> tuple[Tensor, Tensor]:
-    """Place Gaussians in the space of the tessellation.
-
-    Args:
-        scene: The Gaussians.
-        rows: Which of them.
-        outlook: What is known of them.
-        target: Number of cells, which sets what colour counts.
-        config: Every choice.
-
-    Returns:
-        The rows and their points, both along a Morton curve.
-    """
+    """Place Gaussians in the space of the tessellation."""
     rows = rows_along_curve(scene, rows, outlook)
     return rows, places_of(scene, rows, outlook, target, config)
 
 
 def rows_along_curve(scene: GaussianScene, rows: Tensor, outlook: Outlook) -> Tensor:
-    """Order Gaussians along a Morton curve.
-
-    Args:
-        scene: The Gaussians.
-        rows: Which of them.
-        outlook: What is known of them.
-
-    Returns:
-        The rows in their order.
-    """
+    """Order Gaussians along a Morton curve."""
     # A curve through contracted space stays fine where the bulk is, whatever flies away.
     curve = cvt.embed(scene.means[rows], frame=outlook.frame, contraction=1.0)
     return rows[morton_order(curve, ties=outlook.seen_areas[rows] * scene.opacities[rows])]
@@ -47,18 +27,7 @@ def rows_along_curve(scene: GaussianScene, rows: Tensor, outlook: Outlook) -> Te
 def places_of(
     scene: GaussianScene, rows: Tensor, outlook: Outlook, target: int, config: SimplifyConfig
 ) -> Tensor:
-    """Place Gaussians in the space of the tessellation, in the order that is given.
-
-    Args:
-        scene: The Gaussians.
-        rows: Which of them.
-        outlook: What is known of them.
-        target: Number of cells, which sets what colour counts.
-        config: Every choice.
-
-    Returns:
-        Their points.
-    """
+    """Place Gaussians in the space of the tessellation, in the order that is given."""
     return cvt.embed(
         scene.means[rows],
         scene.sh0[rows],

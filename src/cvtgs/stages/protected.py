@@ -24,20 +24,6 @@ def run_protected(
     """Run the stages on the Gaussians that are not protected.
 
     What hides and crowds them is judged by the whole scene.
-
-    Args:
-        prepared: The scene, and how to run the stages on it.
-        target: Number of Gaussians to keep, the protected ones among them.
-        keep: Mask of the protected Gaussians.
-        clock: Measures each stage.
-
-    Returns:
-        The small scene, in which the protected Gaussians come first, as they were and in their
-        order, but for infinite opacity logits; and the facts that the report holds.
-
-    Raises:
-        InvalidArgumentError: The mask does not fit, or leaves nothing of the target for the rest.
-        InvalidSceneError: The scene has no valid row.
     """
     scene = prepared.scene
     check_mask(keep, scene)
@@ -66,15 +52,7 @@ def run_protected(
 
 
 def check_mask(keep: Tensor, scene: GaussianScene) -> None:
-    """Refuse what is not a mask of the Gaussians of a scene.
-
-    Args:
-        keep: The mask.
-        scene: The scene.
-
-    Raises:
-        InvalidArgumentError: It has another shape or dtype.
-    """
+    """Refuse what is not a mask of the Gaussians of a scene."""
     if not isinstance(keep, Tensor) or keep.dtype != torch.bool or keep.shape != (len(scene),):
         shape = f"{keep.dtype} {tuple(keep.shape)}" if isinstance(keep, Tensor) else repr(keep)
         raise InvalidArgumentError(
@@ -83,19 +61,7 @@ def check_mask(keep: Tensor, scene: GaussianScene) -> None:
 
 
 def check_room(kept: int, *, target: int, total: int) -> None:
-    """Check that protected Gaussians leave something of the target for the rest.
-
-    Args:
-        kept: Number of protected Gaussians.
-        target: Number of Gaussians to keep.
-        total: Number of valid Gaussians.
-
-    Raises:
-        InvalidArgumentError: The target cannot be met.
-
-    Example:
-        >>> check_room(9, target=10, total=100)
-    """
+    """Check that protected Gaussians leave something of the target for the rest."""
     needed = kept + (1 if kept < total else 0)
     if kept and min(target, total) < needed:
         raise InvalidArgumentError(
@@ -105,15 +71,7 @@ def check_room(kept: int, *, target: int, total: int) -> None:
 
 
 def join_scenes(first: GaussianScene, second: GaussianScene) -> GaussianScene:
-    """Put the Gaussians of two scenes of one kind behind one another.
-
-    Args:
-        first: A scene; its comments and layout stay.
-        second: A scene of the same SH degree, dtype and extra columns.
-
-    Returns:
-        All Gaussians.
-    """
+    """Put the Gaussians of two scenes of one kind behind one another."""
     others = second.tensors()
     return first.with_tensors(
         {name: torch.cat([values, others[name]]) for name, values in first.tensors().items()},

@@ -66,21 +66,7 @@ def run_stages(
     clock: StageClock,
     on_grouping: Callable[[Grouping], None] | None = None,
 ) -> tuple[GaussianScene, dict[str, Any]]:
-    """Run the stages that follow a look at the scene.
-
-    Args:
-        scene: The Gaussians, with valid rows, on the device to compute on.
-        target: Number of Gaussians to keep.
-        config: Every choice.
-        outlook: What is known of the scene.
-        net: Corrects merged Gaussians, on the same device; None for no correction.
-        clock: Measures each stage.
-        on_grouping: Given the cells, if there are fewer than Gaussians.
-
-    Returns:
-        The small scene, and the facts that :class:`cvtgs.report.SimplifyReport` holds beyond
-        counts and costs.
-    """
+    """Run the stages that follow a look at the scene."""
     if target >= len(scene):
         return all_rows(scene, config, is_whole=target == len(scene), clock=clock)
     reference, facts = _refer(
@@ -99,17 +85,7 @@ def run_stages(
 def all_rows(
     valid: GaussianScene, config: SimplifyConfig, *, is_whole: bool, clock: StageClock
 ) -> tuple[GaussianScene, dict[str, Any]]:
-    """Keep all Gaussians, as they are.
-
-    Args:
-        valid: The Gaussians, with valid rows.
-        config: Every choice.
-        is_whole: Whether all rows of the input were asked for: they stay as they came.
-        clock: Measures the stage.
-
-    Returns:
-        The scene, and the facts that the report holds.
-    """
+    """Keep all Gaussians, as they are."""
     with clock.stage("plan"):
         facts = look_at_scene(valid, config, with_light=False).facts(valid)
     small = filters.with_finite_opacities(valid) if is_whole else filters.standardized(valid)
@@ -117,16 +93,7 @@ def all_rows(
 
 
 def finished(reference: Reference, net: MergeNet | None, *, clock: StageClock) -> GaussianScene:
-    """Let the network correct merged Gaussians, and make them valid ones.
-
-    Args:
-        reference: What to correct.
-        net: Corrects it; None for no correction.
-        clock: Measures the stage.
-
-    Returns:
-        The small scene.
-    """
+    """Let the network correct merged Gaussians, and make them valid ones."""
     small = reference.merged
     if net is not None:
         with clock.stage("network", len(small)) as advance:
@@ -143,20 +110,7 @@ def finished(reference: Reference, net: MergeNet | None, *, clock: StageClock) -
 
 
 def make_reference(scene: GaussianScene, target: int, config: SimplifyConfig) -> Reference:
-    """Run the stages up to the network, to train it.
-
-    Args:
-        scene: The scene, on the device to compute on.
-        target: Number of Gaussians to keep, fewer than there are valid ones.
-        config: Every choice.
-
-    Returns:
-        What the network is to correct.
-
-    Raises:
-        InvalidArgumentError: There are no more valid Gaussians than ``target``.
-        InvalidSceneError: The scene has no valid row.
-    """
+    """Run the stages up to the network, to train it."""
     valid, _ = check_rows(scene)
     if target >= len(valid):
         raise InvalidArgumentError(
@@ -223,16 +177,7 @@ def _refer(
 def grouping_facts(
     partition: cells.Partition, tessellation: cvt.Tessellation, *, shown: cells.Partition
 ) -> dict[str, Any]:
-    """Give what the report says about cells.
-
-    Args:
-        partition: Members of every cell.
-        tessellation: How they were found.
-        shown: The members that the Gaussian of every cell stands for.
-
-    Returns:
-        The facts.
-    """
+    """Return what the report says about cells."""
     return {
         "single_member_cells": int((shown.counts == 1).sum()),
         "largest_cell": int(partition.counts.amax()),

@@ -28,22 +28,7 @@ class Part:
 
 
 def allocate(count: int, shares: Sequence[float]) -> list[int]:
-    """Split a count in proportion to shares, by largest remainder.
-
-    Args:
-        count: What to split, at least 0.
-        shares: Positive numbers.
-
-    Returns:
-        One count per share; they add up to ``count``. Of equal remainders the first wins.
-
-    Raises:
-        InvalidArgumentError: There are no shares, or one of them is not positive.
-
-    Example:
-        >>> allocate(10, [1.0, 1.0, 2.0])
-        [3, 2, 5]
-    """
+    """Split a count in proportion to shares, by largest remainder."""
     if not shares or min(shares) <= 0:
         raise InvalidArgumentError(f"shares must be positive numbers, found {list(shares)}.")
     total = sum(shares)
@@ -66,16 +51,6 @@ def assemble(
     """Draw all parts into one scene.
 
     Memory: the scene and the temporaries of one chunk, about ``CHUNK * 1 kB``.
-
-    Args:
-        parts: What is in the scene.
-        count: Gaussians, at least 1.
-        sh_degree: Degree of the colours, 0 to 3.
-        generator: Where random numbers come from; it moves on.
-        comment: Says where the scene comes from.
-
-    Returns:
-        A scene of exactly ``count`` Gaussians.
     """
     rest = REST_COUNTS[sh_degree]
     shapes: dict[str, tuple[int, ...]] = {

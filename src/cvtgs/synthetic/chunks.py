@@ -40,7 +40,7 @@ class Chunk:
     generator: torch.Generator
 
     def __len__(self) -> int:
-        """Give the number of rows."""
+        """Return the number of rows."""
         return self.stop - self.start
 
     def uniforms(self, *shape: int) -> Tensor:
@@ -56,7 +56,7 @@ class Chunk:
         return median * torch.exp(spread * self.normals())
 
     def positions(self) -> Float[Tensor, "n 2"]:
-        """Give evenly spread points of the unit square.
+        """Return evenly spread points of the unit square.
 
         The R2 sequence (Roberts 2018), each point moved at random by a part of the spacing.
         """
@@ -80,15 +80,7 @@ Draw = Callable[[Chunk], GaussianScene]
 
 
 def frames_of(first: Float[Tensor, "n 3"], second: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
-    """Build rotations whose first column is ``first`` and whose second is near ``second``.
-
-    Args:
-        first: Unit vectors.
-        second: Vectors that are not parallel to ``first``.
-
-    Returns:
-        Rotation matrices.
-    """
+    """Build rotations whose first column is ``first`` and whose second is near ``second``."""
     third = torch.nn.functional.normalize(torch.linalg.cross(first, second), dim=1)
     return torch.stack([first, torch.linalg.cross(third, first), third], dim=2)
 
@@ -102,19 +94,7 @@ def gaussians(
     colors: Float[Tensor, "n 3"],
     rest: Float[Tensor, "n k 3"],
 ) -> GaussianScene:
-    """Store readable values as a scene does.
-
-    Args:
-        means: Centres.
-        frames: Rotation matrices; column ``k`` is the direction of scale ``k``.
-        scales: Standard deviations, positive.
-        opacities: Any numbers; limited to ``OPACITY_RANGE``.
-        colors: Colours averaged over the directions; limited to [0, 1].
-        rest: View-dependent SH coefficients.
-
-    Returns:
-        The Gaussians.
-    """
+    """Store readable values as a scene does."""
     return GaussianScene(
         means=means,
         quats=quaternions.from_matrices(frames),

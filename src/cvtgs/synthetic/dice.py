@@ -66,15 +66,7 @@ class Dice:
         return self.clouds((0.7 * red, 0.7 * green, 0.68 * blue), self.near(color), size)
 
     def pattern(self, size: float, which: int | None = None) -> Texture:
-        """Make one of the textures, in random colours, with details of this size.
-
-        Args:
-            size: Of its details, scene units.
-            which: Number of the texture; any number will do, none draws it.
-
-        Returns:
-            The texture.
-        """
+        """Make one of the textures, in random colours, with details of this size."""
         dark, bright = self.hue(0.6, 0.4), self.hue(0.35, 0.9)
         rough = self.stone(bright, 12 * size)
         step = torch.tensor([self.between(-1, 1), self.between(0.3, 1)]) / size
@@ -89,15 +81,7 @@ class Dice:
         return choices[(drawn if which is None else which) % len(choices)]
 
     def spots(self, count: int, ring: tuple[float, float]) -> list[tuple[float, float]]:
-        """Spread places in a ring around the origin, no two in the same sector.
-
-        Args:
-            count: How many.
-            ring: Its inner and outer radius.
-
-        Returns:
-            Their x and z.
-        """
+        """Spread places in a ring around the origin, no two in the same sector."""
         turn = self.between(0, 1)
         angles = [(k + turn + self.between(-0.18, 0.18)) / count for k in range(count)]
         polar = torch.tensor([(6.2831853 * angle, self.between(*ring)) for angle in angles])

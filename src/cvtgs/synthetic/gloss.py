@@ -19,14 +19,6 @@ def highlights(
 
     A lobe around direction ``d`` has coefficients ``w_l Y_lm(d)`` (Funk-Hecke theorem); the
     weights ``w_l`` are scaled so that the highlight has the wanted colour at its peak.
-
-    Args:
-        directions: Unit vectors from the camera to the Gaussian where the highlight peaks.
-        peaks: Colours that are added there.
-        rest_count: Coefficients per channel above the constant one: 0, 3, 8 or 15.
-
-    Returns:
-        What is added to the colour on average, and the view-dependent coefficients.
     """
     degree = degree_of(rest_count)
     if degree == 0:
@@ -40,13 +32,5 @@ def highlights(
 def mirrored(
     toward_light: Float[Tensor, "3"], normals: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
-    """Give the viewing directions that see a light mirrored in a surface.
-
-    Args:
-        toward_light: Unit vector.
-        normals: Unit normals.
-
-    Returns:
-        Unit vectors from the camera to the surface.
-    """
+    """Return the viewing directions that see a light mirrored in a surface."""
     return toward_light - 2 * (normals @ toward_light)[:, None] * normals

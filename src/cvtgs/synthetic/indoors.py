@@ -26,7 +26,7 @@ def room(dice: Dice) -> list[Part]:
         paper = blend(paper, dado, lambda coords: (coords[:, 1] > 1.4).float())
     planks = bricks(dice.stone(dice.near((0.6, 0.42, 0.26)), 1.0), plain((0.2, 0.13, 0.08)), 0.14)
     ceiling = plain(dice.near((0.9, 0.89, 0.86)))
-    picture = standing(screen(1.4, 1.0), (0.3, 0.5 * depth - 0.03), height=1.1)
+    image = standing(screen(1.4, 1.0), (0.3, 0.5 * depth - 0.03), height=1.1)
     window = standing(
         screen(1.4, 1.2), (-0.5 * width + 0.03, 0.2), height=0.95, turn=-0.5 * math.pi
     )
@@ -35,7 +35,7 @@ def room(dice: Dice) -> list[Part]:
         covered(sides, paper, share=22, finish=GLOWING),
         covered(floor, planks, share=11, finish=Finish(lit=False, gloss=0.2)),
         covered(top, ceiling, share=4, finish=GLOWING),
-        covered(picture, poster(dice, 0.2), share=6, finish=GLOWING),
+        covered(image, poster(dice, 0.2), share=6, finish=GLOWING),
         covered(window, _panes(dice), share=4, finish=GLOWING),
         *_furniture(dice),
         *_shelves(dice, 0.5 * width - 0.32),

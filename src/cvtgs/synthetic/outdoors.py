@@ -104,7 +104,7 @@ def thin_structures(dice: Dice) -> list[Part]:
 
 
 def level(flat: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-    """Give the heights of flat ground."""
+    """Return the heights of flat ground."""
     return torch.zeros(len(flat))
 
 

@@ -65,17 +65,7 @@ def disc_profile(radius: float, height: float) -> Float[Tensor, "k 2"]:
 
 
 def vase_profile(height: float, *, belly: float, neck: float, low: float) -> Float[Tensor, "k 2"]:
-    """Draw a foot, a belly, a neck and a lip.
-
-    Args:
-        height: Of the vase.
-        belly: Largest radius, in heights.
-        neck: Radius of the neck, in heights.
-        low: Where the belly is widest, in heights.
-
-    Returns:
-        The profile.
-    """
+    """Draw a foot, a belly, a neck and a lip."""
     knots = torch.tensor([(0.16, 0.0), (belly, low), (neck, 0.8), (0.2, 1.0)])
     share = torch.linspace(0, 1, 40)[1:, None]
     eased = 0.5 - 0.5 * torch.cos(math.pi * share)

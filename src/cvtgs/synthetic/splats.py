@@ -45,16 +45,7 @@ class Finish:
 
 
 def coated(surface: Surface, texture: Texture, finish: Finish) -> Draw:
-    """Cover a surface with Gaussians.
-
-    Args:
-        surface: Where.
-        texture: In which colours.
-        finish: With what kind of Gaussians.
-
-    Returns:
-        What draws them.
-    """
+    """Cover a surface with Gaussians."""
 
     def draw(chunk: Chunk) -> GaussianScene:
         at = surface(chunk.positions())
@@ -79,15 +70,7 @@ def coated(surface: Surface, texture: Texture, finish: Finish) -> Draw:
 
 
 def opacities(chunk: Chunk, faintness: float) -> Float[Tensor, "n"]:
-    """Draw opacities: some nearly opaque, the others anywhere.
-
-    Args:
-        chunk: The rows.
-        faintness: Subtracted from the logits of the others, which are then more alike and more.
-
-    Returns:
-        Opacities.
-    """
+    """Draw opacities: some nearly opaque, the others anywhere."""
     opaque = chunk.uniforms() < 0.22 * math.exp(-0.5 * faintness)
     spread = 1.6 / (1 + 0.2 * faintness)
     others = spread * chunk.normals() - 0.1 - faintness
@@ -95,14 +78,7 @@ def opacities(chunk: Chunk, faintness: float) -> Float[Tensor, "n"]:
 
 
 def light(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Give the light that falls on a surface: sun, and sky from above.
-
-    Args:
-        normals: Unit normals.
-
-    Returns:
-        Factors for its colour.
-    """
+    """Return the light that falls on a surface: sun, and sky from above."""
     sun = (normals @ _toward_sun()).clamp_min(0.0)[:, None] * torch.tensor(_SUN_COLOR)
     sky = (0.5 - 0.5 * normals[:, 1:2]) * torch.tensor(_SKY_COLOR)
     return 0.24 + 0.72 * sun + 0.42 * sky
@@ -111,16 +87,7 @@ def light(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
 def shine(
     normals: Float[Tensor, "n 3"], gloss: float, chunk: Chunk
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n k 3"]]:
-    """Mirror the sun and the sky, with the noise that trained coefficients have.
-
-    Args:
-        normals: Unit normals.
-        gloss: Brightness of the highlights.
-        chunk: The rows.
-
-    Returns:
-        What is added to the colour on average, and the view-dependent coefficients.
-    """
+    """Mirror the sun and the sky, with the noise that trained coefficients have."""
     jitter = 0.015 + 0.02 * gloss
     rest = jitter * chunk.normals(chunk.rest_count, 3)
     if gloss == 0.0:
@@ -146,7 +113,7 @@ def _toward_sun() -> Float[Tensor, "3"]:
 def _along_edges(
     at: SurfacePoints, texture: Texture, spacing: Float[Tensor, "n"], chunk: Chunk
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3 3"], Float[Tensor, "n"]]:
-    """Give colours, frames whose first axis follows edges, and how busy the texture is."""
+    """Return colours, frames whose first axis follows edges, and how busy the texture is."""
     step = torch.eye(2)[:, None, :] * spacing[:, None]
     colors = texture(at.coords)
     slopes = torch.stack([texture(at.coords + step[k]) - colors for k in range(2)])

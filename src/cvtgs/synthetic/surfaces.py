@@ -55,16 +55,7 @@ Heights = Callable[[Float[Tensor, "n 2"]], Float[Tensor, "n"]]
 
 
 def placed(surface: Surface, offset: Float[Tensor, "3"], rotation: Float[Tensor, "3 3"]) -> Surface:
-    """Move a surface.
-
-    Args:
-        surface: What to move.
-        offset: Where its origin goes.
-        rotation: How it turns about its origin first.
-
-    Returns:
-        The moved surface.
-    """
+    """Move a surface."""
 
     def sample(square: Float[Tensor, "n 2"]) -> SurfacePoints:
         at = surface(square)
@@ -83,13 +74,6 @@ def quads(corners: Float[Tensor, "k 3"], sides: Float[Tensor, "k 2 3"]) -> Surfa
     """Make parallelograms; their normals are ``sides[:, 1] x sides[:, 0]``.
 
     Seen from where the normal points, texture coordinates go right and down if the sides do.
-
-    Args:
-        corners: One corner of each.
-        sides: The two sides that start there.
-
-    Returns:
-        All of them as one surface.
     """
     crosses = torch.linalg.cross(sides[:, 1], sides[:, 0])
     areas = torch.linalg.vector_norm(crosses, dim=1)
@@ -118,29 +102,14 @@ def quads(corners: Float[Tensor, "k 3"], sides: Float[Tensor, "k 2 3"]) -> Surfa
 
 
 def boxes(lows: Float[Tensor, "k 3"], sizes: Float[Tensor, "k 3"]) -> Surface:
-    """Make axis-aligned boxes, seen from outside, six faces each.
-
-    Args:
-        lows: The corners of smallest coordinates.
-        sizes: Positive extents.
-
-    Returns:
-        All of them as one surface.
-    """
+    """Make axis-aligned boxes, seen from outside, six faces each."""
     corners = lows[:, None] + torch.tensor([corner for corner, _, _ in _FACES]) * sizes[:, None]
     faces = torch.tensor([(right, down) for _, right, down in _FACES]) * sizes[:, None, None]
     return quads(corners.reshape(-1, 3), faces.reshape(-1, 2, 3))
 
 
 def revolution(profile: Float[Tensor, "k 2"]) -> Surface:
-    """Turn a profile about the vertical axis.
-
-    Args:
-        profile: Radius and height along the profile; going up, the outside is seen.
-
-    Returns:
-        The surface.
-    """
+    """Turn a profile about the vertical axis."""
     steps = profile.diff(dim=0)
     lengths = torch.linalg.vector_norm(steps, dim=1)
     bands = math.pi * (profile[1:, 0] + profile[:-1, 0]) * lengths
@@ -190,17 +159,7 @@ def torus(radius: float, thickness: float) -> Surface:
 
 
 def ground(heights: Heights, *, core: float, radius: float, hole: float = 0.0) -> Surface:
-    """Make a round piece of ground, dense inside ``core`` and ever sparser outside.
-
-    Args:
-        heights: Height at x, z.
-        core: Radius of the dense middle.
-        radius: Radius of the whole.
-        hole: Radius of the middle that is left out.
-
-    Returns:
-        The surface; texture coordinates are x and z.
-    """
+    """Make a round piece of ground, dense inside ``core`` and ever sparser outside."""
     start = core**2 + hole**2
     growth = math.log((core**2 + radius**2) / start)
 
@@ -232,15 +191,7 @@ def ground(heights: Heights, *, core: float, radius: float, hole: float = 0.0) -
 
 
 def dome(radius: float, lowest: float) -> Surface:
-    """Make the sky: a sphere seen from inside, without what is below.
-
-    Args:
-        radius: Its radius.
-        lowest: Sine of the elevation where it ends, -1 to 1.
-
-    Returns:
-        The surface; texture coordinates are the angle from the zenith times x and z, radians.
-    """
+    """Make the sky: a sphere seen from inside, without what is below."""
 
     def sample(square: Float[Tensor, "n 2"]) -> SurfacePoints:
         rise = 1.0 - (1.0 - lowest) * square[:, 1]

@@ -29,22 +29,13 @@ _FONT = {
 
 
 def plain(color: Color) -> Texture:
-    """Give one colour everywhere."""
+    """Return one colour everywhere."""
     rgb = torch.tensor(color, dtype=torch.float32)
     return lambda coords: rgb.expand(len(coords), 3)
 
 
 def blend(low: Texture, high: Texture, mask: Mask) -> Texture:
-    """Show ``low`` where the mask is 0, ``high`` where it is 1, and mix in between.
-
-    Args:
-        low: A texture.
-        high: Another one.
-        mask: Takes coordinates ``(n, 2)`` to shares ``(n,)`` in [0, 1].
-
-    Returns:
-        The mixture.
-    """
+    """Show ``low`` where the mask is 0, ``high`` where it is 1, and mix in between."""
     return lambda coords: torch.lerp(low(coords), high(coords), mask(coords)[:, None])
 
 
@@ -86,7 +77,7 @@ def letters(paper: Texture, ink: Texture, size: float) -> Texture:
 
 
 def patches(colors: Float[Tensor, "k 3"]) -> Texture:
-    """Give every box of :func:`surfaces.boxes` its own colour."""
+    """Return every box of :func:`surfaces.boxes` its own colour."""
 
     def lookup(coords: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
         face = torch.floor(coords[:, 0] / FACE_STEP).long()
@@ -99,12 +90,6 @@ def cloud_tile(generator: torch.Generator) -> Float[Tensor, "k k"]:
     """Make cloudy noise that repeats, by its spectrum.
 
     Amplitudes fall as the power 1.5 of the frequency, as in clouds and stone.
-
-    Args:
-        generator: Where the random numbers come from.
-
-    Returns:
-        Noise of mean 0 and deviation 1.
     """
     n = _NOISE_TEXELS
     wave = torch.fft.fftfreq(n) * n
@@ -117,17 +102,7 @@ def cloud_tile(generator: torch.Generator) -> Float[Tensor, "k k"]:
 def noise(
     tile: Float[Tensor, "k k"], *, size: float, contrast: float, shift: Float[Tensor, "2"]
 ) -> Mask:
-    """Make a mask of cloudy noise that repeats after ``size``.
-
-    Args:
-        tile: Square noise of mean 0 and deviation 1.
-        size: Edge of the tile, scene units.
-        contrast: Deviation around 0.5; the result is cut at 0 and 1.
-        shift: Which point of the tile comes first, tiles.
-
-    Returns:
-        The mask.
-    """
+    """Make a mask of cloudy noise that repeats after ``size``."""
     n = len(tile)
     table = (0.5 + contrast * tile).clamp(0.0, 1.0).reshape(-1).contiguous()
 
@@ -156,6 +131,6 @@ def shadows(lit: Texture, centers: Float[Tensor, "k 2"], radius: float) -> Textu
 
 
 def scatter(cells: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-    """Give a number in [0, 1) to each integer cell that looks random."""
+    """Return a number in [0, 1) to each integer cell that looks random."""
     mixed = cells @ torch.tensor([12.9898, 78.233])
     return (torch.sin(mixed.remainder(2 * math.pi)) * 4375.85).remainder(1.0)

@@ -40,16 +40,7 @@ def joined(*strands: Strands) -> Strands:
 
 
 def railing(start: Float[Tensor, "3"], along: Float[Tensor, "3"], height: float) -> Strands:
-    """Build posts every 0.15 units, with a rail above and one below.
-
-    Args:
-        start: Foot of the first post.
-        along: From there to the foot of the last one.
-        height: How high it is.
-
-    Returns:
-        The pieces.
-    """
+    """Build posts every 0.15 units, with a rail above and one below."""
     up = torch.tensor([0.0, -height, 0.0])
     count = max(2, round(float(along.norm()) / 0.15))
     feet = start + torch.linspace(0, 1, count)[:, None] * along
@@ -72,16 +63,7 @@ def wire(start: Float[Tensor, "3"], end: Float[Tensor, "3"], sag: float) -> Stra
 def tree(
     foot: Float[Tensor, "3"], height: float, generator: torch.Generator
 ) -> tuple[Strands, Float[Tensor, "k 3"]]:
-    """Grow a tree: each branch carries four thinner ones, four times over.
-
-    Args:
-        foot: Where it stands.
-        height: About how high it gets.
-        generator: Where the random numbers come from.
-
-    Returns:
-        Trunk and branches, and the tips of the last ones.
-    """
+    """Grow a tree: each branch carries four thinner ones, four times over."""
     starts, directions = foot[None, :], torch.tensor([[0.0, -1.0, 0.0]])
     length, radius = 0.38 * height, 0.028 * height
     levels = []
@@ -102,16 +84,7 @@ def tree(
 
 
 def rods(strands: Strands, texture: Texture, gloss: float) -> Draw:
-    """Cover strands with Gaussians: needles where they are thinner than the spacing.
-
-    Args:
-        strands: The pieces.
-        texture: Their colours; texture coordinates are around and along.
-        gloss: Brightness of the highlights.
-
-    Returns:
-        What draws them.
-    """
+    """Cover strands with Gaussians: needles where they are thinner than the spacing."""
     axes = strands.ends - strands.starts
     lengths = torch.linalg.vector_norm(axes, dim=1).clamp_min(1e-6)
     axes = axes / lengths[:, None]
@@ -153,16 +126,7 @@ def rods(strands: Strands, texture: Texture, gloss: float) -> Draw:
 
 
 def grass(roots: Float[Tensor, "k 3"], height: float, colors: tuple[Texture, Texture]) -> Draw:
-    """Plant blades of grass: one needle each, leaning any way.
-
-    Args:
-        roots: Middles of tufts; the blades stand around them.
-        height: Of the blades.
-        colors: Of the foot and of the tip of a blade, by x and z.
-
-    Returns:
-        What draws them.
-    """
+    """Plant blades of grass: one needle each, leaning any way."""
 
     def draw(chunk: Chunk) -> GaussianScene:
         tuft = (chunk.uniforms() * len(roots)).long()
@@ -191,16 +155,7 @@ def grass(roots: Float[Tensor, "k 3"], height: float, colors: tuple[Texture, Tex
 
 
 def leaves(tips: Float[Tensor, "k 3"], spread: float, texture: Texture) -> Draw:
-    """Hang leaves around the tips of branches, enough to be nearly opaque together.
-
-    Args:
-        tips: Middles of the clusters.
-        spread: Their deviation from it.
-        texture: Their colours, by x and y.
-
-    Returns:
-        What draws them.
-    """
+    """Hang leaves around the tips of branches, enough to be nearly opaque together."""
 
     def draw(chunk: Chunk) -> GaussianScene:
         tip = (chunk.uniforms() * len(tips)).long()

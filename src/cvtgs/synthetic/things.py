@@ -40,17 +40,7 @@ def vase(dice: Dice, height: float) -> Surface:
 
 
 def exhibits(dice: Dice, places: list[Place], *, share: float, pedestal: float) -> list[Part]:
-    """Show textured things on round and square pedestals.
-
-    Args:
-        dice: Chances.
-        places: One place each, at most 6.
-        share: Share of the Gaussians for all of them.
-        pedestal: Height of the pedestals.
-
-    Returns:
-        Two parts for each.
-    """
+    """Show textured things on round and square pedestals."""
     size = [dice.between(0.42, 0.58) for _ in range(6)]
     edge = 1.5 * size[1]
     models = [
@@ -83,17 +73,7 @@ def exhibits(dice: Dice, places: list[Place], *, share: float, pedestal: float) 
 def trees(
     dice: Dice, place: tuple[float, float, float], *, height: float, share: float
 ) -> list[Part]:
-    """Grow one tree: its wood and its leaves.
-
-    Args:
-        dice: Chances.
-        place: Its foot: x, y and z.
-        height: About how high it gets.
-        share: Share of the Gaussians for all of it.
-
-    Returns:
-        Two parts.
-    """
+    """Grow one tree: its wood and its leaves."""
     strands, tips = tree(torch.tensor(place), height, dice.generator)
     bark = dice.clouds((0.22, 0.16, 0.11), dice.near((0.46, 0.36, 0.27)), 0.5)
     crown = dice.clouds((0.16, 0.3, 0.08), dice.near((0.36, 0.52, 0.16)), 0.2 * height)

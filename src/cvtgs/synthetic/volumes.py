@@ -21,15 +21,6 @@ def haze(
 
     Their size follows from their number, so that the haze dims what is behind it alike for
     every count.
-
-    Args:
-        center: Its middle.
-        extent: Standard deviations along x, y and z.
-        depth: Optical depth through the middle.
-        color: Its colour.
-
-    Returns:
-        What draws it.
     """
     rgb = torch.tensor(color, dtype=torch.float32)
     shadow = 2 * math.pi * float(extent.prod()) ** (2 / 3)
@@ -51,15 +42,7 @@ def haze(
 
 
 def floaters(center: Float[Tensor, "3"], radius: float) -> Draw:
-    """Scatter stray Gaussians of any size and colour, most of them faint.
-
-    Args:
-        center: Middle of the scene.
-        radius: Its radius; some floaters are three times as far away.
-
-    Returns:
-        What draws them.
-    """
+    """Scatter stray Gaussians of any size and colour, most of them faint."""
 
     def draw(chunk: Chunk) -> GaussianScene:
         distance = radius * (0.4 + 2.6 * chunk.uniforms().square())

@@ -16,17 +16,7 @@ METRICS = (("psnr", "PSNR", "PSNR, dB"), ("ssim", "SSIM", "SSIM"))
 
 
 def tradeoff_chart(tradeoff: Tradeoff) -> bytes:
-    """Draw PSNR and SSIM over seconds, a line per ratio through the runs that none beats.
-
-    Args:
-        tradeoff: At least one result.
-
-    Returns:
-        A PNG file. Points are labelled with their preset; those that are beaten are hollow.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
+    """Draw PSNR and SSIM over seconds, a line per ratio through the runs that none beats."""
     return line_chart(_panels(tradeoff), width=WIDTH, height=HEIGHT)
 
 
@@ -63,19 +53,7 @@ def _value(result: TradeoffResult, metric: str) -> float:
 
 
 def ticks(low: float, high: float) -> Sequence[float]:
-    """Give round numbers for a logarithmic axis: 1, 2, 3, 5, 7 and their tenfolds, or fewer.
-
-    Args:
-        low: Smallest value, above 0.
-        high: Largest value.
-
-    Returns:
-        The round numbers around and between them.
-
-    Example:
-        >>> ticks(1.5, 12.0)
-        [1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0]
-    """
+    """Return round numbers for a logarithmic axis: 1, 2, 3, 5, 7 and their tenfolds, or fewer."""
     for digits in DIGITS:
         found = _round_numbers(max(low, 1e-3), max(high, 1e-3), digits)
         if len(found) <= MOST_TICKS:

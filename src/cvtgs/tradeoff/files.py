@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cvtgs.errors import MissingDependencyError
-from cvtgs.evaluate.exhibition import PAGE, make_folder
+from cvtgs.evaluate.comparison_files import PAGE, make_folder
 from cvtgs.evaluate.page import comparison_page
 from cvtgs.io import atomic_output, check_output
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.tradeoff.chart import tradeoff_chart
-from cvtgs.tradeoff.foreword import foreword
 from cvtgs.tradeoff.measure import Measured
+from cvtgs.tradeoff.summary import foreword
 
 CSV, JSON, PLOT = "tradeoff.csv", "tradeoff.json", "tradeoff.png"
 STAGE = "write pages"
@@ -32,17 +32,7 @@ class Written(NamedTuple):
 def check_tradeoff_files(
     folder: str | os.PathLike[str], *, more: tuple[str, ...] = (), overwrite: bool = False
 ) -> None:
-    """Make the folder and check that the files could be written, before the work begins.
-
-    Args:
-        folder: Where to write.
-        more: Names of further files.
-        overwrite: Whether existing files may be replaced.
-
-    Raises:
-        OutputExistsError: A file exists and may not be replaced.
-        OutputError: The folder cannot be made or written to.
-    """
+    """Make the folder and check that the files could be written, before the work begins."""
     make_folder(folder)
     for name in (CSV, JSON, PLOT, PAGE, *more):
         check_output(Path(folder) / name, overwrite)

@@ -34,7 +34,7 @@ class Measured(NamedTuple):
 
     Attributes:
         tradeoff: Costs and scores.
-        comparison: Pictures of the full scene and of all results.
+        comparison: Images of the full scene and of all results.
     """
 
     tradeoff: Tradeoff
@@ -70,10 +70,10 @@ def measure_tradeoff(
         device: Where to compute: ``auto``, ``cpu`` or ``cuda``.
         folder: Keep the results there, as ``fast_0.01.ply``, replacing what has that name; None
             keeps none.
-        listener: Told about each run and picture.
+        listener: Told about each run and image.
 
     Returns:
-        Costs, scores and pictures.
+        Costs, scores and images.
 
     Raises:
         CvtgsError: The scene cannot be read, or a preset or ratio is none.
@@ -163,14 +163,7 @@ def _result(run: Run, scores: SceneScores, size: int) -> TradeoffResult:
 
 
 def with_fronts(results: Sequence[TradeoffResult]) -> Iterator[TradeoffResult]:
-    """Mark the results that no other of the same ratio beats in seconds and a metric.
-
-    Args:
-        results: Results of one or several ratios.
-
-    Yields:
-        The same results, in that order, with :attr:`TradeoffResult.fronts`.
-    """
+    """Mark the results that no other of the same ratio beats in seconds and a metric."""
     fronts: dict[str, list[str]] = {result.name: [] for result in results}
     for rho in dict.fromkeys(result.rho for result in results):
         same = [result for result in results if result.rho == rho]

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 
 def on_front(costs: Sequence[float], gains: Sequence[float]) -> tuple[bool, ...]:
-    """Say which of several choices no other beats.
+    """Report which of several choices no other beats.
 
     One beats another if it costs no more and gains no less, and is better in one of the two.
 

@@ -31,20 +31,6 @@ def run_process(command: Sequence[str]) -> ProcessCost:
     r"""Run a command to its end and measure it.
 
     If this call is interrupted, the process is ended first.
-
-    Args:
-        command: The program and its arguments.
-
-    Returns:
-        What it cost.
-
-    Raises:
-        RunError: It failed; the text is the last line that it wrote to stderr, without the name
-            of the program.
-
-    Example:
-        >>> run_process([sys.executable, "-c", "print(1 + 1)"]).output
-        '2\n'
     """
     launcher = [sys.executable, "-S", "-c", LAUNCHER, *command]
     with subprocess.Popen(launcher, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:

@@ -25,7 +25,7 @@ class TradeoffResult(_Record):
         bytes: Size of the file that came out.
         seconds: Wall-clock seconds of the whole process, from its start to its end.
         peak_memory_bytes: Its largest resident size; 0 where the system does not tell.
-        psnr: Mean over the views, dB; infinite if pictures are equal.
+        psnr: Mean over the views, dB; infinite if images are equal.
         ssim: Mean over the views.
         lpips: Mean over the views; None if it was not measured.
         fronts: Metrics by which no other run of this ratio beats it: ``psnr``, ``ssim``, ``lpips``.
@@ -72,7 +72,7 @@ class Tradeoff(_Record):
         source_bytes: Its size.
         start_seconds: What every process costs before it reads: Python, torch and cvtgs start.
         machine: Where this was measured.
-        evaluation: From where pictures were taken, and the scores per view.
+        evaluation: From where images were taken, and the scores per view.
         results: One per ratio and preset, ratio by ratio.
         failures: Runs that gave nothing.
     """
@@ -104,7 +104,7 @@ class Tradeoff(_Record):
         return tuple(names)
 
     def rest_seconds(self, result: TradeoffResult) -> float:
-        """Give what is left of a run beyond start and stages: reading and writing.
+        """Return what is left of a run beyond start and stages: reading and writing.
 
         Args:
             result: One of the results.
@@ -115,7 +115,7 @@ class Tradeoff(_Record):
         return max(0.0, result.seconds - self.start_seconds - sum(result.stage_seconds.values()))
 
     def to_json(self) -> str:
-        """Give everything as indented JSON; infinite numbers are the string ``Infinity``.
+        """Return everything as indented JSON; infinite numbers are the string ``Infinity``.
 
         Returns:
             JSON text that ends with a line break.
@@ -123,7 +123,7 @@ class Tradeoff(_Record):
         return self.model_dump_json(indent=2) + "\n"
 
     def to_csv(self) -> str:
-        """Give one line per run, with seconds per stage.
+        """Return one line per run, with seconds per stage.
 
         Returns:
             Comma-separated values under a line of headings; what was not measured is empty.

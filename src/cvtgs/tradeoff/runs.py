@@ -63,23 +63,7 @@ class Run:
 
 
 def tasks_of(presets: Sequence[str] | None, ratios: Sequence[float]) -> tuple[Task, ...]:
-    """List what to run, ratio by ratio.
-
-    Args:
-        presets: Names; None for all, from the fastest to the best.
-        ratios: Ratios to keep.
-
-    Returns:
-        One task per ratio and preset.
-
-    Raises:
-        ConfigError: There is no such preset.
-        InvalidArgumentError: A ratio is out of range, or something is missing or named twice.
-
-    Example:
-        >>> [task.name for task in tasks_of(["standard"], [0.1, 0.01])]
-        ['standard 0.1', 'standard 0.01']
-    """
+    """List what to run, ratio by ratio."""
     names = list(PRESETS) if presets is None else list(presets)
     for name in names:
         if name not in PRESETS:
@@ -105,18 +89,7 @@ def run_tasks(
     device: str,
     listener: ProgressListener,
 ) -> Iterator[Run | Failure]:
-    """Run every task in a process of its own, one after the other.
-
-    Args:
-        source: The scene's file.
-        tasks: What to do.
-        folder: Where results and reports go.
-        device: Where to compute.
-        listener: Told about each task.
-
-    Yields:
-        What each did, or why it failed.
-    """
+    """Run every task in a process of its own, one after the other."""
     heard: set[str] = set()
     for done, task in enumerate(tasks):
         listener(ProgressEvent(stage=STAGE, done=done, total=len(tasks), note=task.name))
@@ -133,20 +106,7 @@ def run_tasks(
 def run_task(
     source: str | os.PathLike[str], task: Task, folder: Path, *, device: str = "auto"
 ) -> Run:
-    """Run one task as ``cvtgs simplify`` does, in a process of its own.
-
-    Args:
-        source: The scene's file.
-        task: What to do.
-        folder: Where the result goes; what stands there under its name is replaced.
-        device: Where to compute.
-
-    Returns:
-        What it did.
-
-    Raises:
-        RunError: It failed.
-    """
+    """Run one task as ``cvtgs simplify`` does, in a process of its own."""
     path, report = folder / task.file_name, folder / f".{task.file_name}.json"
     words = ["--rho", repr(task.rho), "--preset", task.preset, "--device", device]
     words += ["--report", str(report), "--overwrite", "--quiet"]
@@ -161,16 +121,12 @@ def run_task(
 
 
 def start_seconds() -> float:
-    """Measure what a process costs before it reads a scene.
-
-    Returns:
-        Wall-clock seconds.
-    """
+    """Measure what a process costs before it reads a scene."""
     return run_process([sys.executable, "-c", START]).wall_seconds
 
 
 def _pass_on(errors: str, heard: set[str]) -> None:
-    """Say what a process warned of, once for all processes."""
+    """Report what a process warned of, once for all processes."""
     for line in errors.splitlines():
         if line.startswith(WARNING) and line not in heard:
             heard.add(line)

@@ -11,16 +11,7 @@ MARK_MEANS = "* no other preset is as good in less time, with as many Gaussians"
 
 
 def cells(tradeoff: Tradeoff, result: TradeoffResult) -> Mapping[str, str]:
-    """Write a result as words.
-
-    Args:
-        tradeoff: All results.
-        result: One of them.
-
-    Returns:
-        Words by heading; all results of a tradeoff have the same headings. A star marks the
-        scores on the Pareto front.
-    """
+    """Write a result as words."""
     stages = {f"{name}, s": _seconds(result.stage_seconds.get(name)) for name in tradeoff.stages}
     measured = tradeoff.evaluation.lpips_network is not None
     distance = {"LPIPS": _score(result, "lpips", result.lpips, 4)} if measured else {}
@@ -39,28 +30,13 @@ def cells(tradeoff: Tradeoff, result: TradeoffResult) -> Mapping[str, str]:
 
 
 def heading(tradeoff: Tradeoff, rho: float) -> str:
-    """Name a ratio and what it means.
-
-    Args:
-        tradeoff: All results.
-        rho: One of its ratios.
-
-    Returns:
-        For example ``rho 0.01: 5,000 of 500,000 Gaussians``.
-    """
+    """Name a ratio and what it means."""
     count = max(result.count for result in tradeoff.results if result.rho == rho)
     return f"rho {rho:g}: {count:,} of {tradeoff.source_count:,} Gaussians"
 
 
 def how_measured(tradeoff: Tradeoff) -> str:
-    """Say where and how this was measured.
-
-    Args:
-        tradeoff: All results.
-
-    Returns:
-        A few sentences.
-    """
+    """Report where and how this was measured."""
     seen = tradeoff.evaluation
     return (
         f"{len(seen.views)} views of {seen.width} x {seen.height} pixels, rendered by "

@@ -34,7 +34,7 @@ class Prepared:
 
     Attributes:
         name: Name of the scene.
-        views: Pictures, one entry per size.
+        views: Images, one entry per size.
         cases: The scene at several ratios.
     """
 
@@ -44,21 +44,10 @@ class Prepared:
 
 
 def prepare(source: Source, config: TrainConfig, folder: Path) -> Prepared:
-    """Give what a training needs of a scene, from the cache if it is there.
+    """Return what a training needs of a scene, from the cache if it is there.
 
-    Pictures and cases are kept in two files, so that trainings for other presets share pictures.
+    Images and cases are kept in two files, so that trainings for other presets share images.
     Memory: that of one scene while it is prepared; what comes from the cache is mapped.
-
-    Args:
-        source: The scene.
-        config: The training.
-        folder: Where the cache is; it must exist.
-
-    Returns:
-        Views and cases.
-
-    Raises:
-        OutputError: The cache cannot be written.
     """
     simplify = SimplifyConfig.from_preset(config.preset)
     ratios = config.data.validation_ratios if source.validates else config.data.ratios

@@ -40,28 +40,14 @@ class Case:
         return f"{self.scene_name} at {self.ratio:g}"
 
     def select(self, rows: Int[Tensor, "s"]) -> "Case":
-        """Take some of the cells, and describe them anew.
-
-        Args:
-            rows: Which of ``cells``.
-
-        Returns:
-            A case of these cells only.
-        """
+        """Take some of the cells, and describe them anew."""
         chosen = torch.zeros(len(self.cells), dtype=torch.bool, device=self.cells.device)
         chosen[rows] = True
         part = self.part.select(chosen)
         return make_case(self.scene_name, self.ratio, self.reference, self.cells[chosen], part)
 
     def changed(self, residuals: Residuals) -> dict[str, Tensor]:
-        """Change the cells, differentiably.
-
-        Args:
-            residuals: What the network wants changed.
-
-        Returns:
-            The standard tensors of the cells.
-        """
+        """Change the cells, differentiably."""
         return compose(
             self.reference.scene,
             self.reference.merged,
@@ -72,14 +58,7 @@ class Case:
         )
 
     def corrected(self, residuals: Residuals) -> GaussianScene:
-        """Give the whole small scene with its cells changed, differentiably.
-
-        Args:
-            residuals: What the network wants changed.
-
-        Returns:
-            The small scene.
-        """
+        """Return the whole small scene with its cells changed, differentiably."""
         merged = self.reference.merged
         changed = self.changed(residuals)
         return merged.with_tensors(
@@ -91,14 +70,7 @@ class Case:
         )
 
     def to(self, device: torch.device) -> "Case":
-        """Move the case to a device.
-
-        Args:
-            device: Where to.
-
-        Returns:
-            The case there.
-        """
+        """Move the case to a device."""
         reference, part = self.reference, self.part
         if reference.scene.device == device:
             return self
@@ -122,18 +94,7 @@ class Case:
 def make_case(
     scene_name: str, ratio: float, reference: Reference, cells: Tensor, part: Partition
 ) -> Case:
-    """Describe some cells of a reference.
-
-    Args:
-        scene_name: Name of the scene.
-        ratio: Gaussians kept, as a share.
-        reference: What the network is to correct.
-        cells: Which cells.
-        part: Their members.
-
-    Returns:
-        The case.
-    """
+    """Describe some cells of a reference."""
     described = describe_cells(
         reference.scene,
         reference.merged,
@@ -156,17 +117,7 @@ def make_case(
 def refer_case(
     scene_name: str, scene: GaussianScene, ratio: float, config: SimplifyConfig
 ) -> Case | None:
-    """Simplify a scene without a network, and describe its cells.
-
-    Args:
-        scene_name: Name of the scene.
-        scene: The scene.
-        ratio: Gaussians to keep, as a share.
-        config: How to simplify.
-
-    Returns:
-        The case; None if no cell has several members, so that there is nothing to learn.
-    """
+    """Simplify a scene without a network, and describe its cells."""
     target = target_count(len(scene), ratio)
     if target >= len(scene):
         return None

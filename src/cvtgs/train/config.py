@@ -50,11 +50,11 @@ class ViewsConfig(Section):
 
     Attributes:
         count: Views of each scene at each size.
-        sizes: Sides of the square pictures, pixels.
+        sizes: Sides of the square images, pixels.
         per_step: Views that one step renders.
         crop: Side of the random crop of each that is compared, pixels.
         validation_count: Views of each validation scene.
-        validation_size: Side of their pictures, pixels.
+        validation_size: Side of their images, pixels.
     """
 
     count: Count = 16
@@ -102,7 +102,7 @@ class TrainConfig(Section):
         cells: Cells of one step of a ``local`` training.
         note: A sentence about the training data, for the checkpoint.
         data: Scenes.
-        views: Pictures.
+        views: Images.
         loss: Loss.
 
     Example:

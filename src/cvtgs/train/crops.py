@@ -1,4 +1,4 @@
-"""Crops: cells side by side in one picture, each alone, turned, and cut at random."""
+"""Crops: cells side by side in one image, each alone, turned, and cut at random."""
 
 import math
 import random
@@ -18,7 +18,7 @@ TILE = 32
 """Pixels of a crop's side."""
 
 FAR = 50.0
-"""The camera is this many picture widths away, so that all cells are seen alike."""
+"""The camera is this many image widths away, so that all cells are seen alike."""
 
 WIDEST = 7.0
 """A crop is this many of the largest standard deviations wide, before the random zoom."""
@@ -45,14 +45,6 @@ def crop_cells(case: Case, changed: dict[str, Tensor], *, dice: random.Random) -
     """Lay cells side by side, each turned and zoomed at random and somewhat off the middle.
 
     Colours are those of the constant band: the network mixes all bands alike.
-
-    Args:
-        case: The cells.
-        changed: Their corrected tensors.
-        dice: Draws turns, zooms and places.
-
-    Returns:
-        Three scenes in the same layout, and a camera.
     """
     reference, count = case.reference, len(case.cells)
     side = math.ceil(math.sqrt(count))

@@ -32,7 +32,7 @@ class Validation(NamedTuple):
         return mean(gain for row in self.gains.values() for gain in row.values())
 
     def by_ratio(self) -> dict[float, list[float]]:
-        """Give the gains of all scenes, by ratio.
+        """Return the gains of all scenes, by ratio.
 
         Returns:
             Decibels by ratio, the largest ratio first.
@@ -59,7 +59,7 @@ class History:
         self.validations: list[Validation] = []
 
     def best(self) -> Validation | None:
-        """Give the first validation with the largest score.
+        """Return the first validation with the largest score.
 
         Returns:
             It, or None before the first.
@@ -76,7 +76,7 @@ class History:
         return 0 if best is None else len(self.validations) - 1 - self.validations.index(best)
 
     def to_json(self) -> list[Any]:
-        """Give plain values.
+        """Return plain values.
 
         Returns:
             Lists, dictionaries, numbers and texts.

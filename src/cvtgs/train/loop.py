@@ -38,7 +38,7 @@ class TrainFiles:
     Attributes:
         checkpoint: The best network so far.
         state: All that is needed to go on.
-        curves: A picture of the history; there is none without matplotlib.
+        curves: An image of the history; there is none without matplotlib.
         cache: Folder of prepared scenes.
     """
 
@@ -49,7 +49,7 @@ class TrainFiles:
 
     @classmethod
     def beside(cls, checkpoint: Path, cache: Path | None = None) -> "TrainFiles":
-        """Give the usual names.
+        """Return the usual names.
 
         Args:
             checkpoint: The best network so far.
@@ -258,7 +258,7 @@ def _validate(
     try:
         curves = history.curves()
     except MissingDependencyError:
-        return  # hours of training are not lost for a picture
+        return  # hours of training are not lost for an image
     with atomic_output(files.curves, overwrite=True) as file:
         file.write(curves)
 

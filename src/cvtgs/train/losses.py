@@ -21,18 +21,8 @@ def scene_loss(
 ) -> Float[Tensor, ""]:
     """Render the corrected scene from some views, and compare a random crop of each.
 
-    Each has a random background. Whole pictures are rendered: a camera that sees the crop only
+    Each has a random background. Whole images are rendered: a camera that sees the crop only
     would draw what lies beside it differently.
-
-    Args:
-        net: The network.
-        case: A scene at a ratio.
-        views: Pictures of the full scene, squares of one size.
-        config: Number of views, size of the crops, and what counts how much.
-        dice: Draws views, crops and backgrounds.
-
-    Returns:
-        The loss.
     """
     residuals: Residuals = net(case.descriptors)
     corrected = case.corrected(residuals)
@@ -41,26 +31,16 @@ def scene_loss(
         background = _drawn_color(dice, case)
         view = views.select(dice.randrange(len(views.cameras)))
         y, x = (_drawn_slice(view.cameras.width, config.views.crop, dice) for _ in range(2))
-        picture = render(corrected, view.cameras, background=background).rgb
+        image = render(corrected, view.cameras, background=background).rgb
         target = view.over(background)
-        losses.append(picture_loss(picture[:, y, x], target[:, y, x], config.loss))
+        losses.append(view_loss(image[:, y, x], target[:, y, x], config.loss))
     return torch.stack(losses).mean() + _price(residuals, config.loss)
 
 
 def local_loss(
     net: MergeNet, case: Case, *, config: TrainConfig, dice: random.Random
 ) -> Float[Tensor, ""]:
-    """Render some cells, each alone, in random crops: members against the corrected Gaussian.
-
-    Args:
-        net: The network.
-        case: A scene at a ratio.
-        config: Number of cells, and what counts how much.
-        dice: Draws cells, turns, crops and background.
-
-    Returns:
-        The loss.
-    """
+    """Render some cells, each alone, in random crops: members against the corrected Gaussian."""
     number = min(config.cells, len(case.cells))
     rows = torch.tensor(sorted(dice.sample(range(len(case.cells)), number)))
     some = case.select(rows)
@@ -69,25 +49,16 @@ def local_loss(
     background = _drawn_color(dice, case)
     with torch.no_grad():
         target = render(crops.members, crops.camera, background=background).rgb
-    picture = render(crops.corrected, crops.camera, background=background).rgb
-    return picture_loss(picture, target, config.loss) + _price(residuals, config.loss)
+    image = render(crops.corrected, crops.camera, background=background).rgb
+    return view_loss(image, target, config.loss) + _price(residuals, config.loss)
 
 
-def picture_loss(
-    picture: Float[Tensor, "1 h w 3"], target: Float[Tensor, "1 h w 3"], config: LossConfig
+def view_loss(
+    image: Float[Tensor, "1 h w 3"], target: Float[Tensor, "1 h w 3"], config: LossConfig
 ) -> Float[Tensor, ""]:
-    """Compare a picture with what it should be.
-
-    Args:
-        picture: Picture of the corrected Gaussians.
-        target: What it should be.
-        config: What counts how much.
-
-    Returns:
-        The sum of logarithms of :class:`LossConfig`.
-    """
+    """Compare an image with what it should be."""
     return relative_loss(
-        picture,
+        image,
         target,
         squared_weight=config.squared,
         image_weight=config.image,
@@ -108,16 +79,7 @@ def _drawn_slice(size: int, crop: int, dice: random.Random) -> slice:
 
 @torch.no_grad()
 def scores(net: MergeNet, case: Case, views: Views) -> tuple[float, float]:
-    """Tell how good the merged Gaussians look without and with the network, over grey.
-
-    Args:
-        net: The network.
-        case: A scene at a ratio.
-        views: Pictures of the full scene.
-
-    Returns:
-        PSNR before and after, the mean over the views.
-    """
+    """Return how good the merged Gaussians look without and with the network, over grey."""
     grey = case.reference.merged.means.new_full((3,), 0.5)
     target = views.over(grey)
     before, after = case.reference.merged, case.corrected(net(case.descriptors))

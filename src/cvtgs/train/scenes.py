@@ -162,20 +162,7 @@ def _generated(config: DataConfig, seed: int) -> Iterator[Source]:
 
 
 def cut_block(scene: GaussianScene, count: int, *, seed: int) -> GaussianScene:
-    """Cut a compact piece out of a scene: a Gaussian, and those that are nearest to it.
-
-    Args:
-        scene: The scene.
-        count: Gaussians of the piece; a scene that has no more is returned whole.
-        seed: Which piece.
-
-    Returns:
-        The piece, in the order of the scene.
-
-    Example:
-        >>> len(cut_block(synthetic.scene("room", 500), 100, seed=1))
-        100
-    """
+    """Cut a compact piece out of a scene: a Gaussian, and those that are nearest to it."""
     if len(scene) <= count:
         return scene
     middle = scene.means[random.Random(seed).randrange(len(scene))]
@@ -187,17 +174,6 @@ def perturb(scene: GaussianScene, dice: random.Random) -> GaussianScene:
     """Make a scene that looks like another one: thinned, stretched, recoloured.
 
     Turning, moving or scaling a scene would teach nothing: descriptors do not change then.
-
-    Args:
-        scene: The scene, on the CPU.
-        dice: Draws the changes.
-
-    Returns:
-        Another scene.
-
-    Example:
-        >>> len(perturb(synthetic.scene("object", 500), random.Random(0))) <= 500
-        True
     """
     generator = torch.Generator().manual_seed(dice.getrandbits(62))
     share = dice.uniform(0.4, 1.0)

@@ -19,12 +19,7 @@ AVERAGED_STEPS = 500
 
 
 class TrainState:
-    """A network in training: its weights, their running mean, the optimiser, and the past.
-
-    Args:
-        net: The network to train.
-        config: The training.
-    """
+    """A network in training: its weights, their running mean, the optimiser, and the past."""
 
     def __init__(self, net: MergeNet, config: TrainConfig) -> None:
         self.net = net
@@ -43,15 +38,7 @@ class TrainState:
                 mean.lerp_(now, share)
 
     def save(self, path: Path, config: TrainConfig) -> None:
-        """Write the state to a file.
-
-        Args:
-            path: The file; it is replaced.
-            config: The training.
-
-        Raises:
-            OutputError: The file cannot be written.
-        """
+        """Write the state to a file."""
         tensors = add_prefix("net/", self.net.state_dict())
         tensors |= add_prefix("mean/", self.mean_net.state_dict())
         for number, values in self.optimizer.state_dict()["state"].items():
@@ -64,15 +51,7 @@ class TrainState:
         save_tensors(path, tensors, {"state": json.dumps(facts)})
 
     def load(self, path: Path, config: TrainConfig) -> None:
-        """Take over a state that was saved.
-
-        Args:
-            path: The file.
-            config: The training; it must be the same, but for note and patience.
-
-        Raises:
-            CheckpointError: The file is damaged, or of another training.
-        """
+        """Take over a state that was saved."""
         try:
             tensors, metadata = map_tensors(path)
             facts = json.loads(metadata["state"])

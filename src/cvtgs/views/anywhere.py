@@ -24,7 +24,7 @@ def views_from_anywhere(
     Args:
         scene: The scene.
         count: Number of views.
-        size: Side of the square pictures, pixels.
+        size: Side of the square images, pixels.
         seed: Which views.
         reach: Smallest and largest distance, robust radii.
 

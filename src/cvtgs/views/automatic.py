@@ -48,8 +48,8 @@ def automatic_views(
     visible (:func:`cvtgs.views.orientation.find_up`; y-down without evidence), so flyaways,
     sky shells and haze do not matter. The cameras stand around the scene at several heights; if
     its middle is free, surfaces are all around and above, and much of the scene can be seen from
-    there, they stand inside and look across. Every camera takes a picture of 64 pixels first: one
-    that is inside of a Gaussian, has something near in its picture, or sees nothing is moved to
+    there, they stand inside and look across. Every camera takes an image of 64 pixels first: one
+    that is inside of a Gaussian, has something near in its image, or sees nothing is moved to
     the first alternate that stands well, or to the best of them.
 
     The same scene, count, size and seed give the same cameras. Memory: a sample of at most
@@ -98,7 +98,7 @@ def _stands(known: Survey, count: int, *, size: tuple[int, int], turn: float) ->
 
 
 def _middle_of_room(known: Survey) -> Float[Tensor, "3"] | None:
-    """Give the middle at the height of the eyes if there is room and surfaces are all around."""
+    """Return the middle at the height of the eyes if there is room and surfaces are all around."""
     points = known.voxels.points
     if len(points) == 0:
         return None
@@ -123,7 +123,7 @@ def _middle_of_room(known: Survey) -> Float[Tensor, "3"] | None:
 
 
 def _enclosure(offsets: Float[Tensor, "v 3"], up: Float[Tensor, "3"]) -> float:
-    """Give the share of the upper half of all directions in which there is a surface."""
+    """Return the share of the upper half of all directions in which there is a surface."""
     directions = torch.nn.functional.normalize(offsets, dim=1)
     axes = torch.linalg.svd(up[None]).Vh[1:]
     rise = directions @ up

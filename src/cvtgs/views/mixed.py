@@ -20,7 +20,7 @@ def mixed_views(scene: GaussianScene, count: int, *, size: int, seed: int = 0) -
     Args:
         scene: A scene with at least one valid Gaussian.
         count: Number of views, at least 1.
-        size: Side of the square pictures, pixels.
+        size: Side of the square images, pixels.
         seed: Which views.
 
     Returns:

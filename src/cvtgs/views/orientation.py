@@ -38,28 +38,12 @@ class _Plane(NamedTuple):
 
 
 def find_up(voxels: Voxels, far: Float[Tensor, "k 3"]) -> Float[Tensor, "3"]:
-    """Say which way is up.
+    """Report which way is up.
 
     The axis is at right angles to the ground, the plane with the largest area; planes that lie
     as captures usually have it (y-down, then z-up) are preferred where areas are similar. Up is
     as captures usually have it, -y or else +z, unless the scene hangs below its ground, or more
     below a ceiling than on a floor, or the sky is below. Without a ground, up is -y.
-
-    Args:
-            voxels: The surfaces of the scene.
-            far: Directions of the Gaussians far away, unit vectors, float64; none if there are few.
-
-    Returns:
-            A unit vector, float64; exactly along a coordinate axis if within 5.5 degrees of one.
-
-    Example:
-            >>> from cvtgs.views.voxels import voxels_of
-            >>> from cvtgs.math.frames import robust_frame
-            >>> from cvtgs.synthetic import demo_scene
-            >>> scene = demo_scene(3000)
-            >>> voxels = voxels_of(scene, robust_frame(scene.means))
-            >>> [round(part) for part in find_up(voxels, voxels.points[:0]).tolist()]
-            [0, -1, 0]
     """
     usual = voxels.points.new_tensor(_USUAL)
     if len(voxels.points) < 8:
@@ -137,7 +121,7 @@ def _bonus(normal: Tensor) -> float:
 
 
 def _usual_sense(axis: Tensor) -> Tensor:
-    """Give the axis the sense that captures usually have: -y, else +z."""
+    """Return the axis the sense that captures usually have: -y, else +z."""
     cosines = axis.new_tensor(_USUAL) @ axis
     # At right angles to both, either sense is as good: +x.
     senses = torch.cat([cosines[cosines.abs().argmax()][None], axis[:1]])
@@ -145,7 +129,7 @@ def _usual_sense(axis: Tensor) -> Tensor:
 
 
 def _stands_on_its_head(heights: Float[Tensor, "v"], ground: float) -> bool:
-    """Tell whether the scene says clearly that up is the other way."""
+    """Return whether the scene says clearly that up is the other way."""
     low, high = heights.quantile(heights.new_tensor([0.01, 0.99])).tolist()
     opposite = low if abs(ground - high) < abs(ground - low) else high
     lid = float(((heights - opposite).abs() < _THICKNESS).double().mean())

@@ -1,4 +1,4 @@
-"""Small pictures that tell whether a camera stands well."""
+"""Small images that tell whether a camera stands well."""
 
 from dataclasses import dataclass
 
@@ -43,43 +43,34 @@ class Verdicts:
 
 
 def probe(known: Survey, cameras: Cameras, *, reach: Float[Tensor, "c"], inside: bool) -> Verdicts:
-    """Take small pictures and judge the cameras by them.
+    """Take small images and judge the cameras by them.
 
     A camera stands badly if it is inside of a Gaussian, if something near fills part of the
-    picture or hides the middle, or if the picture is empty.
-
-    Args:
-        known: The survey of the scene.
-        cameras: The cameras, at least one.
-        reach: Distance from each camera to what it is to show, scene units.
-        inside: Whether they stand in a room, where pictures are full.
-
-    Returns:
-        The verdicts.
+    image or hides the middle, or if the image is empty.
     """
     factor = PIXELS / max(cameras.width, cameras.height)
     small = cameras.resized(
         max(8, round(factor * cameras.width)), max(8, round(factor * cameras.height))
     )
-    pictures = render(known.sample, small, depth=True)
-    depth = pictures.alpha.new_zeros(()) if pictures.depth is None else pictures.depth
-    near = (pictures.alpha > _HIDING) & (depth < _NEAR * reach.to(depth)[:, None, None])
+    images = render(known.sample, small, depth=True)
+    depth = images.alpha.new_zeros(()) if images.depth is None else images.depth
+    near = (images.alpha > _HIDING) & (depth < _NEAR * reach.to(depth)[:, None, None])
     near_share = near.double().mean(dim=(1, 2))
     rows, columns = (slice(side // 4, side - side // 4) for side in (small.height, small.width))
-    halfway = (pictures.alpha > _SOLID) & (depth < 0.45 * reach.to(depth)[:, None, None])
+    halfway = (images.alpha > _SOLID) & (depth < 0.45 * reach.to(depth)[:, None, None])
     blocked = halfway[:, rows, columns].double().mean(dim=(1, 2))
-    filled = pictures.alpha.double().mean(dim=(1, 2))
+    filled = images.alpha.double().mean(dim=(1, 2))
     lacking = (_LEAST_FILLED[inside] - filled).clamp_min(0)
     swallowed = _swallowed(known, small)
     good = (near_share <= _MOST_NEAR) & (blocked <= _MOST_BLOCKED) & (lacking == 0) & ~swallowed
     demerits = 2 * near_share + blocked + 2 * lacking + swallowed.double()
     return Verdicts(
-        good=good, demerits=demerits, seen=_seen(known, small, pictures.alpha, depth=depth)
+        good=good, demerits=demerits, seen=_seen(known, small, images.alpha, depth=depth)
     )
 
 
 def _swallowed(known: Survey, cameras: Cameras) -> Bool[Tensor, "c"]:
-    """Tell which cameras are inside of a Gaussian that hides something."""
+    """Return which cameras are inside of a Gaussian that hides something."""
     sample = known.sample.select(known.sample.opacities > _HIDING)
     means = sample.means.double()
     largest = sample.scales.amax(dim=1)
@@ -97,7 +88,7 @@ def _swallowed(known: Survey, cameras: Cameras) -> Bool[Tensor, "c"]:
 def _seen(
     known: Survey, cameras: Cameras, alpha: Float[Tensor, "c h w"], *, depth: Float[Tensor, "c h w"]
 ) -> Bool[Tensor, "c v"]:
-    """Tell which voxels are in the pictures and not behind what the pictures show."""
+    """Return which voxels are in the images and not behind what the images show."""
     points = known.frame.center + known.frame.radius * known.voxels.points
     rotations, shifts = cameras.viewmats[:, :3, :3].double(), cameras.viewmats[:, :3, 3].double()
     local = points @ rotations.transpose(1, 2) + shifts[:, None]

@@ -41,7 +41,7 @@ _INSIDE = (
     (0.0, 0.0, 0.0),
 )
 OUTSIDE_FIELD = 45.0
-"""Field of view around a scene along the shorter side of the picture, degrees."""
+"""Field of view around a scene along the shorter side of the image, degrees."""
 
 INSIDE_FIELD = 62.0
 """The same inside a room."""
@@ -70,17 +70,7 @@ class Stands:
 
 
 def outside_stands(known: Survey, count: int, *, size: tuple[int, int], turn: float) -> Stands:
-    """Stand around the scene at several heights and look at its middle.
-
-    Args:
-        known: What is known of the scene.
-        count: Number of views.
-        size: Width and height of the pictures, pixels.
-        turn: Where the first camera stands on its circle, in slots.
-
-    Returns:
-        The places.
-    """
+    """Stand around the scene at several heights and look at its middle."""
     right, ahead = _level_axes(known.up)
     shown = known.radius * (_THING_RADIUS if known.bounded else _PLACE_RADIUS)
     distance = shown / math.sin(math.radians(0.5 * OUTSIDE_FIELD))
@@ -110,18 +100,7 @@ def outside_stands(known: Survey, count: int, *, size: tuple[int, int], turn: fl
 def inside_stands(
     known: Survey, middle: Float[Tensor, "3"], count: int, *, size: tuple[int, int], turn: float
 ) -> Stands:
-    """Stand in a room, back from its middle, and look across.
-
-    Args:
-        known: What is known of the scene.
-        middle: The middle of the room at the height of the eyes, scene units.
-        count: Number of views.
-        size: Width and height of the pictures, pixels.
-        turn: Where the first camera looks, in slots.
-
-    Returns:
-        The places.
-    """
+    """Stand in a room, back from its middle, and look across."""
     right, ahead = _level_axes(known.up)
     pitch = math.radians(_INSIDE_PITCH)
     rounds, reaches = [], []
@@ -139,7 +118,7 @@ def inside_stands(
 def _ways_to_walls(
     known: Survey, start: Float[Tensor, "3"], directions: Float[Tensor, "c 3"]
 ) -> Float[Tensor, "c"]:
-    """Give the distances to the walls, past what stands in the room, scene units."""
+    """Return the distances to the walls, past what stands in the room, scene units."""
     points = known.frame.center + known.frame.radius * known.voxels.points - start
     along = directions @ points.T
     aside = (points.square().sum(dim=1) - along.square()).clamp_min(0).sqrt()
@@ -152,7 +131,7 @@ def _ways_to_walls(
 
 
 def _level_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Give two level directions, fixed by ``up`` alone."""
+    """Return two level directions, fixed by ``up`` alone."""
     least = torch.eye(3, dtype=up.dtype)[up.abs().argmin()]
     right = torch.nn.functional.normalize(torch.linalg.cross(up, least), dim=0)
     return right, torch.linalg.cross(right, up)

@@ -54,20 +54,6 @@ def survey(scene: GaussianScene) -> Survey:
     """Look at a scene once.
 
     Memory: a mask per attribute, and a sample of at most 30,000 Gaussians.
-
-    Args:
-        scene: Any scene.
-
-    Returns:
-        What is known of it.
-
-    Raises:
-        InvalidSceneError: The scene has no valid row.
-
-    Example:
-        >>> from cvtgs.synthetic import scene as make
-        >>> survey(make("object", 2000, seed=0)).bounded
-        True
     """
     valid = _valid(scene)
     sample, places = _sample(valid), _visible_places(valid)
@@ -105,7 +91,7 @@ def _valid(scene: GaussianScene) -> GaussianScene:
 
 
 def _visible_places(scene: GaussianScene) -> Float[Tensor, "k 3"]:
-    """Give the positions of every k-th Gaussian that is not faint; of any if all are."""
+    """Return the positions of every k-th Gaussian that is not faint; of any if all are."""
     step = -(-len(scene) // _MOST_PLACES)
     means = scene.means[::step].cpu()
     visible = means[(scene.opacities[::step] > _VISIBLE).cpu()]
@@ -128,8 +114,8 @@ def _sample(scene: GaussianScene) -> GaussianScene:
         rest = torch.sort(heaviest_first[_HEAVIEST:]).values
         step = -(-len(rest) // (MOST_GAUSSIANS - _HEAVIEST))
         rows = torch.cat([heaviest_first[:_HEAVIEST], rest[::step]])
-        widening = torch.zeros(len(rows), 1, dtype=scene.dtype, device=scene.device)
-        widening[_HEAVIEST:] = 0.5 * torch.log(widening.new_tensor(len(rest) / len(rest[::step])))
+        inflation = torch.zeros(len(rows), 1, dtype=scene.dtype, device=scene.device)
+        inflation[_HEAVIEST:] = 0.5 * torch.log(inflation.new_tensor(len(rest) / len(rest[::step])))
         plain = plain.select(rows)
-        plain = plain.with_tensors({"log_scales": plain.log_scales + widening}, {})
+        plain = plain.with_tensors({"log_scales": plain.log_scales + inflation}, {})
     return with_finite_opacities(plain.to("cpu"))

@@ -39,22 +39,7 @@ class Voxels:
 
 
 def voxels_of(scene: GaussianScene, frame: RobustFrame) -> Voxels:
-    """Gather the Gaussians near the middle in voxels.
-
-    Args:
-        scene: Valid Gaussians, on the CPU.
-        frame: Where the middle is.
-
-    Returns:
-        At most ``(6 / 0.1)^3`` voxels, in a fixed order; those of haze and floaters are left out.
-
-    Example:
-        >>> from cvtgs.math.frames import robust_frame
-        >>> from cvtgs.synthetic import demo_scene
-        >>> scene = demo_scene(2000)
-        >>> bool((voxels_of(scene, robust_frame(scene.means)).points.abs() <= 3).all())
-        True
-    """
+    """Gather the Gaussians near the middle in voxels."""
     places = frame.normalize(scene.means)
     near = (places.abs() < REACH).all(dim=1)
     part, places = scene.select(near), places[near]

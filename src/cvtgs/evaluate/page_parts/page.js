@@ -79,9 +79,9 @@
     at("views").append(...views.map((name, index) => choice("view", index + 1, [
       make("img", undefined, { src: data.full[index], alt: name, title: name, loading: "lazy" }),
     ])));
-    const lpips = data.lpips ? `, LPIPS (${data.lpips === "vgg" ? "VGG" : "Alex"}) is lower for closer pictures` : "";
+    const lpips = data.lpips ? `, LPIPS (${data.lpips === "vgg" ? "VGG" : "Alex"}) is lower for closer images` : "";
     at("about").textContent =
-      `Scores compare pictures of each simplified scene with pictures of the full one, ${data.width} × ${data.height} pixels: ` +
+      `Scores compare images of each simplified scene with images of the full one, ${data.width} × ${data.height} pixels: ` +
       `higher PSNR and SSIM mean closer${lpips}. Rendered by cvtgs with its ${data.backend} backend.`;
   };
 
@@ -91,7 +91,7 @@
     const index = state.view - 1;
     at("full").src = data.full[index];
     at("full").alt = `${name} of ${data.reference.name}, ${count(data.reference.count)} Gaussians`;
-    at("small").src = (state.error ? scene.errors : scene.pictures)[index];
+    at("small").src = (state.error ? scene.errors : scene.images)[index];
     at("small").alt = state.error
       ? `Where ${scene.name} differs from the full scene in ${name}`
       : `${name} of ${scene.name}, ${count(scene.count)} Gaussians`;

@@ -15,35 +15,12 @@ from cvtgs.math import quaternions
 
 
 def is_colmap(folder: Path) -> bool:
-    """Say whether a folder holds a sparse model.
-
-    Args:
-        folder: The folder.
-
-    Returns:
-        Whether it has a file of images, binary or text.
-
-    Example:
-        >>> is_colmap(Path("there is none"))
-        False
-    """
+    """Report whether a folder holds a sparse model."""
     return any(is_file(folder / f"images.{suffix}") for suffix in ("bin", "txt"))
 
 
 def colmap_views(folder: Path) -> list[View]:
-    """Read a sparse model; binary files go before text files.
-
-    Args:
-        folder: Where ``cameras`` and ``images`` are.
-
-    Returns:
-        The views in the order of their names.
-
-    Raises:
-        InputNotFoundError: A file is missing.
-        InputError: A file cannot be opened or read.
-        FileFormatError: A file is damaged, or a camera model is not supported.
-    """
+    """Read a sparse model; binary files go before text files."""
     if is_file(folder / "images.bin"):
         lenses = colmap_binary.read_cameras(folder / "cameras.bin")
         images = colmap_binary.read_images(folder / "images.bin")

@@ -70,19 +70,7 @@ class _Bytes:
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:
-    """Read ``cameras.bin``.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The lens of each camera.
-
-    Raises:
-        InputNotFoundError: There is no such file.
-        InputError: It cannot be opened or read.
-        FileFormatError: It is damaged, or a camera model is not supported.
-    """
+    """Read ``cameras.bin``."""
     lenses: dict[int, Lens] = {}
     with open_input(path) as file:
         data = _Bytes(file=file, size=os.fstat(file.fileno()).st_size, path=path)
@@ -97,19 +85,7 @@ def read_cameras(path: Path) -> dict[int, Lens]:
 
 
 def read_images(path: Path) -> list[ColmapImage]:
-    """Read ``images.bin``; the points in the images are skipped.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The images, in the order of the file.
-
-    Raises:
-        InputNotFoundError: There is no such file.
-        InputError: It cannot be opened or read.
-        FileFormatError: It is damaged.
-    """
+    """Read ``images.bin``; the points in the images are skipped."""
     images: list[ColmapImage] = []
     with open_input(path) as file:
         data = _Bytes(file=file, size=os.fstat(file.fileno()).st_size, path=path)

@@ -25,24 +25,7 @@ class ColmapImage:
 
 
 def checked_image(name: str, camera: int, *, pose: Sequence[float], where: str) -> ColmapImage:
-    """Refuse poses that are none.
-
-    Args:
-        name: The photograph's name.
-        camera: Number of its camera.
-        pose: Quaternion, w first, and translation.
-        where: Path and row, for the error text.
-
-    Returns:
-        The image.
-
-    Raises:
-        FileFormatError: A number is not finite, the quaternion is zero or the name is empty.
-
-    Example:
-        >>> checked_image("a.jpg", 1, pose=[1.0, 0, 0, 0, 0, 0, 2.0], where="images.txt").shift
-        (0, 0, 2.0)
-    """
+    """Refuse poses that are none."""
     if not all(map(math.isfinite, pose)) or not any(pose[:4]):
         raise FileFormatError(
             f"{where}: the pose must be finite with a quaternion other than 0, "

@@ -45,39 +45,13 @@ _OTHERS = {
 
 
 def model_name(number: int) -> str:
-    """Give the name of the model that a binary file calls by number.
-
-    Args:
-        number: The number.
-
-    Returns:
-        The name, also of models that are not supported.
-
-    Example:
-        >>> model_name(1)
-        'PINHOLE'
-    """
+    """Return the name of the model that a binary file calls by number."""
     names = {model.number: name for name, model in MODELS.items()} | _OTHERS
     return names.get(number, f"number {number}")
 
 
 def find_model(name: str, where: str) -> Model:
-    """Look a model up.
-
-    Args:
-        name: Its name.
-        where: Path and row, for the error text.
-
-    Returns:
-        The model.
-
-    Raises:
-        FileFormatError: It is not supported.
-
-    Example:
-        >>> find_model("PINHOLE", "cameras.txt: camera 1").parameters
-        4
-    """
+    """Look a model up."""
     if name not in MODELS:
         raise FileFormatError(
             f"{where}: the camera model must be one of {', '.join(MODELS)}, found {name}; "
@@ -89,28 +63,7 @@ def find_model(name: str, where: str) -> Model:
 def lens_of(
     model: Model, parameters: Sequence[float], *, width: int, height: int, where: str
 ) -> Lens:
-    """Take the pinhole part of a camera.
-
-    Args:
-        model: Its model.
-        parameters: As many as the model has, in COLMAP's order.
-        width: Pixels per row.
-        height: Rows.
-        where: Path and row, for error texts.
-
-    Returns:
-        The lens; it says whether a distortion other than 0 is left out.
-
-    Raises:
-        FileFormatError: A number is out of range.
-
-    Example:
-        >>> lens = lens_of(
-        ...     MODELS["SIMPLE_RADIAL"], [90.0, 32.0, 24.0, 0.1], width=64, height=48, where="a"
-        ... )
-        >>> lens.fy, lens.distorted
-        (90.0, True)
-    """
+    """Take the pinhole part of a camera."""
     focals, rest = parameters[: model.focals], parameters[model.focals :]
     cx, cy, *distortion = rest
     for value in distortion:

@@ -13,19 +13,7 @@ from cvtgs.io.files import open_input
 
 
 def read_cameras(path: Path) -> dict[int, Lens]:
-    """Read ``cameras.txt``: number, model, width, height and parameters in a line.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The lens of each camera.
-
-    Raises:
-        InputNotFoundError: There is no such file.
-        InputError: It cannot be opened or read.
-        FileFormatError: A line does not fit.
-    """
+    """Read ``cameras.txt``: number, model, width, height and parameters in a line."""
     lenses: dict[int, Lens] = {}
     with open_input(path) as file:
         for number, line in _lines(file):
@@ -48,19 +36,7 @@ def read_cameras(path: Path) -> dict[int, Lens]:
 
 
 def read_images(path: Path) -> list[ColmapImage]:
-    """Read ``images.txt``: a line with number, pose, camera and name, and a line of points.
-
-    Args:
-        path: The file.
-
-    Returns:
-        The images, in the order of the file.
-
-    Raises:
-        InputNotFoundError: There is no such file.
-        InputError: It cannot be opened or read.
-        FileFormatError: A line does not fit.
-    """
+    """Read ``images.txt``: a line with number, pose, camera and name, and a line of points."""
     images: list[ColmapImage] = []
     with open_input(path) as file:
         lines = _lines(file)

@@ -14,19 +14,7 @@ _EVERY = 8
 
 
 def hold_out(views: Sequence[View], split: Split | None) -> list[View]:
-    """Take every 8th view in the order of names for testing, as Mip-NeRF 360 and 3DGS do.
-
-    Args:
-        views: All views.
-        split: Which of them; None for all.
-
-    Returns:
-        Those views, in the given order; the first name is for testing.
-
-    Example:
-        >>> hold_out([], "test")
-        []
-    """
+    """Take every 8th view in the order of names for testing, as Mip-NeRF 360 and 3DGS do."""
     if split is None:
         return list(views)
     by_name = sorted(range(len(views)), key=lambda row: views[row].name)

@@ -9,18 +9,7 @@ from cvtgs.io.fields import Fields
 
 
 def inria_views(entries: Sequence[Any], path: Path) -> list[View]:
-    """Read the cameras of a ``cameras.json``.
-
-    Args:
-        entries: The parsed file.
-        path: Its path, for error texts.
-
-    Returns:
-        The views, in the order of the file. The principal point is the middle of the image.
-
-    Raises:
-        FileFormatError: A key is missing or has a value that does not fit.
-    """
+    """Read the cameras of a ``cameras.json``."""
     return [_view(Fields.of(entry, f"{path}: camera {row}")) for row, entry in enumerate(entries)]
 
 

@@ -11,19 +11,7 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def png_size(path: Path) -> tuple[int, int]:
-    """Read the size of a PNG image from its first bytes.
-
-    Args:
-        path: The image.
-
-    Returns:
-        Width and height in pixels.
-
-    Raises:
-        InputNotFoundError: There is no such file.
-        InputError: It cannot be opened or read.
-        FileFormatError: It is not a PNG file.
-    """
+    """Read the size of a PNG image from its first bytes."""
     with open_input(path) as file:
         start = file.read(_START.size)
     if len(start) == _START.size:

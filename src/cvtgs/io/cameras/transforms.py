@@ -28,20 +28,7 @@ _OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 def transforms_views(document: Mapping[str, Any], path: Path, split: Split | None) -> list[View]:
-    """Read the frames of a ``transforms.json``.
-
-    Args:
-        document: The parsed file.
-        path: Its path, for error texts, the split in its name, and images beside it.
-        split: Which frames; None for all.
-
-    Returns:
-        The views, in the order of the file.
-
-    Raises:
-        FileFormatError: A key is missing or has a value that does not fit.
-        InvalidArgumentError: The file is that of the other split.
-    """
+    """Read the frames of a ``transforms.json``."""
     everything = Fields.of(document, str(path))
     views = [
         _view(Fields.of(frame, f"{path}: frame {row}"), everything, path.parent)
@@ -102,7 +89,7 @@ def _first(*values: float | None) -> float:
 
 
 def _place(frame: Fields, everything: Fields, key: str) -> Fields | None:
-    """Say who gives a key: the frame, the whole file or nobody."""
+    """Report who gives a key: the frame, the whole file or nobody."""
     return next((fields for fields in (frame, everything) if key in fields), None)
 
 

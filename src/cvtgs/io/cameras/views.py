@@ -60,22 +60,7 @@ class View:
 
 
 def checked_lens(lens: Lens, where: str) -> Lens:
-    """Refuse intrinsics that no camera has.
-
-    Args:
-        lens: What the file gives.
-        where: Path and row, for the error text.
-
-    Returns:
-        The same lens.
-
-    Raises:
-        FileFormatError: A size or focal length is out of range, or a number is not finite.
-
-    Example:
-        >>> checked_lens(Lens(fx=9.0, fy=9.0, cx=4.0, cy=3.0, width=8, height=6), "a.json").width
-        8
-    """
+    """Refuse intrinsics that no camera has."""
     if not (1 <= lens.width <= MAX_PIXELS and 1 <= lens.height <= MAX_PIXELS):
         raise FileFormatError(
             f"{where}: the image size must be from 1 to {MAX_PIXELS:,} pixels, "
@@ -93,24 +78,7 @@ def checked_lens(lens: Lens, where: str) -> Lens:
 def viewmat_of_pose(
     rotation: Float[np.ndarray, "3 3"], center: Float[np.ndarray, "3"], *, where: str
 ) -> Float[np.ndarray, "4 4"]:
-    """Invert a camera's pose.
-
-    Args:
-        rotation: From camera (OpenCV axes) to world; rounded numbers are set right to the
-            nearest rotation.
-        center: The camera's position in the world.
-        where: Path and row, for the error text.
-
-    Returns:
-        The matrix from world to camera.
-
-    Raises:
-        FileFormatError: The matrix is no rotation.
-
-    Example:
-        >>> viewmat_of_pose(np.eye(3), np.array([0.0, 0.0, -2.0]), where="a.json")[2].tolist()
-        [0.0, 0.0, 1.0, 2.0]
-    """
+    """Invert a camera's pose."""
     skew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     determinant = float(np.linalg.det(rotation))
     if skew > _SKEW or determinant < 0:
@@ -127,15 +95,7 @@ def viewmat_of_pose(
 
 
 def to_cameras(views: Sequence[View], path: str) -> Cameras:
-    """Bring views to the most frequent image size, and warn of distortion once.
-
-    Args:
-        views: At least one.
-        path: Where they came from, for the warning.
-
-    Returns:
-        The cameras, float64 on the CPU, in the same order.
-    """
+    """Bring views to the most frequent image size, and warn of distortion once."""
     sizes = Counter((view.lens.width, view.lens.height) for view in views)
     (width, height), _ = sizes.most_common(1)[0]
     _warn_of_distortion(views, path)

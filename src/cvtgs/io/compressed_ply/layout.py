@@ -32,21 +32,7 @@ QUAT_BITS = (10, 10, 10)
 def pack(
     fractions: Float[np.ndarray, "n k"], bits: tuple[int, ...], *, high: UInt32[np.ndarray, "n"]
 ) -> UInt32[np.ndarray, "n"]:
-    """Put fractions side by side into 32 bits.
-
-    Args:
-        fractions: Numbers in [0, 1].
-        bits: Size of each field, the highest first.
-        high: What stands in the bits above them.
-
-    Returns:
-        The words.
-
-    Example:
-        >>> none = np.zeros(1, np.uint32)
-        >>> hex(pack(np.array([[1.0, 0.0, 1.0]]), (11, 10, 11), high=none)[0])
-        '0xffe007ff'
-    """
+    """Put fractions side by side into 32 bits."""
     words = high
     for column, size in zip(fractions.T, bits, strict=True):
         most = (1 << size) - 1
@@ -56,19 +42,7 @@ def pack(
 
 
 def unpack(words: UInt32[np.ndarray, "n"], bits: tuple[int, ...]) -> Float[np.ndarray, "n k"]:
-    """Take fractions out of 32 bits, the inverse of :func:`pack`.
-
-    Args:
-        words: The words.
-        bits: Size of each field, the highest first; the last ends at the lowest bit.
-
-    Returns:
-        Numbers in [0, 1].
-
-    Example:
-        >>> unpack(np.array([0xFFE007FF], np.uint32), (11, 10, 11)).tolist()
-        [[1.0, 0.0, 1.0]]
-    """
+    """Take fractions out of 32 bits, the inverse of :func:`pack`."""
     fractions = np.empty((len(words), len(bits)), np.float32)
     shift = sum(bits)
     for column, size in enumerate(bits):

@@ -32,7 +32,7 @@ Rows = NDArray[Any]
 
 
 def is_compressed_ply(path: Path) -> bool:
-    """Tell by its header whether a PLY file is a compressed one, whatever its name.
+    """Return by its header whether a PLY file is a compressed one, whatever its name.
 
     Args:
         path: A file.
@@ -95,7 +95,7 @@ def _between(
 
 
 def _ranges(chunks: Rows) -> Float[np.ndarray, "c 18"]:
-    """Give the ranges of each chunk; colours without any are in [0, 1]."""
+    """Return the ranges of each chunk; colours without any are in [0, 1]."""
     names = RANGES if RANGES[-1] in (chunks.dtype.names or ()) else RANGES[:UNCOLORED]
     ranges = np.tile(np.array([0, 0, 0, 1, 1, 1], np.float32), (len(chunks), 3))
     for column, name in enumerate(names):

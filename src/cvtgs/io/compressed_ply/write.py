@@ -17,7 +17,7 @@ from cvtgs.io.compressed_ply.layout import (
     THREE_BITS,
     pack,
 )
-from cvtgs.io.holds import Holds
+from cvtgs.io.limits import Holds
 from cvtgs.io.morton import morton_rows
 from cvtgs.io.smallest_three import drop_largest
 from cvtgs.scene import GaussianScene
@@ -97,7 +97,7 @@ def _header(comments: tuple[str, ...], count: int, rest: int) -> bytes:
 def _packed(
     arrays: Arrays, order: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Give the ranges of each chunk and the words of each Gaussian."""
+    """Return the ranges of each chunk and the words of each Gaussian."""
     log_scales = np.clip(arrays.log_scales, -_MOST_LOG_SCALE, _MOST_LOG_SCALE)
     opacities = opacity_bytes(arrays.logit_opacities)[order].astype(np.uint32)
     place, place_range = _fractions(arrays.means[order])
@@ -120,7 +120,7 @@ def _packed(
 def _fractions(
     values: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "c 6"]]:
-    """Say where values lie between the least and the largest of their chunk, and give these."""
+    """Report where values lie between the least and the largest of their chunk, and give these."""
     starts = np.arange(0, len(values), CHUNK_ROWS)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     size = np.diff(np.append(starts, len(values)))

@@ -33,18 +33,6 @@ def assemble(
     """Copy rows into a new scene, chunk by chunk.
 
     Memory is the scene plus what ``chunks`` holds.
-
-    Args:
-        chunks: Structured arrays that together have ``count`` rows, a field per property.
-        count: Number of Gaussians, n.
-        layout: Names and types of the scalar properties, all standard ones of an SH degree
-            among them (``scale_2`` may be missing).
-        comments: Comment lines of the file.
-        sh_degree: SH bands above are not copied; their zeros take no memory until written to.
-        with_extras: Whether columns beyond the standard ones are copied.
-
-    Returns:
-        The scene; all-zero normals are in its layout only, other unknown columns are extras.
     """
     types = dict(layout)
     tensors = _empty_tensors(count, rest_count_of(types) or 0, dtype_of(layout))
@@ -99,7 +87,7 @@ def _empty_tensors(count: int, rest_count: int, dtype: torch.dtype) -> dict[str,
 def _standard_columns(
     tensors: dict[str, Tensor], types: dict[str, str], sh_degree: int | None
 ) -> dict[str, NDArray[Any]]:
-    """Give a writable view of every standard column that is to be read, in file order."""
+    """Return a writable view of every standard column that is to be read, in file order."""
     slots = standard_slots(tensors["shN"].shape[1])
     if sh_degree is not None:
         read = REST_COUNTS[sh_degree]

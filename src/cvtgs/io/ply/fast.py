@@ -14,14 +14,7 @@ CHUNK_BYTES = 1 << 20
 
 
 def can_read(header: Header) -> bool:
-    """Tell whether the vertex rows can be mapped as they are.
-
-    Args:
-        header: The parsed header.
-
-    Returns:
-        True for binary little endian, the vertex element first, and no lists in it.
-    """
+    """Return whether the vertex rows can be mapped as they are."""
     first = header.elements[0]
     little = header.encoding == "binary_little_endian"
     return little and first.name == "vertex" and not first.has_lists
@@ -32,13 +25,6 @@ def read_chunks(file: BinaryIO, header: Header) -> Iterator[NDArray[Any]]:
 
     Each chunk is unmapped when the caller lets go of it, so the file's pages do not add up:
     memory is one or two chunks.
-
-    Args:
-        file: The file, open for reading; long enough for the rows its header promises.
-        header: The parsed header, one that :func:`can_read` accepts.
-
-    Yields:
-        Structured arrays with one field per property.
     """
     vertex = header.elements[0]
     dtype = _record_dtype(vertex)

@@ -23,18 +23,6 @@ def read_chunks(
     """Read the vertex rows of any PLY file.
 
     ASCII rows and rows with lists are held in memory as a whole, others are mapped.
-
-    Args:
-        file: The file, open for reading.
-        header: The parsed header.
-        vertex: Its vertex element.
-        path: The file, for error texts.
-
-    Yields:
-        Structured arrays with one field per property.
-
-    Raises:
-        FileFormatError: The file is cut short or a number cannot be read.
     """
     rows = _read_rows(file, header, vertex=vertex, path=path)
     for start in range(0, vertex.count, CHUNK_ROWS):
@@ -100,15 +88,15 @@ class _CleanStream(io.BufferedIOBase):
         return self.read(size)
 
     def readable(self) -> bool:
-        """Say yes."""
+        """Report yes."""
         return True
 
     def seekable(self) -> bool:
-        """Say yes."""
+        """Report yes."""
         return True
 
     def tell(self) -> int:
-        """Give the position in the real file."""
+        """Return the position in the real file."""
         return self._file.tell()
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
@@ -116,7 +104,7 @@ class _CleanStream(io.BufferedIOBase):
         return self._file.seek(offset, whence)
 
     def fileno(self) -> int:
-        """Give the real file, for memory mapping."""
+        """Return the real file, for memory mapping."""
         return self._file.fileno()
 
 

@@ -66,14 +66,7 @@ class Element:
         return any(prop.count_type for prop in self.properties)
 
     def row_bytes(self, encoding: Encoding) -> int:
-        """Give the least size of a row.
-
-        Args:
-            encoding: How the file stores numbers.
-
-        Returns:
-            Bytes; exact for binary rows without lists.
-        """
+        """Return the least size of a row."""
         if encoding == "ascii":
             return 2 * len(self.properties)
         return sum(prop.least_bytes for prop in self.properties)
@@ -100,23 +93,6 @@ def read_header(file: BinaryIO, path: str) -> Header:
     r"""Parse the header of a PLY file.
 
     Lines may end in LF, CRLF or CR and have trailing blanks; blank lines are skipped.
-
-    Args:
-        file: The file, at its start.
-        path: Its name, for error texts.
-
-    Returns:
-        The header.
-
-    Raises:
-        FileFormatError: This is no PLY header.
-
-    Example:
-        >>> import io
-        >>> text = b"ply\nformat ascii 1.0\nelement vertex 1\nend_header\n"
-        >>> header = read_header(io.BytesIO(text), "point.ply")
-        >>> header.elements[0].count, header.data_offset
-        (1, 49)
     """
     lines, data_offset = _header_lines(file.read(MAX_HEADER_BYTES), path)
     encoding: Encoding | None = None
@@ -158,7 +134,7 @@ def read_header(file: BinaryIO, path: str) -> Header:
 
 
 def _start_of(block: bytes) -> str:
-    """Say what a file is that is no PLY file, as far as its first bytes tell."""
+    """Report what a file is that is no PLY file, as far as its first bytes tell."""
     for start, found in _STRANGERS.items():
         if block.startswith(start):
             return found
@@ -166,7 +142,7 @@ def _start_of(block: bytes) -> str:
 
 
 def _header_lines(block: bytes, path: str) -> tuple[list[str], int]:
-    """Give the lines between ``ply`` and ``end_header``, and where the data starts."""
+    """Return the lines between ``ply`` and ``end_header``, and where the data starts."""
     if not block:
         raise FileFormatError(f"{path}: must be a PLY file, found an empty file.")
     first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", block)
@@ -201,7 +177,7 @@ def _is_count(text: str) -> bool:
 
 
 def _is_name(text: str) -> bool:
-    """Tell whether a name can stand in a sentence; real ones have some twenty letters."""
+    """Return whether a name can stand in a sentence; real ones have some twenty letters."""
     return len(text) <= _MAX_NAME_LETTERS
 
 

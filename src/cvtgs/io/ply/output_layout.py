@@ -32,20 +32,11 @@ _NATURAL_TYPES = {
 
 
 def output_layout(scene: GaussianScene) -> Layout:
-    """Give the properties to write.
+    """Return the properties to write.
 
     A scene that was read keeps names, order and types. Where its layout does not fit any more,
     the standard properties follow the scene (SH degree, dtype), columns that are gone are left
     out, and new extras are appended. A scene without a layout gets INRIA's.
-
-    Args:
-        scene: The scene to write.
-
-    Returns:
-        Names and canonical types, in order.
-
-    Raises:
-        InvalidSceneError: An extra column cannot be written.
     """
     _check_names(scene)
     slots = standard_slots(scene.shN.shape[1])
@@ -110,7 +101,7 @@ def _check_names(scene: GaussianScene) -> None:
 
 
 def _extra_type(name: str, column: Tensor, kind: str | None) -> str:
-    """Give the type that the column came with if it still holds every value, else its own."""
+    """Return the type that the column came with if it still holds every value, else its own."""
     if kind is not None and SCALARS[kind].dtype == column.dtype and _fits(column, kind):
         return kind
     if column.dtype == torch.int64:

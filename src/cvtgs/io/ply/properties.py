@@ -82,19 +82,7 @@ class Slot:
 
 
 def standard_slots(rest_count: int) -> dict[str, Slot]:
-    """Give the standard properties in INRIA's order, and where each belongs.
-
-    Args:
-        rest_count: View-dependent SH coefficients per channel, k in {0, 3, 8, 15}. Files store
-            them channel by channel: ``f_rest_[c k + j]`` is ``shN[:, j, c]``.
-
-    Returns:
-        Slots by property name.
-
-    Example:
-        >>> standard_slots(3)["f_rest_4"]
-        Slot(tensor='shN', index=(1, 1))
-    """
+    """Return the standard properties in INRIA's order, and where each belongs."""
     return {
         **{name: Slot(tensor="means", index=(i,)) for i, name in enumerate("xyz")},
         **{f"f_dc_{c}": Slot(tensor="sh0", index=(0, c)) for c in range(3)},
@@ -110,84 +98,29 @@ def standard_slots(rest_count: int) -> dict[str, Slot]:
 
 
 def is_standard(name: str) -> bool:
-    """Tell whether a property is one of the scene's own, of any SH degree.
-
-    Args:
-        name: Property name.
-
-    Returns:
-        Whether it can not be an extra column.
-
-    Example:
-        >>> is_standard("f_rest_44"), is_standard("nx")
-        (True, False)
-    """
+    """Return whether a property is one of the scene's own, of any SH degree."""
     return name in standard_slots(0) or rest_index(name) is not None
 
 
 def rest_index(name: str) -> int | None:
-    """Give the number of an ``f_rest_*`` property.
-
-    Args:
-        name: Property name.
-
-    Returns:
-        The number, None for other properties.
-
-    Example:
-        >>> rest_index("f_rest_7"), rest_index("opacity")
-        (7, None)
-    """
+    """Return the number of an ``f_rest_*`` property."""
     match = _REST_NAME.fullmatch(name)
     return int(match[1]) if match else None
 
 
 def rest_count_of(names: Iterable[str]) -> int | None:
-    """Count the view-dependent SH coefficients per channel.
-
-    Args:
-        names: Property names.
-
-    Returns:
-        0, 3, 8 or 15; None if the number of ``f_rest_*`` belongs to no SH degree.
-
-    Example:
-        >>> rest_count_of(f"f_rest_{i}" for i in range(24)), rest_count_of(["f_rest_0"])
-        (8, None)
-    """
+    """Count the view-dependent SH coefficients per channel."""
     total = sum(rest_index(name) is not None for name in names)
     return total // 3 if total in {3 * count for count in REST_COUNTS} else None
 
 
 def lacks_third_scale(layout: Layout) -> bool:
-    """Tell whether the Gaussians of a file have two scales: surfels of 2DGS (Huang et al. 2024).
-
-    Args:
-        layout: Property names and canonical types; empty for a scene that was made in memory.
-
-    Returns:
-        Whether there is no place for a third one.
-
-    Example:
-        >>> lacks_third_scale((("scale_0", "float"), ("scale_1", "float"))), lacks_third_scale(())
-        (True, False)
-    """
+    """Return whether Gaussians of a file have two scales: surfels of 2DGS (Huang et al. 2024)."""
     return bool(layout) and "scale_2" not in dict(layout)
 
 
 def dtype_of(layout: Layout) -> torch.dtype:
-    """Give the dtype of a scene that was read from this layout.
-
-    Args:
-        layout: Property names and canonical types.
-
-    Returns:
-        float64 if a coordinate is double, else float32.
-
-    Example:
-        >>> dtype_of((("x", "double"), ("y", "double"), ("z", "double"), ("opacity", "float")))
-        torch.float64
-    """
+    """Return the dtype of a scene that was read from this layout."""
     types = dict(layout)
     double = any(types.get(axis) == "double" for axis in "xyz")
     return torch.float64 if double else torch.float32

@@ -16,18 +16,7 @@ OPTIONAL = ("scale_2",)
 
 
 def find_vertices(header: Header, path: str) -> Element:
-    """Find the vertex element and check that it holds Gaussians.
-
-    Args:
-        header: The parsed header.
-        path: The file, for error texts.
-
-    Returns:
-        The vertex element.
-
-    Raises:
-        FileFormatError: It is missing or empty, or its properties are not those of a 3DGS scene.
-    """
+    """Find the vertex element and check that it holds Gaussians."""
     vertex = next((element for element in header.elements if element.name == "vertex"), None)
     if vertex is None:
         found = ", ".join(repr(element.name) for element in header.elements[:5]) or "no element"
@@ -41,17 +30,7 @@ def find_vertices(header: Header, path: str) -> Element:
 
 
 def check_size(header: Header, vertex: Element, *, path: str, size: int) -> None:
-    """Check that the file is long enough for the rows it promises, before room is made for them.
-
-    Args:
-        header: The parsed header.
-        vertex: Its vertex element.
-        path: The file, for error texts.
-        size: Its size in bytes.
-
-    Raises:
-        FileFormatError: The file is cut short, or its header lies.
-    """
+    """Check that the file is long enough for the rows it promises, before room is made for them."""
     before = header.elements[: header.elements.index(vertex)]
     room = size - header.data_offset
     room -= sum(element.count * element.row_bytes(header.encoding) for element in before)
@@ -69,16 +48,10 @@ def check_size(header: Header, vertex: Element, *, path: str, size: int) -> None
 
 
 def layout_of(vertex: Element) -> Layout:
-    """Give the layout that a scene remembers.
+    """Return the layout that a scene remembers.
 
     Lists are left out. Standard properties that the file stores as integers are ``float`` from
     here on, since merged values are not whole numbers.
-
-    Args:
-        vertex: The vertex element.
-
-    Returns:
-        Names and canonical types, in file order.
     """
     return tuple(
         (

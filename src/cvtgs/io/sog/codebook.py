@@ -31,17 +31,6 @@ def codebook(values: Float[np.ndarray, "*n"]) -> Codebook:
     One-dimensional k-means (Lloyd 1982) on the sorted values, from codes whose density follows
     the cube root of that of the values (Panter and Dite 1951). Up to 256 different values are
     kept. Memory: three copies of the values in float64.
-
-    Args:
-        values: Finite numbers.
-
-    Returns:
-        The numbers and the label of each value.
-
-    Example:
-        >>> codes, labels = codebook(np.array([[0.0, 1.0], [1.0, 5.0]]))
-        >>> codes[labels].tolist()
-        [[0.0, 1.0], [1.0, 5.0]]
     """
     ordered = np.sort(values, axis=None).astype(np.float64)
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
@@ -88,18 +77,6 @@ def palette(rows: Float[np.ndarray, "n d"], most: int = PALETTE) -> Palette:
     mean of its most varied column (Wu 1991, in all groups at once); entries are means of groups.
     This takes seconds for a million rows, where k-means would take an hour on a CPU. Memory: three
     copies of the rows.
-
-    Args:
-        rows: Finite numbers.
-        most: A power of two.
-
-    Returns:
-        The entries and the label of each row.
-
-    Example:
-        >>> rows = np.array([[0.0], [0.1], [5.0], [5.1]])
-        >>> palette(rows, 2).entries.round(2).tolist()
-        [[0.05], [5.05]]
     """
     if len(rows) <= most:
         return Palette(rows, np.arange(len(rows)))
@@ -126,7 +103,7 @@ def _halved(rows: Tensor, squares: Tensor, order: Tensor, starts: Tensor) -> tup
 
 
 def _groups(starts: Tensor, count: int) -> Tensor:
-    """Give the number of the group of every place."""
+    """Return the number of the group of every place."""
     ends = torch.cat([starts[1:], starts.new_tensor([count])])
     return torch.repeat_interleave(ends - starts)
 

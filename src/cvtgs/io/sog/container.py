@@ -17,26 +17,12 @@ Reader = Callable[[str, int], bytes]
 
 
 def open_container(path: Path) -> AbstractContextManager[Reader]:
-    """Open a bundled or an unbundled SOG.
-
-    Args:
-        path: The ``.sog`` file, or the ``meta.json``.
-
-    Returns:
-        A context that gives the files by name.
-    """
+    """Open a bundled or an unbundled SOG."""
     return _beside(path) if path.name == META else _inside(path)
 
 
 def read_meta(read: Reader) -> bytes:
-    """Read the ``meta.json``.
-
-    Args:
-        read: The open container.
-
-    Returns:
-        Its text.
-    """
+    """Read the ``meta.json``."""
     return read(META, _MOST_META_BYTES)
 
 

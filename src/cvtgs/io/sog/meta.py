@@ -46,18 +46,7 @@ class Meta:
 
 
 def parse_meta(document: Any, where: str) -> Meta:
-    """Check a ``meta.json``.
-
-    Args:
-        document: The parsed JSON.
-        where: Its path, for error texts.
-
-    Returns:
-        What it says.
-
-    Raises:
-        FileFormatError: Something is missing or does not fit.
-    """
+    """Check a ``meta.json``."""
     root = Fields.of(document, where)
     version = root.whole("version") if "version" in root else 1
     if version not in (1, 2):
@@ -108,7 +97,7 @@ def _bands(rest: Fields) -> int:
 
 
 def _codebooks(parts: dict[str, Fields]) -> dict[str, NDArray[np.float64]]:
-    """Give what bytes stand for in version 2: all channels share at most 256 numbers."""
+    """Return what bytes stand for in version 2: all channels share at most 256 numbers."""
     tables = {}
     for name in {"scales", "sh0", "shN"} & parts.keys():
         count = len(parts[name].items("codebook"))
@@ -118,7 +107,7 @@ def _codebooks(parts: dict[str, Fields]) -> dict[str, NDArray[np.float64]]:
 
 
 def _ranges(parts: dict[str, Fields]) -> dict[str, NDArray[np.float64]]:
-    """Give what bytes stand for in version 1: equal steps from a least to a largest number."""
+    """Return what bytes stand for in version 1: equal steps from a least to a largest number."""
     steps = np.arange(256) / 255
     tables = {}
     for name, channels in (("scales", 3), ("sh0", 4)):

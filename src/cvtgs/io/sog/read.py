@@ -68,7 +68,7 @@ class _Images:
         return decode_webp(content, f"{self._path}: {name}", most_pixels=most)
 
     def rows(self, purpose: str) -> UInt8[np.ndarray, "n 4"]:
-        """Give the pixel of every Gaussian."""
+        """Return the pixel of every Gaussian."""
         if self._last is None or self._last[0] != purpose:
             count = self._meta.count
             pixels = self.pixels(purpose, 4 * count + _SPARE_PIXELS).reshape(-1, 4)

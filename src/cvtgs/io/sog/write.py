@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 
 from cvtgs.io.arrays import arrays_of, opacity_bytes, to_bytes
-from cvtgs.io.holds import Holds
+from cvtgs.io.limits import Holds
 from cvtgs.io.morton import morton_rows
 from cvtgs.io.smallest_three import HALF_RANGE, drop_largest
 from cvtgs.io.sog.codebook import codebook, palette

@@ -42,20 +42,7 @@ class SpzFile(NamedTuple):
 
 
 def read_blocks(path: Path) -> SpzFile:
-    """Read and decompress a file.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Its parts.
-
-    Raises:
-        InputNotFoundError: There is no such file.
-        InputError: It cannot be opened or read.
-        FileFormatError: It is not an ``.spz`` file, or damaged.
-        MissingDependencyError: It is of version 4, and zstandard is not installed.
-    """
+    """Read and decompress a file."""
     content = read_bytes(path)
     if content[:2] == _GZIP:
         return _read_gzip(content, path)

@@ -66,11 +66,7 @@ class SpzHeader:
         return {name: self.count * size for name, size in per_row.items()}
 
     def packed(self) -> bytes:
-        """Give the first 16 bytes of the file.
-
-        Returns:
-            The bytes.
-        """
+        """Return the first 16 bytes of the file."""
         return HEADER.pack(
             MAGIC,
             self.version,
@@ -83,14 +79,7 @@ class SpzHeader:
 
 
 def turned(arrays: Arrays) -> Arrays:
-    """Turn a scene by half a turn about x: between right-up-back and right-down-forward axes.
-
-    Args:
-        arrays: The scene.
-
-    Returns:
-        The turned scene; turned twice it is itself.
-    """
+    """Turn a scene by half a turn about x: between right-up-back and right-down-forward axes."""
     quats = arrays.quats.copy()
     quats[:, 1:] *= _SIGNS  # of y z, x z and x y, which are the same
     return Arrays(

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from cvtgs.io.arrays import Arrays, arrays_of, opacity_bytes, to_bytes, writable_rows
-from cvtgs.io.holds import Holds
+from cvtgs.io.limits import Holds
 from cvtgs.io.smallest_three import HALF_RANGE, drop_largest
 from cvtgs.io.spz.layout import ANTIALIASED_FLAG, COLOR_SCALE, Axes, SpzHeader, turned
 from cvtgs.math.spherical_harmonics import REST_COUNTS, degree_of
@@ -29,17 +29,6 @@ def fractional_bits(scene: GaussianScene) -> int:
     12, as Niantic's library has it, or more in scenes smaller than 8 units, so that a coordinate
     has 16 bits at least, or fewer in scenes larger than 2,048 units. A thousandth of the
     Gaussians may lie beyond; they are moved to the border.
-
-    Args:
-        scene: The scene.
-
-    Returns:
-        The number of bits; a file holds coordinates below ``2^23 / 2^bits``.
-
-    Example:
-        >>> from cvtgs.synthetic import scene
-        >>> fractional_bits(scene("object", 100, sh_degree=0, seed=0))
-        14
     """
     rows = scene.means.detach()[writable_rows(scene)].abs().amax(dim=1)
     if not len(rows):
@@ -117,7 +106,7 @@ def write_spz(
 
 
 def _blocks(arrays: Arrays, header: SpzHeader) -> Iterator[UInt8[np.ndarray, "n b"]]:
-    """Give the blocks in the order of the file, a part of a block at a time."""
+    """Return the blocks in the order of the file, a part of a block at a time."""
     parts = [
         slice(start, start + _CHUNK_ROWS) for start in range(0, len(arrays.means), _CHUNK_ROWS)
     ]

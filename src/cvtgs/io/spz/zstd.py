@@ -7,20 +7,7 @@ from cvtgs.errors import FileFormatError, MissingDependencyError
 
 
 def decompress(content: bytes, size: int, where: str) -> UInt8[np.ndarray, "b"]:
-    """Decompress a block of known size.
-
-    Args:
-        content: The compressed block.
-        size: Its size when decompressed, bytes.
-        where: Path and block, for error texts.
-
-    Returns:
-        The bytes.
-
-    Raises:
-        MissingDependencyError: zstandard is not installed.
-        FileFormatError: The block is damaged or has another size.
-    """
+    """Decompress a block of known size."""
     try:
         import zstandard  # noqa: PLC0415 (optional)
     except ImportError as error:

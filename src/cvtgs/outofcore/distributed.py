@@ -1,0 +1,104 @@
+"""Blocks on many machines, by Dask's distributed scheduler; the only file that imports dask."""
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cvtgs.errors import MissingDependencyError, RunError
+from cvtgs.outofcore.run import simplify_file
+from cvtgs.outofcore.turns import Item, Result
+from cvtgs.report import SimplifyReport
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+DEATHS = 5
+"""A piece of work that so many workers have died with is given up."""
+
+
+def simplify_distributed(
+    source: str | os.PathLike[str],
+    rho: float,
+    client: "Client | str",
+    *,
+    output: str | os.PathLike[str] | None = None,
+    **options: Any,
+) -> SimplifyReport:
+    """Simplify a file on the workers of a Dask cluster.
+
+    What :func:`cvtgs.outofcore.simplify_file` does, with the same bits for the same number of
+    blocks (processors of one kind given): ranges of the file and blocks are tasks of a few
+    seconds to minutes each, and all that they exchange are files in the folder beside the output.
+    Every worker must see source and output under the same path. Workers may die and come back;
+    what they were doing is done again.
+
+    Args:
+        source: A binary PLY file.
+        rho: Ratio of Gaussians to keep, in (0, 1].
+        client: A client of the cluster, or the address of its scheduler.
+        output: The file to write; None writes ``<stem>_rho<rho>.ply`` beside the source.
+        **options: Those of :func:`cvtgs.outofcore.simplify_file`; ``memory`` is that of one task.
+
+    Returns:
+        The report.
+
+    Raises:
+        MissingDependencyError: ``distributed`` is not installed.
+        RunError: A piece of work fails again and again, or there is no such scheduler.
+        CvtgsError: What :func:`cvtgs.outofcore.simplify_file` raises.
+    """
+    if output is None:
+        output = Path(source).with_name(f"{Path(source).stem}_rho{rho:g}.ply")
+    if isinstance(client, str):
+        with connect(client) as found:
+            return simplify_file(source, output, rho, workers=workers_of(found), **options)
+    return simplify_file(source, output, rho, workers=workers_of(client), **options)
+
+
+def connect(address: str) -> "Client":
+    """Connect to a scheduler."""
+    try:
+        from distributed import Client  # noqa: PLC0415 (optional)
+    except ImportError as error:
+        raise MissingDependencyError(
+            "work on many machines needs the package distributed; "
+            "install it with: pip install 'cvtgs[dask]'."
+        ) from error
+    try:
+        return Client(address)
+    except (OSError, ValueError) as error:
+        raise RunError(f"{address}: no scheduler answers there: {error}.") from error
+
+
+def workers_of(client: "Client") -> "_Cluster":
+    """Let the workers of a cluster do the work."""
+    return _Cluster(client)
+
+
+class _Cluster:
+    """Calls functions on the workers of a cluster, again where a worker died or a disk failed."""
+
+    def __init__(self, client: "Client") -> None:
+        self._client = client
+
+    def __call__(
+        self, function: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterable[Result]:
+        from distributed import KilledWorker  # noqa: PLC0415 (optional)
+
+        futures = [self._client.submit(function, item, pure=False, retries=2) for item in items]
+        try:
+            for future in futures:
+                yield _result_of(future, KilledWorker, self._client)
+        finally:
+            self._client.cancel(futures)
+
+
+def _result_of(future: Any, killed: type[BaseException], client: "Client") -> Any:
+    for _ in range(DEATHS):
+        try:
+            return future.result()
+        except killed:
+            client.retry([future])
+    raise RunError(f"{DEATHS} rounds of workers died with the same piece of work.")

@@ -1,0 +1,165 @@
+"""The comparison from end to end on a tiny scene, and how its tables and plots are made."""
+
+import sys
+
+import pytest
+import torch
+
+import cvtgs
+import lpips_cases
+from benchmarks import compare, compare_report, scoring
+from benchmarks.baselines import BASELINES, baseline
+
+COPY = """
+import sys
+
+import torch
+
+import cvtgs
+
+full = cvtgs.load(sys.argv[1])
+rows = torch.arange(int(sys.argv[3]) + int(sys.argv[4]))
+cvtgs.save(full.select(rows), sys.argv[2], overwrite=True)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _small_images(monkeypatch):
+    monkeypatch.setattr(scoring, "VIEWS", 2)
+    monkeypatch.setattr(scoring, "SIZE", 48)
+
+
+@pytest.fixture
+def file(tmp_path):
+    cvtgs.save(cvtgs.synthetic.scene("object", 1000, sh_degree=0, seed=0), tmp_path / "thing.ply")
+    return tmp_path / "thing.ply"
+
+
+def rows_of(text: str) -> list[list[str]]:
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def result(psnr: float, *, seconds: float = 2.0, lpips: float | None = None, count: int = 10):
+    quality = scoring.Quality(psnr=psnr, ssim=0.5, lpips=lpips)
+    return compare_report.Result(
+        quality=quality, wall_seconds=seconds, cpu_seconds=1.0, count=count, wanted=10
+    )
+
+
+def test_methods_and_a_tool_are_run_judged_and_reported(file, tmp_path, capsys):
+    (tmp_path / "first_rows.py").write_text(COPY)
+    tool = f"copy={sys.executable} {tmp_path / 'first_rows.py'} {{IN}} {{OUT}} {{COUNT}} 1"
+    out = tmp_path / "new"
+    methods = ["standard, no network", "mass pruning"]
+    compare.main(
+        [str(file), "--rho", "0.05", "--methods", *methods, "--tool", tool, "-o", str(out)]
+    )
+    text = capsys.readouterr().out
+    head, _, *rows = rows_of(text)
+    assert head == ["scene", "method", "PSNR at 0.05", "SSIM at 0.05", "s at 0.05"]
+    assert [row[:2] for row in rows] == [
+        [scene, name] for scene in ("mean", "thing") for name in (*methods, "copy")
+    ]
+    assert all(5 < float(row[2]) < 60 and 0 < float(row[3]) <= 1 for row in rows)
+    assert all(0 < float(row[4]) < 100 for row in rows)
+    assert "- copy, thing, 0.05: 51 instead of 50" in text
+    assert "Failed" not in text
+    assert (out / "compare.md").read_text().strip() == text.strip()
+    assert (out / "compare.png").read_bytes()[1:4] == b"PNG"
+
+
+def test_the_table_has_what_the_baseline_itself_gives(file, capsys):
+    compare.main([str(file), "--rho", "0.1", "--methods", "mass pruning"])
+    full = cvtgs.load(file)
+    (quality,) = scoring.own_scorer(None)(full, [baseline("mass pruning")(full, 100)])
+    assert rows_of(capsys.readouterr().out)[-1][2:4] == [
+        f"{quality.psnr:.2f}",
+        f"{quality.ssim:.4f}",
+    ]
+
+
+def test_a_failing_tool_does_not_stop_the_others(file, tmp_path, capsys):
+    broken = f"broken={sys.executable} -c raise({{COUNT}}) {{IN}} {{OUT}}"
+    silent = f"silent={sys.executable} -c pass {{IN}} {{OUT}}"
+    missing = "missing=/no/such/tool {IN} {OUT}"
+    tools = [part for tool in (broken, silent, missing) for part in ("--tool", tool)]
+    arguments = ["--rho", "0.1", "--methods", "opacity pruning", *tools, "-o", str(tmp_path)]
+    compare.main([str(file), *arguments])
+    text = capsys.readouterr().out
+    assert [row[2:] for row in rows_of(text)[-3:]] == [["-", "-", "-"]] * 3
+    assert float(rows_of(text)[-4][2]) > 5
+    assert "Failed:\n\n- broken, thing, 0.1\n- silent, thing, 0.1\n- missing, thing, 0.1" in text
+
+
+def test_another_judge_and_lpips(file, tmp_path, capsys):
+    torch.save(dict(lpips_cases.random_state("alex")), tmp_path / "weights.pth")
+    weights = str(tmp_path / "weights.pth")
+    arguments = [str(file), "--rho", "0.1", "--methods", "opacity pruning", "--means"]
+    compare.main([*arguments, "--lpips", weights])
+    head, _, row = rows_of(capsys.readouterr().out)
+    assert head[4] == "LPIPS at 0.1"
+    assert float(row[4]) > 0
+    (tmp_path / "judge.py").write_text('print(\'[{"psnr": 7, "ssim": 1}]\')')
+    compare.main([*arguments, "--scorer", f"{sys.executable} {tmp_path / 'judge.py'}"])
+    text = capsys.readouterr().out
+    assert rows_of(text)[-1][2:4] == ["7.00", "1.0000"]
+    assert "Judge: the command of --scorer" in text
+
+
+def test_settings_reach_cvtgs_and_every_method_is_there_unless_chosen():
+    options = compare.parser().parse_args(["--set", "cvt.iterations=1"])
+    commands = compare.commands_of(options)
+    assert list(commands) == [*cvtgs.PRESETS, "standard, no network", *BASELINES]
+    assert all("cvt.iterations=1" in commands[name] for name in cvtgs.PRESETS)
+    assert commands["NanoGS"][1:4] == ["-m", "benchmarks.baselines", "NanoGS"]
+
+
+@pytest.mark.parametrize("tool", ["name", "name=tool {IN}", "name=tool {OUT}"])
+def test_a_tool_without_places_is_refused(tool):
+    with pytest.raises(SystemExit, match="NAME=COMMAND"):
+        compare.commands_of(compare.parser().parse_args(["--tool", tool]))
+
+
+def test_a_tool_must_have_a_name_of_its_own():
+    options = compare.parser().parse_args(["--tool", "NanoGS=other {IN} {OUT}"])
+    with pytest.raises(SystemExit, match="'NanoGS' already"):
+        compare.commands_of(options)
+
+
+def test_nothing_to_compare_is_refused():
+    with pytest.raises(SystemExit, match="at least one"):
+        compare.main(["--methods"])
+
+
+def test_places_are_filled_and_other_braces_stay():
+    places = {"{IN}": "{OUT}.ply", "{OUT}": "b", "{COUNT}": "12"}
+    assert compare.filled("--x={COUNT},{other}{{}}", places) == "--x=12,{other}{{}}"
+    assert compare.filled("{IN}:{OUT}", places) == "{OUT}.ply:b"
+
+
+def test_means_are_over_scenes_and_a_failure_leaves_a_dash():
+    table = {
+        "a": {"x": [result(20.0, lpips=0.1), result(30.0)], "y": [result(10.0), None]},
+        "b": {"x": [result(30.0, seconds=4.0), result(30.0)], "y": [result(11.0), result(1.0)]},
+    }
+    text = compare_report.markdown(table, [0.1, 0.01], means_only=True)
+    assert rows_of(text)[2:] == [
+        ["mean", "x", "25.00", "0.5000", "-", "3.0", "30.00", "0.5000", "-", "2.0"],
+        ["mean", "y", "10.50", "0.5000", "-", "2.0", "-", "-", "-", "-"],
+    ]
+    cpu = compare_report.markdown(table, [0.1, 0.01], means_only=True, clock="cpu")
+    assert rows_of(cpu)[2][5] == "1.0"
+    assert compare_report.failures(table, [0.1, 0.01]).splitlines()[2:] == ["- y, a, 0.01"]
+    assert compare_report.wrong_counts(table, [0.1, 0.01]) == ""
+
+
+def test_the_plot_shows_what_succeeded_everywhere(monkeypatch):
+    table = {"a": {"x": [result(20.0), result(10.0)], "y": [result(9.0), None], "z": [None, None]}}
+    drawn = []
+    monkeypatch.setattr(compare_report, "line_chart", lambda panels, **_: drawn.extend(panels))
+    compare_report.chart(table, [0.1, 0.01])
+    lines = {line.name: (line.x, line.y, line.markers) for line in drawn[0].series}
+    assert lines == {"x": ([2.0, 2.0], [20.0, 10.0], True), "y": ([2.0], [9.0], True)}
+    assert drawn[0].log_x
+    assert compare_report.chart({"a": {"z": [None]}}, [0.1]) is None

@@ -1,0 +1,172 @@
+"""The smallest count that reaches a quality."""
+
+import math
+import warnings
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs.budget import find_count
+from cvtgs.budget.bisect import CLOSE, smallest_enough
+from cvtgs.budget.judge import HELDOUT_SEED, Judge
+from cvtgs.errors import DroppedDataWarning, GoalError, InvalidArgumentError
+from cvtgs.progress import silent
+from cvtgs.views import automatic_views
+from scenes import same_bits
+
+
+def search(values, wanted: float, most: int) -> list[tuple[int, float]]:
+    return list(smallest_enough(values, wanted, most=most))
+
+
+def answer(tried: list[tuple[int, float]], wanted: float) -> int | None:
+    return min((count for count, value in tried if value >= wanted), default=None)
+
+
+@pytest.mark.parametrize("wanted", [3.0, 17.0, 25.0, 31.4, 44.0])
+@pytest.mark.parametrize("most", [100, 9_000, 900_000])
+@pytest.mark.parametrize(
+    "curve",
+    [
+        lambda share: 50 + 8 * math.log10(share),
+        lambda share: 60 * share**0.3,
+        lambda share: 60 * (1 - math.exp(-40 * share)),
+    ],
+    ids=["straight", "bent", "saturating"],
+)
+def test_the_answer_is_the_smallest_to_3_percent_in_few_tries(wanted, most, curve):
+    def reach(count: int) -> float:
+        return curve(count / most)
+
+    tried = search(reach, wanted, most)
+    found = answer(tried, wanted)
+    assert found is not None
+    assert found == 1 or reach(max(1, math.floor(found / CLOSE) - 1)) < wanted
+    assert len(tried) <= 16
+    assert len({count for count, _ in tried}) == len(tried)
+
+
+def test_ends():
+    assert answer(search(lambda count: 1.0, 1.0, 1000), 1.0) == 1
+    assert answer(search(lambda count: 0.0, 1.0, 1000), 1.0) is None
+    assert search(lambda count: 0.0, 1.0, 1) == [(1, 0.0)]
+    assert answer(search(float, 2.0, 2), 2.0) == 2
+
+
+def test_steps_never_leave_the_range():
+    tried = search(lambda count: float(count == 900), 1.0, 900)
+    assert all(1 <= count <= 900 for count, _ in tried)
+    assert answer(tried, 1.0) == 900
+
+
+@pytest.fixture(scope="module")
+def full() -> cvtgs.GaussianScene:
+    return cvtgs.synthetic.scene("object", 600, sh_degree=0, seed=2)
+
+
+@pytest.fixture(scope="module")
+def views(full) -> cvtgs.Cameras:
+    return automatic_views(full, 2, width=40, height=30, seed=HELDOUT_SEED)
+
+
+@pytest.fixture(scope="module")
+def simplifier() -> cvtgs.Simplifier:
+    return cvtgs.Simplifier(config="draft", device="cpu")
+
+
+@pytest.mark.parametrize("goal", [{"psnr": 22.0}, {"ssim": 0.8}])
+def test_a_goal_is_reached_and_fewer_did_not(full, views, simplifier, goal):
+    found = find_count(full, **goal, simplifier=simplifier, heldout=views)
+    (metric, wanted), *_ = goal.items()
+    assert getattr(found, metric) >= wanted
+    assert len(found.scene) == found.report.output_count < len(full)
+    below = [one for one in found.tried if one.count < len(found.scene)]
+    assert below
+    assert all(getattr(one, metric) < wanted for one in below)
+    largest = max(one.count for one in below)
+    assert len(found.scene) <= max(CLOSE * largest, largest + 1)
+    mine = next(one for one in found.tried if one.count == len(found.scene))
+    assert (mine.psnr, mine.ssim) == (found.psnr, found.ssim)
+
+
+def test_the_scores_are_those_of_an_evaluation(full, views, simplifier):
+    small = simplifier.simplify(full, 0.2)
+    quality = Judge(full, views, listener=silent).score(small)
+    settings = cvtgs.evaluate.EvaluationSettings(lpips="off")
+    wanted = cvtgs.evaluate.evaluate(full, {"small": small}, views, settings=settings).scenes[0]
+    assert quality.psnr == pytest.approx(wanted.psnr.mean, abs=1e-4)
+    assert quality.ssim == pytest.approx(wanted.ssim.mean, abs=1e-5)
+
+
+def test_the_full_scene_is_rendered_once(full, views, simplifier, monkeypatch):
+    from cvtgs.budget import judge  # noqa: PLC0415 (to be changed here)
+
+    sizes = []
+
+    def counting(scene, camera):
+        sizes.append(len(scene))
+        return cvtgs.render.render(scene, camera)
+
+    monkeypatch.setattr(judge, "render", counting)
+    find_count(full, psnr=22.0, simplifier=simplifier, heldout=views)
+    assert sizes.count(len(full)) == len(views)
+
+
+def test_the_scene_is_looked_at_once(full, views, simplifier, monkeypatch):
+    from cvtgs.stages import prepared  # noqa: PLC0415 (to be changed here)
+
+    looks = []
+
+    def counting(scene, *arguments, **choices):
+        looks.append(len(scene))
+        return look(scene, *arguments, **choices)
+
+    look = prepared.look
+    monkeypatch.setattr(prepared, "look", counting)
+    found = find_count(full, psnr=22.0, simplifier=simplifier, heldout=views)
+    assert looks == [len(full)]
+    assert len(found.tried) > 2
+    assert same_bits(found.scene, simplifier.simplify(full, count=len(found.scene)))
+
+
+def test_a_goal_that_nothing_reaches(full, views, simplifier):
+    with pytest.raises(GoalError) as caught:
+        find_count(full, psnr=60.0, simplifier=simplifier, heldout=views)
+    text = str(caught.value)
+    assert text.startswith("no smaller scene reaches 60.00 dB: the best that was tried, 540 of 600")
+    assert text.endswith(" dB.")
+
+
+@pytest.mark.parametrize(
+    ("goal", "text"),
+    [
+        ({}, "give either psnr or ssim, not both and not neither."),
+        ({"psnr": 30.0, "ssim": 0.9}, "give either psnr or ssim, not both and not neither."),
+        ({"psnr": 0.0}, "the PSNR to reach must be above 0 and at most 60 dB, found 0.0."),
+        ({"psnr": math.nan}, "the PSNR to reach must be above 0 and at most 60 dB, found nan."),
+        ({"ssim": 1.0}, "the SSIM to reach must be above 0 and below 1, found 1.0."),
+    ],
+)
+def test_goals_that_cannot_be(full, goal, text):
+    with pytest.raises(InvalidArgumentError) as caught:
+        find_count(full, **goal)
+    assert str(caught.value) == text
+
+
+def test_invalid_rows_are_told_once(full, views, simplifier):
+    means = full.means.clone()
+    means[:3] = torch.nan
+    bad = full.with_tensors({"means": means}, {})
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        find_count(bad, psnr=20.0, simplifier=simplifier, heldout=views)
+    assert [one.category for one in heard] == [DroppedDataWarning]
+
+
+def test_a_listener_hears_every_try(full, views, simplifier):
+    heard = []
+    found = find_count(full, psnr=22.0, simplifier=simplifier, heldout=views, listener=heard.append)
+    notes = [event.note for event in heard if event.note]
+    assert len(notes) == len(found.tried)
+    assert notes[0].startswith("54: ")

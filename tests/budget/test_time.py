@@ -1,0 +1,300 @@
+"""The cost model and what is chosen by it; all seconds are made up."""
+
+import json
+import math
+import os
+import time
+
+import pytest
+
+import cvtgs
+from cvtgs.budget import CostModel, Work, choose_preset, cost_model
+from cvtgs.budget.calibrate import CANDIDATES, SHORT, Trial, calibrate, measured_seconds
+from cvtgs.budget.fit import fit_rates
+from cvtgs.budget.remember import STALE_SECONDS, cache_folder, is_known
+from cvtgs.errors import ConfigError, DeviceError, GoalError, InvalidArgumentError
+
+TRIALS = [
+    Trial(kind="object", count=count, sh_degree=degree, ratios=ratios)
+    for count, degree, ratios in ((50, 0, (0.1, 0.5)), (200, 3, (0.05, 0.4)), (400, 1, (0.2, 0.1)))
+]
+SPEEDS = dict(zip(CANDIDATES, (1.0, 2.0, 4.0, 50.0, 50.0), strict=True))
+
+
+def made_up(config, scene, count) -> dict[str, float]:
+    """Seconds that are exactly what the features say."""
+    speed = SPEEDS[config.preset] * 1e-6
+    seconds = {
+        "check": speed * len(scene),
+        "merge": speed * (2 * len(scene) + 3 * count),
+        "something new": 0.1 + speed * count,
+    }
+    if config.visibility.views:
+        seconds["visibility"] = 1e-6 * config.visibility.views * len(scene)
+    if config.refine.enabled:
+        work = Work(count=len(scene), target=count)
+        seconds["refine"] = work.features("refine", config)["look_pixels"]
+    return seconds
+
+
+@pytest.fixture(scope="module")
+def model() -> CostModel:
+    return calibrate(made_up, trials=TRIALS)
+
+
+def test_rates_are_found_and_never_negative():
+    rows = [{"once": 1.0, "n": n} for n in (1.0, 2.0, 4.0)]
+    assert fit_rates(rows, [5.0, 7.0, 11.0]) == pytest.approx({"once": 3.0, "n": 2.0})
+    falling = fit_rates(rows, [11.0, 7.0, 5.0])
+    assert min(falling.values()) >= 0.0
+    assert falling["n"] == 0.0
+
+
+def test_large_errors_weigh_as_shares():
+    """One second more on a hundred matters as little as a tenth on ten."""
+    rates = fit_rates([{"n": 1.0}, {"n": 10.0}], [1.0, 11.0])
+    assert 1.0 < rates["n"] < 1.1
+
+
+@pytest.mark.parametrize("preset", ["draft", "fast", "standard"])
+def test_what_follows_the_features_is_predicted_exactly(model, preset):
+    work = Work(count=1_000_000, target=10_000, colors=12)
+    wanted = 0.1 + SPEEDS[preset] * (3 + 0.03 + 0.01)
+    assert model.seconds(preset, work) == pytest.approx(wanted, rel=1e-3)
+    assert set(model.stage_seconds(preset, work)) == {"check", "merge", "something new"}
+
+
+def test_few_images_stand_for_many(model):
+    high = cvtgs.SimplifyConfig.from_preset("high")
+    work = Work(count=100_000, target=1000)
+    stages = model.stage_seconds("high", work)
+    assert stages["visibility"] == pytest.approx(0.1 * high.visibility.views, rel=0.01)
+    pixels = work.features("refine", high)["look_pixels"]
+    assert stages["refine"] == pytest.approx(pixels, rel=0.01)
+    assert model.seconds("max", work) > model.seconds("high", work)
+
+
+def test_settings_count(model):
+    """Stages that are left out cost nothing, those asked for cost what they cost elsewhere."""
+    work = Work(count=100_000, target=1000)
+
+    def stages(preset: str, **settings: str) -> dict[str, float]:
+        texts = {name.replace("_", "."): text for name, text in settings.items()}
+        config = cvtgs.SimplifyConfig.compose(preset=preset, settings=texts)
+        return model.stage_seconds(preset, work, config=config)
+
+    high = model.stage_seconds("high", work)
+    assert "refine" not in stages("high", refine_steps="0")
+    for setting in ({"visibility_views": "0"}, {"effects_visibility": "off"}):
+        assert set(high) - set(stages("high", **setting)) == {"visibility"}
+    few = stages("high", refine_steps=str(high_steps() // 2))
+    assert 0.4 < few["refine"] / high["refine"] < 0.6
+    assert 0.2 < stages("high", refine_size="200")["refine"] / high["refine"] < 0.3
+    added = stages("standard", refine_steps=str(high_steps()), refine_size="400")
+    assert set(added) - set(model.stage_seconds("standard", work)) == {"refine"}
+    assert added["refine"] == pytest.approx(high["refine"], rel=0.01)
+    assert stages("draft", refine_seconds="7")["refine"] == 7.0
+
+
+def test_a_setting_makes_room_for_a_better_preset(model):
+    work = Work(count=1_000_000, target=10_000)
+    budget = 1.3 * model.seconds("high", work) - 1
+    assert choose_preset(work, budget, model=model).preset == "standard"
+    fewer = {"refine.steps": str(high_steps() // 2)}
+    choice = choose_preset(work, budget, settings=fewer, model=model)
+    assert choice.preset == CANDIDATES[-1]
+    assert choice.seconds < budget / 1.3
+    with pytest.raises(ConfigError, match="refine"):
+        choose_preset(work, budget, settings={"refine.steps": "-1"}, model=model)
+
+
+def high_steps() -> int:
+    return cvtgs.SimplifyConfig.from_preset("high").refine.steps
+
+
+def test_calibration_takes_few_images_and_steps():
+    seen = []
+
+    def run(config, scene, count):
+        seen.append(config)
+        return made_up(config, scene, count)
+
+    calibrate(run, trials=TRIALS[:1])
+    assert "paper" not in {config.preset for config in seen}
+    most = max(short["steps"] for short in SHORT)
+    assert max(config.refine.steps for config in seen) == most
+    assert max(config.visibility.views for config in seen) <= max(one["views"] for one in SHORT)
+
+
+def test_the_fastest_of_several_runs_counts():
+    calls = []
+
+    def run(config, scene, count):
+        calls.append(config)
+        return {"check": len(scene) * (1.0 if len(calls) % 3 == 0 else 3.0)}
+
+    model = calibrate(run, presets=["draft"], trials=TRIALS[:2], clock=lambda: 0.0)
+    assert model.stage_seconds("draft", Work(count=10, target=1))["check"] == pytest.approx(10.0)
+    assert len(calls) == 1 + 3 * 4
+
+
+def test_a_slow_machine_measures_once():
+    calls, clock = [], iter(range(0, 10_000, 60))
+
+    def run(config, scene, count):
+        calls.append(config)
+        return {"check": 60.0}
+
+    calibrate(run, presets=["draft"], trials=TRIALS[:2], clock=lambda: float(next(clock)))
+    assert len(calls) == 1 + 4
+
+
+def test_real_seconds_come_from_the_report():
+    run = measured_seconds("cpu")
+    scene = cvtgs.synthetic.scene("object", 200, sh_degree=0, seed=0)
+    seconds = run(cvtgs.SimplifyConfig.from_preset("draft"), scene, 20)
+    assert {"check", "plan", "filter", "tessellate", "merge"} <= set(seconds)
+    assert all(value >= 0 for value in seconds.values())
+
+
+def test_refinements_by_time_take_that_time(model, monkeypatch):
+    changed = {**cvtgs.PRESETS, "max": {"refine": {"seconds": 7.0}}}
+    monkeypatch.setattr("cvtgs.config.simplify.PRESETS", changed)
+    assert model.stage_seconds("max", Work(count=1000, target=10))["refine"] == 7.0
+
+
+def test_the_best_that_fits_is_chosen(model):
+    work = Work(count=1_000_000, target=10_000)
+    costs = [model.seconds(name, work) for name in CANDIDATES]
+    assert costs == sorted(costs)
+    for name, cost in zip(CANDIDATES, costs, strict=True):
+        assert choose_preset(work, 1.31 * cost, model=model) == (name, cost)
+    assert choose_preset(work, 1e9, model=model).preset == CANDIDATES[-1]
+
+
+def test_a_scene_tells_its_size(model):
+    scene = cvtgs.synthetic.scene("object", 300, sh_degree=2, seed=0)
+    assert Work.of(scene, 3) == Work(count=300, target=3, colors=27)
+    by_ratio = choose_preset(scene, 1e9, rho=0.01, model=model)
+    assert by_ratio == choose_preset(scene, 1e9, count=3, model=model)
+    assert by_ratio == choose_preset(Work.of(scene, 3), 1e9, model=model)
+
+
+def test_no_preset_fits(model):
+    work = Work(count=1_000_000, target=10_000)
+    with pytest.raises(GoalError) as caught:
+        choose_preset(work, 0.5, model=model)
+    assert str(caught.value) == (
+        "no preset fits into 0.5 s: the fastest, draft, takes about 3.1 s to make 10,000 of "
+        "1,000,000 Gaussians, and is given 1.3 times that."
+    )
+
+
+def test_what_cannot_be_chosen_by(model):
+    work = Work(count=100, target=10)
+    for seconds in (0.0, -1.0, math.inf, math.nan):
+        with pytest.raises(InvalidArgumentError, match="the time must be above 0 and finite"):
+            choose_preset(work, seconds, model=model)
+    with pytest.raises(InvalidArgumentError, match="a size knows its target"):
+        choose_preset(work, 1.0, rho=0.1, model=model)
+    with pytest.raises(ConfigError, match="whose cost was measured; found 'paper'"):
+        model.seconds("paper", work)
+
+
+class Calibration:
+    """Counts how often it is asked."""
+
+    def __init__(self, model: CostModel) -> None:
+        self.model, self.calls = model, 0
+
+    def __call__(self) -> CostModel:
+        self.calls += 1
+        return self.model
+
+
+def test_it_is_measured_once_and_remembered(model, tmp_path):
+    calibration = Calibration(model)
+    folder = tmp_path / "cache"
+    assert not is_known("cpu", folder=folder)
+    assert cost_model("cpu", calibration=calibration, folder=folder) == model
+    assert is_known("cpu", folder=folder)
+    assert cost_model("cpu", calibration=calibration, folder=folder) == model
+    assert calibration.calls == 1
+    cost_model("cpu", recalibrate=True, calibration=calibration, folder=folder)
+    assert calibration.calls == 2
+
+
+def damaged(text: str) -> str:
+    return text[: len(text) // 2]
+
+
+def stale(text: str) -> str:
+    return text.replace('"made"', f'"made": {time.time() - STALE_SECONDS - 1}, "was"')
+
+
+def changed(key: str, value: object):
+    def change(text: str) -> str:
+        record = json.loads(text)
+        record[key] = value
+        return json.dumps(record)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        damaged,
+        stale,
+        lambda text: "",
+        lambda text: "\x00\xff",
+        changed("made", 1.0),
+        changed("made", time.time() + 1e6),
+        changed("version", 0),
+        changed("key", {}),
+        changed("model", {"rates": {}}),
+        changed("model", {"rates": {"draft": {"check": {"in": -1.0}}}}),
+    ],
+)
+def test_what_cannot_be_used_is_measured_anew(model, tmp_path, change):
+    calibration = Calibration(model)
+    cost_model("cpu", calibration=calibration, folder=tmp_path)
+    (path,) = tmp_path.iterdir()
+    path.write_text(change(path.read_text()))
+    assert cost_model("cpu", calibration=calibration, folder=tmp_path) == model
+    assert calibration.calls == 2
+    assert cost_model("cpu", calibration=calibration, folder=tmp_path) == model
+    assert calibration.calls == 2
+
+
+def test_presets_that_changed_are_measured_anew(model, tmp_path, monkeypatch):
+    calibration = Calibration(model)
+    cost_model("cpu", calibration=calibration, folder=tmp_path)
+    other = {**cvtgs.PRESETS, "draft": {"cvt": {"iterations": 1}}}
+    monkeypatch.setattr("cvtgs.config.simplify.PRESETS", other)
+    cost_model("cpu", calibration=calibration, folder=tmp_path)
+    assert calibration.calls == 2
+
+
+def test_where_nothing_can_be_written_it_is_measured_in_memory(model, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("no folder")
+    calibration = Calibration(model)
+    assert cost_model("cpu", calibration=calibration, folder=blocked / "cache") == model
+    assert calibration.calls == 1
+    assert blocked.read_text() == "no folder"
+
+
+def test_where_the_cache_is(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_folder() == tmp_path / "cvtgs"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.delenv("LOCALAPPDATA", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    if os.name == "posix":
+        assert cache_folder().parent.parent in (tmp_path, tmp_path / "Library")
+
+
+def test_a_device_that_is_not_there(tmp_path):
+    with pytest.raises(DeviceError):
+        cost_model("abacus", folder=tmp_path)

@@ -1,0 +1,129 @@
+"""Inflation of opaque, crowded cells: against the oracle, and what it leaves alone."""
+
+import numpy as np
+import pytest
+import torch
+
+import oracles
+from cvtgs import GaussianScene
+from cvtgs.cells import Partition, inflate_cells, side_cover
+from cvtgs.cvt import nearest_neighbors
+from scenes import assert_same_gaussians, moved, random_scene, same_bits
+
+GROWTH = {"everywhere": 0.1, "covered": 0.4}
+
+
+def crowded(counts: list[int]) -> Partition:
+    labels = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
+    return Partition.from_labels(labels, len(counts))
+
+
+def opaque_scene(count: int) -> GaussianScene:
+    """Overlapping, mostly opaque Gaussians."""
+    scene = random_scene(count, dtype=torch.float64)
+    return scene.with_tensors(
+        {
+            "means": scene.means * 0.3,
+            "log_scales": scene.log_scales + 1.0,
+            "logit_opacities": scene.logit_opacities + 2.0,
+        },
+        {},
+    )
+
+
+def widened(scene: GaussianScene, counts: list[int], **growth: float) -> GaussianScene:
+    neighbors = nearest_neighbors(scene.means, 8, backend="torch")
+    return inflate_cells(scene, crowded(counts), neighbors, **{**GROWTH, **growth})
+
+
+def test_an_opaque_cell_of_a_hundred_grows_by_a_tenth_where_nothing_is_near():
+    scene = random_scene(2, dtype=torch.float64)
+    far = torch.tensor([[0.0, 0, 0], [1e6, 0, 0]]).double()
+    logits = torch.full((2,), 20.0).double()
+    scene = scene.with_tensors({"means": far, "logit_opacities": logits}, {})
+    ratio = widened(scene, [100, 10]).scales / scene.scales
+    assert ratio[0].tolist() == pytest.approx([1.1] * 3, rel=1e-5)
+    assert ratio[1].tolist() == pytest.approx([1.05] * 3, rel=1e-5)
+
+
+def test_an_axis_grows_more_where_both_its_ends_are_covered():
+    """Opaque balls to the left and right, none above: the x axis is covered, y is not."""
+    scene = random_scene(3, dtype=torch.float64)
+    row = scene.select(torch.tensor([0, 0, 0]))
+    scene = row.with_tensors(
+        {
+            "means": torch.tensor([[0.0, 0, 0], [3, 0, 0], [-3, 0, 0]]).double(),
+            "quats": torch.tensor([[1.0, 0, 0, 0]] * 3).double(),
+            "log_scales": torch.zeros(3, 3).double(),
+            "logit_opacities": torch.full((3,), 20.0).double(),
+        },
+        {},
+    )
+    ratio = widened(scene, [100, 1, 1]).scales / scene.scales
+    assert ratio[0].tolist() == pytest.approx([1.5, 1.1, 1.1], rel=1e-2)
+    assert bool((ratio[1:] == 1).all())
+
+
+def test_cover_equals_the_oracle():
+    scene = opaque_scene(12)
+    rows = torch.tensor([0, 5, 7])
+    others = torch.tensor([[1, 2, 3], [4, 6, 8], [9, 10, 11]])
+    found = side_cover(scene, rows, others)
+    quats = torch.nn.functional.normalize(scene.quats, dim=1)
+    arrays = [tensor.numpy() for tensor in (scene.means, quats, scene.scales, scene.opacities)]
+    for place, row in enumerate(rows.tolist()):
+        wanted = oracles.side_cover(*arrays, row, others[place].tolist())
+        assert found[place].flatten().tolist() == pytest.approx(np.ravel(wanted), abs=1e-12)
+    assert float(found.amax()) > 0.1
+
+
+def test_inflation_equals_the_oracle():
+    scene, counts = opaque_scene(9), [1, 2, 3, 10, 50, 100, 1000, 2, 7]
+    rows = torch.arange(9)
+    cover = side_cover(scene, rows, nearest_neighbors(scene.means, 8, backend="torch"))
+    ratio = widened(scene, counts).scales / scene.scales
+    for row in rows.tolist():
+        wanted = [
+            oracles.inflation(float(scene.opacities[row]), counts[row], side, **GROWTH)
+            for side in cover[row].amin(dim=1).tolist()
+        ]
+        wanted = [1.0] * 3 if counts[row] == 1 else wanted
+        assert ratio[row].tolist() == pytest.approx(wanted, rel=1e-9)
+
+
+def test_only_scales_change_and_only_of_cells_of_several():
+    scene = opaque_scene(40)
+    wide = widened(scene, [1] * 20 + [50] * 20)
+    assert same_bits(wide.select(torch.arange(20)), scene.select(torch.arange(20)))
+    assert bool((wide.log_scales[20:] > scene.log_scales[20:]).all())
+    assert same_bits(wide.with_tensors({"log_scales": scene.log_scales}, {}), scene)
+
+
+def test_haze_is_left_alone():
+    scene = opaque_scene(30)
+    hazy = scene.with_tensors({"logit_opacities": scene.logit_opacities * 0 - 9.0}, {})
+    ratio = widened(hazy, [100] * 30).scales / hazy.scales
+    assert float((ratio - 1).abs().amax()) < 1e-6
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_few_cells_have_few_neighbours(count):
+    scene = opaque_scene(count)
+    assert len(widened(scene, [10] * count)) == count
+
+
+def test_chunks_do_not_change_a_bit(monkeypatch):
+    scene = opaque_scene(50)
+    whole = widened(scene, [3] * 50)
+    monkeypatch.setitem(inflate_cells.__globals__, "CHUNK", 7)
+    assert same_bits(widened(scene, [3] * 50), whole)
+
+
+def test_inflation_moves_with_the_scene():
+    scene, counts = opaque_scene(30), [20] * 30
+    motion = {"quat": (0.3, -0.5, 0.8, 0.1), "shift": (3.0, -2.0, 5.0), "scale": 10.0}
+    assert_same_gaussians(
+        widened(moved(scene, **motion), counts),
+        moved(widened(scene, counts), **motion),
+        tolerance=1e-7,
+    )

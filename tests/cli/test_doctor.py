@@ -1,0 +1,98 @@
+"""``cvtgs doctor`` and ``cvtgs --version``: what is there, and does it work."""
+
+import platform
+import subprocess
+import sys
+from importlib import metadata
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs.cli import doctor
+from cvtgs.cli.main import main
+from cvtgs.cli.versions import BACKENDS, version_lines, version_of
+
+
+def test_version_names_what_computes(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--version"])
+    lines = capsys.readouterr().out.splitlines()
+    assert stopped.value.code == 0
+    assert lines[0] == f"cvtgs {cvtgs.__version__}"
+    assert lines[1] == f"Python {platform.python_version()}"
+    assert [line.split()[0] for line in lines[2:]] == list(BACKENDS)
+    assert lines == version_lines()
+
+
+def test_version_of_what_is_there_and_what_is_not():
+    assert version_of("torch") == metadata.version("torch")
+    assert version_of("no-such-package") == "not installed"
+
+
+def test_version_loads_nothing():
+    code = (
+        "import sys; from cvtgs.cli.versions import version_lines; version_lines();"
+        "print([name for name in ('torch', 'numpy', 'numba') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+@pytest.fixture
+def _small(monkeypatch):
+    monkeypatch.setattr(doctor, "COUNT", 300)
+    monkeypatch.setattr(doctor, "SIDE", 32)
+
+
+@pytest.mark.usefixtures("_small")
+def test_a_healthy_machine(capsys):
+    assert main(["doctor", "--device", "cpu"]) == 0
+    printed = capsys.readouterr().out
+    assert "images by torch   yes" in printed
+    assert "images by gsplat  no: " in printed
+    assert "nearest site by  scipy" in printed
+    assert "300 generated Gaussians to 10%" in printed
+    for step in ("generate", "simplify", "views", "render"):
+        assert f"  {step} " in printed
+    assert printed.endswith("The default path works.\n")
+
+
+@pytest.mark.usefixtures("_small")
+def test_every_device_is_looked_at(capsys):
+    assert main(["doctor"]) == 0
+    printed = capsys.readouterr().out
+    assert "\ncpu: " in printed
+    assert printed.count("\ncuda:") == torch.cuda.device_count()
+
+
+@pytest.mark.usefixtures("_small")
+def test_a_default_path_that_fails_ends_with_1(capsys, monkeypatch):
+    def broken(*words: object, **settings: object) -> None:
+        raise RuntimeError("no kernel image is available\nand much more")
+
+    monkeypatch.setattr("cvtgs.simplify.Simplifier.run", broken)
+    assert main(["doctor", "--device", "cpu"]) == 1
+    captured = capsys.readouterr()
+    assert captured.err == (
+        "cvtgs: error: the default path does not work on cpu: no kernel image is available; "
+        "try cvtgs doctor --device cpu.\n"
+    )
+    assert "The default path works." not in captured.out
+
+
+@pytest.mark.usefixtures("_small")
+def test_a_wrong_image_is_noticed(capsys, monkeypatch):
+    monkeypatch.setattr("cvtgs.synthetic.demo_scene", all_black)
+    assert main(["doctor", "--device", "cpu"]) == 1
+    assert "a mean colour of 0 came out" in capsys.readouterr().err
+
+
+def all_black(count: int, *, sh_degree: int) -> cvtgs.GaussianScene:
+    scene = cvtgs.synthetic.scene("object", count, sh_degree=sh_degree, seed=0)
+    return scene.with_tensors({"sh0": torch.full_like(scene.sh0, -9.0)}, {})
+
+
+def test_a_device_that_is_not_there(capsys):
+    assert main(["doctor", "--device", "nowhere"]) == 1
+    assert "device 'nowhere' cannot be used here" in capsys.readouterr().err

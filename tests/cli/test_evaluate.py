@@ -1,0 +1,139 @@
+"""``cvtgs evaluate``, ``cvtgs render`` and ``cvtgs compare``."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+import cvtgs
+from cvtgs.cli.main import main
+from cvtgs.evaluate import Evaluation
+from cvtgs.evaluate.images import encode
+
+SMALL = ["--views", "2", "--size", "48"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A full scene, two simplified ones, and cameras with photographs."""
+    place = tmp_path_factory.mktemp("scenes")
+    scene = cvtgs.synthetic.scene("object", 2000, sh_degree=0, seed=0)
+    cvtgs.save(scene, place / "full.ply")
+    for rho in (0.1, 0.01):
+        cvtgs.save(cvtgs.Simplifier(device="cpu").simplify(scene, rho), place / f"{rho}.ply")
+    pose = [[1, 0, 0, 0], [0, -1, 0, -1], [0, 0, -1, -5], [0, 0, 0, 1]]
+    frames = [{"file_path": f"images/{n}.png", "transform_matrix": pose} for n in range(9)]
+    document = {"w": 64, "h": 48, "fl_x": 60.0, "frames": frames}
+    (place / "transforms.json").write_text(json.dumps(document))
+    (place / "images").mkdir()
+    for number in range(9):
+        image = np.full((96, 128, 3), 20 * number, np.uint8)
+        (place / "images" / f"{number}.png").write_bytes(encode(image, "png"))
+    return place
+
+
+@pytest.fixture
+def scenes(folder):
+    return [str(folder / name) for name in ("full.ply", "0.1.ply", "0.01.ply")]
+
+
+def test_evaluate_prints_a_row_per_scene(scenes, capsys):
+    assert main(["evaluate", *scenes, *SMALL, "--lpips", "off"]) == 0
+    printed = capsys.readouterr().out
+    assert "2 views of 48 x 36 pixels, rendered by" in printed
+    assert "against full.ply, 2,000 Gaussians:" in printed
+    assert re.search(r"0\.1\.ply +200 +[\d.]+ kB +\d+\.\d\d +0\.\d{4}  -", printed)
+    assert "LPIPS" in printed
+
+
+def test_evaluate_as_json(scenes, capsys):
+    assert main(["evaluate", *scenes, *SMALL, "--lpips", "off", "--json"]) == 0
+    evaluation = Evaluation.model_validate_json(capsys.readouterr().out)
+    assert [scores.count for scores in evaluation.scenes] == [200, 20]
+    assert (evaluation.width, evaluation.height, len(evaluation.views)) == (48, 36, 2)
+
+
+def test_evaluate_against_photographs(folder, scenes, capsys):
+    words = ["--cameras", str(folder), "--images", str(folder), "--split", "train"]
+    assert main(["evaluate", *scenes[:2], *words, "--lpips", "off", "--json"]) == 0
+    evaluation = Evaluation.model_validate_json(capsys.readouterr().out)
+    assert len(evaluation.views) == 7
+    assert (evaluation.width, evaluation.height) == (64, 48)
+    assert [scores.name for scores in evaluation.photographs] == ["full.ply", "0.1.ply"]
+    assert main(["evaluate", *scenes[:2], *words, "--lpips", "off", *SMALL]) == 0
+    assert "against photographs:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--images", "."], "--images needs the cameras of the photographs: --cameras."),
+        (["--views", "0"], "--views must be at least 1, found 0."),
+        (["--size", "-3"], "--size must be at least 1, found -3."),
+        (["--split", "test"], "--split chooses among cameras and needs --cameras."),
+        (["--background", "1,2,3"], "--background must be black, gray, white or red,green,blue"),
+        (["--background", "pink"], "--background must be black, gray, white or red,green,blue"),
+        (["--cameras", "nowhere.json"], "nowhere.json: "),
+    ],
+)
+def test_bad_arguments_get_one_sentence(scenes, capsys, words, text):
+    assert main(["evaluate", *scenes[:2], *words]) == 1
+    errors = capsys.readouterr().err
+    assert errors.startswith(f"cvtgs: error: {text}")
+    assert errors.count("\n") == 1
+
+
+def test_photographs_that_are_missing_are_named(folder, scenes, tmp_path, capsys):
+    words = ["--cameras", str(folder), "--images", str(tmp_path)]
+    assert main(["evaluate", *scenes[:2], *words]) == 1
+    assert "9 of 9 cameras have none, the first is 'images/" in capsys.readouterr().err
+
+
+def test_a_scene_given_twice_is_refused(scenes, capsys):
+    assert main(["evaluate", scenes[0], scenes[0]]) == 1
+    assert "every scene must be given once" in capsys.readouterr().err
+
+
+def test_scenes_of_the_same_name_are_told_apart(scenes, tmp_path, capsys):
+    (tmp_path / "full.ply").write_bytes((tmp_path / scenes[1]).read_bytes())
+    words = [scenes[0], str(tmp_path / "full.ply"), *SMALL, "--lpips", "off"]
+    assert main(["evaluate", *words]) == 0
+    assert str(tmp_path / "full.ply") in capsys.readouterr().out
+
+
+def test_render_writes_a_png_per_view(scenes, tmp_path, capsys):
+    words = ["render", scenes[0], "-o", str(tmp_path / "new"), *SMALL]
+    assert main([*words, "--background", "0,0,1"]) == 0
+    names = sorted(path.name for path in (tmp_path / "new").iterdir())
+    assert names == ["view_1.png", "view_2.png"]
+    assert "2 images of 48 x 36 pixels" in capsys.readouterr().out
+    assert main(words) == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert main([*words, "--overwrite", "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_render_names_images_after_photographs(folder, scenes, tmp_path):
+    words = ["--cameras", str(folder), "--views", "3", "--size", "32"]
+    assert main(["render", scenes[0], "-o", str(tmp_path), *words]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0.png", "3.png", "6.png"]
+
+
+def test_compare_writes_page_sheet_and_maps(scenes, tmp_path, capsys):
+    words = ["compare", *scenes, "-o", str(tmp_path / "page"), *SMALL, "--lpips", "off"]
+    assert main(words) == 0
+    names = sorted(path.name for path in (tmp_path / "page").iterdir())
+    assert names == ["errors.png", "index.html", "sheet.png"]
+    assert f"Open {tmp_path / 'page' / 'index.html'} in a browser." in capsys.readouterr().out
+    assert "full.ply" in (tmp_path / "page" / "index.html").read_text(encoding="utf-8")
+    assert main(words) == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert main([*words, "--overwrite"]) == 0
+
+
+def test_compare_takes_eight_of_many_cameras(folder, scenes, tmp_path, capsys):
+    words = ["--cameras", str(folder / "transforms.json"), "--lpips", "off"]
+    assert main(["compare", *scenes[:2], "-o", str(tmp_path), *words]) == 0
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert page.count("images/") == 8

@@ -1,0 +1,172 @@
+"""Goals on the command line: what goes together, times, and what is said."""
+
+import argparse
+
+import pytest
+
+import cvtgs
+from cvtgs.budget import CostModel
+from cvtgs.budget.calibrate import CANDIDATES
+from cvtgs.cli.goals import STARTED, Goals, add_goal_options, seconds_of
+from cvtgs.errors import GoalError, InvalidArgumentError
+from cvtgs.progress import silent
+
+RATES = dict(zip(CANDIDATES, (1e-6, 1e-5, 1e-4, 1e-2, 1.0), strict=True))
+MODEL = CostModel(
+    rates={name: {"check": {"in": rate, "in_values": 0.0}} for name, rate in RATES.items()}
+)
+
+
+def options(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    size = parser.add_mutually_exclusive_group(required=True)
+    size.add_argument("--rho", type=float)
+    size.add_argument("--count", type=int)
+    add_goal_options(parser, size)
+    for name in ("--preset", "--config"):
+        parser.add_argument(name)
+    parser.add_argument("--ckpt", default="auto")
+    parser.add_argument("--keep")
+    parser.add_argument("--refine", type=float)
+    parser.add_argument("--refine-steps", type=int)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--quiet", action="store_true")
+    return parser.parse_args(words)
+
+
+@pytest.fixture(scope="module")
+def scene() -> cvtgs.GaussianScene:
+    return cvtgs.synthetic.scene("object", 300, sh_degree=0, seed=0)
+
+
+@pytest.fixture
+def measured(monkeypatch) -> list[bool]:
+    """Replace the calibration; the list tells for each call whether it was asked for anew."""
+    asked: list[bool] = []
+
+    def known(device, *, recalibrate, listener):
+        asked.append(recalibrate)
+        return MODEL
+
+    monkeypatch.setattr(cvtgs.budget, "cost_model", known)
+    monkeypatch.setattr("cvtgs.budget.remember.is_known", lambda device: len(asked) > 0)
+    monkeypatch.setattr("cvtgs.cli.goals.time.perf_counter", lambda: STARTED)
+    return asked
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("20s", 20.0), ("20", 20.0), (" 2m", 120.0), ("1.5min", 90.0), ("0.5h", 1800.0)],
+)
+def test_times(text, seconds):
+    assert seconds_of(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "s", "-3s", "0", "20 parsecs", "nan", "inf", "1:30"])
+def test_no_times(text):
+    with pytest.raises(InvalidArgumentError, match="--time-budget must be a time above 0"):
+        seconds_of(text)
+
+
+def test_a_target_takes_the_place_of_the_ratio(capsys):
+    for words in (["--rho", "0.1", "--target-psnr", "30"], ["--target-psnr", "3", "--count", "5"]):
+        with pytest.raises(SystemExit):
+            options(*words)
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--target-psnr", "99"], "the PSNR to reach must be above 0 and at most 60 dB, found"),
+        (["--target-ssim", "30"], "the SSIM to reach must be above 0 and below 1, found 30.0."),
+        (["--rho", "0.1", "--recalibrate"], "--recalibrate goes with --time-budget."),
+        (
+            ["--rho", "0.1", "--time-budget", "2m", "--preset", "fast", "--refine", "3"],
+            "--time-budget chooses the preset and cannot go with --preset, --refine.",
+        ),
+        (
+            ["--target-psnr", "30", "--time-budget", "2m"],
+            "--time-budget chooses the preset and cannot go with --target-psnr and --target-ssim.",
+        ),
+    ],
+)
+def test_what_does_not_go_together(words, text):
+    with pytest.raises(InvalidArgumentError) as caught:
+        Goals(options(*words))
+    assert str(caught.value).startswith(text)
+
+
+def test_without_goals_nothing_changes(scene):
+    goals = Goals(options("--rho", "0.1"))
+    heard = []
+    assert goals.preset(scene, {}, silent) is None
+    assert goals.stage_listener(heard.append) == heard.append
+    small, report = goals.run(cvtgs.Simplifier(config="draft", device="cpu"), scene)
+    assert len(small) == report.output_count == 30
+    assert goals.said == []
+
+
+@pytest.mark.usefixtures("measured")
+def test_a_budget_chooses_a_preset_and_says_so(scene):
+    goals = Goals(options("--rho", "0.1", "--time-budget", "5s"))
+    assert goals.preset(scene, {}, silent) == "high"
+    assert goals.said[0].startswith("Preset high, the best that fits into 5 s: expected to take 3")
+
+
+@pytest.mark.parametrize(
+    ("words", "settings", "preset"),
+    [
+        ([], {}, "fast"),
+        ([], {"merge.network": "false"}, "standard"),
+        (["--ckpt", "none"], {}, "standard"),
+        (["--ckpt", "none"], {"refine.seconds": "2"}, "standard"),
+        (["--ckpt", "none"], {"refine.seconds": "200"}, None),
+    ],
+)
+def test_a_budget_knows_what_else_is_set(scene, monkeypatch, words, settings, preset):
+    nothing = {"check": {"in": 0.0}}
+    slow = {"network": {"once": 9.0}, "refine": {"look_pixels": 0.0}}
+    rates = {"fast": nothing, "standard": nothing | slow}
+    model = CostModel(rates=rates)
+    monkeypatch.setattr(cvtgs.budget, "cost_model", lambda *_, **__: model)
+    monkeypatch.setattr("cvtgs.budget.remember.is_known", lambda device: True)
+    monkeypatch.setattr("cvtgs.cli.goals.time.perf_counter", lambda: STARTED)
+    goals = Goals(options("--rho", "0.1", "--time-budget", "5s", *words))
+    if preset is None:
+        with pytest.raises(GoalError, match="takes about 2e\\+02 s"):
+            goals.preset(scene, settings, silent)
+    else:
+        assert goals.preset(scene, settings, silent) == preset
+
+
+def test_the_machine_is_measured_once_or_when_asked(scene, measured, capsys):
+    words = ["--rho", "0.1", "--time-budget", "5s"]
+    Goals(options(*words)).preset(scene, {}, silent)
+    assert capsys.readouterr().err == "cvtgs: measuring this machine once, about a minute\n"
+    Goals(options(*words)).preset(scene, {}, silent)
+    assert capsys.readouterr().err == ""
+    Goals(options(*words, "--recalibrate", "--quiet")).preset(scene, {}, silent)
+    assert capsys.readouterr().err == ""
+    assert measured == [True, False, True]
+
+
+@pytest.mark.usefixtures("measured")
+def test_a_budget_that_is_too_short(scene, monkeypatch):
+    monkeypatch.setattr("cvtgs.cli.goals.STARTED", STARTED - 60)
+    with pytest.raises(GoalError, match=r"fits into 5 s: starting and reading took 60\.0 s\."):
+        Goals(options("--count", "10", "--time-budget", "5s")).preset(scene, {}, silent)
+
+
+def test_a_target_is_searched_and_said(scene):
+    goals = Goals(options("--target-psnr", "15"))
+    assert goals.stage_listener(print) is silent
+    small, report = goals.run(cvtgs.Simplifier(config="draft", device="cpu"), scene)
+    assert len(small) == report.output_count < 300
+    assert goals.said[0].startswith("PSNR ")
+    assert "over views that were held out; found in" in goals.said[0]
+
+
+def test_protected_regions_need_a_size():
+    with pytest.raises(InvalidArgumentError, match=r"--keep needs --rho or --count\."):
+        Goals(options("--target-psnr", "30", "--keep", "box.json"))

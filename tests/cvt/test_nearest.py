@@ -1,0 +1,168 @@
+"""Nearest site: both backends equal brute force."""
+
+import numpy as np
+import pytest
+import torch
+
+import oracles
+from cvtgs.cvt import nearest_backend, nearest_scipy, nearest_torch
+from cvtgs.errors import DeviceError
+from cvtgs.math.morton import morton_order
+
+BACKENDS = {"scipy": nearest_scipy, "torch": nearest_torch}
+both = pytest.mark.parametrize("backend", BACKENDS.values(), ids=BACKENDS)
+dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+
+
+def cloud(kind: str, count: int, d: int, *, seed: int = 0) -> torch.Tensor:
+    g = torch.Generator().manual_seed(1000 * seed + count)
+    points = torch.randn(count, d, generator=g, dtype=torch.float64)
+    if kind == "clusters":
+        centers = 50 * torch.randn(5, d, generator=torch.Generator().manual_seed(9)).double()
+        points = 0.01 * points + centers[torch.randint(0, 5, (count,), generator=g)]
+    if kind == "far-flung":
+        points *= 10 ** (6 * torch.rand(count, 1, generator=g, dtype=torch.float64))
+    if kind == "line":
+        points[:, 1:] = 0
+    if kind == "lattice":
+        points = points.mul(2).round()
+    return points
+
+
+def brute_force(points: torch.Tensor, sites: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the smallest of all distances, summed as float64 squares (checked by an oracle)."""
+    squared = (points.double()[:, None, :] - sites.double()[None, :, :]).square().sum(dim=2)
+    return squared.argmin(dim=1), squared.amin(dim=1)
+
+
+def assert_nearest(points, sites, found):
+    """Distances equal the smallest, and each label names a site at that distance."""
+    labels, squared = found
+    _, wanted = brute_force(points, sites)
+    torch.testing.assert_close(squared, wanted, rtol=1e-12, atol=1e-30)
+    of_labels = (points.double() - sites.double()[labels]).square().sum(dim=1)
+    torch.testing.assert_close(of_labels, wanted, rtol=1e-12, atol=1e-30)
+
+
+def test_brute_force_equals_the_scalar_oracle():
+    points, sites = cloud("lattice", 60, 3), cloud("lattice", 20, 3, seed=1)
+    labels, squared = oracles.nearest(points.numpy(), sites.numpy())
+    found = brute_force(points, sites)
+    assert found[0].tolist() == labels
+    np.testing.assert_allclose(found[1], squared, rtol=1e-14)
+
+
+@both
+def test_known_points(backend):
+    sites = torch.tensor([[0.0, 0, 0], [10, 0, 0], [0, 10, 0]])
+    points = torch.tensor([[1.0, 0, 0], [8, 1, 0], [0, 7, 2], [-5, 0, 0]])
+    labels, squared = backend(points, sites)
+    assert labels.tolist() == [0, 1, 2, 0]
+    assert labels.dtype == torch.int64
+    assert squared.tolist() == pytest.approx([1.0, 5.0, 13.0, 25.0])
+
+
+@both
+@dtypes
+@pytest.mark.parametrize("d", [1, 2, 3, 6])
+@pytest.mark.parametrize(
+    ("n", "m"), [(1, 1), (1, 5), (5, 1), (127, 31), (128, 32), (129, 33), (500, 257), (1000, 999)]
+)
+def test_shapes(backend, n, m, d, dtype):
+    points, sites = cloud("normal", n, d).to(dtype), cloud("normal", m, d, seed=1).to(dtype)
+    labels, squared = backend(points, sites)
+    assert labels.shape == squared.shape == (n,)
+    assert_nearest(points, sites, (labels, squared))
+
+
+@both
+@dtypes
+@pytest.mark.parametrize("kind", ["clusters", "far-flung", "line", "lattice"])
+def test_kinds_of_clouds(backend, kind, dtype):
+    points, sites = cloud(kind, 2000, 3).to(dtype), cloud(kind, 300, 3, seed=1).to(dtype)
+    assert_nearest(points, sites, backend(points, sites))
+
+
+@both
+def test_sites_among_the_points_are_at_distance_zero(backend):
+    points = cloud("normal", 1000, 6)
+    labels, squared = backend(points, points[::3])
+    assert bool((squared[::3] == 0).all())
+    assert labels[::3].tolist() == list(range(334))
+
+
+@both
+def test_coincident_points_and_sites(backend):
+    points, sites = torch.full((300, 3), 2.5), torch.full((70, 3), 2.5)
+    _, squared = backend(points, sites)
+    assert not bool(squared.any())
+
+
+@pytest.mark.parametrize("n", [50, 700])
+def test_torch_names_the_first_of_equally_near_sites(n):
+    points, sites = cloud("lattice", n, 3), cloud("lattice", 400, 3, seed=2)
+    labels, _ = nearest_torch(points, sites)
+    assert torch.equal(labels, brute_force(points, sites)[0])
+
+
+def test_torch_equals_brute_force_bit_for_bit():
+    points, sites = cloud("far-flung", 900, 3), cloud("clusters", 150, 3)
+    total = torch.zeros(900, 150, dtype=torch.float64)
+    for axis in range(3):
+        total += (points[:, None, axis] - sites[None, :, axis]).square()
+    labels, squared = nearest_torch(points, sites)
+    assert torch.equal(squared, total.amin(dim=1))
+    assert torch.equal(labels, total.argmin(dim=1))
+
+
+@pytest.mark.parametrize("entries", [1, 100_000])
+def test_torch_gives_the_same_answer_in_less_memory(monkeypatch, entries):
+    points, sites = cloud("clusters", 1000, 3), cloud("clusters", 200, 3, seed=1)
+    wanted = nearest_torch(points, sites)
+    monkeypatch.setitem(nearest_torch.__globals__, "MAX_ENTRIES", entries)
+    found = nearest_torch(points, sites)
+    assert torch.equal(found[0], wanted[0])
+    assert torch.equal(found[1], wanted[1])
+
+
+def test_torch_never_holds_more_than_its_bound(monkeypatch):
+    module = nearest_torch.__globals__
+    monkeypatch.setitem(module, "MAX_ENTRIES", 1 << 17)
+    inner, largest = module["_nearest_in_pairs"], []
+
+    def spy(points, sites, ids):
+        largest.append(points.shape[0] * points.shape[1] * sites.shape[1])
+        return inner(points, sites, ids)
+
+    monkeypatch.setitem(module, "_nearest_in_pairs", spy)
+    points, sites = cloud("clusters", 4000, 3), cloud("clusters", 600, 3, seed=1)
+    points = points[morton_order(points)]
+    assert_nearest(points, sites, nearest_torch(points, sites))
+    assert max(largest) <= 1 << 17
+    assert sum(largest) < 0.5 * 4000 * 600  # blocks that are too far away were skipped
+
+
+@both
+def test_same_bits_twice_and_input_unchanged(backend):
+    points, sites = cloud("clusters", 1500, 3), cloud("normal", 200, 3)
+    before = points.clone(), sites.clone()
+    first, second = backend(points, sites), backend(points, sites)
+    assert torch.equal(first[0], second[0])
+    assert torch.equal(first[1], second[1])
+    assert torch.equal(points, before[0])
+    assert torch.equal(sites, before[1])
+
+
+def test_backends_by_name():
+    cpu, cuda = torch.device("cpu"), torch.device("cuda")
+    assert nearest_backend("auto", cpu) == ("scipy", nearest_scipy)
+    assert nearest_backend("auto", cuda) == ("torch", nearest_torch)
+    assert nearest_backend("torch", cpu) == ("torch", nearest_torch)
+
+
+def test_scipy_elsewhere_is_an_error():
+    with pytest.raises(DeviceError) as caught:
+        nearest_backend("scipy", torch.device("cuda:1"))
+    assert str(caught.value) == (
+        "cvt.backend 'scipy' works on the CPU only, found device cuda:1; use 'torch' or 'auto'."
+    )

@@ -1,0 +1,184 @@
+"""The tessellation of hard scenes: its space, weights, seeds, searches and cells."""
+
+from importlib import import_module
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from cvtgs.config import SimplifyConfig
+from cvtgs.cvt import (
+    ambient_visibility,
+    embed,
+    falloff,
+    nearest_neighbors,
+    nearest_scipy,
+    nearest_torch,
+    stratified_seeds,
+    tessellate,
+    tessellation_weights,
+)
+from cvtgs.cvt.distinct import distinct_rows, runs_of_equal
+from cvtgs.math.frames import robust_frame
+from cvtgs.math.morton import morton_order
+from hard_cases import CASES, each_case
+from hard_scenes import devices, dtypes, presets, valid_rows
+
+COUNT = 60
+SEARCHES = {"scipy": nearest_scipy, "torch": nearest_torch}
+searches = pytest.mark.parametrize("search", SEARCHES.values(), ids=SEARCHES)
+
+
+def valid_scene(make, dtype, device="cpu"):
+    scene = make(COUNT, dtype)
+    return scene.select(valid_rows(scene)).to(device)
+
+
+def squared_distances(points, sites):
+    """All of them, in float64, by numpy alone."""
+    a, b = (x.double().numpy() for x in (points, sites))
+    return np.square(a[:, None] - b[None]).sum(axis=2)
+
+
+@dtypes
+@devices
+@each_case
+def test_space_and_weights_are_finite(make, device, dtype):
+    scene = valid_scene(make, dtype, device)
+    frame = robust_frame(scene.means)
+    assert frame.radius > 0
+    if dtype == torch.float32:  # it is the same in float64, and takes longest
+        light = ambient_visibility(scene.means, scene.masses, frame)
+        assert bool(((light >= 0) & (light <= 1)).all())
+    far = falloff(scene.means, frame)
+    assert bool(((far >= 0) & (far <= 1)).all())
+    for contraction in (0.0, 0.5, 1.0):
+        points = embed(scene.means, scene.sh0, frame=frame, contraction=contraction, color=0.05)
+        assert bool(points.isfinite().all())
+    for power in (0.0, 0.8, 1.0):
+        weights = tessellation_weights(
+            scene.opacities, scene.areas * far, area_power=power, floor=1e-3
+        )
+        assert bool((weights.isfinite() & (weights >= 0)).all())
+        assert float(weights.amax()) > 0
+
+
+@presets
+@dtypes
+@devices
+@each_case
+def test_every_cell_gets_a_member_and_lloyd_never_loses(make, device, dtype, preset):
+    scene = valid_scene(make, dtype, device)
+    frame = robust_frame(scene.means)
+    points = embed(scene.means, frame=frame)
+    order = morton_order(points)
+    points, weights = points[order], scene.masses[order]
+    weights = weights if float(weights.amax()) > 0 else torch.ones_like(weights)
+    weights = weights / weights.amax()
+    rounding = 1e-12 * float((weights * points.square().sum(dim=1)).sum())
+    for backend in ("auto", "torch"):
+        config = SimplifyConfig.from_mapping({"preset": preset, "cvt": {"backend": backend}}).cvt
+        for count in sorted({1, max(1, len(scene) // 3), max(1, len(scene) - 1), len(scene)}):
+            found = tessellate(points, weights, count, config=config)
+            assert torch.bincount(found.labels, minlength=count).amin() >= 1
+            assert len(found.sites) == count
+            assert bool(found.sites.isfinite().all())
+            energies = [*found.energies, found.energy]
+            assert all(after <= before + rounding for before, after in pairwise(energies))
+
+
+@searches
+@dtypes
+@each_case
+def test_the_nearest_site_is_the_nearest(make, dtype, search):
+    scene = valid_scene(make, dtype)
+    points = embed(scene.means, frame=robust_frame(scene.means))
+    sites = points[::3]
+    labels, squared = search(points, sites)
+    every = squared_distances(points, sites)
+    own = every[np.arange(len(points)), labels.numpy()]
+    np.testing.assert_allclose(own, every.min(axis=1), rtol=1e-12, atol=0)
+    np.testing.assert_allclose(squared.numpy(), own, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("backend", SEARCHES)
+@dtypes
+@each_case
+def test_neighbours_are_the_nearest_others(make, dtype, backend):
+    scene = valid_scene(make, dtype)
+    sites = embed(scene.means, frame=robust_frame(scene.means))
+    found = nearest_neighbors(sites, 8, backend=backend)
+    assert found.shape == (len(sites), min(8, len(sites) - 1))
+    assert not bool((found == torch.arange(len(sites))[:, None]).any())
+    assert all(len(set(row)) == len(row) for row in found.tolist())
+    every = squared_distances(sites, sites)
+    np.fill_diagonal(every, np.inf)
+    wanted = np.sort(every, axis=1)[:, : found.shape[1]]
+    own = np.sort(np.take_along_axis(every, found.numpy(), axis=1), axis=1)
+    np.testing.assert_allclose(own, wanted, rtol=1e-9, atol=0)
+
+
+@searches
+def test_coincident_sites_are_searched_once(search, monkeypatch):
+    """A tree cannot part them, and would compare every point with every site."""
+    sites = torch.tensor([[1.0, 2.0, 3.0]]).repeat(1000, 1)
+    sites[700] = 0.0
+    seen = []
+    for module, name in (("nearest_scipy", "build_tree"), ("nearest_torch", "_nearest_of_blocks")):
+        home = import_module(f"cvtgs.cvt.{module}")
+        honest = getattr(home, name)
+
+        def spy(*args, honest=honest):
+            seen.append(len(args[0]) if len(args) == 1 else len(args[1]))
+            return honest(*args)
+
+        monkeypatch.setattr(home, name, spy)
+    labels, squared = search(sites, sites)
+    assert seen == [2 if search is nearest_scipy else 1]  # sites, or blocks of sites
+    assert labels.tolist() == [700 if row == 700 else 0 for row in range(1000)]
+    assert not bool(squared.any())
+
+
+def test_coincident_sites_are_apart_for_the_tree_of_neighbours(monkeypatch):
+    home, seen = import_module("cvtgs.cvt.neighbors"), []
+    honest = home.build_tree
+    monkeypatch.setattr(home, "build_tree", lambda sites: seen.append(sites) or honest(sites))
+    far = 3e38 * torch.tensor([[1.0, -1.0, 1.0]])  # their extent is beyond float32
+    sites = torch.cat([torch.zeros(500, 3), far, -far])
+    found = nearest_neighbors(sites, 8, backend="scipy")
+    assert bool(seen[0].isfinite().all())
+    assert len(seen[0].unique(dim=0)) == 502
+    assert int(found[:500].amax()) < 500
+
+
+@pytest.mark.parametrize("width", [1, 2, 3, 6])
+def test_equal_rows_are_found(width):
+    g = torch.Generator().manual_seed(0)
+    sites = torch.rand(50, width, generator=g)[torch.randint(0, 50, (200,), generator=g)]
+    first = {}
+    for row, site in enumerate(sites.tolist()):
+        first.setdefault(tuple(site), row)
+    assert distinct_rows(sites).tolist() == sorted(first.values())
+    order, ranks = runs_of_equal(sites)
+    assert sorted(order.tolist()) == list(range(200))
+    assert int((ranks == 0).sum()) == len(first)
+    assert distinct_rows(sites[sorted(first.values())]) is None
+
+
+def test_seeds_of_equal_points_are_different_points():
+    for name in ("coincident", "duplicates", "all_transparent"):
+        scene = CASES[name](COUNT, torch.float32)
+        for count in (1, 7, COUNT - 1, COUNT):
+            rows, shares = stratified_seeds(scene.masses, count)
+            assert len(set(rows.tolist())) == count
+            assert float(shares.sum()) == pytest.approx(float(scene.masses.sum()))
+
+
+def test_coincident_points_come_in_the_order_of_ties():
+    points = torch.tensor([[0.0, 0, 0], [1, 1, 1], [0, 0, 0], [1, 1, 1], [0, 0, 0]])
+    ties = torch.tensor([3.0, 2.0, 1.0, 1.0, 1.0])
+    assert morton_order(points).tolist() == [0, 2, 4, 1, 3]
+    assert morton_order(points, ties).tolist() == [2, 4, 0, 3, 1]
+    apart = points + 3 * torch.arange(5)[:, None]
+    assert torch.equal(morton_order(apart, ties), morton_order(apart))

@@ -1,0 +1,215 @@
+"""Whole simplifications of hard scenes: count, report, warnings, stability, and no giant blobs.
+
+What cannot hold to 1e-4, and why (docs/numerics.md says more):
+
+- Turns move the axes that the Morton curve, the median and the light know, so seeds are others and
+  cells are others, as good: here the energy is compared, in test_hard_merge.py given cells.
+- In ``isotropic_cells`` points lie just between two sites, so rounding decides which cell they
+  join. There images are compared.
+- Where a handful of Gaussians holds all the distance (``LUCK``), one seed more or less among them
+  decides the energy.
+- Denormal coordinates have no digits that could survive another unit.
+"""
+
+import math
+import warnings
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs import Simplifier
+from cvtgs.errors import DroppedDataWarning
+from cvtgs.views import automatic_views
+from hard_cases import CASES, each_case
+from hard_scenes import (
+    changed,
+    coarsen_light,
+    devices,
+    dtypes,
+    presets,
+    simplifier,
+    valid_rows,
+)
+from scenes import assert_same_gaussians, assert_standard, moved
+
+COUNT = 60
+LUCK = ("flyaways", "far_flyaways", "two_clusters", "crowd_beside_loners")
+
+
+@pytest.fixture(autouse=True)
+def coarse_light(monkeypatch):
+    coarsen_light(monkeypatch)
+
+
+def counts_for(total):
+    return sorted({1, max(1, total // 5), max(1, total - 1), total})
+
+
+def case(name_or_make, count=COUNT):
+    make = CASES.get(name_or_make, name_or_make)
+    scene = make(count, torch.float64)
+    return scene.select(valid_rows(scene))
+
+
+def moments_only(preset):
+    return Simplifier(None, config=preset, device="cpu")
+
+
+@presets
+@dtypes
+@devices
+@each_case
+def test_exact_count_finite_output_sane_report_one_warning(make, device, dtype, preset):
+    scene = make(COUNT, dtype).to(device)
+    valid = int(valid_rows(scene).sum())
+    for count in counts_for(len(scene)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            small, report = simplifier(preset, device).run(scene, count=count)
+        assert [w.category for w in caught] == [DroppedDataWarning] * (valid < len(scene))
+        assert len(small) == report.output_count == min(count, valid)
+        assert (small.dtype, small.device, small.comments) == (dtype, scene.device, scene.comments)
+        assert small.layout == scene.layout
+        assert report.invalid_count == len(scene) - valid
+        assert (report.shortfall == "") == (count <= valid)
+        if count < len(scene):
+            assert_standard(small)
+        else:  # the scene's own rows
+            assert torch.equal(small.means, scene.means[valid_rows(scene)])
+        masses = report.mass_in, report.mass_out, report.energy, *report.energies
+        assert all(math.isfinite(mass) and mass >= 0 for mass in masses)
+        assert 0 <= report.filtered_mass_share <= 1
+
+
+@presets
+@dtypes
+@each_case
+def test_the_order_of_the_rows_changes_nothing(make, dtype, preset):
+    """Not even where all rows tie: of coincident, equal and equally faint ones mass decides."""
+    scene = make(COUNT, dtype)
+    shuffle = torch.randperm(len(scene), generator=torch.Generator().manual_seed(1))
+    count = max(1, len(scene) // 5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DroppedDataWarning)
+        first, second = (
+            simplifier(preset).simplify(s, count=count) for s in (scene, scene.select(shuffle))
+        )
+    assert_same_gaussians(first, second)
+
+
+@presets
+@each_case
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_the_unit_changes_nothing(make, scale, preset):
+    if make.__name__ == "denormals" and scale < 1:
+        pytest.skip("numbers below the smallest normal one lose their digits")
+    if make.__name__ == "isotropic_cells":
+        pytest.skip("points between two sites: see test_even_cells_give_the_same_image")
+    scene = case(make)
+    count = max(1, len(scene) // 5)
+    run = simplifier(preset)
+    assert_same_gaussians(
+        run.simplify(moved(scene, scale=scale), count=count),
+        moved(run.simplify(scene, count=count), scale=scale),
+    )
+
+
+@presets
+@each_case
+def test_a_shift_changes_nothing(make, preset):
+    """By twice the size of the scene, in float64."""
+    if make.__name__ == "isotropic_cells":
+        pytest.skip("points between two sites: see test_even_cells_give_the_same_image")
+    scene = case(make)
+    extent = float((scene.means - scene.means.median(dim=0).values).abs().median()) or 1.0
+    shift, count = (2 * extent, -extent, 0.3 * extent), max(1, len(scene) // 5)
+    run = simplifier(preset)
+    assert_same_gaussians(
+        run.simplify(moved(scene, shift=shift), count=count),
+        moved(run.simplify(scene, count=count), shift=shift),
+    )
+
+
+@presets
+@each_case
+def test_a_turn_gives_cells_as_good(make, preset):
+    scene = case(make, 300)
+    count = max(1, len(scene) // 5)
+    first, second = (
+        moments_only(preset).run(s, count=count).report
+        for s in (scene, moved(scene, quat=(0.9, 0.1, -0.3, 0.2)))
+    )
+    assert second.mass_in == pytest.approx(first.mass_in, rel=1e-9)
+    if make.__name__ not in LUCK:
+        assert second.energy <= 1.5 * first.energy + 1e-12
+
+
+@presets
+@pytest.mark.parametrize("name", ["isotropic_cells", "giants"])
+def test_even_cells_give_the_same_image(name, preset):
+    """To 25 dB, while single Gaussians differ by as much as the network may change them."""
+    scene = case(name, 300)
+    there = moved(scene, shift=(1.0, 2.0, -3.0))
+    views = automatic_views(scene, 2, width=32, height=32, seed=0)
+    first = simplifier(preset).simplify(scene, 0.2)
+    second = moved(simplifier(preset).simplify(there, 0.2), shift=(-1.0, -2.0, 3.0))
+    ours, theirs = (cvtgs.render(s, views).rgb.clamp(0, 1) for s in (first, second))
+    assert -10 * float((ours - theirs).square().mean().log10()) > 25
+
+
+@dtypes
+@devices
+@pytest.mark.parametrize("name", ["flyaways", "far_flyaways"])
+def test_flyaways_neither_grow_nor_spoil_the_rest(name, device, dtype):
+    """Nothing larger than the scene comes out, and the ball is as if they were not there."""
+    scene = CASES[name](300, dtype).to(device)
+    small, report = simplifier("standard", device).run(scene, count=60)
+    assert report.filtered_count >= 5
+    assert float(small.means.abs().amax()) < 2
+    assert float(small.scales.amax()) < 1
+    alone = simplifier("standard", device).simplify(scene.select(torch.arange(300) >= 5), count=60)
+    assert float(small.masses.sum()) == pytest.approx(float(alone.masses.sum()), rel=0.05)
+
+
+@dtypes
+def test_flyaways_of_the_paper_come_out_alone(dtype):
+    """The paper's filter keeps them; their cell is theirs, and no Gaussian spans the way."""
+    small = simplifier("paper").simplify(CASES["flyaways"](300, dtype), count=60)
+    near = small.means.abs().amax(dim=1) < 2
+    assert int(near.sum()) >= 50
+    assert float(small.scales[near].amax()) < 1
+
+
+@presets
+@dtypes
+def test_equal_gaussians_merge_into_themselves(dtype, preset):
+    """Of each Gaussian five copies: as many cells as there are places have one place each."""
+    scene = CASES["duplicates"](COUNT, dtype)
+    small = simplifier(preset).simplify(scene, count=COUNT // 5)
+    places = scene.means[::5]
+    gaps = torch.cdist(small.means.double(), places.double())
+    assert float(gaps.amin(dim=1).median()) < 0.05
+    assert_standard(small)
+
+
+def test_a_report_counts_what_was_filtered_of_faint_and_transparent_scenes():
+    for name in ("all_faint", "all_transparent"):
+        scene = CASES[name](COUNT, torch.float32)
+        faint = simplifier("standard").run(scene, count=6).report
+        assert faint.filtered_mass_share <= 0.01
+        paper = simplifier("paper").run(scene, count=6).report
+        assert paper.filtered_count == COUNT - 6
+        assert paper.output_count == 6
+
+
+@dtypes
+def test_half_a_million_units_of_colour_do_not_leave_their_hull(dtype):
+    scene = CASES["huge_colours"](COUNT, dtype)
+    small = moments_only("standard").simplify(scene, count=12)
+    assert float(small.sh0.amax()) <= float(scene.sh0.amax()) * (1 + 1e-6)
+    assert float(small.sh0.amin()) >= float(scene.sh0.amin()) * (1 + 1e-6)
+    grey = changed(scene, sh0=scene.sh0 * 0 + 1e4)
+    torch.testing.assert_close(
+        moments_only("standard").simplify(grey, count=12).sh0, grey.sh0[:12], rtol=1e-6, atol=0
+    )

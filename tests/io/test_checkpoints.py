@@ -1,0 +1,133 @@
+"""Checkpoints of nerfstudio and gsplat."""
+
+import pickle
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from cvtgs import GaussianScene, load, to_dict
+from cvtgs.errors import FileFormatError
+from scenes import random_scene, same_bits
+
+NEWER, OLDER = "_model.gauss_params.", "_model."
+
+
+def splatfacto(scene: GaussianScene, prefix: str = NEWER) -> dict[str, Any]:
+    """Return what nerfstudio saves, with the things around the scene that it saves too."""
+    state: OrderedDict[str, Tensor] = OrderedDict()
+    state["datamanager.dummy"] = torch.zeros(0)
+    state["_model.device_indicator_param"] = torch.empty(0)
+    state["_model.camera_optimizer.pose_adjustment"] = torch.zeros(5, 6)
+    state[prefix + "means"] = scene.means
+    state[prefix + "scales"] = scene.log_scales
+    state[prefix + "quats"] = scene.quats
+    state[prefix + "features_dc"] = scene.sh0[:, 0]
+    state[prefix + "features_rest"] = scene.shN
+    state[prefix + "opacities"] = scene.logit_opacities[:, None]
+    rate = np.float64(1.6e-6)
+    group = {"lr": rate, "betas": (0.9, 0.999), "params": [0], "foreach": None}
+    moments = {0: {"step": torch.tensor(3.0), "exp_avg": torch.zeros(4)}}
+    return {
+        "step": 29999,
+        "pipeline": state,
+        "optimizers": {"means": {"state": moments, "param_groups": [group]}},
+        "schedulers": {"means": {"base_lrs": [1e-4], "last_epoch": 3, "_last_lr": [rate]}},
+        "scalers": {},
+    }
+
+
+@pytest.mark.parametrize("prefix", [NEWER, OLDER, "module._model.gauss_params."])
+@pytest.mark.parametrize("degree", [1, 3])
+def test_splatfacto(tmp_path: Path, prefix: str, degree: int) -> None:
+    scene = random_scene(7, degree=degree)
+    torch.save(splatfacto(scene, prefix), tmp_path / "step-000029999.ckpt")
+    assert same_bits(load(tmp_path / "step-000029999.ckpt"), scene)
+
+
+def test_colours_without_sh_went_through_a_sigmoid(tmp_path: Path) -> None:
+    scene = random_scene(5, degree=0)
+    path = tmp_path / "a.ckpt"
+    torch.save(splatfacto(scene), path)
+    shown = 0.5 + 0.28209479177387814 * load(path).sh0
+    torch.testing.assert_close(shown, torch.sigmoid(scene.sh0))
+
+
+@pytest.mark.parametrize("suffix", ["pt", "ckpt"])
+def test_gsplat(tmp_path: Path, suffix: str) -> None:
+    scene = random_scene(7, degree=2)
+    path = tmp_path / f"ckpt_29999_rank0.{suffix}"
+    torch.save({"step": 29999, "splats": OrderedDict(to_dict(scene))}, path)
+    again = load(path)
+    assert same_bits(again, scene)
+    path.write_bytes(b"")  # the scene is a copy, not a map of the file
+    assert same_bits(again, scene)
+
+
+def test_nothing_is_left_allowed(tmp_path: Path) -> None:
+    before = set(torch.serialization.get_safe_globals())
+    torch.save(splatfacto(random_scene(2)), tmp_path / "a.ckpt")
+    load(tmp_path / "a.ckpt")
+    assert set(torch.serialization.get_safe_globals()) == before
+
+
+class Evil:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (Path("evil"),))
+
+
+def test_nothing_is_executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "a.ckpt"
+    torch.save({**splatfacto(random_scene(2)), "config": Evil()}, path)
+    with pytest.raises(FileFormatError, match="must be a whole checkpoint of tensors and plain"):
+        load(path)
+    assert not (tmp_path / "evil").exists()
+
+
+def test_other_checkpoints(tmp_path: Path) -> None:
+    path = tmp_path / "a.ckpt"
+    torch.save({"step": 1, "model": {"means": torch.zeros(2, 3)}}, path)
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    assert str(caught.value) == (
+        f"{path}: a checkpoint must hold a scene under 'splats' (gsplat) or 'pipeline' "
+        f"(nerfstudio's Splatfacto), found 'step', 'model'."
+    )
+    torch.save([1, 2], path)
+    with pytest.raises(FileFormatError, match="found neither"):
+        load(path)
+    torch.save({"splats": {"other": torch.zeros(2, 3)}}, path)
+    with pytest.raises(FileFormatError, match="found 'splats'"):
+        load(path)
+    torch.save({"splats": {"means": torch.zeros(2, 3)}}, path)
+    with pytest.raises(FileFormatError, match="found none named quats, scales, opacities, sh0"):
+        load(path)
+    state = to_dict(random_scene(3)) | {"quats": torch.zeros(2, 4)}
+    torch.save({"splats": state}, path)
+    with pytest.raises(FileFormatError, match=r"a\.ckpt: quats must have shape"):
+        load(path)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.97])
+def test_cut_short(tmp_path: Path, share: float) -> None:
+    path = tmp_path / "a.ckpt"
+    torch.save(splatfacto(random_scene(50)), path)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    assert str(caught.value) == (
+        f"{path}: must be a checkpoint that torch.save wrote as a zip, found another file."
+    )
+
+
+def test_a_pickle_is_not_opened(tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    path.write_bytes(pickle.dumps(Evil()))
+    with pytest.raises(FileFormatError, match="found another file"):
+        load(path)

@@ -1,0 +1,274 @@
+"""Blocks: exact counts, the same bits whoever does what when, seams, filters, awkward files."""
+
+import json
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.boxes import Box
+from cvtgs.cli.main import main
+from cvtgs.counts import shared_out
+from cvtgs.devices import one_thread
+from cvtgs.errors import ConfigError, FileFormatError, InvalidArgumentError, InvalidSceneError
+from cvtgs.evaluate import EvaluationSettings
+from cvtgs.io.ply import open_rows
+from cvtgs.outofcore import block_count, memory, read_bytes, simplify_file
+from cvtgs.outofcore.cuts import cut_space
+from cvtgs.views import automatic_views
+from scenes import random_scene, same_bits
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return cvtgs.synthetic.scene("courtyard", 6000, sh_degree=1, seed=4)
+
+
+@pytest.fixture(scope="module")
+def source(scene, tmp_path_factory):
+    path = tmp_path_factory.mktemp("blocks") / "in.ply"
+    cvtgs.save(scene, path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("total", "shares", "rooms", "wanted"),
+    [
+        (10, [1.0, 1.0, 2.0], [9, 9, 9], [3, 2, 5]),
+        (3, [0.0, 0.0, 1.0], [5, 5, 5], [1, 1, 1]),
+        (12, [1.0, 1.0, 1.0], [2, 9, 9], [2, 5, 5]),
+        (7, [0.0, 0.0], [0, 7], [0, 7]),
+        (0, [1.0], [0], [0]),
+    ],
+)
+def test_counts_are_shared_out(total, shares, rooms, wanted):
+    assert shared_out(total, shares, rooms=rooms) == wanted
+
+
+def test_shared_counts_always_add_up():
+    g = torch.Generator().manual_seed(0)
+    for _ in range(300):
+        n = int(torch.randint(1, 9, (), generator=g))
+        rooms = (torch.randint(0, 5, (n,), generator=g) ** 4).tolist()
+        shares = torch.exp(5 * torch.randn(n, generator=g, dtype=torch.float64)).tolist()
+        least = sum(min(1, room) for room in rooms)
+        total = int(torch.randint(least, sum(rooms) + 1, (), generator=g))
+        counts = shared_out(total, shares, rooms=rooms)
+        assert sum(counts) == total
+        assert all(min(1, b) <= a <= b for a, b in zip(counts, rooms, strict=True))
+    with pytest.raises(InvalidArgumentError, match="between 1 and 2"):
+        shared_out(3, [1.0], rooms=[2])
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 16])
+def test_blocks_have_equal_measure_whatever_flies_away(count):
+    g = torch.Generator().manual_seed(1)
+    points = torch.randn(4000, 3, generator=g, dtype=torch.float64)
+    points[:5] *= 1e12
+    measure = torch.rand(4000, generator=g, dtype=torch.float64)
+    blocks = cut_space(points, measure, count).blocks_of(points)
+    sums = torch.bincount(blocks, measure, minlength=count)
+    assert len(sums) == count
+    assert float((sums / sums.sum() * count - 1).abs().max()) < 0.05
+
+
+def test_coincident_points_lie_in_one_block():
+    points = torch.zeros(10, 3).double()
+    assert len(set(cut_space(points, torch.ones(10).double(), 4).blocks_of(points).tolist())) == 1
+
+
+@pytest.mark.parametrize(
+    ("blocks", "rho"), [(1, 0.002), (5, 0.002), (2, 0.0501), (5, 0.6), (3, 1.0)]
+)
+def test_the_total_is_exact_and_the_output_is_an_ordinary_scene(source, tmp_path, blocks, rho):
+    report = simplify_file(source, tmp_path / "out.ply", rho, blocks=blocks)
+    small = cvtgs.load(tmp_path / "out.ply")
+    assert len(small) == report.output_count == cvtgs.target_count(6000, rho)
+    assert small.comments == cvtgs.load(source).comments
+    assert not cvtgs.filters.invalid_rows(small)
+    assert [path.name for path in tmp_path.iterdir()] == ["out.ply"]
+
+
+def test_one_block_is_the_scene_in_one_piece(scene, source, tmp_path):
+    simplify_file(source, tmp_path / "out.ply", 0.05, blocks=1)
+    with one_thread():
+        whole = Simplifier(device="cpu").simplify(cvtgs.load(source), 0.05)
+    assert same_bits(cvtgs.load(tmp_path / "out.ply"), whole)
+
+
+def test_who_works_on_what_and_when_does_not_matter(source, tmp_path):
+    def backwards(function, items):
+        results = {item: function(item) for item in reversed(items)}
+        return [results[item] for item in items]
+
+    outputs = [tmp_path / name for name in ("a.ply", "b.ply")]
+    simplify_file(source, outputs[0], 0.05, blocks=4, range_rows=1500)
+    simplify_file(source, outputs[1], 0.05, blocks=4, range_rows=1500, workers=backwards)
+    assert outputs[0].read_bytes() == outputs[1].read_bytes()
+
+
+def test_how_the_file_is_cut_into_ranges_hardly_matters(source, tmp_path):
+    for name, rows in (("a.ply", 1 << 20), ("b.ply", 1777)):
+        simplify_file(source, tmp_path / name, 0.05, blocks=3, range_rows=rows)
+    assert same_bits(cvtgs.load(tmp_path / "a.ply"), cvtgs.load(tmp_path / "b.ply"))
+
+
+def test_seams_cost_little(scene, source, tmp_path):
+    simplify_file(source, tmp_path / "out.ply", 0.1, blocks=4)
+    small = {
+        "one": Simplifier(device="cpu").simplify(scene, 0.1),
+        "four": cvtgs.load(tmp_path / "out.ply"),
+    }
+    cameras = automatic_views(scene, 4, width=96, height=72)
+    scores = cvtgs.evaluate(scene, small, cameras, settings=EvaluationSettings(lpips="off")).scenes
+    assert scores[1].psnr.mean > scores[0].psnr.mean - 0.5  # 150 cells per block: many seams
+
+
+def test_protected_rows_come_first_and_are_the_same_bits(scene, source, tmp_path):
+    box = Box(min=(-0.5, -9, -0.5), max=(0.5, 9, 0.5))
+    kept = scene.select(cvtgs.boxes.inside([box], scene.means))
+    assert 0 < len(kept) < 1000
+    report = simplify_file(
+        source, tmp_path / "out.ply", 0.2, blocks=3, range_rows=2000, boxes=[box]
+    )
+    small = cvtgs.load(tmp_path / "out.ply")
+    assert (len(small), report.kept_count) == (1200, len(kept))
+    first = small.select(torch.arange(len(kept)))
+    assert all(torch.equal(a, kept.tensors()[name]) for name, a in first.tensors().items())
+    everything = Box(min=(-1e30,) * 3, max=(1e30,) * 3)
+    with pytest.raises(InvalidArgumentError, match="must be left"):
+        simplify_file(source, tmp_path / "no.ply", 0.2, blocks=3, boxes=[everything])
+
+
+def test_invalid_rows_and_flyaways_do_not_disturb(tmp_path):
+    scene = random_scene(2000, degree=0)
+    means, logits = scene.means.clone(), scene.logit_opacities.clone()
+    means[7], means[11] = torch.nan, 1e9
+    logits[20] = torch.inf
+    changed = scene.with_tensors({"means": means, "logit_opacities": logits}, {})
+    cvtgs.save(changed, tmp_path / "in.ply")
+    with pytest.warns(UserWarning, match="dropped 1 of 2000"):
+        report = simplify_file(tmp_path / "in.ply", tmp_path / "out.ply", 0.1, blocks=4)
+    assert (report.output_count, report.invalid_count) == (200, 1)
+    assert not cvtgs.filters.invalid_rows(cvtgs.load(tmp_path / "out.ply"))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_fewer_gaussians_than_blocks(source, tmp_path, count):
+    report = simplify_file(source, tmp_path / "out.ply", count=count, blocks=8)
+    assert (report.output_count, len(cvtgs.load(tmp_path / "out.ply"))) == (count, count)
+
+
+def test_blocks_that_keep_nothing_are_not_left_out(tmp_path):
+    """Protected Gaussians take so many of the target that four of six blocks get none."""
+    scene = random_scene(500, degree=0)
+    scene = scene.with_tensors({"logit_opacities": torch.full((500,), 2.0)}, {})
+    cvtgs.save(scene, tmp_path / "in.ply")
+    box = Box(min=(-9.0, -9.0, 0.5), max=(9.0, 9.0, 9.0))
+    kept = int((scene.means[:, 2] >= 0.5).sum())
+    report = simplify_file(
+        tmp_path / "in.ply", tmp_path / "out.ply", count=kept + 2, blocks=6, boxes=[box]
+    )
+    assert (report.kept_count, report.output_count, report.blocks) == (kept, kept + 2, 6)
+    assert report.filtered_count == 0
+    assert report.largest_cell >= (500 - kept) / 2
+    assert report.energy > 0
+
+
+def test_a_filter_that_is_too_strict_gives_way(tmp_path):
+    """Nine tenths of the Gaussians are faint, and more are asked for than are not."""
+    scene = random_scene(600, seed=5)
+    logits = torch.where(torch.arange(600) % 10 == 0, 4.0, -8.0)
+    cvtgs.save(scene.with_tensors({"logit_opacities": logits}, {}), tmp_path / "in.ply")
+    report = simplify_file(tmp_path / "in.ply", tmp_path / "out.ply", 0.9, blocks=3)
+    assert (report.output_count, report.shortfall) == (540, "")
+
+
+def test_files_without_a_valid_row_are_refused(tmp_path):
+    scene = random_scene(20)
+    nothing = scene.with_tensors({"means": torch.full_like(scene.means, torch.nan)}, {})
+    cvtgs.save(nothing, tmp_path / "in.ply")
+    with pytest.raises(InvalidSceneError, match="found no valid Gaussian"):
+        simplify_file(tmp_path / "in.ply", tmp_path / "out.ply", 0.5, blocks=2)
+    assert not (tmp_path / "out.ply").exists()
+
+
+def test_extra_columns_and_other_formats(tmp_path):
+    scene = random_scene(500, degree=0)
+    extra = {"id": torch.arange(500, dtype=torch.int32), "heat": torch.rand(500)}
+    cvtgs.save(scene.with_tensors({}, extra), tmp_path / "in.ply")
+    box = Box(min=(0, 0, 0), max=(1, 1, 1))
+    simplify_file(tmp_path / "in.ply", tmp_path / "out.ply", 0.5, blocks=3, boxes=[box])
+    assert set(cvtgs.load(tmp_path / "out.ply").extras) == {"id", "heat"}
+    with pytest.warns(UserWarning, match="do not hold"):
+        simplify_file(tmp_path / "in.ply", tmp_path / "out.splat", 0.5, blocks=3, boxes=[box])
+    assert len(cvtgs.load(tmp_path / "out.splat")) == 250
+    (tmp_path / "in.splat").write_bytes(b" " * 32)
+    with pytest.raises(FileFormatError):
+        simplify_file(tmp_path / "in.splat", tmp_path / "no.ply", 0.5, blocks=3)
+
+
+def test_presets_that_look_at_images_are_refused(source, tmp_path):
+    for preset in ("high", "max"):
+        simplifier = Simplifier(config=preset, device="cpu")
+        with pytest.raises(ConfigError, match="blocks need a preset that takes no images"):
+            simplify_file(source, tmp_path / "no.ply", 0.1, blocks=2, simplifier=simplifier)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("preset", ["draft", "paper"])
+def test_other_presets(source, tmp_path, preset):
+    simplifier = Simplifier(config=SimplifyConfig.from_preset(preset), device="cpu")
+    simplify_file(source, tmp_path / "out.ply", 0.03, blocks=3, simplifier=simplifier)
+    assert len(cvtgs.load(tmp_path / "out.ply")) == 180
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"), [("4GB", 4 * 10**9), ("2 GiB", 2**31), ("1500mb", 15 * 10**8)]
+)
+def test_amounts_of_memory(text, wanted):
+    assert read_bytes(text) == wanted
+
+
+@pytest.mark.parametrize("text", ["", "4XB", "-1GB", "much", "100MB"])
+def test_bad_amounts_of_memory(text):
+    with pytest.raises(InvalidArgumentError, match="memory must be"):
+        read_bytes(text)
+
+
+def test_free_memory_is_known_where_linux_does_not_tell(monkeypatch):
+    def refuse(*_, **__):
+        raise OSError
+
+    told = memory.available_memory()
+    monkeypatch.setattr(memory.Path, "read_text", refuse)
+    assert memory.available_memory() >= told  # all of it, where nobody says what is free
+    monkeypatch.setattr(memory.os, "sysconf", refuse)
+    assert memory.available_memory() == 1 << 62
+
+
+def test_less_memory_makes_more_blocks(source):
+    rows = open_rows(source)
+    assert block_count(rows, 10**10) == 1
+    assert block_count(rows, 600_100_000) > block_count(rows, 600_500_000) > 1
+
+
+def test_command(source, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("cvtgs.outofcore.memory.BASE_BYTES", 10)
+    monkeypatch.setattr(
+        "cvtgs.outofcore.memory.needed_memory", lambda source, rows: 10 + 1000 * rows
+    )
+    words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.01"]
+    words += ["--report", str(tmp_path / "report.json"), "--overwrite"]
+    assert main([*words, "--memory", "2MB"]) == 0
+    assert "In 7 blocks." in capsys.readouterr().out
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["output_count"], report["blocks"]) == (60, 7)
+    assert main([*words, "--memory", "7MB"]) == 0
+    assert "blocks" not in capsys.readouterr().out
+    monkeypatch.setattr("cvtgs.outofcore.memory.available_memory", lambda: 3_000_000)
+    assert main(words) == 0
+    assert "In 5 blocks." in capsys.readouterr().out
+    assert main([*words, "--memory", "2MB", "--preset", "max"]) == 1
+    assert main([*words, "--memory", "2MB", "--time-budget", "20s"]) == 1

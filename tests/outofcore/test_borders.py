@@ -1,0 +1,286 @@
+"""Borders: what blocks compute together is what one piece computes, wherever space is cut."""
+
+import time
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs import Simplifier, cells, cvt, filters
+from cvtgs.cvt.neighbors import nearest_several
+from cvtgs.evaluate import EvaluationSettings
+from cvtgs.io.ply import open_rows
+from cvtgs.io.tensors import map_tensors
+from cvtgs.mergenet import correct_cells
+from cvtgs.outofcore import simplify_file
+from cvtgs.outofcore.borders import Across, Reach, bounds_of, halo, nearest_anywhere
+from cvtgs.outofcore.job import Job
+from cvtgs.outofcore.merging import read_cells
+from cvtgs.stages import join_scenes
+from cvtgs.stages.merging import shape_cells
+from cvtgs.views import automatic_views
+from scenes import same_bits
+
+COUNT, BLOCKS, TARGET = 4000, 5, 230
+
+
+class StoppedError(Exception):
+    """Ends a run from its listener."""
+
+
+def stop_before_join(event):
+    if event.stage == "join":
+        raise StoppedError
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory):
+    """A job that is done, but for putting its blocks together."""
+    folder = tmp_path_factory.mktemp("borders")
+    scene = cvtgs.synthetic.scene("courtyard", COUNT, sh_degree=1, seed=4)
+    cvtgs.save(scene, folder / "in.ply")
+    with pytest.raises(StoppedError):
+        simplify_file(
+            folder / "in.ply",
+            folder / "out.ply",
+            count=TARGET,
+            blocks=BLOCKS,
+            listener=stop_before_join,
+        )
+    return Job.beside(
+        folder / "out.ply",
+        source=open_rows(folder / "in.ply"),
+        target=TARGET,
+        blocks=BLOCKS,
+        boxes=(),
+        config=Simplifier().config,
+        has_network=True,
+        range_rows=1 << 26,
+    )
+
+
+def of_all(job, path, name):
+    return torch.cat([map_tensors(path(block))[0][name] for block in job.busy()])
+
+
+def scene_of_all(job, path):
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
+    return cvtgs.GaussianScene(**{name: of_all(job, path, name) for name in names})
+
+
+def block_starts(job):
+    _, targets = job.read_survey()
+    return torch.tensor([0, *targets]).cumsum(0)
+
+
+def random_blocks(count, dim, *, seed=0):
+    """Points and sites in slabs along the first axis, and the other slabs as seen by one."""
+    g = torch.Generator().manual_seed(seed)
+    points = torch.rand(900, dim, generator=g)
+    sites = torch.rand(60, dim, generator=g).double()
+    slab = [(values[:, 0] * count).long() for values in (points, sites)]
+    return [(points[slab[0] == k], sites[slab[1] == k]) for k in range(count)]
+
+
+def others_of(blocks, own):
+    return [
+        Across(k, bounds_of(sites), lambda sites=sites: sites)
+        for k, (_, sites) in enumerate(blocks)
+        if k != own
+    ]
+
+
+def test_rows_within_reach_of_a_box_by_hand():
+    points = torch.tensor([[0.0, 0.0], [0.0, 2.0], [5.0, 0.0]])
+    box = torch.tensor([[1.0, -1.0], [2.0, 1.0]])
+    assert Reach.of(points, torch.tensor([1.5, 1.5, 9.5])).rows(box).tolist() == [0, 2]
+    assert Reach.of(points, torch.tensor([1.0, 2.5, 9.0])).rows(box).tolist() == [1]
+    assert len(Reach.of(points, torch.zeros(3)).rows(box)) == 0
+
+
+@pytest.mark.parametrize("count", [1, 2, 7])
+@pytest.mark.parametrize("dim", [3, 6])
+def test_the_nearest_site_is_found_in_any_block(count, dim):
+    blocks = random_blocks(count, dim)
+    sites = torch.cat([sites for _, sites in blocks])
+    owners = torch.cat([torch.full((len(s),), k) for k, (_, s) in enumerate(blocks)])
+    crossed = 0
+    for own, (points, own_sites) in enumerate(blocks):
+        found = nearest_anywhere(
+            points, own_sites, others_of(blocks, own), nearest=cvt.nearest_scipy
+        )
+        distances = torch.cdist(points.double(), sites)
+        wanted = owners[distances.argmin(dim=1)]
+        assert torch.equal(torch.where(found.blocks < 0, own, found.blocks), wanted)
+        torch.testing.assert_close(found.squared, distances.amin(dim=1).square())
+        for k, (_, theirs) in enumerate(blocks):
+            mine = found.blocks == (-1 if k == own else k)
+            gaps = (points[mine].double() - theirs[found.labels[mine]]).square().sum(dim=1)
+            torch.testing.assert_close(gaps, found.squared[mine])
+        crossed += int((found.blocks >= 0).sum())
+    assert (crossed > 0) == (count > 1)
+
+
+def test_equally_near_sites_stay_in_the_own_block():
+    others = [Across(3, torch.tensor([[2.0], [2.0]]), lambda: torch.tensor([[2.0]]))]
+    found = nearest_anywhere(
+        torch.tensor([[1.0]]), torch.zeros(1, 1).double(), others, nearest=cvt.nearest_scipy
+    )
+    assert found.blocks.tolist() == [-1]
+
+
+@pytest.mark.parametrize("backend", ["scipy", "torch"])
+def test_several_nearest(backend):
+    g = torch.Generator().manual_seed(1)
+    points, sites = torch.rand(50, 3, generator=g), torch.rand(20, 3, generator=g)
+    rows, distances = nearest_several(points, sites, 4, backend=backend)
+    wanted = torch.cdist(points.double(), sites.double()).sort(dim=1)
+    assert torch.equal(rows, wanted.indices[:, :4])
+    torch.testing.assert_close(distances, wanted.values[:, :4])
+    assert nearest_several(points, sites, 99, backend=backend)[0].shape == (50, 20)
+
+
+def test_coincident_sites_are_not_compared_all_with_all():
+    """Without care that is quadratic: six times as long as sites that lie apart take."""
+    apart = torch.rand(30_000, 3, generator=torch.Generator().manual_seed(0)).double()
+    seconds = []
+    for sites in (apart, torch.zeros_like(apart)):
+        start = time.process_time()
+        _, distances = nearest_several(sites, sites, 9, backend="scipy")
+        seconds.append(time.process_time() - start)
+    assert float(distances.amax()) < 1e-6
+    assert seconds[1] < 2 * seconds[0] + 0.1
+
+
+@pytest.mark.parametrize("count", [2, 7, 30])  # of 30 blocks many have fewer cells than neighbours
+def test_a_halo_holds_all_that_may_be_a_neighbour(count):
+    blocks = [(None, sites) for _, sites in random_blocks(count, 3, seed=2) if len(sites)]
+    starts = torch.tensor([0, *[len(sites) for _, sites in blocks]]).cumsum(0)
+    centers = torch.cat([sites for _, sites in blocks])
+    wanted = cvt.nearest_neighbors(centers, 8, backend="scipy")
+    for own, (_, sites) in enumerate(blocks):
+        found = halo(sites, others_of(blocks, own), count=8, backend="scipy")
+        held = set((starts[found[:, 0]] + found[:, 1]).tolist())
+        held |= set(range(int(starts[own]), int(starts[own + 1])))
+        assert set(wanted[starts[own] : starts[own + 1]].flatten().tolist()) <= held
+
+
+def test_sites_move_as_in_one_piece(job):
+    points = of_all(job, job.sample_path, "points")
+    weights = of_all(job, job.sample_path, "weights")
+    sites = of_all(job, lambda block: job.sites_path(0, block), "sites")
+    moves = len(list(job.path("").glob("sites_*_00000"))) - 1
+    assert moves == job.config.cvt.iterations
+    whole = cvt.lloyd(
+        points, weights, sites, nearest=cvt.nearest_scipy, iterations=moves, tolerance=0.0
+    )
+    moved = of_all(job, lambda block: job.sites_path(moves, block), "sites")
+    torch.testing.assert_close(moved, whole.sites)
+
+
+def test_gaussians_go_to_cells_of_other_blocks(job):
+    labels = [map_tensors(job.labels_path(block))[0] for block in job.busy()]
+    left = sum(int((one["labels"] < 0).sum()) for one in labels)
+    assert left == sum(int(one["sent"].sum()) for one in labels) > COUNT // 50
+    survey, _ = job.read_survey()
+    sizes = of_all(job, job.merged_path, "sizes")
+    assert (len(sizes), int(sizes.amin())) == (TARGET, 1)
+    members = sum(int(read_cells(job, block).partition.counts.sum()) for block in job.busy())
+    rows = sum(job.rows_path(block, 0).stat().st_size for block in job.busy())
+    assert rows % members == 0  # every Gaussian is in one cell
+    assert members <= survey.rows
+
+
+def test_cells_have_the_neighbours_of_one_piece(job):
+    merged = scene_of_all(job, job.merged_path)
+    wanted = cvt.nearest_neighbors(merged.means, 8, backend="scipy")
+    starts, crossed = block_starts(job), 0
+    for block in job.busy():
+        own, _ = map_tensors(job.wide_path(block))
+        strangers = own["strangers"]
+        numbers = torch.cat(
+            [
+                torch.arange(len(own["means"])) + starts[block],
+                starts[strangers[:, 0]] + strangers[:, 1],
+            ]
+        )
+        found = numbers[own["neighbors"]]
+        assert torch.equal(found, wanted[starts[block] : starts[block + 1]])
+        crossed += int((own["neighbors"] >= len(own["means"])).any(dim=1).sum())
+    assert crossed > TARGET // 5
+
+
+def test_axes_and_width_are_those_of_one_piece(job):
+    merged, wide = scene_of_all(job, job.merged_path), scene_of_all(job, job.wide_path)
+    sizes = of_all(job, job.merged_path, "sizes")
+    partition = cells.Partition.from_labels(
+        torch.repeat_interleave(torch.arange(TARGET), sizes), TARGET
+    )
+    neighbors = cvt.nearest_neighbors(merged.means, 8, backend="scipy")
+    wanted = shape_cells(merged, partition, neighbors, job.config.merge)
+    assert bool((wide.log_scales != merged.log_scales).any())
+    assert same_bits(wide, wanted)
+
+
+def test_the_network_corrects_as_in_one_piece(job):
+    members = [read_cells(job, block) for block in job.busy()]
+    scene, light = members[0].scene, torch.cat([one.light for one in members])
+    for one in members[1:]:
+        scene = join_scenes(scene, one.scene)
+    counts = torch.cat([one.partition.counts for one in members])
+    firsts = torch.tensor([0, *[len(one.scene) for one in members]]).cumsum(0)
+    pairs = list(zip(members, firsts[:-1], strict=True))
+    order = torch.cat([one.partition.order + first for one, first in pairs])
+    partition = cells.Partition(
+        order=order, offsets=torch.nn.functional.pad(counts.cumsum(0), (1, 0))
+    )
+    lone = [map_tensors(job.merged_path(block))[0]["lone"] for block in job.busy()]
+    lone = torch.cat(
+        [
+            torch.where(rows < 0, -1, rows + first)
+            for rows, (_, first) in zip(lone, pairs, strict=True)
+        ]
+    )
+    shown = partition.narrowed(lone)
+    assert int((lone >= 0).sum()) > 0
+    wide = scene_of_all(job, job.wide_path)
+    neighbors = cvt.nearest_neighbors(wide.means, 8, backend="scipy")
+    wanted = filters.standardized(
+        correct_cells(job.network.net, scene, wide, shown, neighbors=neighbors, light=light)
+    )
+    small = [cvtgs.load(job.small_path(block)) for block in job.busy()]
+    assert bool((wide.means != wanted.means).any())
+    for name, values in wanted.tensors().items():
+        found = torch.cat([one.tensors()[name] for one in small])
+        torch.testing.assert_close(found, values, rtol=1e-4, atol=1e-5)
+
+
+def test_seams_cost_less_than_a_tenth_of_a_decibel(tmp_path):
+    """Means over counts: one of them alone moves by more than a seam may cost."""
+    scene = cvtgs.synthetic.scene("object", 20_000, sh_degree=0, seed=3)
+    source, counts = tmp_path / "in.ply", (960, 980, 1000, 1020, 1040)
+    cvtgs.save(scene, source)
+    small = {}
+    for blocks in (1, 8):
+        for count in counts:
+            output = tmp_path / f"{blocks}_{count}.ply"
+            simplify_file(source, output, count=count, blocks=blocks)
+            small[output.stem] = cvtgs.load(output)
+    cameras = automatic_views(scene, 6, width=120, height=90)
+    settings = EvaluationSettings(lpips="off")
+    found = cvtgs.evaluate(scene, small, cameras, settings=settings).scenes
+    psnr = [one.psnr.mean for one in found]
+    whole, cut = sum(psnr[:5]) / 5, sum(psnr[5:]) / 5
+    assert cut > whole - 0.1
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_all_that_is_kept_stays_as_it_is_in_any_number_of_blocks(tmp_path, degree):
+    scene = cvtgs.synthetic.scene("room", 600, sh_degree=degree, seed=1)
+    cvtgs.save(scene, tmp_path / "in.ply")
+    simplify_file(tmp_path / "in.ply", tmp_path / "out.ply", 1.0, blocks=4)
+    small = cvtgs.load(tmp_path / "out.ply")
+    first, second = (
+        torch.cat([s.means, s.log_scales, s.sh.flatten(1)], dim=1) for s in (scene, small)
+    )
+    assert set(map(tuple, first.tolist())) == set(map(tuple, second.tolist()))

@@ -1,0 +1,121 @@
+"""A run that is killed goes on where it was, or starts over; nothing is left behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+import cvtgs
+from cvtgs.outofcore import simplify_file
+
+CODE = """
+import sys
+from cvtgs.outofcore import simplify_file
+simplify_file(sys.argv[1], sys.argv[2], 0.05, blocks=8)
+"""
+
+
+@pytest.fixture
+def source(tmp_path):
+    path = tmp_path / "in.ply"
+    cvtgs.save(cvtgs.synthetic.scene("object", 20_000, sh_degree=1, seed=4), path)
+    return path
+
+
+def start(source, output):
+    return subprocess.Popen([sys.executable, "-c", CODE, str(source), str(output)])
+
+
+def kill_when(process, found):
+    """Kill a process as soon as something is found; False if it ended before."""
+    while process.poll() is None:
+        if found():
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            return True
+        time.sleep(0.002)
+    return False
+
+
+@pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
+def test_a_killed_run_goes_on_with_the_blocks_that_are_missing(source, tmp_path):
+    output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
+    whole = tmp_path / "whole.ply"
+    simplify_file(source, whole, 0.05, blocks=8)
+    assert kill_when(start(source, output), lambda: len(list(folder.glob("small_*.ply"))) >= 2)
+    assert not output.exists()
+    done = {path.name: path.stat().st_mtime_ns for path in folder.glob("small_*.ply")}
+    seen = {}
+
+    def note(event):
+        seen.update({path.name: path.stat().st_mtime_ns for path in folder.glob("small_*.ply")})
+
+    report = simplify_file(source, output, 0.05, blocks=8, listener=note)
+    assert report.resumed_blocks == len(done) >= 2
+    assert done.items() <= seen.items()  # the same files, not made again
+    assert output.read_bytes() == whole.read_bytes()
+    assert not folder.exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
+@pytest.mark.parametrize("step", ["sums_02", "labels", "merged", "wide"])
+def test_a_run_killed_while_blocks_work_together_goes_on(source, tmp_path, step):
+    output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
+    whole = tmp_path / "whole.ply"
+    simplify_file(source, whole, 0.05, blocks=8)
+    assert kill_when(start(source, output), lambda: len(list(folder.glob(f"{step}_*"))) >= 3)
+    assert not output.exists()
+    names = ("sample", "sites", "sums", "labels", "merged", "wide")
+    files = [path for name in names for path in folder.glob(f"{name}_*")]
+    done = {path: path.stat().st_mtime_ns for path in files}
+    seen = {}
+
+    def note(event):
+        if event.stage == "blocks":
+            seen.update({path: path.stat().st_mtime_ns for path in done})
+
+    simplify_file(source, output, 0.05, blocks=8, listener=note)
+    assert seen == done  # the same files, not made again
+    assert output.read_bytes() == whole.read_bytes()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
+def test_a_run_killed_before_all_blocks_were_cut_starts_over(source, tmp_path):
+    output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
+    killed = kill_when(start(source, output), folder.exists)
+    assert killed
+    assert not (folder / "manifest.json").exists()
+    report = simplify_file(source, output, 0.05, blocks=8)
+    assert report.resumed_blocks == 0
+    assert len(cvtgs.load(output)) == 1000
+    assert not folder.exists()
+
+
+class StoppedError(Exception):
+    """Ends a run from its listener."""
+
+
+def stop_in_blocks(event):
+    if event.stage == "blocks" and event.done == 3:
+        raise StoppedError
+
+
+@pytest.mark.parametrize("change", ["rho", "blocks", "file", "config", "manifest"])
+def test_blocks_of_another_job_are_not_used(source, tmp_path, change):
+    output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
+    with pytest.raises(StoppedError):
+        simplify_file(source, output, 0.05, blocks=8, listener=stop_in_blocks)
+    assert len(list(folder.glob("small_*.ply"))) == 3
+    simplifier = cvtgs.Simplifier(config="draft" if change == "config" else None, device="cpu")
+    if change == "file":
+        os.utime(source, ns=(0, 0))
+    if change == "manifest":
+        (folder / "manifest.json").write_text("[]")
+    rho, blocks = (0.04 if change == "rho" else 0.05), (7 if change == "blocks" else 8)
+    report = simplify_file(source, output, rho, blocks=blocks, simplifier=simplifier)
+    assert report.resumed_blocks == 0
+    assert len(cvtgs.load(output)) == cvtgs.target_count(20_000, rho)
+    assert not folder.exists()

@@ -1,0 +1,291 @@
+"""Parts of a tradeoff: the front, processes, tables, and files, on made-up results."""
+
+import csv
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs.errors import ConfigError, InvalidArgumentError, RunError
+from cvtgs.evaluate import Evaluation, EvaluationSettings, SceneScores, Score, compare
+from cvtgs.report import SimplifyReport, StageCost
+from cvtgs.tradeoff import Failure, Measured, Tradeoff, TradeoffResult, on_front, write_tradeoff
+from cvtgs.tradeoff.chart import ticks, tradeoff_chart
+from cvtgs.tradeoff.measure import with_fronts
+from cvtgs.tradeoff.processes import run_process
+from cvtgs.tradeoff.runs import WARNING, _pass_on, tasks_of
+from cvtgs.tradeoff.summary import foreword
+from cvtgs.tradeoff.table import cells, heading, how_measured
+from cvtgs.views import automatic_views
+
+
+def result(preset: str, seconds: float, psnr: float, rho: float = 0.1, **more) -> TradeoffResult:
+    stages = tuple(
+        StageCost(stage=name, seconds=part, cpu_seconds=part, peak_memory_bytes=2**28)
+        for name, part in {"check": 0.25, **more.pop("stages", {})}.items()
+    )
+    return TradeoffResult(
+        name=f"{preset} {rho:g}",
+        preset=preset,
+        rho=rho,
+        count=50,
+        bytes=4200,
+        seconds=seconds,
+        peak_memory_bytes=300_000_000,
+        psnr=psnr,
+        ssim=psnr / 100,
+        report=SimplifyReport(
+            input_count=500,
+            output_count=50,
+            target_count=50,
+            rho=rho,
+            stages=stages,
+            config=cvtgs.SimplifyConfig(),
+        ),
+        **more,
+    )
+
+
+def scores(name: str) -> SceneScores:
+    one = Score.of([30.0])
+    return SceneScores(name=name, count=50, psnr=one, ssim=one)
+
+
+def tradeoff(*results: TradeoffResult, failures: tuple[Failure, ...] = ()) -> Tradeoff:
+    return Tradeoff(
+        source="a<b>.ply",
+        source_count=500,
+        source_bytes=42_000,
+        start_seconds=1.0,
+        machine="abacus",
+        evaluation=Evaluation(
+            reference="a<b>.ply",
+            reference_count=500,
+            views=("view 1",),
+            width=64,
+            height=48,
+            backend="torch",
+            lpips_note="not asked for",
+            scenes=tuple(scores(one.name) for one in results),
+        ),
+        results=tuple(with_fronts(results)),
+        failures=failures,
+    )
+
+
+MADE = (
+    result("draft", 2.0, 20.0, stages={"merge": 0.5}),
+    result("fast", 3.0, 19.0, stages={"merge": 0.5}),
+    result("high", 9.0, 25.0, stages={"visibility": 5.0, "merge": 0.5}),
+    result("draft", 1.9, 15.0, 0.01),
+)
+
+
+def test_the_front_by_hand():
+    assert on_front([1, 2, 3, 3], [5, 4, 6, 7]) == (True, False, False, True)
+    assert on_front([1, 1], [2, 2]) == (True, True)
+    assert on_front([1, 2], [float("nan"), 1.0]) == (False, True)
+    assert on_front([], []) == ()
+
+
+def test_fronts_are_found_ratio_by_ratio():
+    assert [one.fronts for one in with_fronts(MADE)] == [
+        ("psnr", "ssim"),
+        (),
+        ("psnr", "ssim"),
+        ("psnr", "ssim"),
+    ]
+
+
+def test_less_lpips_is_better():
+    both = [result("a", 1.0, 20.0, lpips=0.3), result("b", 2.0, 20.0, lpips=0.1)]
+    assert [one.fronts for one in with_fronts(both)] == [("psnr", "ssim", "lpips"), ("lpips",)]
+
+
+def test_stages_of_different_runs_come_in_one_order():
+    made = tradeoff(*MADE)
+    assert made.stages == ("check", "visibility", "merge")
+    assert made.rest_seconds(made.results[0]) == pytest.approx(2.0 - 1.0 - 0.25 - 0.5)
+    assert made.rest_seconds(result("slow start", 0.5, 20.0)) == 0.0
+
+
+def test_csv_has_a_line_per_run_and_seconds_per_stage():
+    rows = list(csv.DictReader(io.StringIO(tradeoff(*MADE).to_csv())))
+    assert [row["preset"] for row in rows] == ["draft", "fast", "high", "draft"]
+    assert rows[2]["visibility_seconds"] == "5.0"
+    assert rows[0]["visibility_seconds"] == ""
+    assert rows[0]["fronts"] == "psnr ssim"
+    assert float(rows[3]["rho"]) == 0.01
+
+
+def test_json_comes_back():
+    made = tradeoff(*MADE, result("same", 3.0, float("inf"), 1.0))
+    assert Tradeoff.model_validate_json(made.to_json()) == made
+    stages = json.loads(made.to_json())["results"][0]["report"]["stages"]
+    assert all(stage["peak_memory_bytes"] > 0 for stage in stages)
+
+
+def test_words_of_the_table():
+    made = tradeoff(*MADE)
+    assert cells(made, made.results[0]) == {
+        "preset": "draft",
+        "start, s": "1.00",
+        "check, s": "0.25",
+        "visibility, s": "",
+        "merge, s": "0.50",
+        "read, write, s": "0.25",
+        "all, s": "2.00",
+        "PSNR, dB": "20.00*",
+        "SSIM": "0.2000*",
+        "file": "4.2 kB",
+        "memory": "300 MB",
+    }
+    assert heading(made, 0.01) == "rho 0.01: 50 of 500 Gaussians"
+    assert "1 views of 64 x 48 pixels" in how_measured(made)
+    assert how_measured(made).endswith(" on abacus.")
+    network = made.evaluation.model_copy(update={"lpips_network": "vgg", "lpips_note": ""})
+    named = made.model_copy(update={"evaluation": network})
+    assert how_measured(named).endswith(" on abacus. LPIPS with the network vgg.")
+
+
+def test_warnings_of_processes_are_passed_on_once():
+    errors = f"{WARNING}dropped 3 rows.\nsome noise\n{WARNING}dropped 3 rows.\n"
+    with pytest.warns(UserWarning, match=r"^dropped 3 rows\.$") as caught:
+        _pass_on(errors, set())
+    assert len(caught) == 1
+
+
+def test_the_page_part_is_escaped_and_names_failures():
+    made = tradeoff(*MADE, failures=(Failure(name="max 0.1", reason="a < b."),))
+    html = foreword(made, None)
+    assert "<img" not in html
+    assert "max 0.1 failed: a &lt; b." in html
+    assert html.count('class="best"') == 6
+    assert 'src="data:image/png;base64,' in foreword(made, b"png")
+
+
+def test_round_numbers_on_the_axis():
+    assert ticks(0.9, 1.1) == [0.7, 1.0, 2.0]
+    assert ticks(2.0, 20.0) == [2.0, 3.0, 5.0, 7.0, 10.0, 20.0]
+    assert ticks(0.06, 150.0)[:5] == [0.05, 0.1, 0.2, 0.5, 1.0]
+    assert ticks(0.06, 900.0) == [0.01, 0.1, 1.0, 10.0, 100.0, 1000.0]
+
+
+def test_the_chart_is_a_png():
+    pytest.importorskip("matplotlib")
+    assert tradeoff_chart(tradeoff(*MADE))[1:4] == b"PNG"
+
+
+@pytest.fixture
+def measured() -> Measured:
+    scene = cvtgs.synthetic.scene("object", 500, sh_degree=0, seed=0)
+    small = {one.name: scene.select(torch.arange(50)) for one in MADE}
+    comparison = compare(
+        scene,
+        small,
+        automatic_views(scene, 2, width=32, height=24),
+        settings=EvaluationSettings(lpips="off"),
+    )
+    return Measured(tradeoff(*MADE), comparison)
+
+
+def test_files_are_written_completely_and_replaced_only_when_asked(measured, tmp_path):
+    pytest.importorskip("matplotlib")
+    paths, note = write_tradeoff(measured, tmp_path / "new")
+    names = ["tradeoff.csv", "tradeoff.json", "tradeoff.png", "index.html"]
+    assert [path.name for path in paths] == names
+    assert note == ""
+    page = paths[-1].read_text(encoding="utf-8")
+    assert 'id="tradeoff"' in page
+    assert "sheet.png" not in page
+    with pytest.raises(cvtgs.errors.OutputExistsError):
+        write_tradeoff(measured, tmp_path / "new")
+    write_tradeoff(measured, tmp_path / "new", overwrite=True)
+
+
+def test_without_matplotlib_the_rest_is_written(measured, tmp_path, monkeypatch):
+    for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
+        monkeypatch.setitem(sys.modules, name, None)
+    paths, note = write_tradeoff(measured, tmp_path)
+    assert [path.name for path in paths] == ["tradeoff.csv", "tradeoff.json", "index.html"]
+    assert "pip install 'cvtgs[plots]'" in note
+
+
+def test_a_process_is_measured():
+    cost = run_process([sys.executable, "-c", "print('done'); x = bytearray(80_000_000)"])
+    assert cost.output == "done\n"
+    assert cost.wall_seconds > 0
+    if cost.peak_memory_bytes:
+        assert 80_000_000 < cost.peak_memory_bytes < 200_000_000
+
+
+@pytest.mark.parametrize(
+    ("code", "text"),
+    [
+        ("import sys; sys.exit('cvtgs: error: no such scene.')", "no such scene."),
+        ("import sys; sys.exit(3)", "it ended with exit code 3."),
+        ("import os; os.kill(os.getpid(), 9)", "it was ended by signal 9; 9 often means that"),
+    ],
+)
+def test_why_a_process_failed_is_one_sentence(code, text):
+    with pytest.raises(RunError) as caught:
+        run_process([sys.executable, "-c", code])
+    assert str(caught.value).startswith(text)
+
+
+def test_a_program_that_is_not_there():
+    with pytest.raises(RunError, match="no-such-program could not be started"):
+        run_process(["no-such-program"])
+
+
+def test_tasks_are_checked():
+    names = [task.name for task in tasks_of(None, [0.1])]
+    assert names == [f"{preset} 0.1" for preset in cvtgs.PRESETS]
+    with pytest.raises(ConfigError, match="found 'best'"):
+        tasks_of(["best"], [0.1])
+    with pytest.raises(InvalidArgumentError, match=r"rho must be above 0 and at most 1; found 2\."):
+        tasks_of(None, [2.0])
+    with pytest.raises(InvalidArgumentError, match=r"given once, found standard 0\.1 twice"):
+        tasks_of(["standard"], [0.1, 0.10])
+    with pytest.raises(InvalidArgumentError, match="at least one preset and one ratio"):
+        tasks_of([], [0.1])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are those of POSIX")
+def test_an_interrupt_ends_the_process_too(tmp_path):
+    note = tmp_path / "pid"
+    inner = f"import os, pathlib, time; pathlib.Path({str(note)!r}).write_text(str(os.getpid()))"
+    outer = "import signal, sys; from cvtgs.tradeoff.processes import run_process;"
+    outer += "signal.signal(signal.SIGINT, signal.default_int_handler);"  # ignored in background
+    outer += "run_process("
+    outer += f"[sys.executable, '-c', {inner + '; time.sleep(120)'!r}])"
+    with subprocess.Popen([sys.executable, "-c", outer], stderr=subprocess.PIPE) as process:
+        pid = wait_for(lambda: note.exists() and note.read_text())
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
+    assert process.returncode != 0
+    assert wait_for(lambda: not is_alive(int(pid)))
+
+
+def wait_for(found):
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        if value := found():
+            return value
+        time.sleep(0.05)
+    raise TimeoutError
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True

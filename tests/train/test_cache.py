@@ -1,0 +1,181 @@
+"""The cache: everything is made once, and is the same as if it were made anew."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from cvtgs import GaussianScene
+from cvtgs.config import SimplifyConfig
+from cvtgs.errors import OutputError
+from cvtgs.scene import ANTIALIASED_TAG
+from cvtgs.train import Source, TrainConfig, ViewsConfig
+from cvtgs.train.cache import prepare
+from cvtgs.train.cases import refer_case
+from cvtgs.train.views import look_at_scene
+from train_cases import (
+    bits_of_case,
+    bits_of_views,
+    small_scene,
+    source_of,
+    tiny_config,
+    tiny_data,
+)
+
+RATIOS = (0.2, 0.05)
+
+
+def config_of(**changes) -> TrainConfig:
+    data = tiny_data(Path(), ratios=RATIOS, validation_ratios=(0.3,))
+    return tiny_config(changes.pop("data", data), **changes)
+
+
+class Counting:
+    """Makes a scene, and counts how often."""
+
+    def __init__(self, scene: GaussianScene) -> None:
+        self.scene, self.count = scene, 0
+
+    def __call__(self) -> GaussianScene:
+        self.count += 1
+        return self.scene
+
+
+@pytest.fixture
+def made() -> Counting:
+    return Counting(small_scene(300))
+
+
+@pytest.fixture
+def source(made) -> Source:
+    return replace(source_of(made.scene), make=made)
+
+
+def files_in(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+
+
+def test_a_scene_is_made_once(source, made, tmp_path):
+    first = prepare(source, config_of(), tmp_path)
+    assert made.count == 1
+    files = files_in(tmp_path)
+    again = prepare(source, config_of(), tmp_path)
+    assert made.count == 1
+    assert files_in(tmp_path) == files
+    assert [bits_of_case(case) for case in again.cases] == [bits_of_case(c) for c in first.cases]
+    assert [bits_of_views(v) for v in again.views] == [bits_of_views(v) for v in first.views]
+
+
+def test_what_is_cached_equals_what_is_fresh(source, made, tmp_path):
+    config = config_of()
+    for prepared in (prepare(source, config, tmp_path), prepare(source, config, tmp_path)):
+        assert prepared.name == "made"
+        for ratio, case in zip(RATIOS, prepared.cases, strict=True):
+            fresh = refer_case("made", made.scene, ratio, SimplifyConfig())
+            assert bits_of_case(case) == bits_of_case(fresh)
+        for place, (size, views) in enumerate(zip((32, 40), prepared.views, strict=True)):
+            fresh = look_at_scene(made.scene, 4, size=size, seed=place)
+            assert bits_of_views(views) == bits_of_views(fresh)
+
+
+def test_scenes_for_validation_have_their_own_ratios_and_views(made, tmp_path):
+    source = replace(source_of(made.scene, validates=True), make=made)
+    prepared = prepare(source, config_of(), tmp_path)
+    assert [case.ratio for case in prepared.cases] == [0.3]
+    assert [tuple(views.rgb.shape) for views in prepared.views] == [(2, 36, 36, 3)]
+
+
+def test_learning_from_a_scene_that_validated_makes_new_images(source, made, tmp_path):
+    """Also where both have the same ratios."""
+    config = tiny_config(tiny_data(Path(), ratios=(0.2,), validation_ratios=(0.2,)))
+    prepare(replace(source, validates=True), config, tmp_path)
+    prepared = prepare(source, config, tmp_path)
+    assert made.count == 2
+    assert [len(views.cameras) for views in prepared.views] == [4, 4]
+
+
+def test_what_cannot_be_simplified_has_no_cases(tmp_path):
+    few = small_scene(300).select(torch.arange(3))
+    scene = few.with_tensors({"log_scales": few.log_scales + 3}, {})  # they overlap: none is lone
+    for _ in range(2):
+        prepared = prepare(source_of(scene), config_of(), tmp_path)
+        assert [case.ratio for case in prepared.cases] == [0.2, 0.05]
+    config = tiny_config(tiny_data(Path(), ratios=(0.9,)))
+    for _ in range(2):
+        prepared = prepare(source_of(scene), config, tmp_path)
+        assert prepared.cases == ()
+        assert len(prepared.views) == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "images", "cases"),
+    [
+        ({"seed": 1}, 1, 0),
+        ({"preset": "paper"}, 0, 1),
+        ({"data": tiny_data(Path(), ratios=(0.2, 0.06))}, 0, 1),
+        ({"views": ViewsConfig(count=3, sizes=(32,))}, 1, 0),
+        ({"views": ViewsConfig(count=4, sizes=(32,))}, 1, 0),
+        ({"steps": 1000, "learning_rate": 0.1, "kind": "local", "width": 9}, 0, 0),
+    ],
+    ids=["seed", "preset", "ratios", "count", "sizes", "nothing that matters"],
+)
+def test_only_what_has_changed_is_made_anew(source, made, tmp_path, changes, images, cases):
+    prepare(source, config_of(), tmp_path)
+    before = files_in(tmp_path)
+    assert len(before) == 2
+    prepare(source, config_of(**changes), tmp_path)
+    after = files_in(tmp_path)
+    new = sorted(after.keys() - before.keys())
+    assert sum("-views-" in name for name in new) == images
+    assert sum("-cases-" in name for name in new) == cases
+    assert {name: after[name] for name in before} == before
+    assert made.count == 1 + (images + cases > 0)
+
+
+def test_another_identity_is_another_scene(source, made, tmp_path):
+    prepare(source, config_of(), tmp_path)
+    prepare(replace(source, identity="another"), config_of(), tmp_path)
+    assert made.count == 2
+    assert len(files_in(tmp_path)) == 4
+
+
+DAMAGE = {
+    "empty": lambda content: b"",
+    "cut short": lambda content: content[:-100],
+    "garbage": lambda content: b"?" * 1000,
+    "without a tensor": lambda content: content.replace(b"0/order", b"0/odder", 1).replace(
+        b"0/alpha", b"0/alphb", 1
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
+def test_a_damaged_file_is_made_anew(source, made, tmp_path, damage):
+    first = prepare(source, config_of(), tmp_path)
+    wanted = [bits_of_case(case) for case in first.cases], [bits_of_views(v) for v in first.views]
+    for path in tmp_path.iterdir():
+        content = path.read_bytes()
+        path.unlink()
+        path.write_bytes(damage(content))
+        again = prepare(source, config_of(), tmp_path)
+        assert path.read_bytes() == content
+        found = [bits_of_case(case) for case in again.cases]
+        assert (found, [bits_of_views(views) for views in again.views]) == wanted
+    assert made.count == 3
+
+
+def test_an_antialiased_scene_stays_one(tmp_path):
+    """Its merged Gaussians are rendered as it was."""
+    scene = replace(small_scene(300), comments=(ANTIALIASED_TAG,))
+    for _ in range(2):
+        case = prepare(source_of(scene), config_of(), tmp_path).cases[1]
+        assert case.reference.merged.antialiased
+        assert bits_of_case(case) == bits_of_case(
+            refer_case("made", scene, RATIOS[1], SimplifyConfig())
+        )
+
+
+def test_a_folder_that_is_not_there_is_an_error(source, tmp_path):
+    with pytest.raises(OutputError):
+        prepare(source, config_of(), tmp_path / "nowhere")

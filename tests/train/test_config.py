@@ -1,0 +1,125 @@
+"""TrainConfig: what a TOML file may say."""
+
+from pathlib import Path
+
+import pydantic
+import pytest
+
+from cvtgs.errors import ConfigError
+from cvtgs.train import DataConfig, TrainConfig
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+
+
+def from_text(folder: Path, text: str) -> TrainConfig:
+    path = folder / "training.toml"
+    path.write_text(text, encoding="utf-8")
+    return TrainConfig.from_toml(path)
+
+
+def test_values_of_every_section(tmp_path):
+    config = from_text(
+        tmp_path,
+        """
+        kind = "local"
+        preset = "paper"
+        steps = 12
+        learning_rate = 0.25
+        note = "two scenes"
+        [data]
+        generated = 7
+        ratios = [0.5, 0.25]
+        validation = ["a", "b"]
+        [views]
+        sizes = [33]
+        [loss]
+        residual = 0.125
+        """,
+    )
+    assert (config.kind, config.preset, config.steps) == ("local", "paper", 12)
+    assert (config.learning_rate, config.note) == (0.25, "two scenes")
+    assert (config.data.generated, config.data.ratios) == (7, (0.5, 0.25))
+    assert config.data.validation == ("a", "b")
+    assert config.views.sizes == (33,)
+    assert config.loss.residual == 0.125
+
+
+def test_an_empty_file_is_the_default(tmp_path):
+    assert from_text(tmp_path, "") == TrainConfig()
+
+
+def test_relative_paths_start_at_the_file(tmp_path):
+    text = 'start = "first.safetensors"\n[data]\nfolders = ["scenes", "../more", "/far/away"]'
+    config = from_text(tmp_path, text)
+    assert config.start == tmp_path / "first.safetensors"
+    assert config.data.folders == (tmp_path / "scenes", tmp_path / "../more", Path("/far/away"))
+
+
+def test_paths_may_be_texts_and_the_path_of_the_file_too(tmp_path):
+    (tmp_path / "training.toml").write_text("steps = 3")
+    assert TrainConfig.from_toml(str(tmp_path / "training.toml")).steps == 3
+
+
+@pytest.mark.parametrize("recipe", sorted(RECIPES.glob("*.toml")), ids=lambda path: path.stem)
+def test_the_recipes_are_of_the_preset_that_they_are_called(recipe):
+    assert TrainConfig.from_toml(recipe).preset == recipe.stem.partition("-")[0]
+
+
+def test_there_are_recipes():
+    assert {path.stem for path in RECIPES.glob("*.toml")} == {
+        "standard",
+        "standard-low",
+        "paper",
+        "paper-local",
+    }
+
+
+def test_a_configuration_is_frozen():
+    with pytest.raises(pydantic.ValidationError, match="frozen"):
+        TrainConfig().steps = 3
+    with pytest.raises(pydantic.ValidationError, match="frozen"):
+        DataConfig().generated = 3
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("epochs = 3", "epochs: is not a known setting."),
+        ("[data]\nfolder = 'x'", "data.folder: is not a known setting."),
+        ("[view]\ncount = 3", "view: is not a known setting."),
+        ("steps = 0", "steps: input should be greater than or equal to 1, found 0."),
+        ("kind = 'both'", "kind: input should be 'scene' or 'local', found 'both'."),
+        ("preset = 'best'", "preset: input should be 'standard' or 'paper', found 'best'."),
+        ("learning_rate = 0", "learning_rate: input should be greater than 0, found 0."),
+        ("learning_rate = nan", "learning_rate: input should be a finite number, found nan."),
+        ("[data]\nratios = [0.1, 1.0]", "data.ratios.1: input should be less than 1, found 1.0."),
+        ("[views]\nsizes = [0]", "views.sizes.0: input should be greater than or equal to 1"),
+        ("[loss]\nimage = -1", "loss.image: input should be greater than or equal to 0, found -1."),
+    ],
+)
+def test_a_bad_setting_is_named_with_its_file(tmp_path, text, problem):
+    with pytest.raises(ConfigError) as caught:
+        from_text(tmp_path, text)
+    assert str(caught.value).startswith(f"{tmp_path / 'training.toml'}: {problem}")
+
+
+def test_every_problem_is_named(tmp_path):
+    with pytest.raises(ConfigError) as caught:
+        from_text(tmp_path, "steps = 0\nepochs = 3")
+    assert "steps: " in str(caught.value)
+    assert "epochs: " in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"steps: 3", b"\xff\xfe"])
+def test_what_is_no_toml_is_an_error(tmp_path, content):
+    path = tmp_path / "training.toml"
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match="is not a TOML file") as caught:
+        TrainConfig.from_toml(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_a_missing_file_is_an_error(tmp_path):
+    with pytest.raises(ConfigError, match=r"cannot be read: No such file or directory\.") as caught:
+        TrainConfig.from_toml(tmp_path / "none.toml")
+    assert str(tmp_path / "none.toml") in str(caught.value)

@@ -1,0 +1,180 @@
+"""Crops: cells side by side, each in a tile of its own."""
+
+import random
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor
+
+from cvtgs import GaussianScene
+from cvtgs.render import render
+from cvtgs.stages import Reference
+from cvtgs.train.cases import Case, make_case
+from cvtgs.train.crops import TILE, Crops, crop_cells
+from mergenet_cases import Case as Cells
+from mergenet_cases import case_of, fields_of, lively_net
+from scenes import covariances_of, random_scene
+from train_cases import small_net, some_case
+
+SIDE = 4
+
+
+def as_case(cells: Cells) -> Case:
+    light = cells.light.to(cells.scene.dtype)
+    reference = Reference(cells.scene, cells.merged, cells.part, cells.neighbors, light)
+    several = cells.part.counts > 1
+    rows = several.nonzero()[:, 0]
+    return make_case("made", 0.1, reference, rows, cells.part.select(several))
+
+
+def twins(cells: int = 16) -> Case:
+    """Cells of two equal members of half the depth each; their moments are those of a member."""
+    single = random_scene(cells, degree=0)
+    opacities = single.opacities
+    half = torch.logit(1 - (1 - opacities).sqrt())
+    scene = single.select(torch.arange(cells).repeat(2))
+    scene = scene.with_tensors({"logit_opacities": half.repeat(2)}, {})
+    return as_case(case_of(scene, torch.arange(cells).repeat(2), near=4))
+
+
+def cropped(case: Case, *, seed: int = 0, changed: dict[str, Tensor] | None = None) -> Crops:
+    same = case.reference.merged.select(case.cells).tensors()
+    return crop_cells(case, changed or same, dice=random.Random(seed))
+
+
+def image(scene: GaussianScene, crops: Crops) -> Tensor:
+    return render(scene, crops.camera, background=torch.zeros(3)).rgb[0]
+
+
+def sixteen(case: Case) -> Case:
+    return case.select(torch.arange(SIDE * SIDE))
+
+
+def tile_of(number: int) -> tuple[slice, slice]:
+    row, column = divmod(number, SIDE)
+    return (
+        slice(row * TILE, (row + 1) * TILE),
+        slice(column * TILE, (column + 1) * TILE),
+    )
+
+
+def test_equal_members_and_their_cell_look_the_same():
+    crops = cropped(twins())
+    members, merged = image(crops.members, crops), image(crops.merged, crops)
+    assert float(members.amax()) > 0.3
+    assert float((members - merged).abs().mean()) < 0.01
+
+
+def test_what_is_not_changed_looks_the_same():
+    crops = cropped(twins())
+    assert torch.equal(image(crops.merged, crops), image(crops.corrected, crops))
+
+
+@pytest.mark.parametrize("count", [1, 2, 4, 5, 9, 10])
+def test_there_is_a_tile_for_every_cell(count):
+    case = some_case(1500, ratio=0.1).select(torch.arange(count))
+    crops = cropped(case)
+    side = {1: 1, 2: 2, 4: 2, 5: 3, 9: 3, 10: 4}[count]
+    assert (crops.camera.width, crops.camera.height) == (side * TILE, side * TILE)
+    assert len(crops.merged) == len(crops.corrected) == count
+    assert len(crops.members) == len(case.part.order)
+
+
+def test_cells_lie_in_their_tiles_of_comparable_size():
+    crops = cropped(sixteen(some_case(1500, ratio=0.1)))
+    numbers = torch.arange(SIDE * SIDE)
+    middles = torch.stack([numbers % SIDE, numbers // SIDE], dim=1) + 0.5 - SIDE / 2
+    steps = crops.merged.means[:, :2] - middles
+    assert float(steps.abs().amax()) <= 0.15 + 1e-5
+    assert len({tuple(step) for step in steps.tolist()}) == SIDE * SIDE
+    largest = crops.merged.scales.amax(dim=1)
+    assert bool((largest > 0.7 / 7).all())
+    assert bool((largest < 1.42 / 7).all())
+
+
+def test_a_cell_paints_its_own_tile():
+    """Each cell rendered by itself: hardly anything of it falls into the tiles of others."""
+    crops = cropped(sixteen(some_case(1500, ratio=0.1)))
+    for number in range(SIDE * SIDE):
+        light = image(crops.merged.select(torch.tensor([number])), crops).sum(dim=2)
+        assert float(light[tile_of(number)].sum()) > 0.95 * float(light.sum()) > 0
+
+
+def test_members_stay_with_their_cell():
+    case = sixteen(some_case(1500, ratio=0.1))
+    crops = cropped(case)
+    for number, (first, last) in enumerate(pairwise(case.part.offsets.tolist())):
+        steps = crops.members.means[first:last] - crops.merged.means[number]
+        reach = 4 * crops.merged.scales[number].amax()
+        assert float(torch.linalg.vector_norm(steps, dim=1).median()) < reach
+
+
+def test_a_layout_turns_and_scales_and_nothing_else():
+    """Distances over scales, shapes against one another, opacities and colours stay."""
+    case = sixteen(some_case(1500, ratio=0.1))
+    crops, own = cropped(case), case.reference.merged.select(case.cells)
+    members = case.reference.scene.select(case.part.order)
+    ids = torch.repeat_interleave(torch.arange(len(own)), case.part.counts)
+    for before, after, rows in ((own, crops.merged, slice(None)), (members, crops.members, ids)):
+        zooms = (crops.merged.scales / own.scales)[:, 0][rows]
+        torch.testing.assert_close(after.scales, before.scales * zooms[:, None])
+        old = (before.means - own.means[rows]) * zooms[:, None]
+        new = after.means - crops.merged.means[rows]
+        lengths = [torch.linalg.vector_norm(steps, dim=1) for steps in (old, new)]
+        torch.testing.assert_close(*lengths, rtol=1e-3, atol=1e-4)
+        seen = [
+            torch.einsum("ni,nij,nj->n", steps.double(), covariances_of(shapes), steps.double())
+            for steps, shapes in ((old, before), (new, after))
+        ]
+        torch.testing.assert_close(seen[1], seen[0] * zooms.double() ** 2, rtol=1e-2, atol=1e-6)
+        assert torch.equal(after.logit_opacities, before.logit_opacities)
+        assert torch.equal(after.sh0, before.sh0)
+        assert after.sh_degree == 0
+
+
+def test_the_dice_decide():
+    case = twins()
+    first, again, other = (cropped(case, seed=seed) for seed in (0, 0, 1))
+    assert torch.equal(first.members.means, again.members.means)
+    assert not torch.equal(first.members.means, other.members.means)
+    assert not torch.equal(first.members.log_scales, other.members.log_scales)
+
+
+@pytest.mark.parametrize("net", [small_net(), lively_net(torch.float32)], ids=["new", "lively"])
+def test_gradients_flow_into_what_is_changed(net):
+    case = sixteen(some_case(1500, ratio=0.1))
+    changed = {
+        name: values.detach().requires_grad_()
+        for name, values in case.changed(net(case.descriptors)).items()
+    }
+    crops = cropped(case, changed=changed)
+    (image(crops.corrected, crops) - image(crops.members, crops)).square().sum().backward()
+    for name in ("means", "quats", "log_scales", "logit_opacities", "sh0"):
+        grad = changed[name].grad
+        assert bool(grad.isfinite().all())
+        assert float((grad.reshape(len(grad), -1) != 0).any(dim=1).double().mean()) > 0.9
+    assert not crops.members.means.requires_grad
+
+
+def test_gradients_flow_into_the_residuals():
+    case, net = sixteen(some_case(1500, ratio=0.1)), small_net()
+    residuals = net(case.descriptors)
+    for values in fields_of(residuals).values():
+        values.retain_grad()
+    crops = cropped(case, changed=case.changed(residuals))
+    (image(crops.corrected, crops) - image(crops.members, crops)).square().sum().backward()
+    assert all(bool((values.grad != 0).any()) for values in fields_of(residuals).values())
+
+
+@pytest.mark.parametrize("log_scale", [-80.0, -40.0, 20.0, 40.0])
+def test_cells_of_any_size(log_scale):
+    """Everything scaled, so the images are those of the cells of size 1."""
+    scene = random_scene(12, degree=0, size=0.5)
+    factor = torch.exp(torch.tensor(log_scale))
+    far = scene.with_tensors(
+        {"means": scene.means * factor, "log_scales": scene.log_scales + log_scale}, {}
+    )
+    crops = [cropped(as_case(case_of(one, torch.arange(12) % 4, near=3))) for one in (scene, far)]
+    images = [image(some.members, some) for some in crops]
+    torch.testing.assert_close(images[1], images[0], rtol=0, atol=2e-2)

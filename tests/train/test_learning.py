@@ -1,0 +1,116 @@
+"""A training learns: on scenes and views that it never sees, too."""
+
+import random
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import cvtgs
+from cvtgs.evaluate import psnr
+from cvtgs.mergenet import load_checkpoint
+from cvtgs.render import render
+from cvtgs.train import History, TrainConfig, TrainFiles
+from cvtgs.train.losses import local_loss, scene_loss
+from cvtgs.views import automatic_views
+from train_cases import (
+    needs_matplotlib,
+    run,
+    small_net,
+    small_scene,
+    some_case,
+    some_views,
+    tiny_config,
+    tiny_data,
+    write_scenes,
+)
+
+pytestmark = needs_matplotlib
+COUNT = 1200
+UNSEEN = 7
+"""Seed of a scene that is neither learned from nor validated with."""
+
+
+@dataclass(frozen=True)
+class Trained:
+    config: TrainConfig
+    history: History
+    files: TrainFiles
+
+
+@pytest.fixture(scope="module", params=["scene", "local"])
+def trained(request, tmp_path_factory) -> Trained:
+    """The preset ``paper`` leaves most to be learned, so little training gains much."""
+    folder = tmp_path_factory.mktemp("scenes")
+    write_scenes(folder, ["lesson", "exam", "lesson2"], COUNT)
+    config = tiny_config(
+        tiny_data(folder),
+        kind=request.param,
+        preset="paper",
+        steps=70,
+        validate_every=35,
+        learning_rate=0.01,
+    )
+    name = tmp_path_factory.mktemp("out") / "net.safetensors"
+    history = run(config, name)
+    return Trained(config, history, TrainFiles.beside(name))
+
+
+def test_a_scene_never_learned_from_gains(trained):
+    start, *later = trained.history.validations
+    assert start.gains == {"exam": {0.06: 0.0}}
+    assert all(entry.score > 0.3 for entry in later)
+    assert trained.history.best().score > 1.0
+
+
+def test_a_training_scene_gains_in_views_never_seen(trained):
+    """Other views, at another ratio, through the simplifier and the file that was written."""
+    scene = small_scene(COUNT, seed=0)
+    views = automatic_views(scene, 2, width=48, height=40, seed=9)
+    found = {}
+    for ckpt in (None, trained.files.checkpoint):
+        small = cvtgs.Simplifier(ckpt, config="paper", device="cpu").simplify(scene, 0.07)
+        images = render(scene, views).rgb, render(small, views).rgb
+        found[ckpt] = psnr(*images).mean().item()
+    assert found[trained.files.checkpoint] > found[None] + 1.0
+
+
+def test_the_loss_of_an_unseen_scene_falls(trained):
+    config = trained.config
+    case = some_case(COUNT, seed=UNSEEN, ratio=0.05, preset="paper")
+    views = some_views(COUNT, seed=UNSEEN)
+
+    def loss(net) -> float:
+        total = 0.0
+        for seed in range(4):
+            dice = random.Random(seed)
+            if config.kind == "local":
+                total += local_loss(net, case, config=config, dice=dice).item()
+            else:
+                total += scene_loss(net, case, views, config=config, dice=dice).item()
+        return total / 4
+
+    net = load_checkpoint(trained.files.checkpoint).net
+    assert loss(net) < loss(small_net()) - 0.05
+
+
+def test_the_checkpoint_says_what_it_is(trained):
+    info = load_checkpoint(trained.files.checkpoint).info
+    assert info.preset == "paper"
+    assert info.training == f"{trained.config.kind} training"
+    assert info.steps == trained.history.best().step > 0
+    assert (info.seed, info.version) == (0, cvtgs.__version__)
+    assert (info.architecture.width, info.architecture.cell_width) == (6, 10)
+
+
+def test_curves_are_a_image(trained):
+    content = trained.files.curves.read_bytes()
+    assert content == trained.history.curves()
+    assert content[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_nothing_else_is_left_behind(trained):
+    folder = Path(trained.files.checkpoint).parent
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"net.safetensors", "net.state", "net.png", "net.cache"}
+    assert len(list(trained.files.cache.iterdir())) == 6

@@ -1,0 +1,161 @@
+"""What a step makes small, and what validations measure."""
+
+import math
+import random
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs.evaluate import psnr
+from cvtgs.losses import image_loss
+from cvtgs.render import render
+from cvtgs.train import LossConfig
+from cvtgs.train.losses import local_loss, scene_loss, scores, view_loss
+from mergenet_cases import lively_net
+from train_cases import small_net, small_scene, some_case, some_views, tiny_config, tiny_data
+
+
+def config_of(**loss):
+    return tiny_config(tiny_data(cvtgs.__path__[0]), loss=LossConfig(**loss))
+
+
+def images() -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(0)
+    target = torch.rand(1, 16, 20, 3, generator=g)
+    return target + 0.1 * torch.randn(1, 16, 20, 3, generator=g), target
+
+
+def test_a_known_loss():
+    """All pixels are off by a tenth: a squared error of a hundredth."""
+    target = torch.full((1, 12, 12, 3), 0.25)
+    config = LossConfig(squared=2.0, image=0.0)
+    assert view_loss(target + 0.1, target, config).item() == pytest.approx(
+        2 * math.log(0.01 + 1e-5), rel=1e-5
+    )
+
+
+def test_the_loss_of_equal_images_is_finite():
+    target = torch.rand(1, 12, 12, 3, generator=torch.Generator().manual_seed(0))
+    same = target.clone().requires_grad_()
+    loss = view_loss(same, target, LossConfig(squared=1.0, image=1.0))
+    assert loss.item() == pytest.approx(math.log(1e-5) + math.log(1e-3), abs=1e-2)
+    loss.backward()
+    assert bool(same.grad.isfinite().all())
+
+
+def test_the_parts_add_up():
+    image, target = images()
+    error = (image - target).square().mean().item()
+    other = image_loss(image, target).item()
+    for squared, image in ((0.5, 0.5), (1.0, 0.0), (0.0, 2.0), (0.0, 0.0)):
+        loss = view_loss(image, target, LossConfig(squared=squared, image=image)).item()
+        wanted = squared * math.log(error + 1e-5) + image * math.log(other + 1e-3)
+        assert loss == pytest.approx(wanted, rel=1e-4)
+
+
+def test_twice_the_error_costs_the_same_wherever_one_starts():
+    image, target = images()
+    config = LossConfig(squared=1.0, image=0.0)
+    losses = [
+        view_loss(target + factor * (image - target), target, config).item()
+        for factor in (0.5, 1.0, 2.0, 4.0)
+    ]
+    steps = torch.tensor(losses).diff()
+    torch.testing.assert_close(steps, torch.full((3,), math.log(4)), rtol=0, atol=2e-2)
+
+
+def test_an_untrained_network_has_the_loss_of_the_reference():
+    """The same views over the same backgrounds, cut the same way, rendered here."""
+    case, views, config = some_case(), some_views(size=40), config_of()
+    found = scene_loss(small_net(), case, views, config=config, dice=random.Random(3))
+    dice, losses = random.Random(3), []
+    for _ in range(config.views.per_step):
+        background = torch.tensor([dice.random() for _ in range(3)])
+        camera = views.cameras.select(torch.tensor([dice.randrange(len(views.cameras))]))
+        y, x = dice.randint(0, 40 - 32), dice.randint(0, 40 - 32)
+        before, full = (
+            render(scene, camera, background=background).rgb[:, y : y + 32, x : x + 32]
+            for scene in (case.reference.merged, small_scene())
+        )
+        losses.append(view_loss(before, full, config.loss).item())
+    assert found.item() == pytest.approx(sum(losses) / len(losses), abs=5e-3)
+
+
+@pytest.mark.parametrize("kind", ["scene", "local"])
+def test_the_dice_decide_and_nothing_else(kind):
+    case, views, config = some_case(), some_views(), config_of()
+
+    def loss(seed: int) -> float:
+        dice = random.Random(seed)
+        if kind == "local":
+            return local_loss(small_net(), case, config=config, dice=dice).item()
+        return scene_loss(small_net(), case, views, config=config, dice=dice).item()
+
+    assert loss(0) == loss(0)
+    assert len({loss(seed) for seed in range(4)}) == 4
+
+
+@pytest.mark.parametrize("kind", ["scene", "local"])
+def test_changes_have_their_price(kind):
+    case, views, net = some_case(), some_views(), lively_net(torch.float32)
+
+    def loss(residual: float) -> float:
+        config, dice = config_of(residual=residual), random.Random(0)
+        if kind == "local":
+            return local_loss(net, case, config=config, dice=dice).item()
+        return scene_loss(net, case, views, config=config, dice=dice).item()
+
+    price = loss(2.0) - loss(0.0)
+    assert 0 < price <= 2
+    if kind == "scene":
+        assert price == pytest.approx(2 * net(case.descriptors).cost().item(), rel=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["scene", "local"])
+def test_gradients_reach_the_last_layers_of_a_new_network(kind):
+    """They start at zero, and nothing below them can move before they do."""
+    case, views, net, config = some_case(), some_views(), small_net(), config_of()
+    dice = random.Random(0)
+    if kind == "local":
+        local_loss(net, case, config=config, dice=dice).backward()
+    else:
+        scene_loss(net, case, views, config=config, dice=dice).backward()
+    moved = {
+        name.split(".")[0]
+        for name, values in net.named_parameters()
+        if values.grad is not None and bool((values.grad != 0).any())
+    }
+    assert moved == {"decoder", "member_gates", "pair_gates"}
+    assert all(bool(values.grad.isfinite().all()) for values in net.parameters())
+
+
+def test_a_local_step_takes_no_more_cells_than_there_are():
+    case = some_case().select(torch.arange(3))
+    loss = local_loss(small_net(), case, config=config_of(), dice=random.Random(0))
+    assert math.isfinite(loss.item())
+
+
+def test_an_untrained_network_gains_nothing():
+    before, after = scores(small_net(), some_case(), some_views())
+    assert before == after
+    assert 5 < before < 60
+
+
+def test_scores_are_those_of_the_images_over_grey():
+    case, views, net = some_case(), some_views(), lively_net(torch.float32)
+    before, after = scores(net, case, views)
+    grey = torch.full((3,), 0.5)
+    wanted = render(small_scene(), views.cameras, background=grey).rgb
+    with torch.no_grad():
+        corrected = case.corrected(net(case.descriptors))
+    for scene, found in ((case.reference.merged, before), (corrected, after)):
+        rendered = render(scene, views.cameras, background=grey).rgb
+        assert found == pytest.approx(psnr(rendered, wanted).mean().item(), abs=0.02)
+    assert abs(after - before) > 0.05
+
+
+def test_scores_leave_no_gradient():
+    net = lively_net(torch.float32)
+    scores(net, some_case(), some_views())
+    assert all(values.grad is None for values in net.parameters())
