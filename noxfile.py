@@ -18,7 +18,7 @@ WHEEL_TESTS = (
     "tests/io/test_*.py",
     "tests/simplify/test_*.py",
     "tests/mergenet/test_*.py",
-    "tests/evaluate/test_compare.py",
+    "tests/evaluation/test_compare.py",
 )
 """What tells whether anything is missing in the wheel: data files, names, types, commands."""
 
@@ -119,4 +119,4 @@ def fuzz(session: nox.Session) -> None:
 def browser(session: nox.Session) -> None:
     """Load the comparison page in a real headless browser (Debian package chromium)."""
     session.install(*CONSTRAINTS, "-e", ".[test]")
-    session.run("pytest", "tests/evaluate/test_page_browser.py", *session.posargs)
+    session.run("pytest", "tests/evaluation/test_page_browser.py", *session.posargs)

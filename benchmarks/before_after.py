@@ -11,7 +11,7 @@ from PIL import Image
 
 import cvtgs
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.render import render
+from cvtgs.rendering import render
 
 RATIOS = (1.0, 0.1, 0.01)
 SIZE = 480

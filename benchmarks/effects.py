@@ -20,7 +20,7 @@ import cvtgs
 from benchmarks.processes import machine, run_python
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.effects import BAND_LOSS, figures
-from cvtgs.evaluate import psnr
+from cvtgs.evaluation import psnr
 from cvtgs.math.frames import robust_frame
 from cvtgs.scene import ANTIALIASED_TAG, FLAT_LOG_SCALE
 from cvtgs.synthetic import scene as make

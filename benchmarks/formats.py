@@ -16,7 +16,7 @@ import torch
 import cvtgs
 from benchmarks.processes import machine, spread
 from cvtgs.errors import DroppedDataWarning
-from cvtgs.evaluate import EvaluationSettings, evaluate
+from cvtgs.evaluation import EvaluationSettings, evaluate
 
 FORMATS = ("ply", "compressed.ply", "spz", "splat", "sog")
 SCENES = (("courtyard", 3), ("object", 3), ("landscape", 0))

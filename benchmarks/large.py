@@ -18,7 +18,7 @@ import torch
 
 import cvtgs
 from benchmarks.processes import machine, run_python
-from cvtgs.evaluate import EvaluationSettings
+from cvtgs.evaluation import EvaluationSettings
 from cvtgs.outofcore import simplify_file
 from cvtgs.views import automatic_views
 

@@ -21,7 +21,7 @@ import cvtgs
 from benchmarks.processes import machine, run_python, spread
 from benchmarks.speed import generated_scenes
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.render import BackendName, render
+from cvtgs.rendering import BackendName, render
 
 SCENES = (("courtyard", 150_000, 0), ("courtyard", 150_000, 3), ("object", 150_000, 3))
 

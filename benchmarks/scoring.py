@@ -16,7 +16,7 @@ from torch import Tensor
 
 import cvtgs
 from cvtgs.errors import FileFormatError
-from cvtgs.evaluate import EvaluationSettings, LpipsWeights, evaluate, load_lpips, lpips
+from cvtgs.evaluation import EvaluationSettings, LpipsWeights, evaluate, load_lpips, lpips
 from cvtgs.views import automatic_views
 
 VIEWS = 8

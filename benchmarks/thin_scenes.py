@@ -13,7 +13,7 @@ import cvtgs
 from benchmarks.baselines.pruning import keep_most_mass
 from benchmarks.numerics import catalogue
 from cvtgs import Simplifier, SimplifyConfig
-from cvtgs.evaluate import EvaluationSettings, evaluate
+from cvtgs.evaluation import EvaluationSettings, evaluate
 from cvtgs.views import automatic_views
 
 MOMENTS = {"merge.representatives": "false"}

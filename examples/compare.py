@@ -7,7 +7,7 @@ import argparse
 from pathlib import Path
 
 import cvtgs
-from cvtgs.evaluate import EvaluationSettings, compare, write_exhibition
+from cvtgs.evaluation import EvaluationSettings, compare, write_exhibition
 
 
 def main() -> None:

@@ -2,7 +2,7 @@
 
 python examples/gsplat_loop.py --steps 50
 
-With CUDA and gsplat the images come from gsplat.rasterization; elsewhere from cvtgs.render.
+With CUDA and gsplat the images come from gsplat.rasterization; elsewhere from cvtgs.rendering.
 """
 
 import argparse

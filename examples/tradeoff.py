@@ -7,7 +7,7 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from cvtgs.evaluate import EvaluationSettings
+from cvtgs.evaluation import EvaluationSettings
 from cvtgs.tradeoff import measure_tradeoff, write_tradeoff
 from cvtgs.views import automatic_views
 

@@ -6,7 +6,7 @@ from functools import cache
 
 import torch
 
-from cvtgs.evaluate import LpipsWeights
+from cvtgs.evaluation import LpipsWeights
 
 # What torchvision's feature extractors hold: (layer, out, in, kernel, stride, padding), pools as
 # (side,), and "tap" after a ReLU that LPIPS compares.

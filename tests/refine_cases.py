@@ -7,7 +7,7 @@ import torch
 import cvtgs
 from cvtgs import GaussianScene
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.refine import RefineConfig
+from cvtgs.refinement import RefineConfig
 
 
 def quick(**changes: Any) -> RefineConfig:

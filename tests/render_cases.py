@@ -9,7 +9,7 @@ import torch
 import render_oracle as oracle
 from cvtgs import GaussianScene
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.render import render
+from cvtgs.rendering import render
 
 BACKENDS = ["torch", *(["numba"] if find_spec("numba") else [])]
 backends = pytest.mark.parametrize("backend", BACKENDS)

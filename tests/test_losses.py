@@ -204,7 +204,7 @@ def test_cuda_gives_the_same_values_and_gradients(loss) -> None:
 
 def test_importing_losses_is_light() -> None:
     program = (
-        "import sys, cvtgs, cvtgs.losses, cvtgs.evaluate, cvtgs.io\n"
+        "import sys, cvtgs, cvtgs.losses, cvtgs.evaluation, cvtgs.io\n"
         "print(sorted({'kornia', 'scipy', 'lpips', 'torchvision'} & set(sys.modules)))\n"
     )
     result = subprocess.run(

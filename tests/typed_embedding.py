@@ -12,9 +12,9 @@ from torch import Tensor
 
 import cvtgs
 from cvtgs.cvt import Tessellation
-from cvtgs.evaluate import Evaluation, EvaluationSettings
+from cvtgs.evaluation import Evaluation, EvaluationSettings
 from cvtgs.mergenet import MergeNet, load_checkpoint
-from cvtgs.refine import Refined
+from cvtgs.refinement import Refined
 from cvtgs.simplify import Level
 
 

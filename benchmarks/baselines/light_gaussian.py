@@ -24,7 +24,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from benchmarks.baselines.rows import keep_largest, usable
-from cvtgs.render import contributions
+from cvtgs.rendering import contributions
 from cvtgs.scene import GaussianScene
 from cvtgs.views import automatic_views
 

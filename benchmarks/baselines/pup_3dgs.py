@@ -28,7 +28,7 @@ from torch import Tensor
 
 from benchmarks.baselines.rows import keep_largest, usable
 from cvtgs.cameras import Cameras
-from cvtgs.render import BackendName, render
+from cvtgs.rendering import BackendName, render
 from cvtgs.scene import GaussianScene
 from cvtgs.views import automatic_views
 

@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 
 def public_names() -> Iterator[tuple[str, set[str]]]:
     """Return all public names, and what else they are called."""
-    packages = [f"cvtgs.{name}" for name in (*cvtgs._MODULES, *cvtgs._CALLABLE)]
+    packages = [f"cvtgs.{name}" for name in cvtgs._MODULES]
     pairs = [(home, name) for name, home in cvtgs._HOME.items()]
     pairs += [
         (package, name)

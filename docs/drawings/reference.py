@@ -11,7 +11,7 @@ import torch
 
 import cvtgs
 from benchmarks.before_after import camera
-from cvtgs.evaluate import psnr
+from cvtgs.evaluation import psnr
 from docs.drawings.saving import figure, save_small
 
 COUNT, RHO, CROP = 100_000, 0.05, (slice(70, 430), slice(40, 440))

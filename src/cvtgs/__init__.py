@@ -9,9 +9,7 @@
 Names are loaded when they are first used, so that ``import cvtgs`` costs nothing.
 """
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -22,6 +20,7 @@ if TYPE_CHECKING:
         cvt,
         effects,
         errors,
+        evaluation,
         filters,
         io,
         levels,
@@ -29,6 +28,8 @@ if TYPE_CHECKING:
         math,
         mergenet,
         outofcore,
+        refinement,
+        rendering,
         synthetic,
         tradeoff,
         train,
@@ -38,12 +39,12 @@ if TYPE_CHECKING:
     from cvtgs.config import PRESETS, SimplifyConfig
     from cvtgs.effects import EffectPlan
     from cvtgs.errors import CvtgsError
-    from cvtgs.evaluate import evaluate
+    from cvtgs.evaluation import evaluate
     from cvtgs.info import SceneInfo, describe
     from cvtgs.io import from_dict, load, load_cameras, save, to_dict
     from cvtgs.progress import ProgressEvent, ProgressListener
-    from cvtgs.refine import refine
-    from cvtgs.render import Rendering, render
+    from cvtgs.refinement import refine
+    from cvtgs.rendering import Rendering, render
     from cvtgs.report import SimplifyReport
     from cvtgs.scene import GaussianScene
     from cvtgs.simplify import Level, Prepared, Simplified, Simplifier, target_count
@@ -62,10 +63,13 @@ _HOME = {
     "load": "cvtgs.io",
     "load_cameras": "cvtgs.io",
     "save": "cvtgs.io",
+    "evaluate": "cvtgs.evaluation",
+    "refine": "cvtgs.refinement",
+    "render": "cvtgs.rendering",
     "to_dict": "cvtgs.io",
     "ProgressEvent": "cvtgs.progress",
     "ProgressListener": "cvtgs.progress",
-    "Rendering": "cvtgs.render",
+    "Rendering": "cvtgs.rendering",
     "SimplifyReport": "cvtgs.report",
     "GaussianScene": "cvtgs.scene",
     "Level": "cvtgs.simplify",
@@ -75,6 +79,9 @@ _HOME = {
     "target_count": "cvtgs.simplify",
 }
 _MODULES = (
+    "rendering",
+    "refinement",
+    "evaluation",
     "outofcore",
     "boxes",
     "cells",
@@ -93,8 +100,6 @@ _MODULES = (
     "train",
     "views",
 )
-_CALLABLE = ("evaluate", "refine", "render")
-
 __all__ = [
     "PRESETS",
     "Cameras",
@@ -119,6 +124,7 @@ __all__ = [
     "effects",
     "errors",
     "evaluate",
+    "evaluation",
     "filters",
     "from_dict",
     "io",
@@ -130,7 +136,9 @@ __all__ = [
     "mergenet",
     "outofcore",
     "refine",
+    "refinement",
     "render",
+    "rendering",
     "save",
     "synthetic",
     "target_count",
@@ -141,28 +149,8 @@ __all__ = [
 ]
 
 
-class _CallablePackage(ModuleType):
-    """A package that is called like its function of the same name: ``cvtgs.render(...)``."""
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        name: str = self.__name__.rpartition(".")[2]
-        return vars(self)[name](*args, **kwargs)
-
-
-class _FrontPage(ModuleType):
-    """Makes the packages that are named like their function callable when they are loaded."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name in _CALLABLE and isinstance(value, ModuleType):
-            value.__class__ = _CallablePackage
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _FrontPage
-
-
 def __getattr__(name: str) -> Any:
-    if name in (*_MODULES, *_CALLABLE):
+    if name in _MODULES:
         return import_module(f"cvtgs.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'cvtgs' has no attribute {name!r}")

@@ -93,8 +93,8 @@ def test_a_goal_is_reached_and_fewer_did_not(full, views, simplifier, goal):
 def test_the_scores_are_those_of_an_evaluation(full, views, simplifier):
     small = simplifier.simplify(full, 0.2)
     quality = Judge(full, views, listener=silent).score(small)
-    settings = cvtgs.evaluate.EvaluationSettings(lpips="off")
-    wanted = cvtgs.evaluate.evaluate(full, {"small": small}, views, settings=settings).scenes[0]
+    settings = cvtgs.evaluation.EvaluationSettings(lpips="off")
+    wanted = cvtgs.evaluation.evaluate(full, {"small": small}, views, settings=settings).scenes[0]
     assert quality.psnr == pytest.approx(wanted.psnr.mean, abs=1e-4)
     assert quality.ssim == pytest.approx(wanted.ssim.mean, abs=1e-5)
 
@@ -106,7 +106,7 @@ def test_the_full_scene_is_rendered_once(full, views, simplifier, monkeypatch):
 
     def counting(scene, camera):
         sizes.append(len(scene))
-        return cvtgs.render.render(scene, camera)
+        return cvtgs.rendering.render(scene, camera)
 
     monkeypatch.setattr(judge, "render", counting)
     find_count(full, psnr=22.0, simplifier=simplifier, heldout=views)

@@ -8,8 +8,8 @@ import pytest
 
 import cvtgs
 from cvtgs.cli.main import main
-from cvtgs.evaluate import Evaluation
-from cvtgs.evaluate.images import encode
+from cvtgs.evaluation import Evaluation
+from cvtgs.evaluation.images import encode
 
 SMALL = ["--views", "2", "--size", "48"]
 

@@ -72,7 +72,7 @@ def test_bad_numbers_are_found_before_the_work(tmp_path, capsys, words, text):
 
 
 def test_an_interrupt_leaves_nothing(source, tmp_path, capsys, monkeypatch):
-    descent = import_module("cvtgs.refine.optimize")
+    descent = import_module("cvtgs.refinement.optimize")
     honest, calls = descent.relative_loss, []
 
     def interrupted(image, target, **weights):

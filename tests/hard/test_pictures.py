@@ -11,9 +11,9 @@ import cvtgs
 from benchmarks.baselines.pruning import keep_most_mass
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.errors import DroppedDataWarning
-from cvtgs.evaluate import EvaluationSettings, evaluate
-from cvtgs.refine import refine
-from cvtgs.render import render
+from cvtgs.evaluation import EvaluationSettings, evaluate
+from cvtgs.refinement import refine
+from cvtgs.rendering import render
 from cvtgs.views import automatic_views
 from hard_cases import CASES, each_case
 from hard_scenes import (

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from cvtgs import GaussianScene
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError
 from cvtgs.filters import invalid_rows
-from cvtgs.render import render
+from cvtgs.rendering import render
 from hard_cases import CASES
 from hard_scenes import coarsen_light, presets, simplifier, valid_rows
 from render_cases import around

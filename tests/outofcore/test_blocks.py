@@ -12,7 +12,7 @@ from cvtgs.cli.main import main
 from cvtgs.counts import shared_out
 from cvtgs.devices import one_thread
 from cvtgs.errors import ConfigError, FileFormatError, InvalidArgumentError, InvalidSceneError
-from cvtgs.evaluate import EvaluationSettings
+from cvtgs.evaluation import EvaluationSettings
 from cvtgs.io.ply import open_rows
 from cvtgs.outofcore import block_count, memory, read_bytes, simplify_file
 from cvtgs.outofcore.cuts import cut_space

@@ -8,7 +8,7 @@ import torch
 import cvtgs
 from cvtgs import Simplifier, cells, cvt, filters
 from cvtgs.cvt.neighbors import nearest_several
-from cvtgs.evaluate import EvaluationSettings
+from cvtgs.evaluation import EvaluationSettings
 from cvtgs.io.ply import open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import correct_cells

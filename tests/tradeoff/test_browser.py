@@ -6,7 +6,7 @@ import pytest
 from test_page_browser import BROWSER, BROWSERS, attribute, dom, layout_on_a_phone
 
 import cvtgs
-from cvtgs.evaluate import EvaluationSettings
+from cvtgs.evaluation import EvaluationSettings
 from cvtgs.tradeoff import measure_tradeoff, write_tradeoff
 from cvtgs.views import automatic_views
 

@@ -14,7 +14,7 @@ import torch
 
 import cvtgs
 from cvtgs.errors import ConfigError, InvalidArgumentError, RunError
-from cvtgs.evaluate import Evaluation, EvaluationSettings, SceneScores, Score, compare
+from cvtgs.evaluation import Evaluation, EvaluationSettings, SceneScores, Score, compare
 from cvtgs.report import SimplifyReport, StageCost
 from cvtgs.tradeoff import Failure, Measured, Tradeoff, TradeoffResult, on_front, write_tradeoff
 from cvtgs.tradeoff.chart import ticks, tradeoff_chart

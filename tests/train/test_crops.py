@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cvtgs import GaussianScene
-from cvtgs.render import render
+from cvtgs.rendering import render
 from cvtgs.stages import Reference
 from cvtgs.train.cases import Case, make_case
 from cvtgs.train.crops import TILE, Crops, crop_cells

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 import cvtgs
-from cvtgs.evaluate import psnr
+from cvtgs.evaluation import psnr
 from cvtgs.mergenet import load_checkpoint
-from cvtgs.render import render
+from cvtgs.rendering import render
 from cvtgs.train import History, TrainConfig, TrainFiles
 from cvtgs.train.losses import local_loss, scene_loss
 from cvtgs.views import automatic_views

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import cvtgs
-from cvtgs.evaluate import psnr
+from cvtgs.evaluation import psnr
 from cvtgs.losses import image_loss
-from cvtgs.render import render
+from cvtgs.rendering import render
 from cvtgs.train import LossConfig
 from cvtgs.train.losses import local_loss, scene_loss, scores, view_loss
 from mergenet_cases import lively_net

@@ -5,7 +5,7 @@ import torch
 
 from cvtgs.cameras import Cameras
 from cvtgs.math.frames import robust_frame
-from cvtgs.render import render
+from cvtgs.rendering import render
 from cvtgs.train.views import Views, look_at_scene
 from cvtgs.views import automatic_views, views_from_anywhere
 from train_cases import bits_of_views, small_scene

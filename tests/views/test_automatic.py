@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 import cvtgs
-from cvtgs.evaluate import psnr
+from cvtgs.evaluation import psnr
 from cvtgs.math import quaternions
-from cvtgs.render import render
+from cvtgs.rendering import render
 from cvtgs.synthetic import KINDS
 from cvtgs.views import automatic_views, mixed_views, views_from_anywhere
 from cvtgs.views.automatic import _stands

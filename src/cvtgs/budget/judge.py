@@ -5,9 +5,9 @@ from typing import NamedTuple
 import torch
 
 from cvtgs.cameras import Cameras
-from cvtgs.evaluate import psnr, ssim
+from cvtgs.evaluation import psnr, ssim
 from cvtgs.progress import ProgressEvent, ProgressListener
-from cvtgs.render import render
+from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
 from cvtgs.views import automatic_views
 

@@ -38,12 +38,12 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    from cvtgs.evaluate import (  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.evaluation import (  # noqa: PLC0415 (keeps --help fast)
         EvaluationSettings,
         compare,
         write_exhibition,
     )
-    from cvtgs.evaluate.comparison_files import check_exhibition  # noqa: PLC0415
+    from cvtgs.evaluation.comparison_files import check_exhibition  # noqa: PLC0415
 
     check_looking_options(options)
     check_exhibition(options.output, overwrite=options.overwrite)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from cvtgs.cli.display import PRESET_NAMES, file_size, progress_bars
 
 if TYPE_CHECKING:
-    from cvtgs.evaluate import SceneScores
+    from cvtgs.evaluation import SceneScores
     from cvtgs.report import StageCost
 
 RATIOS = (0.1, 0.01, 0.001)
@@ -47,12 +47,12 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    from cvtgs.evaluate import (  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.evaluation import (  # noqa: PLC0415 (keeps --help fast)
         EvaluationSettings,
         compare,
         write_exhibition,
     )
-    from cvtgs.evaluate.comparison_files import make_folder  # noqa: PLC0415
+    from cvtgs.evaluation.comparison_files import make_folder  # noqa: PLC0415
     from cvtgs.io import save  # noqa: PLC0415
     from cvtgs.simplify import Simplifier  # noqa: PLC0415
     from cvtgs.synthetic import demo_scene  # noqa: PLC0415

@@ -11,7 +11,7 @@ from cvtgs.errors import CvtgsError, DeviceError
 if TYPE_CHECKING:
     import torch
 
-    from cvtgs.render import BackendName
+    from cvtgs.rendering import BackendName
 
 COUNT, RHO = 20_000, 0.1
 SIDE = 256
@@ -66,7 +66,7 @@ def _devices() -> "list[torch.device]":
 
 def _renderer(name: str, device: "torch.device") -> str:
     """Report whether a renderer works on a device, and if not, why."""
-    from cvtgs.render import choose_backend  # noqa: PLC0415
+    from cvtgs.rendering import choose_backend  # noqa: PLC0415
 
     try:
         choose_backend(cast("BackendName", name), device)
@@ -86,7 +86,7 @@ def _small_run(device: "torch.device") -> list[str]:
     """Generate, simplify and render; say how long each took and what did it."""
     import torch  # noqa: PLC0415
 
-    from cvtgs.render import render  # noqa: PLC0415
+    from cvtgs.rendering import render  # noqa: PLC0415
     from cvtgs.simplify import Simplifier  # noqa: PLC0415
     from cvtgs.synthetic import demo_scene  # noqa: PLC0415
     from cvtgs.views import automatic_views  # noqa: PLC0415

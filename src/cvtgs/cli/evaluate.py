@@ -17,7 +17,7 @@ from cvtgs.cli.looking import (
 from cvtgs.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
-    from cvtgs.evaluate import Evaluation, SceneScores
+    from cvtgs.evaluation import Evaluation, SceneScores
 
 SIZE = 640
 
@@ -45,7 +45,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    from cvtgs.evaluate import (  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.evaluation import (  # noqa: PLC0415 (keeps --help fast)
         EvaluationSettings,
         evaluate,
         load_photographs,

@@ -18,7 +18,7 @@ from cvtgs.cli.simplify import read_settings
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from cvtgs.evaluate import Evaluation
+    from cvtgs.evaluation import Evaluation
     from cvtgs.levels import LevelsIndex
     from cvtgs.progress import ProgressListener
     from cvtgs.scene import GaussianScene
@@ -102,7 +102,7 @@ def _scores(
     names: "Sequence[str]",
     listener: "ProgressListener",
 ) -> "Evaluation":
-    from cvtgs.evaluate import EvaluationSettings, evaluate  # noqa: PLC0415
+    from cvtgs.evaluation import EvaluationSettings, evaluate  # noqa: PLC0415
     from cvtgs.filters import valid_rows  # noqa: PLC0415
 
     device = looking_device(options)

@@ -37,12 +37,12 @@ def run(options: argparse.Namespace) -> None:
     """Run the command."""
     import torch  # noqa: PLC0415 (keeps --help fast)
 
-    from cvtgs.evaluate.compare import as_bytes  # noqa: PLC0415
-    from cvtgs.evaluate.comparison_files import make_folder  # noqa: PLC0415
-    from cvtgs.evaluate.images import encode  # noqa: PLC0415
+    from cvtgs.evaluation.compare import as_bytes  # noqa: PLC0415
+    from cvtgs.evaluation.comparison_files import make_folder  # noqa: PLC0415
+    from cvtgs.evaluation.images import encode  # noqa: PLC0415
     from cvtgs.io import atomic_output, check_output, load  # noqa: PLC0415
     from cvtgs.progress import ProgressEvent  # noqa: PLC0415
-    from cvtgs.render import render  # noqa: PLC0415
+    from cvtgs.rendering import render  # noqa: PLC0415
 
     check_looking_options(options)
     scene = load(options.input).to(looking_device(options))

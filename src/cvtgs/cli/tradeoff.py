@@ -46,7 +46,7 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    from cvtgs.evaluate import EvaluationSettings  # noqa: PLC0415 (keeps --help fast)
+    from cvtgs.evaluation import EvaluationSettings  # noqa: PLC0415 (keeps --help fast)
     from cvtgs.tradeoff import measure_tradeoff, write_tradeoff  # noqa: PLC0415
     from cvtgs.tradeoff.files import check_tradeoff_files  # noqa: PLC0415
     from cvtgs.tradeoff.runs import tasks_of  # noqa: PLC0415

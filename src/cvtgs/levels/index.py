@@ -5,7 +5,7 @@ from typing import Self
 import pydantic
 import torch
 
-from cvtgs.evaluate import SceneScores
+from cvtgs.evaluation import SceneScores
 from cvtgs.scene import GaussianScene
 from cvtgs.simplify import Level
 

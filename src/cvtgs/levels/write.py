@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from cvtgs.evaluate import Evaluation
+from cvtgs.evaluation import Evaluation
 from cvtgs.io import atomic_output, check_output, check_save, save
 from cvtgs.levels.index import LevelEntry, LevelsIndex
 from cvtgs.simplify import Level

@@ -230,7 +230,7 @@ class Simplifier:
     def _refined(
         self, simplified: Simplified, full: GaussianScene, cameras: Cameras | None
     ) -> Simplified:
-        from cvtgs.refine import join_reports, refine  # noqa: PLC0415 (most never need it)
+        from cvtgs.refinement import join_reports, refine  # noqa: PLC0415 (most never need it)
 
         plan, choices = simplified.report.plan, self.config.effects
         ours, theirs = (limited(scene, choices) for scene in (simplified.scene, full))

@@ -12,7 +12,7 @@ from cvtgs.effects import EffectPlan, imaged, plan_effects
 from cvtgs.io.ply.properties import lacks_third_scale
 from cvtgs.math import activations
 from cvtgs.math.frames import RobustFrame, robust_frame
-from cvtgs.render import contributions
+from cvtgs.rendering import contributions
 from cvtgs.report import StageClock
 from cvtgs.scene import GaussianScene
 from cvtgs.views import mixed_views

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cvtgs.errors import MissingDependencyError
-from cvtgs.evaluate.comparison_files import PAGE, make_folder
-from cvtgs.evaluate.page import comparison_page
+from cvtgs.evaluation.comparison_files import PAGE, make_folder
+from cvtgs.evaluation.page import comparison_page
 from cvtgs.io import atomic_output, check_output
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.tradeoff.chart import tradeoff_chart

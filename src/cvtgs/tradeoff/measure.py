@@ -14,7 +14,7 @@ import torch
 from cvtgs.cameras import Cameras
 from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import RunError
-from cvtgs.evaluate import Comparison, EvaluationSettings, SceneScores, compare
+from cvtgs.evaluation import Comparison, EvaluationSettings, SceneScores, compare
 from cvtgs.io import load
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.scene import GaussianScene
@@ -58,7 +58,7 @@ def measure_tradeoff(
     that users see. Then all results are looked at from the same views. A run that fails is
     warned about and listed; the others go on.
 
-    Memory: here, what :func:`cvtgs.evaluate.compare` needs; the processes need theirs one after
+    Memory: here, what :func:`cvtgs.evaluation.compare` needs; the processes need theirs one after
     the other.
 
     Args:

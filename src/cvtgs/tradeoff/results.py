@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import pydantic
 
-from cvtgs.evaluate.scores import Evaluation
+from cvtgs.evaluation.scores import Evaluation
 from cvtgs.report import SimplifyReport
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from cvtgs.evaluate.labels import megabytes
+from cvtgs.evaluation.labels import megabytes
 from cvtgs.tradeoff.results import Tradeoff, TradeoffResult
 
 MARK = "*"

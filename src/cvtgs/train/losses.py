@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.evaluate import psnr
+from cvtgs.evaluation import psnr
 from cvtgs.losses import relative_loss
 from cvtgs.mergenet import MergeNet, Residuals
-from cvtgs.render import render
+from cvtgs.rendering import render
 from cvtgs.train.cases import Case
 from cvtgs.train.config import LossConfig, TrainConfig
 from cvtgs.train.crops import crop_cells

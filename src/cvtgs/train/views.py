@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.render import render
+from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
 from cvtgs.views import automatic_views, views_from_anywhere
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.math import quaternions
-from cvtgs.render import render
+from cvtgs.rendering import render
 from cvtgs.views.survey import Survey
 from cvtgs.views.voxels import SIZE
 

@@ -1,6 +1,0 @@
-"""Fine-tune a simplified scene against images of the full one."""
-
-from cvtgs.config import RefineConfig
-from cvtgs.refine.refine import Refined, join_reports, refine
-
-__all__ = ["RefineConfig", "Refined", "join_reports", "refine"]

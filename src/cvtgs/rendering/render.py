@@ -1,0 +1,141 @@
+"""The public entry: images of a scene, differentiable in everything that the scene is."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs.cameras import Cameras
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.math import activations
+from cvtgs.progress import ProgressListener, silent
+from cvtgs.rendering.backends import BackendName, choose_backend
+from cvtgs.rendering.output import RasterOutput
+from cvtgs.scene import GaussianScene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rendering:
+    """Images of a scene.
+
+    Attributes:
+        rgb: ``(c, h, w, 3)`` red, green, blue over the background; at least 0, and above 1 where
+            the scene's colours are.
+        alpha: ``(c, h, w)`` what the Gaussians hide of the background, 0 to 1.
+        depth: ``(c, h, w)`` mean depth of what is seen along the view axis, scene units, 0 where
+            nothing is; None unless asked for.
+        backend: Name of what rendered.
+    """
+
+    rgb: Float[Tensor, "c h w 3"]
+    alpha: Float[Tensor, "c h w"]
+    depth: Float[Tensor, "c h w"] | None
+    backend: str
+
+
+def render(
+    scene: GaussianScene,
+    cameras: Cameras,
+    *,
+    backend: BackendName = "auto",
+    background: Float[Tensor, "3"] | Float[Tensor, "c 3"] | None = None,
+    sh_degree: int | None = None,
+    depth: bool = False,
+    listener: ProgressListener = silent,
+) -> Rendering:
+    """Render a scene by the rules of 3DGS (Kerbl et al. 2023).
+
+    EWA projection with a dilation of 0.3 squared pixels, alpha at most 0.99, contributions under
+    1/255 skipped, front to back until the transmittance would fall under 1e-4. Scenes tagged
+    ``SplatRenderMode: mip`` get the opacity compensation of Mip-Splatting (Yu et al. 2024). Where
+    3DGS cuts a Gaussian at three standard deviations, rounded up to tiles, this ends where alpha
+    falls under 1/255, so that no image depends on tiles.
+
+    The result is differentiable in means, quats, log scales, opacity logits, sh0, shN and in the
+    background; cameras are constants. Gaussians whose place, shape or opacity is not
+    finite paint nothing.
+
+    Memory: cameras are rendered one by one; each backend's ``rasterize`` states its formula.
+
+    Args:
+        scene: The Gaussians; their device and dtype are those of the images.
+        cameras: From where to look, any dtype and device.
+        backend: ``torch``, ``numba`` (CPU), ``gsplat`` (CUDA) or ``auto``, the fastest of them
+            that works on the scene's device.
+        background: Colour behind everything, for all cameras or for each; black if None.
+        sh_degree: Degree up to which colours depend on the direction; the scene's if None.
+        depth: Whether to give depths too.
+        listener: Told about each camera.
+
+    Returns:
+        The images.
+
+    Raises:
+        InvalidArgumentError: A camera is no pinhole camera, the background has another shape,
+            the scene has no such SH degree, or there is no such backend.
+        DeviceError: The backend does not work on the scene's device.
+        MissingDependencyError: The backend's package is missing.
+
+    Example:
+        >>> from cvtgs.cameras import look_at
+        >>> from cvtgs.synthetic import demo_scene
+        >>> viewmats = look_at(
+        ...     torch.tensor([[0.0, -2, -8]]), torch.zeros(1, 3), torch.tensor([0.0, -1, 0])
+        ... )
+        >>> Ks = torch.tensor([[[40.0, 0, 32], [0, 40, 24], [0, 0, 1]]])
+        >>> cameras = Cameras(viewmats=viewmats, Ks=Ks, width=64, height=48)
+        >>> render(demo_scene(1000), cameras, backend="torch").rgb.shape
+        torch.Size([1, 48, 64, 3])
+    """
+    degree = _degree(scene, sh_degree)
+    behind = _background(scene, cameras, background)
+    name, chosen = choose_backend(backend, scene.device)
+    painting = chosen.rasterize(
+        scene, cameras.to(scene.device), sh_degree=degree, listener=listener
+    )
+    return Rendering(
+        rgb=_over(painting, behind),
+        alpha=painting.alpha,
+        depth=_mean_depth(painting) if depth else None,
+        backend=name,
+    )
+
+
+def _degree(scene: GaussianScene, sh_degree: int | None) -> int:
+    if sh_degree is None:
+        return scene.sh_degree
+    if not 0 <= sh_degree <= scene.sh_degree:
+        raise InvalidArgumentError(
+            f"sh_degree must be from 0 to {scene.sh_degree}, the degree of the scene, "
+            f"found {sh_degree}."
+        )
+    return sh_degree
+
+
+def _background(
+    scene: GaussianScene, cameras: Cameras, background: Tensor | None
+) -> Float[Tensor, "c_or_1 3"] | None:
+    if background is None:
+        return None
+    if not isinstance(background, Tensor) or background.shape not in ((3,), (len(cameras), 3)):
+        found = (
+            f"shape {tuple(background.shape)}"
+            if isinstance(background, Tensor)
+            else type(background).__name__
+        )
+        raise InvalidArgumentError(
+            f"background must be a tensor of shape (3,) or ({len(cameras)}, 3), found {found}."
+        )
+    return background.to(device=scene.device, dtype=scene.dtype).reshape(-1, 3)
+
+
+def _over(painting: RasterOutput, background: Tensor | None) -> Float[Tensor, "c h w 3"]:
+    if background is None:
+        return painting.rgb.contiguous()
+    through = 1 - painting.alpha
+    return painting.rgb + through[..., None] * background[:, None, None]
+
+
+def _mean_depth(painting: RasterOutput) -> Float[Tensor, "c h w"]:
+    return activations.divide(painting.depth, torch.where(painting.alpha > 0, painting.alpha, 1))

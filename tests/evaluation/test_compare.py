@@ -1,0 +1,261 @@
+"""Scores, comparisons, error maps, sheets, pages and photographs."""
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+import torch
+
+import cvtgs
+from cvtgs.errors import InputError, InvalidArgumentError
+from cvtgs.evaluation import (
+    Evaluation,
+    EvaluationSettings,
+    compare,
+    evaluate,
+    load_photographs,
+    lpips,
+    psnr,
+    ssim,
+    write_exhibition,
+)
+from cvtgs.evaluation.error_maps import ERROR_SCALE, error_map
+from cvtgs.evaluation.images import encode, read_image
+from cvtgs.evaluation.judge import Judge
+from cvtgs.evaluation.labels import megabytes
+from cvtgs.evaluation.page import comparison_page
+from cvtgs.evaluation.sheet import contact_sheet, error_sheet
+from cvtgs.rendering import render
+from cvtgs.views import automatic_views
+from lpips_cases import random_images, random_weights
+
+OFF = EvaluationSettings(lpips="off")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return cvtgs.synthetic.scene("object", 3000, sh_degree=1, seed=0)
+
+
+@pytest.fixture(scope="module")
+def cameras(scene):
+    return automatic_views(scene, 3, width=48, height=36)
+
+
+@pytest.fixture(scope="module")
+def small(scene):
+    return {
+        rho: cvtgs.Simplifier(device="cpu").simplify(scene, float(rho)) for rho in ("0.1", "0.01")
+    }
+
+
+@pytest.fixture(scope="module")
+def comparison(scene, small, cameras):
+    return compare(scene, small, cameras, sizes={"full": 123_456, "0.1": 12_345}, settings=OFF)
+
+
+def test_scores_are_those_of_the_metrics(scene, small, cameras):
+    evaluation = evaluate(scene, small, cameras, settings=OFF)
+    truth, image = (render(s, cameras).rgb.clamp(0, 1) for s in (scene, small["0.1"]))
+    scores = evaluation.scenes[0]
+    assert (scores.name, scores.count) == ("0.1", 300)
+    assert scores.psnr.views == pytest.approx(psnr(image, truth).tolist(), rel=1e-5)
+    assert scores.ssim.views == pytest.approx(ssim(image, truth).tolist(), rel=1e-5)
+    assert scores.psnr.mean == pytest.approx(sum(scores.psnr.views) / 3)
+    assert scores.lpips is None
+    assert evaluation.lpips_note == "not asked for"
+    assert evaluation.scenes[1].psnr.mean < scores.psnr.mean
+    assert evaluation.views == ("view 1", "view 2", "view 3")
+
+
+def test_the_full_scene_is_rendered_once_per_view(scene, small, cameras):
+    seen = []
+    evaluate(scene, small, cameras, settings=OFF, on_image=lambda v, n, p: seen.append((v, n)))
+    assert seen == [(view, name) for view in range(3) for name in ("full", "0.1", "0.01")]
+
+
+def test_progress_counts_images(scene, small, cameras):
+    events = []
+    evaluate(scene, small, cameras, settings=OFF, listener=events.append)
+    assert [(event.done, event.total) for event in events] == [(k, 9) for k in range(10)]
+
+
+def test_an_equal_scene_is_infinitely_close_and_survives_json(scene, cameras):
+    evaluation = evaluate(scene, {"same": scene}, cameras, settings=OFF)
+    assert math.isinf(evaluation.scenes[0].psnr.mean)
+    assert evaluation.scenes[0].ssim.mean == pytest.approx(1)
+    assert '"mean": "Infinity"' in evaluation.to_json()
+    assert Evaluation.model_validate_json(evaluation.to_json()) == evaluation
+
+
+def test_missing_lpips_weights_are_named_not_fatal(scene, small, cameras, monkeypatch, tmp_path):
+    monkeypatch.setenv("CVTGS_LPIPS_WEIGHTS", str(tmp_path))
+    evaluation = evaluate(scene, small, cameras)
+    assert evaluation.lpips_network is None
+    assert "lpips_alex*.pth" in evaluation.lpips_note
+    with pytest.raises(cvtgs.errors.InputNotFoundError):
+        evaluate(scene, small, cameras, settings=EvaluationSettings(lpips="vgg"))
+
+
+def test_photographs_are_scored_for_every_scene(scene, small, cameras):
+    photographs = render(scene, cameras).rgb.clamp(0, 1) * 0.9
+    evaluation = evaluate(scene, small, cameras, settings=OFF, photographs=photographs)
+    assert [scores.name for scores in evaluation.photographs] == ["full", "0.1", "0.01"]
+    full, tenth, _ = evaluation.photographs
+    assert tenth.psnr.mean < full.psnr.mean < 40
+    with pytest.raises(ValueError, match=r"photographs must have shape \(3, 36, 48, 3\)"):
+        evaluate(scene, small, cameras, settings=OFF, photographs=photographs[:2])
+
+
+def test_evaluate_refuses_what_makes_no_sense(scene, cameras):
+    with pytest.raises(ValueError, match="'full' is that of the full scene"):
+        evaluate(scene, {"full": scene}, cameras, settings=OFF)
+    with pytest.raises(ValueError, match="at least one camera"):
+        evaluate(scene, {"a": scene}, cameras.select(torch.tensor([], dtype=torch.long)))
+    with pytest.raises(ValueError, match="lpips must be auto, vgg, alex or off, found 'x'"):
+        evaluate(scene, {"a": scene}, cameras, settings=EvaluationSettings(lpips="x"))
+
+
+def test_the_background_shows_through(scene, small, cameras):
+    settings = EvaluationSettings(lpips="off", background=(1.0, 1.0, 1.0))
+    white = compare(scene, small, cameras, settings=settings)
+    assert (white.full[:, 0, 0] == 255).all()
+
+
+def test_photographs_are_found_by_name_suffix_and_last_part(tmp_path, cameras):
+    names = ("train/a", "b.jpg", "images/c.png")
+    named = cvtgs.Cameras(
+        viewmats=cameras.viewmats, Ks=cameras.Ks, width=48, height=36, names=names
+    )
+    (tmp_path / "images").mkdir()
+    for value, path in ((50, "a.PNG"), (100, "b.png"), (150, "images/c.png"), (9, "a_mask.png")):
+        (tmp_path / path).write_bytes(encode(np.full((72, 96, 3), value, np.uint8), "png"))
+    photographs = load_photographs(tmp_path, named)
+    assert photographs.shape == (3, 36, 48, 3)
+    assert (photographs[:, 18, 24, 0] * 255).round().tolist() == [50, 100, 150]
+
+
+def test_transparent_pixels_show_the_background(tmp_path, cameras):
+    from PIL import Image  # noqa: PLC0415
+
+    one = cvtgs.Cameras(
+        viewmats=cameras.viewmats[:1], Ks=cameras.Ks[:1], width=48, height=36, names=("a",)
+    )
+    Image.new("RGBA", (48, 36), (255, 0, 0, 0)).save(tmp_path / "a.png")
+    assert load_photographs(tmp_path, one, background=(0.0, 0.5, 1.0))[0, 5, 5].tolist() == [
+        0.0,
+        0.5,
+        1.0,
+    ]
+
+
+def test_photographs_that_do_not_match_are_named(tmp_path, cameras):
+    with pytest.raises(FileNotFoundError, match="3 of 3 cameras have none, the first is 'view 1'"):
+        load_photographs(tmp_path, cameras)
+    with pytest.raises(FileNotFoundError, match="the folder of photographs must exist"):
+        load_photographs(tmp_path / "nowhere", cameras)
+    for number in (1, 2, 3):
+        (tmp_path / f"view {number}.png").write_bytes(b"no image")
+    with pytest.raises(cvtgs.errors.FileFormatError, match=r"view 1\.png: must be an image"):
+        load_photographs(tmp_path, cameras)
+    content = encode(np.zeros((36, 48, 3), np.uint8), "png")
+    (tmp_path / "view 1.png").write_bytes(content[: len(content) // 2])
+    with pytest.raises(cvtgs.errors.FileFormatError, match="must be a whole image"):
+        load_photographs(tmp_path, cameras)
+
+
+def test_error_maps_grow_brighter_with_the_error():
+    black = np.zeros((1, 4, 3), np.uint8)
+    other = np.array([[[0] * 3, [20] * 3, [60] * 3, [255] * 3]], np.uint8)
+    brightness = error_map(black, other).astype(int).sum(axis=2)[0]
+    assert (np.diff(brightness) > 0).all()
+    limit = np.full((1, 1, 3), round(255 * ERROR_SCALE), np.uint8)
+    assert error_map(black[:, :1], limit).tolist()[0][0] == pytest.approx([252, 253, 191], abs=6)
+
+
+def test_sheets_hold_every_image(comparison):
+    sheet, errors = contact_sheet(comparison), error_sheet(comparison)
+    assert sheet.dtype == errors.dtype == np.uint8
+    full = comparison.full[1]
+    windows = np.lib.stride_tricks.sliding_window_view(sheet, full.shape)[:, :, 0]
+    assert (windows == full).all(axis=(2, 3, 4)).any()
+    assert errors.shape[1] == sheet.shape[1]
+
+
+def data_of(page: str) -> dict:
+    return json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL).group(1))
+
+
+def test_the_page_holds_everything_and_needs_nothing(comparison):
+    page = comparison_page(comparison)
+    data = data_of(page)
+    assert data["reference"] == {"name": "full", "count": 3000, "bytes": 123_456}
+    assert [scene["count"] for scene in data["small"]] == [300, 30]
+    assert [scene["bytes"] for scene in data["small"]] == [12_345, None]
+    assert all(len(scene[part]) == 3 for scene in data["small"] for part in ("images", "errors"))
+    without_images = re.sub(r"data:image/webp;base64,[\w+/=]+", "", page)
+    assert not re.search(r"(https?:)?//[a-z]|src=|@import|url\(|fetch\(|XMLHttp", without_images)
+    assert "{{" not in without_images
+
+
+def test_hostile_names_stay_text(scene, cameras):
+    name = '</script><b onclick="x">{{SCRIPT}}'
+    page = comparison_page(
+        compare(scene, {name: scene}, cameras, reference_name="<i>&", settings=OFF)
+    )
+    assert "</script><b" not in page
+    assert "<title>&lt;i&gt;&amp;" in page
+    data = data_of(page)
+    assert data["small"][0]["name"] == name
+    assert data["small"][0]["psnr"]["mean"] == "Infinity"
+
+
+def test_pages_are_kept_small(comparison):
+    large, tight = comparison_page(comparison), comparison_page(comparison, most_bytes=1)
+    assert len(tight) < len(large)
+
+
+def test_files_are_replaced_only_when_asked(comparison, tmp_path):
+    folder = tmp_path / "new" / "page"
+    paths = write_exhibition(comparison, folder)
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "errors.png",
+        "index.html",
+        "sheet.png",
+    ]
+    first = paths[-1].read_bytes()
+    with pytest.raises(FileExistsError, match=r"index\.html.*--overwrite"):
+        write_exhibition(comparison, folder)
+    write_exhibition(comparison, folder, overwrite=True)
+    assert paths[-1].read_bytes() == first
+    (tmp_path / "file").write_text("")
+    with pytest.raises(cvtgs.errors.OutputError, match="cannot be made"):
+        write_exhibition(comparison, tmp_path / "file" / "page")
+
+
+def test_lpips_is_a_third_number_where_there_are_weights():
+    weights = random_weights("alex")
+    image, truth = (images[0] for images in random_images(64, 64))
+    found = Judge(weights=weights).compare(image, truth)
+    wanted = lpips(image[None], truth[None], network="alex", weights=weights)
+    assert found == [*Judge(weights=None).compare(image, truth), float(wanted)]
+
+
+def test_cameras_without_names_have_no_photographs(tmp_path):
+    camera = cvtgs.Cameras(viewmats=torch.eye(4)[None], Ks=torch.eye(3)[None], width=4, height=3)
+    with pytest.raises(InvalidArgumentError, match="matched by the names of the cameras"):
+        load_photographs(tmp_path, camera)
+
+
+def test_a_photograph_that_cannot_be_opened_is_an_error(tmp_path):
+    with pytest.raises(InputError, match="the file must be readable, found: is a directory"):
+        read_image(tmp_path, (4, 3), (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("count", "text"), [(999, "999 B"), (250_000_000, "250 MB"), (5 * 10**12, "5000 GB")]
+)
+def test_bytes_in_words(count, text):
+    assert megabytes(count) == text

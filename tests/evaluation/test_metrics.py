@@ -1,0 +1,121 @@
+"""PSNR and SSIM against hand-computed values and scipy."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import correlate1d
+
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.evaluation import psnr, ssim
+from cvtgs.losses import ssim_loss
+
+
+def noisy_pair(size: tuple[int, int], noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: size[0], : size[1]]
+    waves = [0.5 + 0.4 * np.sin(x / (3 + k) + y / (5 - k)) for k in range(3)]
+    image = np.stack(waves, axis=-1)
+    return image, np.clip(image + noise * rng.standard_normal(image.shape), 0, 1)
+
+
+def ssim_by_scipy(first: np.ndarray, second: np.ndarray) -> float:
+    """Wang et al. 2004 with scipy's filters: windows inside the image only."""
+    taps = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    taps /= taps.sum()
+
+    def mean(image: np.ndarray) -> np.ndarray:
+        rows = correlate1d(image, taps, axis=0, mode="constant")
+        return correlate1d(rows, taps, axis=1, mode="constant")[5:-5, 5:-5]
+
+    values = []
+    for channel in range(3):
+        x, y = first[..., channel], second[..., channel]
+        mx, my = mean(x), mean(y)
+        vx, vy, vxy = mean(x * x) - mx**2, mean(y * y) - my**2, mean(x * y) - mx * my
+        top = (2 * mx * my + 0.01**2) * (2 * vxy + 0.03**2)
+        values.append(top / ((mx**2 + my**2 + 0.01**2) * (vx + vy + 0.03**2)))
+    return float(np.mean(values))
+
+
+def test_psnr_by_hand() -> None:
+    first = torch.zeros(2, 5, 4, 3, dtype=torch.float64)
+    second = torch.stack([first[0] + 0.1, first[1] + 1.0])
+    torch.testing.assert_close(psnr(first, second), torch.tensor([20.0, 0.0]).double())
+    one_value = first.clone()
+    one_value[0, 2, 1, 0] = 0.5
+    assert psnr(first, one_value)[0].item() == pytest.approx(10 * math.log10(60 / 0.25))
+
+
+def test_psnr_of_equal_images_is_infinite() -> None:
+    image = torch.rand(2, 3, 3, 3, generator=torch.Generator().manual_seed(0))
+    assert psnr(image, image).tolist() == [math.inf, math.inf]
+
+
+def test_images_are_clipped() -> None:
+    first, second = (torch.from_numpy(image)[None] for image in noisy_pair((16, 18), 0.2))
+    beyond = torch.where(second >= 1, second + 3, torch.where(second <= 0, second - 2, second))
+    assert not torch.equal(beyond, second)
+    for metric in (psnr, ssim):
+        assert torch.equal(metric(first, second), metric(first, beyond))
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.1, 0.5])
+@pytest.mark.parametrize("size", [(11, 11), (12, 30), (41, 37)])
+def test_ssim_against_scipy(size, noise) -> None:
+    first, second = noisy_pair(size, noise)
+    wanted = ssim_by_scipy(first, second)
+    images = [torch.from_numpy(image)[None] for image in (first, second)]
+    assert ssim(*images).item() == pytest.approx(wanted, abs=1e-12)
+    assert ssim(*[image.float() for image in images]).item() == pytest.approx(wanted, abs=1e-5)
+
+
+def test_ssim_of_nearly_equal_flat_images_survives_float32() -> None:
+    first = torch.full((1, 40, 40, 3), 0.9)
+    assert ssim(first, first + 1e-3).item() == pytest.approx(1.0, abs=1e-4)
+
+
+def test_each_image_by_itself() -> None:
+    pairs = [noisy_pair((20, 14), noise, seed) for seed, noise in enumerate((0.05, 0.2, 0.4))]
+    first, second = (
+        torch.from_numpy(np.stack(images)).float() for images in zip(*pairs, strict=True)
+    )
+    for metric in (psnr, ssim):
+        values = metric(first, second)
+        assert values.shape == (3,)
+        assert values.dtype == torch.float32
+        assert values.tolist() == sorted(values.tolist(), reverse=True)
+        for row in range(3):
+            alone = metric(first[row, None], second[row, None])
+            torch.testing.assert_close(alone[0], values[row])
+
+
+def test_the_loss_is_one_minus_the_metric() -> None:
+    first, second = (torch.from_numpy(image)[None] for image in noisy_pair((20, 14), 0.1))
+    torch.testing.assert_close(1 - ssim_loss(first, second), ssim(first, second)[0])
+
+
+def test_metrics_have_no_gradient() -> None:
+    image = torch.full((1, 12, 12, 3), 0.5, requires_grad=True)
+    for metric in (psnr, ssim):
+        assert not metric(image, image * 0.9).requires_grad
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cuda_gives_the_same_values() -> None:
+    first, second = (torch.from_numpy(image)[None].float() for image in noisy_pair((41, 37), 0.1))
+    for metric in (psnr, ssim):
+        found = metric(first.cuda(), second.cuda())
+        assert found.is_cuda
+        torch.testing.assert_close(found.cpu(), metric(first, second), rtol=1e-5, atol=1e-5)
+
+
+def test_error_texts() -> None:
+    image = torch.zeros(1, 10, 12, 3)
+    with pytest.raises(InvalidArgumentError) as error:
+        ssim(image, image)
+    assert str(error.value) == "images must have at least 11 x 11 pixels here, found 12 x 10."
+    with pytest.raises(InvalidArgumentError, match="both stacks of images must have one shape"):
+        psnr(image, image[:, :5])

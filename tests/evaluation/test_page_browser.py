@@ -1,0 +1,169 @@
+"""The page in a real browser: does its script run, does it fit a phone, is it quiet."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import cvtgs
+from cvtgs.evaluation import EvaluationSettings, compare, write_exhibition
+from cvtgs.views import automatic_views
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
+QUIET = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-dev-shm-usage",
+    "--hide-scrollbars",
+)
+
+pytestmark = pytest.mark.skipif(
+    BROWSER is None, reason=f"needs one of {', '.join(BROWSERS)} on the PATH"
+)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    scene = cvtgs.synthetic.scene("object", 1000, sh_degree=0, seed=0)
+    simplifier = cvtgs.Simplifier(device="cpu")
+    small = {f"small_{rho:g}.ply": simplifier.simplify(scene, rho) for rho in (0.1, 0.01)}
+    comparison = compare(
+        scene,
+        small | {"a_scene_with_a_name_that_is_too_long_for_any_phone.ply": scene},
+        automatic_views(scene, 3, width=64, height=48),
+        reference_name="full.ply",
+        sizes={"full.ply": 68_000, "small_0.1.ply": 6_800},
+        settings=EvaluationSettings(lpips="off"),
+    )
+    folder = tmp_path_factory.mktemp("page")
+    write_exhibition(comparison, folder)
+    return folder / "index.html", comparison.evaluation
+
+
+def layout_on_a_phone(path: Path) -> str:
+    """A window cannot be as narrow as a phone, a frame can."""
+    holder = path.parent / "phone.html"
+    holder.write_text(
+        f'<iframe id="phone" src="{path.name}" style="width:390px;height:800px;border:0"></iframe>'
+        "<script>setTimeout(() => { const page = phone.contentDocument.documentElement;"
+        "document.documentElement.dataset.layout = page.dataset.layout + ' ' + "
+        "page.scrollWidth; }, 1500)</script>",
+        encoding="utf-8",
+    )
+    html = browse(holder, "", "--allow-file-access-from-files", "--dump-dom")
+    return attribute(html, "layout")
+
+
+def browse(path: Path, hash_: str, *arguments: str) -> str:
+    command = [
+        str(BROWSER),
+        *QUIET,
+        f"--user-data-dir={path.parent / 'profile'}",
+        "--virtual-time-budget=3000",
+        *arguments,
+        path.as_uri() + hash_,
+    ]
+    done = subprocess.run(command, capture_output=True, timeout=120, check=True)
+    return done.stdout.decode()
+
+
+def dom(path: Path, hash_: str = "", size: str = "1280,900") -> str:
+    return browse(path, hash_, f"--window-size={size}", "--dump-dom")
+
+
+def attribute(html: str, name: str) -> str:
+    return re.search(rf'<html[^>]* data-{name}="([^"]*)"', html).group(1)
+
+
+def text_of(html: str, name: str) -> str:
+    return re.search(rf'id="{name}"[^>]*>([^<]*)<', html).group(1)
+
+
+def test_the_script_runs_and_shows_the_first_view(page):
+    path, evaluation = page
+    html = dom(path)
+    assert attribute(html, "ready") == "yes"
+    chosen = [attribute(html, name) for name in ("view", "small", "split", "error")]
+    assert chosen == ["1", "1", "50", "0"]
+    assert text_of(html, "title") == "full.ply"
+    assert "1,000 Gaussians · 68.0 kB" in text_of(html, "lead")
+    assert text_of(html, "view-name") == "view 1"
+    first = evaluation.scenes[0]
+    score = f"PSNR {first.psnr.views[0]:.2f} dB · SSIM {first.ssim.views[0]:.3f}"
+    assert text_of(html, "score") == score
+    assert "10\u00d7 fewer" in html
+    assert "100 Gaussians · 6.8 kB · small_0.1.ply" in html
+
+
+def test_the_address_chooses_scene_view_and_divider(page):
+    path, evaluation = page
+    html = dom(path, "#view=2&small=2&split=30")
+    chosen = [attribute(html, name) for name in ("view", "small", "split", "error")]
+    assert chosen == ["2", "2", "30", "0"]
+    assert "--split: 30" in re.search(r"<html[^>]*>", html).group(0)
+    assert text_of(html, "view-name") == "view 2"
+    assert f"PSNR {evaluation.scenes[1].psnr.views[1]:.2f} dB" in text_of(html, "score")
+    assert text_of(html, "views-title") == "Per view of small_0.01.ply"
+    assert re.search(r'<img id="small"[^>]*alt="view 2 of small_0.01.ply, 10 Gaussians"', html)
+
+
+def test_differences_and_equal_scenes_are_shown(page):
+    path, _ = page
+    html = dom(path, "#view=3&small=3&error=1")
+    assert attribute(html, "error") == "1"
+    assert "PSNR equal · SSIM 1.000" in text_of(html, "score")
+    assert re.search(r'id="differences"[^>]*aria-pressed="true"', html)
+    assert not re.search(r'id="scale"[^>]* hidden', html)
+    assert "Where a_scene_with" in html
+
+
+def test_numbers_out_of_range_are_clamped(page):
+    path, _ = page
+    html = dom(path, "#view=99&small=-1&split=400&error=x")
+    chosen = [attribute(html, name) for name in ("view", "small", "split", "error")]
+    assert chosen == ["3", "1", "100", "0"]
+
+
+def test_the_page_fits_a_phone(page):
+    path, _ = page
+    assert layout_on_a_phone(path) == "390/390 390"
+
+
+def test_the_page_asks_for_nothing(page):
+    """Its policy allows images inside the page only, and Chromium reports no breach of it."""
+    path, _ = page
+    content = path.read_text(encoding="utf-8")
+    assert "default-src 'none'; img-src data:" in content
+    assert not re.search(r"https?://", content)
+    done = subprocess.run(
+        [
+            str(BROWSER),
+            *QUIET,
+            f"--user-data-dir={path.parent / 'profile'}",
+            "--virtual-time-budget=3000",
+            "--enable-logging=stderr",
+            "--dump-dom",
+            path.as_uri(),
+        ],
+        capture_output=True,
+        timeout=120,
+        check=True,
+    )
+    console = [line for line in done.stderr.decode().splitlines() if "CONSOLE" in line]
+    assert console == []
+    assert 'data-ready="yes"' in done.stdout.decode()
+
+
+def test_a_screenshot_shows_both_scenes(page):
+    path, _ = page
+    shot = path.parent / "shot.png"
+    browse(path, "#split=50", "--window-size=1000,900", f"--screenshot={shot}")
+    assert shot.stat().st_size > 10_000

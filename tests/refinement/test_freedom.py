@@ -1,0 +1,69 @@
+"""How far each Gaussian may move: not at all where it is right from everywhere."""
+
+import math
+
+import pytest
+import torch
+
+from cvtgs import GaussianScene
+from cvtgs.math.frames import robust_frame
+from cvtgs.refinement import refine
+from cvtgs.refinement.freedom import freedom
+from refine_cases import discolored, full_scene, quick, small_scene
+from scenes import random_scene, same_bits
+
+
+def with_one_far_away(scene: GaussianScene, one: GaussianScene) -> GaussianScene:
+    """The same scene, and one Gaussian more with nothing around it."""
+    tensors = one.with_tensors({"means": one.means + 1e3}, {}).tensors()
+    return GaussianScene(
+        **{name: torch.cat([values, tensors[name]]) for name, values in scene.tensors().items()}
+    )
+
+
+def light_on(scene: GaussianScene) -> torch.Tensor:
+    return ambient_visibility(scene.means, scene.masses, robust_frame(scene.means)).float()
+
+
+def test_what_stands_for_itself_alone_does_not_move():
+    full, one = full_scene(300), full_scene(1, seed=1)
+    small = with_one_far_away(full.select(torch.arange(40)), one)
+    factors = freedom(small, with_one_far_away(full, one))
+    assert factors[-1] == 0.0
+    assert float(factors[:-1].median()) > 0.1  # pruned: they stand for others, too
+
+
+def test_copies_of_one_gaussian_share_what_it_stands_for():
+    full = full_scene(300)
+    twice = full.select(torch.arange(300).repeat(2))
+    assert not freedom(full, full).any()
+    torch.testing.assert_close(freedom(full, twice), 0.5 * light_on(full))
+
+
+@pytest.mark.parametrize("name", ["means", "log_scales", "logit_opacities", "sh0"])
+def test_what_was_changed_moves_as_it_is_seen(name):
+    full = full_scene(300)
+    changed = full.with_tensors({name: full.tensors()[name] + 1e-3}, {})
+    torch.testing.assert_close(freedom(changed, full), light_on(changed))
+
+
+def test_what_cannot_be_drawn_does_not_move():
+    full = random_scene(50)
+    means = full.means.clone()
+    means[3], means[7] = math.nan, 0.1
+    factors = freedom(full.with_tensors({"means": means}, {}), full)
+    assert factors[3] == 0.0
+    assert factors[7] > 0.0
+
+
+def test_a_refinement_leaves_exact_ones_alone_and_moves_merged_ones():
+    full = full_scene(500)
+    small = discolored(small_scene(full, 0.1), 0.5)
+    exact = (small.means[:, None] == full.means).all(dim=2).any(dim=1)
+    sh0 = torch.where(exact[:, None, None], small.sh0 - 0.5, small.sh0)
+    small = small.with_tensors({"sh0": sh0}, {})
+    free = freedom(small, full) > 0
+    scene, report = refine(small, full, steps=40, config=quick())
+    assert 0 < int((~free).sum()) < len(small)
+    assert same_bits(scene.select(~free), small.select(~free))
+    assert report.changed_count > 0

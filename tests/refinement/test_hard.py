@@ -1,0 +1,144 @@
+"""Refinement of hard scenes: hidden, invalid, single, infinite; gradients that are not finite."""
+
+import math
+from importlib import import_module
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs.math.activations import LOGIT_LIMIT
+from cvtgs.refinement import refine
+from refine_cases import as_dtype, discolored, full_scene, quick, ring, small_scene
+from scenes import same_bits
+
+
+def test_gaussians_that_no_view_shows_stay_bit_for_bit():
+    full = full_scene()
+    hidden = small_scene(full, 0.02)
+    count = len(hidden)
+    behind = hidden.with_tensors(
+        {
+            "means": torch.tensor([[-0.0, 0.0, -50.0]]).repeat(count, 1),
+            "quats": 7 * hidden.quats,
+            "logit_opacities": torch.full((count,), math.inf),
+        },
+        {},
+    )
+    seen = discolored(full)
+    both = seen.with_tensors(
+        {name: torch.cat([ours, behind.tensors()[name]]) for name, ours in seen.tensors().items()},
+        {},
+    )
+    scene, report = refine(both, full, steps=20, cameras=ring(), config=quick())
+    assert report.gain > 0
+    assert 0 < report.changed_count <= len(full)
+    assert same_bits(scene.select(torch.arange(len(full), len(both))), behind)
+
+
+def test_invalid_rows_stay_and_do_no_harm():
+    full = full_scene()
+    small = discolored(full)
+    means, logits, scales = (
+        tensor.clone() for tensor in (small.means, small.logit_opacities, small.log_scales)
+    )
+    means[0], logits[1], scales[2] = math.nan, math.nan, math.inf
+    changes = {"means": means, "logit_opacities": logits, "log_scales": scales}
+    small = small.with_tensors(changes, {})
+    scene, report = refine(small, small_scene(full, 1.0), steps=20, config=quick())
+    assert report.gain > 0
+    rows = torch.arange(3)
+    assert same_bits(scene.select(rows), small.select(rows))
+    assert cvtgs.filters.invalid_rows(scene.select(torch.arange(3, 500))) == {}
+
+
+def test_invalid_rows_of_the_full_scene_are_left_out():
+    full = full_scene()
+    means = full.means.clone()
+    means[:7] = math.nan
+    broken = full.with_tensors({"means": means}, {})
+    whole = full.select(torch.arange(7, 500))
+    small = discolored(whole)
+    first, second = (refine(small, one, steps=5, config=quick()) for one in (broken, whole))
+    assert same_bits(first.scene, second.scene)
+
+
+def test_gradients_that_are_not_finite_are_survived(monkeypatch):
+    full = full_scene()
+    descent = import_module("cvtgs.refinement.optimize")
+    honest, calls = descent.relative_loss, []
+
+    def sometimes_nan(image, target, **weights):
+        calls.append(1)
+        return honest(image, target, **weights) * (math.nan if len(calls) % 2 else 1.0)
+
+    monkeypatch.setattr(descent, "relative_loss", sometimes_nan)
+    scene, report = refine(discolored(full), full, steps=40, config=quick())
+    assert report.gain > 0.5
+    assert cvtgs.filters.invalid_rows(scene) == {}
+
+
+def test_rho_1_is_perfect_already():
+    full = full_scene()
+    small = small_scene(full, 1.0)
+    refined = refine(small, full, steps=50, config=quick())
+    assert refined.scene is small
+    assert (refined.report.stopped, refined.report.steps) == ("perfect", 0)
+    assert refined.report.psnr_after == 60
+
+
+def test_a_single_gaussian():
+    full = full_scene()
+    refined = refine(small_scene(full, 1e-9), full, steps=20, config=quick())
+    assert len(refined.scene) == 1
+    assert refined.report.gain >= 0
+
+
+@pytest.mark.parametrize("kind", [kind for kind in cvtgs.synthetic.KINDS if kind != "object"])
+def test_other_kinds_of_scenes(kind):
+    full = cvtgs.synthetic.scene(kind, 800, sh_degree=0, seed=1)
+    assert refine(small_scene(full), full, steps=10, config=quick()).report.gain >= 0
+
+
+def test_antialiased_scenes_are_shown_so():
+    full = full_scene()
+    object.__setattr__(full, "comments", ("SplatRenderMode: mip",))
+    small = small_scene(full, 0.3)
+    assert small.antialiased
+    tagged = refine(discolored(small), full, steps=20, config=quick())
+    assert tagged.scene.antialiased
+    assert tagged.report.gain > 0
+    plain = full_scene()
+    untagged = refine(discolored(small_scene(plain, 0.3)), plain, steps=20, config=quick())
+    assert untagged.report.psnr_before != tagged.report.psnr_before
+
+
+@pytest.mark.parametrize("other", [torch.float32, torch.float64])
+def test_float64_stays_float64(other):
+    full = full_scene(200)
+    small = as_dtype(discolored(full), torch.float64)
+    scene, report = refine(small, as_dtype(full, other), steps=40, config=quick())
+    assert scene.dtype == torch.float64
+    assert report.gain > 0
+
+
+def test_infinite_logits():
+    full = full_scene()
+    logits = full.logit_opacities.clone()
+    logits[::3], logits[1::3] = math.inf, -math.inf
+    hard = full.with_tensors({"logit_opacities": logits}, {})
+    scene, report = refine(discolored(hard), hard, steps=30, config=quick())
+    assert report.gain > 0
+    changed = (scene.sh0 != discolored(hard).sh0).flatten(1).any(dim=1)
+    assert float(scene.logit_opacities[changed].abs().amax()) <= LOGIT_LIMIT + 1e-5
+    assert torch.equal(scene.logit_opacities[~changed], logits[~changed])
+
+
+def test_an_empty_background_stays_empty():
+    full = full_scene(1500, degree=0)
+    small = small_scene(full, 0.05)
+    config = quick(size=48, heldout=12, patience=100)
+    refined = refine(small, full, steps=120, config=config).scene
+    views = cvtgs.views.automatic_views(full, 4, width=48, height=48, seed=3)
+    wanted, before, after = (cvtgs.render(scene, views).alpha for scene in (full, small, refined))
+    assert (after - wanted).square().mean() < (before - wanted).square().mean()

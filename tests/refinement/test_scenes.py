@@ -1,0 +1,200 @@
+"""Refinement as a whole: what is gained, what stays, when it ends, and what it tells."""
+
+import math
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs.config import Rates, SimplifyConfig
+from cvtgs.errors import DeviceError, InvalidArgumentError, InvalidSceneError
+from cvtgs.progress import ProgressEvent
+from cvtgs.refinement import RefineConfig, join_reports, refine
+from refine_cases import discolored, full_scene, quick, ring, small_scene
+from scenes import same_bits
+
+WILD = Rates(means=50, quats=5, log_scales=5, logit_opacities=50, sh0=50, shN=50)
+
+
+def test_wrong_colours_are_mended():
+    full = full_scene()
+    refined = refine(discolored(full), full, steps=60, config=quick())
+    report = refined.report
+    assert report.gain > 1
+    assert report.psnr_after == pytest.approx(report.psnr_before + report.gain)
+    assert (report.steps, report.stopped, report.heldout) == (60, "steps", 4)
+    assert 0 < report.changed_count <= 500
+    before, after = (
+        (scene.sh0 - full.sh0).abs().mean() for scene in (discolored(full), refined[0])
+    )
+    assert after < before
+
+
+def test_a_simplified_scene_gets_better_on_views_that_nobody_chose():
+    full = full_scene(2000, degree=0)
+    small = small_scene(full, 0.02)
+    refined = refine(small, full, steps=80, config=quick(size=48))
+    views = cvtgs.views.automatic_views(full, 6, width=64, height=64, seed=5)
+    before, after = (
+        cvtgs.evaluation.psnr(cvtgs.render(scene, views).rgb, cvtgs.render(full, views).rgb).mean()
+        for scene in (small, refined.scene)
+    )
+    assert refined.report.gain > 0
+    assert after > before
+
+
+def test_count_degree_layout_comments_and_extras_stay():
+    full = full_scene()
+    small = small_scene(full)
+    extras = {"label": torch.arange(len(small))}
+    small = small.with_tensors({}, extras)
+    object.__setattr__(small, "comments", ("made by hand", "SplatRenderMode: mip"))
+    object.__setattr__(small, "layout", (("x", "f4"),))
+    scene, report = refine(discolored(small), full, steps=20, config=quick())
+    assert report.changed_count > 0
+    assert (len(scene), scene.sh_degree, scene.dtype) == (len(small), 1, torch.float32)
+    assert (scene.comments, scene.layout) == (small.comments, small.layout)
+    assert torch.equal(scene.extras["label"], extras["label"])
+    lengths = torch.linalg.vector_norm(scene.quats, dim=1)
+    torch.testing.assert_close(lengths, torch.ones(len(small)))
+
+
+def test_the_scenes_that_come_in_are_not_changed():
+    full = full_scene()
+    small = small_scene(full)
+    copies = [scene.select(torch.arange(len(scene))) for scene in (small, full)]
+    refine(small, full, steps=10, config=quick())
+    assert same_bits(small, copies[0])
+    assert same_bits(full, copies[1])
+
+
+def test_never_worse():
+    """Steps so long that every scene but the first is nonsense."""
+    full = full_scene()
+    small = small_scene(full)
+    refined = refine(small, full, steps=20, config=quick(rates=WILD, half_after=10**9))
+    assert refined.scene is small
+    assert (refined.report.gain, refined.report.changed_count) == (0, 0)
+
+
+def test_it_stops_when_held_out_views_do_not_improve():
+    full = full_scene()
+    config = quick(rates=WILD, half_after=10**9, patience=3, check_every=2)
+    report = refine(small_scene(full), full, steps=500, config=config).report
+    assert (report.steps, report.stopped) == (6, "patience")
+
+
+def test_the_same_steps_give_the_same_bits_and_another_seed_others():
+    full = full_scene()
+    small = discolored(small_scene(full))
+    first, again, other = (
+        refine(small, full, steps=12, config=quick(), seed=seed) for seed in (0, 0, 1)
+    )
+    assert first.report.gain > 0
+    assert same_bits(first.scene, again.scene)
+    assert first.report.gain == again.report.gain
+    assert not same_bits(first.scene, other.scene)
+
+
+def test_without_time_for_a_step_the_scene_comes_back():
+    full = full_scene()
+    small = small_scene(full)
+    refined = refine(small, full, seconds=1e-3, config=quick())
+    assert refined.scene is small
+    assert (refined.report.steps, refined.report.stopped) == (0, "time")
+
+
+def test_time_ends_it_before_the_steps():
+    patient = quick(patience=10**6)
+    full = full_scene()
+    report = refine(small_scene(full), full, seconds=1.5, steps=10**9, config=patient).report
+    assert report.stopped == "time"
+    assert report.cost.seconds < 3
+
+
+def test_steps_of_the_configuration():
+    full = full_scene()
+    report = refine(discolored(full), full, config=quick(steps=3)).report
+    assert report.steps == 3
+
+
+def test_given_cameras():
+    full = full_scene()
+    report = refine(discolored(full), full, steps=20, cameras=ring(9), config=quick()).report
+    assert (report.heldout, report.images) == (1, 8)
+    assert report.gain > 0
+
+
+def test_every_step_is_told_with_the_gain_so_far():
+    events: list[ProgressEvent] = []
+    full = full_scene()
+    report = refine(discolored(full), full, steps=12, config=quick(), listener=events.append).report
+    assert {event.stage for event in events} == {"refine"}
+    assert [event.done for event in events] == [0, *range(1, 12), 11, 12]
+    assert {event.total for event in events} == {12}
+    notes = [event.note for event in events]
+    assert notes[:2] == ["", "+0.00 dB"]
+    assert notes[-2] == f"{report.gain:+.2f} dB"
+
+
+def test_a_listener_can_end_it():
+    def stop(event: ProgressEvent) -> None:
+        if event.done == 3:
+            raise KeyboardInterrupt
+
+    full = full_scene()
+    with pytest.raises(KeyboardInterrupt):
+        refine(discolored(full), full, steps=12, config=quick(), listener=stop)
+
+
+def test_reports_are_joined():
+    full = full_scene()
+    small, report = cvtgs.Simplifier(device="cpu").run(full, 0.1)
+    refined = refine(discolored(small), full, steps=10, config=quick())
+    joined = join_reports(report, refined)
+    assert [stage.stage for stage in joined.stages][-2:] == ["network", "refine"]
+    assert joined.refinement == refined.report
+    assert joined.mass_out == float(refined.scene.masses.sum())
+    assert joined.seconds == pytest.approx(report.seconds + refined.report.cost.seconds)
+    assert type(joined).model_validate_json(joined.to_json()) == joined
+    assert report.refinement is None
+    assert joined.config == SimplifyConfig()
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "text"),
+    [
+        ({"seconds": 0.0}, InvalidArgumentError, "above 0 and finite, found 0.0."),
+        ({"seconds": math.nan}, InvalidArgumentError, "above 0 and finite, found nan."),
+        ({"seconds": math.inf}, InvalidArgumentError, "above 0 and finite, found inf."),
+        ({"steps": 0}, InvalidArgumentError, "a whole number of at least 1, found 0."),
+        ({"steps": 2.5}, InvalidArgumentError, "a whole number of at least 1, found 2.5."),
+        ({"steps": True}, InvalidArgumentError, "a whole number of at least 1, found True."),
+        ({"cameras": ring(1)}, InvalidArgumentError, "at least 2 cameras, one of them to be held"),
+        ({"device": "abacus"}, DeviceError, "device 'abacus' cannot be used here"),
+    ],
+)
+def test_bad_arguments(options, error, text):
+    full = full_scene(50)
+    with pytest.raises(error) as caught:
+        refine(full, full, **options)
+    assert text in str(caught.value)
+
+
+@pytest.mark.parametrize("which", ["simplified", "full"])
+def test_a_scene_without_valid_rows(which):
+    full = full_scene(50)
+    bad = full.with_tensors({"means": full.means * math.nan}, {})
+    scenes = (bad, full) if which == "simplified" else (full, bad)
+    with pytest.raises(InvalidSceneError) as caught:
+        refine(*scenes, steps=1)
+    assert f"none of the 50 of the {which} scene is valid." in str(caught.value)
+
+
+def test_rates_of_zero_change_nothing():
+    full = full_scene()
+    still = Rates(means=0, quats=0, log_scales=0, logit_opacities=0, sh0=0, shN=0)
+    small = discolored(full)
+    refined = refine(small, full, steps=3, config=quick(rates=still))
+    assert refined.scene is small
+    assert RefineConfig().rates != still

@@ -1,0 +1,143 @@
+"""Contributions: what every Gaussian paints of some images, and what presets make of it."""
+
+import pytest
+import torch
+
+import cvtgs
+from baseline_cases import gaussians
+from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.cameras import Cameras, look_at
+from cvtgs.rendering import contributions
+from cvtgs.views import automatic_views
+from render_cases import one_camera
+from scenes import random_scene
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_contributions_are_alpha_times_transmittance_over_all_pixels(backend):
+    """An image of one Gaussian alone is its alpha; what stands in front dims those behind."""
+    scene = gaussians(
+        [[0.0, 0, 0], [0.2, 0, 1], [-0.5, 0.1, -1]], opacities=[0.6, 0.9, 0.3], scales=[0.2] * 3
+    )
+    cameras = one_camera(16, 12)
+    alone = [
+        cvtgs.render(scene.select(torch.tensor([row])), cameras, backend="torch").alpha[0]
+        for row in range(3)
+    ]
+    through, wanted = torch.ones_like(alone[0]), {}
+    for row in (2, 0, 1):  # front to back
+        wanted[row] = float((alone[row] * through).sum())
+        through = through * (1 - alone[row])
+    found = contributions(scene, cameras, backend=backend)
+    assert found.tolist() == pytest.approx([wanted[row] for row in range(3)], rel=1e-9)
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_they_do_not_depend_on_colours_and_sum_to_the_alpha_of_the_images(backend):
+    scene = random_scene(50, degree=1, dtype=torch.float64)
+    dark = scene.with_tensors({"sh0": scene.sh0 - 100.0}, {})
+    cameras = one_camera(16, 12)
+    found = contributions(scene, cameras, backend=backend)
+    assert torch.equal(found, contributions(dark, cameras, backend=backend))
+    alpha = cvtgs.render(scene, cameras, backend="torch").alpha
+    assert float(found.sum()) == pytest.approx(float(alpha.sum()), rel=1e-9)
+
+
+def test_what_is_hidden_is_not_visible():
+    """Behind an opaque wall nothing is, however opaque."""
+    shield = [[x / 4, y / 4, -1.0] for x in range(-4, 5) for y in range(-4, 5)]
+    back = [[x, y, z + 2] for x, y, z in shield]
+    cameras = one_camera(16, 16)
+    scene = gaussians(shield + back, opacities=[0.99] * 162, scales=[0.3] * 162)
+    seen = contributions(scene, cameras, backend="torch")
+    assert float(seen[:81].sum()) > 50 * float(seen[81:].sum())
+
+
+def test_it_needs_no_gradients_and_leaves_none():
+    scene = random_scene(20)
+    with torch.no_grad():
+        found = contributions(scene, automatic_views(scene, 1, width=16, height=16))
+    assert not found.requires_grad
+    assert scene.sh0.grad is None
+
+
+def ball_and_core(count: int = 600) -> cvtgs.GaussianScene:
+    """An opaque shell around as many Gaussians that nobody sees."""
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    core = 0.5 * torch.rand(count, 1, generator=generator) * directions
+    places = torch.cat([directions, core]).tolist()
+    return gaussians(places, opacities=[0.95] * len(places), scales=[0.08] * len(places))
+
+
+def test_cells_go_where_images_show_something():
+    scene = ball_and_core()
+    settings = {"merge.network": "false", "cvt.hidden_share": "1"}
+    blind = SimplifyConfig.compose(settings=settings)
+    seeing = SimplifyConfig.compose(
+        settings=settings | {"visibility.views": "6", "visibility.mass_share": "0.1"}
+    )
+    inside = []
+    for config in (blind, seeing):
+        small, report = Simplifier(config=config, device="cpu").run(scene, 0.1)
+        inside.append(int((small.means.norm(dim=1) < 0.6).sum()))
+        assert len(small) == 120
+    assert [stage.stage for stage in report.stages][:3] == ["check", "plan", "visibility"]
+    assert inside[1] < 0.7 * inside[0]
+
+
+def test_given_cameras_decide_what_is_seen():
+    """Only one half of a plane is in the image, and most cells lie there."""
+    steps = torch.linspace(-2, 2, 30)
+    places = [[float(x), float(y), 0.0] for x in steps for y in steps]
+    scene = gaussians(places, opacities=[0.9] * 900, scales=[0.06] * 900)
+    eye = torch.tensor([[1.2, 0.0, -3.0]])
+    cameras = Cameras(
+        viewmats=look_at(eye, torch.tensor([[1.2, 0.0, 0.0]]), torch.tensor([0.0, -1.0, 0.0])),
+        Ks=torch.tensor([[[48.0, 0, 16], [0, 48.0, 16], [0, 0, 1]]]),
+        width=32,
+        height=32,
+    )
+    config = SimplifyConfig.compose(
+        settings={
+            "merge.network": "false",
+            "visibility.views": "4",
+            "visibility.mass_share": "0.5",
+            "filter.min_opacity": "0",
+        }
+    )
+    simplifier = Simplifier(config=config, device="cpu")
+    small = simplifier.simplify(scene, 0.1, cameras=cameras)
+    assert int((small.means[:, 0] > 0).sum()) > 60
+    even = simplifier.simplify(scene, 0.1, cameras=cameras.select(torch.tensor([0, 0])))
+    assert torch.equal(even.means, small.means)
+
+
+def test_images_that_show_nothing_change_nothing():
+    scene = random_scene(200)
+    away = Cameras(
+        viewmats=look_at(
+            torch.tensor([[50.0, 0, 0]]), torch.tensor([[90.0, 0, 0]]), torch.tensor([0.0, -1, 0])
+        ),
+        Ks=torch.tensor([[[30.0, 0, 16], [0, 30.0, 16], [0, 0, 1]]]),
+        width=32,
+        height=32,
+    )
+    seeing = SimplifyConfig.compose(settings={"visibility.views": "4"})
+    one = Simplifier(config=seeing, device="cpu").simplify(scene, 0.2, cameras=away)
+    assert torch.equal(one.means, Simplifier(device="cpu").simplify(scene, 0.2).means)
+
+
+@pytest.mark.parametrize("name", ["draft", "fast", "high", "max"])
+def test_every_preset_gives_the_exact_count(name):
+    settings = {"refine.size": "32", "visibility.size": "32", "refine.heldout": "2"}
+    if name in ("high", "max"):
+        settings |= {"refine.steps": "2"}
+    config = SimplifyConfig.compose(preset=name, settings=settings)
+    scene = cvtgs.synthetic.scene("object", 700, sh_degree=1, seed=1)
+    small, report = Simplifier(config=config, device="cpu").run(scene, 0.1)
+    assert len(small) == 70
+    names = [stage.stage for stage in report.stages]
+    assert ("visibility" in names) == ("refine" in names) == (name in ("high", "max"))
+    assert ("network" in names) == (name in ("high", "max"))
+    assert report.checkpoint == ("standard" if name in ("high", "max") else "none")

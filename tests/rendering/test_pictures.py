@@ -1,0 +1,169 @@
+"""Images, by every backend that is installed: hand-computed, shapes, error texts."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.rendering import render
+from render_cases import MIP, around, backends, dtypes, scene_of, straight
+from scenes import random_scene
+
+# Hand-computed answers
+
+
+@backends
+@dtypes
+def test_one_gaussian(backend, dtype):
+    """Variance (20 px / 2 units * 0.1)^2 + 0.3 = 1.3 squared pixels, centre at (4.5, 3.5)."""
+    scene = scene_of(((0, 0, 2), (0.1, 0.1, 0.1), 0.8, (1.0, 0.5, 0.25)), dtype=dtype)
+    found = render(scene, straight(), backend=backend, depth=True)
+    assert found.rgb.dtype == found.alpha.dtype == dtype
+    for y in range(7):
+        for x in range(9):
+            alpha = 0.8 * math.exp(-((x - 4) ** 2 + (y - 3) ** 2) / (2 * 1.3))
+            alpha = alpha if alpha >= 1 / 255 else 0.0
+            assert found.alpha[0, y, x].item() == pytest.approx(alpha, abs=1e-6)
+            color = [alpha, 0.5 * alpha, 0.25 * alpha]
+            assert found.rgb[0, y, x].tolist() == pytest.approx(color, abs=1e-6)
+            assert found.depth[0, y, x].item() == pytest.approx(2.0 if alpha else 0.0, rel=1e-4)
+
+
+@backends
+def test_the_nearer_of_two_is_in_front_whatever_their_order(backend):
+    near = ((0, 0, 2), (0.5, 0.5, 0.5), 0.6, (1.0, 0, 0))
+    far = ((0, 0, 3), (0.75, 0.75, 0.75), 0.5, (0, 1.0, 0))
+    for rows in ((near, far), (far, near)):
+        pixel = render(scene_of(*rows), straight(), backend=backend).rgb[0, 3, 4].tolist()
+        assert pixel == pytest.approx([0.6, 0.4 * 0.5, 0.0])
+
+
+@backends
+def test_equal_depths_keep_the_order_of_the_scene(backend):
+    rows = [((0, 0, 2), (0.5, 0.5, 0.5), 0.6, color) for color in ((1.0, 0, 0), (0, 1.0, 0))]
+    assert render(scene_of(*rows), straight(), backend=backend).rgb[0, 3, 4].tolist() == (
+        pytest.approx([0.6, 0.4 * 0.6, 0.0])
+    )
+
+
+@backends
+def test_background_shines_through(backend):
+    scene = scene_of(((0, 0, 2), (0.5, 0.5, 0.5), 0.25, (1.0, 0, 0)))
+    cameras = straight()
+    found = render(scene, cameras, backend=backend, background=torch.tensor([0.0, 1.0, 0.5]))
+    assert found.rgb[0, 3, 4].tolist() == pytest.approx([0.25, 0.75, 0.375])
+    two = replace(cameras, viewmats=cameras.viewmats.repeat(2, 1, 1), Ks=cameras.Ks.repeat(2, 1, 1))
+    each = torch.tensor([[0.0, 0, 0], [1.0, 1, 1]])
+    found = render(scene, two, backend=backend, background=each).rgb[:, 3, 4]
+    assert found[0].tolist() == pytest.approx([0.25, 0, 0])
+    assert found[1].tolist() == pytest.approx([1.0, 0.75, 0.75])
+
+
+@backends
+def test_opacity_0_and_1(backend):
+    scene = scene_of(((0, 0, 2), (0.5, 0.5, 0.5), 0.5, (1.0, 1.0, 1.0)))
+    for logit, alpha in ((-math.inf, 0.0), (math.inf, 0.99), (40.0, 0.99), (-5.6, 0.0)):
+        changed = scene.with_tensors({"logit_opacities": torch.tensor([logit]).double()}, {})
+        found = render(changed, straight(), backend=backend)
+        assert found.alpha[0, 3, 4].item() == pytest.approx(alpha)
+
+
+@backends
+def test_light_ends_before_the_gaussian_that_would_take_the_last_of_it(backend):
+    """Of 0.02^2 = 4e-4 a third of the same kind would leave 8e-6, and half of it 13 times 1e-4."""
+    rows = [((0, 0, 2.0 + k), (9.0, 9.0, 9.0), 0.98, (1.0, 1.0, 1.0)) for k in range(4)]
+    found = render(scene_of(*rows), straight(), backend=backend).alpha[0, 3, 4].item()
+    assert found == pytest.approx(1 - 4e-4)
+    faint = [((0, 0, 2.0 + k), (9.0, 9.0, 9.0), 0.5, (1.0, 1.0, 1.0)) for k in range(40)]
+    found = render(scene_of(*faint), straight(), backend=backend).alpha[0, 3, 4].item()
+    assert found == pytest.approx(1 - 0.5**13, abs=1e-5)
+
+
+@backends
+def test_antialiased_scenes_lose_what_the_dilation_adds(backend):
+    """Bare variance 1, dilated 1.3: the opacity is multiplied by 1 / 1.3."""
+    row = ((0, 0, 2), (0.1, 0.1, 0.1), 0.8, (1.0, 1.0, 1.0))
+    for comments, alpha in (((), 0.8), (MIP, 0.8 / 1.3)):
+        found = render(scene_of(row, comments=comments), straight(), backend=backend)
+        assert found.alpha[0, 3, 4].item() == pytest.approx(alpha)
+
+
+# Shapes
+
+
+@backends
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (3, 40), (16, 16), (17, 33)])
+def test_any_size_and_number_of_cameras(backend, width, height):
+    scene = random_scene(20, degree=1)
+    for count in (0, 1, 3):
+        cameras = around(count, width, height)
+        found = render(scene, cameras, backend=backend, depth=True)
+        assert found.rgb.shape == (count, height, width, 3)
+        assert found.alpha.shape == found.depth.shape == (count, height, width)
+        assert found.backend == backend
+    assert render(scene, around(1), backend=backend).depth is None
+
+
+@backends
+def test_no_gaussians_and_none_in_view(backend):
+    background = torch.tensor([0.1, 0.2, 0.3])
+    behind = scene_of(((0, 0, -2), (0.5, 0.5, 0.5), 0.9, (1.0, 1.0, 1.0)), dtype=torch.float32)
+    empty = behind.select(torch.zeros(1, dtype=torch.bool))
+    for scene in (behind, empty):
+        found = render(scene, straight(), backend=backend, background=background, depth=True)
+        assert torch.equal(found.rgb, background.expand(1, 7, 9, 3))
+        assert not found.alpha.any()
+        assert not found.depth.any()
+
+
+# Error texts
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (
+            {"background": torch.zeros(4)},
+            "background must be a tensor of shape (3,) or (1, 3), found shape (4,).",
+        ),
+        (
+            {"background": (0, 0, 0)},
+            "background must be a tensor of shape (3,) or (1, 3), found tuple.",
+        ),
+        (
+            {"sh_degree": 2},
+            "sh_degree must be from 0 to 1, the degree of the scene, found 2.",
+        ),
+        (
+            {"backend": "opengl"},
+            "backend must be one of auto, torch, numba, gsplat, found 'opengl'.",
+        ),
+    ],
+)
+def test_wrong_arguments(options, text):
+    with pytest.raises(InvalidArgumentError) as caught:
+        render(random_scene(3), around(1), **options)
+    assert str(caught.value) == text
+
+
+@pytest.mark.parametrize(
+    ("changes", "wish"),
+    [
+        ({"viewmats": torch.full((1, 4, 4), math.nan)}, "finite viewmats and Ks"),
+        ({"viewmats": torch.zeros(1, 4, 4)}, "viewmats that have an inverse"),
+        (
+            {"Ks": torch.tensor([[[9.0, 1, 4], [0, 9, 4], [0, 0, 1]]])},
+            "Ks of pinhole cameras, focal lengths above 0 and no skew",
+        ),
+    ],
+)
+@backends
+def test_wrong_cameras(backend, changes, wish):
+    cameras = straight(dtype=torch.float32)
+    with pytest.raises(InvalidArgumentError) as caught:
+        render(random_scene(3), replace(cameras, **changes), backend=backend)
+    assert str(caught.value) == (
+        f"cameras must have {wish}; 1 of 1 have not, the first is camera 0."
+    )
