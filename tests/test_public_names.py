@@ -208,10 +208,10 @@ def test_public_names():
     assert len(cvtgs.__all__) == len(NAMES)
 
 
-@pytest.mark.parametrize("name", sorted(NAMES))
-def test_every_name_resolves_and_is_listed(name):
-    assert getattr(cvtgs, name) is not None
-    assert name in dir(cvtgs)
+def test_every_name_resolves_and_is_listed():
+    missing = [name for name in sorted(NAMES) if getattr(cvtgs, name, None) is None]
+    assert missing == []
+    assert set(dir(cvtgs)) >= NAMES
 
 
 def test_tables_agree_with_what_type_checkers_see():
@@ -225,11 +225,11 @@ def test_names_live_where_the_table_says():
         assert getattr(cvtgs, name) is getattr(import_module(home), name)
 
 
-@pytest.mark.parametrize(("module", "names"), STAGES.items(), ids=STAGES)
-def test_names_of_the_stages(module, names):
-    stage = getattr(cvtgs, module)
-    assert set(stage.__all__) == names
-    assert all(hasattr(stage, name) for name in names)
+def test_names_of_the_stages():
+    for module, names in STAGES.items():
+        stage = getattr(cvtgs, module)
+        assert set(stage.__all__) == names, module
+        assert [name for name in sorted(names) if not hasattr(stage, name)] == []
 
 
 def test_every_error_is_also_the_builtin_it_specialises():
