@@ -40,7 +40,7 @@ OWNERS = {
     "plyfile": "io/ply/generic.py",
     "tomli_w": "config/simplify.py",
     "rich": "cli/",
-    "kornia": "losses/ssim.py",
+    "kornia": "losses.py",
     "numba": "rendering/compiled.py",
     "gsplat": "rendering/gsplat_backend.py",
     "PIL": ("evaluation/images.py", "io/webp.py"),

@@ -10,7 +10,7 @@ from torch import Tensor
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation.lpips_network import NETWORKS, LpipsNetwork, Network, activations
 from cvtgs.evaluation.lpips_weights import LpipsWeights, load_lpips
-from cvtgs.losses.pairs import check_pair
+from cvtgs.losses import check_pair
 
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)

@@ -4,8 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.losses.pairs import check_pair
-from cvtgs.losses.ssim import SSIM_WINDOW, mean_ssim
+from cvtgs.losses import SSIM_WINDOW, check_pair, mean_ssim
 
 
 @torch.no_grad()
@@ -35,7 +34,7 @@ def psnr(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tens
 def ssim(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tensor, "c"]:
     """Return the structural similarity of each pair of images.
 
-    :func:`cvtgs.losses.ssim.mean_ssim` of clipped images: Gaussian window of 11 x 11 pixels and
+    :func:`cvtgs.losses.mean_ssim` of clipped images: Gaussian window of 11 x 11 pixels and
     1.5 pixels, border "valid" (only windows inside the image count), mean over places and
     channels; what scikit-image gives with ``gaussian_weights=True, sigma=1.5,
     use_sample_covariance=False``. In float32 it is within 1e-4 of float64, mostly within 1e-5.

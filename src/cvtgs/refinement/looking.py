@@ -10,7 +10,7 @@ import torch
 from cvtgs.cameras import Cameras
 from cvtgs.config import RefineConfig
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.losses.ssim import SSIM_WINDOW
+from cvtgs.losses import SSIM_WINDOW
 from cvtgs.scene import GaussianScene
 from cvtgs.views import mixed_views
 

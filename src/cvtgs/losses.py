@@ -1,0 +1,249 @@
+"""Losses between rendered images and the images that they should be."""
+
+import math
+
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.math.activations import positive_log
+
+__all__ = ["gradient_loss", "image_loss", "l1_loss", "relative_loss", "ssim_loss"]
+
+SSIM_WINDOW = 11
+"""Side of the Gaussian window in pixels; its standard deviation is 1.5 pixels."""
+
+SQUARED_FLOOR = 1e-5
+IMAGE_FLOOR = 1e-3
+"""Added to errors before their logarithm, so that near-perfect images count less."""
+
+
+def l1_loss(
+    prediction: Float[Tensor, "c h w 3"], target: Float[Tensor, "c h w 3"]
+) -> Float[Tensor, ""]:
+    """Return the mean absolute difference over images, pixels and channels.
+
+    Args:
+        prediction: ``(c, h, w, 3)`` rendered images.
+        target: ``(c, h, w, 3)`` what they should be.
+
+    Returns:
+        A scalar, 0 for equal images; differentiable in both.
+
+    Raises:
+        InvalidArgumentError: Shape, dtype or device do not fit.
+
+    Example:
+        >>> import torch
+        >>> l1_loss(torch.zeros(1, 2, 2, 3), torch.full((1, 2, 2, 3), 0.25)).item()
+        0.25
+    """
+    check_pair(prediction, target)
+    return (prediction - target).abs().mean()
+
+
+def ssim_loss(
+    prediction: Float[Tensor, "c h w 3"], target: Float[Tensor, "c h w 3"]
+) -> Float[Tensor, ""]:
+    """Return 1 minus the mean structural similarity; see :func:`cvtgs.losses.mean_ssim`.
+
+    Args:
+        prediction: ``(c, h, w, 3)`` rendered images, not clipped.
+        target: ``(c, h, w, 3)`` what they should be.
+
+    Returns:
+        A scalar from 0 (equal images) to 2; differentiable in both.
+
+    Raises:
+        InvalidArgumentError: Shape, dtype or device do not fit, or the images are smaller than
+            the window.
+
+    Example:
+        >>> import torch
+        >>> image = torch.linspace(0, 1, 12 * 13 * 3).reshape(1, 12, 13, 3)
+        >>> round(ssim_loss(image, image).item(), 5)
+        0.0
+    """
+    return 1 - mean_ssim(prediction, target).mean()
+
+
+def mean_ssim(
+    prediction: Float[Tensor, "c h w 3"], target: Float[Tensor, "c h w 3"]
+) -> Float[Tensor, "c"]:
+    """Return the structural similarity (SSIM) of each image (Wang, Bovik, Sheikh, Simoncelli 2004).
+
+    Window 11 x 11, Gaussian of 1.5 pixels, K1 = 0.01, K2 = 0.03, range of values 1, each channel
+    by itself. Border "valid", as in the paper (section III-C, equation 13): only windows inside
+    the image count, so the mean is over ``(h - 10) * (w - 10)`` places. Memory: about 12 copies
+    of one stack of images, and as much again for the gradient.
+    """
+    check_pair(prediction, target, least=SSIM_WINDOW)
+    from kornia.metrics import ssim  # noqa: PLC0415 (half a second)
+
+    similarity = ssim(
+        prediction.permute(0, 3, 1, 2),
+        target.permute(0, 3, 1, 2),
+        SSIM_WINDOW,
+        max_val=1.0,
+        eps=0.0,
+        padding="valid",
+    )
+    return similarity.mean(dim=(1, 2, 3))
+
+
+def gradient_loss(
+    prediction: Float[Tensor, "c h w 3"], target: Float[Tensor, "c h w 3"]
+) -> Float[Tensor, ""]:
+    """Return the mean of ``|dx|`` plus the mean of ``|dy|`` of the image difference.
+
+    The derivatives are differences of neighbouring pixels, inside the image only: ``w - 1`` of
+    them in a row and ``h - 1`` in a column. A constant offset costs nothing, a shifted or
+    blurred edge does.
+
+    Args:
+        prediction: ``(c, h, w, 3)`` rendered images.
+        target: ``(c, h, w, 3)`` what they should be.
+
+    Returns:
+        A scalar, at least 0; differentiable in both. An image of one column (row) has no
+        ``dx`` (``dy``), which then counts 0.
+
+    Raises:
+        InvalidArgumentError: Shape, dtype or device do not fit.
+
+    Example:
+        >>> import torch
+        >>> edge = torch.tensor([0.0, 0.5])[None, None, :, None].expand(1, 2, 2, 3)
+        >>> gradient_loss(edge, torch.zeros(1, 2, 2, 3)).item()
+        0.5
+    """
+    check_pair(prediction, target)
+    difference = prediction - target
+    return _mean_step(difference, 2) + _mean_step(difference, 1)
+
+
+def _mean_step(difference: Float[Tensor, "c h w 3"], axis: int) -> Float[Tensor, ""]:
+    steps = difference.diff(dim=axis).abs()
+    return steps.sum() / max(steps.numel(), 1)
+
+
+def image_loss(
+    prediction: Float[Tensor, "c h w 3"],
+    target: Float[Tensor, "c h w 3"],
+    *,
+    ssim_weight: float = 0.2,
+    gradient_weight: float = 0.2,
+) -> Float[Tensor, ""]:
+    """Return ``(1 - l) L1 + l (1 - SSIM) + l_g (|dx| + |dy|)``, the loss of CVT-GS.
+
+    The first two terms are those of 3DGS (Kerbl et al. 2023, equation 7); the third is
+    :func:`gradient_loss`. A term of weight 0 is not computed.
+
+    Args:
+        prediction: ``(c, h, w, 3)`` rendered images.
+        target: ``(c, h, w, 3)`` what they should be, in [0, 1].
+        ssim_weight: ``l``, from 0 to 1.
+        gradient_weight: ``l_g``, at least 0.
+
+    Returns:
+        A scalar, 0 for equal images; differentiable in both.
+
+    Raises:
+        InvalidArgumentError: A weight is out of range, shape, dtype or device do not fit, or the
+            images are smaller than the SSIM window of 11 pixels.
+
+    Example:
+        >>> import torch
+        >>> grey, white = torch.full((1, 11, 11, 3), 0.5), torch.ones(1, 11, 11, 3)
+        >>> round(image_loss(grey, white, ssim_weight=0.0).item(), 4)
+        0.5
+    """
+    if not 0 <= ssim_weight <= 1:
+        raise InvalidArgumentError(f"ssim_weight must be from 0 to 1, found {ssim_weight!r}.")
+    if not 0 <= gradient_weight < math.inf:
+        raise InvalidArgumentError(
+            f"gradient_weight must be a finite number of at least 0, found {gradient_weight!r}."
+        )
+    loss = (1 - ssim_weight) * l1_loss(prediction, target)
+    if ssim_weight:
+        loss = loss + ssim_weight * ssim_loss(prediction, target)
+    if gradient_weight:
+        loss = loss + gradient_weight * gradient_loss(prediction, target)
+    return loss
+
+
+def relative_loss(
+    prediction: Float[Tensor, "c h w 3"],
+    target: Float[Tensor, "c h w 3"],
+    *,
+    squared_weight: float = 0.5,
+    image_weight: float = 0.5,
+    ssim_weight: float = 0.0,
+) -> Float[Tensor, ""]:
+    """Return ``w_s log(mse) + w_i log(image_loss) + w_d log(1 - SSIM)``.
+
+    It falls with the PSNR of the images by as much whether they are good or poor.
+
+    A term of weight 0 is not computed.
+
+    Args:
+        prediction: ``(c, h, w, 3)`` rendered images.
+        target: ``(c, h, w, 3)`` what they should be.
+        squared_weight: ``w_s``, at least 0.
+        image_weight: ``w_i``, at least 0.
+        ssim_weight: ``w_d``, at least 0.
+
+    Returns:
+        A scalar, negative for good images; differentiable in both.
+
+    Raises:
+        InvalidArgumentError: Shape, dtype or device do not fit, or the images are smaller than
+            the SSIM window of 11 pixels.
+
+    Example:
+        >>> import torch
+        >>> grey, white = torch.full((1, 11, 11, 3), 0.5), torch.ones(1, 11, 11, 3)
+        >>> round(relative_loss(grey, white, image_weight=0.0).item(), 3)
+        -0.693
+    """
+    loss = prediction.new_zeros(())
+    if squared_weight:
+        squared = (prediction - target).square().mean()
+        loss = loss + squared_weight * positive_log(squared + SQUARED_FLOOR)
+    if image_weight:
+        loss = loss + image_weight * positive_log(image_loss(prediction, target) + IMAGE_FLOOR)
+    if ssim_weight:
+        loss = loss + ssim_weight * positive_log(ssim_loss(prediction, target) + IMAGE_FLOOR)
+    return loss
+
+
+def check_pair(
+    prediction: Float[Tensor, "c h w 3"], target: Float[Tensor, "c h w 3"], *, least: int = 1
+) -> None:
+    """Check that two stacks of images can be compared."""
+    for images in (prediction, target):
+        if not isinstance(images, Tensor) or not images.is_floating_point():
+            raise InvalidArgumentError(
+                f"images must be tensors of floats, "
+                f"found {getattr(images, 'dtype', type(images).__name__)}."
+            )
+        if images.ndim != 4 or images.shape[-1] != 3 or 0 in images.shape:
+            raise InvalidArgumentError(
+                f"images must have shape (c, h, w, 3) with nothing empty, "
+                f"found {tuple(images.shape)}."
+            )
+    if prediction.shape != target.shape:
+        raise InvalidArgumentError(
+            f"both stacks of images must have one shape, "
+            f"found {tuple(prediction.shape)} and {tuple(target.shape)}."
+        )
+    if prediction.dtype != target.dtype or prediction.device != target.device:
+        raise InvalidArgumentError(
+            f"both stacks of images must share dtype and device, found {prediction.dtype} on "
+            f"{prediction.device} and {target.dtype} on {target.device}."
+        )
+    height, width = prediction.shape[1:3]
+    if min(height, width) < least:
+        raise InvalidArgumentError(
+            f"images must have at least {least} x {least} pixels here, found {width} x {height}."
+        )
