@@ -4,11 +4,8 @@ Nothing is fetched: formulas become MathML, and types of other packages link to 
 by a table (``_extensions/external_types.py``).
 """
 
-import re
 import sys
 from pathlib import Path
-
-from sphinx.application import Sphinx
 
 import cvtgs
 
@@ -62,18 +59,3 @@ autodoc_inherit_docstrings = False
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 napoleon_attr_annotations = False
-
-
-def leave_out_missing_pages(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Drop lines of a table of contents that end in `` ?``, if there is no such page."""
-    folder = (Path(app.srcdir) / docname).parent
-
-    def keep_or_drop(line: re.Match[str]) -> str:
-        return f"{line[1]}\n" if (folder / f"{line[1]}.md").is_file() else ""
-
-    source[0] = re.sub(r"^(\S+) \?\n", keep_or_drop, source[0], flags=re.MULTILINE)
-
-
-def setup(app: Sphinx) -> None:
-    """Listen to sources."""
-    app.connect("source-read", leave_out_missing_pages)

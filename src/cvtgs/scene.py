@@ -47,8 +47,9 @@ class GaussianScene:
         shN: ``(n, k, 3)`` view-dependent SH bands, k in {0, 3, 8, 15}.
         extras: Further columns ``(n,)`` by name, of any dtype; they are carried along.
         comments: Comment lines of the file, such as ``SplatRenderMode: mip``.
-        layout: Property names and types of the file, in order; empty if there was none. Only
-            ``cvtgs.io`` reads it, to write the scene back the way it came.
+        layout: Property names and types of the file, in order; empty if there was none.
+            ``cvtgs.io`` writes the scene back in it, and a file without a third scale is one of
+            flat Gaussians.
 
     Raises:
         InvalidSceneError: Shapes, dtypes or devices do not fit together.
