@@ -189,7 +189,7 @@ def corrected_scales(
 ) -> Tensor:
     net = Simplifier(device="cpu").checkpoint.net.to(scene.dtype)  # type: ignore[union-attr]
     light = torch.ones(len(scene), dtype=torch.float64)
-    small = correct_cells(net, scene, merged, part, neighbors=neighbors, light=light)
+    small = correct_cells(net, scene, merged, part, neighbors=neighbors, visibility=light)
     return small.log_scales.double()
 
 

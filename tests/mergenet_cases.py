@@ -22,7 +22,7 @@ class Case(NamedTuple):
     merged: GaussianScene
     part: Partition
     neighbors: Tensor
-    light: Tensor
+    visibility: Tensor
 
     @property
     def cells(self) -> Tensor:
@@ -36,7 +36,7 @@ class Case(NamedTuple):
             cells=self.cells,
             neighbors=self.neighbors,
             sizes=self.part.counts,
-            light=self.light,
+            visibility=self.visibility,
         )
 
     def compose(self, residuals: Residuals) -> dict[str, Tensor]:
@@ -51,7 +51,12 @@ class Case(NamedTuple):
 
     def correct(self, net: MergeNet) -> GaussianScene:
         return correct_cells(
-            net, self.scene, self.merged, self.part, neighbors=self.neighbors, light=self.light
+            net,
+            self.scene,
+            self.merged,
+            self.part,
+            neighbors=self.neighbors,
+            visibility=self.visibility,
         )
 
     def oracle_cells(self) -> list[oracle.Cell]:
@@ -62,7 +67,7 @@ class Case(NamedTuple):
             oracle.Cell(
                 own=merged[cell],
                 members=[members[row] for row in self.part.order[start:end].tolist()],
-                lights=self.light[self.part.order[start:end]].tolist(),
+                lights=self.visibility[self.part.order[start:end]].tolist(),
                 others=[merged[other] for other in self.neighbors[cell].tolist()],
                 other_sizes=self.part.counts[self.neighbors[cell]].tolist(),
             )
@@ -86,18 +91,18 @@ def case_of(
     scene: GaussianScene,
     labels: Tensor,
     *,
-    light: Tensor | None = None,
+    visibility: Tensor | None = None,
     near: int = 8,
     config: MergeConfig | None = None,
 ) -> Case:
     """Merge given cells; lights are strewn over 0 to 1 unless given."""
     part = Partition.from_labels(labels, int(labels.amax()) + 1)
     merged = merge_cells(scene, part, config=config or MergeConfig())
-    if light is None:
-        light = torch.rand(len(scene), generator=torch.Generator().manual_seed(5))
+    if visibility is None:
+        visibility = torch.rand(len(scene), generator=torch.Generator().manual_seed(5))
     neighbors = nearest_neighbors(merged.means, near, backend="torch")
     merged = align_axes(merged, part, neighbors)
-    return Case(scene, merged, part, neighbors, light.double())
+    return Case(scene, merged, part, neighbors, visibility.double())
 
 
 def some_labels(count: int, cells: int, *, seed: int = 0) -> Tensor:
@@ -152,6 +157,6 @@ def assert_same_features(
     for name, values in features_of(first).items():
         other = features_of(second)[name]
         torch.testing.assert_close(values, other, rtol=tolerance, atol=tolerance, msg=name)
-    for name in ("places", "pair_places"):
+    for name in ("positions", "pair_positions"):
         ours, theirs = getattr(first, name).abs(), getattr(second, name).abs()
         torch.testing.assert_close(ours, theirs, rtol=tolerance, atol=tolerance, msg=name)

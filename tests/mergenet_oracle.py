@@ -256,10 +256,10 @@ def predict(weights: Mapping[str, Array], cell: Cell) -> dict[str, Array]:
         turn += 2.0 * gate[2:] * twist(place / (1.0 + np.abs(place))) / len(of_pairs)
     sizes = dense(weights, "decoder", pooled)
     return {
-        "shifts": shift,
-        "growths": 0.6 * np.tanh(sizes[:3]),
-        "turns": 0.5 * np.tanh(turn),
-        "logits": 2.0 * np.tanh(0.5 * sizes[3]),
+        "d_means": shift,
+        "d_log_scales": 0.6 * np.tanh(sizes[:3]),
+        "d_rotvecs": 0.5 * np.tanh(turn),
+        "d_logit_opacities": 2.0 * np.tanh(0.5 * sizes[3]),
         "member_colors": shares * [gate[1] for gate in of_members],
         "pair_colors": np.array([gate[1] for gate in of_pairs]) / max(1, len(of_pairs)),
     }

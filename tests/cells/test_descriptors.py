@@ -43,11 +43,11 @@ def test_two_round_members_side_by_side():
         },
         {},
     )
-    case = case_of(scene, torch.tensor([0, 0]), light=torch.tensor([1.0, 0.0]))
+    case = case_of(scene, torch.tensor([0, 0]), visibility=torch.tensor([1.0, 0.0]))
     seen = case.describe()
     far = math.log1p(2 / math.sqrt(5))
     inside = 0.3 * math.log(1 / math.sqrt(5))
-    assert seen.places.abs().tolist() == [pytest.approx([2 / math.sqrt(5), 0, 0])] * 2
+    assert seen.positions.abs().tolist() == [pytest.approx([2 / math.sqrt(5), 0, 0])] * 2
     first = seen.members[0].tolist()
     assert first[:7] == pytest.approx([far, 0, 0, far, inside, 0, 0])
     assert first[7:11] == [0, 0, 0, 0]
@@ -82,7 +82,7 @@ def test_descriptors_equal_the_oracle(seed, near):
         pairs = [oracle.describe_pairs(cell) for cell in cells]
         np.testing.assert_allclose(seen.pairs, pairs, rtol=1e-9, atol=1e-9)
         places = [[cell.own.locate(other.mean) for other in cell.others] for cell in cells]
-        np.testing.assert_allclose(seen.pair_places, places, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(seen.pair_positions, places, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -92,8 +92,8 @@ def test_shapes_and_dtypes(dtype):
     assert seen.members.shape == (60, MEMBER_FEATURES)
     assert seen.pairs.shape == (12, 8, PAIR_FEATURES)
     assert seen.cells.shape == (12, CELL_FEATURES)
-    assert seen.places.shape == (60, 3)
-    assert seen.pair_places.shape == (12, 8, 3)
+    assert seen.positions.shape == (60, 3)
+    assert seen.pair_positions.shape == (12, 8, 3)
     assert {values.dtype for values in features_of(seen).values()} == {dtype}
     assert seen.offsets.dtype == torch.int64
 
@@ -111,7 +111,7 @@ def test_some_cells_are_described_as_among_all():
         cells=keep,
         neighbors=case.neighbors[keep],
         sizes=case.part.counts,
-        light=case.light,
+        visibility=case.visibility,
     )
     members = torch.repeat_interleave(mask, case.part.counts)
     torch.testing.assert_close(some.cells, whole.cells[keep])
@@ -153,7 +153,7 @@ def test_which_way_axes_point_does_not_show(axis):
     quats[::2] = turned_about_own_axis(quats[::2], axis)
     flipped = case._replace(merged=case.merged.with_tensors({"quats": quats}, {}))
     assert_same_features(case.describe(), flipped.describe())
-    assert not torch.allclose(case.describe().places, flipped.describe().places)
+    assert not torch.allclose(case.describe().positions, flipped.describe().positions)
 
 
 @pytest.mark.parametrize("factor", [-1.0, 1e-3, 1e3])
@@ -192,7 +192,9 @@ def test_order_of_members_does_not_matter():
     case = some_case()
     shuffle = torch.randperm(60, generator=torch.Generator().manual_seed(0))
     labels = some_labels(60, 12)
-    other = case_of(case.scene.select(shuffle), labels[shuffle], light=case.light[shuffle])
+    other = case_of(
+        case.scene.select(shuffle), labels[shuffle], visibility=case.visibility[shuffle]
+    )
     first, second = case.describe(), other.describe()
     rows = shuffle[other.part.order].argsort()[case.part.order]  # where each member went
     torch.testing.assert_close(first.members, second.members[rows])
@@ -214,7 +216,7 @@ def test_order_of_neighbours_does_not_matter():
 def test_the_other_side_shows():
     """A mirrored cell differs by nothing that is seen; light from the other end does show."""
     case = some_case()
-    dark = case._replace(light=1 - case.light)
+    dark = case._replace(visibility=1 - case.visibility)
     assert not torch.allclose(case.describe().members, dark.describe().members)
     mirror = torch.tensor([-1.0, 1, 1]).double()
     flip = torch.tensor([1.0, 1, -1, -1]).double()  # of a quaternion, in the mirror x -> -x

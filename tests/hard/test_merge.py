@@ -46,7 +46,7 @@ def case_of_cells(make, dtype, device="cpu") -> Case:
     if device == "cpu":
         return case
     part = case.part.to(torch.device(device))
-    there = case.neighbors.to(device), case.light.to(device)
+    there = case.neighbors.to(device), case.visibility.to(device)
     return Case(scene, case.merged.to(device), part, *there)
 
 
@@ -135,7 +135,7 @@ def test_the_order_of_members_changes_nothing(make, dtype, preset):
 @each_case
 def test_what_the_network_sees_is_bounded(make, device, dtype):
     seen = case_of_cells(make, dtype, device).describe()
-    for name, values in {**features_of(seen), "places": seen.places}.items():
+    for name, values in {**features_of(seen), "positions": seen.positions}.items():
         assert bool(values.isfinite().all()), name
         assert values.numel() == 0 or float(values.abs().amax()) <= 50, name
 

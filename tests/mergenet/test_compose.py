@@ -22,10 +22,10 @@ def rest(case: Case) -> dict[str, torch.Tensor]:
     m, n, k = len(case.part), len(case.part.order), case.neighbors.shape[1]
     like = {"dtype": case.scene.dtype}
     return {
-        "shifts": torch.zeros(m, 3, **like),
-        "growths": torch.zeros(m, 3, **like),
-        "turns": torch.zeros(m, 3, **like),
-        "logits": torch.zeros(m, **like),
+        "d_means": torch.zeros(m, 3, **like),
+        "d_log_scales": torch.zeros(m, 3, **like),
+        "d_rotvecs": torch.zeros(m, 3, **like),
+        "d_logit_opacities": torch.zeros(m, **like),
         "member_colors": torch.zeros(n, **like),
         "pair_colors": torch.zeros(m, k, **like),
     }
@@ -39,7 +39,7 @@ def composed(case: Case, **changes: torch.Tensor) -> GaussianScene:
 def test_a_shift_is_along_the_own_axes_in_standard_deviations():
     case = some_case()
     shifts = torch.randn(12, 3, generator=torch.Generator().manual_seed(0)).double()
-    small = composed(case, shifts=shifts)
+    small = composed(case, d_means=shifts)
     for row in range(12):
         axes = oracles.rotation(case.merged.quats[row].tolist())
         move = axes @ (case.merged.scales[row] * shifts[row]).numpy()
@@ -52,7 +52,7 @@ def test_growths_and_logits_are_added():
     case = some_case()
     growths = torch.linspace(-0.6, 0.6, 36).double().reshape(12, 3)
     logits = torch.linspace(-2, 2, 12).double()
-    small = composed(case, growths=growths, logits=logits)
+    small = composed(case, d_log_scales=growths, d_logit_opacities=logits)
     assert torch.equal(small.log_scales, case.merged.log_scales + growths)
     assert torch.equal(small.logit_opacities, case.merged.logit_opacities + logits)
     rested = {name: getattr(case.merged, name) for name in ("log_scales", "logit_opacities")}
@@ -66,7 +66,7 @@ def test_a_turn_is_about_the_own_axes(axis, angle):
     case = some_case()
     turns = torch.zeros(12, 3).double()
     turns[:, axis] = angle
-    small = composed(case, turns=turns)
+    small = composed(case, d_rotvecs=turns)
     half = math.atan(angle / 2)
     turn = [math.cos(half), *(math.sin(half) if other == axis else 0.0 for other in range(3))]
     for row in range(12):

@@ -57,7 +57,9 @@ def test_members_in_any_order():
     case, net = some_case(200, 30), lively_net()
     shuffle = torch.randperm(200, generator=torch.Generator().manual_seed(0))
     labels = some_labels(200, 30)
-    there = case_of(case.scene.select(shuffle), labels[shuffle], light=case.light[shuffle])
+    there = case_of(
+        case.scene.select(shuffle), labels[shuffle], visibility=case.visibility[shuffle]
+    )
     assert_close(there.correct(net), case.correct(net), 1e-9)
 
 
@@ -99,7 +101,7 @@ def test_nothing_but_cells_of_one():
     case = case_of(scene, torch.arange(5))
     net = lively_net(torch.float32)
     small = correct_cells(
-        net, *case[:3], neighbors=case.neighbors, light=case.light, on_cells=told.append
+        net, *case[:3], neighbors=case.neighbors, visibility=case.visibility, on_cells=told.append
     )
     assert same_bits(small, scene)
     assert told == []
@@ -110,7 +112,9 @@ def test_done_cells_are_told(monkeypatch):
     scene, told = random_scene(10), []
     case = case_of(scene, torch.tensor([0, 0, 1, 2, 2, 2, 3, 3, 4, 0]), near=0)
     net = lively_net(torch.float32)
-    correct_cells(net, *case[:3], neighbors=case.neighbors, light=case.light, on_cells=told.append)
+    correct_cells(
+        net, *case[:3], neighbors=case.neighbors, visibility=case.visibility, on_cells=told.append
+    )
     assert told == [3, 4, 5]
 
 
@@ -200,7 +204,7 @@ def test_cuda_gives_the_same_gaussians(dtype, tolerance):
         case.merged.to("cuda"),
         Partition(order=case.part.order.cuda(), offsets=case.part.offsets.cuda()),
         case.neighbors.cuda(),
-        case.light.cuda(),
+        case.visibility.cuda(),
     )
     first, second = (there.correct(lively_net(dtype).cuda()) for _ in "ab")
     assert first.device.type == "cuda"

@@ -82,8 +82,8 @@ def assert_finite(tensors: dict[str, Tensor]) -> None:
 @each_hard
 def test_descriptors_are_finite_and_of_bounded_size(change, dtype):
     seen = hard_case(change, dtype).describe()
-    assert_finite(features_of(seen) | {"places": seen.places, "pairs": seen.pair_places})
-    for values in (seen.cells, seen.pairs, seen.places, seen.pair_places):
+    assert_finite(features_of(seen) | {"positions": seen.positions, "pairs": seen.pair_positions})
+    for values in (seen.cells, seen.pairs, seen.positions, seen.pair_positions):
         assert float(values.abs().amax()) <= 50
     assert bool((seen.weights >= 0).all())
 

@@ -11,16 +11,16 @@ from cvtgs.mergenet import Architecture, MergeNet, Residuals
 from mergenet_cases import case_of, fields_of, lively_net, some_case, some_labels
 from scenes import random_scene
 
-PER_CELL = ("shifts", "growths", "turns", "logits")
+PER_CELL = ("d_means", "d_log_scales", "d_rotvecs", "d_logit_opacities")
 dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
 
 def residuals_of(**changes: torch.Tensor) -> Residuals:
     rest = {
-        "shifts": torch.zeros(2, 3),
-        "growths": torch.zeros(2, 3),
-        "turns": torch.zeros(2, 3),
-        "logits": torch.zeros(2),
+        "d_means": torch.zeros(2, 3),
+        "d_log_scales": torch.zeros(2, 3),
+        "d_rotvecs": torch.zeros(2, 3),
+        "d_logit_opacities": torch.zeros(2),
         "member_colors": torch.zeros(5),
         "pair_colors": torch.zeros(2, 1),
     }
@@ -29,11 +29,13 @@ def residuals_of(**changes: torch.Tensor) -> Residuals:
 
 def test_cost_is_the_mean_square_of_the_four_kinds_of_change():
     assert residuals_of().cost().item() == 0
-    largest = residuals_of(growths=torch.full((2, 3), 0.6))
+    largest = residuals_of(d_log_scales=torch.full((2, 3), 0.6))
     assert largest.cost().item() == pytest.approx(1 / 4)
-    some = residuals_of(logits=torch.tensor([2.0, 0.0]), turns=torch.full((2, 3), -0.25))
+    some = residuals_of(
+        d_logit_opacities=torch.tensor([2.0, 0.0]), d_rotvecs=torch.full((2, 3), -0.25)
+    )
     assert some.cost().item() == pytest.approx((1 / 2 + 1 / 4) / 4)
-    assert residuals_of(shifts=torch.full((2, 3), 9.0)).cost().item() == pytest.approx(1 / 4)
+    assert residuals_of(d_means=torch.full((2, 3), 9.0)).cost().item() == pytest.approx(1 / 4)
     assert residuals_of(member_colors=torch.ones(5)).cost().item() == 0
 
 
@@ -69,10 +71,10 @@ def test_shapes(near, dtype):
     found = net(some_case(60, 12, dtype=dtype, near=near).describe())
     shapes = {name: tuple(values.shape) for name, values in fields_of(found).items()}
     assert shapes == {
-        "shifts": (12, 3),
-        "growths": (12, 3),
-        "turns": (12, 3),
-        "logits": (12,),
+        "d_means": (12, 3),
+        "d_log_scales": (12, 3),
+        "d_rotvecs": (12, 3),
+        "d_logit_opacities": (12,),
         "member_colors": (60,),
         "pair_colors": (12, near),
     }
@@ -88,12 +90,12 @@ def test_changes_are_limited(seed, growth):
     with torch.no_grad():
         found = net(case.describe())
     shares = case.describe().weights
-    assert float(found.growths.abs().amax()) <= growth
-    assert float(found.turns.abs().amax()) <= 0.5
-    assert float(found.logits.abs().amax()) <= 2.0
+    assert float(found.d_log_scales.abs().amax()) <= growth
+    assert float(found.d_rotvecs.abs().amax()) <= 0.5
+    assert float(found.d_logit_opacities.abs().amax()) <= 2.0
     assert bool((found.member_colors.abs() <= 2.0 * shares).all())
     assert float(found.pair_colors.abs().sum(dim=1).amax()) <= 0.5
-    assert float(found.growths.abs().amax()) > 0.8 * growth
+    assert float(found.d_log_scales.abs().amax()) > 0.8 * growth
 
 
 @pytest.mark.parametrize(("width", "cell_width"), [(1, 1), (7, 5), (64, 128)])
@@ -116,7 +118,7 @@ def test_cells_do_not_see_one_another():
     """Any subset of cells gets the same residuals."""
     case, net = some_case(), lively_net()
     whole = fields_of(net(case.describe()))
-    alone = case_of(case.scene, some_labels(60, 12), light=case.light, near=8)
+    alone = case_of(case.scene, some_labels(60, 12), visibility=case.visibility, near=8)
     mask = torch.arange(12) % 3 == 0
     part = alone.part.select(mask)
     members = torch.repeat_interleave(mask, alone.part.counts)
@@ -127,8 +129,8 @@ def test_cells_do_not_see_one_another():
         cells=seen.cells[mask],
         weights=seen.weights[members],
         offsets=part.offsets,
-        places=seen.places[members],
-        pair_places=seen.pair_places[mask],
+        positions=seen.positions[members],
+        pair_positions=seen.pair_positions[mask],
     )
     for name, values in fields_of(net(some)).items():
         rows = members if name == "member_colors" else mask
@@ -139,7 +141,9 @@ def test_order_of_members_does_not_matter():
     case, net = some_case(), lively_net()
     shuffle = torch.randperm(60, generator=torch.Generator().manual_seed(0))
     labels = some_labels(60, 12)
-    other = case_of(case.scene.select(shuffle), labels[shuffle], light=case.light[shuffle])
+    other = case_of(
+        case.scene.select(shuffle), labels[shuffle], visibility=case.visibility[shuffle]
+    )
     first, second = (fields_of(net(c.describe())) for c in (case, other))
     for name in (*PER_CELL, "pair_colors"):
         torch.testing.assert_close(first[name], second[name])
@@ -161,7 +165,7 @@ def test_equal_members_are_treated_equally():
     one = random_scene(1, dtype=torch.float64)
     scene = one.select(torch.zeros(6, dtype=torch.int64))
     labels, light = torch.tensor([0, 0, 0, 0, 1, 1]), torch.full((6,), 0.7)
-    found = lively_net()(case_of(scene, labels, light=light).describe())
+    found = lively_net()(case_of(scene, labels, visibility=light).describe())
     gates = found.member_colors * torch.tensor([4.0] * 4 + [2.0] * 2)
     torch.testing.assert_close(gates[:4], gates[:1].expand(4))
     torch.testing.assert_close(gates[4:], gates[4:5].expand(2))

@@ -241,12 +241,12 @@ def test_the_network_corrects_as_in_one_piece(job):
             for rows, (_, first) in zip(lone, pairs, strict=True)
         ]
     )
-    shown = partition.narrowed(lone)
+    shown = partition.keep_only(lone)
     assert int((lone >= 0).sum()) > 0
     wide = scene_of_all(job, job.wide_path)
     neighbors = cvt.nearest_neighbors(wide.means, 8, backend="scipy")
     wanted = filters.standardized(
-        correct_cells(job.network.net, scene, wide, shown, neighbors=neighbors, light=light)
+        correct_cells(job.network.net, scene, wide, shown, neighbors=neighbors, visibility=light)
     )
     small = [cvtgs.load(job.small_path(block)) for block in job.busy()]
     assert bool((wide.means != wanted.means).any())

@@ -143,7 +143,7 @@ def test_the_reference_is_what_the_network_is_given(lively):
         reference.merged,
         reference.partition,
         neighbors=reference.neighbors,
-        light=reference.light,
+        visibility=reference.light,
     )
     assert reference.neighbors.shape == (30, 8)
     assert reference.light.shape == (300,)

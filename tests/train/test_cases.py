@@ -61,7 +61,7 @@ def test_corrected_is_what_the_simplifier_does():
         reference.merged,
         reference.partition,
         neighbors=reference.neighbors,
-        light=reference.light,
+        visibility=reference.light,
     )
     for name, values in wanted.tensors().items():
         torch.testing.assert_close(getattr(corrected, name), values, rtol=1e-5, atol=1e-5)
@@ -75,7 +75,7 @@ def test_some_cells_are_seen_as_among_all():
     assert some.cells.tolist() == case.cells[rows].tolist()
     assert some.name == case.name
     every, few = net(case.descriptors), net(some.descriptors)
-    for name in ("shifts", "growths", "turns", "logits", "pair_colors"):
+    for name in ("d_means", "d_log_scales", "d_rotvecs", "d_logit_opacities", "pair_colors"):
         torch.testing.assert_close(getattr(few, name), getattr(every, name)[rows])
     changed = case.changed(every)
     for name, values in some.changed(few).items():

@@ -21,7 +21,7 @@ SIDE = 4
 
 
 def as_case(cells: Cells) -> Case:
-    light = cells.light.to(cells.scene.dtype)
+    light = cells.visibility.to(cells.scene.dtype)
     reference = Reference(cells.scene, cells.merged, cells.part, cells.neighbors, light)
     several = cells.part.counts > 1
     rows = several.nonzero()[:, 0]

@@ -24,7 +24,9 @@ def stepped(state: TrainState, steps: int) -> TrainState:
     seen = some_case(dtype=torch.float32).describe()
     for _ in range(steps):
         residuals = state.net(seen)
-        loss = (residuals.growths - 0.1).square().sum() + (residuals.shifts - 0.1).square().sum()
+        loss = (residuals.d_log_scales - 0.1).square().sum() + (
+            residuals.d_means - 0.1
+        ).square().sum()
         state.optimizer.zero_grad()
         loss.backward()
         state.optimizer.step()

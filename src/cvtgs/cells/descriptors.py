@@ -36,9 +36,9 @@ class Descriptors:
         cells: ``(m, 19)`` features of the cells.
         weights: ``(n,)`` shares of the mass of the cell; those of one cell sum to 1.
         offsets: ``(m + 1,)`` where each cell starts, and the end of the last one.
-        places: ``(n, 3)`` where members are, from the centre of the cell, in its frame and in
+        positions: ``(n, 3)`` where members are, from the centre of the cell, in its frame and in
             its standard deviations.
-        pair_places: ``(m, k, 3)`` the same of the neighbours.
+        pair_positions: ``(m, k, 3)`` the same of the neighbours.
     """
 
     members: Float[Tensor, "n d"]
@@ -46,8 +46,8 @@ class Descriptors:
     cells: Float[Tensor, "m c"]
     weights: Float[Tensor, "n"]
     offsets: Int[Tensor, "m_plus_1"]
-    places: Float[Tensor, "n 3"]
-    pair_places: Float[Tensor, "m k 3"]
+    positions: Float[Tensor, "n 3"]
+    pair_positions: Float[Tensor, "m k 3"]
 
     def __len__(self) -> int:
         """Return the number of cells."""
@@ -79,7 +79,7 @@ def describe_cells(
     cells: Int[Tensor, "m"],
     neighbors: Int[Tensor, "m k"],
     sizes: Int[Tensor, "m_all"],
-    light: Float[Tensor, "n_all"],
+    visibility: Float[Tensor, "n_all"],
 ) -> Descriptors:
     """Describe some cells to their network.
 
@@ -98,7 +98,7 @@ def describe_cells(
         cells: Which cells those are.
         neighbors: The nearest other cells of each of them.
         sizes: Number of members of every cell, of all cells.
-        light: How freely every Gaussian of the scene can be seen, 0 to 1
+        visibility: Ambient visibility of every Gaussian of the scene, 0 to 1
             (:func:`cvtgs.cvt.ambient_visibility`).
 
     Returns:
@@ -113,21 +113,25 @@ def describe_cells(
         >>> seen = describe_cells(
         ...     scene, merge_cells(scene, part, config=MergeConfig()), part,
         ...     cells=torch.arange(2), neighbors=torch.tensor([[1], [0]]), sizes=part.counts,
-        ...     light=torch.ones(5),
+        ...     visibility=torch.ones(5),
         ... )
         >>> tuple(seen.members.shape), tuple(seen.pairs.shape), tuple(seen.cells.shape)
         ((5, 19), (2, 1, 18), (2, 19))
     """
     around = neighbor_context(merged, cells=cells, neighbors=neighbors, sizes=sizes)
-    return describe_members(scene, part, around=around, light=light)
+    return describe_members(scene, part, around=around, visibility=visibility)
 
 
 def describe_members(
-    scene: GaussianScene, part: Partition, *, around: NeighborContext, light: Float[Tensor, "n_all"]
+    scene: GaussianScene,
+    part: Partition,
+    *,
+    around: NeighborContext,
+    visibility: Float[Tensor, "n_all"],
 ) -> Descriptors:
     """Describe some cells whose surroundings are known, as :func:`describe_cells` does."""
     members = activate_rows(scene, part.order)
-    lights = light.index_select(0, part.order).to(scene.dtype)
+    lights = visibility.index_select(0, part.order).to(scene.dtype)
     seen = see_members(members, around.own, part.offsets, lights)
     return Descriptors(
         members=member_features(seen, around.bare),
@@ -135,6 +139,6 @@ def describe_members(
         cells=cell_features(around.own, seen, around.sides, around.places),
         weights=seen.weights,
         offsets=part.offsets,
-        places=seen.places.clamp(-FARTHEST, FARTHEST),
-        pair_places=around.places.clamp(-FARTHEST, FARTHEST),
+        positions=seen.places.clamp(-FARTHEST, FARTHEST),
+        pair_positions=around.places.clamp(-FARTHEST, FARTHEST),
     )

@@ -78,7 +78,7 @@ class Partition:
         offsets = torch.nn.functional.pad(counts[cells].cumsum(0), (1, 0))
         return type(self)(order=self.order[members], offsets=offsets)
 
-    def narrowed(self, lone: Int[Tensor, "m"]) -> Self:
+    def keep_only(self, lone: Int[Tensor, "m"]) -> Self:
         """Leave one member in some cells.
 
         Args:
@@ -89,7 +89,7 @@ class Partition:
 
         Example:
             >>> whole = Partition.from_labels(torch.tensor([1, 0, 1]), 2)
-            >>> whole.narrowed(torch.tensor([-1, 2])).order.tolist()
+            >>> whole.keep_only(torch.tensor([-1, 2])).order.tolist()
             [1, 2]
         """
         only = torch.repeat_interleave(lone, self.counts)

@@ -64,7 +64,7 @@ def keep_representatives(
     heads, cells = scene.select(kept[lone]), lone.nonzero()[:, 0]
     tensors = _with_rows(merged.tensors(), cells, heads.tensors())
     extras = _with_rows(merged.extras, cells, heads.extras)
-    shown = partition.narrowed(torch.where(lone, kept, -1))
+    shown = partition.keep_only(torch.where(lone, kept, -1))
     return merged.with_tensors(tensors, extras), shown
 
 

@@ -42,7 +42,7 @@ def compose(
         >>> scene = make("object", 2, sh_degree=0, seed=0)
         >>> merged, none = scene.select(torch.tensor([0])), torch.zeros(1, 3)
         >>> residuals = Residuals(
-        ...     shifts=none, growths=none + 0.5, turns=none, logits=none[:, 0],
+        ...     d_means=none, d_log_scales=none + 0.5, d_rotvecs=none, d_logit_opacities=none[:, 0],
         ...     member_colors=torch.tensor([0.0, 1.0]), pair_colors=torch.zeros(1, 0),
         ... )
         >>> tensors = compose(
@@ -58,13 +58,13 @@ def compose(
     own = merged.select(cells)
     quats = quaternions.normalize(own.quats)
     moves = torch.einsum(
-        "mij,mj->mi", quaternions.to_matrices(quats), own.scales * residuals.shifts
+        "mij,mj->mi", quaternions.to_matrices(quats), own.scales * residuals.d_means
     )
     tensors = {
         "means": own.means + moves,
-        "quats": _turned(own.quats, residuals.turns),
-        "log_scales": own.log_scales + residuals.growths,
-        "logit_opacities": own.logit_opacities + residuals.logits,
+        "quats": _turned(own.quats, residuals.d_rotvecs),
+        "log_scales": own.log_scales + residuals.d_log_scales,
+        "logit_opacities": own.logit_opacities + residuals.d_logit_opacities,
     }
     near = torch.arange(len(cells) + 1, device=cells.device) * neighbors.shape[1]
     for name in ("sh0", "shN"):

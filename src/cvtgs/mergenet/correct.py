@@ -24,7 +24,7 @@ def correct_cells(
     partition: Partition,
     *,
     neighbors: Int[Tensor, "m k"],
-    light: Float[Tensor, "n"],
+    visibility: Float[Tensor, "n"],
     sizes: Int[Tensor, "m_all"] | None = None,
     on_cells: Callable[[int], None] = lambda done: None,
 ) -> GaussianScene:
@@ -37,7 +37,7 @@ def correct_cells(
             seen by their neighbours.
         partition: Members of the cells; cells of one member are not looked at.
         neighbors: The nearest other cells of every cell of the partition.
-        light: How freely every Gaussian can be seen, 0 to 1.
+        visibility: Ambient visibility of every Gaussian of the scene, 0 to 1.
         sizes: Number of members of every cell in ``merged``; None if all are in the partition.
         on_cells: Told how many cells are done.
 
@@ -55,7 +55,7 @@ def correct_cells(
         >>> untrained = MergeNet(Architecture())
         >>> corrected = correct_cells(
         ...     untrained, scene, merged, cells,
-        ...     neighbors=torch.tensor([[1], [0]]), light=torch.ones(5),
+        ...     neighbors=torch.tensor([[1], [0]]), visibility=torch.ones(5),
         ... )
         >>> bool((corrected.means == merged.means).all())
         True
@@ -75,7 +75,7 @@ def correct_cells(
             )
             for run, part in several.cut(block).chunks(CHUNK_MEMBERS, cell_cost=near):
                 rows = cells[block][run]
-                seen = describe_members(scene, part, around=around.cut(run), light=light)
+                seen = describe_members(scene, part, around=around.cut(run), visibility=visibility)
                 changed = compose(
                     scene, merged, part, cells=rows, neighbors=neighbors[rows], residuals=net(seen)
                 )

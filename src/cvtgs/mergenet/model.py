@@ -50,18 +50,18 @@ class Residuals:
     """What MergeNet changes of the merged Gaussians; zeros change nothing.
 
     Attributes:
-        shifts: ``(m, 3)`` moves of the centres, in the frame and the standard deviations of each.
-        growths: ``(m, 3)`` added to the log scales.
-        turns: ``(m, 3)`` rotation vectors in the frame of each, radians.
-        logits: ``(m,)`` added to the opacity logits.
+        d_means: ``(m, 3)`` moves of the centres, in the frame and the standard deviations of each.
+        d_log_scales: ``(m, 3)`` added to the log scales.
+        d_rotvecs: ``(m, 3)`` rotation vectors in the frame of each, radians.
+        d_logit_opacities: ``(m,)`` added to the opacity logits.
         member_colors: ``(n,)`` how much of a member's difference in colour is added.
         pair_colors: ``(m, k)`` how much of a neighbour's difference in colour is added.
     """
 
-    shifts: Float[Tensor, "m 3"]
-    growths: Float[Tensor, "m 3"]
-    turns: Float[Tensor, "m 3"]
-    logits: Float[Tensor, "m"]
+    d_means: Float[Tensor, "m 3"]
+    d_log_scales: Float[Tensor, "m 3"]
+    d_rotvecs: Float[Tensor, "m 3"]
+    d_logit_opacities: Float[Tensor, "m"]
     member_colors: Float[Tensor, "n"]
     pair_colors: Float[Tensor, "m k"]
 
@@ -72,10 +72,10 @@ class Residuals:
             A number, 0 for no change.
         """
         parts = [
-            self.growths / LARGE_GROWTH,
-            self.logits / LARGEST_LOGIT_CHANGE,
-            self.turns / LARGEST_TURN,
-            self.shifts.clamp(-1, 1),
+            self.d_log_scales / LARGE_GROWTH,
+            self.d_logit_opacities / LARGEST_LOGIT_CHANGE,
+            self.d_rotvecs / LARGEST_TURN,
+            self.d_means.clamp(-1, 1),
         ]
         return torch.stack([part.square().mean() for part in parts]).mean()
 
@@ -137,17 +137,17 @@ class MergeNet(nn.Module):
         of_members = LARGEST_MEMBER_GATE * self.member_gates(members, cells, ids)
         pair_ids = torch.arange(len(cells), device=ids.device).repeat_interleave(shape[1])
         of_pairs = LARGEST_PAIR_GATE / max(1, shape[1]) * self.pair_gates(pairs, cells, pair_ids)
-        places, pair_places = descriptors.places, descriptors.pair_places.flatten(0, 1)
+        places, pair_positions = descriptors.positions, descriptors.pair_positions.flatten(0, 1)
         pulls = segment_sum(_pulls(of_members, places, places.clamp(-5, 5)), offsets, weights)
-        near = pair_places / (1 + pair_places.abs())
-        others = _pulls(of_pairs, pair_places, near).unflatten(0, shape).sum(dim=1)
+        near = pair_positions / (1 + pair_positions.abs())
+        others = _pulls(of_pairs, pair_positions, near).unflatten(0, shape).sum(dim=1)
         # Twice, so that neighbours may turn a cell as a gate of 1 does.
         twists = pulls[:, 3:] + 2 * others[:, 3:]
         return Residuals(
-            shifts=pulls[:, :3] + others[:, :3],
-            growths=self.architecture.largest_growth * torch.tanh(sizes[:, :3]),
-            turns=LARGEST_TURN * torch.tanh(twists),
-            logits=LARGEST_LOGIT_CHANGE * torch.tanh(0.5 * sizes[:, 3]),
+            d_means=pulls[:, :3] + others[:, :3],
+            d_log_scales=self.architecture.largest_growth * torch.tanh(sizes[:, :3]),
+            d_rotvecs=LARGEST_TURN * torch.tanh(twists),
+            d_logit_opacities=LARGEST_LOGIT_CHANGE * torch.tanh(0.5 * sizes[:, 3]),
             member_colors=of_members[:, 1] * weights,
             pair_colors=of_pairs[:, 1].unflatten(0, shape),
         )

@@ -103,7 +103,7 @@ def finish(job: Job, block: int) -> None:
     survey, _ = job.read_survey()
     original, scene, light, partition = read_cells(job, block)
     own, _ = map_tensors(job.wide_path(block))
-    shown = partition.narrowed(own["lone"])
+    shown = partition.keep_only(own["lone"])
     around = _around(job, block, own["strangers"], job.wide_path)
     small, checkpoint = around.scene, job.network
     if checkpoint is not None:
@@ -113,7 +113,7 @@ def finish(job: Job, block: int) -> None:
             small,
             shown,
             neighbors=own["neighbors"],
-            light=light,
+            visibility=light,
             sizes=around.sizes,
         )
     tensors = {name: values[: around.own] for name, values in small.tensors().items()}

@@ -103,7 +103,7 @@ def finished(reference: Reference, net: MergeNet | None, *, clock: StageClock) -
                 small,
                 reference.partition,
                 neighbors=reference.neighbors,
-                light=reference.light,
+                visibility=reference.light,
                 on_cells=advance,
             )
     return filters.standardized(small)

@@ -102,7 +102,7 @@ def make_case(
         cells=cells,
         neighbors=reference.neighbors[cells],
         sizes=reference.partition.counts,
-        light=reference.light,
+        visibility=reference.light,
     )
     return Case(
         scene_name=scene_name,

@@ -68,7 +68,7 @@ def view_loss(
 
 def _price(residuals: Residuals, config: LossConfig) -> Float[Tensor, ""]:
     if not config.residual:
-        return residuals.logits.new_zeros(())
+        return residuals.d_logit_opacities.new_zeros(())
     return config.residual * residuals.cost()
 
 
