@@ -31,7 +31,7 @@ PRESETS: Mapping[str, Mapping[str, str]] = {name: {"preset": name} for name in c
 SWITCHES: Mapping[str, Mapping[str, str]] = {
     **{name: settings for name, settings in CHOICES.items() if name != "paper"},
     "no network": {"merge.network": "false"},
-    "16 views tell what is seen": {"visibility.views": "16"},
+    "visibility from 16 views": {"visibility.views": "16"},
     "100 steps of refinement": {"refine.steps": "100"},
 }
 

@@ -1,4 +1,4 @@
-"""From cells to Gaussians: members, moments and the reference; blind to how cells were made."""
+"""From labels to Gaussians: partition, moments, representatives, inflation, descriptors."""
 
 from cvtgs.cells.axes import align_axes
 from cvtgs.cells.descriptors import Descriptors, describe_cells

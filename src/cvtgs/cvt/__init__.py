@@ -1,4 +1,4 @@
-"""Weighted centroidal Voronoi tessellation of points; knows nothing of Gaussians beyond weights."""
+"""Weighted centroidal Voronoi tessellation: weights, embedding, seeds, Lloyd, search."""
 
 from cvtgs.cvt.density import falloff, tessellation_weights
 from cvtgs.cvt.embedding import embed
