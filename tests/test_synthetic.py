@@ -8,8 +8,8 @@ import torch
 from cvtgs import synthetic
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import covariances
-from cvtgs.synthetic import gloss, surfaces, textures
-from cvtgs.synthetic.assemble import allocate
+from cvtgs.synthetic import gaussians, surfaces, textures
+from cvtgs.synthetic.scenes import allocate
 
 SH_C0 = 0.28209479177387814
 
@@ -39,7 +39,7 @@ def test_allocation_adds_up(count):
 def test_highlight_peaks_where_it_should():
     peak = torch.nn.functional.normalize(torch.tensor([[0.3, -0.8, 0.5]]), dim=1)
     color = torch.tensor([[0.5, 0.4, 0.3]])
-    average, rest = gloss.highlights(peak, color, 15)
+    average, rest = gaussians.highlights(peak, color, 15)
     views = torch.nn.functional.normalize(
         torch.randn(4000, 3, generator=torch.Generator().manual_seed(1)), dim=1
     )
@@ -51,18 +51,18 @@ def test_highlight_peaks_where_it_should():
     # seen from any direction, by the basis that is left when the weights are divided out
     weights = torch.tensor([0.9] * 3 + [0.72] * 5 + [0.5] * 7)
     scale = (1 + 2.7 + 3.6 + 3.5) / (4 * math.pi)
-    basis = gloss.highlights(views, torch.ones(len(views), 3), 15)[1][:, :, 0] / weights * scale
+    basis = gaussians.highlights(views, torch.ones(len(views), 3), 15)[1][:, :, 0] / weights * scale
     seen = average + torch.einsum("vk,kc->vc", basis, rest[0])
     assert torch.allclose(seen[0], color[0], atol=1e-5)
     assert (seen[1:] < seen[0]).all()
     assert torch.allclose(seen[1:].mean(0), average[0], atol=0.01)
 
 
-def test_mirrored_light_by_hand():
+def test_reflected_light_by_hand():
     up = torch.tensor([[0.0, -1.0, 0.0]])
     light = torch.tensor([0.6, -0.8, 0.0])
     # light comes from +x and above; who looks along +x and down sees it in the floor
-    assert torch.allclose(gloss.mirrored(light, up), torch.tensor([[0.6, 0.8, 0.0]]))
+    assert torch.allclose(gaussians.reflected(light, up), torch.tensor([[0.6, 0.8, 0.0]]))
 
 
 def test_surfaces_have_orthonormal_frames_and_the_right_area():

@@ -1,11 +1,12 @@
-"""Parametric surfaces: from points of the unit square to points, frames and areas.
+"""Parametric surfaces: functions from points of the unit square to points, frames and areas.
 
-Up is -y. Every surface stands at the origin; :func:`placed` moves it.
+Up is -y. Surfaces are made at the origin; :func:`placed` moves them.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -21,11 +22,11 @@ class SurfacePoints:
 
     Attributes:
         points: ``(n, 3)`` positions.
-        normals: ``(n, 3)`` unit normals of the side that is seen.
+        normals: ``(n, 3)`` unit normals of the visible side.
         tangents: ``(n, 3)`` unit directions of the first texture coordinate.
         bitangents: ``(n, 3)`` unit directions of the second one.
         coords: ``(n, 2)`` texture coordinates, scene units.
-        areas: ``(n,)`` area of the whole surface if all of it were as sparse as here.
+        areas: ``(n,)`` area of the whole surface at the point density found here.
         rims: ``(n, 2)`` distance to the border along each texture coordinate.
     """
 
@@ -45,17 +46,41 @@ _FACES = (
     ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
     ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
     ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-)  # corner of the unit cube, and what is right and down for who looks at the face
+)
+"""Faces of the unit cube: a corner, and the directions right and down, seen from outside."""
 
 Surface = Callable[[Float[Tensor, "n 2"]], SurfacePoints]
-"""Takes points of the unit square to points of the surface."""
+"""Function from points of the unit square to points of the surface."""
 
 Heights = Callable[[Float[Tensor, "n 2"]], Float[Tensor, "n"]]
 """Height of the ground at x, z."""
 
 
-def placed(surface: Surface, offset: Float[Tensor, "3"], rotation: Float[Tensor, "3 3"]) -> Surface:
-    """Move a surface."""
+def placed(
+    surface: Surface,
+    position: tuple[float, float] = (0.0, 0.0),
+    *,
+    height: float = 0.0,
+    turn: float = 0.0,
+    tilt: float = 0.0,
+) -> Surface:
+    """Tilt a surface about x, turn it about the vertical, and put it at x, z above the ground."""
+    turned = torch.tensor(
+        [
+            [math.cos(turn), 0.0, math.sin(turn)],
+            [0.0, 1.0, 0.0],
+            [-math.sin(turn), 0.0, math.cos(turn)],
+        ]
+    )
+    tilted = torch.tensor(
+        [
+            [1.0, 0.0, 0.0],
+            [0.0, math.cos(tilt), -math.sin(tilt)],
+            [0.0, math.sin(tilt), math.cos(tilt)],
+        ]
+    )
+    rotation = turned @ tilted
+    offset = torch.tensor([position[0], -height, position[1]])
 
     def sample(square: Float[Tensor, "n 2"]) -> SurfacePoints:
         at = surface(square)
@@ -71,9 +96,9 @@ def placed(surface: Surface, offset: Float[Tensor, "3"], rotation: Float[Tensor,
 
 
 def quads(corners: Float[Tensor, "k 3"], sides: Float[Tensor, "k 2 3"]) -> Surface:
-    """Make parallelograms; their normals are ``sides[:, 1] x sides[:, 0]``.
+    """Build parallelograms; their normals are ``sides[:, 1] x sides[:, 0]``.
 
-    Seen from where the normal points, texture coordinates go right and down if the sides do.
+    Seen from outside, texture coordinates go right and down if the sides do.
     """
     crosses = torch.linalg.cross(sides[:, 1], sides[:, 0])
     areas = torch.linalg.vector_norm(crosses, dim=1)
@@ -102,14 +127,14 @@ def quads(corners: Float[Tensor, "k 3"], sides: Float[Tensor, "k 2 3"]) -> Surfa
 
 
 def boxes(lows: Float[Tensor, "k 3"], sizes: Float[Tensor, "k 3"]) -> Surface:
-    """Make axis-aligned boxes, seen from outside, six faces each."""
+    """Build axis-aligned boxes, six faces each."""
     corners = lows[:, None] + torch.tensor([corner for corner, _, _ in _FACES]) * sizes[:, None]
     faces = torch.tensor([(right, down) for _, right, down in _FACES]) * sizes[:, None, None]
     return quads(corners.reshape(-1, 3), faces.reshape(-1, 2, 3))
 
 
 def revolution(profile: Float[Tensor, "k 2"]) -> Surface:
-    """Turn a profile about the vertical axis."""
+    """Build a surface of revolution of a profile of (radius, height) about the vertical."""
     steps = profile.diff(dim=0)
     lengths = torch.linalg.vector_norm(steps, dim=1)
     bands = math.pi * (profile[1:, 0] + profile[:-1, 0]) * lengths
@@ -146,20 +171,20 @@ def revolution(profile: Float[Tensor, "k 2"]) -> Surface:
 
 
 def sphere(radius: float) -> Surface:
-    """Make a sphere around the origin."""
+    """Build a sphere around the origin."""
     angle = torch.linspace(-math.pi / 2, math.pi / 2, 257)
     return revolution(radius * torch.stack([torch.cos(angle).abs(), torch.sin(angle)], dim=1))
 
 
 def torus(radius: float, thickness: float) -> Surface:
-    """Make a torus that lies around the origin; ``thickness`` is the radius of the tube."""
+    """Build a horizontal torus around the origin; ``thickness`` is the radius of the tube."""
     angle = torch.linspace(-math.pi, math.pi, 257)
     ring = torch.stack([torch.cos(angle), torch.sin(angle)], dim=1)
     return revolution(torch.tensor([radius, 0.0]) + thickness * ring)
 
 
 def ground(heights: Heights, *, core: float, radius: float, hole: float = 0.0) -> Surface:
-    """Make a round piece of ground, dense inside ``core`` and ever sparser outside."""
+    """Build a disc of ground, sampled densely inside ``core`` and ever sparser outside."""
     start = core**2 + hole**2
     growth = math.log((core**2 + radius**2) / start)
 
@@ -191,7 +216,7 @@ def ground(heights: Heights, *, core: float, radius: float, hole: float = 0.0) -
 
 
 def dome(radius: float, lowest: float) -> Surface:
-    """Make the sky: a sphere seen from inside, without what is below."""
+    """Build the sky: the upper part of a sphere, seen from inside."""
 
     def sample(square: Float[Tensor, "n 2"]) -> SurfacePoints:
         rise = 1.0 - (1.0 - lowest) * square[:, 1]
@@ -210,3 +235,72 @@ def dome(radius: float, lowest: float) -> Surface:
         )
 
     return sample
+
+
+def box(width: float, height: float, depth: float) -> Surface:
+    """Build a box that stands on the origin."""
+    size = torch.tensor([[width, height, depth]])
+    return boxes(size * torch.tensor([-0.5, -1.0, -0.5]), size)
+
+
+def table(width: float, height: float, depth: float) -> Surface:
+    """Build a board on four legs."""
+    legs = torch.tensor([(x, z) for x in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    feet = legs * (torch.tensor([width, depth]) - 0.1) - 0.025
+    lows = torch.stack([feet[:, 0], torch.full((4,), 0.05 - height), feet[:, 1]], dim=1)
+    board = torch.tensor([[-0.5 * width, -height, -0.5 * depth]])
+    sizes = torch.tensor([[width, 0.05, depth]] + [[0.05, height - 0.05, 0.05]] * 4)
+    return boxes(torch.cat([board, lows]), sizes)
+
+
+def wall(start: tuple[float, float], end: tuple[float, float], height: float) -> Surface:
+    """Build a wall between two positions on the ground."""
+    middle = (0.5 * (start[0] + end[0]), 0.5 * (start[1] + end[1]))
+    turn = -math.atan2(end[1] - start[1], end[0] - start[0])
+    return placed(box(math.dist(start, end), height, 0.24), middle, turn=turn)
+
+
+def upright_rectangle(width: float, height: float) -> Surface:
+    """Build an upright rectangle with its foot at the origin, seen from -z."""
+    sides = torch.tensor([[[width, 0.0, 0.0], [0.0, height, 0.0]]])
+    return quads(torch.tensor([[-0.5 * width, -height, 0.0]]), sides)
+
+
+def room_shell(width: float, height: float, depth: float) -> tuple[Surface, Surface, Surface]:
+    """Build the walls, the floor and the ceiling of a room, seen from inside."""
+    across, away = torch.tensor([width, 0.0, 0.0]), torch.tensor([0.0, 0.0, depth])
+    down = torch.tensor([0.0, height, 0.0])
+    left_back = -0.5 * across - 0.5 * away - down
+    corners = torch.stack(
+        [left_back + away, left_back + across, left_back, left_back + across + away]
+    )
+    sides = torch.stack([torch.stack([right, down]) for right in (across, -across, away, -away)])
+    floor = quads((left_back + down + away)[None], torch.stack([across, -away])[None])
+    ceiling = quads(left_back[None], torch.stack([across, away])[None])
+    return quads(corners, sides), floor, ceiling
+
+
+def column(radius: float, height: float) -> Surface:
+    """Build a column with base and capital."""
+    profile = [
+        (0.0, 0.0), (1.5, 0.0), (1.5, 0.05), (1.15, 0.08), (1.0, 0.1), (0.97, 0.5), (0.88, 0.9),
+        (1.1, 0.92), (1.45, 0.96), (1.45, 1.0), (0.0, 1.0),
+    ]  # fmt: skip
+    return revolution(torch.tensor(profile) * torch.tensor([radius, height]))
+
+
+def disc(radius: float, height: float) -> Surface:
+    """Build a round plate."""
+    return revolution(torch.tensor([(0.0, 0.0), (radius, 0.0), (radius, height), (0.0, height)]))
+
+
+def vase(height: float, *, belly: float, neck: float, low: float) -> Surface:
+    """Build a vase: a foot, a belly, a neck and a lip."""
+    knots = torch.tensor([(0.16, 0.0), (belly, low), (neck, 0.8), (0.2, 1.0)])
+    share = torch.linspace(0, 1, 40)[1:, None]
+    eased = 0.5 - 0.5 * torch.cos(math.pi * share)
+    bends = [
+        torch.lerp(start, end, torch.cat([eased, share], dim=1))
+        for start, end in pairwise(knots.unbind())
+    ]
+    return revolution(height * torch.cat([torch.tensor([(0.0, 0.0), (0.16, 0.0)]), *bends]))

@@ -8,8 +8,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.scene import GaussianScene
-from cvtgs.synthetic.chunks import Chunk, Draw, frames_of, gaussians
-from cvtgs.synthetic.splats import light, opacities, shine
+from cvtgs.synthetic.gaussians import (
+    Chunk,
+    Draw,
+    diffuse_light,
+    gaussians,
+    rotations_from_axes,
+    specular_colors,
+)
 from cvtgs.synthetic.textures import Texture
 
 _MANY_BLADES = 12_000  # more blades than these are slimmer, so that the ground still shows
@@ -20,8 +26,8 @@ class Strands:
     """Straight pieces of round rods.
 
     Attributes:
-        starts: ``(k, 3)`` where they start.
-        ends: ``(k, 3)`` where they end.
+        starts: ``(k, 3)`` first end of each.
+        ends: ``(k, 3)`` other end of each.
         radii: ``(k,)`` their radii.
     """
 
@@ -31,7 +37,7 @@ class Strands:
 
 
 def joined(*strands: Strands) -> Strands:
-    """Take several sets of strands as one."""
+    """Concatenate sets of strands."""
     return Strands(
         starts=torch.cat([s.starts for s in strands]),
         ends=torch.cat([s.ends for s in strands]),
@@ -53,7 +59,7 @@ def railing(start: Float[Tensor, "3"], along: Float[Tensor, "3"], height: float)
 
 
 def wire(start: Float[Tensor, "3"], end: Float[Tensor, "3"], sag: float) -> Strands:
-    """Hang a wire between two points; it sags by ``sag`` units in the middle."""
+    """Build a wire between two points; it sags by ``sag`` units in the middle."""
     share = torch.linspace(0, 1, 33)[:, None]
     points = torch.lerp(start.expand(33, 3), end.expand(33, 3), share)
     points = points + 4 * sag * share * (1 - share) * torch.tensor([0.0, 1.0, 0.0])
@@ -63,7 +69,7 @@ def wire(start: Float[Tensor, "3"], end: Float[Tensor, "3"], sag: float) -> Stra
 def tree(
     foot: Float[Tensor, "3"], height: float, generator: torch.Generator
 ) -> tuple[Strands, Float[Tensor, "k 3"]]:
-    """Grow a tree: each branch carries four thinner ones, four times over."""
+    """Grow a tree, four thinner branches on each for four levels; return it and its tips."""
     starts, directions = foot[None, :], torch.tensor([[0.0, -1.0, 0.0]])
     length, radius = 0.38 * height, 0.028 * height
     levels = []
@@ -83,7 +89,7 @@ def tree(
     return joined(*levels), levels[-1].ends
 
 
-def rods(strands: Strands, texture: Texture, gloss: float) -> Draw:
+def rods(strands: Strands, texture: Texture, specular: float) -> Draw:
     """Cover strands with Gaussians: needles where they are thinner than the spacing."""
     axes = strands.ends - strands.starts
     lengths = torch.linalg.vector_norm(axes, dim=1).clamp_min(1e-6)
@@ -92,14 +98,14 @@ def rods(strands: Strands, texture: Texture, gloss: float) -> Draw:
     ends = (weights / weights.sum()).double().cumsum(0)
 
     def draw(chunk: Chunk) -> GaussianScene:
-        square = chunk.positions()
+        square = chunk.square_points()
         target = square[:, 0].double()
         piece = torch.searchsorted(ends, target, right=True).clamp_max(len(ends) - 1)
         share = (1.0 - (ends[piece] - target) * weights.sum() / weights[piece]).float()
         share = share.clamp(0.02, 0.98)
         radius, length, axis = strands.radii[piece], lengths[piece], axes[piece]
         side = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])[(axis[:, 0].abs() > 0.7).long()]
-        local = frames_of(axis, side)
+        local = rotations_from_axes(axis, side)
         angle = 2 * math.pi * square[:, 1:]
         outward = torch.cos(angle) * local[:, :, 1] + torch.sin(angle) * local[:, :, 2]
         step = length * weights.sum() / (weights[piece] * chunk.total)
@@ -109,16 +115,16 @@ def rods(strands: Strands, texture: Texture, gloss: float) -> Draw:
         along = torch.minimum(along * chunk.lognormals(1.0, 0.35), 0.45 * length)
         thin = torch.minimum(0.6 * around, chunk.lognormals(0.3, 0.5) * around)
         along_coords = share * length + piece
-        average, rest = shine(outward, gloss, chunk)
+        average, rest = specular_colors(outward, specular, chunk)
         colors = texture(torch.stack([angle[:, 0] * radius, along_coords], dim=1))
         return gaussians(
             means=strands.starts[piece]
             + (share * length)[:, None] * axis
             + (0.6 * radius)[:, None] * outward,
-            frames=frames_of(axis, torch.linalg.cross(outward, axis)),
+            rotations=rotations_from_axes(axis, torch.linalg.cross(outward, axis)),
             scales=torch.stack([along, around, thin], dim=1),
-            opacities=opacities(chunk, -1.0),
-            colors=colors * light(outward) + average + 0.02 * chunk.normals(3),
+            opacities=chunk.opacities(-1.0),
+            colors=colors * diffuse_light(outward) + average + 0.02 * chunk.normals(3),
             rest=rest,
         )
 
@@ -126,7 +132,7 @@ def rods(strands: Strands, texture: Texture, gloss: float) -> Draw:
 
 
 def grass(roots: Float[Tensor, "k 3"], height: float, colors: tuple[Texture, Texture]) -> Draw:
-    """Plant blades of grass: one needle each, leaning any way."""
+    """Make blades of grass: one needle each, leaning in any direction."""
 
     def draw(chunk: Chunk) -> GaussianScene:
         tuft = (chunk.uniforms() * len(roots)).long()
@@ -139,23 +145,23 @@ def grass(roots: Float[Tensor, "k 3"], height: float, colors: tuple[Texture, Tex
         slimness = math.sqrt(min(1.0, _MANY_BLADES / chunk.total))
         across = along * chunk.lognormals(0.07 * slimness, 0.3)
         side = chunk.directions()
-        frames = frames_of(axis, side)
+        rotations = rotations_from_axes(axis, side)
         flat = means[:, [0, 2]]
         shade = torch.lerp(colors[0](flat), colors[1](flat), chunk.uniforms(1))
         return gaussians(
             means=means,
-            frames=frames,
+            rotations=rotations,
             scales=torch.stack([along, across, 0.15 * across], dim=1),
-            opacities=opacities(chunk, -0.5),
+            opacities=chunk.opacities(-0.5),
             colors=shade * (0.8 + 0.2 * chunk.normals(1)),
-            rest=shine(side, 0.0, chunk)[1],
+            rest=specular_colors(side, 0.0, chunk)[1],
         )
 
     return draw
 
 
 def leaves(tips: Float[Tensor, "k 3"], spread: float, texture: Texture) -> Draw:
-    """Hang leaves around the tips of branches, enough to be nearly opaque together."""
+    """Make leaves around the tips of branches, nearly opaque together."""
 
     def draw(chunk: Chunk) -> GaussianScene:
         tip = (chunk.uniforms() * len(tips)).long()
@@ -164,16 +170,16 @@ def leaves(tips: Float[Tensor, "k 3"], spread: float, texture: Texture) -> Draw:
         size = spread * math.sqrt(1.6 * len(tips) / chunk.total)
         length = chunk.lognormals(size, 0.4).clamp_max(0.7 * spread)
         width = length * (0.35 + 0.4 * chunk.uniforms())
-        frames = chunk.frames()
-        facing = frames[:, :, 2] * torch.where(frames[:, 1:2, 2] > 0, -1.0, 1.0)
+        rotations = chunk.rotations()
+        facing = rotations[:, :, 2] * torch.where(rotations[:, 1:2, 2] > 0, -1.0, 1.0)
         outward = torch.nn.functional.normalize(facing + 0.5 * offset, dim=1)
         return gaussians(
             means=means,
-            frames=frames,
+            rotations=rotations,
             scales=torch.stack([length, width, 0.06 * width], dim=1),
-            opacities=opacities(chunk, 0.0),
-            colors=texture(means[:, :2]) * light(outward) * (1 + 0.15 * chunk.normals(1)),
-            rest=shine(outward, 0.0, chunk)[1],
+            opacities=chunk.opacities(0.0),
+            colors=texture(means[:, :2]) * diffuse_light(outward) * (1 + 0.15 * chunk.normals(1)),
+            rest=specular_colors(outward, 0.0, chunk)[1],
         )
 
     return draw
