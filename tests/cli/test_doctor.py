@@ -10,8 +10,8 @@ import torch
 
 import cvtgs
 from cvtgs.cli import doctor
+from cvtgs.cli.doctor import BACKENDS, version_lines, version_of
 from cvtgs.cli.main import main
-from cvtgs.cli.versions import BACKENDS, version_lines, version_of
 
 
 def test_version_names_what_computes(capsys):
@@ -32,7 +32,7 @@ def test_version_of_what_is_there_and_what_is_not():
 
 def test_version_loads_nothing():
     code = (
-        "import sys; from cvtgs.cli.versions import version_lines; version_lines();"
+        "import sys; from cvtgs.cli.doctor import version_lines; version_lines();"
         "print([name for name in ('torch', 'numpy', 'numba') if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

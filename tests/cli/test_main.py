@@ -62,6 +62,51 @@ def test_wrong_usage_exits_with_2(words, capsys):
     assert "usage: cvtgs" in capsys.readouterr().err
 
 
+def test_without_a_command_the_help_is_printed(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main([])
+    assert stopped.value.code == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err == build_parser().format_help()
+
+
+@pytest.mark.parametrize(
+    ("words", "end"),
+    [
+        (["simplif", "in.ply", "out.ply"], "; did you mean simplify?\n"),
+        (["simplify", "in.ply", "out.ply", "--rhoo=0.1"], ": --rhoo; did you mean --rho?\n"),
+        (["evaluate", "a.ply", "b.ply", "--backend", "numbaa"], "; did you mean numba?\n"),
+        (["info", "a.ply", "--zzz"], "unrecognized argument: --zzz\n"),
+    ],
+)
+def test_mistyped_words_get_a_suggestion(words, end, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(words)
+    assert stopped.value.code == 2
+    assert capsys.readouterr().err.endswith(end)
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--set", "iterations=3"], "iterations: is not a known setting; did you mean cvt.iterat"),
+        (["--set", "refine.rates.mean=0"], "did you mean refine.rates.means?"),
+        (["--effects", "hase=on"], "effects.hase: is not a known setting; did you mean effects.ha"),
+        (["--set", "nothing.like=it"], "nothing: is not a known setting.\n"),
+    ],
+)
+def test_mistyped_settings_get_a_suggestion(words, text, capsys):
+    assert main(["simplify", "in.ply", "out.ply", "--rho", "0.1", *words]) == 1
+    assert text in capsys.readouterr().err
+
+
+def test_options_may_be_shortened_and_files_may_have_odd_names(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["info", "--js", "--", "--missing.ply"]) == 1
+    assert capsys.readouterr().err.startswith("cvtgs: error: --missing.ply: ")
+
+
 def test_an_error_is_one_sentence_on_stderr(tmp_path, capsys):
     missing = tmp_path / "missing.ply"
     assert main(["info", str(missing)]) == 1

@@ -106,12 +106,12 @@ def test_a_line_per_validation_and_a_summary(again, made, tmp_path, capsys):
 
 
 def test_the_worst_scene_is_told(capsys):
-    from cvtgs.cli.train import _show  # noqa: PLC0415
+    from cvtgs.cli.train import print_validation  # noqa: PLC0415
 
     history = History()
     gains = {"a": {0.1: 1.0, 0.01: 3.0}, "b": {0.1: -0.5}}
     history.validations.append(Validation(step=7, loss=-1.23456, gains=gains))
-    _show(history)
+    print_validation(history)
     assert capsys.readouterr().out == (
         "step 7: loss -1.235, dB gained: +0.25 (least -0.50) at 0.1, +3.00 (least +3.00) at 0.01\n"
     )

@@ -1,11 +1,13 @@
-"""``cvtgs demo``: the main job on a scene that the library makes itself."""
+"""``cvtgs demo``: a generated scene, simplified and compared."""
 
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cvtgs.cli.display import PRESET_NAMES, file_size, progress_bars
+import cvtgs
+from cvtgs.cli.display import file_size, progress_bars
+from cvtgs.cli.options import AddParser, add_options
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import SceneScores
@@ -15,73 +17,70 @@ RATIOS = (0.1, 0.01, 0.001)
 VIEWS, WIDTH, HEIGHT = 8, 640, 480
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command."""
-    parser = commands.add_parser(
+def add_demo(add_parser: AddParser) -> None:
+    """Add the command and its options."""
+    parser = add_parser(
         "demo",
-        help="try it on a generated scene; needs no files",
-        description="Generate a scene, make it 10, 100 and 1000 times smaller, write all four, "
-        "and a page to look at them side by side.",
+        help="simplify a generated scene; needs no files",
+        description="Generate a scene, make it 10, 100 and 1000 times smaller, and write all four "
+        "and a page that shows them side by side.",
     )
+    parser.set_defaults(run=demo)
     parser.add_argument(
         "-o",
         "--output",
         type=Path,
         default=Path("cvtgs-demo"),
         metavar="DIR",
-        help="directory to write to (default cvtgs-demo); an earlier demo in it is replaced",
+        help="directory to write to (default cvtgs-demo); the files of an earlier demo are "
+        "replaced",
     )
     parser.add_argument(
-        "--count", type=int, default=200_000, metavar="N", help="Gaussians to generate (200000)"
+        "--count",
+        type=int,
+        default=200_000,
+        metavar="N",
+        help="number of Gaussians to generate (default 200000)",
     )
+    add_options(parser, "--preset")
     parser.add_argument(
-        "--preset", default="standard", metavar="NAME", help=f"{PRESET_NAMES} (standard)"
+        "--seed", type=int, default=0, metavar="N", help="seed of the generated scene (default 0)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the generated scene")
-    parser.add_argument(
-        "--device", default="auto", metavar="DEVICE", help="auto (default), cpu or cuda"
-    )
-    parser.add_argument("--quiet", action="store_true", help="print errors and warnings only")
-    parser.set_defaults(run=run)
+    add_options(parser, "--device", "--quiet")
 
 
-def run(options: argparse.Namespace) -> None:
-    """Run the command."""
-    from cvtgs.evaluation import (  # noqa: PLC0415 (keeps --help fast)
-        EvaluationSettings,
-        compare,
-        write_exhibition,
-    )
-    from cvtgs.evaluation.comparison_files import make_folder  # noqa: PLC0415
-    from cvtgs.io import save  # noqa: PLC0415
-    from cvtgs.simplify import Simplifier  # noqa: PLC0415
-    from cvtgs.synthetic import demo_scene  # noqa: PLC0415
-    from cvtgs.views import automatic_views  # noqa: PLC0415
+def demo(options: argparse.Namespace) -> None:
+    """Run ``cvtgs demo``."""
+    from cvtgs.evaluation.comparison_files import make_folder
 
     make_folder(options.output)
     with progress_bars(quiet=options.quiet) as listener:
-        simplifier = Simplifier(config=options.preset, device=options.device, listener=listener)
-        scene = demo_scene(options.count, seed=options.seed)
+        simplifier = cvtgs.Simplifier(
+            config=options.preset or "standard", device=options.device, listener=listener
+        )
+        scene = cvtgs.synthetic.demo_scene(options.count, seed=options.seed)
         path = options.output / "full.ply"
-        save(scene, path, overwrite=True)
+        cvtgs.save(scene, path, overwrite=True)
         columns = [_column(path, len(scene), ())]
         sizes, smaller = {path.name: path.stat().st_size}, {}
         for rho in RATIOS:
             small, report = simplifier.run(scene, rho)
             path = options.output / f"small_{rho:g}.ply"
-            save(small, path, overwrite=True)
+            cvtgs.save(small, path, overwrite=True)
             columns.append(_column(path, len(small), report.stages))
             sizes[path.name], smaller[path.name] = path.stat().st_size, small
-        comparison = compare(
+        comparison = cvtgs.evaluation.compare(
             scene,
             smaller,
-            automatic_views(scene, VIEWS, width=WIDTH, height=HEIGHT),
+            cvtgs.views.automatic_views(scene, VIEWS, width=WIDTH, height=HEIGHT),
             reference_name="full.ply",
             sizes=sizes,
-            settings=EvaluationSettings(lpips="off"),
+            settings=cvtgs.evaluation.EvaluationSettings(lpips="off"),
             listener=listener,
         )
-        write_exhibition(comparison, options.output, overwrite=True, listener=listener)
+        cvtgs.evaluation.write_exhibition(
+            comparison, options.output, overwrite=True, listener=listener
+        )
     if not options.quiet:
         scores = [{}, *map(_scores, comparison.evaluation.scenes)]
         _print_table([one | other for one, other in zip(columns, scores, strict=True)])
@@ -99,9 +98,9 @@ def _column(path: Path, count: int, stages: "Sequence[StageCost]") -> dict[str, 
 
 
 def _print_table(columns: list[dict[str, str]]) -> None:
-    from rich.box import SIMPLE_HEAD  # noqa: PLC0415 (keeps --help fast)
-    from rich.console import Console  # noqa: PLC0415
-    from rich.table import Table  # noqa: PLC0415
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
 
     first, *other_rows = columns[-1]
     table = Table(first, *(column[first] for column in columns), box=SIMPLE_HEAD)

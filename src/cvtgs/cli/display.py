@@ -1,4 +1,4 @@
-"""What the commands share when they show something: sizes, seconds, progress bars."""
+"""Texts that several commands print: sizes, times, progress bars."""
 
 import sys
 from collections.abc import Iterator, Sequence
@@ -6,20 +6,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cvtgs
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 
 if TYPE_CHECKING:
     from cvtgs.report import StageCost
-
-
-READABLE = ".ply, .spz, .splat, .sog, .ckpt, .pt or the folder of a trained model"
-"""What ``cvtgs.load`` reads, for help texts."""
-
-WRITABLE = ".ply, .compressed.ply, .spz, .splat or .sog"
-"""What ``cvtgs.save`` writes, for help texts."""
-
-PRESET_NAMES = "from the fastest to the best: draft, fast, standard, high, max; or paper"
-"""The presets, for help texts."""
 
 
 def size_text(count: int) -> str:
@@ -35,14 +26,12 @@ def size_text(count: int) -> str:
 
 
 def file_size(path: Path) -> str:
-    """Return the size of a file, or of the scene in a folder."""
-    from cvtgs.io import scene_size  # noqa: PLC0415 (keeps --help fast)
-
-    return size_text(scene_size(path))
+    """Return the size of a scene file, or of the scene in a folder."""
+    return size_text(cvtgs.io.scene_size(path))
 
 
 def stage_seconds(stages: Sequence["StageCost"]) -> str:
-    """Return the time of all stages, and of each."""
+    """Return the time of all stages together, and of each."""
     total = f"{sum(stage.seconds for stage in stages):.2f} s"
     parts = ", ".join(f"{stage.stage} {stage.seconds:.2f}" for stage in stages)
     return f"{total} ({parts})" if parts else total
@@ -50,12 +39,12 @@ def stage_seconds(stages: Sequence["StageCost"]) -> str:
 
 @contextmanager
 def progress_bars(*, quiet: bool) -> Iterator[ProgressListener]:
-    """Show a bar per stage on stderr, if that is a terminal."""
+    """Show a bar per stage on stderr if it is a terminal."""
     if quiet or not sys.stderr.isatty():
         yield silent
         return
-    from rich.console import Console  # noqa: PLC0415 (only for terminals)
-    from rich.progress import Progress, TaskID  # noqa: PLC0415
+    from rich.console import Console
+    from rich.progress import Progress, TaskID
 
     with Progress(console=Console(stderr=True)) as progress:
         bars: dict[str, TaskID] = {}
@@ -65,7 +54,7 @@ def progress_bars(*, quiet: bool) -> Iterator[ProgressListener]:
                 bars[event.stage] = progress.add_task(event.stage, total=event.total)
             progress.update(bars[event.stage], completed=event.done, total=event.total)
             if event.note:
-                said = f"{event.stage} {event.note}"
-                progress.update(bars[event.stage], description=said)
+                text = f"{event.stage} {event.note}"
+                progress.update(bars[event.stage], description=text)
 
         yield listen

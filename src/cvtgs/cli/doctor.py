@@ -1,11 +1,15 @@
-"""``cvtgs doctor``: which devices and backends work here, and how long a small run takes."""
+"""``cvtgs doctor`` and ``cvtgs --version``: versions, devices, backends and a small timed run."""
 
 import argparse
+import platform
 import time
+from collections.abc import Sequence
+from importlib import metadata
 from itertools import pairwise
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
-from cvtgs.cli.versions import version_lines
+import cvtgs
+from cvtgs.cli.options import AddParser
 from cvtgs.errors import CvtgsError, DeviceError
 
 if TYPE_CHECKING:
@@ -13,36 +17,78 @@ if TYPE_CHECKING:
 
     from cvtgs.rendering import BackendName
 
-COUNT, RHO = 20_000, 0.1
-SIDE = 256
+BACKENDS = ("torch", "numpy", "scipy", "numba", "gsplat")
+"""The packages that compute; the last two are optional."""
+
 RENDERERS = ("torch", "numba", "gsplat")
+COUNT, RHO, SIDE = 20_000, 0.1, 256
+"""The small run: Gaussians, ratio, and width and height of an image in pixels."""
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command."""
-    parser = commands.add_parser(
+class ShowVersions(argparse.Action):
+    """Print the versions and exit, without loading any of the packages."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **settings: Any) -> None:
+        super().__init__(option_strings, dest, nargs=0, **settings)
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> NoReturn:
+        """Print the versions and exit."""
+        print("\n".join(version_lines()))
+        parser.exit()
+
+
+def version_lines() -> list[str]:
+    """Return a line for cvtgs, for Python, and for every package that computes."""
+    lines = [f"cvtgs {cvtgs.__version__}", f"Python {platform.python_version()}"]
+    return lines + [f"{name} {version_of(name)}" for name in BACKENDS]
+
+
+def version_of(package: str) -> str:
+    """Return the version of a package."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def add_doctor(add_parser: AddParser) -> None:
+    """Add the command and its options."""
+    parser = add_parser(
         "doctor",
-        help="say what works on this machine",
-        description="Say which devices and backends work here, and time a small run on a "
-        "generated scene. Ends with 0 if the default path works, else with 1.",
+        help="check what works on this machine",
+        description="Show which devices and backends work on this machine, and time a small run "
+        "on a generated scene. Ends with 0 if the default path works, else with 1.",
     )
+    parser.set_defaults(run=doctor)
     parser.add_argument(
-        "--device", default="auto", metavar="DEVICE", help="check this one: auto, cpu or cuda"
+        "--device",
+        default="auto",
+        metavar="DEVICE",
+        help="device to check: auto (default: all), cpu or cuda",
     )
-    parser.set_defaults(run=run)
 
 
-def run(options: argparse.Namespace) -> None:
-    """Run the command."""
-    from cvtgs.devices import chosen_device, device_name, resolve_device  # noqa: PLC0415
+def doctor(options: argparse.Namespace) -> None:
+    """Run ``cvtgs doctor``."""
+    import torch
+
+    from cvtgs.devices import chosen_device, device_name, resolve_device
 
     print("\n".join(version_lines()))
     device = resolve_device(options.device)
-    for one in _devices() if device is None else [device]:
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    devices = [torch.device("cpu"), *(torch.device("cuda", number) for number in range(gpus))]
+    for one in devices if device is None else [device]:
         print(f"\n{one}: {device_name(one)}")
         for name in RENDERERS:
-            print(f"  images by {name:<7} {_renderer(name, one)}")
-        print(f"  nearest site by  {_search(one)}")
+            print(f"  images by {name:<7} {_renderer_state(name, one)}")
+        print(f"  nearest site by  {cvtgs.cvt.nearest_backend('auto', one)[0]}")
     default = chosen_device(options.device)
     print(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one image")
     try:
@@ -56,61 +102,39 @@ def run(options: argparse.Namespace) -> None:
     print("The default path works.")
 
 
-def _devices() -> "list[torch.device]":
-    """Return the CPU, and the CUDA devices that torch sees."""
-    import torch  # noqa: PLC0415
-
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    return [torch.device("cpu"), *(torch.device("cuda", number) for number in range(count))]
-
-
-def _renderer(name: str, device: "torch.device") -> str:
-    """Report whether a renderer works on a device, and if not, why."""
-    from cvtgs.rendering import choose_backend  # noqa: PLC0415
-
+def _renderer_state(name: str, device: "torch.device") -> str:
+    """Return whether a renderer works on a device, and if not, why."""
     try:
-        choose_backend(cast("BackendName", name), device)
+        cvtgs.rendering.choose_backend(cast("BackendName", name), device)
     except CvtgsError as error:
         return f"no: {error}"
     return "yes"
 
 
-def _search(device: "torch.device") -> str:
-    """Name what searches the nearest site on a device."""
-    from cvtgs.cvt import nearest_backend  # noqa: PLC0415
-
-    return nearest_backend("auto", device)[0]
-
-
 def _small_run(device: "torch.device") -> list[str]:
-    """Generate, simplify and render; say how long each took and what did it."""
-    import torch  # noqa: PLC0415
-
-    from cvtgs.rendering import render  # noqa: PLC0415
-    from cvtgs.simplify import Simplifier  # noqa: PLC0415
-    from cvtgs.synthetic import demo_scene  # noqa: PLC0415
-    from cvtgs.views import automatic_views  # noqa: PLC0415
+    """Generate, simplify and render; return the time and the backend of each step."""
+    import torch
 
     times = [time.perf_counter()]
-    scene = demo_scene(COUNT, sh_degree=1)
+    scene = cvtgs.synthetic.demo_scene(COUNT, sh_degree=1)
     times.append(time.perf_counter())
-    small, report = Simplifier(device=device).run(scene, RHO)
+    small, report = cvtgs.Simplifier(device=device).run(scene, RHO)
     times.append(time.perf_counter())
-    cameras = automatic_views(small, 1, width=SIDE, height=SIDE)
+    cameras = cvtgs.views.automatic_views(small, 1, width=SIDE, height=SIDE)
     times.append(time.perf_counter())
     with torch.no_grad():
-        image = render(small.to(device), cameras)
-    lit = float(image.rgb.mean())
+        image = cvtgs.render(small.to(device), cameras)
+    color = float(image.rgb.mean())
     times.append(time.perf_counter())
-    if len(small) != report.target_count or not 0.0 < lit < 1.0:
-        raise DeviceError(f"{len(small):,} Gaussians and a mean colour of {lit:.3g} came out")
-    made, simplified, found, shown = (after - before for before, after in pairwise(times))
+    if len(small) != report.target_count or not 0.0 < color < 1.0:
+        raise DeviceError(f"{len(small):,} Gaussians and a mean colour of {color:.3g} came out")
+    generated, simplified, viewed, rendered = (after - before for before, after in pairwise(times))
     compiles = image.backend == "numba"
     note = "   the first images with numba compile for some ten seconds" if compiles else ""
     return [
-        f"generate  {made:6.2f} s",
+        f"generate  {generated:6.2f} s",
         f"simplify  {simplified:6.2f} s   search by {report.backend}, "
         f"checkpoint {report.checkpoint}",
-        f"views     {found:6.2f} s{note}",
-        f"render    {shown:6.2f} s   {SIDE} x {SIDE} pixels by {image.backend}",
+        f"views     {viewed:6.2f} s{note}",
+        f"render    {rendered:6.2f} s   {SIDE} x {SIDE} pixels by {image.backend}",
     ]

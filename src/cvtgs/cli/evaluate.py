@@ -1,84 +1,176 @@
-"""``cvtgs evaluate``: scores of simplified scenes."""
+"""``cvtgs render``, ``evaluate``, ``compare`` and ``tradeoff``: images and scores of scenes."""
 
 import argparse
-from pathlib import Path
-from typing import TYPE_CHECKING
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, NamedTuple
 
+import cvtgs
 from cvtgs.cli.display import progress_bars, size_text
-from cvtgs.cli.looking import (
-    add_looking_options,
-    add_scoring_options,
+from cvtgs.cli.options import (
+    AddParser,
+    add_options,
+    add_view_options,
     background_color,
-    check_looking_options,
-    chosen_cameras,
-    load_scenes,
-    looking_device,
+    check_view_options,
+    choose_cameras,
+    evaluation_settings,
+    read_ratios,
+    read_words,
 )
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.progress import ProgressEvent
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation, SceneScores
+    from cvtgs.scene import GaussianScene
+    from cvtgs.tradeoff import Tradeoff
 
-SIZE = 640
+MOST_CAMERAS = 8
+"""Cameras that a page shows unless ``--views`` sets another number."""
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command."""
-    parser = commands.add_parser(
+def add_render(add_parser: AddParser) -> None:
+    """Add the command and its options."""
+    parser = add_parser(
+        "render",
+        help="write images of a scene",
+        description="Write one PNG per view into DIR, named after the cameras.",
+    )
+    parser.set_defaults(run=render)
+    add_options(parser, "input", "-o/--output", "--overwrite")
+    add_view_options(parser, size=800)
+
+
+def render(options: argparse.Namespace) -> None:
+    """Run ``cvtgs render``."""
+    import torch
+
+    from cvtgs.devices import chosen_device
+    from cvtgs.evaluation.compare import as_bytes
+    from cvtgs.evaluation.comparison_files import make_folder
+    from cvtgs.evaluation.images import encode
+
+    check_view_options(options)
+    scene = cvtgs.io.load(options.input).to(chosen_device(options.device))
+    cameras = choose_cameras(options, scene)
+    make_folder(options.output)
+    paths = [options.output / name for name in file_names(cameras.view_names)]
+    for path in paths:
+        cvtgs.io.check_output(path, options.overwrite)
+    background = torch.tensor(background_color(options))
+    with progress_bars(quiet=options.quiet) as listener, torch.no_grad():
+        for number, path in enumerate(paths):
+            listener(ProgressEvent(stage="render", done=number, total=len(paths)))
+            image = cvtgs.render(
+                scene,
+                cameras.select(torch.tensor([number])),
+                backend=options.backend,
+                background=background,
+            ).rgb[0]
+            with cvtgs.io.atomic_output(path, overwrite=options.overwrite) as file:
+                file.write(encode(as_bytes(image), "png"))
+        listener(ProgressEvent(stage="render", done=len(paths), total=len(paths)))
+    if not options.quiet:
+        print(
+            f"{len(paths)} images of {cameras.width} x {cameras.height} pixels in {options.output}"
+        )
+
+
+def file_names(views: Sequence[str]) -> list[str]:
+    """Return a PNG name for every view; numbered if two views have the same name."""
+    stems = []
+    for view in views:
+        name = PurePosixPath(view.replace("\\", "/")).name
+        bare = re.sub(r"\.(png|jpe?g|webp|tiff?|bmp)$", "", name, flags=re.IGNORECASE)
+        stems.append(re.sub(r"[^\w.-]+", "_", bare).strip("._") or "view")
+    if len({stem.lower() for stem in stems}) == len(stems):
+        return [f"{stem}.png" for stem in stems]
+    return [f"{number:03d}_{stem}.png" for number, stem in enumerate(stems, start=1)]
+
+
+class _Scenes(NamedTuple):
+    """The full scene, the others, and the bytes of all their files, by name."""
+
+    name: str
+    reference: "GaussianScene"
+    others: "dict[str, GaussianScene]"
+    sizes: dict[str, int]
+
+
+def _read_scenes(options: argparse.Namespace) -> _Scenes:
+    """Read REF and all SMALL, named after their files."""
+    from cvtgs.devices import chosen_device
+
+    paths = [options.reference, *options.small]
+    names = [path.name for path in paths]
+    names = [
+        name if names.count(name) == 1 else str(path)
+        for name, path in zip(names, paths, strict=True)
+    ]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise InvalidArgumentError(f"every scene must be given once, found {twice[0]} twice.")
+    device = chosen_device(options.device)
+    reference, *others = (cvtgs.io.load(path).to(device) for path in paths)
+    sizes = [cvtgs.io.scene_size(path) for path in paths]
+    return _Scenes(
+        name=names[0],
+        reference=reference,
+        others=dict(zip(names[1:], others, strict=True)),
+        sizes=dict(zip(names, sizes, strict=True)),
+    )
+
+
+def add_evaluate(add_parser: AddParser) -> None:
+    """Add the command and its options."""
+    parser = add_parser(
         "evaluate",
         help="score simplified scenes against the full one",
-        description="Render REF and every SMALL from the same views and print PSNR, SSIM and, "
-        "where its weights are, LPIPS against the images of REF; with --images also against "
+        description="Render REF and every SMALL from the same views and print PSNR, SSIM and, if "
+        "its weights are installed, LPIPS against the images of REF; with --images also against "
         "photographs.",
     )
-    add_scoring_options(parser)
+    parser.set_defaults(run=evaluate)
+    add_options(parser, "reference", "small", "--lpips")
     parser.add_argument(
         "--images",
         type=Path,
         metavar="DIR",
-        help="photographs of the cameras of --cameras, found by name",
+        help="directory of the photographs of --cameras, found by name",
     )
-    parser.add_argument("--json", action="store_true", help="print JSON, with every view")
-    add_looking_options(parser, size=SIZE)
-    parser.set_defaults(run=run)
+    add_options(parser, "--json")
+    add_view_options(parser, size=640)
 
 
-def run(options: argparse.Namespace) -> None:
-    """Run the command."""
-    from cvtgs.evaluation import (  # noqa: PLC0415 (keeps --help fast)
-        EvaluationSettings,
-        evaluate,
-        load_photographs,
-    )
-
-    check_looking_options(options)
+def evaluate(options: argparse.Namespace) -> None:
+    """Run ``cvtgs evaluate``."""
+    check_view_options(options)
     if options.images is not None and options.cameras is None:
         raise InvalidArgumentError("--images needs the cameras of the photographs: --cameras.")
-    background = background_color(options)
-    scenes, sizes = load_scenes([options.reference, *options.small], looking_device(options))
-    name, *others = scenes
+    settings = evaluation_settings(options)
+    scenes = _read_scenes(options)
     with progress_bars(quiet=options.quiet) as listener:
-        cameras = chosen_cameras(options, scenes[name])
-        photographs = (
-            load_photographs(options.images, cameras, background=background)
-            if options.images is not None
-            else None
-        )
-        evaluation = evaluate(
-            scenes[name],
-            {other: scenes[other] for other in others},
+        cameras = choose_cameras(options, scenes.reference)
+        photographs = None
+        if options.images is not None:
+            photographs = cvtgs.evaluation.load_photographs(
+                options.images, cameras, background=settings.background
+            )
+        evaluation = cvtgs.evaluate(
+            scenes.reference,
+            scenes.others,
             cameras,
-            reference_name=name,
+            reference_name=scenes.name,
             photographs=photographs,
-            settings=EvaluationSettings(
-                background=background, lpips=options.lpips, backend=options.backend
-            ),
+            settings=settings,
             listener=listener,
         )
     if options.json:
         print(evaluation.to_json(), end="")
     elif not options.quiet:
-        _print_scores(evaluation, sizes)
+        _print_scores(evaluation, scenes.sizes)
 
 
 def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
@@ -87,15 +179,15 @@ def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
         f"rendered by {evaluation.backend}"
     )
     print(f"against {evaluation.reference}, {evaluation.reference_count:,} Gaussians:")
-    _print_table(evaluation.scenes, sizes)
+    _print_score_table(evaluation.scenes, sizes)
     if evaluation.photographs:
         print("against photographs:")
-        _print_table(evaluation.photographs, sizes)
+        _print_score_table(evaluation.photographs, sizes)
     if evaluation.lpips_sentence:
         print(evaluation.lpips_sentence)
 
 
-def _print_table(scenes: "tuple[SceneScores, ...]", sizes: dict[str, int]) -> None:
+def _print_score_table(scenes: "tuple[SceneScores, ...]", sizes: dict[str, int]) -> None:
     width = max(len(scene.name) for scene in scenes)
     print(f"  {'':{width}}  {'Gaussians':>12}  {'size':>9}  {'PSNR':>6}  {'SSIM':>6}  LPIPS")
     for scene in scenes:
@@ -104,3 +196,116 @@ def _print_table(scenes: "tuple[SceneScores, ...]", sizes: dict[str, int]) -> No
             f"  {scene.name:{width}}  {scene.count:>12,}  {size_text(sizes[scene.name]):>9}  "
             f"{scene.psnr.mean:>6.2f}  {scene.ssim.mean:>6.4f}  {distance}"
         )
+
+
+def add_compare(add_parser: AddParser) -> None:
+    """Add the command and its options."""
+    parser = add_parser(
+        "compare",
+        help="write a page that shows the full scene and simplified ones side by side",
+        description="Write index.html, a single file that works offline, with a divider between "
+        "REF and each SMALL; sheet.png, all images with their scores; and errors.png, maps of "
+        f"the differences. Of --cameras, {MOST_CAMERAS} are used unless --views sets a number.",
+    )
+    parser.set_defaults(run=compare)
+    add_options(parser, "reference", "small", "--lpips", "-o/--output", "--overwrite")
+    add_view_options(parser, size=800)
+
+
+def compare(options: argparse.Namespace) -> None:
+    """Run ``cvtgs compare``."""
+    from cvtgs.evaluation.comparison_files import check_exhibition
+
+    check_view_options(options)
+    check_exhibition(options.output, overwrite=options.overwrite)
+    scenes = _read_scenes(options)
+    with progress_bars(quiet=options.quiet) as listener:
+        comparison = cvtgs.evaluation.compare(
+            scenes.reference,
+            scenes.others,
+            choose_cameras(options, scenes.reference, most=MOST_CAMERAS),
+            reference_name=scenes.name,
+            sizes=scenes.sizes,
+            settings=evaluation_settings(options),
+            listener=listener,
+        )
+        paths = cvtgs.evaluation.write_exhibition(
+            comparison, options.output, overwrite=options.overwrite, listener=listener
+        )
+    if not options.quiet:
+        for scores in comparison.evaluation.scenes:
+            print(
+                f"{scores.name}: {scores.count:,} Gaussians, "
+                f"PSNR {scores.psnr.mean:.2f} dB, SSIM {scores.ssim.mean:.4f}"
+            )
+        print(f"Wrote {', '.join(path.name for path in paths)}. Open {paths[-1]} in a browser.")
+
+
+def add_tradeoff(add_parser: AddParser) -> None:
+    """Add the command and its options."""
+    parser = add_parser(
+        "tradeoff",
+        help="run all presets on a scene and show seconds against quality",
+        description="Simplify IN by every preset, each run in its own process, score the results "
+        "against IN, print a table, and write tradeoff.csv, tradeoff.json, tradeoff.png and "
+        "index.html, a single file that works offline. Of --cameras, "
+        f"{MOST_CAMERAS} are used unless --views sets a number.",
+    )
+    parser.set_defaults(run=tradeoff)
+    add_options(parser, "input", "--rho")
+    parser.add_argument("--presets", metavar="NAME,NAME", help="presets to run (default: all)")
+    add_options(parser, "-o/--output")
+    parser.add_argument(
+        "--save", action="store_true", help="write the simplified scenes to DIR, too"
+    )
+    add_options(parser, "--lpips", "--overwrite")
+    add_view_options(parser, size=640)
+
+
+def tradeoff(options: argparse.Namespace) -> None:
+    """Run ``cvtgs tradeoff``."""
+    from cvtgs.tradeoff.files import check_tradeoff_files
+    from cvtgs.tradeoff.runs import tasks_of
+
+    check_view_options(options)
+    presets = None if options.presets is None else read_words(options.presets)
+    ratios = read_ratios(options.rho)
+    kept = tuple(task.file_name for task in tasks_of(presets, ratios) if options.save)
+    check_tradeoff_files(options.output, more=kept, overwrite=options.overwrite)
+    with progress_bars(quiet=options.quiet) as listener:
+        measured = cvtgs.tradeoff.measure_tradeoff(
+            options.input,
+            presets=presets,
+            ratios=ratios,
+            cameras=lambda scene: choose_cameras(options, scene, most=MOST_CAMERAS),
+            settings=evaluation_settings(options),
+            device=options.device,
+            folder=options.output if options.save else None,
+            listener=listener,
+        )
+        paths, note = cvtgs.tradeoff.write_tradeoff(
+            measured, options.output, overwrite=options.overwrite, listener=listener
+        )
+    if not options.quiet:
+        _print_tradeoff(measured.tradeoff)
+        names = ", ".join(path.name for path in paths)
+        print(f"Wrote {names}. Open {paths[-1]} in a browser.")
+        if note:
+            print(f"Without a plot: {note}")
+
+
+def _print_tradeoff(tradeoff: "Tradeoff") -> None:
+    from cvtgs.tradeoff.table import MARK_MEANS, cells, heading, how_measured
+
+    for rho in tradeoff.ratios:
+        print(heading(tradeoff, rho))
+        columns = [cells(tradeoff, result) for result in tradeoff.results if result.rho == rho]
+        left = max(len(name) for name in columns[0])
+        widths = [max(map(len, column.values())) for column in columns]
+        for name in columns[0]:
+            words = (
+                f"{column[name]:>{width}}" for column, width in zip(columns, widths, strict=True)
+            )
+            print(f"  {name:{left}}  {'  '.join(words)}".rstrip())
+    print(MARK_MEANS)
+    print(how_measured(tradeoff))

@@ -1,89 +1,77 @@
 """``cvtgs levels``: several sizes of one scene, and an index for viewers."""
 
 import argparse
-from pathlib import Path
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from cvtgs.cli.display import READABLE, progress_bars, size_text
-from cvtgs.cli.lists import add_ratios_option, ratios_of
-from cvtgs.cli.looking import (
-    add_looking_options,
-    background_color,
-    check_looking_options,
-    chosen_cameras,
-    looking_device,
+import cvtgs
+from cvtgs.cli.display import progress_bars, size_text
+from cvtgs.cli.options import (
+    AddParser,
+    add_options,
+    add_view_options,
+    check_view_options,
+    choose_cameras,
+    evaluation_settings,
+    read_ratios,
+    read_settings,
 )
-from cvtgs.cli.simplify import read_settings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from cvtgs.evaluation import Evaluation
     from cvtgs.levels import LevelsIndex
     from cvtgs.progress import ProgressListener
     from cvtgs.scene import GaussianScene
     from cvtgs.simplify import Level
 
-SIZE = 400
 
-
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command."""
-    parser = commands.add_parser(
+def add_levels(add_parser: AddParser) -> None:
+    """Add the command and its options."""
+    parser = add_parser(
         "levels",
         help="make several sizes of a scene at once",
         description="Write IN in several sizes, each an ordinary scene of exactly ceil(rho * N) "
         "Gaussians, and levels.json with counts, bytes, scores, geometric errors and boxes. It "
-        "takes little more time than the finest size alone; scoring comes on top (--no-scores).",
+        "takes little more time than the finest size alone, plus the time of the scores "
+        "(--no-scores).",
     )
-    parser.add_argument("input", metavar="IN", type=Path, help=f"scene to read ({READABLE})")
-    parser.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="DIR", help="directory to write to"
-    )
-    add_ratios_option(parser)
+    parser.set_defaults(run=levels)
+    add_options(parser, "input", "-o/--output", "--rho")
     parser.add_argument(
         "--suffix", default=".ply", metavar="END", help="format of the files (default .ply)"
     )
-    parser.add_argument("--preset", metavar="NAME", help="as of cvtgs simplify")
-    parser.add_argument("--ckpt", default="auto", metavar="NAME", help="as of cvtgs simplify")
-    parser.add_argument("--config", type=Path, metavar="F.toml", help="configuration file")
+    add_options(parser, "--preset", "--ckpt", "--config", "--set")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
-        help="change one setting; may be repeated",
-    )  # fmt: skip
-    parser.add_argument("--no-scores", action="store_true", help="do not look at the levels")
-    parser.add_argument("--overwrite", action="store_true", help="replace existing files")
-    add_looking_options(parser, size=SIZE)
-    parser.set_defaults(run=run)
+        "--no-scores", action="store_true", help="skip rendering and scoring the levels"
+    )
+    add_options(parser, "--overwrite")
+    add_view_options(parser, size=400)
 
 
-def run(options: argparse.Namespace) -> None:
-    """Run the command."""
-    from cvtgs.config import SimplifyConfig  # noqa: PLC0415 (keeps --help fast)
-    from cvtgs.counts import target_count  # noqa: PLC0415
-    from cvtgs.io import load, load_cameras  # noqa: PLC0415
-    from cvtgs.levels import level_names, write_levels  # noqa: PLC0415
-    from cvtgs.levels.write import check_levels  # noqa: PLC0415
-    from cvtgs.simplify import Simplifier  # noqa: PLC0415
+def levels(options: argparse.Namespace) -> None:
+    """Run ``cvtgs levels``."""
+    from cvtgs.levels.write import check_levels
 
-    check_looking_options(options)
-    rhos = sorted(ratios_of(options.rho), reverse=True)
+    check_view_options(options)
+    rhos = sorted(read_ratios(options.rho), reverse=True)
     for rho in rhos:
-        target_count(1, rho)
-    names = level_names(rhos, options.suffix)
+        cvtgs.target_count(1, rho)
+    names = cvtgs.levels.level_names(rhos, options.suffix)
     check_levels(options.output, names, overwrite=options.overwrite)
-    config = SimplifyConfig.compose(
+    config = cvtgs.SimplifyConfig.compose(
         file=options.config, preset=options.preset, settings=read_settings(options.settings)
     )
     checkpoint = None if options.ckpt == "none" else options.ckpt
     with progress_bars(quiet=options.quiet) as listener:
-        simplifier = Simplifier(checkpoint, config=config, device=options.device, listener=listener)
-        scene = load(options.input)
-        cameras = None if options.cameras is None else load_cameras(options.cameras)
-        levels = simplifier.levels(scene, rhos, cameras=cameras)
-        scores = None if options.no_scores else _scores(options, scene, levels, names, listener)
-        index = write_levels(
-            levels,
+        simplifier = cvtgs.Simplifier(
+            checkpoint, config=config, device=options.device, listener=listener
+        )
+        scene = cvtgs.load(options.input)
+        cameras = None if options.cameras is None else cvtgs.load_cameras(options.cameras)
+        made = simplifier.levels(scene, rhos, cameras=cameras)
+        scores = None if options.no_scores else _score(options, scene, made, names, listener)
+        index = cvtgs.levels.write_levels(
+            made,
             options.output,
             rhos=rhos,
             source=options.input.name,
@@ -95,23 +83,22 @@ def run(options: argparse.Namespace) -> None:
         _print_index(index)
 
 
-def _scores(
+def _score(
     options: argparse.Namespace,
     scene: "GaussianScene",
     levels: "Sequence[Level]",
-    names: "Sequence[str]",
+    names: Sequence[str],
     listener: "ProgressListener",
 ) -> "Evaluation":
-    from cvtgs.evaluation import EvaluationSettings, evaluate  # noqa: PLC0415
-    from cvtgs.filters import valid_rows  # noqa: PLC0415
+    from cvtgs.devices import chosen_device
 
-    device = looking_device(options)
-    full = scene.select(valid_rows(scene)).to(device)
-    return evaluate(
+    device = chosen_device(options.device)
+    full = scene.select(cvtgs.filters.valid_rows(scene)).to(device)
+    return cvtgs.evaluate(
         full,
         {name: level.scene.to(device) for name, level in zip(names, levels, strict=True)},
-        chosen_cameras(options, full),
-        settings=EvaluationSettings(background=background_color(options), backend=options.backend),
+        choose_cameras(options, full),
+        settings=evaluation_settings(options),
         listener=listener,
     )
 

@@ -1,6 +1,5 @@
-"""``cvtgs``: reads the command, runs it, and turns errors into exit codes."""
+"""``cvtgs``: parse the command line, run a command, turn errors into exit codes."""
 
-import argparse
 import os
 import signal
 import sys
@@ -9,20 +8,14 @@ from collections.abc import Sequence
 from types import FrameType
 from typing import NoReturn, TextIO
 
-from cvtgs.cli import (
-    compare,
-    convert,
-    demo,
-    doctor,
-    evaluate,
-    info,
-    levels,
-    render,
-    simplify,
-    tradeoff,
-    train,
-    versions,
-)
+from cvtgs.cli.demo import add_demo
+from cvtgs.cli.doctor import ShowVersions, add_doctor
+from cvtgs.cli.evaluate import add_compare, add_evaluate, add_render, add_tradeoff
+from cvtgs.cli.files import add_convert, add_info
+from cvtgs.cli.levels import add_levels
+from cvtgs.cli.options import CommandParser
+from cvtgs.cli.simplify import add_simplify
+from cvtgs.cli.train import add_train
 from cvtgs.errors import CvtgsError
 
 INTERRUPTED = 130
@@ -33,7 +26,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line."""
     # Idle OpenMP threads that spin burn several times the useful work; read when torch starts.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    options = build_parser().parse_args(arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    parser = build_parser()
+    if not words:
+        parser.exit(2, parser.format_help())
+    options = parser.parse_args(words)
     interrupt = _Interrupt()
     before = signal.signal(signal.SIGINT, interrupt), signal.signal(signal.SIGTERM, _terminate)
     with warnings.catch_warnings():
@@ -77,33 +74,33 @@ class _Interrupt:
         raise KeyboardInterrupt
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Describe every command and option."""
-    parser = argparse.ArgumentParser(
+def build_parser() -> CommandParser:
+    """Build the parser of all commands and options."""
+    parser = CommandParser(
         prog="cvtgs",
         description="Make trained 3D Gaussian Splatting scenes 10 to 1000 times smaller.",
         epilog="Start with: cvtgs demo",
     )
     parser.add_argument(
         "--version",
-        action=versions.ShowVersions,
-        help="print the versions of cvtgs and of what it computes with",
+        action=ShowVersions,
+        help="print the versions of cvtgs and of the packages that it computes with",
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for command in (
-        simplify,
-        levels,
-        convert,
-        info,
-        evaluate,
-        render,
-        compare,
-        tradeoff,
-        demo,
-        doctor,
-        train,
+    for add in (
+        add_simplify,
+        add_levels,
+        add_convert,
+        add_info,
+        add_evaluate,
+        add_render,
+        add_compare,
+        add_tradeoff,
+        add_demo,
+        add_doctor,
+        add_train,
     ):
-        command.add_parser(commands)
+        add(commands.add_parser)
     return parser
 
 

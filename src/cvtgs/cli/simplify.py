@@ -1,177 +1,357 @@
-"""``cvtgs simplify``: a scene in, a smaller scene out."""
+"""``cvtgs simplify``: a smaller scene, by size, quality or time, in memory or block by block."""
 
 import argparse
+import math
+import sys
+import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from cvtgs.cli.display import (
-    PRESET_NAMES,
-    READABLE,
-    WRITABLE,
-    file_size,
-    progress_bars,
-    stage_seconds,
+import cvtgs
+from cvtgs.cli.display import file_size, progress_bars, stage_seconds
+from cvtgs.cli.options import (
+    CAMERA_FILES,
+    AddParser,
+    add_options,
+    read_scene,
+    read_settings,
 )
-from cvtgs.cli.effects import add_effects_option, effect_settings, load_needed
-from cvtgs.cli.goals import Goals, add_goal_options
-from cvtgs.cli.large import add_large_options, block_memory, run_by_blocks
-from cvtgs.errors import ConfigError
+from cvtgs.errors import (
+    ConfigError,
+    FileFormatError,
+    GoalError,
+    InputError,
+    InvalidArgumentError,
+)
+from cvtgs.progress import ProgressListener, silent
 
 if TYPE_CHECKING:
+    from cvtgs.config import SimplifyConfig
     from cvtgs.report import SimplifyReport
+    from cvtgs.scene import GaussianScene
+    from cvtgs.simplify import Simplifier
+
+STARTED = time.perf_counter()
+"""When this process started, about: a time budget counts from here."""
+
+UNITS = {"s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command."""
-    parser = commands.add_parser(
+class ChosenPreset(NamedTuple):
+    """A preset, and the sentence that says why."""
+
+    name: str
+    reason: str
+
+
+def add_simplify(add_parser: AddParser) -> None:
+    """Add the command and its options."""
+    parser = add_parser(
         "simplify",
         help="make a scene smaller",
         description="Write a scene with exactly ceil(rho * N) of the N Gaussians of IN.",
     )
-    parser.add_argument("input", metavar="IN", type=Path, help=f"scene to read ({READABLE})")
-    parser.add_argument("output", metavar="OUT", type=Path, help=f"scene to write ({WRITABLE})")
+    parser.set_defaults(run=simplify)
+    add_options(parser, "input", "output")
     size = parser.add_mutually_exclusive_group(required=True)
     size.add_argument("--rho", type=float, metavar="R", help="ratio of Gaussians to keep, (0, 1]")
     size.add_argument("--count", type=int, metavar="M", help="number of Gaussians to keep")
-    add_goal_options(parser, size)
-    parser.add_argument(
-        "--preset",
-        metavar="NAME",
-        help=f"{PRESET_NAMES} (default standard)",
+    size.add_argument(
+        "--target-psnr",
+        type=float,
+        metavar="DB",
+        help="PSNR to reach over held-out views with as few Gaussians as possible",
+    )
+    size.add_argument(
+        "--target-ssim",
+        type=float,
+        metavar="S",
+        help="SSIM to reach in the same way, for example 0.9",
     )
     parser.add_argument(
-        "--ckpt",
-        default="auto",
-        metavar="NAME",
-        help="MergeNet checkpoint: auto (default, that of the preset), standard, paper, a file, "
-        "or none to merge by moments alone",
+        "--time-budget",
+        metavar="TIME",
+        help="time to finish in, for example 20s or 2m, with the best preset that fits; the first "
+        "use measures this machine, which takes about a minute and does not count",
     )
-    parser.add_argument("--config", type=Path, metavar="F.toml", help="configuration file")
     parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        dest="settings",
-        help="change one setting, for example cvt.iterations=10; may be repeated",
+        "--recalibrate", action="store_true", help="measure this machine again for --time-budget"
     )
-    add_effects_option(parser)
+    add_options(parser, "--preset", "--ckpt", "--config", "--set", "--effects")
     parser.add_argument(
         "--refine",
         type=float,
         metavar="SECONDS",
-        help="fine-tune the result against images of IN for so long at most, while views that "
-        "are held out improve; 0 does not, whatever the preset",
+        help="time limit of refining the result against images of IN, as long as held-out views "
+        "improve; 0 turns off the refinement of a preset",
     )
     parser.add_argument(
-        "--refine-steps", type=int, metavar="N", help="fine-tune for N steps at most"
+        "--refine-steps", type=int, metavar="N", help="step limit of refining the result"
     )
     parser.add_argument(
         "--cameras",
         type=Path,
         metavar="F",
-        help="from where to look, for presets that look and for --refine: transforms.json, a "
-        "COLMAP model, cameras.json, or a folder of these (default: automatic views)",
+        help="cameras to render from, for --refine and for presets that render: "
+        f"{CAMERA_FILES} (default: automatic views)",
     )
-    add_large_options(parser)
-    parser.add_argument("--report", type=Path, metavar="R.json", help="write what was done as JSON")
     parser.add_argument(
-        "--device", default="auto", metavar="DEVICE", help="auto (default), cpu or cuda"
+        "--keep",
+        type=Path,
+        metavar="BOX.json",
+        help="boxes whose Gaussians stay unchanged, come first in OUT and count: "
+        '{"min": [x, y, z], "max": [x, y, z]}, or a list of these',
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace existing output files")
-    parser.add_argument("--quiet", action="store_true", help="print errors and warnings only")
-    parser.set_defaults(run=run)
-
-
-def run(options: argparse.Namespace) -> None:
-    """Run the command."""
-    from cvtgs.config import SimplifyConfig  # noqa: PLC0415 (keeps --help fast)
-    from cvtgs.io import (  # noqa: PLC0415
-        atomic_output,
-        check_output,
-        check_save,
-        load_cameras,
-        save,
+    parser.add_argument(
+        "--memory",
+        metavar="AMOUNT",
+        help="memory to use, for example 4GB (default: what is free); a binary .ply that needs "
+        "more is simplified block by block, and the same command resumes an interrupted run",
     )
-    from cvtgs.mergenet import load_checkpoint  # noqa: PLC0415
-    from cvtgs.simplify import Simplifier, target_count  # noqa: PLC0415
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="address of a Dask cluster that simplifies the blocks; its workers need access to "
+        "IN and OUT, and --memory is the memory of each task",
+    )
+    parser.add_argument(
+        "--report", type=Path, metavar="R.json", help="file for a report of the run in JSON"
+    )
+    add_options(parser, "--device", "--overwrite", "--quiet")
 
-    goals = Goals(options)
+
+def simplify(options: argparse.Namespace) -> None:
+    """Run ``cvtgs simplify``."""
+    check_goals(options)
     checkpoint = None if options.ckpt == "none" else options.ckpt
     preset = options.preset
     if checkpoint not in (None, "auto") and preset is None and options.config is None:
-        preset = load_checkpoint(checkpoint).info.preset
-    settings = _refinement(options) | effect_settings(options.effects)
-    settings |= read_settings(options.settings)
-    config = SimplifyConfig.compose(file=options.config, preset=preset, settings=settings)
+        preset = cvtgs.mergenet.load_checkpoint(checkpoint).info.preset
+    settings = _refine_settings(options) | read_settings(options.settings, options.effects)
+    config = cvtgs.SimplifyConfig.compose(file=options.config, preset=preset, settings=settings)
     if options.rho is not None:
-        target_count(1, options.rho)
-    check_save(options.output, overwrite=options.overwrite)
+        cvtgs.target_count(1, options.rho)
+    cvtgs.io.check_save(options.output, overwrite=options.overwrite)
     if options.report is not None:
-        check_output(options.report, overwrite=options.overwrite)
+        cvtgs.io.check_output(options.report, overwrite=options.overwrite)
+    notes: list[str] = []
     with progress_bars(quiet=options.quiet) as listener:
         memory = block_memory(options, config)
         if memory is not None:
-            report = run_by_blocks(options, checkpoint, config, memory=memory, listener=listener)
+            simplifier = cvtgs.Simplifier(checkpoint, config=config, device="cpu")
+            report = _simplify_blocks(options, simplifier, memory, listener)
         else:
-            scene = load_needed(options.input, config)
-            cameras = None if options.cameras is None else load_cameras(options.cameras)
-            chosen = goals.preset(scene, settings, listener)
-            if chosen is not None:
-                config = SimplifyConfig.compose(preset=chosen, settings=settings)
-            simplifier = Simplifier(
-                checkpoint,
-                config=config,
-                device=options.device,
-                listener=goals.stage_listener(listener),
-            )
-            small, report = goals.run(simplifier, scene, cameras=cameras, listener=listener)
-            save(small, options.output, overwrite=options.overwrite)
+            report, notes = _simplify_in_memory(options, checkpoint, config, settings, listener)
     if options.report is not None:
-        with atomic_output(options.report, overwrite=options.overwrite) as file:
+        with cvtgs.io.atomic_output(options.report, overwrite=options.overwrite) as file:
             file.write(report.to_json().encode())
     if not options.quiet:
-        print(
-            f"{report.input_count:,} -> {report.output_count:,} Gaussians, "
-            f"{file_size(options.input)} -> {file_size(options.output)}, "
-            f"{stage_seconds(report.stages)}"
+        _print_summary(options, report)
+        for note in notes:
+            print(note)
+
+
+def _simplify_in_memory(
+    options: argparse.Namespace,
+    checkpoint: str | None,
+    config: "SimplifyConfig",
+    settings: Mapping[str, str],
+    listener: ProgressListener,
+) -> "tuple[SimplifyReport, list[str]]":
+    """Read, simplify and save a scene; return the report, and notes to print below it."""
+    notes = []
+    scene = read_scene(options.input, config)
+    cameras = None if options.cameras is None else cvtgs.load_cameras(options.cameras)
+    if options.time_budget is not None:
+        chosen = choose_preset(options, scene, settings, listener)
+        config = cvtgs.SimplifyConfig.compose(preset=chosen.name, settings=settings)
+        notes.append(chosen.reason)
+    search = _has_target(options)
+    simplifier = cvtgs.Simplifier(
+        checkpoint, config=config, device=options.device, listener=silent if search else listener
+    )
+    if search:
+        found = cvtgs.budget.find_count(
+            scene,
+            psnr=options.target_psnr,
+            ssim=options.target_ssim,
+            simplifier=simplifier,
+            cameras=cameras,
+            listener=listener,
         )
-        _print_details(report)
-        for sentence in goals.said:
-            print(sentence)
-
-
-def _print_details(report: "SimplifyReport") -> None:
-    if report.blocks > 1:
-        resumed = f", {report.resumed_blocks} of them done before" if report.resumed_blocks else ""
-        print(f"In {report.blocks} blocks{resumed}.")
-    if report.shortfall:
-        print(f"Fewer than the {report.target_count:,} asked for: {report.shortfall}.")
-    if report.refinement is not None:
-        gained = report.refinement
-        print(
-            f"Refined in {gained.steps:,} {'step' if gained.steps == 1 else 'steps'}: "
-            f"{gained.gain:+.2f} dB on views that were held out, "
-            f"{gained.psnr_before:.2f} -> {gained.psnr_after:.2f}."
+        small, report = found.scene, found.report
+        notes.append(
+            f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f} over views that were held out; "
+            f"found in {len(found.tried)} tries."
         )
+    else:
+        keep = None
+        if options.keep is not None:
+            keep = cvtgs.boxes.inside(cvtgs.boxes.read_boxes(options.keep), scene.means)
+        small, report = simplifier.run(
+            scene, options.rho, count=options.count, cameras=cameras, keep=keep
+        )
+    cvtgs.io.save(small, options.output, overwrite=options.overwrite)
+    return report, notes
 
 
-def _refinement(options: argparse.Namespace) -> dict[str, str]:
-    """Return the settings that the options of the refinement stand for; either replaces both."""
+def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
+    """Return the settings of ``--refine`` and ``--refine-steps``; either one replaces both."""
     if options.refine is None and options.refine_steps is None:
         return {}
     steps, seconds = options.refine_steps or 0, options.refine or 0.0
     return {"refine.steps": str(steps), "refine.seconds": str(seconds)}
 
 
-def read_settings(words: list[str]) -> dict[str, str]:
-    """Read what ``--set`` was given."""
-    settings = {}
-    for word in words:
-        key, equals, value = word.partition("=")
-        if not (key and equals):
-            raise ConfigError(
-                f"--set needs KEY=VALUE, for example cvt.iterations=10; found {word!r}."
-            )
-        settings[key.strip()] = value.strip()
-    return settings
+def _print_summary(options: argparse.Namespace, report: "SimplifyReport") -> None:
+    print(
+        f"{report.input_count:,} -> {report.output_count:,} Gaussians, "
+        f"{file_size(options.input)} -> {file_size(options.output)}, "
+        f"{stage_seconds(report.stages)}"
+    )
+    if report.blocks > 1:
+        resumed = f", {report.resumed_blocks} of them done before" if report.resumed_blocks else ""
+        print(f"In {report.blocks} blocks{resumed}.")
+    if report.shortfall:
+        print(f"Fewer than the {report.target_count:,} asked for: {report.shortfall}.")
+    if report.refinement is not None:
+        refined = report.refinement
+        print(
+            f"Refined in {refined.steps:,} {'step' if refined.steps == 1 else 'steps'}: "
+            f"{refined.gain:+.2f} dB on views that were held out, "
+            f"{refined.psnr_before:.2f} -> {refined.psnr_after:.2f}."
+        )
+
+
+def _has_target(options: argparse.Namespace) -> bool:
+    return options.target_psnr is not None or options.target_ssim is not None
+
+
+def check_goals(options: argparse.Namespace) -> None:
+    """Check the targets and the time budget, and the options that exclude them."""
+    if options.time_budget is not None:
+        read_seconds(options.time_budget)
+    if _has_target(options):
+        from cvtgs.budget.goal import check_target
+
+        if options.keep is not None:
+            raise InvalidArgumentError("--keep needs --rho or --count.")
+        check_target(options.target_psnr, ssim=options.target_ssim)
+    if options.time_budget is None:
+        if options.recalibrate:
+            raise InvalidArgumentError("--recalibrate goes with --time-budget.")
+        return
+    excluded = {
+        "--preset": options.preset is not None,
+        "--config": options.config is not None,
+        "--ckpt": options.ckpt not in ("auto", "none"),
+        "--refine": options.refine is not None or options.refine_steps is not None,
+        "--target-psnr and --target-ssim": _has_target(options),
+    }
+    wrong = [name for name, is_given in excluded.items() if is_given]
+    if wrong:
+        raise InvalidArgumentError(
+            f"--time-budget chooses the preset and cannot go with {', '.join(wrong)}."
+        )
+
+
+def read_seconds(text: str) -> float:
+    """Read the time of ``--time-budget``."""
+    number = text.strip().rstrip("abcdefghijklmnopqrstuvwxyz")
+    unit = text.strip()[len(number) :] or "s"
+    try:
+        seconds = float(number) * UNITS[unit]
+    except (ValueError, KeyError):
+        seconds = math.nan
+    if not 0 < seconds < math.inf:
+        raise InvalidArgumentError(
+            f"--time-budget must be a time above 0, for example 20s or 2m; found {text!r}."
+        )
+    return seconds
+
+
+def choose_preset(
+    options: argparse.Namespace,
+    scene: "GaussianScene",
+    settings: Mapping[str, str],
+    listener: ProgressListener,
+) -> ChosenPreset:
+    """Choose the best preset that fits into the rest of the time budget."""
+    from cvtgs.budget.remember import is_known
+
+    budget, spent = read_seconds(options.time_budget), time.perf_counter() - STARTED
+    if budget <= spent:
+        raise GoalError(
+            f"no preset fits into {budget:g} s: starting and reading took {spent:.1f} s."
+        )
+    target = cvtgs.target_count(len(scene), options.rho, count=options.count)
+    again = options.recalibrate or not is_known(options.device)
+    if again and not options.quiet:
+        print("cvtgs: measuring this machine once, about a minute", file=sys.stderr)
+    model = cvtgs.budget.cost_model(options.device, recalibrate=again, listener=listener)
+    if options.ckpt == "none":
+        settings = {**settings, "merge.network": "false"}
+    choice = cvtgs.budget.choose_preset(
+        cvtgs.budget.Work.of(scene, target), budget - spent, settings=settings, model=model
+    )
+    reason = (
+        f"Preset {choice.preset}, the best that fits into {budget:g} s: expected to take "
+        f"{choice.seconds:.1f} s after {spent:.1f} s of starting and reading."
+    )
+    return ChosenPreset(choice.preset, reason)
+
+
+def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int | None:
+    """Return the memory for simplifying block by block; None if it is not needed or possible."""
+    from cvtgs.io.ply import open_rows
+    from cvtgs.outofcore.memory import available_memory, block_count, read_bytes
+    from cvtgs.outofcore.run import check_config
+
+    names = ("target_psnr", "target_ssim", "time_budget", "cameras")
+    excluded = [name for name in names if getattr(options, name) is not None]
+    memory = available_memory() if options.memory is None else read_bytes(options.memory)
+    if options.memory is None and options.scheduler is None:
+        try:
+            if excluded or block_count(open_rows(options.input), memory) == 1:
+                return None
+            check_config(config)
+        except (InputError, FileFormatError, ConfigError):
+            return None
+        return memory
+    if options.scheduler is None and block_count(open_rows(options.input), memory) == 1:
+        return None
+    if excluded:
+        words = ", ".join("--" + name.replace("_", "-") for name in excluded)
+        raise InvalidArgumentError(f"blocks cannot go with {words}, which need the whole scene.")
+    check_config(config)
+    return memory
+
+
+def _simplify_blocks(
+    options: argparse.Namespace,
+    simplifier: "Simplifier",
+    memory: int,
+    listener: ProgressListener,
+) -> "SimplifyReport":
+    """Simplify a file block by block, in this process or on a cluster."""
+    from cvtgs.outofcore.distributed import connect, workers_of
+    from cvtgs.outofcore.turns import this_process
+
+    client = None if options.scheduler is None else connect(options.scheduler)
+    try:
+        return cvtgs.outofcore.simplify_file(
+            options.input,
+            options.output,
+            options.rho,
+            count=options.count,
+            memory=memory,
+            boxes=() if options.keep is None else cvtgs.boxes.read_boxes(options.keep),
+            simplifier=simplifier,
+            workers=this_process if client is None else workers_of(client),
+            overwrite=options.overwrite,
+            listener=listener,
+        )
+    finally:
+        if client is not None:
+            client.close()

@@ -5,7 +5,9 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cvtgs
 from cvtgs.cli.display import progress_bars
+from cvtgs.cli.options import AddParser, add_options
 from cvtgs.errors import OutputError
 
 if TYPE_CHECKING:
@@ -14,17 +16,25 @@ if TYPE_CHECKING:
 WITHOUT_CURVES = "no image of its curves: that needs pip install 'cvtgs[plots]'"
 
 
-def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Describe the command."""
-    parser = commands.add_parser(
+def add_train(add_parser: AddParser) -> None:
+    """Add the command and its options."""
+    parser = add_parser(
         "train",
         help="train the network that merges Gaussians",
-        description="Train a MergeNet as CONFIG.toml says, and write the best one to NAME, its "
-        "curves and the state to resume from beside it.",
+        description="Train a MergeNet with the configuration CONFIG.toml. Writes the best network "
+        "to NAME.safetensors, and its curves and the state to resume from beside it.",
     )
-    parser.add_argument("config", metavar="CONFIG.toml", type=Path, help="choices of the training")
+    parser.set_defaults(run=train)
     parser.add_argument(
-        "-o", "--output", required=True, type=Path, metavar="NAME.safetensors", help="checkpoint"
+        "config", metavar="CONFIG.toml", type=Path, help="configuration of the training"
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        type=Path,
+        metavar="NAME.safetensors",
+        help="checkpoint to write",
     )
     parser.add_argument(
         "--scenes",
@@ -32,47 +42,43 @@ def add_parser(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
         default=[],
         type=Path,
         metavar="DIR",
-        help="folder of PLY files to learn from, besides those of CONFIG.toml; may be repeated",
+        help="directory of PLY files to train on, besides those of CONFIG.toml; can be repeated",
     )
     parser.add_argument(
-        "--cache", type=Path, metavar="DIR", help="folder of prepared scenes (default: NAME.cache)"
+        "--cache",
+        type=Path,
+        metavar="DIR",
+        help="directory of prepared scenes (default: NAME.cache)",
     )
-    parser.add_argument("--resume", action="store_true", help="go on where a training stopped")
-    parser.add_argument(
-        "--device", default="auto", metavar="DEVICE", help="auto (default), cpu or cuda"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing checkpoint")
-    parser.add_argument("--quiet", action="store_true", help="print errors and warnings only")
-    parser.set_defaults(run=run)
+    parser.add_argument("--resume", action="store_true", help="continue an interrupted training")
+    add_options(parser, "--device", "--overwrite", "--quiet")
 
 
-def run(options: argparse.Namespace) -> None:
-    """Run the command."""
-    from cvtgs.devices import chosen_device  # noqa: PLC0415
-    from cvtgs.io import check_output  # noqa: PLC0415
-    from cvtgs.train import TrainConfig, TrainFiles, train  # noqa: PLC0415
+def train(options: argparse.Namespace) -> None:
+    """Run ``cvtgs train``."""
+    from cvtgs.devices import chosen_device
 
-    config = _with_scenes(TrainConfig.from_toml(options.config), options.scenes)
+    config = _with_scenes(cvtgs.train.TrainConfig.from_toml(options.config), options.scenes)
     if options.output.suffix != ".safetensors":
         raise OutputError(f"{options.output}: the name must end in .safetensors.")
-    files = TrainFiles.beside(options.output, options.cache)
-    goes_on = options.resume and files.state.is_file()
-    check_output(options.output, overwrite=options.overwrite or goes_on)
+    files = cvtgs.train.TrainFiles.beside(options.output, options.cache)
+    resumes = options.resume and files.state.is_file()
+    cvtgs.io.check_output(options.output, overwrite=options.overwrite or resumes)
     device = chosen_device(options.device)
     with progress_bars(quiet=options.quiet) as listener:
-        history = train(
+        history = cvtgs.train.train(
             config,
             files,
             resume=options.resume,
             device=device,
             listener=listener,
-            on_validation=lambda history: None if options.quiet else _show(history),
+            on_validation=lambda history: None if options.quiet else print_validation(history),
         )
     best = history.best()
     if best is not None and not options.quiet:
         print(f"best at step {best.step}: {best.score:+.2f} dB on scenes it never learned from")
-        drawn = f"curves in {files.curves}" if files.curves.is_file() else WITHOUT_CURVES
-        print(f"{files.checkpoint}, {drawn}")
+        curves = f"curves in {files.curves}" if files.curves.is_file() else WITHOUT_CURVES
+        print(f"{files.checkpoint}, {curves}")
 
 
 def _with_scenes(config: "TrainConfig", folders: list[Path]) -> "TrainConfig":
@@ -80,8 +86,8 @@ def _with_scenes(config: "TrainConfig", folders: list[Path]) -> "TrainConfig":
     return config.model_copy(update={"data": data})
 
 
-def _show(history: "History") -> None:
-    """Print one line for the last validation."""
+def print_validation(history: "History") -> None:
+    """Print a line about the last validation."""
     last = history.validations[-1]
     gains = ", ".join(
         f"{sum(row) / len(row):+.2f} (least {min(row):+.2f}) at {ratio:g}"

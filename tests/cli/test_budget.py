@@ -1,13 +1,16 @@
 """Goals on the command line: what goes together, times, and what is said."""
 
 import argparse
+from contextlib import nullcontext
+from pathlib import Path
 
 import pytest
 
 import cvtgs
 from cvtgs.budget import CostModel
 from cvtgs.budget.calibrate import CANDIDATES
-from cvtgs.cli.goals import STARTED, Goals, add_goal_options, seconds_of
+from cvtgs.cli.main import build_parser, main
+from cvtgs.cli.simplify import STARTED, check_goals, choose_preset, read_seconds
 from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.progress import silent
 
@@ -18,20 +21,7 @@ MODEL = CostModel(
 
 
 def options(*words: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    size = parser.add_mutually_exclusive_group(required=True)
-    size.add_argument("--rho", type=float)
-    size.add_argument("--count", type=int)
-    add_goal_options(parser, size)
-    for name in ("--preset", "--config"):
-        parser.add_argument(name)
-    parser.add_argument("--ckpt", default="auto")
-    parser.add_argument("--keep")
-    parser.add_argument("--refine", type=float)
-    parser.add_argument("--refine-steps", type=int)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--quiet", action="store_true")
-    return parser.parse_args(words)
+    return build_parser().parse_args(["simplify", "in.ply", "out.ply", "--device", "cpu", *words])
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +40,7 @@ def measured(monkeypatch) -> list[bool]:
 
     monkeypatch.setattr(cvtgs.budget, "cost_model", known)
     monkeypatch.setattr("cvtgs.budget.remember.is_known", lambda device: len(asked) > 0)
-    monkeypatch.setattr("cvtgs.cli.goals.time.perf_counter", lambda: STARTED)
+    monkeypatch.setattr("cvtgs.cli.simplify.time.perf_counter", lambda: STARTED)
     return asked
 
 
@@ -59,13 +49,13 @@ def measured(monkeypatch) -> list[bool]:
     [("20s", 20.0), ("20", 20.0), (" 2m", 120.0), ("1.5min", 90.0), ("0.5h", 1800.0)],
 )
 def test_times(text, seconds):
-    assert seconds_of(text) == seconds
+    assert read_seconds(text) == seconds
 
 
 @pytest.mark.parametrize("text", ["", "s", "-3s", "0", "20 parsecs", "nan", "inf", "1:30"])
 def test_no_times(text):
     with pytest.raises(InvalidArgumentError, match="--time-budget must be a time above 0"):
-        seconds_of(text)
+        read_seconds(text)
 
 
 def test_a_target_takes_the_place_of_the_ratio(capsys):
@@ -93,25 +83,44 @@ def test_a_target_takes_the_place_of_the_ratio(capsys):
 )
 def test_what_does_not_go_together(words, text):
     with pytest.raises(InvalidArgumentError) as caught:
-        Goals(options(*words))
+        check_goals(options(*words))
     assert str(caught.value).startswith(text)
 
 
-def test_without_goals_nothing_changes(scene):
-    goals = Goals(options("--rho", "0.1"))
-    heard = []
-    assert goals.preset(scene, {}, silent) is None
-    assert goals.stage_listener(heard.append) == heard.append
-    small, report = goals.run(cvtgs.Simplifier(config="draft", device="cpu"), scene)
-    assert len(small) == report.output_count == 30
-    assert goals.said == []
+@pytest.fixture
+def source(scene, tmp_path) -> Path:
+    path = tmp_path / "in.ply"
+    cvtgs.save(scene, path)
+    return path
+
+
+@pytest.fixture
+def shown(monkeypatch) -> set[str]:
+    """The stages whose progress is shown."""
+    stages: set[str] = set()
+    listeners = nullcontext(lambda event: stages.add(event.stage))
+    monkeypatch.setattr("cvtgs.cli.simplify.progress_bars", lambda *, quiet: listeners)
+    return stages
+
+
+def simplified(source: Path, *words: str) -> cvtgs.GaussianScene:
+    output = source.with_name("out.ply")
+    assert main(["simplify", str(source), str(output), "--preset", "draft", *words]) == 0
+    return cvtgs.load(output)
+
+
+def test_without_goals_nothing_is_said(source, capsys, shown):
+    check_goals(options("--rho", "0.1"))
+    assert len(simplified(source, "--rho", "0.1")) == 30
+    assert len(capsys.readouterr().out.splitlines()) == 1
+    assert "tessellate" in shown
 
 
 @pytest.mark.usefixtures("measured")
 def test_a_budget_chooses_a_preset_and_says_so(scene):
-    goals = Goals(options("--rho", "0.1", "--time-budget", "5s"))
-    assert goals.preset(scene, {}, silent) == "high"
-    assert goals.said[0].startswith("Preset high, the best that fits into 5 s: expected to take 3")
+    chosen = choose_preset(options("--rho", "0.1", "--time-budget", "5s"), scene, {}, silent)
+    assert chosen.name == "high"
+    assert chosen.reason.startswith("Preset high, the best that fits into 5 s: expected to take 3")
 
 
 @pytest.mark.parametrize(
@@ -131,42 +140,44 @@ def test_a_budget_knows_what_else_is_set(scene, monkeypatch, words, settings, pr
     model = CostModel(rates=rates)
     monkeypatch.setattr(cvtgs.budget, "cost_model", lambda *_, **__: model)
     monkeypatch.setattr("cvtgs.budget.remember.is_known", lambda device: True)
-    monkeypatch.setattr("cvtgs.cli.goals.time.perf_counter", lambda: STARTED)
-    goals = Goals(options("--rho", "0.1", "--time-budget", "5s", *words))
+    monkeypatch.setattr("cvtgs.cli.simplify.time.perf_counter", lambda: STARTED)
+    budget = options("--rho", "0.1", "--time-budget", "5s", *words)
+    check_goals(budget)
     if preset is None:
         with pytest.raises(GoalError, match="takes about 2e\\+02 s"):
-            goals.preset(scene, settings, silent)
+            choose_preset(budget, scene, settings, silent)
     else:
-        assert goals.preset(scene, settings, silent) == preset
+        assert choose_preset(budget, scene, settings, silent).name == preset
 
 
 def test_the_machine_is_measured_once_or_when_asked(scene, measured, capsys):
     words = ["--rho", "0.1", "--time-budget", "5s"]
-    Goals(options(*words)).preset(scene, {}, silent)
+    choose_preset(options(*words), scene, {}, silent)
     assert capsys.readouterr().err == "cvtgs: measuring this machine once, about a minute\n"
-    Goals(options(*words)).preset(scene, {}, silent)
+    choose_preset(options(*words), scene, {}, silent)
     assert capsys.readouterr().err == ""
-    Goals(options(*words, "--recalibrate", "--quiet")).preset(scene, {}, silent)
+    choose_preset(options(*words, "--recalibrate", "--quiet"), scene, {}, silent)
     assert capsys.readouterr().err == ""
     assert measured == [True, False, True]
 
 
 @pytest.mark.usefixtures("measured")
 def test_a_budget_that_is_too_short(scene, monkeypatch):
-    monkeypatch.setattr("cvtgs.cli.goals.STARTED", STARTED - 60)
+    monkeypatch.setattr("cvtgs.cli.simplify.STARTED", STARTED - 60)
     with pytest.raises(GoalError, match=r"fits into 5 s: starting and reading took 60\.0 s\."):
-        Goals(options("--count", "10", "--time-budget", "5s")).preset(scene, {}, silent)
+        choose_preset(options("--count", "10", "--time-budget", "5s"), scene, {}, silent)
 
 
-def test_a_target_is_searched_and_said(scene):
-    goals = Goals(options("--target-psnr", "15"))
-    assert goals.stage_listener(print) is silent
-    small, report = goals.run(cvtgs.Simplifier(config="draft", device="cpu"), scene)
-    assert len(small) == report.output_count < 300
-    assert goals.said[0].startswith("PSNR ")
-    assert "over views that were held out; found in" in goals.said[0]
+def test_a_target_is_searched_and_said(source, capsys, shown):
+    small = simplified(source, "--target-psnr", "15")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"300 -> {len(small)} Gaussians, ")
+    assert len(small) < 300
+    assert lines[1].startswith("PSNR ")
+    assert "over views that were held out; found in" in lines[1]
+    assert "tessellate" not in shown
 
 
 def test_protected_regions_need_a_size():
     with pytest.raises(InvalidArgumentError, match=r"--keep needs --rho or --count\."):
-        Goals(options("--target-psnr", "30", "--keep", "box.json"))
+        check_goals(options("--target-psnr", "30", "--keep", "box.json"))

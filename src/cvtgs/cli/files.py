@@ -1,0 +1,113 @@
+"""``cvtgs info`` and ``cvtgs convert``: facts about a scene, and other formats."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cvtgs
+from cvtgs.cli.display import file_size
+from cvtgs.cli.options import AddParser, add_options, read_scene, read_settings
+
+if TYPE_CHECKING:
+    from cvtgs.effects import Effect
+    from cvtgs.info import SceneInfo
+
+
+def add_info(add_parser: AddParser) -> None:
+    """Add the command and its options."""
+    parser = add_parser(
+        "info",
+        help="show facts about a scene",
+        description="Show counts, sizes and statistics of a scene, and which effects simplify "
+        "would compute for it.",
+    )
+    parser.set_defaults(run=show_info)
+    add_options(parser, "input", "--json", "--effects")
+
+
+def show_info(options: argparse.Namespace) -> None:
+    """Run ``cvtgs info``."""
+    settings = read_settings(effects=options.effects)
+    config = cvtgs.SimplifyConfig.compose(settings=settings)
+    facts = cvtgs.describe(read_scene(options.input, config), config)
+    if options.json:
+        print(facts.model_dump_json(indent=2))
+    else:
+        for label, text in _rows(facts, options.input):
+            print(f"{label:<16} {text}")
+
+
+def _rows(facts: "SceneInfo", path: Path) -> list[tuple[str, str]]:
+    from cvtgs.info import HEAVIEST, QUANTILES
+
+    invalid = ", ".join(f"{name} {number:,}" for name, number in facts.invalid_rows.items())
+    rows = [
+        ("file", f"{path}, {file_size(path)}"),
+        ("Gaussians", f"{facts.count:,}"),
+        ("SH degree", f"{facts.sh_degree}"),
+        ("bounds", f"{_vector(facts.bounds[0])} to {_vector(facts.bounds[1])}"),
+        ("robust radius", f"{facts.robust_radius:.4g} around {_vector(facts.robust_center)}"),
+        ("opacity at", _labelled(QUANTILES, facts.opacity_quantiles, "{:.0%} {:.3f}")),
+        ("mass", f"{facts.mass:.4g} square units"),
+        ("heaviest hold", _labelled(HEAVIEST, facts.mass_shares, "{:.1%} {:.1%}")),
+        (
+            "opacity < 0.1",
+            f"{facts.faint_share:.1%} of the Gaussians, {facts.faint_mass_share:.1%} of the mass",
+        ),
+        ("invalid rows", f"{facts.invalid_count:,}" + (f" ({invalid})" if invalid else "")),
+        ("tags", "anti-aliased (mip)" if facts.antialiased else "none"),
+        ("comments", "; ".join(facts.comments) or "none"),
+        ("extra columns", ", ".join(facts.extra_columns) or "none"),
+    ]
+    return rows + [(name, _effect_text(effect)) for name, effect in facts.plan]
+
+
+def _effect_text(effect: "Effect") -> str:
+    from cvtgs.effects import BandsEffect
+
+    state, figures = "on " if effect.active else "off", f"{effect.figure:.3g}"
+    if isinstance(effect, BandsEffect) and effect.bands:
+        state += f" up to degree {effect.degree}" if effect.active else ""
+        figures = ", ".join(f"{loss:.3g}" for loss in effect.bands)
+    return f"{state} {figures} ({effect.meaning}{'; forced' if effect.forced else ''})"
+
+
+def _labelled(shares: tuple[float, ...], values: tuple[float, ...], form: str) -> str:
+    return "   ".join(form.format(*pair) for pair in zip(shares, values, strict=True))
+
+
+def _vector(values: tuple[float, ...]) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
+
+
+def add_convert(add_parser: AddParser) -> None:
+    """Add the command and its options."""
+    parser = add_parser(
+        "convert",
+        help="write a scene in another format",
+        description="Read IN and write it as OUT; the suffixes of the names set the formats. "
+        "Prints what the format of OUT cannot hold before writing it.",
+    )
+    parser.set_defaults(run=convert)
+    add_options(parser, "input", "output", "--overwrite", "--quiet")
+
+
+def convert(options: argparse.Namespace) -> None:
+    """Run ``cvtgs convert``."""
+    cvtgs.io.check_save(options.output, overwrite=options.overwrite)
+    scene = cvtgs.io.load(options.input)
+    lost = cvtgs.io.losses(scene, options.output)
+    if not options.quiet:
+        print(f"{options.input}: {len(scene):,} Gaussians of SH degree {scene.sh_degree}")
+        if lost.changed:
+            print(f"Files like {options.output.name} hold:")
+        for phrase in lost.changed:
+            print(f"  {phrase}", flush=True)
+    cvtgs.io.save(scene, options.output, overwrite=options.overwrite)  # warns of losses first
+    if not options.quiet:
+        print(
+            f"{options.output}: {lost.count:,} Gaussians of SH degree {lost.sh_degree}, "
+            f"{file_size(options.input)} -> {file_size(options.output)}"
+        )
+        rest = "nothing but precision" if lost.changed else "nothing"
+        print(f"Lost: {'; '.join(lost.dropped) or rest}.")

@@ -1,0 +1,272 @@
+"""Options that several commands share, and reading their values."""
+
+import argparse
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from itertools import takewhile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import cvtgs
+from cvtgs.errors import ConfigError, InvalidArgumentError
+
+if TYPE_CHECKING:
+    import pydantic
+
+    from cvtgs.cameras import Cameras
+    from cvtgs.config import SimplifyConfig
+    from cvtgs.evaluation import EvaluationSettings
+    from cvtgs.scene import GaussianScene
+
+Color = tuple[float, float, float]
+
+READABLE = ".ply, .spz, .splat, .sog, .ckpt, .pt or the folder of a trained model"
+PRESETS = "draft, fast, standard, high, max (from the fastest to the best) or paper"
+CAMERA_FILES = "transforms.json, a COLMAP model, cameras.json, or a folder of these"
+COLORS: Mapping[str, Color] = {
+    "black": (0.0, 0.0, 0.0),
+    "gray": (0.5, 0.5, 0.5),
+    "white": (1.0, 1.0, 1.0),
+}
+AUTOMATIC_VIEWS = 8
+
+# By name, or by both spellings. The help of a value is a noun phrase, that of a flag begins with
+# a verb.
+_SHARED: Mapping[str, Mapping[str, Any]] = {
+    "input": {"metavar": "IN", "type": Path, "help": f"scene to read ({READABLE})"},
+    "output": {
+        "metavar": "OUT",
+        "type": Path,
+        "help": "scene to write (.ply, .compressed.ply, .spz, .splat or .sog)",
+    },
+    "reference": {"metavar": "REF", "type": Path, "help": f"full scene ({READABLE})"},
+    "small": {"metavar": "SMALL", "type": Path, "nargs": "+", "help": "simplified scenes"},
+    "-o/--output": {
+        "metavar": "DIR",
+        "type": Path,
+        "required": True,
+        "help": "directory to write to",
+    },
+    "--rho": {
+        "metavar": "R,R",
+        "default": "0.1,0.01,0.001",
+        "help": "ratios of Gaussians to keep (default 0.1,0.01,0.001)",
+    },
+    "--preset": {"metavar": "NAME", "help": f"preset: {PRESETS} (default standard)"},
+    "--ckpt": {
+        "metavar": "NAME",
+        "default": "auto",
+        "help": "MergeNet checkpoint: auto (default: the one of the preset), standard, paper, a "
+        "file, or none to merge by moments alone",
+    },
+    "--config": {"metavar": "F.toml", "type": Path, "help": "configuration file"},
+    "--set": {
+        "metavar": "KEY=VALUE",
+        "action": "append",
+        "default": [],
+        "dest": "settings",
+        "help": "setting to change, for example cvt.iterations=10; can be repeated",
+    },
+    "--effects": {
+        "metavar": "NAME=VALUE,...",
+        "help": "effects to force, for example sh=1,mip=off, instead of those that the scene "
+        "needs: sh (0 to 3); mip, unbounded, haze, duplicates (on or off); flat, extras, "
+        "visibility (off)",
+    },
+    "--lpips": {
+        "default": "auto",
+        "choices": ("auto", "vgg", "alex", "off"),
+        "help": "network of LPIPS (default auto: VGG or Alex, if weights are installed)",
+    },
+    "--cameras": {
+        "metavar": "F",
+        "type": Path,
+        "help": f"cameras to render from: {CAMERA_FILES} (default: those in the folder of REF or "
+        "IN if it is a model of INRIA's code, else automatic views)",
+    },
+    "--split": {"choices": ("train", "test"), "help": "part of the cameras of --cameras to use"},
+    "--views": {
+        "metavar": "N",
+        "type": int,
+        "help": "number of views; of --cameras, N spread evenly (default 8, or all of --cameras)",
+    },
+    "--background": {
+        "metavar": "COLOR",
+        "default": "black",
+        "help": "background color: black (default), gray, white, or red,green,blue from 0 to 1",
+    },
+    "--backend": {
+        "default": "auto",
+        "choices": ("auto", "torch", "numba", "gsplat"),
+        "help": "renderer (default auto: the fastest available)",
+    },
+    "--device": {
+        "metavar": "DEVICE",
+        "default": "auto",
+        "help": "device to compute on: auto (default), cpu or cuda",
+    },
+    "--overwrite": {"action": "store_true", "help": "replace existing files"},
+    "--quiet": {"action": "store_true", "help": "print only errors and warnings"},
+    "--json": {"action": "store_true", "help": "print JSON"},
+}
+
+
+class CommandParser(argparse.ArgumentParser):
+    """An argument parser that suggests the nearest command, option or choice for an unknown one."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Report an unknown option, even if a required one is missing; then parse the words."""
+        if self._subparsers is None:  # the parser of one command
+            options = self._option_string_actions
+            for word in takewhile(lambda word: word != "--", args or ()):
+                name = word.partition("=")[0]
+                if name.startswith("--") and not any(one.startswith(name) for one in options):
+                    self.error(f"unrecognized argument: {name}{suggestion(name, options)}")
+        return super().parse_known_args(args, namespace)
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and a message with a suggestion, and exit with status 2."""
+        wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        if wrong:
+            message += suggestion(wrong[1], re.findall(r"[\w-]+", wrong[2]))
+        super().error(message)
+
+
+AddParser = Callable[..., CommandParser]
+"""``add_parser`` of the subparsers of ``cvtgs``: makes the parser of one command."""
+
+
+def suggestion(word: str, choices: Iterable[str], *, likeness: float = 0.6) -> str:
+    """Return "; did you mean X?" with the choice most like a word; empty if none is alike."""
+    near = get_close_matches(word, list(choices), n=1, cutoff=likeness)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Add shared options to a command."""
+    for name in names:
+        parser.add_argument(*name.split("/"), **_SHARED[name])
+
+
+def add_view_options(parser: argparse.ArgumentParser, *, size: int) -> None:
+    """Add the options of cameras and images; ``size`` is the default of ``--size``."""
+    add_options(parser, "--cameras", "--split", "--views")
+    parser.add_argument(
+        "--size",
+        type=int,
+        metavar="N",
+        help=f"longer side of the images in pixels (default {size}, or that of --cameras)",
+    )
+    add_options(parser, "--background", "--backend", "--device", "--quiet")
+    parser.set_defaults(default_size=size)
+
+
+def check_view_options(options: argparse.Namespace) -> None:
+    """Check the options of :func:`add_view_options` before any file is read."""
+    for name in ("views", "size"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise InvalidArgumentError(f"--{name} must be at least 1, found {value}.")
+    if options.split is not None and options.cameras is None:
+        raise InvalidArgumentError("--split chooses among cameras and needs --cameras.")
+    background_color(options)
+
+
+def background_color(options: argparse.Namespace) -> Color:
+    """Read ``--background``."""
+    word = options.background.strip().lower()
+    if word in COLORS:
+        return COLORS[word]
+    try:
+        red, green, blue = (float(part) for part in word.split(","))
+    except ValueError:
+        red = green = blue = -1.0
+    if not all(0 <= part <= 1 for part in (red, green, blue)):
+        raise InvalidArgumentError(
+            f"--background must be {', '.join(COLORS)} or red,green,blue from 0 to 1, "
+            f"found {options.background!r}."
+        )
+    return red, green, blue
+
+
+def evaluation_settings(options: argparse.Namespace) -> "EvaluationSettings":
+    """Return how to render and score; a command without ``--lpips`` measures it if it can."""
+    return cvtgs.evaluation.EvaluationSettings(
+        background=background_color(options),
+        lpips=getattr(options, "lpips", "auto"),
+        backend=options.backend,
+    )
+
+
+def choose_cameras(
+    options: argparse.Namespace, scene: "GaussianScene", *, most: int | None = None
+) -> "Cameras":
+    """Read the cameras of an option or of the scene's folder, or find views of the scene."""
+    size, views = options.size or options.default_size, options.views or AUTOMATIC_VIEWS
+    if options.cameras is not None:
+        cameras = cvtgs.load_cameras(options.cameras, split=options.split)
+        cameras = cameras.spread(options.views or most or len(cameras))
+        return cameras if options.size is None else cameras.fitted(size)
+    path = options.reference if "reference" in options else options.input
+    if (path / "cameras.json").is_file():  # beside a scene, as INRIA's code writes them
+        return cvtgs.load_cameras(path / "cameras.json").spread(views).fitted(size)
+    height = max(1, round(0.75 * size))
+    return cvtgs.views.automatic_views(scene, views, width=size, height=height)
+
+
+def read_words(text: str) -> list[str]:
+    """Read words with commas between them."""
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def read_ratios(text: str) -> list[float]:
+    """Read the list of ratios of ``--rho``."""
+    try:
+        ratios = [float(word) for word in read_words(text)]
+    except ValueError:
+        ratios = []
+    if not ratios or len(set(ratios)) < len(ratios):
+        raise InvalidArgumentError(
+            f"--rho must be different numbers with commas, for example 0.1,0.01; found {text!r}."
+        )
+    return ratios
+
+
+def read_settings(words: Sequence[str] = (), effects: str | None = None) -> dict[str, str]:
+    """Read ``--set`` and ``--effects`` as settings by dotted key; those of ``--set`` win."""
+    example = "--effects needs NAME=VALUE, for example sh=1,mip=off"
+    forced = _assignments([] if effects is None else effects.split(","), example)
+    settings = {f"effects.{name}": value for name, value in forced.items()}
+    settings |= _assignments(words, "--set needs KEY=VALUE, for example cvt.iterations=10")
+    known = list(_setting_names(cvtgs.SimplifyConfig))
+    for key in settings:
+        nearest = "" if key in known else suggestion(key, known, likeness=0.82)
+        if nearest:  # the configuration reports what is like no setting
+            raise ConfigError(f"{key}: is not a known setting{nearest}")
+    return settings
+
+
+def _assignments(words: Sequence[str], example: str) -> dict[str, str]:
+    assignments = {}
+    for word in words:
+        key, equals, value = (part.strip() for part in word.partition("="))
+        if not (key and equals and value):
+            raise ConfigError(f"{example}; found {word!r}.")
+        assignments[key] = value
+    return assignments
+
+
+def _setting_names(section: "type[pydantic.BaseModel]", prefix: str = "") -> Iterator[str]:
+    """List the dotted keys of a configuration."""
+    for name, field in section.model_fields.items():
+        if isinstance(field.annotation, type) and hasattr(field.annotation, "model_fields"):
+            yield from _setting_names(field.annotation, f"{prefix}{name}.")
+        else:
+            yield prefix + name
+
+
+def read_scene(path: Path, config: "SimplifyConfig") -> "GaussianScene":
+    """Read a scene without what ``--effects`` switches off."""
+    degree = None if config.effects.sh == "auto" else config.effects.sh
+    return cvtgs.io.load(path, sh_degree=degree, extras=config.effects.extras != "off")
