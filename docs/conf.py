@@ -1,7 +1,7 @@
 """Sphinx configuration; ``nox -s docs`` builds the pages into ``docs/_build/html``.
 
 Nothing is fetched: formulas become MathML, and types of other packages link to their documentation
-by a table (``_extensions/external_types.py``).
+by a table (``_extensions/references.py``).
 """
 
 import sys
@@ -21,12 +21,9 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "commands",
-    "constants",
-    "every_name",
-    "external_types",
-    "house_style",
+    "docstrings",
     "mathml",
-    "models",
+    "references",
 ]
 exclude_patterns = ["_build", "_extensions", "drawings"]
 

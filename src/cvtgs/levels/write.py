@@ -10,6 +10,7 @@ from cvtgs.levels.index import LevelEntry, LevelsIndex
 from cvtgs.simplify import Level
 
 INDEX_NAME = "levels.json"
+"""Name of the index beside the levels."""
 
 
 def level_names(rhos: Sequence[float], suffix: str = ".ply") -> tuple[str, ...]:
