@@ -8,9 +8,8 @@ import torch
 import render_oracle as oracle
 from cvtgs.cameras import Cameras
 from cvtgs.math import spherical_harmonics
-from cvtgs.rendering.projection import project, reach_of
-from cvtgs.rendering.tiles import intersect
-from cvtgs.rendering.views import views_of
+from cvtgs.rendering.projection import project, reach_of, to_pinholes
+from cvtgs.rendering.torch_backend import intersect
 from scenes import random_scene
 
 
@@ -70,7 +69,7 @@ def test_tiles_are_those_with_a_pixel_that_is_reached(side, size):
     viewmat = torch.eye(4).double()
     viewmat[2, 3] = 3.0
     Ks = torch.tensor([[[30.0, 0, 19], [0, 30, 14], [0, 0, 1]]]).double()  # noqa: N806
-    view = views_of(Cameras(viewmats=viewmat[None], Ks=Ks, width=37, height=29))[0]
+    view = to_pinholes(Cameras(viewmats=viewmat[None], Ks=Ks, width=37, height=29))[0]
     splats = project(scene, view, 0)
     lists = intersect(splats, view.size, side)
     listed = set()
@@ -97,7 +96,7 @@ def test_tiles_by_splat_are_the_same_intersections():
     viewmat = torch.eye(4)
     viewmat[2, 3] = 3.0
     Ks = torch.tensor([[[30.0, 0, 19], [0, 30, 14], [0, 0, 1]]])  # noqa: N806
-    view = views_of(Cameras(viewmats=viewmat[None], Ks=Ks, width=37, height=29))[0]
+    view = to_pinholes(Cameras(viewmats=viewmat[None], Ks=Ks, width=37, height=29))[0]
     lists = intersect(project(scene, view, 0), view.size, 8)
     by_splat = torch.empty_like(lists.splats)
     by_splat[lists.ranks] = lists.splats

@@ -5,7 +5,6 @@ imported only when they are chosen.
 """
 
 from cvtgs.rendering.backends import BackendName, choose_backend
-from cvtgs.rendering.contributions import contributions
-from cvtgs.rendering.render import Rendering, render
+from cvtgs.rendering.render import Rendering, contributions, render
 
 __all__ = ["BackendName", "Rendering", "choose_backend", "contributions", "render"]

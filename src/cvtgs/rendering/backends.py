@@ -1,26 +1,47 @@
-"""Choose, once and by name, what renders."""
+"""The backends: choose one by name, and what all of them take and give."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Literal, Protocol, cast, get_args
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError, InvalidArgumentError, MissingDependencyError
-from cvtgs.progress import ProgressListener
-from cvtgs.rendering.output import RasterOutput
+from cvtgs.math.spherical_harmonics import SH_C0
+from cvtgs.progress import ProgressEvent, ProgressListener
 from cvtgs.scene import GaussianScene
 
 BackendName = Literal["auto", "torch", "numba", "gsplat"]
 """The names that :func:`choose_backend` takes."""
 
+STAGE = "render"
+"""The stage of the progress events; a step is a camera."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RasterOutput:
+    """Images on black, before any background.
+
+    Attributes:
+        rgb: ``(c, h, w, 3)`` colours, each times its weight ``alpha * T``.
+        alpha: ``(c, h, w)`` sums of the weights, 0 to 1.
+        depth: ``(c, h, w)`` depths, each times its weight, scene units.
+    """
+
+    rgb: Float[Tensor, "c h w 3"]
+    alpha: Float[Tensor, "c h w"]
+    depth: Float[Tensor, "c h w"]
+
 
 class Backend(Protocol):
-    """What every backend's module offers."""
+    """The functions of every backend's module."""
 
     def require(self, device: torch.device) -> None:
-        """Raise a DeviceError or MissingDependencyError unless it works on that device."""
+        """Raise a DeviceError or MissingDependencyError unless the backend works on that device."""
         ...
 
     def rasterize(
@@ -35,7 +56,7 @@ class Backend(Protocol):
         ...
 
     def contributions(self, scene: GaussianScene, camera: Cameras) -> Tensor:
-        """Return the pixels that every Gaussian paints of one image."""
+        """Return every Gaussian's sum of weights ``alpha * T`` over one image."""
         ...
 
 
@@ -76,3 +97,31 @@ def _backend(name: str, device: torch.device) -> Backend:
     backend = cast("Backend", import_module(f"cvtgs.rendering.{name}_backend"))
     backend.require(device)
     return backend
+
+
+def render_each(
+    images: Sequence[Callable[[], Float[Tensor, "h w 5"]]],
+    empty: Float[Tensor, "0 h w 5"],
+    listener: ProgressListener,
+) -> RasterOutput:
+    """Render cameras one after the other: colours, depth and transmittance of each."""
+    listener(ProgressEvent(stage=STAGE, done=0, total=len(images)))
+    found = [empty]
+    for number, image in enumerate(images, start=1):
+        found.append(image()[None])
+        listener(ProgressEvent(stage=STAGE, done=number, total=len(images)))
+    layers = torch.cat(found)
+    return RasterOutput(rgb=layers[..., :3], depth=layers[..., 3], alpha=1 - layers[..., 4])
+
+
+def contributions_by_gradient(
+    rasterize: Callable[..., RasterOutput], scene: GaussianScene, camera: Cameras
+) -> Float[Tensor, "n"]:
+    """Compute contributions as the gradient of the image's sum with respect to the colours."""
+    with torch.enable_grad():
+        # Grey, where no colour is clipped, without the bands that do not matter here.
+        sh0 = torch.zeros_like(scene.sh0).requires_grad_()
+        gray = scene.with_tensors({"sh0": sh0, "shN": scene.shN[:, :0]}, {})
+        image = rasterize(gray, camera, sh_degree=0).rgb
+        (gradient,) = torch.autograd.grad(image[..., 0].sum(), sh0)
+    return gradient[:, 0, 0].double().clamp_min(0.0) / SH_C0

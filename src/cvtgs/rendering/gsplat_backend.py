@@ -15,10 +15,8 @@ from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError, MissingDependencyError
 from cvtgs.math.spherical_harmonics import REST_COUNTS, evaluate
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.rendering.contributions import contributions_by_gradient
-from cvtgs.rendering.output import STAGE, RasterOutput
-from cvtgs.rendering.rules import DILATION, NEAR_PLANE
-from cvtgs.rendering.views import views_of
+from cvtgs.rendering.backends import STAGE, RasterOutput, contributions_by_gradient
+from cvtgs.rendering.projection import DILATION, NEAR_PLANE, to_pinholes
 from cvtgs.scene import GaussianScene
 
 
@@ -52,10 +50,10 @@ def rasterize(
 
     Memory: gsplat's, linear in cameras times Gaussians, and in intersections.
     """
-    views_of(cameras)  # checks them
+    to_pinholes(cameras)  # checks them
     listener(ProgressEvent(stage=STAGE, done=0, total=len(cameras)))
     if len(scene) and len(cameras):
-        layers, alpha = _paint(scene, cameras, sh_degree)
+        layers, alpha = _rasterize_all(scene, cameras, sh_degree)
     else:
         layers = scene.means.new_zeros(len(cameras), cameras.height, cameras.width, 4)
         alpha = layers[..., :1]
@@ -69,7 +67,7 @@ def contributions(scene: GaussianScene, camera: Cameras) -> Tensor:
     return contributions_by_gradient(rasterize, scene, camera)
 
 
-def _paint(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tuple[Tensor, Tensor]:
+def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tuple[Tensor, Tensor]:
     """Return colours with depths, times what they hide, and alpha."""
     rest = scene.shN[:, : REST_COUNTS[sh_degree]]
     if sh_degree:

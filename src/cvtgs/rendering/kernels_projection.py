@@ -1,4 +1,4 @@
-"""Project Gaussians in one compiled loop; the arithmetic of ``projection.py``, in float64."""
+"""Project Gaussians, forward and backward, in compiled loops: ``projection.py`` in float64."""
 
 import math
 
@@ -7,9 +7,16 @@ from numpy.typing import NDArray
 
 from cvtgs.math.activations import LOGIT_LIMIT
 from cvtgs.math.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
-from cvtgs.rendering.arrays import Array, GaussianArrays, Setting
-from cvtgs.rendering.compiled import parallel, prange, serial
-from cvtgs.rendering.rules import DILATION, MIN_ALPHA, NEAR_PLANE
+from cvtgs.rendering.compiled import (
+    Array,
+    GaussianArrays,
+    RasterSettings,
+    SplatArrays,
+    parallel,
+    prange,
+    serial,
+)
+from cvtgs.rendering.projection import DILATION, MIN_ALPHA, NEAR_PLANE
 
 C2A, C2B = SH_C2
 C3A, C3B, C3C, C3D = SH_C3
@@ -17,7 +24,7 @@ C3A, C3B, C3C, C3D = SH_C3
 
 @serial
 def rotation_of(quat: Array, out: Array) -> float:
-    """Write the rotation matrix of a quaternion of any length; give its length."""
+    """Write the rotation matrix of a quaternion of any length; return its length."""
     largest = max(abs(quat[0]), abs(quat[1]), abs(quat[2]), abs(quat[3]))
     w, x, y, z = quat[0] / largest, quat[1] / largest, quat[2] / largest, quat[3] / largest
     norm = math.sqrt(w * w + x * x + y * y + z * z)
@@ -120,7 +127,7 @@ def local_of(mean: Array, camera: Array, offset: Array, local: Array) -> None:
 
 @serial
 def normalize_in_place(vector: Array) -> float:
-    """Scale a vector to unit length; give its length before."""
+    """Scale a vector to unit length; return its length before."""
     norm = math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
     for k in range(3):
         vector[k] /= norm
@@ -135,7 +142,7 @@ def sigmoid(logit: float) -> float:
 
 @serial
 def splat_of(axes: Array, local: Array, camera: Array, opacity: float, out: Array) -> bool:
-    """Write all of a packed splat but its colour; tell whether it touches the image."""
+    """Write all of a packed splat but its colour; return whether it touches the image."""
     a, b, d, bare = covariance_of(axes)
     schur = bare + DILATION * (a + d - DILATION) / d
     x = camera[4, 0] * local[0] / local[2] + camera[5, 0]
@@ -154,16 +161,16 @@ def splat_of(axes: Array, local: Array, camera: Array, opacity: float, out: Arra
 
 @parallel
 def project_all(
-    gaussians: GaussianArrays, setting: Setting, packed: Array, seen: NDArray[np.bool_]
+    gaussians: GaussianArrays, settings: RasterSettings, packed: Array, visible: NDArray[np.bool_]
 ) -> None:
     """Write a packed splat for every Gaussian, and which of them are in view."""
     means, quats, log_scales, logits, sh0, rest = gaussians
-    camera, _, degree, antialiased = setting
+    camera, _, degree, antialiased = settings
     for i in prange(len(means)):
         scratch = np.empty((11, 3))
         offset, local, color = scratch[0], scratch[1], scratch[2]
         rotation, axes = scratch[3:6], scratch[6:11]
-        seen[i] = False
+        visible[i] = False
         local_of(means[i], camera, offset, local)
         opacity = sigmoid(logits[i])
         if not (local[2] >= NEAR_PLANE and local[2] < math.inf and opacity >= MIN_ALPHA):
@@ -180,4 +187,200 @@ def project_all(
         color_of((sh0[i], rest[i]), offset, degree, np.empty(15), color)
         for channel in range(3):
             packed[i, 6 + channel] = max(0.0, color[channel])
-        seen[i] = True
+        visible[i] = True
+
+
+@serial
+def rest_slopes_at(x: float, y: float, z: float, degree: int, out: Array) -> None:
+    """Write the derivatives of the view-dependent SH functions by x, y and z."""
+    out[:] = 0
+    out[0, 1], out[1, 2], out[2, 0] = -SH_C1, SH_C1, -SH_C1
+    if degree > 1:
+        out[3, 0], out[3, 1] = C2A * y, C2A * x
+        out[4, 1], out[4, 2] = -C2A * z, -C2A * y
+        out[5, 0], out[5, 1], out[5, 2] = -2 * C2B * x, -2 * C2B * y, 4 * C2B * z
+        out[6, 0], out[6, 2] = -C2A * z, -C2A * x
+        out[7, 0], out[7, 1] = C2A * x, -C2A * y
+    if degree > 2:
+        xx, yy, zz = x * x, y * y, z * z
+        out[8, 0], out[8, 1] = -6 * C3A * x * y, -3 * C3A * (xx - yy)
+        out[9, 0], out[9, 1], out[9, 2] = C3B * y * z, C3B * x * z, C3B * x * y
+        out[10, 0], out[10, 2] = 2 * C3C * x * y, -8 * C3C * y * z
+        out[10, 1] = -C3C * (4 * zz - xx - 3 * yy)
+        out[11, 0], out[11, 1] = -6 * C3D * x * z, -6 * C3D * y * z
+        out[11, 2] = C3D * (6 * zz - 3 * xx - 3 * yy)
+        out[12, 0], out[12, 1] = -C3C * (4 * zz - 3 * xx - yy), 2 * C3C * x * y
+        out[12, 2] = -8 * C3C * x * z
+        out[13, 0], out[13, 1], out[13, 2] = C3B * x * z, -C3B * y * z, 0.5 * C3B * (xx - yy)
+        out[14, 0], out[14, 1] = -3 * C3A * (xx - yy), 6 * C3A * x * y
+
+
+@serial
+def color_gradient(
+    grad: Array,
+    offset: Array,
+    degree: int,
+    sh: tuple[Array, Array],
+    out: tuple[Array, Array],
+    toward: Array,
+) -> None:
+    """Write the gradient by the coefficients, and add that by the way from the camera."""
+    direction, basis, slopes = offset.copy(), np.empty(15), np.empty((15, 3))
+    color, kept = np.empty(3), np.empty(3)
+    norm = normalize_in_place(direction)
+    color_of(sh, direction, degree, basis, color)
+    for channel in range(3):
+        kept[channel] = grad[channel] if color[channel] >= 0 else 0.0
+        out[0][0, channel] = SH_C0 * kept[channel]
+    if degree == 0:
+        return
+    rest_slopes_at(direction[0], direction[1], direction[2], degree, slopes)
+    turn = np.zeros(3)
+    for j in range((degree + 1) * (degree + 1) - 1):
+        worth = 0.0
+        for channel in range(3):
+            out[1][j, channel] = basis[j] * kept[channel]
+            worth += kept[channel] * sh[1][j, channel]
+        for k in range(3):
+            turn[k] += worth * slopes[j, k]
+    radial = turn[0] * direction[0] + turn[1] * direction[1] + turn[2] * direction[2]
+    for k in range(3):
+        toward[k] += (turn[k] - radial * direction[k]) / norm
+
+
+@serial
+def covariance_gradient(grad: Array, axes: Array, antialiased: bool) -> tuple[float, float, float]:
+    """Return the gradient by a, b, d of the covariance."""
+    a, b, d, bare = covariance_of(axes)
+    schur = bare + DILATION * (a + d - DILATION) / d
+    shear, flat = -b / d, 1 / d
+    of_schur = 0.5 * grad[2] / (schur * schur)
+    of_a = of_schur
+    of_b = 2 * shear * of_schur - flat * grad[3]
+    of_d = of_schur * shear * shear - flat * shear * grad[3] + 0.5 * grad[4] * flat * flat
+    if antialiased:
+        # log survival = (log bare_det - log det) / 2; the packed splat holds log opacity.
+        bare_det, det = bare * d, schur * d
+        of_a += 0.5 * grad[5] * ((d - DILATION) / bare_det - d / det)
+        of_d += 0.5 * grad[5] * ((a - DILATION) / bare_det - a / det)
+        of_b += grad[5] * (b / det - b / bare_det)
+    return of_a, of_b, of_d
+
+
+@serial
+def quaternion_gradient(quat: Array, length: float, of_rotation: Array, out: Array) -> None:
+    """Write the gradient by a quaternion of any length from that by its rotation matrix."""
+    w, x, y, z = quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length
+    g = of_rotation
+    of_w = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
+    of_x = 2 * (
+        w * (g[2, 1] - g[1, 2]) + y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0])
+        - 2 * x * (g[1, 1] + g[2, 2])
+    )  # fmt: skip
+    of_y = 2 * (
+        w * (g[0, 2] - g[2, 0]) + x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1])
+        - 2 * y * (g[0, 0] + g[2, 2])
+    )  # fmt: skip
+    of_z = 2 * (
+        w * (g[1, 0] - g[0, 1]) + x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1])
+        - 2 * z * (g[0, 0] + g[1, 1])
+    )  # fmt: skip
+    radial = of_w * w + of_x * x + of_y * y + of_z * z
+    out[0], out[1] = (of_w - radial * w) / length, (of_x - radial * x) / length
+    out[2], out[3] = (of_y - radial * y) / length, (of_z - radial * z) / length
+
+
+@serial
+def axes_gradient(
+    covariance: tuple[float, float, float],
+    axes: Array,
+    log_scales: Array,
+    place: tuple[Array, Array],
+    out: tuple[Array, Array, Array],
+) -> None:
+    """Write the gradient by axes in the camera and log scales; add that by the position there."""
+    of_a, of_b, of_d = covariance
+    camera, local = place
+    of_axes, of_log_scales, of_local = out
+    x, y = local[0] / local[2], local[1] / local[2]
+    x_slope = min(max(x, camera[6, 0]), camera[6, 1])
+    y_slope = min(max(y, camera[7, 0]), camera[7, 1])
+    of_x, of_y, size = 0.0, 0.0, 0.0
+    for k in range(3):
+        across = 2 * of_a * axes[3, k] + of_b * axes[4, k]
+        down = 2 * of_d * axes[4, k] + of_b * axes[3, k]
+        share = across * axes[3, k] + down * axes[4, k]
+        of_log_scales[k] = share
+        size += share
+        scale = math.exp(log_scales[k]) / local[2]
+        across *= camera[4, 0] * scale
+        down *= camera[4, 1] * scale
+        of_axes[0, k], of_axes[1, k] = across, down
+        of_axes[2, k] = -x_slope * across - y_slope * down
+        of_x -= across * axes[2, k]
+        of_y -= down * axes[2, k]
+    of_local[2] -= size / local[2]
+    if camera[6, 0] <= x <= camera[6, 1]:
+        of_local[0] += of_x / local[2]
+        of_local[2] -= of_x * x / local[2]
+    if camera[7, 0] <= y <= camera[7, 1]:
+        of_local[1] += of_y / local[2]
+        of_local[2] -= of_y * y / local[2]
+
+
+@serial
+def rotate_back(
+    camera: Array, of_axes: Array, of_local: Array, of_rotation: Array, of_offset: Array
+) -> None:
+    """Write gradients by rotation and position along the world's axes."""
+    for j in range(3):
+        of_offset[j] = 0
+        for k in range(3):
+            of_offset[j] += camera[k, j] * of_local[k]
+            of_rotation[j, k] = (
+                camera[0, j] * of_axes[0, k]
+                + camera[1, j] * of_axes[1, k]
+                + camera[2, j] * of_axes[2, k]
+            )
+
+
+@parallel
+def project_all_gradient(
+    gaussians: GaussianArrays,
+    settings: RasterSettings,
+    splats: SplatArrays,
+    per_intersection: Array,
+    gradients: GaussianArrays,
+) -> None:
+    """Sum the gradients of each splat's intersections and write those by the scene's tensors."""
+    means, quats, log_scales, logits, sh0, rest = gaussians
+    of_means, of_quats, of_log_scales, of_logits, of_sh0, of_rest = gradients
+    camera, _, degree, antialiased = settings
+    rows, starts, _ = splats
+    for splat in prange(len(rows)):
+        i = rows[splat]
+        grad, scratch = np.zeros(10), np.zeros((18, 3))
+        for place in range(starts[splat], starts[splat + 1]):
+            for column in range(10):
+                grad[column] += per_intersection[place, column]
+        offset, local, of_local, of_offset = scratch[0], scratch[1], scratch[2], scratch[3]
+        rotation, axes = scratch[4:7], scratch[7:12]
+        of_axes, of_rotation = scratch[12:15], scratch[15:18]
+        local_of(means[i], camera, offset, local)
+        length = rotation_of(quats[i], rotation)
+        axes_of(rotation, log_scales[i], camera, local, axes)
+        opacity = sigmoid(logits[i])
+        of_a, of_b, of_d = covariance_gradient(grad, axes, antialiased)
+        if abs(logits[i]) < LOGIT_LIMIT:
+            of_logits[i] = grad[5] * (1 - opacity)
+        of_local[0] = grad[0] * camera[4, 0] / local[2]
+        of_local[1] = grad[1] * camera[4, 1] / local[2]
+        of_local[2] = grad[9] - (of_local[0] * local[0] + of_local[1] * local[1]) / local[2]
+        out = (of_axes, of_log_scales[i], of_local)
+        axes_gradient((of_a, of_b, of_d), axes, log_scales[i], (camera, local), out)
+        rotate_back(camera, of_axes, of_local, of_rotation, of_offset)
+        quaternion_gradient(quats[i], length, of_rotation, of_quats[i])
+        sh, of_sh = (sh0[i], rest[i]), (of_sh0[i], of_rest[i])
+        color_gradient(grad[6:9], offset, degree, sh, of_sh, of_offset)
+        for k in range(3):
+            of_means[i, k] = of_offset[k]

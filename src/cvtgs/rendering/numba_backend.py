@@ -13,15 +13,23 @@ from torch.autograd.function import once_differentiable
 from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.rendering.arrays import GaussianArrays, Setting, SplatArrays, TileArrays
-from cvtgs.rendering.compiled import use_threads
-from cvtgs.rendering.kernels_blending import composite_all
-from cvtgs.rendering.kernels_blending_gradient import composite_all_gradient
-from cvtgs.rendering.kernels_projection import project_all
-from cvtgs.rendering.kernels_projection_gradient import project_all_gradient
-from cvtgs.rendering.kernels_tiles import count_tiles, name_tiles, sort_by_tile
-from cvtgs.rendering.output import RasterOutput, paint_each
-from cvtgs.rendering.views import View, views_of
+from cvtgs.rendering.backends import RasterOutput, render_each
+from cvtgs.rendering.compiled import (
+    GaussianArrays,
+    RasterSettings,
+    SplatArrays,
+    TileArrays,
+    use_threads,
+)
+from cvtgs.rendering.kernels_blending import (
+    composite_all,
+    composite_all_gradient,
+    count_tiles,
+    sort_by_tile,
+    write_tiles,
+)
+from cvtgs.rendering.kernels_projection import project_all, project_all_gradient
+from cvtgs.rendering.projection import Pinhole, to_pinholes
 from cvtgs.scene import GaussianScene
 
 SIDE = 16
@@ -56,27 +64,26 @@ def rasterize(
     """
     use_threads(torch.get_num_threads())
     tensors = [tensor.contiguous() for tensor in scene.tensors().values()]
-    settings = [
-        Setting(_numbers(view), view.size, sh_degree, scene.antialiased)
-        for view in views_of(cameras)
+    images = [
+        partial(_Render.apply, _settings(camera, sh_degree, scene.antialiased), *tensors)
+        for camera in to_pinholes(cameras)
     ]
-    views = [partial(_Render.apply, setting, *tensors) for setting in settings]
-    blank = scene.means.new_zeros(0, cameras.height, cameras.width, 5)
-    return paint_each(views, blank, listener)
+    empty = scene.means.new_zeros(0, cameras.height, cameras.width, 5)
+    return render_each(images, empty, listener)
 
 
 def contributions(scene: GaussianScene, camera: Cameras) -> Float[Tensor, "n"]:
-    """Return the pixels that every Gaussian paints of one image, by one forward pass."""
+    """Return every Gaussian's sum of weights ``alpha * T`` over one image, by one forward pass."""
     use_threads(torch.get_num_threads())
     found = np.zeros(len(scene))
-    arrays = {name: tensor.detach().contiguous() for name, tensor in scene.tensors().items()}
-    gaussians = GaussianArrays(*(tensor.numpy() for tensor in arrays.values()))
-    for view in views_of(camera):
-        splats, tiles = _listed(gaussians, Setting(_numbers(view), view.size, 0, scene.antialiased))
-        image = np.empty((view.size[1], view.size[0], 5), splats.packed.dtype)
-        painted = np.zeros(len(tiles.lists))
-        composite_all(splats.packed, tiles, _centers(image), image, painted)
-        sums = np.concatenate([[0.0], np.cumsum(painted)])[splats.starts]
+    arrays = [tensor.detach().contiguous().numpy() for tensor in scene.tensors().values()]
+    for pinhole in to_pinholes(camera):
+        settings = _settings(pinhole, 0, scene.antialiased)
+        splats, tiles = _splats_by_tile(GaussianArrays(*arrays), settings)
+        image = np.empty((settings.size[1], settings.size[0], 5), splats.packed.dtype)
+        weights = np.zeros(len(tiles.lists))
+        composite_all(splats.packed, tiles, _pixel_centers(image), image, weights)
+        sums = np.concatenate([[0.0], np.cumsum(weights)])[splats.starts]
         found[splats.rows] += np.diff(sums)
     return torch.from_numpy(found)
 
@@ -85,14 +92,14 @@ class _Render(torch.autograd.Function):
     """One image. The backward pass uses the lists of the forward pass, and blends once more."""
 
     @staticmethod
-    def forward(ctx: Any, setting: Setting, *tensors: Tensor) -> Float[Tensor, "h w 5"]:
+    def forward(ctx: Any, settings: RasterSettings, *tensors: Tensor) -> Float[Tensor, "h w 5"]:
         gaussians = GaussianArrays(*(tensor.detach().numpy() for tensor in tensors))
-        splats, tiles = _listed(gaussians, setting)
-        image = np.empty((setting.size[1], setting.size[0], 5), splats.packed.dtype)
-        composite_all(splats.packed, tiles, _centers(image), image, np.empty(0))
+        splats, tiles = _splats_by_tile(gaussians, settings)
+        image = np.empty((settings.size[1], settings.size[0], 5), splats.packed.dtype)
+        composite_all(splats.packed, tiles, _pixel_centers(image), image, np.empty(0))
         result = torch.from_numpy(image)
         ctx.save_for_backward(result, *tensors)
-        ctx.setting, ctx.splats, ctx.tiles = setting, splats, tiles
+        ctx.settings, ctx.splats, ctx.tiles = settings, splats, tiles
         return result
 
     @staticmethod
@@ -101,41 +108,43 @@ class _Render(torch.autograd.Function):
         use_threads(torch.get_num_threads())
         image, *arrays = (tensor.detach().numpy() for tensor in ctx.saved_tensors)
         gaussians = GaussianArrays(*arrays)
-        per_place = np.zeros((len(ctx.tiles.lists), 10), image.dtype)
-        of_image = grad.contiguous().numpy()
+        per_intersection = np.zeros((len(ctx.tiles.lists), 10), image.dtype)
+        image_grad = grad.contiguous().numpy()
         composite_all_gradient(
-            ctx.splats.packed, ctx.tiles, _centers(image), image, of_image, per_place
+            ctx.splats.packed, ctx.tiles, _pixel_centers(image), image, image_grad, per_intersection
         )
         gradients = GaussianArrays(*(np.zeros_like(array) for array in arrays))
-        project_all_gradient(gaussians, ctx.setting, ctx.splats, per_place, gradients)
+        project_all_gradient(gaussians, ctx.settings, ctx.splats, per_intersection, gradients)
         return None, *(torch.from_numpy(gradient) for gradient in gradients)
 
 
-def _listed(gaussians: GaussianArrays, setting: Setting) -> tuple[SplatArrays, TileArrays]:
+def _splats_by_tile(
+    gaussians: GaussianArrays, settings: RasterSettings
+) -> tuple[SplatArrays, TileArrays]:
     """Project, sort by depth and list the tiles."""
     count = len(gaussians.means)
-    packed, seen = np.empty((count, 10), gaussians.means.dtype), np.empty(count, np.bool_)
-    project_all(gaussians, setting, packed, seen)
-    rows = np.flatnonzero(seen)
+    packed, visible = np.empty((count, 10), gaussians.means.dtype), np.empty(count, np.bool_)
+    project_all(gaussians, settings, packed, visible)
+    rows = np.flatnonzero(visible)
     rows = rows[np.argsort(packed[rows, 9], kind="stable")]
     packed = packed[rows]
     splat_starts = np.zeros(len(rows) + 1, np.int64)
-    count_tiles(packed, setting.size, SIDE, splat_starts[1:])
+    count_tiles(packed, settings.size, SIDE, splat_starts[1:])
     np.cumsum(splat_starts, out=splat_starts)
-    names = np.empty(splat_starts[-1], np.int32)
-    name_tiles(packed, setting.size, SIDE, splat_starts, names)
-    tiles = -(-setting.size[0] // SIDE) * -(-setting.size[1] // SIDE)
-    tile_starts, lists = np.zeros(tiles + 1, np.int64), np.empty((len(names), 2), np.int32)
-    sort_by_tile(names, splat_starts, tile_starts, lists)
+    tile_ids = np.empty(splat_starts[-1], np.int32)
+    write_tiles(packed, settings.size, SIDE, splat_starts, tile_ids)
+    tiles = -(-settings.size[0] // SIDE) * -(-settings.size[1] // SIDE)
+    tile_starts, lists = np.zeros(tiles + 1, np.int64), np.empty((len(tile_ids), 2), np.int32)
+    sort_by_tile(tile_ids, splat_starts, tile_starts, lists)
     return SplatArrays(rows, splat_starts, packed), TileArrays(tile_starts, lists, SIDE)
 
 
-def _numbers(view: View) -> NDArray[np.float64]:
-    """Lay a view out as ``Setting`` describes."""
-    pairs = (view.focal, view.principal, *view.slopes, view.size)
-    return np.array([*view.rotation, view.center, *((*pair, 0.0) for pair in pairs)])
+def _settings(camera: Pinhole, sh_degree: int, antialiased: bool) -> RasterSettings:
+    pairs = (camera.focal, camera.principal, *camera.slopes, camera.size)
+    rows = [*camera.rotation, camera.center, *((*pair, 0.0) for pair in pairs)]
+    return RasterSettings(np.array(rows), camera.size, sh_degree, antialiased)
 
 
-def _centers(image: NDArray[np.floating]) -> NDArray[np.floating]:
+def _pixel_centers(image: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the coordinates of pixel centres, in the image's dtype."""
     return (np.arange(max(image.shape[:2])) + 0.5).astype(image.dtype)

@@ -1,4 +1,4 @@
-"""Project Gaussians onto an image, in differentiable torch operations."""
+"""Project Gaussians onto an image, in differentiable torch operations, by the rules of 3DGS."""
 
 from dataclasses import dataclass
 
@@ -6,10 +6,100 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.cameras import Cameras
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import activations, quaternions, spherical_harmonics
-from cvtgs.rendering.rules import DILATION, MIN_ALPHA, NEAR_PLANE
-from cvtgs.rendering.views import View
 from cvtgs.scene import GaussianScene
+
+# The numbers of the rasterizer of 3DGS (Kerbl et al. 2023, section 6 and their renderer).
+
+NEAR_PLANE = 0.01
+"""Gaussians whose centre is nearer to the camera's plane are not rendered; scene units."""
+
+DILATION = 0.3
+"""Variance that every projected Gaussian gains, squared pixels."""
+
+FRUSTUM_MARGIN = 0.3
+"""The Jacobian is taken no farther outside the image than this share of half its size."""
+
+MAX_ALPHA = 0.99
+"""No single Gaussian hides more than this."""
+
+MIN_ALPHA = 1 / 255
+"""What would hide less than this is skipped."""
+
+MIN_TRANSMITTANCE = 1e-4
+"""A pixel is finished before the Gaussian that would let less light than this through."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pinhole:
+    """A pinhole camera as plain numbers, so that projection is arithmetic only.
+
+    Attributes:
+        rotation: Rows of the linear part of the view matrix.
+        center: Position of the camera in the world.
+        focal: Focal lengths along x and y, pixels.
+        principal: Principal point, pixels.
+        size: Width and height, pixels.
+    """
+
+    rotation: tuple[tuple[float, float, float], ...]
+    center: tuple[float, float, float]
+    focal: tuple[float, float]
+    principal: tuple[float, float]
+    size: tuple[int, int]
+
+    @property
+    def slopes(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Bounds of x/z and of y/z, within which the Jacobian of the projection is taken.
+
+        With the principal point in the middle they are 1.3 times the tangent of half the field of
+        view, as in 3DGS; elsewhere they move with the edges of the image, as in gsplat.
+        """
+        (x_low, x_high), (y_low, y_high) = (
+            (
+                -principal / focal - FRUSTUM_MARGIN * 0.5 * size / focal,
+                (size - principal) / focal + FRUSTUM_MARGIN * 0.5 * size / focal,
+            )
+            for focal, principal, size in zip(self.focal, self.principal, self.size, strict=True)
+        )
+        return (x_low, x_high), (y_low, y_high)
+
+
+def to_pinholes(cameras: Cameras) -> list[Pinhole]:
+    """Return plain numbers of each camera, after checks."""
+    viewmats = cameras.viewmats.detach().double().cpu()
+    Ks = cameras.Ks.detach().double().cpu()  # noqa: N806 (the name that gsplat gives it)
+    _check(viewmats, Ks)
+    centers = -torch.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[:, :, 0]
+    return [
+        Pinhole(
+            rotation=tuple((row[0], row[1], row[2]) for row in viewmat[:3]),
+            center=(center[0], center[1], center[2]),
+            focal=(K[0][0], K[1][1]),
+            principal=(K[0][2], K[1][2]),
+            size=(cameras.width, cameras.height),
+        )
+        for viewmat, center, K in zip(viewmats.tolist(), centers.tolist(), Ks.tolist(), strict=True)
+    ]
+
+
+def _check(viewmats: Tensor, Ks: Tensor) -> None:  # noqa: N803 (the name that gsplat gives it)
+    finite = torch.isfinite(viewmats).all(dim=(1, 2)) & torch.isfinite(Ks).all(dim=(1, 2))
+    upright = torch.linalg.det(viewmats[:, :3, :3]).abs() > 0
+    pinhole = (Ks[:, 0, 0] > 0) & (Ks[:, 1, 1] > 0) & (Ks[:, 0, 1] == 0) & (Ks[:, 1, 0] == 0)
+    for good, wish in (
+        (finite, "finite viewmats and Ks"),
+        (upright, "viewmats that have an inverse"),
+        (pinhole, "Ks of pinhole cameras, focal lengths above 0 and no skew"),
+    ):
+        bad = (~good).nonzero()[:, 0].tolist()
+        if bad:
+            raise InvalidArgumentError(
+                f"cameras must have {wish}; {len(bad)} of {len(good)} have not, "
+                f"the first is camera {bad[0]}."
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,7 +127,7 @@ class Splats:
     depths: Float[Tensor, "m"]
 
 
-def project(scene: GaussianScene, view: View, sh_degree: int) -> Splats:
+def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
     """Project a scene: EWA splatting (Zwicker et al. 2001) by the rules of 3DGS.
 
     The covariance is ``M M^T + 0.3 I`` with ``M = J W R S``; its determinant comes from the minors
@@ -47,18 +137,18 @@ def project(scene: GaussianScene, view: View, sh_degree: int) -> Splats:
     Memory with gradients: about ``(150 + 6 k) n`` numbers for n Gaussians in view with k rest
     coefficients.
     """
-    rows = _candidates(scene, view)
-    offsets = _offsets(scene.means.index_select(0, rows), view)
-    rotation = scene.means.new_tensor(view.rotation)
+    rows = _candidates(scene, camera)
+    offsets = _offsets(scene.means.index_select(0, rows), camera)
+    rotation = scene.means.new_tensor(camera.rotation)
     local = offsets @ rotation.T
-    axes = _image_axes(scene, rows, local, view)
+    axes = _image_axes(scene, rows, local, camera)
     ellipses, survival = _ellipses(axes)
     opacities = activations.opacity_from_logit(scene.logit_opacities.index_select(0, rows))
     if scene.antialiased:
         opacities = opacities * survival
     slopes = local[:, :2] / local[:, 2:]
-    centers = slopes * slopes.new_tensor(view.focal) + slopes.new_tensor(view.principal)
-    order = _front_to_back(centers, ellipses, opacities, local[:, 2], view)
+    centers = slopes * slopes.new_tensor(camera.focal) + slopes.new_tensor(camera.principal)
+    order = _front_to_back(centers, ellipses, opacities, local[:, 2], camera)
     return Splats(
         rows=rows[order],
         centers=centers[order],
@@ -69,9 +159,17 @@ def project(scene: GaussianScene, view: View, sh_degree: int) -> Splats:
     )
 
 
+def pack(splats: Splats) -> Float[Tensor, "m 10"]:
+    """Return what compositing needs of each splat, side by side."""
+    steep, shear, flat = splats.ellipses.unbind(1)
+    columns = [-0.5 * steep, shear, -0.5 * flat, activations.positive_log(splats.opacities)]
+    exponents = torch.stack(columns, dim=1)
+    return torch.cat([splats.centers, exponents, splats.colors, splats.depths[:, None]], dim=1)
+
+
 @torch.no_grad()
 def reach_of(opacities: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
-    """Return how far Gaussians paint: the squared distance at which alpha falls to 1/255."""
+    """Return how far Gaussians reach: the squared distance at which alpha falls to 1/255."""
     return (2 * activations.positive_log(opacities / MIN_ALPHA)).clamp_min(0)
 
 
@@ -84,19 +182,19 @@ def half_sizes(
     return (reach / steep + reach * shear * shear / flat).sqrt(), (reach / flat).sqrt()
 
 
-def _offsets(means: Float[Tensor, "n 3"], view: View) -> Float[Tensor, "n 3"]:
+def _offsets(means: Float[Tensor, "n 3"], camera: Pinhole) -> Float[Tensor, "n 3"]:
     """Return ways from the camera; far from the origin float32 holds them, but not the camera."""
-    center = torch.tensor(view.center, dtype=torch.float64, device=means.device)
+    center = torch.tensor(camera.center, dtype=torch.float64, device=means.device)
     return (means.double() - center).to(means.dtype)
 
 
 @torch.no_grad()
-def _candidates(scene: GaussianScene, view: View) -> Tensor:
+def _candidates(scene: GaussianScene, camera: Pinhole) -> Tensor:
     """Leave out what cannot be in the image, by a ball around each Gaussian."""
-    rotation = scene.means.new_tensor(view.rotation)
-    x, y, z = (_offsets(scene.means, view) @ rotation.T).unbind(1)
-    steepest = sum(max(abs(low), abs(high)) ** 2 for low, high in view.slopes)
-    stretch = rotation.norm() * max(view.focal) * (1 + steepest) ** 0.5 / z
+    rotation = scene.means.new_tensor(camera.rotation)
+    x, y, z = (_offsets(scene.means, camera) @ rotation.T).unbind(1)
+    steepest = sum(max(abs(low), abs(high)) ** 2 for low, high in camera.slopes)
+    stretch = rotation.norm() * max(camera.focal) * (1 + steepest) ** 0.5 / z
     deviation = stretch * scene.log_scales.amax(dim=1).exp()
     # 3.33 standard deviations is where even an opacity of 1 falls to 1/255.
     radius = 3.34 * deviation + 3.34 * DILATION**0.5
@@ -105,7 +203,7 @@ def _candidates(scene: GaussianScene, view: View) -> Tensor:
     keep: Tensor = deviation < torch.finfo(scene.dtype).max ** 0.5 / 4
     keep &= (z >= NEAR_PLANE) & torch.isfinite(z) & torch.isfinite(quats) & (quats > 0)
     for way, focal, principal, size in zip(
-        (x, y), view.focal, view.principal, view.size, strict=True
+        (x, y), camera.focal, camera.principal, camera.size, strict=True
     ):
         place = way / z * focal + principal
         keep &= (place + radius > 0) & (place - radius < size)
@@ -114,14 +212,14 @@ def _candidates(scene: GaussianScene, view: View) -> Tensor:
 
 
 def _image_axes(
-    scene: GaussianScene, rows: Tensor, local: Tensor, view: View
+    scene: GaussianScene, rows: Tensor, local: Tensor, camera: Pinhole
 ) -> Float[Tensor, "m 2 3"]:
     """Return ``M = J W R S``: the own axes of each Gaussian, to first order in the image."""
     quats = quaternions.normalize(scene.quats.index_select(0, rows))
-    turned = scene.means.new_tensor(view.rotation) @ quaternions.to_matrices(quats)
-    low, high = scene.means.new_tensor(view.slopes).unbind(1)
+    turned = scene.means.new_tensor(camera.rotation) @ quaternions.to_matrices(quats)
+    low, high = scene.means.new_tensor(camera.slopes).unbind(1)
     slopes = torch.minimum(torch.maximum(local[:, :2] / local[:, 2:], low), high)
-    stretch = scene.means.new_tensor(view.focal) / local[:, 2:]
+    stretch = scene.means.new_tensor(camera.focal) / local[:, 2:]
     jacobian = stretch[:, :, None] * (turned[:, :2] - slopes[:, :, None] * turned[:, 2:])
     return jacobian * torch.exp(scene.log_scales.index_select(0, rows))[:, None, :]
 
@@ -145,12 +243,12 @@ def _ellipses(axes: Float[Tensor, "m 2 3"]) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def _front_to_back(
-    centers: Tensor, ellipses: Tensor, opacities: Tensor, depths: Tensor, view: View
+    centers: Tensor, ellipses: Tensor, opacities: Tensor, depths: Tensor, camera: Pinhole
 ) -> Tensor:
     """Order what touches the image by depth."""
     keep = (opacities >= MIN_ALPHA) & torch.isfinite(ellipses).all(dim=1)
     halves = half_sizes(ellipses, reach_of(opacities))
-    for place, half, size in zip(centers.unbind(1), halves, view.size, strict=True):
+    for place, half, size in zip(centers.unbind(1), halves, camera.size, strict=True):
         keep &= (place + half >= 0) & (place - half <= size)
     touching = keep.nonzero()[:, 0]
     return touching[torch.sort(depths[touching], stable=True).indices]

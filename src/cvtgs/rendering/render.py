@@ -1,4 +1,4 @@
-"""The public entry: images of a scene, differentiable in everything that the scene is."""
+"""Images of a scene, differentiable in all its tensors, and what each Gaussian adds to them."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,6 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import activations
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.rendering.backends import BackendName, choose_backend
-from cvtgs.rendering.output import RasterOutput
 from cvtgs.scene import GaussianScene
 
 
@@ -24,7 +23,7 @@ class Rendering:
             the scene's colours are.
         alpha: ``(c, h, w)`` what the Gaussians hide of the background, 0 to 1.
         depth: ``(c, h, w)`` mean depth of what is seen along the view axis, scene units, 0 where
-            nothing is; None unless asked for.
+            nothing is; None unless requested.
         backend: Name of what rendered.
     """
 
@@ -54,7 +53,7 @@ def render(
 
     The result is differentiable in means, quats, log scales, opacity logits, sh0, shN and in the
     background; cameras are constants. Gaussians whose place, shape or opacity is not
-    finite paint nothing.
+    finite contribute nothing.
 
     Memory: cameras are rendered one by one; each backend's ``rasterize`` states its formula.
 
@@ -66,7 +65,7 @@ def render(
         background: Colour behind everything, for all cameras or for each; black if None.
         sh_degree: Degree up to which colours depend on the direction; the scene's if None.
         depth: Whether to give depths too.
-        listener: Told about each camera.
+        listener: Called before the first camera and after each.
 
     Returns:
         The images.
@@ -91,15 +90,56 @@ def render(
     degree = _degree(scene, sh_degree)
     behind = _background(scene, cameras, background)
     name, chosen = choose_backend(backend, scene.device)
-    painting = chosen.rasterize(
-        scene, cameras.to(scene.device), sh_degree=degree, listener=listener
-    )
-    return Rendering(
-        rgb=_over(painting, behind),
-        alpha=painting.alpha,
-        depth=_mean_depth(painting) if depth else None,
-        backend=name,
-    )
+    output = chosen.rasterize(scene, cameras.to(scene.device), sh_degree=degree, listener=listener)
+    if behind is None:
+        rgb = output.rgb.contiguous()
+    else:
+        rgb = output.rgb + (1 - output.alpha)[..., None] * behind[:, None, None]
+    depths = None
+    if depth:
+        divisor = torch.where(output.alpha > 0, output.alpha, 1)
+        depths = activations.divide(output.depth, divisor)
+    return Rendering(rgb=rgb, alpha=output.alpha, depth=depths, backend=name)
+
+
+def contributions(
+    scene: GaussianScene, cameras: Cameras, *, backend: BackendName = "auto"
+) -> Float[Tensor, "n"]:
+    """Sum what every Gaussian adds to the pixels of some images: ``alpha * T``.
+
+    ``T`` is the transmittance of what lies in front (Kerbl et al. 2023, equation 3). Colours do
+    not matter. The sums of all Gaussians add up to the alpha of the images.
+
+    Memory: that of rendering one image, with its gradient for backends other than ``numba``.
+
+    Args:
+        scene: The Gaussians.
+        cameras: From where to look.
+        backend: What renders, as in :func:`cvtgs.rendering.render`.
+
+    Returns:
+        Pixels, float64: 0 for what no image shows.
+
+    Raises:
+        InvalidArgumentError: A camera is no pinhole camera, or there is no such backend.
+        DeviceError: The backend does not work on the scene's device.
+        MissingDependencyError: The backend's package is missing.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> from cvtgs.views import automatic_views
+        >>> scene = make("object", 500, sh_degree=0, seed=0)
+        >>> seen = contributions(scene, automatic_views(scene, 2, width=32, height=32))
+        >>> tuple(seen.shape), bool((seen >= 0).all()), bool(seen.sum() <= 2 * 32 * 32)
+        ((500,), True, True)
+    """
+    chosen = choose_backend(backend, scene.device)[1]
+    placed = cameras.to(scene.device)
+    total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
+    for number in range(len(cameras)):
+        camera = placed.select(torch.tensor([number], device=scene.device))
+        total += chosen.contributions(scene, camera)
+    return total
 
 
 def _degree(scene: GaussianScene, sh_degree: int | None) -> int:
@@ -128,14 +168,3 @@ def _background(
             f"background must be a tensor of shape (3,) or ({len(cameras)}, 3), found {found}."
         )
     return background.to(device=scene.device, dtype=scene.dtype).reshape(-1, 3)
-
-
-def _over(painting: RasterOutput, background: Tensor | None) -> Float[Tensor, "c h w 3"]:
-    if background is None:
-        return painting.rgb.contiguous()
-    through = 1 - painting.alpha
-    return painting.rgb + through[..., None] * background[:, None, None]
-
-
-def _mean_depth(painting: RasterOutput) -> Float[Tensor, "c h w"]:
-    return activations.divide(painting.depth, torch.where(painting.alpha > 0, painting.alpha, 1))

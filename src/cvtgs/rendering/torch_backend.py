@@ -1,27 +1,69 @@
-"""The reference backend: tiles composited in batches of torch operations, on any device."""
+"""The reference backend: splats listed per tile and composited in torch operations, anywhere."""
 
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from cvtgs.cameras import Cameras
+from cvtgs.math import segments
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.rendering.blending import composite, composite_gradient
-from cvtgs.rendering.contributions import contributions_by_gradient
-from cvtgs.rendering.output import RasterOutput, pack, paint_each
-from cvtgs.rendering.projection import project
-from cvtgs.rendering.tiles import TileLists, intersect
-from cvtgs.rendering.views import View, views_of
+from cvtgs.rendering.backends import RasterOutput, contributions_by_gradient, render_each
+from cvtgs.rendering.projection import (
+    MAX_ALPHA,
+    MIN_ALPHA,
+    MIN_TRANSMITTANCE,
+    Pinhole,
+    Splats,
+    half_sizes,
+    pack,
+    project,
+    reach_of,
+    to_pinholes,
+)
 from cvtgs.scene import GaussianScene
 
 TILE = {"cpu": 8}
 """Pixels along a tile's edge, by type of device: small tiles waste fewer operations."""
 
 _TILE_ELSEWHERE = 16
+
+CELLS = {"cpu": 1 << 18}
+"""Pairs of splat and pixel in one batch, by type of device: few stay in a CPU's caches."""
+
+_CELLS_ELSEWHERE = 1 << 23
+
+_DEPTH = 32
+"""Splats of each tile in one batch."""
+
+_SLACK = 1e-3
+"""Pixels by which boxes are enlarged, so that rounding leaves nothing out."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TileLists:
+    """The splats of each tile, front to back.
+
+    Attributes:
+        splats: ``(p,)`` splat of each intersection; by tile, then by depth.
+        starts: ``(t + 1,)`` where each tile's list starts; tiles run along the rows.
+        ranks: ``(p,)`` place of each intersection if they were by splat, then by tile.
+        splat_starts: ``(m + 1,)`` where each splat's intersections start in that other order.
+        side: Pixels along a tile's edge.
+        across: Tiles per row.
+    """
+
+    splats: Int[Tensor, "p"]
+    starts: Int[Tensor, "t_plus_1"]
+    ranks: Int[Tensor, "p"]
+    splat_starts: Int[Tensor, "m_plus_1"]
+    side: int
+    across: int
 
 
 def require(device: torch.device) -> None:
@@ -38,25 +80,25 @@ def rasterize(
     """Render with torch operations only.
 
     Memory: for p intersections of splats and tiles, ``60 p`` bytes while they are listed, and
-    about ``10 * CELLS`` numbers while a batch is composited (see :mod:`cvtgs.rendering.blending`).
+    about ``10 * CELLS`` numbers while a batch is composited.
     With gradients each camera also keeps what its projection keeps, ``30 p`` bytes and the
     image; its backward pass needs ``10 p`` numbers at a time.
     """
-    blank = scene.means.new_zeros(0, cameras.height, cameras.width, 5)
-    views = [partial(_paint, scene, view, sh_degree) for view in views_of(cameras)]
-    return paint_each(views, blank, listener)
+    empty = scene.means.new_zeros(0, cameras.height, cameras.width, 5)
+    images = [partial(_render_one, scene, camera, sh_degree) for camera in to_pinholes(cameras)]
+    return render_each(images, empty, listener)
 
 
 def contributions(scene: GaussianScene, camera: Cameras) -> Tensor:
-    """Return the pixels that every Gaussian paints of one image."""
+    """Return every Gaussian's sum of weights ``alpha * T`` over one image."""
     return contributions_by_gradient(rasterize, scene, camera)
 
 
-def _paint(scene: GaussianScene, view: View, sh_degree: int) -> Float[Tensor, "h w 5"]:
-    splats = project(scene, view, sh_degree)
-    lists = intersect(splats, view.size, TILE.get(scene.device.type, _TILE_ELSEWHERE))
+def _render_one(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Float[Tensor, "h w 5"]:
+    splats = project(scene, camera, sh_degree)
+    lists = intersect(splats, camera.size, TILE.get(scene.device.type, _TILE_ELSEWHERE))
     tiles: Tensor = _Composite.apply(pack(splats), lists)  # type: ignore[no-untyped-call]
-    return _assemble(tiles, lists, view.size)
+    return _assemble(tiles, lists, camera.size)
 
 
 def _assemble(
@@ -89,3 +131,238 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
         packed, tiles = ctx.saved_tensors
         return composite_gradient(packed, ctx.lists, tiles, grad.flatten(1, 2)), None
+
+
+@torch.no_grad()
+def intersect(splats: Splats, size: tuple[int, int], side: int) -> TileLists:
+    """List the tiles that hold a pixel on which a splat's alpha reaches 1/255.
+
+    The test is exact up to rounding, which only ever adds tiles: each splat is cut into the rows
+    of tiles that it crosses, and the ellipse's extent within each row gives the tiles.
+
+    Memory: about 60 bytes per intersection and 100 per splat.
+    """
+    width, height = size
+    across, down = -(-width // side), -(-height // side)
+    splat, row, first, last = _strips(splats, size, side)
+    counts = (last - first + 1).clamp_min(0)
+    strip, place = _expand(counts)
+    tiles = (row[strip] * across + first[strip] + place).to(torch.int32)
+    owner = splat[strip]
+    sorted_tiles, ranks = torch.sort(tiles, stable=True)
+    per_tile = torch.bincount(sorted_tiles, minlength=across * down)
+    per_splat = torch.bincount(owner, minlength=len(splats.rows))
+    return TileLists(
+        splats=owner[ranks],
+        starts=torch.nn.functional.pad(per_tile.cumsum(0), (1, 0)),
+        ranks=ranks,
+        splat_starts=torch.nn.functional.pad(per_splat.cumsum(0), (1, 0)),
+        side=side,
+        across=across,
+    )
+
+
+def _strips(
+    splats: Splats, size: tuple[int, int], side: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Cut splats into rows of tiles; return splat, row, first and last column of tiles of each."""
+    width, height = size
+    reach = reach_of(splats.opacities)
+    half_height = half_sizes(splats.ellipses, reach)[1]
+    y = splats.centers[:, 1]
+    top, bottom = _pixels(y - half_height, y + half_height, height)
+    first, last = top // side, bottom // side
+    splat, place = _expand(torch.where(bottom >= top, last - first + 1, 0))
+    row = first[splat] + place
+    y = y[splat]
+    upper = torch.maximum(row * side, top[splat]) + 0.5 - y
+    lower = torch.minimum(row * side + side - 1, bottom[splat]) + 0.5 - y
+    left, right = _extent(splats.ellipses[splat], reach[splat], upper, lower)
+    x = splats.centers[:, 0][splat]
+    begin, end = _pixels(x + left, x + right, width)
+    return splat, row, begin // side, torch.where(end >= begin, end // side, -1)
+
+
+def _extent(ellipses: Tensor, reach: Tensor, upper: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
+    """Return how far ellipses go left and right between two heights, all relative to the centre.
+
+    The right edge is a concave function of the height: it is largest at the ellipse's rightmost
+    point, or at the end that is nearest to it.
+    """
+    steep, shear, flat = ellipses.unbind(1)
+    half_width = half_sizes(ellipses, reach)[0]
+    tip = -shear / flat * reach / half_width.clamp_min(torch.finfo(reach.dtype).tiny)
+
+    def edge(at: Tensor, side: int) -> Tensor:
+        height = torch.minimum(torch.maximum(at, upper), lower)
+        inside = (reach - flat * height * height).clamp_min(0)
+        return -shear * height + side * (inside / steep).sqrt()
+
+    return edge(-tip, -1), edge(tip, 1)
+
+
+def _pixels(low: Tensor, high: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the first and the last of ``count`` pixels whose centres lie in an interval."""
+    slack = _SLACK + 1e-6 * (high - low)
+    first = (low - 0.5 - slack).ceil().clamp(0, count)
+    last = (high - 0.5 + slack).floor().clamp(-1, count - 1)
+    return first.to(torch.int64), last.to(torch.int64)
+
+
+def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Repeat row numbers ``counts`` times; return them, and the number of each repetition."""
+    starts = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
+    rows = segments.segment_ids(starts)
+    return rows, torch.arange(len(rows), device=rows.device) - starts[rows]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TileBatch:
+    """The next splats of some tiles, and what they do to the tiles' pixels.
+
+    Attributes:
+        tiles: ``(b,)`` numbers of the tiles.
+        entries: ``(b, k)`` places in the lists; any place where there is none.
+        valid: ``(b, k)`` whether there is one.
+        params: ``(b, k, 10)`` packed splats.
+        along: ``(b, k, s, s)`` sheared way along x from the centre, pixels.
+        down: ``(b, k, s)`` way along y from the centre, pixels.
+        alpha: ``(b, k, q)`` opacity of each in each pixel, 0 where it is skipped.
+        transmittance: ``(b, k, q)`` in front of each, 0 where the pixel is finished.
+        remaining: ``(b, q)`` transmittance behind the last splat of a pixel; infinite if none.
+    """
+
+    tiles: Int[Tensor, "b"]
+    entries: Int[Tensor, "b k"]
+    valid: Bool[Tensor, "b k"]
+    params: Float[Tensor, "b k 10"]
+    along: Float[Tensor, "b k s s"]
+    down: Float[Tensor, "b k s"]
+    alpha: Float[Tensor, "b k q"]
+    transmittance: Float[Tensor, "b k q"]
+    remaining: Float[Tensor, "b q"]
+
+
+def composite(packed: Float[Tensor, "m 10"], lists: TileLists) -> Float[Tensor, "t q 5"]:
+    """Composite every tile.
+
+    Memory: the result, and about ten arrays of ``CELLS`` numbers.
+    """
+    result = packed.new_zeros(len(lists.starts) - 1, lists.side**2, 5)
+    result[..., 4] = 1
+    for batch in _batches(packed, lists):
+        weights = batch.alpha * batch.transmittance
+        result[batch.tiles, :, :4] += weights.transpose(1, 2) @ batch.params[:, :, 6:]
+        result[batch.tiles, :, 4] = torch.minimum(result[batch.tiles, :, 4], batch.remaining)
+    return result
+
+
+def composite_gradient(
+    packed: Float[Tensor, "m 10"],
+    lists: TileLists,
+    result: Float[Tensor, "t q 5"],
+    grad: Float[Tensor, "t q 5"],
+) -> Float[Tensor, "m 10"]:
+    """Return the gradient of :func:`composite`, front to back over the same batches.
+
+    Going forward again gives the same transmittances as before, bit for bit; what lies behind a
+    splat is the whole minus what lies in front of it. (3DGS goes backward and divides.)
+
+    Memory: ten numbers per intersection, and about fifteen arrays of ``CELLS`` numbers.
+    """
+    behind = (result * grad).sum(dim=2)
+    per_entry = packed.new_zeros(len(lists.splats), packed.shape[1])
+    for batch in _batches(packed, lists):
+        worth = batch.params[:, :, 6:] @ grad[batch.tiles, :, :4].transpose(1, 2)
+        alpha, transmittance = batch.alpha, batch.transmittance
+        weights = alpha * transmittance
+        rest = behind[batch.tiles][:, None] - _scan(weights * worth, torch.add)
+        behind[batch.tiles] = rest[:, -1]
+        of_alpha = transmittance * worth - (transmittance > 0) * rest / (1 - alpha)
+        of_log_alpha = torch.where(alpha < MAX_ALPHA, alpha * of_alpha, 0)
+        columns = [_exponent_gradient(batch, of_log_alpha), weights @ grad[batch.tiles, :, :4]]
+        per_entry[lists.ranks[batch.entries[batch.valid]]] = torch.cat(columns, dim=2)[batch.valid]
+    return segments.segment_sum(per_entry, lists.splat_starts)
+
+
+def _exponent_gradient(
+    batch: TileBatch, of_log_alpha: Float[Tensor, "b k q"]
+) -> Float[Tensor, "b k 6"]:
+    """Pass the gradient of the exponents on to centres, ellipses and log opacities."""
+    _, _, square, shear, rest = batch.params[:, :, :5].unbind(2)
+    per_row = of_log_alpha.unflatten(2, batch.along.shape[2:])
+    zeroth, moments = per_row.sum(dim=3), per_row * batch.along
+    first, second = moments.sum(dim=3), (moments * batch.along).sum(dim=3)
+    along = first.sum(dim=2)
+    down = (zeroth * batch.down).sum(dim=2)
+    columns = [
+        -2 * square * along,
+        -2 * square * shear * along - 2 * rest * down,
+        second.sum(dim=2),
+        2 * square * (first * batch.down).sum(dim=2),
+        (zeroth * batch.down * batch.down).sum(dim=2),
+        zeroth.sum(dim=2),
+    ]
+    return torch.stack(columns, dim=2)
+
+
+def _batches(packed: Tensor, lists: TileLists) -> Iterator[TileBatch]:
+    """Composite tiles with lists of similar length together, until all pixels are finished."""
+    counts = lists.starts.diff()
+    order = torch.sort(counts, descending=True, stable=True).indices
+    cells = CELLS.get(packed.device.type, _CELLS_ELSEWHERE)
+    size = max(1, cells // (_DEPTH * lists.side**2))
+    for group in order[: int((counts > 0).sum())].split(size):
+        tiles, start = group, 0
+        transmittance = packed.new_ones(len(group), lists.side**2)
+        while len(tiles):
+            batch = _composite_batch(packed, lists, tiles, start, transmittance)
+            yield batch
+            start += _DEPTH
+            transmittance = batch.transmittance[:, -1] * (1 - batch.alpha[:, -1])
+            going = (transmittance.amax(dim=1) > 0) & (counts[tiles] > start)
+            tiles, transmittance = tiles[going], transmittance[going]
+
+
+def _composite_batch(
+    packed: Tensor, lists: TileLists, tiles: Tensor, start: int, transmittance: Tensor
+) -> TileBatch:
+    """Composite the splats number ``start`` and following of tiles."""
+    places = torch.arange(_DEPTH, device=packed.device) + start + lists.starts[tiles][:, None]
+    valid = places < lists.starts[tiles + 1][:, None]
+    entries = torch.where(valid, places, 0)
+    params = packed[lists.splats[entries]]
+    pixels = torch.arange(lists.side, device=packed.device) + 0.5
+    columns = (tiles % lists.across * lists.side)[:, None] + pixels
+    rows = (tiles // lists.across * lists.side)[:, None] + pixels
+    x, y, square, shear, rest, log_opacity = (
+        part[:, :, None] for part in params[..., :6].unbind(2)
+    )
+    down = rows.to(packed.dtype)[:, None] - y
+    along = (columns.to(packed.dtype)[:, None] - x)[:, :, None] + (shear * down)[..., None]
+    constant = torch.where(valid[:, :, None], log_opacity, -torch.inf) + rest * down * down
+    alpha = (along * along).mul_(square[..., None]).add_(constant[..., None]).exp_().flatten(2)
+    alpha = alpha.clamp_max_(MAX_ALPHA).mul_(alpha >= MIN_ALPHA)
+    after = _scan(1 - alpha, torch.mul).mul_(transmittance[:, None])
+    alive = after >= MIN_TRANSMITTANCE
+    remaining = torch.where(alive, after, torch.inf).amin(dim=1)
+    before = torch.cat([transmittance[:, None], after[:, :-1]], dim=1).mul_(alive)
+    return TileBatch(
+        tiles=tiles, entries=entries, valid=valid, params=params, along=along, down=down,
+        alpha=alpha, transmittance=before, remaining=remaining,
+    )  # fmt: skip
+
+
+def _scan(
+    values: Float[Tensor, "b k q"], combine: Callable[[Tensor, Tensor], Tensor]
+) -> Float[Tensor, "b k q"]:
+    """Combine each row with all before it, by doubling (Hillis and Steele 1986).
+
+    That is several times faster than ``cumprod`` along an axis that is not the last.
+    """
+    reach = 1
+    while reach < values.shape[1]:
+        further = combine(values[:, reach:], values[:, :-reach])
+        values = torch.cat([values[:, :reach], further], dim=1)
+        reach *= 2
+    return values
