@@ -60,7 +60,7 @@ def surfels(count: int) -> GaussianScene:
     log_scales = scene.log_scales.clone()
     log_scales[torch.arange(count), log_scales.argmin(dim=1)] = FLAT_LOG_SCALE
     order = torch.sort(log_scales, dim=1, descending=True)
-    quats = cvtgs.math.quaternions.from_matrices(_right_handed(scene.quats, order.indices))
+    quats = cvtgs.math.parameters.matrices_to_quats(_right_handed(scene.quats, order.indices))
     names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1"]
     names += [f"rot_{i}" for i in range(4)]
     tensors = {**scene.tensors(), "log_scales": order.values, "quats": quats}
@@ -69,7 +69,7 @@ def surfels(count: int) -> GaussianScene:
 
 def _right_handed(quats: torch.Tensor, order: torch.Tensor) -> torch.Tensor:
     """Bring axes into another order; the third is turned round where that makes a mirror."""
-    matrices = cvtgs.math.quaternions.to_matrices(cvtgs.math.quaternions.normalize(quats))
+    matrices = cvtgs.math.parameters.quats_to_matrices(cvtgs.math.parameters.normalize_quats(quats))
     axes = matrices.gather(2, order[:, None, :].expand(-1, 3, -1))
     axes[:, :, 2] *= torch.linalg.det(axes)[:, None]
     return axes

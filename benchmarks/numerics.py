@@ -21,9 +21,8 @@ from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.cells import Partition, gather_members, mean_and_covariance, merge_cells
 from cvtgs.cvt import embed, nearest_neighbors, tessellate
 from cvtgs.filters import invalid_rows
-from cvtgs.math import covariances, quaternions
-from cvtgs.math.frames import robust_frame
-from cvtgs.math.morton import morton_order
+from cvtgs.math import parameters
+from cvtgs.math.frames import morton_order, robust_frame
 from cvtgs.mergenet import correct_cells
 from cvtgs.views import automatic_views
 
@@ -180,8 +179,8 @@ def exact_covariances(scene: GaussianScene, part: Partition, power: float) -> Te
 
 
 def matrices_of(scene: GaussianScene) -> Tensor:
-    quats = quaternions.normalize(scene.quats.double())
-    return covariances.from_scales_and_quats(torch.exp(scene.log_scales.double()), quats)
+    quats = parameters.normalize_quats(scene.quats.double())
+    return parameters.build_covariances(torch.exp(scene.log_scales.double()), quats)
 
 
 def corrected_scales(

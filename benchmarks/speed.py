@@ -15,8 +15,7 @@ import torch
 
 import cvtgs
 from benchmarks.processes import machine, run_python, spread
-from cvtgs.math.frames import robust_frame
-from cvtgs.math.morton import morton_order
+from cvtgs.math.frames import morton_order, robust_frame
 
 SCENES = (("courtyard", 1_000_000, 0), ("courtyard", 250_000, 2), ("courtyard", 400_000, 3))
 

@@ -13,8 +13,7 @@ import torch
 
 import cvtgs
 from cvtgs.config import SimplifyConfig
-from cvtgs.math.frames import robust_frame
-from cvtgs.math.morton import morton_order
+from cvtgs.math.frames import morton_order, robust_frame
 
 APART = 1e3
 """In robust radii: farther than anything in the scene."""

@@ -7,7 +7,7 @@ import torch
 
 from cvtgs import synthetic
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.math import covariances
+from cvtgs.math import parameters
 from cvtgs.synthetic import gaussians, surfaces, textures
 from cvtgs.synthetic.scenes import allocate
 
@@ -157,7 +157,7 @@ def test_courtyard_has_what_it_promises():
     assert scene.scales[sky].amax(1).median() > 20 * scene.scales[~sky].amax(1).median()
     faint = (scene.opacities < 0.1) & ~sky
     assert 0.05 < faint.float().mean() < 0.2
-    mass = scene.opacities * covariances.mean_projected_area(scene.scales)
+    mass = scene.opacities * parameters.mean_projected_area(scene.scales)
     near = distance < 1.5
     assert mass[faint & near].sum() > 0.01 * mass[near].sum()
     shape = scene.scales.sort(dim=1, descending=True).values
@@ -170,7 +170,7 @@ def test_most_of_the_haze_is_faint():
     scene = synthetic.scene("haze", 20_000)
     faint = scene.opacities < 0.1
     assert faint.float().mean() > 0.75
-    mass = scene.opacities * covariances.mean_projected_area(scene.scales)
+    mass = scene.opacities * parameters.mean_projected_area(scene.scales)
     assert mass[faint].sum() > 0.15 * mass.sum()
 
 

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.math import activations, covariances
+from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 
 
@@ -16,7 +16,7 @@ def covariances_of(scene: GaussianScene) -> Float[Tensor, "n 3 3"]:
     """
     scales = torch.exp(scene.log_scales.double()).clamp_min(1e-30)
     scales = torch.maximum(scales, 1e-6 * scales.amax(dim=1, keepdim=True))
-    return covariances.from_scales_and_quats(scales, scene.quats.double())
+    return parameters.build_covariances(scales, scene.quats.double())
 
 
 def from_moments(
@@ -26,8 +26,8 @@ def from_moments(
     appearance: dict[str, Tensor],
 ) -> GaussianScene:
     """Make Gaussians of moments and appearance, with the dtype and the comments of the scene."""
-    scales, quats = covariances.decompose(shapes)
-    tensors = {"means": means, "quats": quats, "log_scales": activations.positive_log(scales)}
+    scales, quats = parameters.decompose_covariances(shapes)
+    tensors = {"means": means, "quats": quats, "log_scales": parameters.positive_log(scales)}
     return scene.with_tensors(
         {name: values.to(scene.dtype) for name, values in (tensors | appearance).items()}, {}
     )

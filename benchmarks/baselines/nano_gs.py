@@ -32,7 +32,7 @@ from torch import Tensor
 from benchmarks.baselines.mixtures import covariances_of, from_moments
 from benchmarks.baselines.rows import usable
 from cvtgs.filters import visible_rows
-from cvtgs.math import activations
+from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 
 MIN_OPACITY = 0.1
@@ -134,13 +134,13 @@ def merge_pairs(scene: GaussianScene, pairs: Int[Tensor, "m 2"]) -> GaussianScen
     means, shapes = merged_moments(
         scene.means.double()[pairs], covariances_of(scene)[pairs], shares
     )
-    depths = activations.optical_depth_from_logit(scene.logit_opacities.double()[pairs])
+    depths = parameters.optical_depth_from_logit(scene.logit_opacities.double()[pairs])
     mean = {
         name: (shares[:, :, None, None] * getattr(scene, name).double()[pairs]).sum(dim=1)
         for name in ("sh0", "shN")
     }
     # 1 - (1 - a)(1 - b): optical depths add up.
-    opacity = {"logit_opacities": activations.logit_from_optical_depth(depths.sum(dim=1))}
+    opacity = {"logit_opacities": parameters.logit_from_optical_depth(depths.sum(dim=1))}
     merged = from_moments(scene, means, shapes, mean | opacity)
     alone = torch.ones(len(scene), dtype=torch.bool)
     alone[pairs.flatten()] = False

@@ -14,8 +14,7 @@ from matplotlib.axes import Axes
 
 import cvtgs
 from cvtgs.config import SimplifyConfig
-from cvtgs.math.frames import robust_frame
-from cvtgs.math.morton import morton_order
+from cvtgs.math.frames import morton_order, robust_frame
 from docs.drawings.saving import figure, save_small
 
 HEIGHT, THICKNESS = -0.28, 0.03

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cvtgs.math import activations, quaternions
+from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 
 
@@ -158,7 +158,7 @@ def with_finite_opacities(scene: GaussianScene) -> GaussianScene:
     infinite = logits.isinf()
     if not bool(infinite.any()):
         return scene
-    finite = torch.where(infinite, activations.clamp_logits(logits), logits)
+    finite = torch.where(infinite, parameters.clamp_logits(logits), logits)
     return scene.with_tensors({"logit_opacities": finite}, scene.extras)
 
 
@@ -179,8 +179,8 @@ def standardized(scene: GaussianScene) -> GaussianScene:
     """
     squared_norms = scene.quats.double().square().sum(dim=1)
     is_unit = ((squared_norms - 1).abs() <= UNIT_TOLERANCE)[:, None]
-    quats = torch.where(is_unit, scene.quats, quaternions.normalize(scene.quats))
-    logits = activations.clamp_logits(scene.logit_opacities)
+    quats = torch.where(is_unit, scene.quats, parameters.normalize_quats(scene.quats))
+    logits = parameters.clamp_logits(scene.logit_opacities)
     return scene.with_tensors({"quats": quats, "logit_opacities": logits}, scene.extras)
 
 

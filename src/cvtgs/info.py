@@ -9,7 +9,7 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.effects import EffectPlan, limited
 from cvtgs.errors import InvalidSceneError
 from cvtgs.filters import invalid_rows
-from cvtgs.math import activations
+from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 from cvtgs.stages.outlook import look_at_scene
 
@@ -108,7 +108,7 @@ def describe(scene: GaussianScene, config: SimplifyConfig | None = None) -> Scen
         mass=float(total),
         mass_shares=_heaviest_shares(masses),
         faint_share=float(faint.double().mean()),
-        faint_mass_share=float(activations.divide(masses[faint].sum(), total)),
+        faint_mass_share=float(parameters.divide(masses[faint].sum(), total)),
         invalid_rows={name: int(mask.sum()) for name, mask in invalid.items()},
         invalid_count=int(bad.sum()),
         antialiased=scene.antialiased,
@@ -126,4 +126,4 @@ def _quantiles(values: Float[Tensor, "n"]) -> tuple[float, ...]:
 def _heaviest_shares(masses: Float[Tensor, "n"]) -> tuple[float, ...]:
     running = torch.sort(masses, descending=True).values.cumsum(0)
     counts = (max(1, round(share * len(masses))) for share in HEAVIEST)
-    return tuple(float(activations.divide(running[count - 1], running[-1])) for count in counts)
+    return tuple(float(parameters.divide(running[count - 1], running[-1])) for count in counts)

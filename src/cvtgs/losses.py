@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.math.activations import positive_log
+from cvtgs.math.parameters import positive_log
 
 __all__ = ["gradient_loss", "image_loss", "l1_loss", "relative_loss", "ssim_loss"]
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.errors import InvalidSceneError
-from cvtgs.math import activations, covariances, spherical_harmonics
+from cvtgs.math import parameters, spherical_harmonics
 
 ANTIALIASED_TAG = "SplatRenderMode: mip"
 """The comment of scenes that were trained with anti-aliasing (Mip-Splatting)."""
@@ -90,13 +90,13 @@ class GaussianScene:
     @property
     def opacities(self) -> Float[Tensor, "n"]:
         """Opacities in [1e-6, 1 - 1e-6]."""
-        return activations.opacity_from_logit(self.logit_opacities)
+        return parameters.opacity_from_logit(self.logit_opacities)
 
     @property
     def areas(self) -> Float[Tensor, "n"]:
         """Mean projected areas of the one-sigma ellipsoids, squared scene units, float64."""
         parts = [
-            covariances.mean_projected_area(torch.exp(part.double()))
+            parameters.mean_projected_area(torch.exp(part.double()))
             for part in self.log_scales.split(_CHUNK)
         ]
         return torch.cat([self.log_scales.new_empty(0, dtype=torch.float64), *parts])

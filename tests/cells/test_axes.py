@@ -9,7 +9,7 @@ from torch import Tensor
 from cvtgs import GaussianScene
 from cvtgs.cells import Partition, align_axes
 from cvtgs.cvt import nearest_neighbors
-from cvtgs.math import quaternions
+from cvtgs.math import parameters
 from hard_scenes import ball
 from mergenet_cases import case_of, lively_net
 from scenes import assert_same_gaussians, covariances_of, moved, random_scene, same_bits
@@ -37,7 +37,7 @@ def settled(scene: GaussianScene, members: int = 2) -> GaussianScene:
 
 
 def axes_of(scene: GaussianScene) -> Tensor:
-    return quaternions.to_matrices(scene.quats)
+    return parameters.quats_to_matrices(scene.quats)
 
 
 def test_a_ball_turns_its_first_axis_to_its_only_neighbour():

@@ -15,7 +15,7 @@ from cvtgs.cells import (
     merged_depth,
 )
 from cvtgs.config import MergeConfig
-from cvtgs.math import covariances
+from cvtgs.math import parameters
 from scenes import assert_same_gaussians, covariances_of, moved, oracle_rows, random_scene
 
 RULES = {
@@ -80,7 +80,7 @@ def test_moments_of_the_mixture_are_conserved(config):
     members = gather_members(scene, cells)
     all_weights = members.weights(config.area_power)
     means, matrices = mean_and_covariance(members, all_weights)
-    second = covariances.from_scales_and_quats(members.scales, members.quats)
+    second = parameters.build_covariances(members.scales, members.quats)
     second = second + members.means[:, :, None] * members.means[:, None, :]
     for cell in range(30):
         rows = slice(int(cells.offsets[cell]), int(cells.offsets[cell + 1]))
@@ -108,7 +108,7 @@ def test_saturating_conserves_depth_times_area():
     depths = -torch.log1p(-small.opacities)
     inside = (depths > 1.1e-6) & (depths < 13.8)
     assert bool(inside.all())
-    areas = covariances.mean_projected_area(small.scales)
+    areas = parameters.mean_projected_area(small.scales)
     torch.testing.assert_close(depths * areas, wanted, rtol=1e-8, atol=0)
     assert float(small.masses.sum()) == pytest.approx(float(scene.masses.sum()), rel=0.01)
 
@@ -117,7 +117,7 @@ def test_saturating_never_gains_mass_and_never_exceeds_one():
     scene, cells = random_scene(500, dtype=torch.float64, spread=0.02), random_cells(500, 10)
     small = merged(scene, cells, RULES["standard"])
     assert bool((small.opacities < 1).all())
-    areas = covariances.mean_projected_area(small.scales)
+    areas = parameters.mean_projected_area(small.scales)
     assert bool((small.masses <= areas).all())
 
 

@@ -5,7 +5,7 @@ import torch
 
 from cvtgs.cvt import lloyd, nearest_scipy, nearest_torch, weighted_centroids, weighted_seeds
 from cvtgs.cvt.seeding import stratified_seeds
-from cvtgs.math.morton import morton_order
+from cvtgs.math.frames import morton_order
 
 BACKENDS = {"scipy": nearest_scipy, "torch": nearest_torch}
 

@@ -7,7 +7,7 @@ import torch
 import oracles
 from cvtgs.cvt import nearest_backend, nearest_scipy, nearest_torch
 from cvtgs.errors import DeviceError
-from cvtgs.math.morton import morton_order
+from cvtgs.math.frames import morton_order
 
 BACKENDS = {"scipy": nearest_scipy, "torch": nearest_torch}
 both = pytest.mark.parametrize("backend", BACKENDS.values(), ids=BACKENDS)

@@ -6,7 +6,7 @@ import torch
 from cvtgs.config import SimplifyConfig, TessellationConfig
 from cvtgs.cvt import Tessellation, tessellate
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.math.morton import morton_order
+from cvtgs.math.frames import morton_order
 
 CONFIGS = {name: SimplifyConfig.from_preset(name).cvt for name in ("standard", "paper")}
 each_config = pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)

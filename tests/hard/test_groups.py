@@ -20,8 +20,7 @@ from cvtgs.cvt import (
     tessellation_weights,
 )
 from cvtgs.cvt.distinct import distinct_rows, runs_of_equal
-from cvtgs.math.frames import robust_frame
-from cvtgs.math.morton import morton_order
+from cvtgs.math.frames import morton_order, robust_frame
 from hard_cases import CASES, each_case
 from hard_scenes import devices, dtypes, presets, valid_rows
 

@@ -1,11 +1,12 @@
-"""The robust frame: a minority of outliers cannot move it."""
+"""The robust frame, which a minority of outliers cannot move, and the Morton curve."""
 
 import math
 
 import pytest
 import torch
 
-from cvtgs.math.frames import RobustFrame, robust_frame
+import oracles
+from cvtgs.math.frames import BITS, RobustFrame, morton_order, robust_frame
 
 UNIT = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
 
@@ -90,3 +91,46 @@ def test_contraction_is_finite_for_float32_flyaways():
     lengths = torch.linalg.vector_norm(UNIT.contract(points), dim=1)
     wanted = [1 + math.log(1e30 * math.sqrt(2)), 1 + math.log(3e38)]
     assert lengths.tolist() == pytest.approx(wanted, rel=0.2)
+
+
+def oracle_order(points: torch.Tensor) -> list[int]:
+    low = points.amin(dim=0)
+    side = float((points.amax(dim=0) - low).amax()) or 1.0
+    steps = ((points - low) / side * (2**BITS - 1)).to(torch.int64).tolist()
+    codes = [oracles.morton_code(step, BITS) for step in steps]
+    return sorted(range(len(codes)), key=lambda row: codes[row])
+
+
+def test_corners_of_a_cube():
+    corners = torch.tensor([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+    walked = corners[morton_order(corners)].tolist()
+    assert walked == [[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)]
+
+
+def test_one_point():
+    assert morton_order(torch.ones(1, 3)).tolist() == [0]
+
+
+def test_coincident_points_keep_their_order():
+    assert morton_order(torch.full((5, 3), 7.0)).tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("count", [2, 100, 1000])
+def test_random_points_equal_the_oracle(count, dtype):
+    points = torch.randn(count, 3, generator=torch.Generator().manual_seed(count), dtype=dtype)
+    assert morton_order(points).tolist() == oracle_order(points)
+
+
+def test_points_on_a_line_come_in_order():
+    points = torch.zeros(1000, 3, dtype=torch.float64)
+    points[:, 1] = torch.randperm(1000, generator=torch.Generator().manual_seed(0)).double()
+    assert points[morton_order(points), 1].tolist() == list(range(1000))
+
+
+def test_neighbours_on_the_curve_are_near():
+    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(1))
+    walked = points[morton_order(points)]
+    step = torch.linalg.vector_norm(walked.diff(dim=0), dim=1).mean()
+    before = torch.linalg.vector_norm(points.diff(dim=0), dim=1).mean()
+    assert float(step) < 0.2 * float(before)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import cvtgs
-from cvtgs.math.activations import LOGIT_LIMIT
+from cvtgs.math.parameters import LOGIT_LIMIT
 from cvtgs.refinement import refine
 from refine_cases import as_dtype, discolored, full_scene, quick, ring, small_scene
 from scenes import same_bits

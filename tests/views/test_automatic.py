@@ -8,7 +8,7 @@ from torch import Tensor
 
 import cvtgs
 from cvtgs.evaluation import psnr
-from cvtgs.math import quaternions
+from cvtgs.math import parameters
 from cvtgs.rendering import render
 from cvtgs.synthetic import KINDS
 from cvtgs.views import automatic_views, mixed_views, views_from_anywhere
@@ -27,11 +27,11 @@ def generated(kind: str, count: int = COUNT) -> cvtgs.GaussianScene:
 
 
 def turned(scene: cvtgs.GaussianScene, quat: tuple[float, ...]) -> cvtgs.GaussianScene:
-    matrix = quaternions.to_matrices(torch.tensor([quat]))[0]
-    frames = quaternions.to_matrices(quaternions.normalize(scene.quats))
+    matrix = parameters.quats_to_matrices(torch.tensor([quat]))[0]
+    frames = parameters.quats_to_matrices(parameters.normalize_quats(scene.quats))
     tensors = {
         "means": scene.means @ matrix.T,
-        "quats": quaternions.from_matrices(matrix @ frames),
+        "quats": parameters.matrices_to_quats(matrix @ frames),
     }
     return scene.with_tensors(tensors, scene.extras)
 
@@ -65,7 +65,9 @@ def ups(cameras: cvtgs.Cameras) -> Tensor:
 def test_views_of_every_kind(kind, turn):
     scene = turned(generated(kind), TURNS[turn])
     cameras = automatic_views(scene, 6, width=48, height=36)
-    up = quaternions.to_matrices(torch.tensor([TURNS[turn]]))[0] @ torch.tensor([0.0, -1.0, 0.0])
+    up = parameters.quats_to_matrices(torch.tensor([TURNS[turn]]))[0] @ torch.tensor(
+        [0.0, -1.0, 0.0]
+    )
     assert (ups(cameras) @ up > 0.5).all(), "images are upright"
     images = render(scene, cameras, depth=True)
     assert (images.alpha.mean(dim=(1, 2)) > 0.1).all(), "no image is empty"
@@ -148,7 +150,9 @@ def test_the_scene_is_in_the_middle_of_upright_images():
     viewmats = cameras.viewmats.float()
     local = viewmats[:, :3, :3] @ center + viewmats[:, :3, 3]
     assert (local[:, :2].abs() < 0.2 * local[:, 2:]).all()
-    matrix = quaternions.to_matrices(quaternions.normalize(torch.tensor([[0.9, 0.2, 0.1, 0.3]])))[0]
+    matrix = parameters.quats_to_matrices(
+        parameters.normalize_quats(torch.tensor([[0.9, 0.2, 0.1, 0.3]]))
+    )[0]
     assert (ups(cameras) @ (matrix @ torch.tensor([0.0, -1, 0])) > 0.7).all()
 
 

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.math import activations, covariances, quaternions
+from cvtgs.math import parameters
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
@@ -48,10 +48,12 @@ def activate_rows(scene: GaussianScene, rows: Int[Tensor, "r"]) -> ActivatedGaus
     log_scales = gather(scene.log_scales, rows)
     return ActivatedGaussians(
         means=gather(scene.means, rows),
-        rotations=quaternions.to_matrices(quaternions.normalize(gather(scene.quats, rows))),
+        rotations=parameters.quats_to_matrices(
+            parameters.normalize_quats(gather(scene.quats, rows))
+        ),
         log_scales=log_scales,
-        log_areas=covariances.log_mean_projected_area(log_scales),
-        logits=activations.clamp_logits(scene.logit_opacities.index_select(0, rows)),
+        log_areas=parameters.log_mean_projected_area(log_scales),
+        logits=parameters.clamp_logits(scene.logit_opacities.index_select(0, rows)),
         colors=gather(scene.sh0[:, 0], rows) * SH_C0,
     )
 
@@ -100,5 +102,5 @@ def extents_in(frames: ActivatedGaussians, others: ActivatedGaussians) -> Float[
     largest = others.log_scales.amax(dim=1, keepdim=True)
     scales = torch.exp(others.log_scales - largest)
     squares = squared_lengths(cosines * scales[:, None, :])
-    logs = 0.5 * activations.positive_log(squares) + largest - frames.log_scales
+    logs = 0.5 * parameters.positive_log(squares) + largest - frames.log_scales
     return logs.clamp(-9, 9)

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cells.partition import Partition
-from cvtgs.math import activations, covariances, quaternions
+from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 
 OPEN = 1e-2
@@ -48,7 +48,7 @@ def align_axes(
     if len(rows) == 0 or neighbors.shape[1] == 0:
         return merged
     logs = merged.log_scales[rows].double()
-    axes = quaternions.to_matrices(quaternions.normalize(merged.quats[rows].double()))
+    axes = parameters.quats_to_matrices(parameters.normalize_quats(merged.quats[rows].double()))
     pulls = axes.mT @ _pulls(merged.means, rows, neighbors[rows]) @ axes
     # Logarithms, since axes of a needle are lost beside its length.
     pulled = torch.diag_embed(2 * (logs - logs[:, :1])) + PULL * pulls * _open_pairs(logs)
@@ -58,7 +58,7 @@ def align_axes(
     tensors["quats"] = tensors["quats"].clone()
     turned = (turns.square() * logs[:, :, None]).sum(dim=1)
     tensors["log_scales"][rows] = turned.to(merged.dtype)
-    quats = quaternions.from_matrices(covariances.canonical_axes(axes @ turns))
+    quats = parameters.matrices_to_quats(parameters.canonical_axes(axes @ turns))
     tensors["quats"][rows] = quats.to(merged.dtype)
     return merged.with_tensors(tensors, merged.extras)
 
@@ -74,7 +74,7 @@ def _pulls(
     ways = torch.where(apart, shifts * (nearest / lengths) / lengths, 0.0)
     sums: Tensor = ways.mT @ ways
     traces = sums.diagonal(dim1=1, dim2=2).sum(dim=1)
-    return activations.divide(sums, traces[:, None, None])
+    return parameters.divide(sums, traces[:, None, None])
 
 
 def _open_pairs(logs: Float[Tensor, "r 3"]) -> Float[Tensor, "r 3 3"]:

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cells.activated import ActivatedGaussians, contrasts_of, extents_in, places_in, take
-from cvtgs.math import activations
+from cvtgs.math import parameters
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
 
 FARTHEST = 50.0
@@ -43,7 +43,7 @@ def see_members(
     ids = segment_ids(offsets)
     cell = own.take(ids)
     opacities = members.opacities
-    weights = _shares(members.log_areas + activations.positive_log(opacities), offsets, ids)
+    weights = _shares(members.log_areas + parameters.positive_log(opacities), offsets, ids)
     contrasts = contrasts_of(members, cell)
     places, extents = places_in(cell, members.means - cell.means), extents_in(cell, members)
     areas = (members.log_areas - cell.log_areas).clamp(-14, 14)
@@ -51,7 +51,7 @@ def see_members(
         side_by_side(
             weights * contrasts.square(),
             weights * lights,
-            activations.optical_depth_from_logit(members.logits) * torch.exp(areas),
+            parameters.optical_depth_from_logit(members.logits) * torch.exp(areas),
             weights[:, None] * torch.exp(2 * extents).clamp_max(4.0),
         ),
         offsets,
@@ -79,7 +79,7 @@ def see_members(
 def member_features(seen: SeenMembers, bare: Float[Tensor, "m 3"]) -> Float[Tensor, "n d"]:
     """Describe members: place, extent, side, share, opacity, area, contrast and light."""
     ids, places = seen.ids, seen.places
-    share = activations.positive_log(seen.weights * seen.counts.index_select(0, ids)).clamp(-14, 14)
+    share = parameters.positive_log(seen.weights * seen.counts.index_select(0, ids)).clamp(-14, 14)
     towards_light = (take(seen.slope, ids) * places).sum(dim=1)
     return side_by_side(
         *distances(places),
@@ -103,7 +103,7 @@ def cell_features(
     pair_places: Float[Tensor, "m k 3"],
 ) -> Float[Tensor, "m c"]:
     """Describe cells: cover of the sides, share of inner extent, size, opacity, shape and light."""
-    painted = activations.positive_log(seen.painted)
+    painted = parameters.positive_log(seen.painted)
     shape = own.log_scales
     distances = pair_places.square().sum(dim=2).sqrt()
     nearest = torch.nn.functional.pad(distances, (0, 1), value=FARTHEST).amin(dim=1)

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from cvtgs.cells.activated import coordinates, gather, squared_lengths, take
 from cvtgs.cells.partition import Partition
-from cvtgs.math import activations, quaternions
+from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 
 PROBE_SIGMAS = 3.0
@@ -66,7 +66,7 @@ def inflate_cells(
         cover = side_cover(merged, part, neighbors[part]).amin(dim=2)
         growth = everywhere + covered * (cover / FULL_COVER).clamp_max(1.0)
         factors = 1 + strength[part, None] * growth
-        log_scales[part] += activations.positive_log(factors).to(merged.dtype)
+        log_scales[part] += parameters.positive_log(factors).to(merged.dtype)
     return merged.with_tensors({"log_scales": log_scales}, merged.extras)
 
 
@@ -98,9 +98,9 @@ def side_cover(
     axes = take(rotations * (PROBE_SIGMAS * scales)[:, None, :], ids)
     arms = coordinates(other_rotations, axes)
     logits = scene.logit_opacities.index_select(0, others).double()
-    opacities = activations.opacity_from_logit(logits)[:, None]
+    opacities = parameters.opacity_from_logit(logits)[:, None]
     painted = [
-        opacities * _bell(activations.divide(ends, other_scales[:, :, None]))
+        opacities * _bell(parameters.divide(ends, other_scales[:, :, None]))
         for ends in (shifts + arms, shifts - arms)
     ]
     return 1 - torch.stack(
@@ -115,6 +115,6 @@ def _bell(places: Float[Tensor, "n 3 k"]) -> Float[Tensor, "n k"]:
 
 def _frames(scene: GaussianScene, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return centres, axes (columns) and scales of some Gaussians in float64."""
-    quats = quaternions.normalize(gather(scene.quats, rows).double())
+    quats = parameters.normalize_quats(gather(scene.quats, rows).double())
     scales = torch.exp(gather(scene.log_scales, rows).double())
-    return gather(scene.means, rows).double(), quaternions.to_matrices(quats), scales
+    return gather(scene.means, rows).double(), parameters.quats_to_matrices(quats), scales

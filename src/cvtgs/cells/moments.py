@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cells.activated import take
-from cvtgs.math import activations, quaternions
+from cvtgs.math import parameters
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
 
 
@@ -47,7 +47,7 @@ class Members:
             return normalized_weights(self.opacities, self.offsets)
         ids = segment_ids(self.offsets)
         largest = segment_max(self.areas, self.offsets).index_select(0, ids)
-        shares = activations.divide(self.areas, largest) ** area_power
+        shares = parameters.divide(self.areas, largest) ** area_power
         return normalized_weights(self.opacities * shares, self.offsets)
 
 
@@ -120,7 +120,7 @@ def mean_and_covariance(
     local = members.means - take(first_rows, ids)
     shift = weighted_mean(local, weights, offsets)
     local = local - take(shift, ids)
-    axes = quaternions.to_matrices(members.quats) * members.scales[:, None, :]
+    axes = parameters.quats_to_matrices(members.quats) * members.scales[:, None, :]
     # Sums of products of columns; products of so many small matrices take ten times as long.
     matrices = local[:, :, None] * local[:, None, :]
     for axis in axes.unbind(2):

@@ -11,7 +11,7 @@ from cvtgs.cells.activated import gather
 from cvtgs.cells.moments import Members, mean_and_covariance, weighted_mean
 from cvtgs.cells.partition import Partition
 from cvtgs.config import MergeConfig
-from cvtgs.math import activations, covariances, quaternions
+from cvtgs.math import parameters
 from cvtgs.math.segments import segment_argmax, segment_sum
 from cvtgs.scene import GaussianScene
 
@@ -73,13 +73,13 @@ def _merge_chunk(
     members = gather_members(scene, part)
     weights = members.weights(config.area_power)
     means, matrices = mean_and_covariance(members, weights)
-    scales, quats = covariances.decompose(matrices)
-    depths = merged_depth(members, covariances.mean_projected_area(scales), rule=config.opacity)
+    scales, quats = parameters.decompose_covariances(matrices)
+    depths = merged_depth(members, parameters.mean_projected_area(scales), rule=config.opacity)
     tensors = {
         "means": means,
         "quats": quats,
-        "log_scales": activations.positive_log(scales),
-        "logit_opacities": activations.logit_from_optical_depth(depths),
+        "log_scales": parameters.positive_log(scales),
+        "logit_opacities": parameters.logit_from_optical_depth(depths),
         "sh0": weighted_mean(scene.sh0.index_select(0, rows), weights, offsets),
         "shN": weighted_mean(scene.shN.index_select(0, rows), weights, offsets),
     }
@@ -110,11 +110,11 @@ def gather_members(scene: GaussianScene, part: Partition) -> Members:
     logits = scene.logit_opacities.index_select(0, rows).double()
     return Members(
         means=gather(scene.means, rows).double(),
-        quats=quaternions.normalize(gather(scene.quats, rows).double()),
+        quats=parameters.normalize_quats(gather(scene.quats, rows).double()),
         scales=torch.exp(log_scales),
-        opacities=activations.opacity_from_logit(logits),
-        depths=activations.optical_depth_from_logit(logits),
-        areas=torch.exp(covariances.log_mean_projected_area(log_scales)),
+        opacities=parameters.opacity_from_logit(logits),
+        depths=parameters.optical_depth_from_logit(logits),
+        areas=torch.exp(parameters.log_mean_projected_area(log_scales)),
         offsets=part.offsets,
     )
 
@@ -139,4 +139,4 @@ def merged_depth(
     """
     if rule == "union":
         return segment_sum(members.depths, members.offsets)
-    return activations.divide(segment_sum(members.depths * members.areas, members.offsets), areas)
+    return parameters.divide(segment_sum(members.depths * members.areas, members.offsets), areas)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cells.partition import Partition
-from cvtgs.math import activations, covariances
+from cvtgs.math import parameters
 from cvtgs.math.segments import segment_argmax, segment_sum
 from cvtgs.scene import GaussianScene
 
@@ -51,12 +51,12 @@ def keep_representatives(
         (1, 1)
     """
     order, offsets = partition.order, partition.offsets
-    opacities = activations.opacity_from_logit(scene.logit_opacities.index_select(0, order))
+    opacities = parameters.opacity_from_logit(scene.logit_opacities.index_select(0, order))
     opacities, own = opacities.double(), areas.index_select(0, order)
     masses = opacities * own
     best = segment_argmax(opacities * masses, offsets)
     together = segment_sum(masses, offsets)
-    wide = torch.exp(covariances.log_mean_projected_area(merged.log_scales.double()))
+    wide = torch.exp(parameters.log_mean_projected_area(merged.log_scales.double()))
     lone = (masses[best] ** 2 * wide > together**2 * own[best]) & (partition.counts > 1)
     if not bool(lone.any()):
         return merged, partition

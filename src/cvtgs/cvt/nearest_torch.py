@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cvt.distinct import distinct_rows
-from cvtgs.math.morton import morton_order
+from cvtgs.math.frames import morton_order
 
 POINT_BLOCK = 32
 SITE_BLOCK = 16

@@ -53,7 +53,7 @@ def tessellate(
     """Group points into a weighted centroidal Voronoi tessellation (Du et al. 1999).
 
     Args:
-        points: Positions in the order of :func:`cvtgs.math.morton.morton_order`, which the
+        points: Positions in the order of :func:`cvtgs.math.frames.morton_order`, which the
             stratified seeds follow and which halves the time of the search.
         weights: Weights, at least 0.
         count: Number of cells, 1 to n.

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.math import activations
+from cvtgs.math import parameters
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
 from cvtgs.scene import GaussianScene
@@ -81,7 +81,7 @@ def far_share(means: Float[Tensor, "n 3"], masses: Float[Tensor, "n"], frame: Ro
         0.75
     """
     far = frame.distances(means) > UNBOUNDED_DISTANCE
-    return float(activations.divide((masses * far).sum(), masses.sum()))
+    return float(parameters.divide((masses * far).sum(), masses.sum()))
 
 
 def faint_share(
@@ -89,7 +89,7 @@ def faint_share(
 ) -> float:
     """Return the share of mass that faint Gaussians hold."""
     masses = masses.double()
-    return float(activations.divide((masses * (opacities < below)).sum(), masses.sum()))
+    return float(parameters.divide((masses * (opacities < below)).sum(), masses.sum()))
 
 
 def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) -> float:
@@ -137,7 +137,7 @@ def _contrast(scene: GaussianScene) -> float:
     """Return the standard deviation of the constant colours of some Gaussians."""
     rows = slice(None, None, max(1, len(scene) // SAMPLE))
     colors = SH_C0 * scene.sh0[rows, 0].double()
-    shares = activations.opacity_from_logit(scene.logit_opacities[rows]).double()
+    shares = parameters.opacity_from_logit(scene.logit_opacities[rows]).double()
     shares = (shares / shares.sum())[:, None]
     mean = (shares * colors).sum(dim=0)
     return float((shares * (colors - mean).square()).sum(dim=0).mean().sqrt())

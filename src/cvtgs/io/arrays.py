@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.errors import InvalidSceneError
-from cvtgs.math import activations
+from cvtgs.math import parameters
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
 
@@ -109,13 +109,13 @@ def to_bytes(values: Float[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
 
 def opacity_bytes(logits: Float[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
     """Store opacities as bytes."""
-    return to_bytes(255 * activations.opacity_from_logit(torch.from_numpy(logits)).numpy())
+    return to_bytes(255 * parameters.opacity_from_logit(torch.from_numpy(logits)).numpy())
 
 
 def logits_of_bytes(opacities: UInt8[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Read opacities that are bytes."""
     values = torch.from_numpy(opacities.astype(np.float32) / np.float32(255))
-    logits: Floats = activations.logit_from_opacity(values).numpy()
+    logits: Floats = parameters.logit_from_opacity(values).numpy()
     return logits
 
 

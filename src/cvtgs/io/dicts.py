@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.errors import InvalidSceneError
-from cvtgs.math import activations
+from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 
 _TENSORS = {
@@ -161,12 +161,12 @@ def _common_dtype(tensors: Mapping[str, Tensor]) -> torch.dtype:
 
 def _stored_scales(scales: Tensor) -> Tensor:
     _check_values("scales", scales < 0, required="at least 0")
-    return activations.positive_log(scales)
+    return parameters.positive_log(scales)
 
 
 def _stored_opacities(opacities: Tensor) -> Tensor:
     _check_values("opacities", (opacities < 0) | (opacities > 1), required="from 0 to 1")
-    return activations.logit_from_opacity(opacities)
+    return parameters.logit_from_opacity(opacities)
 
 
 def _check_values(name: str, wrong: Tensor, *, required: str) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from cvtgs.math.morton import morton_order
+from cvtgs.math.frames import morton_order
 
 
 def morton_rows(means: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:

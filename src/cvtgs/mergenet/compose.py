@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cells import Partition
-from cvtgs.math import quaternions
+from cvtgs.math import parameters
 from cvtgs.math.segments import segment_sum, segment_sum_of
 from cvtgs.mergenet.model import Residuals
 from cvtgs.scene import GaussianScene
@@ -56,9 +56,9 @@ def compose(
         True
     """
     own = merged.select(cells)
-    quats = quaternions.normalize(own.quats)
+    quats = parameters.normalize_quats(own.quats)
     moves = torch.einsum(
-        "mij,mj->mi", quaternions.to_matrices(quats), own.scales * residuals.d_means
+        "mij,mj->mi", parameters.quats_to_matrices(quats), own.scales * residuals.d_means
     )
     tensors = {
         "means": own.means + moves,
@@ -86,7 +86,7 @@ def _turned(quats: Float[Tensor, "m 4"], turns: Float[Tensor, "m 3"]) -> Float[T
     half = turns / 2
     turn = torch.cat([torch.ones_like(half[:, :1]), half], dim=1)
     length = torch.sqrt(1 + half.square().sum(dim=1, keepdim=True))
-    return quaternions.multiply(quats, turn) / length
+    return parameters.multiply_quats(quats, turn) / length
 
 
 def _mixed(

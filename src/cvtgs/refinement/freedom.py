@@ -6,8 +6,8 @@ from torch import Tensor
 
 from cvtgs.cvt import ambient_visibility, nearest_backend
 from cvtgs.filters import valid_rows
-from cvtgs.math.activations import divide
 from cvtgs.math.frames import robust_frame
+from cvtgs.math.parameters import divide
 from cvtgs.scene import GaussianScene
 
 

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from cvtgs.config import Rates
 from cvtgs.filters import standardized, valid_rows, with_finite_opacities
-from cvtgs.math import quaternions
+from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 
 _BETAS = (0.6, 0.99)
@@ -97,7 +97,7 @@ def changed_count(before: GaussianScene, after: GaussianScene) -> int:
 def _started(scene: GaussianScene) -> dict[str, Tensor]:
     """Return the tensors with finite opacities and unit quaternions, which paint the same."""
     start = with_finite_opacities(scene).tensors()
-    return start | {"quats": quaternions.normalize(start["quats"])}
+    return start | {"quats": parameters.normalize_quats(start["quats"])}
 
 
 def _units(scene: GaussianScene, freedom: Float[Tensor, "n"]) -> dict[str, Tensor]:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cvtgs.math.activations import LOGIT_LIMIT
+from cvtgs.math.parameters import LOGIT_LIMIT
 from cvtgs.math.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
 from cvtgs.rendering.compiled import (
     Array,

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.math import activations, quaternions, spherical_harmonics
+from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.scene import GaussianScene
 
 # The numbers of the rasterizer of 3DGS (Kerbl et al. 2023, section 6 and their renderer).
@@ -143,7 +143,7 @@ def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
     local = offsets @ rotation.T
     axes = _image_axes(scene, rows, local, camera)
     ellipses, survival = _ellipses(axes)
-    opacities = activations.opacity_from_logit(scene.logit_opacities.index_select(0, rows))
+    opacities = parameters.opacity_from_logit(scene.logit_opacities.index_select(0, rows))
     if scene.antialiased:
         opacities = opacities * survival
     slopes = local[:, :2] / local[:, 2:]
@@ -162,7 +162,7 @@ def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
 def pack(splats: Splats) -> Float[Tensor, "m 10"]:
     """Return what compositing needs of each splat, side by side."""
     steep, shear, flat = splats.ellipses.unbind(1)
-    columns = [-0.5 * steep, shear, -0.5 * flat, activations.positive_log(splats.opacities)]
+    columns = [-0.5 * steep, shear, -0.5 * flat, parameters.positive_log(splats.opacities)]
     exponents = torch.stack(columns, dim=1)
     return torch.cat([splats.centers, exponents, splats.colors, splats.depths[:, None]], dim=1)
 
@@ -170,7 +170,7 @@ def pack(splats: Splats) -> Float[Tensor, "m 10"]:
 @torch.no_grad()
 def reach_of(opacities: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
     """Return how far Gaussians reach: the squared distance at which alpha falls to 1/255."""
-    return (2 * activations.positive_log(opacities / MIN_ALPHA)).clamp_min(0)
+    return (2 * parameters.positive_log(opacities / MIN_ALPHA)).clamp_min(0)
 
 
 @torch.no_grad()
@@ -207,7 +207,7 @@ def _candidates(scene: GaussianScene, camera: Pinhole) -> Tensor:
     ):
         place = way / z * focal + principal
         keep &= (place + radius > 0) & (place - radius < size)
-    keep &= activations.opacity_from_logit(scene.logit_opacities) >= MIN_ALPHA
+    keep &= parameters.opacity_from_logit(scene.logit_opacities) >= MIN_ALPHA
     return keep.nonzero()[:, 0]
 
 
@@ -215,8 +215,8 @@ def _image_axes(
     scene: GaussianScene, rows: Tensor, local: Tensor, camera: Pinhole
 ) -> Float[Tensor, "m 2 3"]:
     """Return ``M = J W R S``: the own axes of each Gaussian, to first order in the image."""
-    quats = quaternions.normalize(scene.quats.index_select(0, rows))
-    turned = scene.means.new_tensor(camera.rotation) @ quaternions.to_matrices(quats)
+    quats = parameters.normalize_quats(scene.quats.index_select(0, rows))
+    turned = scene.means.new_tensor(camera.rotation) @ parameters.quats_to_matrices(quats)
     low, high = scene.means.new_tensor(camera.slopes).unbind(1)
     slopes = torch.minimum(torch.maximum(local[:, :2] / local[:, 2:], low), high)
     stretch = scene.means.new_tensor(camera.focal) / local[:, 2:]

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.math import activations
+from cvtgs.math import parameters
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.rendering.backends import BackendName, choose_backend
 from cvtgs.scene import GaussianScene
@@ -98,7 +98,7 @@ def render(
     depths = None
     if depth:
         divisor = torch.where(output.alpha > 0, output.alpha, 1)
-        depths = activations.divide(output.depth, divisor)
+        depths = parameters.divide(output.depth, divisor)
     return Rendering(rgb=rgb, alpha=output.alpha, depth=depths, backend=name)
 
 

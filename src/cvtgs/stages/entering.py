@@ -10,7 +10,7 @@ from cvtgs import cvt, filters
 from cvtgs.config import SimplifyConfig
 from cvtgs.effects import with_haze
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError
-from cvtgs.math.activations import divide
+from cvtgs.math.parameters import divide
 from cvtgs.scene import GaussianScene
 from cvtgs.stages.outlook import Outlook
 

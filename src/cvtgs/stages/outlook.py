@@ -10,7 +10,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig, TessellationConfig, VisibilityConfig
 from cvtgs.effects import EffectPlan, imaged, plan_effects
 from cvtgs.io.ply.properties import lacks_third_scale
-from cvtgs.math import activations
+from cvtgs.math import parameters
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.rendering import contributions
 from cvtgs.report import StageClock
@@ -125,7 +125,7 @@ def look_at_images(
         return outlook
     trust = 1.0 - config.mass_share
     blended = config.mass_share * masses + trust * painted * (total / all_painted)
-    seen = activations.divide(blended, scene.opacities.double().clamp_min(FAINTEST))
+    seen = parameters.divide(blended, scene.opacities.double().clamp_min(FAINTEST))
     return outlook._replace(seen_areas=seen.to(outlook.seen_areas.dtype))
 
 

@@ -4,7 +4,7 @@ from torch import Tensor
 
 from cvtgs import cvt
 from cvtgs.config import SimplifyConfig
-from cvtgs.math.morton import morton_order
+from cvtgs.math.frames import morton_order
 from cvtgs.scene import GaussianScene
 from cvtgs.stages.outlook import Outlook
 

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cvtgs.math import activations, quaternions
+from cvtgs.math import parameters
 from cvtgs.math.spherical_harmonics import SH_C0, degree_of, rest_basis
 from cvtgs.scene import GaussianScene
 from cvtgs.synthetic.surfaces import Surface, SurfacePoints
@@ -138,9 +138,9 @@ def gaussians(
     """Build a scene from activated values."""
     return GaussianScene(
         means=means,
-        quats=quaternions.from_matrices(rotations),
-        log_scales=activations.positive_log(scales),
-        logit_opacities=activations.logit_from_opacity(opacities.clamp(*_OPACITY_RANGE)),
+        quats=parameters.matrices_to_quats(rotations),
+        log_scales=parameters.positive_log(scales),
+        logit_opacities=parameters.logit_from_opacity(opacities.clamp(*_OPACITY_RANGE)),
         sh0=((colors.clamp(0.0, 1.0) - 0.5) / SH_C0)[:, None, :],
         shN=rest,
     )

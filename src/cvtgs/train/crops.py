@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.math import quaternions
+from cvtgs.math import parameters
 from cvtgs.math.segments import segment_ids
 from cvtgs.scene import GaussianScene
 from cvtgs.train.cases import Case
@@ -88,7 +88,7 @@ class _Layout:
         like = merged.means
         return cls(
             centers=merged.means,
-            turns=quaternions.normalize(turns).to(like),
+            turns=parameters.normalize_quats(turns).to(like),
             zooms=zooms.to(like) / merged.scales.amax(dim=1),
             places=places.to(like),
         )
@@ -96,10 +96,10 @@ class _Layout:
     def place(self, tensors: dict[str, Tensor], ids: Int[Tensor, "n"]) -> GaussianScene:
         turns, zooms = self.turns[ids], self.zooms[ids]
         local = (tensors["means"] - self.centers[ids]) * zooms[:, None]
-        turned = torch.einsum("nij,nj->ni", quaternions.to_matrices(turns), local)
+        turned = torch.einsum("nij,nj->ni", parameters.quats_to_matrices(turns), local)
         return GaussianScene(
             means=turned + self.places[ids],
-            quats=quaternions.multiply(turns, quaternions.normalize(tensors["quats"])),
+            quats=parameters.multiply_quats(turns, parameters.normalize_quats(tensors["quats"])),
             log_scales=tensors["log_scales"] + torch.log(zooms)[:, None],
             logit_opacities=tensors["logit_opacities"],
             sh0=tensors["sh0"],

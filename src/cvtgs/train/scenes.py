@@ -12,8 +12,8 @@ from cvtgs import synthetic
 from cvtgs.errors import ConfigError
 from cvtgs.filters import valid_rows
 from cvtgs.io import load
-from cvtgs.math import covariances, quaternions
-from cvtgs.math.activations import positive_log
+from cvtgs.math import parameters
+from cvtgs.math.parameters import positive_log
 from cvtgs.scene import GaussianScene
 from cvtgs.train.config import DataConfig
 
@@ -180,9 +180,9 @@ def perturb(scene: GaussianScene, dice: random.Random) -> GaussianScene:
     kept = scene.select(torch.rand(len(scene), generator=generator) < share)
     stretch = torch.tensor([dice.uniform(0.6, 1.5) for _ in range(3)], dtype=scene.dtype)
     wider = share ** (-1 / 3)
-    quats = quaternions.normalize(kept.quats.double())
-    shapes = covariances.from_scales_and_quats(kept.scales.double() * wider, quats)
-    scales, turned = covariances.decompose(shapes * stretch[:, None] * stretch)
+    quats = parameters.normalize_quats(kept.quats.double())
+    shapes = parameters.build_covariances(kept.scales.double() * wider, quats)
+    scales, turned = parameters.decompose_covariances(shapes * stretch[:, None] * stretch)
     mix = torch.eye(3) * dice.uniform(0.5, 1.4) + 0.3 * torch.randn(3, 3, generator=generator)
     mix = mix.to(scene.dtype)
     return kept.with_tensors(

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.math import quaternions
+from cvtgs.math import parameters
 from cvtgs.rendering import render
 from cvtgs.views.survey import Survey
 from cvtgs.views.voxels import SIZE
@@ -78,7 +78,7 @@ def _swallowed(known: Survey, cameras: Cameras) -> Bool[Tensor, "c"]:
     for eye in cameras.centers.to(means):
         offsets = (eye - means).to(sample.dtype)
         near = torch.linalg.vector_norm(offsets, dim=1) < _WITHIN * largest
-        frames = quaternions.to_matrices(quaternions.normalize(sample.quats[near]))
+        frames = parameters.quats_to_matrices(parameters.normalize_quats(sample.quats[near]))
         local = (frames.transpose(1, 2) @ offsets[near][:, :, None])[:, :, 0]
         squares = (local / sample.scales[near].clamp_min(1e-12)).square().sum(dim=1)
         found.append(bool((squares < _WITHIN**2).any()))

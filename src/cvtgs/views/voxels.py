@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.math import quaternions
-from cvtgs.math.activations import divide
+from cvtgs.math import parameters
 from cvtgs.math.frames import RobustFrame
+from cvtgs.math.parameters import divide
 from cvtgs.math.segments import segment_sum
 from cvtgs.scene import GaussianScene
 
@@ -64,6 +64,6 @@ def voxels_of(scene: GaussianScene, frame: RobustFrame) -> Voxels:
 
 
 def _thinnest_axes(scene: GaussianScene) -> Float[Tensor, "n 3"]:
-    matrices = quaternions.to_matrices(quaternions.normalize(scene.quats.double()))
+    matrices = parameters.quats_to_matrices(parameters.normalize_quats(scene.quats.double()))
     thinnest = scene.log_scales.argmin(dim=1)
     return matrices.gather(2, thinnest[:, None, None].expand(-1, 3, 1))[:, :, 0]

@@ -11,7 +11,7 @@ from cvtgs.io.cameras import colmap_binary, colmap_text
 from cvtgs.io.cameras.colmap_image import ColmapImage
 from cvtgs.io.cameras.views import Lens, View
 from cvtgs.io.files import is_file
-from cvtgs.math import quaternions
+from cvtgs.math import parameters
 
 
 def is_colmap(folder: Path) -> bool:
@@ -41,7 +41,7 @@ def _views(images: Sequence[ColmapImage], lenses: Mapping[int, Lens], path: Path
             )
     quats = torch.tensor([image.quat for image in images], dtype=torch.float64).reshape(-1, 4)
     viewmats = np.tile(np.eye(4), (len(images), 1, 1))
-    viewmats[:, :3, :3] = quaternions.to_matrices(quaternions.normalize(quats)).numpy()
+    viewmats[:, :3, :3] = parameters.quats_to_matrices(parameters.normalize_quats(quats)).numpy()
     viewmats[:, :3, 3] = np.array([image.shift for image in images]).reshape(-1, 3)
     return [
         View(name=image.name, viewmat=viewmat, lens=lenses[image.camera])
