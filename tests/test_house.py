@@ -37,14 +37,14 @@ RANKS = {name: rank for rank, level in enumerate(LEVELS) for name in level}
 EVERYWHERE = {"torch", "numpy", "jaxtyping", "pydantic"}
 OWNERS = {
     "scipy": ("cvt/nearest_scipy.py", "budget/fit.py"),
-    "plyfile": "io/ply/generic.py",
+    "plyfile": "io/ply/read.py",
     "tomli_w": "config/simplify.py",
     "rich": "cli/",
     "kornia": "losses.py",
     "numba": "rendering/compiled.py",
     "gsplat": "rendering/gsplat_backend.py",
-    "PIL": ("evaluation/images.py", "io/webp.py"),
-    "zstandard": "io/spz/zstd.py",
+    "PIL": ("evaluation/images.py", "io/sog/container.py"),
+    "zstandard": "io/spz/read.py",
     "safetensors": "io/tensors.py",
     "matplotlib": "plots.py",
     "distributed": "outofcore/distributed.py",

@@ -122,6 +122,11 @@ class GaussianScene:
         return any(ANTIALIASED_TAG.lower() in comment.lower() for comment in self.comments)
 
     @property
+    def has_two_scales(self) -> bool:
+        """Whether the file had two scales per Gaussian: surfels of 2DGS (Huang et al. 2024)."""
+        return bool(self.layout) and "scale_2" not in dict(self.layout)
+
+    @property
     def device(self) -> torch.device:
         """The device that holds every tensor."""
         return self.means.device

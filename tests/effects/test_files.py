@@ -48,7 +48,7 @@ def test_columns_that_are_not_needed_are_not_copied(source, monkeypatch):
             asked.append(name)
             return self.rows[name]
 
-    original = assemble.assemble
+    original = assemble
     monkeypatch.setattr(
         "cvtgs.io.ply.read.assemble",
         lambda chunks, **options: original(map(Watched, chunks), **options),

@@ -103,7 +103,7 @@ def test_a_folder_that_may_not_be_read(tmp_path: Path, monkeypatch: pytest.Monke
     def refuse(folder: Path) -> Iterator[Path]:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("cvtgs.io.folders._scenes", refuse)
+    monkeypatch.setattr("cvtgs.io.files._scenes", refuse)
     with pytest.raises(InputError) as caught:
         scene_file(tmp_path)
     assert (

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from cvtgs.errors import DeviceError, DroppedDataWarning
 from cvtgs.io import load
-from cvtgs.io.ply import FLAT_LOG_SCALE, fast
-from cvtgs.scene import GaussianScene
+from cvtgs.io.ply import read
+from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 from ply_files import CODES, gaussian_properties, gaussian_rows, ply_bytes, write_ply_file
 
 ENCODINGS = ("ascii", "binary_little_endian", "binary_big_endian")
@@ -37,7 +37,7 @@ def same(a: GaussianScene, b: GaussianScene) -> bool:
 def load_with_plyfile(path: Path) -> GaussianScene:
     """Load through the reader that the fast one must agree with."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fast, "can_read", lambda header: False)
+        patch.setattr(read, "can_map", lambda header: False)
         return load(path)
 
 
@@ -69,7 +69,7 @@ def test_every_sh_degree(tmp_path: Path, rest: int, degree: int) -> None:
 
 
 def test_chunks_meet_without_gaps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fast, "CHUNK_BYTES", 3 * 17 * 4 + 5)
+    monkeypatch.setattr(read, "CHUNK_BYTES", 3 * 17 * 4 + 5)
     properties = gaussian_properties()
     rows = gaussian_rows(properties, 10)
     scene = load(write_ply_file(tmp_path / "s.ply", properties, rows))

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from cvtgs.errors import DroppedDataWarning, FileFormatError, InvalidSceneError
 from cvtgs.io import load, save
-from cvtgs.io.ply import FLAT_LOG_SCALE, write
-from cvtgs.scene import GaussianScene
+from cvtgs.io.ply import write
+from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 from ply_files import gaussian_properties, gaussian_rows, parse_header, write_ply_file
 
 

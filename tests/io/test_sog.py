@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from cvtgs import load, save
 from cvtgs.errors import FileFormatError, InputNotFoundError
 from cvtgs.io.sog.codebook import codebook, palette
-from cvtgs.io.webp import encode_webp
+from cvtgs.io.sog.container import encode_webp
 from format_cases import (
     DATA,
     assert_as_oracle,
@@ -186,13 +186,16 @@ DAMAGED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     ),
     "no means": (lambda m: m.pop("means"), "'means': must be a JSON object, found None."),
     "ranges": (lambda m: m["means"].update(mins=[0, 1]), "'mins' must be 3 finite numbers, found"),
-    "codebook": (lambda m: m["scales"].update(codebook=[]), "'codebook' must be 1 finite numbers"),
+    "codebook": (
+        lambda m: m["scales"].update(codebook=[]),
+        "'codebook' must be 1 to 256 finite numbers, found [].",
+    ),
     "bands": (lambda m: m["shN"].update(bands=4), "'bands' must be 1, 2 or 3, found 4."),
     "other bands": (
         lambda m: m["shN"].update(bands=2),
         "shN_centroids.webp must be 512 pixels wide, found 192.",
     ),
-    "files": (lambda m: m["sh0"].update(files=[]), "'files' must be 1 file names, found []."),
+    "files": (lambda m: m["sh0"].update(files=[]), "'files' must be 1 file name, found []."),
     "folder": (
         lambda m: m["sh0"].update(files=["../sh0.webp"]),
         "the files of a SOG must be named without folders, found '../sh0.webp'.",

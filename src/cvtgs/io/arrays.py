@@ -1,4 +1,4 @@
-"""Scenes as numpy arrays, and how compact formats store colours and opacities.
+"""Scenes as numpy arrays, and how compact formats store rotations, colours and opacities.
 
 The readers and writers of compact formats meet stored parameters only here.
 """
@@ -7,31 +7,29 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.errors import InvalidSceneError
+from cvtgs.io.limits import writable_rows
 from cvtgs.math import parameters
-from cvtgs.math.spherical_harmonics import SH_C0
+from cvtgs.math.frames import morton_order
+from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
 from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+
+HALF_RANGE = np.float32(np.sqrt(0.5))
+"""No other component is larger than this."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Arrays:
-    """The standard tensors of a scene, float32, on the CPU.
-
-    Attributes:
-        means: ``(n, 3)`` centres.
-        quats: ``(n, 4)`` rotations, w first.
-        log_scales: ``(n, 3)`` logarithms of the standard deviations.
-        logit_opacities: ``(n,)`` logits of the opacities.
-        sh0: ``(n, 3)`` constant SH band.
-        shN: ``(n, k, 3)`` view-dependent SH bands.
-    """
+    """The standard tensors of a scene, float32, on the CPU."""
 
     means: Float[np.ndarray, "n 3"]
     quats: Float[np.ndarray, "n 4"]
@@ -54,41 +52,31 @@ def arrays_of(scene: GaussianScene, *, sh_degree: int = 3) -> Arrays:
         name: (tensor if whole else tensor[rows]).detach().cpu().float().numpy()
         for name, tensor in scene.tensors().items()
     }
-    held = (0, 3, 8, 15)[sh_degree]
     return Arrays(
         means=own["means"],
         quats=unit_quats(own["quats"]),
         log_scales=own["log_scales"],
         logit_opacities=own["logit_opacities"],
         sh0=own["sh0"][:, 0],
-        shN=own["shN"][:, :held],
+        shN=own["shN"][:, : REST_COUNTS[sh_degree]],
     )
-
-
-def writable_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
-    """Find the rows that compact formats can hold."""
-    rows = ~scene.logit_opacities.isnan() & (scene.quats != 0).any(dim=1)
-    for name, tensor in scene.tensors().items():
-        if name != "logit_opacities" and tensor.numel():
-            rows &= tensor.float().isfinite().reshape(len(scene), -1).all(dim=1)
-    return rows
 
 
 def scene_of(arrays: Arrays, *, antialiased: bool = False) -> GaussianScene:
     """Make a scene of what a reader found."""
+
+    def tensor(values: Floats) -> Tensor:
+        return torch.from_numpy(np.require(values, np.float32, ["C", "W"]))
+
     return GaussianScene(
-        means=_tensor(arrays.means),
-        quats=_tensor(arrays.quats),
-        log_scales=_tensor(arrays.log_scales),
-        logit_opacities=_tensor(arrays.logit_opacities),
-        sh0=_tensor(arrays.sh0)[:, None, :],
-        shN=_tensor(arrays.shN),
+        means=tensor(arrays.means),
+        quats=tensor(arrays.quats),
+        log_scales=tensor(arrays.log_scales),
+        logit_opacities=tensor(arrays.logit_opacities),
+        sh0=tensor(arrays.sh0)[:, None, :],
+        shN=tensor(arrays.shN),
         comments=(ANTIALIASED_TAG,) if antialiased else (),
     )
-
-
-def _tensor(values: Floats) -> Tensor:
-    return torch.from_numpy(np.require(values, np.float32, ["C", "W"]))
 
 
 def unit_quats(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
@@ -127,3 +115,36 @@ def colors_of_sh0(sh0: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 def sh0_of_colors(colors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Return the constant SH band of colours, the inverse of :func:`colors_of_sh0`."""
     return (colors - np.float32(0.5)) / np.float32(SH_C0)
+
+
+def drop_largest(
+    quats: Float[np.ndarray, "n 4"],
+) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+    """Leave out the largest component, after making it positive."""
+    rows = np.arange(len(quats))
+    largest = np.abs(quats).argmax(axis=1)
+    signs = np.where(quats[rows, largest] < 0, -1, 1).astype(quats.dtype)
+    others = quats[rows[:, None], _OTHERS[largest]] * signs[:, None]
+    return largest, others
+
+
+def restore_largest(
+    largest: Int[np.ndarray, "n"], others: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 4"]:
+    """Put the largest component back, the inverse of :func:`drop_largest`."""
+    quats = np.empty((len(others), 4), others.dtype)
+    rows = np.arange(len(others))
+    quats[rows[:, None], _OTHERS[largest]] = others
+    squares = np.einsum("ij,ij->i", others, others)
+    quats[rows, largest] = np.sqrt(np.maximum(1 - squares, 0))
+    return quats
+
+
+def morton_rows(means: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
+    """Order Gaussians along a Morton curve; far ones do not coarsen it."""
+    middle = np.median(means, axis=0)
+    away = means - middle
+    radius = np.quantile(np.abs(away).max(axis=1), 0.9) or 1.0
+    inside = np.sign(away) * np.log1p(np.abs(away) / np.float32(radius))
+    order: Int[np.ndarray, n] = morton_order(torch.from_numpy(inside)).numpy()
+    return order

@@ -1,17 +1,20 @@
-"""Open the files of scenes and cameras, or say in one sentence why not."""
+"""Find and open the files of scenes and cameras, or say in one sentence why not."""
 
-import json
 import os
+import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from cvtgs.errors import CvtgsError, FileFormatError, InputError, InputNotFoundError
 
 _POINTER = b"version https://git-lfs."
 """How the few lines start that a clone without Git LFS has in place of a large file."""
+
+_ITERATION = re.compile(r"iteration_(\d{1,18})")
+_STEP = re.compile(r"step-(\d{1,18})\.ckpt")
 
 
 @contextmanager
@@ -44,28 +47,85 @@ def read_bytes(path: Path) -> bytes:
         return file.read()
 
 
-def read_json(path: Path) -> Any:
-    """Parse a JSON file."""
-    return parse_json(read_bytes(path), path)
-
-
-def parse_json(data: bytes, path: str | Path) -> Any:
-    """Parse JSON that is read already."""
-    try:
-        return json.loads(data.decode("utf-8-sig"))
-    except json.JSONDecodeError as error:
-        raise FileFormatError(
-            f"{path}: must be JSON, found an error in line {error.lineno}, column {error.colno}: "
-            f"{error.msg.lower()}."
-        ) from error
-    except UnicodeDecodeError as error:
-        raise FileFormatError(
-            f"{path}: must be JSON in UTF-8, found another byte at {error.start:,}."
-        ) from error
-    except (RecursionError, ValueError) as error:  # nested without end; numbers without end
-        raise FileFormatError(f"{path}: must be plain JSON, found: {error}.") from error
-
-
 def is_file(path: Path) -> bool:
     """Report whether a file is there, also where its folder may not be looked into."""
     return os.path.isfile(path)  # noqa: PTH113 (Path.is_file raises without permission)
+
+
+def scene_file(path: str | os.PathLike[str]) -> Path:
+    """Find the file that holds the scene of a folder.
+
+    These are looked for, in this order:
+
+    - ``point_cloud/iteration_*/point_cloud.ply``, the largest iteration: a model of INRIA's code;
+    - ``nerfstudio_models/step-*.ckpt`` or ``step-*.ckpt``, the largest step: a run of Splatfacto;
+    - ``point_cloud.ply``;
+    - ``meta.json``: an unbundled SOG.
+
+    Args:
+        path: A folder, or a file, which is its own scene.
+
+    Returns:
+        The file.
+
+    Raises:
+        InputError: There is none of these in the folder, or it cannot be looked into.
+
+    Example:
+        >>> scene_file("scene.ply").name
+        'scene.ply'
+    """
+    folder = Path(path)
+    if not os.path.isdir(folder):  # noqa: PTH112 (Path.is_dir raises without permission)
+        return folder
+    try:
+        found = next(_scenes(folder), None)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise InputError(f"{folder}: the folder must be readable, found: {reason}.") from error
+    if found is None:
+        raise InputError(
+            f"{folder}: must be a file or the folder of a trained model, found a directory "
+            f"without point_cloud/iteration_*/point_cloud.ply, step-*.ckpt, point_cloud.ply or "
+            f"meta.json."
+        )
+    return found
+
+
+def scene_size(path: str | os.PathLike[str]) -> int:
+    """Return the size of a scene on the disk.
+
+    Args:
+        path: A file, or a folder that :func:`scene_file` finds a scene in.
+
+    Returns:
+        Bytes of its file; of an unbundled SOG, those of its images too.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.NamedTemporaryFile(suffix=".splat") as file:
+        ...     scene_size(file.name)
+        0
+    """
+    file = scene_file(path)
+    parts = file.parent.glob("*.webp") if file.name == "meta.json" else ()
+    return sum(part.stat().st_size for part in (file, *parts))
+
+
+def _scenes(folder: Path) -> Iterator[Path]:
+    iterations = _numbered(folder / "point_cloud", _ITERATION)
+    yield from filter(is_file, (part / "point_cloud.ply" for part in iterations))
+    for steps in (folder / "nerfstudio_models", folder):
+        yield from filter(is_file, _numbered(steps, _STEP))
+    for name in ("point_cloud.ply", "meta.json"):
+        if is_file(folder / name):
+            yield folder / name
+
+
+def _numbered(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
+    """Return what is numbered in a folder, the largest number first."""
+    if not folder.is_dir():
+        return []
+    matches = [(pattern.fullmatch(part.name), part) for part in folder.iterdir()]
+    numbers = [(int(match[1]), part) for match, part in matches if match]
+    return [part for _, part in sorted(numbers, reverse=True)]

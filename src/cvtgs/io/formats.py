@@ -1,66 +1,44 @@
-"""Load and save scenes; the end of the file name says which format it is."""
+"""Read and write scenes; the end of the file name says which format it is."""
 
 import os
 import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from pkgutil import resolve_name
 from types import MappingProxyType
-from typing import BinaryIO, TypeVar
+from typing import BinaryIO
 
 import torch
 
 from cvtgs.devices import usable_device
 from cvtgs.errors import DroppedDataWarning, FileFormatError, InvalidArgumentError
 from cvtgs.io.atomic import atomic_output, check_output
-from cvtgs.io.checkpoints import read_checkpoint
-from cvtgs.io.compressed_ply import (
-    COMPRESSED_PLY_HOLDS,
-    is_compressed_ply,
-    read_compressed_ply,
-    write_compressed_ply,
-)
-from cvtgs.io.folders import scene_file
-from cvtgs.io.limits import Holds, Losses, losses_of
-from cvtgs.io.ply import read_ply, write_ply
-from cvtgs.io.sog import SOG_HOLDS, read_sog, write_sog
-from cvtgs.io.splat import SPLAT_HOLDS, read_splat, write_splat
-from cvtgs.io.spz import SPZ_HOLDS, read_spz, write_spz
+from cvtgs.io.files import is_file, scene_file
+from cvtgs.io.limits import FORMAT_LIMITS, Losses, losses_within
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 
-Read = Callable[[Path], GaussianScene]
-Entry = TypeVar("Entry")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Output:
-    """How a format is written; ``holds`` is None where nothing is lost."""
-
-    write: Callable[[GaussianScene, BinaryIO], None]
-    holds: Holds | None = None
-
-
-# By the end of the file name; the first that fits counts.
-_READERS: Mapping[str, Read] = MappingProxyType(
+_READERS: Mapping[str, str] = MappingProxyType(
     {
-        ".compressed.ply": read_ply,
-        ".ply": read_ply,
-        ".spz": read_spz,
-        ".splat": read_splat,
-        ".sog": read_sog,
-        "meta.json": read_sog,
-        ".ckpt": read_checkpoint,
-        ".pt": read_checkpoint,
+        ".compressed.ply": "cvtgs.io.compressed_ply:read_compressed_ply",
+        ".ply": "cvtgs.io.ply:read_ply",
+        ".spz": "cvtgs.io.spz:read_spz",
+        ".splat": "cvtgs.io.splat:read_splat",
+        ".sog": "cvtgs.io.sog:read_sog",
+        "meta.json": "cvtgs.io.sog:read_sog",
+        ".ckpt": "cvtgs.io.checkpoints:read_checkpoint",
+        ".pt": "cvtgs.io.checkpoints:read_checkpoint",
     }
 )
-_OUTPUTS: Mapping[str, _Output] = MappingProxyType(
+"""Readers by the end of the file name, of which the first that fits counts; loaded when needed."""
+
+_WRITERS: Mapping[str, str] = MappingProxyType(
     {
-        ".compressed.ply": _Output(write=write_compressed_ply, holds=COMPRESSED_PLY_HOLDS),
-        ".ply": _Output(write=write_ply),
-        ".spz": _Output(write=write_spz, holds=SPZ_HOLDS),
-        ".splat": _Output(write=write_splat, holds=SPLAT_HOLDS),
-        ".sog": _Output(write=write_sog, holds=SOG_HOLDS),
+        ".compressed.ply": "cvtgs.io.compressed_ply:write_compressed_ply",
+        ".ply": "cvtgs.io.ply:write_ply",
+        ".spz": "cvtgs.io.spz:write_spz",
+        ".splat": "cvtgs.io.splat:write_splat",
+        ".sog": "cvtgs.io.sog:write_sog",
     }
 )
 
@@ -111,16 +89,23 @@ def load(
         GaussianScene(2 Gaussians, SH degree 0, float32, cpu)
     """
     usable_device(device)
-    _check_degree(sh_degree)
+    if sh_degree is not None and not 0 <= sh_degree < len(REST_COUNTS):
+        raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {sh_degree!r}.")
     source = scene_file(path)
-    if not os.path.isfile(source):  # noqa: PTH113 (Path.is_file raises without permission)
-        return read_ply(source)  # says what is wrong, whatever the suffix
-    read = _by_name(source, _READERS)
-    if read is read_ply and is_compressed_ply(source):
-        read = read_compressed_ply
-    if read is read_ply:
-        return read_ply(source, sh_degree=sh_degree, extras=extras).to(device)
-    return _reduced(read(source), sh_degree).to(device)
+    end = _end_of(source, _READERS) if is_file(source) else ".ply"  # which says what is wrong
+    if end.endswith(".ply"):
+        from cvtgs.io.ply.header import is_compressed_ply  # noqa: PLC0415 (loaded as readers are)
+
+        end = ".compressed.ply" if is_compressed_ply(source) else ".ply"
+    read: Callable[..., GaussianScene] = resolve_name(_READERS[end])
+    if end == ".ply":
+        return read(source, sh_degree=sh_degree, extras=extras).to(device)
+    scene = read(source)
+    if sh_degree is not None and sh_degree < scene.sh_degree:
+        rest = scene.shN.clone()
+        rest[:, REST_COUNTS[sh_degree] :] = 0.0
+        scene = scene.with_tensors({"shN": rest}, scene.extras)
+    return scene.to(device)
 
 
 def save(scene: GaussianScene, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -154,7 +139,7 @@ def save(scene: GaussianScene, path: str | os.PathLike[str], *, overwrite: bool 
         ...     save(scene, Path(folder) / "two.ply")
         ...     save(scene, Path(folder) / "two.ply", overwrite=True)
     """
-    write = _by_name(Path(path), _OUTPUTS).write
+    writer = _WRITERS[_end_of(path, _WRITERS)]
     check_output(path, overwrite)
     dropped = losses(scene, path).dropped
     if dropped:
@@ -163,6 +148,7 @@ def save(scene: GaussianScene, path: str | os.PathLike[str], *, overwrite: bool 
             DroppedDataWarning,
             stacklevel=2,
         )
+    write: Callable[[GaussianScene, BinaryIO], None] = resolve_name(writer)
     with atomic_output(path, overwrite=overwrite) as file:
         write(scene, file)
 
@@ -186,10 +172,10 @@ def losses(scene: GaussianScene, path: str | os.PathLike[str]) -> Losses:
         >>> losses(scene("object", 10, sh_degree=1, seed=0), "small.splat").dropped
         ('SH bands above degree 0 (the scene has degree 1)',)
     """
-    holds = _by_name(Path(path), _OUTPUTS).holds
-    if holds is None:
+    limits = FORMAT_LIMITS.get(_end_of(path, _WRITERS))
+    if limits is None:
         return Losses(dropped=(), changed=(), count=len(scene), sh_degree=scene.sh_degree)
-    return losses_of(scene, holds)
+    return losses_within(scene, limits)
 
 
 def check_save(path: str | os.PathLike[str], overwrite: bool = False) -> None:
@@ -209,29 +195,17 @@ def check_save(path: str | os.PathLike[str], overwrite: bool = False) -> None:
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     check_save(Path(folder) / "new.ply")
     """
-    _by_name(Path(path), _OUTPUTS)
+    _end_of(path, _WRITERS)
     check_output(path, overwrite)
 
 
-def _check_degree(sh_degree: int | None) -> None:
-    if sh_degree is not None and not 0 <= sh_degree < len(REST_COUNTS):
-        raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {sh_degree!r}.")
-
-
-def _reduced(scene: GaussianScene, sh_degree: int | None) -> GaussianScene:
-    if sh_degree is None or sh_degree >= scene.sh_degree:
-        return scene
-    rest = scene.shN.clone()
-    rest[:, REST_COUNTS[sh_degree] :] = 0.0
-    return scene.with_tensors({"shN": rest}, scene.extras)
-
-
-def _by_name(path: Path, formats: Mapping[str, Entry]) -> Entry:
-    name = path.name.lower()
-    for end, one in formats.items():
-        if name.endswith(end):
-            return one
-    *ends, last = formats
+def _end_of(path: str | os.PathLike[str], known: Iterable[str]) -> str:
+    """Return the known end of a file name."""
+    path = Path(path)
+    for end in known:
+        if path.name.lower().endswith(end):
+            return end
+    *ends, last = known
     raise FileFormatError(
         f"{path}: the file name must end in {', '.join(ends)} or {last}, "
         f"found {f'the suffix {path.suffix!r}' if path.suffix else 'no suffix'}."

@@ -1,20 +1,15 @@
-"""What a format holds, and what of a scene it therefore loses."""
+"""What each format holds, and what of a scene it therefore loses."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
-from cvtgs.io.arrays import writable_rows
+from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
-
-_NAMES = {
-    "means": "centre",
-    "log_scales": "logarithm of a scale",
-    "sh0": "constant SH band",
-    "shN": "view-dependent SH coefficient",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,70 +30,146 @@ class Losses:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Holds:
-    """What files of a format hold.
-
-    Attributes:
-        sh_degree: The highest SH band.
-        tag: Whether they say that a scene was trained with anti-aliasing.
-        comments: Whether they hold other comments.
-        limits: Least and largest value of a tensor, by its name.
-        reach: Gives the largest coordinate that a file of this scene holds; None if any fits.
-        changed: What is rounded or reordered.
-    """
+class FormatLimits:
+    """What files of a format hold."""
 
     sh_degree: int
-    tag: bool
+    antialiased: bool
+    """Whether they say that a scene was trained with anti-aliasing."""
     comments: bool = False
-    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    reach: Callable[[GaussianScene], float] | None = None
-    changed: tuple[str, ...] = ()
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Least and largest value of a tensor, by its name."""
+    largest_coordinate: Callable[[GaussianScene], float] | None = None
+    """Gives the largest coordinate that a file of a scene holds; None if any fits."""
+    changed: tuple[str, ...]
+    """What is rounded or reordered."""
 
 
-def losses_of(scene: GaussianScene, holds: Holds) -> Losses:
-    """Report what of a scene will be lost in a file."""
-    changed = list(holds.changed)
+def _largest_spz_coordinate(scene: GaussianScene) -> float:
+    from cvtgs.io.spz.write import largest_coordinate  # noqa: PLC0415 (only where it is written)
+
+    return largest_coordinate(scene)
+
+
+FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
+    {
+        ".compressed.ply": FormatLimits(
+            sh_degree=3,
+            antialiased=True,
+            comments=True,
+            ranges={"log_scales": (-20.0, 20.0), "shN": (-4.0, 4.0)},
+            changed=(
+                "rows in Morton order",
+                "positions and scales in 2048 (y: 1024) steps and colours in 256 between the "
+                "least and the largest of 256 Gaussians",
+                "rotations in steps of 1/723 per component",
+                "opacities in steps of 1/255",
+                "view-dependent SH coefficients in steps of 1/32",
+            ),
+        ),
+        ".spz": FormatLimits(  # of version 3
+            sh_degree=3,
+            antialiased=True,
+            ranges={
+                "log_scales": (-10 - 1 / 32, 255 / 16 - 10 + 1 / 32),
+                "sh0": (-3.3464, 3.3464),
+                "shN": (-1.0625, 1.0625),
+            },
+            largest_coordinate=_largest_spz_coordinate,
+            changed=(
+                "positions in steps of 1/4096 (finer in scenes below 8 units, coarser above 2,048)",
+                "scales in steps of 6.4 %",
+                "rotations in steps of 1/723 per component",
+                "opacities in steps of 1/255",
+                "colours in steps of 0.0074",
+                "view-dependent SH coefficients in steps of 1/16 (degree 1) and 1/8",
+            ),
+        ),
+        ".splat": FormatLimits(
+            sh_degree=0,
+            antialiased=False,
+            # colours in [0, 1] and half a step; scales that are float32
+            ranges={"sh0": (-1.7794, 1.7794), "log_scales": (-87.3, 88.7)},
+            changed=(
+                "colours and opacities in steps of 1/255",
+                "rotations in steps of 1/128 per component",
+            ),
+        ),
+        ".sog": FormatLimits(
+            sh_degree=3,
+            antialiased=True,
+            changed=(
+                "rows in Morton order",
+                "positions in 65,536 steps of sign(x) log(1 + |x|) between the least and the "
+                "largest",
+                "scales, colours and SH coefficients to 256 numbers each",
+                "rotations in steps of 1/180 per component",
+                "opacities in steps of 1/255",
+                "view-dependent colours to a palette of 65,536 (all, in smaller scenes)",
+            ),
+        ),
+    }
+)
+"""Limits by the end of the file name; a ``.ply`` has none."""
+
+_VALUES = {
+    "means": "centre",
+    "log_scales": "logarithm of a scale",
+    "sh0": "constant SH band",
+    "shN": "view-dependent SH coefficient",
+}
+
+
+def losses_within(scene: GaussianScene, limits: FormatLimits) -> Losses:
+    """Report what of a scene is lost in a format."""
+    changed = list(limits.changed)
     others = [line for line in scene.comments if ANTIALIASED_TAG.lower() not in line.lower()]
-    if others and not holds.comments:
+    if others and not limits.comments:
         changed.append(f"without {_counted(len(others), 'comment')}")
     return Losses(
-        dropped=tuple(_dropped(scene, holds)),
+        dropped=tuple(_dropped(scene, limits)),
         changed=tuple(changed),
         count=int(writable_rows(scene).sum()),
-        sh_degree=min(scene.sh_degree, holds.sh_degree),
+        sh_degree=min(scene.sh_degree, limits.sh_degree),
     )
 
 
-def _dropped(scene: GaussianScene, holds: Holds) -> Iterator[str]:
+def writable_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
+    """Find the rows that compact formats can hold."""
+    rows = ~scene.logit_opacities.isnan() & (scene.quats != 0).any(dim=1)
+    for name, tensor in scene.tensors().items():
+        if name != "logit_opacities" and tensor.numel():
+            rows &= tensor.float().isfinite().reshape(len(scene), -1).all(dim=1)
+    return rows
+
+
+def _dropped(scene: GaussianScene, limits: FormatLimits) -> Iterator[str]:
     if scene.extras:
         names = ", ".join(map(repr, scene.extras))
         yield f"extra {'columns' if len(scene.extras) > 1 else 'column'} {names}"
-    if scene.sh_degree > holds.sh_degree:
-        yield f"SH bands above degree {holds.sh_degree} (the scene has degree {scene.sh_degree})"
-    if scene.antialiased and not holds.tag:
+    if scene.sh_degree > limits.sh_degree:
+        yield f"SH bands above degree {limits.sh_degree} (the scene has degree {scene.sh_degree})"
+    if scene.antialiased and not limits.antialiased:
         yield f"the tag '{ANTIALIASED_TAG}', without which viewers show the scene too sharp"
     if scene.dtype == torch.float64:
         yield "double precision"
     rows = writable_rows(scene)
     if not bool(rows.all()):
         yield f"{_counted(int((~rows).sum()), 'Gaussian')} that are not finite or have no rotation"
-    limits = dict(holds.limits)
-    if holds.reach is not None:
-        reach = holds.reach(scene)
-        limits["means"] = (-reach, reach)
-    for name, (low, high) in limits.items():
-        held = (0, 3, 8, 15)[holds.sh_degree] if name == "shN" else None
-        beyond = _beyond(getattr(scene, name)[:, :held][rows], low, high)
-        if beyond:
+    ranges = dict(limits.ranges)
+    if limits.largest_coordinate is not None:
+        largest = limits.largest_coordinate(scene)
+        ranges["means"] = (-largest, largest)
+    for name, (low, high) in ranges.items():
+        held = REST_COUNTS[limits.sh_degree] if name == "shN" else None
+        values = getattr(scene, name)[:, :held][rows]
+        beyond = (values < low) | (values > high)
+        count = int(beyond.reshape(len(values), -1).any(dim=1).sum()) if values.numel() else 0
+        if count:
             yield (
-                f"what lies beyond [{low:.5g}, {high:.5g}] in a {_NAMES[name]} of "
-                f"{_counted(beyond, 'Gaussian')}"
+                f"what lies beyond [{low:.5g}, {high:.5g}] in a {_VALUES[name]} of "
+                f"{_counted(count, 'Gaussian')}"
             )
-
-
-def _beyond(values: Tensor, low: float, high: float) -> int:
-    wrong = (values < low) | (values > high)
-    return int(wrong.reshape(len(values), -1).any(dim=1).sum()) if values.numel() else 0
 
 
 def _counted(count: int, what: str) -> str:

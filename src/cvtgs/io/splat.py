@@ -19,7 +19,6 @@ from cvtgs.io.arrays import (
     unit_quats,
 )
 from cvtgs.io.files import open_input
-from cvtgs.io.limits import Holds
 from cvtgs.scene import GaussianScene
 
 _ROW = np.dtype(
@@ -33,18 +32,6 @@ _ROW = np.dtype(
 )
 _CHUNK_ROWS = 1 << 16
 _LEAST_SCALE = np.finfo(np.float32).tiny
-
-SPLAT_HOLDS = Holds(
-    sh_degree=0,
-    tag=False,
-    # colours in [0, 1] and half a step; scales that are float32
-    limits={"sh0": (-1.7794, 1.7794), "log_scales": (-87.3, 88.7)},
-    changed=(
-        "colours and opacities in steps of 1/255",
-        "rotations in steps of 1/128 per component",
-    ),
-)
-"""What a ``.splat`` file holds."""
 
 
 def read_splat(path: Path) -> GaussianScene:

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvtgs.io.ply.assemble import assemble
+from cvtgs.io.ply import assemble
 from cvtgs.io.tensors import map_tensors
 from cvtgs.outofcore.job import Job
 from cvtgs.scene import GaussianScene

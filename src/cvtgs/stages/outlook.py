@@ -9,7 +9,6 @@ from cvtgs import cvt
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig, TessellationConfig, VisibilityConfig
 from cvtgs.effects import EffectPlan, imaged, plan_effects
-from cvtgs.io.ply.properties import lacks_third_scale
 from cvtgs.math import parameters
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.rendering import contributions
@@ -81,7 +80,7 @@ def look_at_scene(scene: GaussianScene, config: SimplifyConfig, *, with_light: b
         masses,
         seen * scene.opacities,
         frame=frame,
-        two_scales=lacks_third_scale(scene.layout),
+        two_scales=scene.has_two_scales,
         config=config,
     )
     return Outlook(frame, areas, seen, light, plan)

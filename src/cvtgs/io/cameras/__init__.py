@@ -1,6 +1,5 @@
 """Cameras from the files of NeRF, nerfstudio, COLMAP and INRIA's code."""
 
-from cvtgs.io.cameras.holdout import Split
 from cvtgs.io.cameras.load import load_cameras
 
-__all__ = ["Split", "load_cameras"]
+__all__ = ["load_cameras"]

@@ -1,17 +1,70 @@
-"""A sparse COLMAP model: a file of cameras and a file of images."""
+"""A sparse COLMAP model: a file of cameras and a file of images, binary or text."""
 
-from collections.abc import Mapping, Sequence
+import math
+import os
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
 
 from cvtgs.errors import FileFormatError
-from cvtgs.io.cameras import colmap_binary, colmap_text
-from cvtgs.io.cameras.colmap_image import ColmapImage
-from cvtgs.io.cameras.views import Lens, View
-from cvtgs.io.files import is_file
+from cvtgs.io.cameras.views import Lens, View, checked_lens
+from cvtgs.io.files import is_file, open_input
 from cvtgs.math import parameters
+
+_COUNT = struct.Struct("<Q")
+_CAMERA = struct.Struct("<iiQQ")
+_IMAGE = struct.Struct("<i7di")
+_POINT_BYTES = 24
+_MAX_NAME = 4096
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Image:
+    """The pose of a registered image, from world to camera."""
+
+    name: str
+    camera: int
+    quat: tuple[float, ...]
+    """Rotation, w first; not zero, not necessarily of unit length."""
+    translation: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Model:
+    """A camera model that a pinhole camera can stand for."""
+
+    number: int
+    """Its name in binary files."""
+    parameters: int
+    """How many it has: focal lengths, principal point, distortion."""
+    focals: int
+    """How many of them are focal lengths, 1 or 2."""
+
+
+_MODELS: Mapping[str, _Model] = MappingProxyType(
+    {
+        "SIMPLE_PINHOLE": _Model(number=0, parameters=3, focals=1),
+        "PINHOLE": _Model(number=1, parameters=4, focals=2),
+        "SIMPLE_RADIAL": _Model(number=2, parameters=4, focals=1),
+        "RADIAL": _Model(number=3, parameters=5, focals=1),
+        "OPENCV": _Model(number=4, parameters=8, focals=2),
+        "FULL_OPENCV": _Model(number=6, parameters=12, focals=2),
+    }
+)
+
+_OTHERS = {
+    5: "OPENCV_FISHEYE",
+    7: "FOV",
+    8: "SIMPLE_RADIAL_FISHEYE",
+    9: "RADIAL_FISHEYE",
+    10: "THIN_PRISM_FISHEYE",
+}
 
 
 def is_colmap(folder: Path) -> bool:
@@ -22,17 +75,17 @@ def is_colmap(folder: Path) -> bool:
 def colmap_views(folder: Path) -> list[View]:
     """Read a sparse model; binary files go before text files."""
     if is_file(folder / "images.bin"):
-        lenses = colmap_binary.read_cameras(folder / "cameras.bin")
-        images = colmap_binary.read_images(folder / "images.bin")
+        lenses = _cameras_of_bin(folder / "cameras.bin")
+        images = _images_of_bin(folder / "images.bin")
         path = folder / "images.bin"
     else:
-        lenses = colmap_text.read_cameras(folder / "cameras.txt")
-        images = colmap_text.read_images(folder / "images.txt")
+        lenses = _cameras_of_txt(folder / "cameras.txt")
+        images = _images_of_txt(folder / "images.txt")
         path = folder / "images.txt"
     return _views(sorted(images, key=lambda image: image.name), lenses, path)
 
 
-def _views(images: Sequence[ColmapImage], lenses: Mapping[int, Lens], path: Path) -> list[View]:
+def _views(images: Sequence[_Image], lenses: Mapping[int, Lens], path: Path) -> list[View]:
     for image in images:
         if image.camera not in lenses:
             raise FileFormatError(
@@ -42,8 +95,193 @@ def _views(images: Sequence[ColmapImage], lenses: Mapping[int, Lens], path: Path
     quats = torch.tensor([image.quat for image in images], dtype=torch.float64).reshape(-1, 4)
     viewmats = np.tile(np.eye(4), (len(images), 1, 1))
     viewmats[:, :3, :3] = parameters.quats_to_matrices(parameters.normalize_quats(quats)).numpy()
-    viewmats[:, :3, 3] = np.array([image.shift for image in images]).reshape(-1, 3)
+    viewmats[:, :3, 3] = np.array([image.translation for image in images]).reshape(-1, 3)
     return [
         View(name=image.name, viewmat=viewmat, lens=lenses[image.camera])
         for image, viewmat in zip(images, viewmats, strict=True)
     ]
+
+
+def _checked_image(name: str, camera: int, *, pose: Sequence[float], where: str) -> _Image:
+    """Make an image; poses that are none are errors."""
+    if not all(map(math.isfinite, pose)) or not any(pose[:4]):
+        raise FileFormatError(
+            f"{where}: the pose must be finite with a quaternion other than 0, "
+            f"found {', '.join(f'{value:g}' for value in pose)}."
+        )
+    if not name:
+        raise FileFormatError(f"{where}: the image must have a name, found none.")
+    return _Image(name=name, camera=camera, quat=tuple(pose[:4]), translation=tuple(pose[4:]))
+
+
+def _model_name(number: int) -> str:
+    """Return the name of the model that a binary file calls by number."""
+    names = {model.number: name for name, model in _MODELS.items()} | _OTHERS
+    return names.get(number, f"number {number}")
+
+
+def _find_model(name: str, where: str) -> _Model:
+    """Look a model up."""
+    if name not in _MODELS:
+        raise FileFormatError(
+            f"{where}: the camera model must be one of {', '.join(_MODELS)}, found {name}; "
+            f"undistort the images first (colmap image_undistorter)."
+        )
+    return _MODELS[name]
+
+
+def _lens_of(
+    model: _Model, parameters: Sequence[float], *, width: int, height: int, where: str
+) -> Lens:
+    """Take the pinhole part of a camera."""
+    focals, rest = parameters[: model.focals], parameters[model.focals :]
+    cx, cy, *distortion = rest
+    for value in distortion:
+        if not math.isfinite(value):
+            raise FileFormatError(f"{where}: the distortion must be finite, found {value}.")
+    lens = Lens(
+        fx=focals[0],
+        fy=focals[-1],
+        cx=cx,
+        cy=cy,
+        width=width,
+        height=height,
+        distorted=any(value != 0 for value in distortion),
+    )
+    return checked_lens(lens, where)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Bytes:
+    """A binary file that never reads more than there is."""
+
+    file: BinaryIO
+    size: int
+    path: Path
+
+    def left(self) -> int:
+        return self.size - self.file.tell()
+
+    def take(self, layout: struct.Struct, what: str) -> tuple[Any, ...]:
+        self.check(layout.size, what)
+        return layout.unpack(self.file.read(layout.size))
+
+    def count(self, what: str, *, least: int) -> int:
+        """Read a count of rows, and refuse it where the file is too short for them."""
+        (count,) = self.take(_COUNT, f"the count of {what}")
+        self.check(count * least, f"{count:,} {what}")
+        return int(count)
+
+    def skip(self, size: int) -> None:
+        self.file.seek(size, os.SEEK_CUR)
+
+    def name(self, what: str) -> str:
+        """Read a text that ends in a zero byte."""
+        start = self.file.tell()
+        text, zero, _ = self.file.read(_MAX_NAME + 1).partition(b"\0")
+        if not zero:
+            raise FileFormatError(
+                f"{self.path}: the name of {what} must end within {_MAX_NAME:,} bytes, "
+                f"found no end."
+            )
+        self.file.seek(start + len(text) + 1)
+        return os.fsdecode(text)
+
+    def check(self, size: int, what: str) -> None:
+        if size > self.left():
+            raise FileFormatError(
+                f"{self.path}: the file is cut short: {what} must have {size:,} bytes, "
+                f"found {self.left():,}."
+            )
+
+
+def _cameras_of_bin(path: Path) -> dict[int, Lens]:
+    """Read ``cameras.bin``."""
+    lenses: dict[int, Lens] = {}
+    with open_input(path) as file:
+        data = _Bytes(file=file, size=os.fstat(file.fileno()).st_size, path=path)
+        for row in range(data.count("cameras", least=_CAMERA.size)):
+            camera, number, width, height = data.take(_CAMERA, f"camera {row}")
+            where = f"{path}: camera {row}"
+            model = _find_model(_model_name(number), where)
+            layout = struct.Struct(f"<{model.parameters}d")
+            parameters = data.take(layout, f"camera {row}")
+            lenses[camera] = _lens_of(model, parameters, width=width, height=height, where=where)
+    return lenses
+
+
+def _images_of_bin(path: Path) -> list[_Image]:
+    """Read ``images.bin``; the points in the images are skipped."""
+    images: list[_Image] = []
+    with open_input(path) as file:
+        data = _Bytes(file=file, size=os.fstat(file.fileno()).st_size, path=path)
+        for row in range(data.count("images", least=_IMAGE.size + 1 + _COUNT.size)):
+            _, *pose, camera = data.take(_IMAGE, f"image {row}")
+            name = data.name(f"image {row}")
+            images.append(_checked_image(name, camera, pose=pose, where=f"{path}: image {row}"))
+            data.skip(_POINT_BYTES * data.count(f"points of image {row}", least=_POINT_BYTES))
+    return images
+
+
+def _cameras_of_txt(path: Path) -> dict[int, Lens]:
+    """Read ``cameras.txt``: number, model, width, height and parameters in a line."""
+    lenses: dict[int, Lens] = {}
+    with open_input(path) as file:
+        for number, line in _lines(file):
+            where = f"{path}: line {number}"
+            if not line or line.startswith("#"):
+                continue
+            words = line.split()
+            if len(words) < 4:
+                raise _wrong(where, "a camera: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line)
+            model = _find_model(words[1], where)
+            if len(words) != 4 + model.parameters:
+                raise _wrong(where, f"{model.parameters} parameters of {words[1]}", line)
+            try:
+                camera, width, height = int(words[0]), int(words[2]), int(words[3])
+                parameters = [float(word) for word in words[4:]]
+            except ValueError as error:
+                raise _wrong(where, "a camera in numbers", line) from error
+            lenses[camera] = _lens_of(model, parameters, width=width, height=height, where=where)
+    return lenses
+
+
+def _images_of_txt(path: Path) -> list[_Image]:
+    """Read ``images.txt``: a line with number, pose, camera and name, and a line of points."""
+    images: list[_Image] = []
+    with open_input(path) as file:
+        lines = _lines(file)
+        for number, line in lines:
+            if not line or line.startswith("#"):
+                continue
+            images.append(_image_of_line(line, f"{path}: line {number}"))
+            number_of_points, points = next(lines, (number + 1, ""))
+            if len(points.split()) % 3:
+                raise _wrong(
+                    f"{path}: line {number_of_points}",
+                    f"the points of image {images[-1].name!r} as X Y POINT3D_ID, or empty",
+                    points,
+                )
+    return images
+
+
+def _image_of_line(line: str, where: str) -> _Image:
+    words = line.split(maxsplit=9)  # names may have blanks
+    if len(words) != 10:
+        raise _wrong(where, "an image: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line)
+    try:
+        pose = [float(word) for word in words[1:8]]
+        camera = int(words[8])
+    except ValueError as error:
+        raise _wrong(where, "an image in numbers", line) from error
+    return _checked_image(words[9], camera, pose=pose, where=where)
+
+
+def _lines(file: BinaryIO) -> Iterator[tuple[int, str]]:
+    for number, line in enumerate(file, start=1):
+        yield number, os.fsdecode(line).strip()
+
+
+def _wrong(where: str, required: str, line: str) -> FileFormatError:
+    found = line if len(line) <= 60 else f"{line[:57]}..."
+    return FileFormatError(f"{where}: must be {required}, found {found!r}.")

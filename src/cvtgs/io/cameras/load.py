@@ -5,12 +5,8 @@ from pathlib import Path
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import FileFormatError, InputNotFoundError, InvalidArgumentError
-from cvtgs.io.cameras.colmap import colmap_views, is_colmap
-from cvtgs.io.cameras.holdout import SPLITS, Split, hold_out
-from cvtgs.io.cameras.inria import inria_views
-from cvtgs.io.cameras.transforms import transforms_views
-from cvtgs.io.cameras.views import View, to_cameras
-from cvtgs.io.files import is_file, read_json
+from cvtgs.io.cameras.views import SPLITS, Split, View, hold_out, to_cameras
+from cvtgs.io.files import is_file
 
 _COLMAP_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 _LOOKED_FOR = (
@@ -85,6 +81,8 @@ def _folder_views(folder: Path, split: Split | None) -> list[View]:
     if there:
         chosen = there if split is None else [parts[split]]
         return [view for part in chosen for view in _file_views(part, split)]
+    from cvtgs.io.cameras.colmap import colmap_views, is_colmap  # noqa: PLC0415 (when it is read)
+
     for model in (folder / "sparse" / "0", folder / "sparse", folder):
         if is_colmap(model):
             return hold_out(colmap_views(model), split)
@@ -95,12 +93,17 @@ def _folder_views(folder: Path, split: Split | None) -> list[View]:
 
 def _file_views(path: Path, split: Split | None) -> list[View]:
     if path.name in _COLMAP_FILES:
+        from cvtgs.io.cameras.colmap import colmap_views  # noqa: PLC0415 (when it is read)
+
         return hold_out(colmap_views(path.parent), split)
     if path.suffix.lower() != ".json" and is_file(path):
         raise FileFormatError(
             f"{path}: a file of cameras must be JSON (.json) or of a COLMAP model "
             f"({', '.join(_COLMAP_FILES)}), found neither."
         )
+    from cvtgs.io.cameras.transforms import inria_views, transforms_views  # noqa: PLC0415
+    from cvtgs.io.documents import read_json  # noqa: PLC0415
+
     content = read_json(path)
     if isinstance(content, list):
         return hold_out(inria_views(content, path), split)

@@ -1,20 +1,28 @@
-"""The ``transforms.json`` of NeRF, instant-ngp and nerfstudio."""
+"""Cameras in JSON files: ``transforms.json`` of NeRF and nerfstudio, ``cameras.json`` of INRIA."""
 
 import math
-from collections.abc import Mapping
+import struct
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
+from pydantic import Field
 
 from cvtgs.errors import FileFormatError, InvalidArgumentError
-from cvtgs.io.cameras.holdout import SPLITS, Split, hold_out
-from cvtgs.io.cameras.png_size import png_size
-from cvtgs.io.cameras.views import Lens, View, checked_lens, viewmat_of_pose
-from cvtgs.io.fields import Fields
-from cvtgs.io.files import is_file
+from cvtgs.io.cameras.views import (
+    SPLITS,
+    Lens,
+    Split,
+    View,
+    checked_lens,
+    hold_out,
+    viewmat_of_pose,
+)
+from cvtgs.io.documents import Document, Items, Number, Text, Vector, Whole, shown, validated
+from cvtgs.io.files import is_file, open_input
 
-_PINHOLE_MODELS = (
+_PinholeModel = Literal[
     "PINHOLE",
     "SIMPLE_PINHOLE",
     "SIMPLE_RADIAL",
@@ -22,17 +30,99 @@ _PINHOLE_MODELS = (
     "OPENCV",
     "FULL_OPENCV",
     "PERSPECTIVE",
-)
+]
 _DISTORTIONS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _OPENGL = np.diag([1.0, -1.0, -1.0])
+_PNG_START = struct.Struct(">8sI4sII")
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+_Row = tuple[Number, Number, Number, Number]
+_Given = TypeVar("_Given")
 
 
-def transforms_views(document: Mapping[str, Any], path: Path, split: Split | None) -> list[View]:
+class _Intrinsics(Document):
+    """What a frame gives, or the file for all its frames."""
+
+    w: Whole | None = None
+    h: Whole | None = None
+    fl_x: Number | None = None
+    fl_y: Number | None = None
+    camera_angle_x: Number | None = None
+    camera_angle_y: Number | None = None
+    cx: Number | None = None
+    cy: Number | None = None
+    camera_model: _PinholeModel | None = Field(
+        None, description=f"one of {', '.join(get_args(_PinholeModel))}"
+    )
+    k1: Number | None = None
+    k2: Number | None = None
+    k3: Number | None = None
+    k4: Number | None = None
+    k5: Number | None = None
+    k6: Number | None = None
+    p1: Number | None = None
+    p2: Number | None = None
+
+
+class _Frame(_Intrinsics):
+    file_path: Text
+    transform_matrix: tuple[_Row, _Row, _Row, _Row] | tuple[_Row, _Row, _Row] = Field(
+        description="4 x 4 or 3 x 4 finite numbers"
+    )
+
+
+class _Transforms(_Intrinsics):
+    frames: Items
+    train_filenames: Items | None = None
+    val_filenames: Items | None = None
+    test_filenames: Items | None = None
+
+
+class _InriaCamera(Document):
+    img_name: Text
+    width: Whole
+    height: Whole
+    fx: Number
+    fy: Number
+    position: Vector
+    rotation: tuple[Vector, Vector, Vector] = Field(description="3 x 3 finite numbers")
+
+
+_Levels = Sequence[tuple[_Intrinsics, str]]
+"""What is given for a frame, then for the whole file, and how errors call the place."""
+
+
+def inria_views(entries: Sequence[Any], path: Path) -> list[View]:
+    """Read the cameras of a ``cameras.json``."""
+    views = []
+    for row, entry in enumerate(entries):
+        where = f"{path}: camera {row}"
+        camera = validated(_InriaCamera, entry, where)
+        rotation, position = np.array(camera.rotation), np.array(camera.position)
+        lens = Lens(
+            fx=camera.fx,
+            fy=camera.fy,
+            cx=camera.width / 2,
+            cy=camera.height / 2,
+            width=camera.width,
+            height=camera.height,
+        )
+        views.append(
+            View(
+                name=camera.img_name,
+                viewmat=viewmat_of_pose(rotation, position, where=where),
+                lens=checked_lens(lens, where),
+            )
+        )
+    return views
+
+
+def transforms_views(content: Any, path: Path, split: Split | None) -> list[View]:
     """Read the frames of a ``transforms.json``."""
-    everything = Fields.of(document, str(path))
+    document = validated(_Transforms, content, str(path))
     views = [
-        _view(Fields.of(frame, f"{path}: frame {row}"), everything, path.parent)
-        for row, frame in enumerate(everything.items("frames"))
+        _view(frame, document, path=path, where=f"{path}: frame {row}")
+        for row, frame in enumerate(document.frames)
     ]
     if split is None:
         return views
@@ -44,98 +134,111 @@ def transforms_views(document: Mapping[str, Any], path: Path, split: Split | Non
                 f"pass the folder to have both."
             )
         return views
-    if any(f"{name}_filenames" in everything for name in (*SPLITS, "val")):
-        return _listed(views, everything, f"{split}_filenames")
+    lists = {
+        "train": document.train_filenames,
+        "val": document.val_filenames,
+        "test": document.test_filenames,
+    }
+    if any(names is not None for names in lists.values()):
+        return _listed(views, lists[split], f"{split}_filenames", path)
     return hold_out(views, split)
 
 
-def _view(frame: Fields, everything: Fields, folder: Path) -> View:
-    pose = frame.array("transform_matrix", (4, 4), (3, 4))
+def _view(content: Any, document: _Transforms, *, path: Path, where: str) -> View:
+    frame = validated(_Frame, content, where)
+    pose = np.array(frame.transform_matrix)
     if len(pose) == 4 and not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
-        raise frame.wrong("transform_matrix", "a pose in rows, with 0 0 0 1 as the last")
-    name = frame.text("file_path")
-    width, height = _size(frame, everything, folder / name)
-    lens = _lens(frame, everything, width=width, height=height)
+        raise FileFormatError(
+            f"{where}: 'transform_matrix' must be a pose in rows, with 0 0 0 1 as the last, "
+            f"found {shown(content['transform_matrix'])}."
+        )
+    lens = _lens(frame, document, path=path, where=where)
     return View(
-        name=name,
-        viewmat=viewmat_of_pose(pose[:3, :3] @ _OPENGL, pose[:3, 3], where=frame.where),
-        lens=checked_lens(lens, frame.where),
+        name=frame.file_path,
+        viewmat=viewmat_of_pose(pose[:3, :3] @ _OPENGL, pose[:3, 3], where=where),
+        lens=checked_lens(lens, where),
     )
 
 
-def _lens(frame: Fields, everything: Fields, *, width: int, height: int) -> Lens:
+def _lens(frame: _Frame, document: _Transforms, *, path: Path, where: str) -> Lens:
     """Take each number from the frame, else from the whole file, else from the image size."""
-    fx = _focal(frame, everything, axis="x", pixels=width)
-    fy = _focal(frame, everything, axis="y", pixels=height)
-    if fx is None and fy is None:
+    width, height = _size(frame, document, path=path, where=where)
+    levels: _Levels = ((frame, where), (document, str(path)))
+    fx, fy = _focal(levels, "x", pixels=width), _focal(levels, "y", pixels=height)
+    fx, fy = _either(fx, fy), _either(fy, fx)
+    if fx is None or fy is None:
         raise FileFormatError(
-            f"{frame.where}: 'fl_x', 'fl_y', 'camera_angle_x' or 'camera_angle_y' must be given "
+            f"{where}: 'fl_x', 'fl_y', 'camera_angle_x' or 'camera_angle_y' must be given "
             f"here or for the whole file, found none."
         )
-    cx, cy = _place(frame, everything, "cx"), _place(frame, everything, "cy")
+    distortions = (_either(getattr(frame, key), getattr(document, key)) for key in _DISTORTIONS)
     return Lens(
-        fx=_first(fx, fy),
-        fy=_first(fy, fx),
-        cx=width / 2 if cx is None else cx.number("cx"),
-        cy=height / 2 if cy is None else cy.number("cy"),
+        fx=fx,
+        fy=fy,
+        cx=_either(frame.cx, _either(document.cx, width / 2)),
+        cy=_either(frame.cy, _either(document.cy, height / 2)),
         width=width,
         height=height,
-        distorted=_distorted(frame, everything),
+        distorted=any(distortions),
     )
 
 
-def _first(*values: float | None) -> float:
-    return next(value for value in values if value is not None)
+def _either(value: _Given | None, other: _Given) -> _Given:
+    return other if value is None else value
 
 
-def _place(frame: Fields, everything: Fields, key: str) -> Fields | None:
-    """Report who gives a key: the frame, the whole file or nobody."""
-    return next((fields for fields in (frame, everything) if key in fields), None)
-
-
-def _focal(frame: Fields, everything: Fields, *, axis: str, pixels: int) -> float | None:
-    for fields in (frame, everything):
-        if f"fl_{axis}" in fields:
-            return fields.number(f"fl_{axis}")
-        key = f"camera_angle_{axis}"
-        if key in fields:
-            angle = fields.number(key)
-            if not 0 < angle < math.pi:
-                raise fields.wrong(key, "an angle between 0 and pi")
-            return 0.5 * pixels / math.tan(0.5 * angle)
+def _focal(levels: _Levels, axis: str, *, pixels: int) -> float | None:
+    for given, where in levels:
+        focal, angle = getattr(given, f"fl_{axis}"), getattr(given, f"camera_angle_{axis}")
+        if focal is not None:
+            return float(focal)
+        if angle is not None and not 0 < angle < math.pi:
+            raise FileFormatError(
+                f"{where}: 'camera_angle_{axis}' must be an angle between 0 and pi, found {angle}."
+            )
+        if angle is not None:
+            return 0.5 * pixels / math.tan(0.5 * float(angle))
     return None
 
 
-def _distorted(frame: Fields, everything: Fields) -> bool:
-    model = _place(frame, everything, "camera_model")
-    if model is not None and model.text("camera_model") not in _PINHOLE_MODELS:
-        raise model.wrong("camera_model", f"one of {', '.join(_PINHOLE_MODELS)}")
-    places = ((_place(frame, everything, key), key) for key in _DISTORTIONS)
-    return any(fields is not None and fields.number(key) != 0 for fields, key in places)
-
-
-def _size(frame: Fields, everything: Fields, image: Path) -> tuple[int, int]:
-    width, height = _place(frame, everything, "w"), _place(frame, everything, "h")
+def _size(frame: _Frame, document: _Transforms, *, path: Path, where: str) -> tuple[int, int]:
+    width, height = _either(frame.w, document.w), _either(frame.h, document.h)
     if width is not None and height is not None:
-        return width.whole("w"), height.whole("h")
+        return width, height
+    image = path.parent / frame.file_path
     for candidate in (image, image.with_name(f"{image.name}.png")):
         if is_file(candidate):
-            return png_size(candidate)
+            return _png_size(candidate)
     raise FileFormatError(
-        f"{frame.where}: 'w' and 'h' must be given here or for the whole file, or the image must "
+        f"{where}: 'w' and 'h' must be given here or for the whole file, or the image must "
         f"be there; found neither them nor {image}."
     )
 
 
-def _listed(views: list[View], everything: Fields, key: str) -> list[View]:
+def _png_size(path: Path) -> tuple[int, int]:
+    """Read the size of a PNG image from its first bytes."""
+    with open_input(path) as file:
+        start = file.read(_PNG_START.size)
+    if len(start) == _PNG_START.size:
+        signature, _, chunk, width, height = _PNG_START.unpack(start)
+        if signature == _PNG_SIGNATURE and chunk == b"IHDR":
+            return width, height
+    raise FileFormatError(
+        f"{path}: must be a PNG file, since its size is not among the cameras; found another "
+        f"format. Give 'w' and 'h' in the file of the cameras."
+    )
+
+
+def _listed(views: Sequence[View], names: Sequence[Any] | None, key: str, path: Path) -> list[View]:
     """Take the frames that the file itself lists, in the order of the frames."""
+    if names is None:
+        raise FileFormatError(f"{path}: {key!r} must be a list, found none.")
     known = {PurePosixPath(view.name) for view in views}
     wanted = set()
-    for row, name in enumerate(everything.items(key)):
+    for row, name in enumerate(names):
         if not isinstance(name, str) or PurePosixPath(name) not in known:
             raise FileFormatError(
-                f"{everything.where}: row {row} of {key!r} must be the 'file_path' of a frame, "
-                f"found {name!r}."
+                f"{path}: row {row} of {key!r} must be the 'file_path' of a frame, found {name!r}."
             )
         wanted.add(PurePosixPath(name))
     return [view for view in views if PurePosixPath(view.name) in wanted]

@@ -4,11 +4,11 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import DroppedDataWarning, FileFormatError
@@ -17,23 +17,15 @@ MAX_PIXELS = 1 << 20
 """Images may not be wider or higher; a size beyond it is a damaged number."""
 
 _SKEW = 0.01
+_TEST_EVERY = 8
 
-Matrix = NDArray[np.float64]
+Split = Literal["train", "test"]
+SPLITS: tuple[Split, ...] = get_args(Split)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lens:
-    """Intrinsics of a camera, in pixels; pixel centres are at half-integers.
-
-    Attributes:
-        fx: Focal length along the rows.
-        fy: Focal length along the columns.
-        cx: Principal point, from the left edge.
-        cy: Principal point, from the upper edge.
-        width: Pixels per row.
-        height: Rows.
-        distorted: Whether the file gives a distortion, which is left out.
-    """
+    """Intrinsics of a camera, in pixels; pixel centres are at half-integers."""
 
     fx: float
     fy: float
@@ -42,25 +34,21 @@ class Lens:
     width: int
     height: int
     distorted: bool = False
+    """Whether the file gives a distortion, which is left out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """One photograph's camera.
-
-    Attributes:
-        name: Name or path of the photograph, as the file has it.
-        viewmat: ``(4, 4)`` from world to camera, OpenCV axes.
-        lens: Its intrinsics.
-    """
+    """One photograph's camera; it has the name or path that the file has."""
 
     name: str
-    viewmat: Matrix
+    viewmat: Float[np.ndarray, "4 4"]
+    """From world to camera, OpenCV axes."""
     lens: Lens
 
 
 def checked_lens(lens: Lens, where: str) -> Lens:
-    """Refuse intrinsics that no camera has."""
+    """Return the lens; intrinsics that no camera has are errors."""
     if not (1 <= lens.width <= MAX_PIXELS and 1 <= lens.height <= MAX_PIXELS):
         raise FileFormatError(
             f"{where}: the image size must be from 1 to {MAX_PIXELS:,} pixels, "
@@ -78,7 +66,7 @@ def checked_lens(lens: Lens, where: str) -> Lens:
 def viewmat_of_pose(
     rotation: Float[np.ndarray, "3 3"], center: Float[np.ndarray, "3"], *, where: str
 ) -> Float[np.ndarray, "4 4"]:
-    """Invert a camera's pose."""
+    """Return the world-to-camera matrix of a camera's pose."""
     skew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     determinant = float(np.linalg.det(rotation))
     if skew > _SKEW or determinant < 0:
@@ -92,6 +80,15 @@ def viewmat_of_pose(
     viewmat[:3, :3] = inverse
     viewmat[:3, 3] = -inverse @ center
     return viewmat
+
+
+def hold_out(views: Sequence[View], split: Split | None) -> list[View]:
+    """Take every 8th view in the order of names for testing, as Mip-NeRF 360 and 3DGS do."""
+    if split is None:
+        return list(views)
+    by_name = sorted(range(len(views)), key=lambda row: views[row].name)
+    test = set(by_name[::_TEST_EVERY])
+    return [view for row, view in enumerate(views) if (row in test) == (split == "test")]
 
 
 def to_cameras(views: Sequence[View], path: str) -> Cameras:
@@ -110,7 +107,7 @@ def to_cameras(views: Sequence[View], path: str) -> Cameras:
     )
 
 
-def _intrinsics(lens: Lens, *, width: int, height: int) -> Matrix:
+def _intrinsics(lens: Lens, *, width: int, height: int) -> Float[np.ndarray, "3 3"]:
     x, y = width / lens.width, height / lens.height
     return np.array([[lens.fx * x, 0, lens.cx * x], [0, lens.fy * y, lens.cy * y], [0, 0, 1]])
 

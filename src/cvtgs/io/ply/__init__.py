@@ -1,8 +1,7 @@
 """PLY files of 3DGS scenes, as INRIA's code and its successors write them."""
 
-from cvtgs.io.ply.read import read_ply
+from cvtgs.io.ply.read import assemble, read_ply
 from cvtgs.io.ply.rows import PlyRows, join_plys, open_rows
 from cvtgs.io.ply.write import write_ply
-from cvtgs.scene import FLAT_LOG_SCALE
 
-__all__ = ["FLAT_LOG_SCALE", "PlyRows", "join_plys", "open_rows", "read_ply", "write_ply"]
+__all__ = ["PlyRows", "assemble", "join_plys", "open_rows", "read_ply", "write_ply"]

@@ -1,16 +1,22 @@
-"""The header of a PLY file, parsed to a small typed object."""
+"""The header of a PLY file: read to a small typed value, and written."""
 
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
-from typing import BinaryIO, Literal, NoReturn, get_args
+from typing import Any, BinaryIO, Literal, NoReturn, get_args
 
 import numpy as np
+import torch
 
-from cvtgs.errors import FileFormatError
-from cvtgs.io.ply.properties import FLOAT_TYPES, SCALARS, TYPE_NAMES
+from cvtgs.errors import CvtgsError, FileFormatError, InvalidSceneError
+from cvtgs.io.files import open_input
 
 Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
+
+Layout = tuple[tuple[str, str], ...]
+"""Property names and PLY types of an element, in order."""
 
 MAX_HEADER_BYTES = 1 << 20
 """Longer headers are refused; a 3DGS header has about two thousand bytes."""
@@ -27,18 +33,56 @@ _MAX_NAME_LETTERS = 200
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Property:
-    """One property line.
+class ScalarType:
+    """A PLY number type."""
 
-    Attributes:
-        name: Its name.
-        type: Canonical name of the number type (of the items, for a list).
-        count_type: Number type of the length of a list; None for a plain number.
-    """
+    code: str
+    """The numpy type, without byte order."""
+    dtype: torch.dtype
+    """The torch dtype that holds every value and that every torch operation knows."""
+
+
+SCALARS: Mapping[str, ScalarType] = MappingProxyType(
+    {
+        "char": ScalarType(code="i1", dtype=torch.int8),
+        "uchar": ScalarType(code="u1", dtype=torch.uint8),
+        "short": ScalarType(code="i2", dtype=torch.int16),
+        "ushort": ScalarType(code="u2", dtype=torch.int32),
+        "int": ScalarType(code="i4", dtype=torch.int32),
+        "uint": ScalarType(code="u4", dtype=torch.int64),
+        "float": ScalarType(code="f4", dtype=torch.float32),
+        "double": ScalarType(code="f8", dtype=torch.float64),
+    }
+)
+"""PLY number types by their canonical names."""
+
+TYPE_NAMES: Mapping[str, str] = MappingProxyType(
+    {
+        **{name: name for name in SCALARS},
+        "int8": "char",
+        "uint8": "uchar",
+        "int16": "short",
+        "uint16": "ushort",
+        "int32": "int",
+        "uint32": "uint",
+        "float32": "float",
+        "float64": "double",
+    }
+)
+"""Every name of a PLY number type, and the canonical one."""
+
+FLOAT_TYPES = ("float", "double")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Property:
+    """One property line."""
 
     name: str
     type: str
+    """Canonical name of the number type (of the items, for a list)."""
     count_type: str | None = None
+    """Number type of the length of a list; None for a plain number."""
 
     @property
     def least_bytes(self) -> int:
@@ -48,13 +92,7 @@ class Property:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Element:
-    """One element: a table of rows.
-
-    Attributes:
-        name: Its name.
-        count: The number of rows that the header promises.
-        properties: What each row holds, in order.
-    """
+    """One element: a table of rows."""
 
     name: str
     count: int
@@ -64,6 +102,11 @@ class Element:
     def has_lists(self) -> bool:
         """Whether rows differ in length."""
         return any(prop.count_type for prop in self.properties)
+
+    @property
+    def columns(self) -> Layout:
+        """Names and types of the properties, without lists."""
+        return tuple((prop.name, prop.type) for prop in self.properties if not prop.count_type)
 
     def row_bytes(self, encoding: Encoding) -> int:
         """Return the least size of a row."""
@@ -133,7 +176,7 @@ def read_header(file: BinaryIO, path: str) -> Header:
     )
 
 
-def _start_of(block: bytes) -> str:
+def _kind_of(block: bytes) -> str:
     """Report what a file is that is no PLY file, as far as its first bytes tell."""
     for start, found in _STRANGERS.items():
         if block.startswith(start):
@@ -148,7 +191,7 @@ def _header_lines(block: bytes, path: str) -> tuple[list[str], int]:
     first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", block)
     if not first:
         raise FileFormatError(
-            f"{path}: a PLY file must start with the line 'ply', found {_start_of(block)}."
+            f"{path}: a PLY file must start with the line 'ply', found {_kind_of(block)}."
         )
     old_mac = first[1] == b"\r"
     newline, blanks = (b"\r", rb"[ \t]*") if old_mac else (b"\n", rb"[ \t]*\r?")
@@ -208,3 +251,40 @@ def _check_unique(elements: tuple[Element, ...], path: str) -> None:
                     f"found {prop.name!r} twice."
                 )
             columns.add(prop.name)
+
+
+def is_compressed_ply(path: Path) -> bool:
+    """Return by its header whether a PLY file is a compressed one, whatever its name.
+
+    Args:
+        path: A file.
+
+    Returns:
+        Whether its vertices are packed; False if it cannot be read.
+    """
+    try:
+        with open_input(path) as file:
+            elements = read_header(file, str(path)).elements
+    except CvtgsError:
+        return False
+    return any(prop.name == "packed_position" for table in elements for prop in table.properties)
+
+
+def header_bytes(comments: Iterable[str], elements: Iterable[tuple[str, int, Layout]]) -> bytes:
+    """Write the header of a binary little endian file; elements have a name, rows and columns."""
+    lines = ["ply", "format binary_little_endian 1.0"]
+    for comment in comments:
+        if "\n" in comment:
+            raise InvalidSceneError(
+                f"a comment must be one line to be written to a PLY, found {comment[:80]!r}."
+            )
+        lines.append(f"comment {comment}".rstrip())
+    for name, count, columns in elements:
+        lines.append(f"element {name} {count}")
+        lines += [f"property {kind} {column}" for column, kind in columns]
+    return "\n".join([*lines, "end_header", ""]).encode()
+
+
+def row_dtype(columns: Layout) -> np.dtype[Any]:
+    """Return the numpy type of a row of a binary little endian file."""
+    return np.dtype([(name, "<" + SCALARS[kind].code) for name, kind in columns])

@@ -1,79 +1,31 @@
-"""INRIA property names and PLY types: the one place where file names meet scene tensors."""
+"""INRIA's vertex properties: the one place where names in a PLY meet tensors of a scene."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import torch
 
+from cvtgs.errors import FileFormatError
+from cvtgs.io.ply.header import FLOAT_TYPES, Element, Header, Layout
 from cvtgs.math.spherical_harmonics import REST_COUNTS
-
-Layout = tuple[tuple[str, str], ...]
-"""Property names and PLY types of a vertex element, in order."""
 
 NORMALS = ("nx", "ny", "nz")
 """Columns that 3DGS files carry for viewers of point clouds, almost always zero."""
+
+_OPTIONAL = ("scale_2",)
+"""Standard properties that a file may lack: 2DGS has two scales."""
 
 _REST_NAME = re.compile(r"f_rest_(0|[1-9][0-9]*)")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScalarType:
-    """One PLY number type.
-
-    Attributes:
-        code: The numpy type, without byte order.
-        dtype: The torch dtype that holds every value and that every torch operation knows.
-    """
-
-    code: str
-    dtype: torch.dtype
-
-
-SCALARS: Mapping[str, ScalarType] = MappingProxyType(
-    {
-        "char": ScalarType(code="i1", dtype=torch.int8),
-        "uchar": ScalarType(code="u1", dtype=torch.uint8),
-        "short": ScalarType(code="i2", dtype=torch.int16),
-        "ushort": ScalarType(code="u2", dtype=torch.int32),
-        "int": ScalarType(code="i4", dtype=torch.int32),
-        "uint": ScalarType(code="u4", dtype=torch.int64),
-        "float": ScalarType(code="f4", dtype=torch.float32),
-        "double": ScalarType(code="f8", dtype=torch.float64),
-    }
-)
-"""PLY number types by their canonical names."""
-
-TYPE_NAMES: Mapping[str, str] = MappingProxyType(
-    {
-        **{name: name for name in SCALARS},
-        "int8": "char",
-        "uint8": "uchar",
-        "int16": "short",
-        "uint16": "ushort",
-        "int32": "int",
-        "uint32": "uint",
-        "float32": "float",
-        "float64": "double",
-    }
-)
-"""Every name of a PLY number type, and the canonical one."""
-
-FLOAT_TYPES = ("float", "double")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Slot:
-    """Where the column of a property lies in a scene.
-
-    Attributes:
-        tensor: Name of the scene's tensor.
-        index: Position in that tensor behind the row, for example ``(0,)``.
-    """
+    """Where the column of a property lies in a scene."""
 
     tensor: str
     index: tuple[int, ...]
+    """Position in that tensor behind the row, for example ``(0,)``."""
 
     @property
     def rows(self) -> tuple[slice | int, ...]:
@@ -114,13 +66,86 @@ def rest_count_of(names: Iterable[str]) -> int | None:
     return total // 3 if total in {3 * count for count in REST_COUNTS} else None
 
 
-def lacks_third_scale(layout: Layout) -> bool:
-    """Return whether Gaussians of a file have two scales: surfels of 2DGS (Huang et al. 2024)."""
-    return bool(layout) and "scale_2" not in dict(layout)
-
-
 def dtype_of(layout: Layout) -> torch.dtype:
     """Return the dtype of a scene that was read from this layout."""
     types = dict(layout)
     double = any(types.get(axis) == "double" for axis in "xyz")
     return torch.float64 if double else torch.float32
+
+
+def find_vertices(header: Header, path: str) -> Element:
+    """Find the vertex element and check that it holds Gaussians."""
+    vertex = next((element for element in header.elements if element.name == "vertex"), None)
+    if vertex is None:
+        found = ", ".join(repr(element.name) for element in header.elements[:5]) or "no element"
+        found += ", ..." if len(header.elements) > 5 else ""
+        raise FileFormatError(f"{path}: must have an element 'vertex', found {found}.")
+    _check_properties(vertex, path)
+    _check_rest(vertex, path)
+    if vertex.count == 0:
+        raise FileFormatError(f"{path}: must hold at least one Gaussian, found 'element vertex 0'.")
+    return vertex
+
+
+def check_size(header: Header, vertex: Element, *, path: str, size: int) -> None:
+    """Check that the file is long enough for the rows it promises, before room is made for them."""
+    before = header.elements[: header.elements.index(vertex)]
+    room = size - header.data_offset
+    room -= sum(element.count * element.row_bytes(header.encoding) for element in before)
+    if header.encoding == "ascii":
+        room += 1  # the last line may lack its line end
+    row_bytes = vertex.row_bytes(header.encoding)
+    if vertex.count * row_bytes > room:
+        exact = header.encoding != "ascii" and not vertex.has_lists
+        exact = exact and not any(element.has_lists for element in before)
+        rows = max(room, 0) // row_bytes
+        raise FileFormatError(
+            f"{path}: the file is cut short: its header promises {vertex.count:,} rows of "
+            f"'vertex', found {'' if exact else 'room for at most '}{rows:,}."
+        )
+
+
+def layout_of(vertex: Element) -> Layout:
+    """Return the layout that a scene remembers.
+
+    Lists are left out. Standard properties that the file stores as integers are ``float`` from
+    here on, since merged values are not whole numbers.
+    """
+    return tuple(
+        (name, "float" if is_standard(name) and kind not in FLOAT_TYPES else kind)
+        for name, kind in vertex.columns
+    )
+
+
+def _check_properties(vertex: Element, path: str) -> None:
+    scalars = {prop.name: prop.count_type is None for prop in vertex.properties}
+    lists = [name for name, scalar in scalars.items() if is_standard(name) and not scalar]
+    if lists:
+        raise FileFormatError(
+            f"{path}: property {lists[0]!r} of 'vertex' must be a number, found a list."
+        )
+    missing = [name for name in standard_slots(0) if name not in scalars and name not in _OPTIONAL]
+    if missing:
+        names = ", ".join(missing)
+        is_cloud = set(missing) == set(standard_slots(0)) - set(_OPTIONAL) - set("xyz")
+        hint = "; a point cloud or a mesh must be trained to a scene first" if is_cloud else ""
+        raise FileFormatError(
+            f"{path}: a 3DGS scene must have the 'vertex' properties x, y, z, f_dc_0..2, opacity, "
+            f"scale_0..1 and rot_0..3, found none named {names}{hint}."
+        )
+
+
+def _check_rest(vertex: Element, path: str) -> None:
+    names = [prop.name for prop in vertex.properties]
+    numbers = {number for name in names if (number := rest_index(name)) is not None}
+    if rest_count_of(names) is None:
+        raise FileFormatError(
+            f"{path}: 'vertex' must have 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3), "
+            f"found {len(numbers)}."
+        )
+    gaps = sorted(set(range(len(numbers))) - numbers)
+    if gaps:
+        raise FileFormatError(
+            f"{path}: the {len(numbers)} f_rest properties of 'vertex' must be numbered from 0 "
+            f"without gaps, found no f_rest_{gaps[0]}."
+        )

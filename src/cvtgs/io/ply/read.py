@@ -1,17 +1,43 @@
-"""Read a 3DGS scene from a PLY file."""
+"""Read a 3DGS scene from a PLY file: mapped where the layout is the common one, else by plyfile.
 
+No other file imports plyfile.
+"""
+
+import io
 import os
 import warnings
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
-from cvtgs.errors import DroppedDataWarning
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cvtgs.errors import DroppedDataWarning, FileFormatError
 from cvtgs.io.files import open_input
-from cvtgs.io.ply import fast, generic
-from cvtgs.io.ply.assemble import assemble
-from cvtgs.io.ply.header import Element, Header, read_header
-from cvtgs.io.ply.vertices import check_size, find_vertices, layout_of
-from cvtgs.scene import GaussianScene
+from cvtgs.io.ply.header import SCALARS, Element, Header, Layout, read_header, row_dtype
+from cvtgs.io.ply.properties import (
+    NORMALS,
+    check_size,
+    dtype_of,
+    find_vertices,
+    is_standard,
+    layout_of,
+    rest_count_of,
+    standard_slots,
+)
+from cvtgs.math.spherical_harmonics import REST_COUNTS
+from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
+
+CHUNK_BYTES = 1 << 20
+"""How much of a file is mapped at a time; a chunk and its copy fit in the second-level cache."""
+
+_CHUNK_ROWS = 1 << 12
+"""How many rows of plyfile are copied at a time; a cache holds them."""
+
+_NOT_ASCII = bytes.maketrans(bytes(range(128, 256)), b"?" * 128)
 
 
 def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -> GaussianScene:
@@ -33,27 +59,24 @@ def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -
         InputError: It cannot be opened or read.
         FileFormatError: It is not a PLY file of a 3DGS scene, or damaged.
     """
+    where = str(path)
     with open_input(path) as file:
-        return _read(file, str(path), sh_degree=sh_degree, extras=extras)
-
-
-def _read(file: BinaryIO, path: str, *, sh_degree: int | None, extras: bool) -> GaussianScene:
-    header = read_header(file, path)
-    vertex = find_vertices(header, path)
-    check_size(header, vertex, path=path, size=os.fstat(file.fileno()).st_size)
-    if fast.can_read(header):
-        chunks = fast.read_chunks(file, header)
-    else:
-        chunks = generic.read_chunks(file, header, vertex=vertex, path=path)
-    scene = assemble(
-        chunks,
-        count=vertex.count,
-        layout=layout_of(vertex),
-        comments=header.comments,
-        sh_degree=sh_degree,
-        with_extras=extras,
-    )
-    _warn_of_dropped(header, vertex, path)
+        header = read_header(file, where)
+        vertex = find_vertices(header, where)
+        check_size(header, vertex, path=where, size=os.fstat(file.fileno()).st_size)
+        if can_map(header):
+            chunks = _mapped_chunks(file, header)
+        else:
+            chunks = _parsed_chunks(file, header, vertex=vertex, path=where)
+        scene = assemble(
+            chunks,
+            count=vertex.count,
+            layout=layout_of(vertex),
+            comments=header.comments,
+            sh_degree=sh_degree,
+            with_extras=extras,
+        )
+    _warn_of_dropped(header, vertex, where)
     return scene
 
 
@@ -73,5 +96,215 @@ def _warn_of_dropped(header: Header, vertex: Element, path: str) -> None:
             f"{path}: left out {', '.join(dropped)}, since a scene holds one number per Gaussian "
             f"and property.",
             DroppedDataWarning,
-            stacklevel=5,
+            stacklevel=4,
         )
+
+
+def assemble(
+    chunks: Iterable[NDArray[Any]],
+    *,
+    count: int,
+    layout: Layout,
+    comments: tuple[str, ...],
+    sh_degree: int | None = None,
+    with_extras: bool = True,
+) -> GaussianScene:
+    """Copy rows into a new scene, chunk by chunk; memory is the scene plus what chunks hold."""
+    types = dict(layout)
+    tensors = _empty_tensors(count, rest_count_of(types) or 0, dtype_of(layout))
+    extras = {
+        name: torch.empty(count, dtype=SCALARS[kind].dtype)
+        for name, kind in layout
+        if with_extras and not is_standard(name) and name not in NORMALS
+    }
+    if sh_degree is not None and REST_COUNTS[sh_degree] < tensors["shN"].shape[1]:
+        # Zeros of numpy take no memory until they are written to, those of torch do.
+        zeros = np.zeros(tensors["shN"].shape, tensors["shN"].numpy().dtype)
+        tensors["shN"] = torch.from_numpy(zeros)
+    standard = _standard_columns(tensors, types, sh_degree)
+    columns = {**standard, **{name: column.numpy() for name, column in extras.items()}}
+    normal_names = tuple(name for name in NORMALS if with_extras and name in types)
+    if "scale_2" not in types:
+        tensors["log_scales"][:, 2] = FLAT_LOG_SCALE
+    normals: dict[str, Tensor] = {}
+    start = 0
+    for rows in chunks:
+        stop = start + len(rows)
+        if not normals and any(rows[name].any() for name in normal_names):
+            normals = {
+                name: torch.zeros(count, dtype=SCALARS[types[name]].dtype) for name in normal_names
+            }
+            columns.update({name: normal.numpy() for name, normal in normals.items()})
+        with np.errstate(over="ignore", invalid="ignore"):
+            for name, column in columns.items():
+                column[start:stop] = rows[name]
+        start = stop
+    carried = {**extras, **normals}
+    return GaussianScene(
+        **tensors,
+        extras={name: carried[name] for name in types if name in carried},
+        comments=comments,
+        layout=layout,
+    )
+
+
+def _empty_tensors(count: int, rest_count: int, dtype: torch.dtype) -> dict[str, Tensor]:
+    shapes = {
+        "means": (count, 3),
+        "quats": (count, 4),
+        "log_scales": (count, 3),
+        "logit_opacities": (count,),
+        "sh0": (count, 1, 3),
+        "shN": (count, rest_count, 3),
+    }
+    return {name: torch.empty(shape, dtype=dtype) for name, shape in shapes.items()}
+
+
+def _standard_columns(
+    tensors: dict[str, Tensor], types: dict[str, str], sh_degree: int | None
+) -> dict[str, NDArray[Any]]:
+    """Return a writable view of every standard column that is to be read, in file order."""
+    slots = standard_slots(tensors["shN"].shape[1])
+    if sh_degree is not None:
+        read = REST_COUNTS[sh_degree]
+        slots = {
+            name: slot
+            for name, slot in slots.items()
+            if slot.tensor != "shN" or slot.index[0] < read
+        }
+    return {
+        name: tensors[slots[name].tensor].numpy()[slots[name].rows]
+        for name in types
+        if name in slots
+    }
+
+
+def can_map(header: Header) -> bool:
+    """Return whether the vertex rows can be mapped as they are."""
+    first = header.elements[0]
+    little = header.encoding == "binary_little_endian"
+    return little and first.name == "vertex" and not first.has_lists
+
+
+def _mapped_chunks(file: BinaryIO, header: Header) -> Iterator[NDArray[Any]]:
+    """Map the vertex rows, a megabyte at a time.
+
+    Each chunk is unmapped when the caller lets go of it, so the file's pages do not add up:
+    memory is one or two chunks.
+    """
+    vertex = header.elements[0]
+    dtype = row_dtype(vertex.columns)
+    rows = max(1, CHUNK_BYTES // dtype.itemsize)
+    for start in range(0, vertex.count, rows):
+        offset = header.data_offset + start * dtype.itemsize
+        shape = (min(rows, vertex.count - start),)
+        yield np.memmap(file, dtype, "r", offset, shape).view(np.ndarray)
+
+
+def _parsed_chunks(
+    file: BinaryIO, header: Header, *, vertex: Element, path: str
+) -> Iterator[NDArray[Any]]:
+    """Read the vertex rows of any PLY file.
+
+    ASCII rows and rows with lists are held in memory as a whole, others are mapped.
+    """
+    rows = _read_rows(file, header, vertex=vertex, path=path)
+    for start in range(0, vertex.count, _CHUNK_ROWS):
+        yield rows[start : start + _CHUNK_ROWS]
+
+
+def _read_rows(file: BinaryIO, header: Header, *, vertex: Element, path: str) -> NDArray[Any]:
+    from plyfile import PlyData, PlyElementParseError, PlyParseError  # noqa: PLC0415
+
+    needed = header.elements[: header.elements.index(vertex) + 1]
+    stream = _CleanStream(file, header, plain_header=_plain_header(header, needed))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # numpy's, on empty lists
+            data = PlyData.read(stream)[f"e{len(needed) - 1}"].data
+    except PlyElementParseError as error:
+        raise FileFormatError(_explain(error, needed, path)) from error
+    except (PlyParseError, ValueError, OverflowError) as error:
+        raise FileFormatError(
+            f"{path}: every value must be a number of the type its property states, "
+            f"found one that is not: {error}."
+        ) from error
+    rows: NDArray[Any] = data.view(np.ndarray)
+    rows.dtype.names = tuple(prop.name for prop in vertex.properties)
+    return rows
+
+
+def _plain_header(header: Header, elements: tuple[Element, ...]) -> bytes:
+    """Write the header as plyfile wants it: no blanks, comments or odd names; e0, p0, ..."""
+    lines = ["ply", f"format {header.encoding} 1.0"]
+    for i, element in enumerate(elements):
+        if element.count == 0 or (header.encoding != "ascii" and not element.properties):
+            continue  # no bytes
+        lines.append(f"element e{i} {element.count}")
+        for j, prop in enumerate(element.properties):
+            length = f"list {prop.count_type} " if prop.count_type else ""
+            lines.append(f"property {length}{prop.type} p{j}")
+    return "\n".join([*lines, "end_header", ""]).encode()
+
+
+class _CleanStream(io.BufferedIOBase):
+    """A PLY file whose header has been replaced; positions are those of the real file."""
+
+    def __init__(self, file: BinaryIO, header: Header, *, plain_header: bytes) -> None:
+        self._file = file
+        self._pending = io.BytesIO(plain_header)
+        self._is_text = header.encoding == "ascii"
+        self._size = file.seek(0, io.SEEK_END)
+        file.seek(header.data_offset)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Read at most what is there; a negative length comes from a damaged list."""
+        if size is None or size < 0:
+            raise ValueError("a list cannot have a negative length")
+        data = self._pending.read(size)
+        if data or size == 0:
+            return data
+        data = self._file.read(min(size, self._size - self._file.tell()))
+        return data.translate(_NOT_ASCII) if self._is_text else data
+
+    def read1(self, size: int = -1, /) -> bytes:
+        """Read as :meth:`read` does."""
+        return self.read(size)
+
+    def readable(self) -> bool:
+        """Report yes."""
+        return True
+
+    def seekable(self) -> bool:
+        """Report yes."""
+        return True
+
+    def tell(self) -> int:
+        """Return the position in the real file."""
+        return self._file.tell()
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        """Move in the real file."""
+        return self._file.seek(offset, whence)
+
+    def fileno(self) -> int:
+        """Return the real file, for memory mapping."""
+        return self._file.fileno()
+
+
+def _explain(error: Any, elements: tuple[Element, ...], path: str) -> str:
+    """Turn plyfile's error into one sentence with the file's own names."""
+    element = elements[int(error.element.name[1:])]
+    place = f"{path}: row {error.row} of {element.name!r}"
+    if error.message == "early end-of-file":
+        return (
+            f"{path}: the file is cut short: its header promises {element.count:,} rows of "
+            f"{element.name!r}, found {error.row:,}."
+        )
+    if error.prop is None:
+        return f"{place} must hold {len(element.properties)} values, found more."
+    prop = element.properties[int(error.prop.name[1:])]
+    if error.message == "early end-of-line":
+        return f"{place} must have a value for property {prop.name!r}, found the end of the line."
+    kind = f"list of {prop.type}" if prop.count_type else prop.type
+    return f"{place}: property {prop.name!r} must be a {kind}, found something unreadable."

@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 
 from cvtgs.errors import FileFormatError
 from cvtgs.io.files import open_input
-from cvtgs.io.ply import fast
-from cvtgs.io.ply.assemble import assemble
-from cvtgs.io.ply.header import read_header
-from cvtgs.io.ply.properties import SCALARS, Layout
-from cvtgs.io.ply.vertices import check_size, find_vertices, layout_of
+from cvtgs.io.ply.header import SCALARS, Layout, header_bytes, read_header
+from cvtgs.io.ply.properties import check_size, find_vertices, layout_of
+from cvtgs.io.ply.read import assemble, can_map
 from cvtgs.scene import GaussianScene
 
 
@@ -92,7 +90,7 @@ def open_rows(path: str | os.PathLike[str]) -> PlyRows:
         size = os.fstat(file.fileno()).st_size
     vertex = find_vertices(header, name)
     check_size(header, vertex, path=name, size=size)
-    if not fast.can_read(header):
+    if not can_map(header):
         raise FileFormatError(
             f"{name}: only binary little endian PLY files with vertices first can be read in "
             f"parts; write one with cvtgs convert."
@@ -132,11 +130,7 @@ def join_plys(
     for part in parts:
         if part.names != first.names:
             raise FileFormatError(f"{part.path}: must have the columns of {first.path}.")
-    lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [f"comment {comment}".rstrip() for comment in first.comments]
-    lines += [f"element vertex {total}"]
-    lines += [f"property {kind} {name}" for name, kind in first.layout]
-    file.write("\n".join([*lines, "end_header", ""]).encode())
+    file.write(header_bytes(first.comments, [("vertex", total, first.layout)]))
     for table in before:
         for start in range(0, len(table), 1 << 14):
             rows = table[start : start + (1 << 14)]

@@ -1,4 +1,4 @@
-"""Write a 3DGS scene to a PLY file."""
+"""Write a 3DGS scene to a PLY file, with the properties that it came with as far as they fit."""
 
 import warnings
 from typing import Any, BinaryIO
@@ -9,12 +9,32 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError
-from cvtgs.io.ply.output_layout import output_layout
-from cvtgs.io.ply.properties import SCALARS, Layout, standard_slots
+from cvtgs.io.ply.header import FLOAT_TYPES, SCALARS, Layout, header_bytes, row_dtype
+from cvtgs.io.ply.properties import (
+    NORMALS,
+    dtype_of,
+    is_standard,
+    rest_index,
+    standard_slots,
+)
 from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 
 CHUNK_BYTES = 1 << 20
 """How much is gathered before it is written."""
+
+_NATURAL_TYPES = {
+    torch.bool: "uchar",
+    torch.int8: "char",
+    torch.uint8: "uchar",
+    torch.int16: "short",
+    torch.uint16: "ushort",
+    torch.int32: "int",
+    torch.uint32: "uint",
+    torch.float16: "float",
+    torch.bfloat16: "float",
+    torch.float32: "float",
+    torch.float64: "double",
+}
 
 
 def write_ply(scene: GaussianScene, file: BinaryIO) -> None:
@@ -44,28 +64,15 @@ def write_ply(scene: GaussianScene, file: BinaryIO) -> None:
     """
     if len(scene) == 0:
         raise InvalidSceneError("a scene must hold at least one Gaussian to be written, found 0.")
-    layout = output_layout(scene)
+    layout = _output_layout(scene)
     _warn_of_flattened(scene, layout)
-    file.write(_header(scene, layout))
-    dtype = np.dtype([(name, "<" + SCALARS[kind].code) for name, kind in layout])
+    file.write(header_bytes(scene.comments, [("vertex", len(scene), layout)]))
+    dtype = row_dtype(layout)
     rows = max(1, CHUNK_BYTES // dtype.itemsize)
     for start in range(0, len(scene), rows):
         block = np.zeros(min(rows, len(scene) - start), dtype)
         _fill(block, scene, start)
         file.write(block.view(np.uint8).data)
-
-
-def _header(scene: GaussianScene, layout: Layout) -> bytes:
-    for comment in scene.comments:
-        if "\n" in comment:
-            raise InvalidSceneError(
-                f"a comment must be one line to be written to a PLY, found {comment[:80]!r}."
-            )
-    lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [f"comment {comment}".rstrip() for comment in scene.comments]
-    lines += [f"element vertex {len(scene)}"]
-    lines += [f"property {kind} {name}" for name, kind in layout]
-    return "\n".join([*lines, "end_header", ""]).encode()
 
 
 def _fill(block: NDArray[Any], scene: GaussianScene, start: int) -> None:
@@ -100,3 +107,101 @@ def _warn_of_flattened(scene: GaussianScene, layout: Layout) -> None:
             DroppedDataWarning,
             stacklevel=4,
         )
+
+
+def _output_layout(scene: GaussianScene) -> Layout:
+    """Return the properties to write.
+
+    A scene that was read keeps names, order and types. Where its layout does not fit any more,
+    the standard properties follow the scene (SH degree, dtype), columns that are gone are left
+    out, and new extras are appended. A scene without a layout gets INRIA's.
+    """
+    _check_names(scene)
+    slots = standard_slots(scene.shN.shape[1])
+    base = dict(scene.layout) or dict.fromkeys(_inria_names(list(slots)), _float_type(scene))
+    if "scale_2" not in base:
+        del slots["scale_2"]
+    keeps_types = dtype_of(tuple(base.items())) == scene.dtype
+    kept: list[tuple[str, str]] = []
+    for name, kind in base.items():
+        if name in slots:
+            usable = keeps_types and kind in FLOAT_TYPES
+            kept.append((name, kind if usable else _float_type(scene)))
+        elif name in scene.extras:
+            kept.append((name, _extra_type(name, scene.extras[name], kind)))
+        elif name in NORMALS:
+            kept.append((name, kind))
+    names = {name for name, _ in kept}
+    missing = [(name, _float_type(scene)) for name in slots if name not in names]
+    at = _end_of_colours([name for name, _ in kept])
+    added = [
+        (name, _extra_type(name, column, None))
+        for name, column in scene.extras.items()
+        if name not in names
+    ]
+    return tuple(kept[:at] + missing + kept[at:] + added)
+
+
+def _inria_names(standard: list[str]) -> list[str]:
+    return [*standard[:3], *NORMALS, *standard[3:]]
+
+
+def _float_type(scene: GaussianScene) -> str:
+    return "double" if scene.dtype == torch.float64 else "float"
+
+
+def _end_of_colours(names: list[str]) -> int:
+    """Find where view-dependent colours belong: behind the last colour, else at the end."""
+    colours = [
+        i
+        for i, name in enumerate(names)
+        if name.startswith("f_dc_") or rest_index(name) is not None
+    ]
+    return max(colours, default=len(names) - 1) + 1
+
+
+def _check_names(scene: GaussianScene) -> None:
+    for name in scene.extras:
+        if is_standard(name):
+            raise InvalidSceneError(
+                f"extra column {name!r} must not be named like a property of the scene itself."
+            )
+        if name.split() != [name]:
+            raise InvalidSceneError(
+                f"extra column {name!r} must have a name without blanks to be written to a PLY."
+            )
+    for name, kind in scene.layout:
+        if kind not in SCALARS:
+            raise InvalidSceneError(
+                f"the layout must give property {name!r} one of the types {', '.join(SCALARS)}, "
+                f"found {kind!r}."
+            )
+
+
+def _extra_type(name: str, column: Tensor, kind: str | None) -> str:
+    """Return the type that the column came with if it still holds every value, else its own."""
+    if kind is not None and SCALARS[kind].dtype == column.dtype and _fits(column, kind):
+        return kind
+    if column.dtype == torch.int64:
+        for wide in ("uint", "int"):
+            if _fits(column, wide):
+                return wide
+        raise InvalidSceneError(
+            f"extra column {name!r} must fit into 32 bits to be written to a PLY, "
+            f"found values from {column.min()} to {column.max()}."
+        )
+    if column.dtype not in _NATURAL_TYPES:
+        raise InvalidSceneError(
+            f"extra column {name!r} must hold real numbers to be written to a PLY, "
+            f"found {column.dtype}."
+        )
+    return _NATURAL_TYPES[column.dtype]
+
+
+def _fits(column: Tensor, kind: str) -> bool:
+    """Check the range where the torch dtype is wider than the PLY type."""
+    if kind in FLOAT_TYPES or (kind not in ("ushort", "uint") and column.dtype != torch.int64):
+        return True
+    bits = 16 if kind == "ushort" else 32
+    low, high = (-(2**31), 2**31 - 1) if kind == "int" else (0, 2**bits - 1)
+    return bool(((column >= low) & (column <= high)).all())

@@ -14,12 +14,7 @@ _KNOTS = 4096
 
 
 class Codebook(NamedTuple):
-    """Numbers, and which of them stands for each value.
-
-    Attributes:
-        codes: ``(256,)`` numbers, ascending.
-        labels: Bytes of the shape of the values.
-    """
+    """Numbers in ascending order, and which of them stands for each value."""
 
     codes: Float[np.ndarray, "256"]
     labels: UInt8[np.ndarray, "*n"]
@@ -59,12 +54,7 @@ def _first_codes(ordered: Float[np.ndarray, "n"]) -> Float[np.ndarray, "256"]:
 
 
 class Palette(NamedTuple):
-    """Rows that stand for many rows.
-
-    Attributes:
-        entries: ``(p, d)`` with p at most 65,536.
-        labels: ``(n,)`` which entry stands for each row.
-    """
+    """At most 65,536 rows that stand for many, and which of them stands for each."""
 
     entries: Float[np.ndarray, "p d"]
     labels: Int[np.ndarray, "n"]

@@ -1,16 +1,24 @@
-"""Where the files of a SOG lie: in a zip, or beside ``meta.json``."""
+"""Where the files of a SOG lie (in a zip, or beside ``meta.json``), and its WebP images."""
 
+import io
 import os
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path, PurePosixPath
 
+import numpy as np
+from jaxtyping import UInt8
+
 from cvtgs.errors import FileFormatError
 from cvtgs.io.files import open_input
 
 META = "meta.json"
-_MOST_META_BYTES = 1 << 24
+MOST_META_BYTES = 1 << 24
+
+PALETTE_COLUMNS = 64
+"""Entries of the SH palette in a row of its image."""
 
 Reader = Callable[[str, int], bytes]
 """Gives the content of a file by its name, unless it is longer than so many bytes."""
@@ -19,11 +27,6 @@ Reader = Callable[[str, int], bytes]
 def open_container(path: Path) -> AbstractContextManager[Reader]:
     """Open a bundled or an unbundled SOG."""
     return _beside(path) if path.name == META else _inside(path)
-
-
-def read_meta(read: Reader) -> bytes:
-    """Read the ``meta.json``."""
-    return read(META, _MOST_META_BYTES)
 
 
 @contextmanager
@@ -78,3 +81,34 @@ def _check_name(name: str, path: Path) -> None:
 
 def _too_long(where: str, most: int, found: int) -> FileFormatError:
     return FileFormatError(f"{where} must have at most {most:,} bytes, found {found:,}.")
+
+
+def decode_webp(content: bytes, where: str, *, most_pixels: int) -> UInt8[np.ndarray, "h w 4"]:
+    """Decode an image that stores numbers in its channels."""
+    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 (loads in its time)
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(content), formats=("WEBP", "PNG")) as image:
+                if image.width * image.height > most_pixels:
+                    raise FileFormatError(
+                        f"{where} must have at most {most_pixels:,} pixels, "
+                        f"found {image.width} x {image.height}."
+                    )
+                return np.asarray(image.convert("RGBA"))
+    except UnidentifiedImageError as error:
+        raise FileFormatError(f"{where} must be a WebP image, found something else.") from error
+    except FileFormatError:
+        raise
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise FileFormatError(f"{where} must be a whole image, found: {error}.") from error
+
+
+def encode_webp(numbers: UInt8[np.ndarray, "h w 4"]) -> bytes:
+    """Write numbers to a lossless image, those below opacity 0 too."""
+    from PIL import Image  # noqa: PLC0415
+
+    file = io.BytesIO()
+    Image.fromarray(numbers).save(file, format="webp", lossless=True, exact=True, quality=80)
+    return file.getvalue()

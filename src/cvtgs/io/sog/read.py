@@ -1,26 +1,130 @@
-"""Read a SOG."""
+"""Read a SOG, version 1 or 2: its ``meta.json``, and the values of its images."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from pydantic import AfterValidator, Field
 
 from cvtgs.errors import FileFormatError
-from cvtgs.io.arrays import Arrays, logits_of_bytes, scene_of
-from cvtgs.io.files import parse_json
-from cvtgs.io.smallest_three import restore_largest
-from cvtgs.io.sog.container import META, Reader, open_container, read_meta
-from cvtgs.io.sog.meta import Meta, parse_meta
-from cvtgs.io.webp import decode_webp
+from cvtgs.io.arrays import Arrays, logits_of_bytes, restore_largest, scene_of
+from cvtgs.io.documents import Document, Number, Text, Vector, Whole, parse_json, validated
+from cvtgs.io.sog.container import (
+    META,
+    MOST_META_BYTES,
+    PALETTE_COLUMNS,
+    Reader,
+    decode_webp,
+    open_container,
+)
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 
-PALETTE_COLUMNS = 64
-"""Entries of the SH palette in a row of its image."""
+_MOST_COUNT = 16383**2
+"""Pixels of the largest WebP image."""
 
 _FIRST_TAG = 252
 _LABELS = 1 << 16
 _SPARE_PIXELS = 1 << 16
+
+
+class _OneImage(Document):
+    files: tuple[Text] = Field(description="1 file name")
+
+
+class _TwoImages(Document):
+    files: tuple[Text, Text] = Field(description="2 file names")
+
+
+class _Means(_TwoImages):
+    """Least and largest of ``sign(x) log(1 + |x|)`` per axis."""
+
+    mins: Vector
+    maxs: Vector
+
+
+class _Root(Document):
+    version: Annotated[Whole, Field(ge=1, le=2, description="1 or 2")] | None = None
+    model: Any = None  # of splat-transform
+    antialias: Any = None  # of the first description of the format
+
+
+_Codes = Annotated[
+    list[Number], Field(min_length=1, max_length=256, description="1 to 256 finite numbers")
+]
+
+
+class _Codebook(_OneImage):
+    codebook: _Codes
+
+
+class _Palette(_TwoImages):
+    count: Whole
+    bands: Annotated[Whole, Field(ge=1, le=3, description="1, 2 or 3")]
+    codebook: _Codes
+
+
+class _Version2(_Root):
+    """Bytes stand for one of at most 256 numbers, the same in all channels."""
+
+    count: Whole
+    means: _Means
+    scales: _Codebook
+    quats: _OneImage
+    sh0: _Codebook
+    shN: _Palette | None = None  # noqa: N815 (the name in the file)
+
+
+def _starts_with_count(shape: list[Any]) -> list[Any]:
+    if not shape or not isinstance(shape[0], int):
+        raise ValueError
+    return shape
+
+
+class _ShapedMeans(_Means):
+    shape: Annotated[list[Any], AfterValidator(_starts_with_count)] = Field(
+        description="a list that starts with the number of Gaussians"
+    )
+
+
+class _ThreeRanges(_OneImage):
+    mins: Vector
+    maxs: Vector
+
+
+class _FourRanges(_OneImage):
+    mins: tuple[Number, Number, Number, Number] = Field(description="4 finite numbers")
+    maxs: tuple[Number, Number, Number, Number] = Field(description="4 finite numbers")
+
+
+class _PaletteRange(_TwoImages):
+    mins: Number
+    maxs: Number
+
+
+class _Version1(_Root):
+    """Bytes stand for equal steps from a least to a largest number per channel."""
+
+    means: _ShapedMeans
+    scales: _ThreeRanges
+    quats: _OneImage
+    sh0: _FourRanges
+    shN: _PaletteRange | None = None  # noqa: N815 (the name in the file)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Meta:
+    """What the images of a SOG mean; tables say what the bytes of a channel stand for."""
+
+    document: _Version1 | _Version2
+    count: int
+    scales: Float[np.ndarray, "3 256"]
+    colors: Float[np.ndarray, "3 256"]
+    opacities: Float[np.ndarray, "256"] | None = None  # of logits; None where bytes are opacities
+    palette: Float[np.ndarray, "256"] | None = None
 
 
 def read_sog(path: Path) -> GaussianScene:
@@ -39,53 +143,100 @@ def read_sog(path: Path) -> GaussianScene:
     """
     with open_container(path) as read:
         where = str(path) if path.name == META else f"{path}: {META}"
-        meta = parse_meta(parse_json(read_meta(read), where), where)
-        images = _Images(read, meta, path)
+        meta = _read_meta(parse_json(read(META, MOST_META_BYTES), where), where)
+        document = meta.document
+        images = _Images(read=read, count=meta.count, path=path)
+        means = _means(images, document.means)
+        quats = _quats(images.rows(document.quats.files[0]))
+        log_scales = _looked_up(meta.scales, images.rows(document.scales.files[0]))
+        colors = images.rows(document.sh0.files[0])
         arrays = Arrays(
-            means=_means(images, meta),
-            quats=_quats(images.rows("quats")),
-            log_scales=_looked_up(meta.scales, images.rows("scales")),
-            logit_opacities=_logits(images.rows("sh0")[:, 3], meta),
-            sh0=_looked_up(meta.colors, images.rows("sh0")),
-            shN=_rest(images, meta, path),
+            means=means,
+            quats=quats,
+            log_scales=log_scales,
+            logit_opacities=_logits(colors[:, 3], meta),
+            sh0=_looked_up(meta.colors, colors),
+            shN=_rest(images, meta),
         )
-    return scene_of(arrays, antialiased=meta.antialiased)
+    antialiased = document.model == "antialiased" or document.antialias is True
+    return scene_of(arrays, antialiased=antialiased)
 
 
+def _read_meta(content: Any, where: str) -> _Meta:
+    version = validated(_Root, content, where).version or 1
+    meta = (
+        _meta_of_version_1(content, where) if version == 1 else _meta_of_version_2(content, where)
+    )
+    if not 0 < meta.count <= _MOST_COUNT:
+        raise FileFormatError(
+            f"{where}: a SOG must hold 1 to {_MOST_COUNT:,} Gaussians, found {meta.count:,}."
+        )
+    return meta
+
+
+def _meta_of_version_1(content: Any, where: str) -> _Meta:
+    document = validated(_Version1, content, where)
+
+    def tables(mins: Sequence[float], maxs: Sequence[float]) -> Float[np.ndarray, "k 256"]:
+        low, high = np.array(mins)[:, None], np.array(maxs)[:, None]
+        values: Float[np.ndarray, "k 256"] = low + (high - low) * (np.arange(256) / 255)
+        return values
+
+    sh0, rest = tables(document.sh0.mins, document.sh0.maxs), document.shN
+    return _Meta(
+        document=document,
+        count=document.means.shape[0],
+        scales=tables(document.scales.mins, document.scales.maxs),
+        colors=sh0[:3],
+        opacities=sh0[3],
+        palette=None if rest is None else tables([rest.mins], [rest.maxs])[0],
+    )
+
+
+def _meta_of_version_2(content: Any, where: str) -> _Meta:
+    document = validated(_Version2, content, where)
+
+    def table(codes: list[float]) -> Float[np.ndarray, "256"]:
+        return np.pad(np.array(codes), (0, 256 - len(codes)), "edge")
+
+    return _Meta(
+        document=document,
+        count=document.count,
+        scales=np.tile(table(document.scales.codebook), (3, 1)),
+        colors=np.tile(table(document.sh0.codebook), (3, 1)),
+        palette=None if document.shN is None else table(document.shN.codebook),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Images:
     """The images of a SOG; none may have many more pixels than there are Gaussians."""
 
-    def __init__(self, read: Reader, meta: Meta, path: Path) -> None:
-        self._read = read
-        self._meta = meta
-        self._path = path
-        self._last: tuple[str, UInt8[np.ndarray, "n 4"]] | None = None
+    read: Reader
+    count: int
+    path: Path
 
-    def pixels(self, purpose: str, most: int) -> UInt8[np.ndarray, "h w 4"]:
+    def pixels(self, name: str, most: int) -> UInt8[np.ndarray, "h w 4"]:
         """Decode an image."""
-        name = self._meta.files[purpose]
-        content = self._read(name, 5 * most + _SPARE_PIXELS)
-        return decode_webp(content, f"{self._path}: {name}", most_pixels=most)
+        content = self.read(name, 5 * most + _SPARE_PIXELS)
+        return decode_webp(content, f"{self.path}: {name}", most_pixels=most)
 
-    def rows(self, purpose: str) -> UInt8[np.ndarray, "n 4"]:
+    def rows(self, name: str) -> UInt8[np.ndarray, "n 4"]:
         """Return the pixel of every Gaussian."""
-        if self._last is None or self._last[0] != purpose:
-            count = self._meta.count
-            pixels = self.pixels(purpose, 4 * count + _SPARE_PIXELS).reshape(-1, 4)
-            if len(pixels) < count:
-                raise FileFormatError(
-                    f"{self._path}: {self._meta.files[purpose]} must have a pixel for each of "
-                    f"{count:,} Gaussians, found {len(pixels):,}."
-                )
-            self._last = purpose, pixels[:count]
-        return self._last[1]
+        pixels = self.pixels(name, 4 * self.count + _SPARE_PIXELS).reshape(-1, 4)
+        if len(pixels) < self.count:
+            raise FileFormatError(
+                f"{self.path}: {name} must have a pixel for each of {self.count:,} Gaussians, "
+                f"found {len(pixels):,}."
+            )
+        return pixels[: self.count]
 
 
-def _means(images: _Images, meta: Meta) -> Float[np.ndarray, "n 3"]:
-    """Read 16 bits per axis, two bytes in two images, of ``sign(x) log(1 + |x|)``."""
-    low = images.rows("means_l")[:, :3].astype(np.uint16)
-    whole = low | images.rows("means_u")[:, :3].astype(np.uint16) << np.uint16(8)
-    least, largest = meta.means.T
+def _means(images: _Images, part: _Means) -> Float[np.ndarray, "n 3"]:
+    """Read 16 bits per axis, two bytes in two images."""
+    low, high = (images.rows(name)[:, :3].astype(np.uint16) for name in part.files)
+    whole = low | high << np.uint16(8)
+    least, largest = np.array(part.mins), np.array(part.maxs)
     squeezed = least + (largest - least) * (whole / 65535)
     means: Float[np.ndarray, "n 3"] = np.copysign(np.expm1(np.abs(squeezed)), squeezed)
     return means.astype(np.float32)
@@ -100,7 +251,7 @@ def _quats(stored: UInt8[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
     return quats
 
 
-def _logits(stored: UInt8[np.ndarray, "n"], meta: Meta) -> Float[np.ndarray, "n"]:
+def _logits(stored: UInt8[np.ndarray, "n"], meta: _Meta) -> Float[np.ndarray, "n"]:
     if meta.opacities is None:
         return logits_of_bytes(stored)
     logits: Float[np.ndarray, n] = meta.opacities.astype(np.float32)[stored]
@@ -114,24 +265,25 @@ def _looked_up(
     return values
 
 
-def _rest(images: _Images, meta: Meta, path: Path) -> Float[np.ndarray, "n k 3"]:
+def _rest(images: _Images, meta: _Meta) -> Float[np.ndarray, "n k 3"]:
     """Look labels up in the palette, and its bytes in the codebook; a label beyond it is 0."""
-    if meta.palette is None:
+    part = meta.document.shN
+    if part is None or meta.palette is None:
         return np.empty((meta.count, 0, 3), np.float32)
-    stored = images.rows("shN_labels")[:, :2].astype(np.uint16)
-    labels = stored[:, 0] | stored[:, 1] << np.uint16(8)
-    pixels = images.pixels("shN_centroids", _LABELS * REST_COUNTS[-1])
+    centroids, labels = part.files
+    stored = images.rows(labels)[:, :2].astype(np.uint16)
+    numbers = stored[:, 0] | stored[:, 1] << np.uint16(8)
+    pixels = images.pixels(centroids, _LABELS * REST_COUNTS[-1])
     k = pixels.shape[1] // PALETTE_COLUMNS
-    allowed = REST_COUNTS[1:] if meta.bands is None else (REST_COUNTS[meta.bands],)
+    allowed = (REST_COUNTS[part.bands],) if isinstance(part, _Palette) else REST_COUNTS[1:]
     if k not in allowed or pixels.shape[1] != PALETTE_COLUMNS * k:
         wanted = " or ".join(str(PALETTE_COLUMNS * count) for count in allowed)
         raise FileFormatError(
-            f"{path}: {meta.files['shN_centroids']} must be {wanted} pixels wide, "
-            f"found {pixels.shape[1]}."
+            f"{images.path}: {centroids} must be {wanted} pixels wide, found {pixels.shape[1]}."
         )
     entries = meta.palette.astype(np.float32)[pixels[:, :, :3]].reshape(-1, k, 3)
-    there = len(entries) if meta.palette_count is None else min(meta.palette_count, len(entries))
-    known = labels < there
-    rest: Float[np.ndarray, "n k 3"] = entries[np.where(known, labels, 0)]
+    count = min(part.count, len(entries)) if isinstance(part, _Palette) else len(entries)
+    known = numbers < count
+    rest: Float[np.ndarray, "n k 3"] = entries[np.where(known, numbers, 0)]
     rest[~known] = 0
     return rest

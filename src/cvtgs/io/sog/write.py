@@ -8,14 +8,16 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 
-from cvtgs.io.arrays import arrays_of, opacity_bytes, to_bytes
-from cvtgs.io.limits import Holds
-from cvtgs.io.morton import morton_rows
-from cvtgs.io.smallest_three import HALF_RANGE, drop_largest
+from cvtgs.io.arrays import (
+    HALF_RANGE,
+    arrays_of,
+    drop_largest,
+    morton_rows,
+    opacity_bytes,
+    to_bytes,
+)
 from cvtgs.io.sog.codebook import codebook, palette
-from cvtgs.io.sog.container import META
-from cvtgs.io.sog.read import PALETTE_COLUMNS
-from cvtgs.io.webp import encode_webp
+from cvtgs.io.sog.container import META, PALETTE_COLUMNS, encode_webp
 from cvtgs.math.spherical_harmonics import degree_of
 from cvtgs.scene import GaussianScene
 
@@ -23,20 +25,6 @@ _TIME = (1980, 1, 1, 0, 0, 0)  # the same scene gives the same bytes
 _QUAT_TAG = 252
 
 Images = dict[str, UInt8[np.ndarray, "h w 4"]]
-
-SOG_HOLDS = Holds(
-    sh_degree=3,
-    tag=True,
-    changed=(
-        "rows in Morton order",
-        "positions in 65,536 steps of sign(x) log(1 + |x|) between the least and the largest",
-        "scales, colours and SH coefficients to 256 numbers each",
-        "rotations in steps of 1/180 per component",
-        "opacities in steps of 1/255",
-        "view-dependent colours to a palette of 65,536 (all, in smaller scenes)",
-    ),
-)
-"""What a ``.sog`` file holds."""
 
 
 def write_sog(scene: GaussianScene, file: BinaryIO) -> None:

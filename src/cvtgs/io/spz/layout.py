@@ -1,7 +1,7 @@
-"""The blocks of an ``.spz`` file: header, sizes, axes."""
+"""What reading and writing ``.spz`` files share: header, sizes of blocks, axes."""
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -29,23 +29,17 @@ _SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.f
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpzHeader:
-    """What an ``.spz`` file says of itself.
-
-    Attributes:
-        version: 1 to 4.
-        count: Number of Gaussians.
-        sh_degree: 0 to 4.
-        fractional_bits: Binary places of coordinates.
-        flags: Antialiased, extensions.
-        streams: Number of compressed blocks of version 4; reserved before.
-    """
+    """What an ``.spz`` file of version 1 to 4 says of itself."""
 
     version: int
     count: int
     sh_degree: int
     fractional_bits: int
+    """Binary places of coordinates."""
     flags: int
+    """Antialiased, extensions."""
     streams: int = 0
+    """Number of compressed blocks of version 4; reserved before."""
 
     @property
     def antialiased(self) -> bool:
@@ -78,15 +72,9 @@ class SpzHeader:
         )
 
 
-def turned(arrays: Arrays) -> Arrays:
+def turn_axes(arrays: Arrays) -> Arrays:
     """Turn a scene by half a turn about x: between right-up-back and right-down-forward axes."""
     quats = arrays.quats.copy()
     quats[:, 1:] *= _SIGNS  # of y z, x z and x y, which are the same
-    return Arrays(
-        means=arrays.means * _SIGNS,
-        quats=quats,
-        log_scales=arrays.log_scales,
-        logit_opacities=arrays.logit_opacities,
-        sh0=arrays.sh0,
-        shN=arrays.shN * _SH_SIGNS[: arrays.shN.shape[1], None],
-    )
+    signs = _SH_SIGNS[: arrays.shN.shape[1], None]
+    return replace(arrays, means=arrays.means * _SIGNS, quats=quats, shN=arrays.shN * signs)

@@ -9,10 +9,16 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from cvtgs.io.arrays import Arrays, arrays_of, opacity_bytes, to_bytes, writable_rows
-from cvtgs.io.limits import Holds
-from cvtgs.io.smallest_three import HALF_RANGE, drop_largest
-from cvtgs.io.spz.layout import ANTIALIASED_FLAG, COLOR_SCALE, Axes, SpzHeader, turned
+from cvtgs.io.arrays import (
+    HALF_RANGE,
+    Arrays,
+    arrays_of,
+    drop_largest,
+    opacity_bytes,
+    to_bytes,
+)
+from cvtgs.io.limits import writable_rows
+from cvtgs.io.spz.layout import ANTIALIASED_FLAG, COLOR_SCALE, Axes, SpzHeader, turn_axes
 from cvtgs.math.spherical_harmonics import REST_COUNTS, degree_of
 from cvtgs.scene import GaussianScene
 
@@ -21,47 +27,6 @@ _MOST_BITS = 22
 _STEPS = 1 << 23
 _OUTLIERS = 0.001
 _CHUNK_ROWS = 1 << 18
-
-
-def fractional_bits(scene: GaussianScene) -> int:
-    """Choose the binary places of the coordinates.
-
-    12, as Niantic's library has it, or more in scenes smaller than 8 units, so that a coordinate
-    has 16 bits at least, or fewer in scenes larger than 2,048 units. A thousandth of the
-    Gaussians may lie beyond; they are moved to the border.
-    """
-    rows = scene.means.detach()[writable_rows(scene)].abs().amax(dim=1)
-    if not len(rows):
-        return _USUAL_BITS
-    rank = math.ceil((1 - _OUTLIERS) * len(rows))
-    extent = float(torch.kthvalue(rows, rank).values)
-    power = math.frexp(extent)[1]  # extent < 2^power
-    return max(0, min(max(_USUAL_BITS, 15 - power), 23 - power, _MOST_BITS))
-
-
-def _reach(scene: GaussianScene) -> float:
-    return _STEPS / (1 << fractional_bits(scene))
-
-
-SPZ_HOLDS = Holds(
-    sh_degree=3,
-    tag=True,
-    limits={
-        "log_scales": (-10 - 1 / 32, 255 / 16 - 10 + 1 / 32),
-        "sh0": (-3.3464, 3.3464),
-        "shN": (-1.0625, 1.0625),
-    },
-    reach=_reach,
-    changed=(
-        "positions in steps of 1/4096 (finer in scenes below 8 units, coarser above 2,048)",
-        "scales in steps of 6.4 %",
-        "rotations in steps of 1/723 per component",
-        "opacities in steps of 1/255",
-        "colours in steps of 0.0074",
-        "view-dependent SH coefficients in steps of 1/16 (degree 1) and 1/8",
-    ),
-)
-"""What an ``.spz`` file of version 3 holds."""
 
 
 def write_spz(
@@ -90,12 +55,12 @@ def write_spz(
         b'\x1f\x8b'
     """
     arrays = arrays_of(scene)
-    arrays = turned(arrays) if axes == "RUB" else arrays
+    arrays = turn_axes(arrays) if axes == "RUB" else arrays
     header = SpzHeader(
         version=version,
         count=len(arrays.means),
         sh_degree=degree_of(arrays.shN.shape[1]),
-        fractional_bits=fractional_bits(scene),
+        fractional_bits=_fractional_bits(scene),
         flags=ANTIALIASED_FLAG if scene.antialiased else 0,
     )
     stream = zlib.compressobj(wbits=zlib.MAX_WBITS | 16)  # gzip without name and time
@@ -103,6 +68,27 @@ def write_spz(
     for block in _blocks(arrays, header):
         file.write(stream.compress(block.tobytes()))
     file.write(stream.flush())
+
+
+def largest_coordinate(scene: GaussianScene) -> float:
+    """Return the largest coordinate that a file of the scene can hold."""
+    return _STEPS / (1 << _fractional_bits(scene))
+
+
+def _fractional_bits(scene: GaussianScene) -> int:
+    """Choose the binary places of the coordinates.
+
+    12, as Niantic's library has it, or more in scenes smaller than 8 units, so that a coordinate
+    has 16 bits at least, or fewer in scenes larger than 2,048 units. A thousandth of the
+    Gaussians may lie beyond; they are moved to the border.
+    """
+    rows = scene.means.detach()[writable_rows(scene)].abs().amax(dim=1)
+    if not len(rows):
+        return _USUAL_BITS
+    rank = math.ceil((1 - _OUTLIERS) * len(rows))
+    extent = float(torch.kthvalue(rows, rank).values)
+    power = math.frexp(extent)[1]  # extent < 2^power
+    return max(0, min(max(_USUAL_BITS, 15 - power), 23 - power, _MOST_BITS))
 
 
 def _blocks(arrays: Arrays, header: SpzHeader) -> Iterator[UInt8[np.ndarray, "n b"]]:

@@ -1,0 +1,295 @@
+"""PlayCanvas' compressed PLY files: 16 bytes per Gaussian and one per view-dependent number."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from jaxtyping import Float, UInt8, UInt32
+from numpy.typing import NDArray
+
+from cvtgs.errors import FileFormatError
+from cvtgs.io.arrays import (
+    Arrays,
+    arrays_of,
+    colors_of_sh0,
+    drop_largest,
+    logits_of_bytes,
+    morton_rows,
+    opacity_bytes,
+    restore_largest,
+    scene_of,
+    sh0_of_colors,
+)
+from cvtgs.io.files import open_input
+from cvtgs.io.limits import FORMAT_LIMITS
+from cvtgs.io.ply.header import (
+    Element,
+    Header,
+    header_bytes,
+    is_compressed_ply,
+    read_header,
+    row_dtype,
+)
+from cvtgs.math.spherical_harmonics import REST_COUNTS
+from cvtgs.scene import GaussianScene
+
+__all__ = ["is_compressed_ply", "read_compressed_ply", "write_compressed_ply"]
+
+Rows = NDArray[Any]
+
+_CHUNK_ROWS = 256
+"""So many Gaussians share the ranges of a chunk."""
+
+_RANGES = tuple(
+    f"{end}_{name}"
+    for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+    for end in ("min", "max")
+    for name in names
+)
+"""Properties of a chunk; the oldest files end before the colours."""
+
+_UNCOLORED = 12
+
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+"""Properties of a vertex, 32 bits each."""
+
+_THREE_BITS = (11, 10, 11)
+"""Of positions and scales."""
+
+_COLOR_BITS = (8, 8, 8, 8)
+"""Of red, green, blue and opacity."""
+
+_QUAT_BITS = (10, 10, 10)
+"""Of the three smaller components of a rotation; the upper two bits say which is missing."""
+
+
+def read_compressed_ply(path: Path) -> GaussianScene:
+    """Read a compressed PLY file, as PlayCanvas' tools write it.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The scene, with the comments of the file.
+
+    Raises:
+        InputNotFoundError: There is no such file.
+        InputError: It cannot be opened or read.
+        FileFormatError: It is not a compressed PLY file, or damaged.
+    """
+    with open_input(path) as file:
+        header = read_header(file, str(path))
+        _check(header, path)
+        tables = _read_tables(file, header, path)
+    ranges = _ranges(tables["chunk"])
+    vertices = tables["vertex"]
+    packed = {name: vertices[name] for name in _PACKED}
+    colors = _unpack(packed["packed_color"], _COLOR_BITS)
+    opacities = (packed["packed_color"] & np.uint32(255)).astype(np.uint8)
+    largest = (packed["packed_rotation"] >> np.uint32(30)).astype(np.int64)
+    others = (_unpack(packed["packed_rotation"], _QUAT_BITS) - np.float32(0.5)) * np.sqrt(
+        np.float32(2)
+    )
+    arrays = Arrays(
+        means=_between(ranges[:, 0:6], _unpack(packed["packed_position"], _THREE_BITS)),
+        quats=restore_largest(largest, others),
+        log_scales=_between(ranges[:, 6:12], _unpack(packed["packed_scale"], _THREE_BITS)),
+        logit_opacities=logits_of_bytes(opacities),
+        sh0=sh0_of_colors(_between(ranges[:, 12:18], colors[:, :3])),
+        shN=_rest(tables.get("sh"), len(vertices)),
+    )
+    return replace(scene_of(arrays), comments=header.comments)
+
+
+def _between(
+    ranges: Float[np.ndarray, "c 6"], fractions: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    own = np.repeat(ranges, _CHUNK_ROWS, axis=0)[: len(fractions)]
+    values: Float[np.ndarray, "n 3"] = own[:, :3] * (1 - fractions) + own[:, 3:] * fractions
+    return values
+
+
+def _ranges(chunks: Rows) -> Float[np.ndarray, "c 18"]:
+    """Return the ranges of each chunk; colours without any are in [0, 1]."""
+    names = _RANGES if _RANGES[-1] in (chunks.dtype.names or ()) else _RANGES[:_UNCOLORED]
+    ranges = np.tile(np.array([0, 0, 0, 1, 1, 1], np.float32), (len(chunks), 3))
+    for column, name in enumerate(names):
+        ranges[:, column] = chunks[name]
+    return ranges
+
+
+def _rest(rows: Rows | None, count: int) -> Float[np.ndarray, "n k 3"]:
+    """Decode bytes that stand for [-4, 4]; the outermost mean the ends, others their middle."""
+    if rows is None:
+        return np.empty((count, 0, 3), np.float32)
+    names = rows.dtype.names or ()
+    stored: UInt8[np.ndarray, "n k"] = np.stack(
+        [rows[f"f_rest_{i}"] for i in range(len(names))], axis=1
+    )
+    table = (np.arange(256, dtype=np.float32) + np.float32(0.5)) / 256
+    table[[0, 255]] = 0, 1
+    values: Float[np.ndarray, "n k"] = (8 * (table - np.float32(0.5)))[stored]
+    return values.reshape(count, 3, -1).transpose(0, 2, 1)
+
+
+def _check(header: Header, path: Path) -> None:
+    found = {table.name: table for table in header.elements}
+    if header.encoding != "binary_little_endian":
+        raise FileFormatError(
+            f"{path}: a compressed PLY must be binary_little_endian, found {header.encoding}."
+        )
+    for name, wanted, kind in (
+        ("chunk", _RANGES[:_UNCOLORED], "float"),
+        ("vertex", _PACKED, "uint"),
+    ):
+        types = {prop.name: prop.type for prop in found[name].properties} if name in found else {}
+        for prop in wanted:
+            if types.get(prop) != kind:
+                raise FileFormatError(
+                    f"{path}: element {name!r} of a compressed PLY must have the {kind} property "
+                    f"{prop!r}, found {types.get(prop, 'none')}."
+                )
+    vertices, chunks = found["vertex"].count, found["chunk"].count
+    if vertices == 0 or chunks != -(-vertices // _CHUNK_ROWS):
+        raise FileFormatError(
+            f"{path}: must hold at least one vertex and a chunk for every {_CHUNK_ROWS} of them, "
+            f"found {vertices:,} vertices and {chunks:,} chunks."
+        )
+    if "sh" in found:
+        _check_rest(found["sh"], vertices, path)
+
+
+def _check_rest(table: Element, vertices: int, path: Path) -> None:
+    names = {prop.name for prop in table.properties if prop.type == "uchar"}
+    counts = [3 * count for count in REST_COUNTS[1:]]
+    wanted = {f"f_rest_{i}" for i in range(len(table.properties))}
+    if names != wanted or len(names) not in counts or table.count != vertices:
+        raise FileFormatError(
+            f"{path}: element 'sh' must have 9, 24 or 45 uchar properties f_rest_0, f_rest_1, ... "
+            f"for each of {vertices:,} vertices, found {len(names)} for {table.count:,}."
+        )
+
+
+def _read_tables(file: BinaryIO, header: Header, path: Path) -> dict[str, Rows]:
+    """Read every element, after checking that the file holds them all."""
+    if any(table.has_lists for table in header.elements):
+        raise FileFormatError(f"{path}: a compressed PLY must hold no lists, found one.")
+    dtypes = {table.name: row_dtype(table.columns) for table in header.elements}
+    wanted = header.data_offset + sum(
+        table.count * dtypes[table.name].itemsize for table in header.elements
+    )
+    size = os.fstat(file.fileno()).st_size
+    if size < wanted:
+        raise FileFormatError(
+            f"{path}: must have {wanted:,} bytes for the rows that its header promises, "
+            f"found {size:,}."
+        )
+    file.seek(header.data_offset)
+    return {
+        table.name: np.fromfile(file, dtypes[table.name], table.count)
+        for table in header.elements
+        if table.properties
+    }
+
+
+def write_compressed_ply(scene: GaussianScene, file: BinaryIO) -> None:
+    """Write a compressed PLY file.
+
+    Rows are sorted along a Morton curve, so that the 256 Gaussians of a chunk lie close together
+    and their common ranges are small.
+
+    Args:
+        scene: The scene, on any device.
+        file: Where to, open for writing.
+
+    Raises:
+        InvalidSceneError: No Gaussian of the scene is finite, or a comment has two lines.
+        OSError: The file cannot be written.
+
+    Example:
+        >>> import io
+        >>> from cvtgs.synthetic import scene
+        >>> file = io.BytesIO()
+        >>> write_compressed_ply(scene("object", 5, sh_degree=0, seed=0), file)
+        >>> file.getvalue()[:3]
+        b'ply'
+    """
+    arrays = arrays_of(scene)
+    order = morton_rows(arrays.means)
+    rest = arrays.shN[order].transpose(0, 2, 1).reshape(len(order), -1)
+    elements = [
+        ("chunk", -(-len(order) // _CHUNK_ROWS), tuple((name, "float") for name in _RANGES)),
+        ("vertex", len(order), tuple((name, "uint") for name in _PACKED)),
+    ]
+    if rest.shape[1]:
+        names = (f"f_rest_{i}" for i in range(rest.shape[1]))
+        elements.append(("sh", len(order), tuple((name, "uchar") for name in names)))
+    file.write(header_bytes(scene.comments, elements))
+    ranges, words = _packed(arrays, order)
+    file.write(ranges.astype("<f4").tobytes())
+    file.write(words.astype("<u4").tobytes())
+    file.write(_rest_bytes(rest).tobytes())
+
+
+def _packed(
+    arrays: Arrays, order: NDArray[np.int64]
+) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Return the ranges of each chunk and the words of each Gaussian."""
+    log_scales = np.clip(arrays.log_scales, *FORMAT_LIMITS[".compressed.ply"].ranges["log_scales"])
+    opacities = opacity_bytes(arrays.logit_opacities)[order].astype(np.uint32)
+    place, place_range = _fractions(arrays.means[order])
+    scale, scale_range = _fractions(log_scales[order])
+    color, color_range = _fractions(colors_of_sh0(arrays.sh0[order]))
+    largest, others = drop_largest(arrays.quats[order])
+    none = np.zeros(len(order), np.uint32)
+    words = np.stack(
+        [
+            _pack(place, _THREE_BITS, high=none),
+            _pack(others * np.sqrt(np.float32(0.5)) + 0.5, _QUAT_BITS, high=largest.astype("u4")),
+            _pack(scale, _THREE_BITS, high=none),
+            _pack(color, _COLOR_BITS[:3], high=none) << np.uint32(8) | opacities,
+        ],
+        axis=1,
+    )
+    return np.concatenate([place_range, scale_range, color_range], axis=1), words
+
+
+def _fractions(
+    values: Float[np.ndarray, "n 3"],
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "c 6"]]:
+    """Report where values lie between the least and the largest of their chunk, and give these."""
+    starts = np.arange(0, len(values), _CHUNK_ROWS)
+    low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+    size = np.diff(np.append(starts, len(values)))
+    below, width = np.repeat(low, size, axis=0), np.repeat(high - low, size, axis=0)
+    fractions = np.where(width > 0, (values - below) / np.where(width > 0, width, 1), 0)
+    return fractions, np.concatenate([low, high], axis=1)
+
+
+def _rest_bytes(rest: Float[np.ndarray, "n k"]) -> UInt8[np.ndarray, "n k"]:
+    return np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
+
+
+def _pack(
+    fractions: Float[np.ndarray, "n k"], bits: tuple[int, ...], *, high: UInt32[np.ndarray, "n"]
+) -> UInt32[np.ndarray, "n"]:
+    """Put fractions side by side into 32 bits."""
+    words = high
+    for column, size in zip(fractions.T, bits, strict=True):
+        most = (1 << size) - 1
+        field = np.clip(np.floor(column * most + 0.5), 0, most).astype(np.uint32)
+        words = (words << np.uint32(size)) | field
+    return words
+
+
+def _unpack(words: UInt32[np.ndarray, "n"], bits: tuple[int, ...]) -> Float[np.ndarray, "n k"]:
+    """Take fractions out of 32 bits, the inverse of :func:`_pack`."""
+    fractions = np.empty((len(words), len(bits)), np.float32)
+    shift = sum(bits)
+    for column, size in enumerate(bits):
+        shift -= size
+        most = (1 << size) - 1
+        fractions[:, column] = ((words >> np.uint32(shift)) & np.uint32(most)) / np.float32(most)
+    return fractions
