@@ -23,8 +23,8 @@ TERMINATED = 143
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line."""
-    # Idle OpenMP threads that spin burn several times the useful work; read when torch starts.
+    """Run a command line and return its exit status."""
+    # Torch reads this when it starts; by default idle OpenMP threads spin and use much CPU time.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     words = sys.argv[1:] if arguments is None else arguments
     parser = build_parser()
@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"cvtgs: error: {error}", file=sys.stderr)
             return 1
         except (KeyboardInterrupt, Exception):
-            # An import that is interrupted may turn the interrupt into an error of its own.
+            # An interrupted import may raise another error instead of KeyboardInterrupt.
             if not interrupt.happened:
                 raise
             print("cvtgs: interrupted; nothing was half-written.", file=sys.stderr)
@@ -54,17 +54,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run_process() -> NoReturn:
-    """Run the command line as a process of its own, and leave.
-
-    What is done is done: an interrupt while Python shuts down must not spoil the exit code.
-    """
+    """Run the command line and end the process with its exit status."""
     code = main()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt from here on must not change it
     sys.exit(code)
 
 
 class _Interrupt:
-    """Raises KeyboardInterrupt on SIGINT, and remembers that it did."""
+    """A handler of SIGINT that raises KeyboardInterrupt and records it."""
 
     def __init__(self) -> None:
         self.happened = False
@@ -116,5 +113,5 @@ def _show_warning(
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:
-    """Leave in an orderly way, so that temporary files are removed."""
+    """Exit through SystemExit, so that temporary files are removed."""
     sys.exit(TERMINATED)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Color = tuple[float, float, float]
 
 READABLE = ".ply, .spz, .splat, .sog, .ckpt, .pt or the folder of a trained model"
-PRESETS = "draft, fast, standard, high, max (from the fastest to the best) or paper"
+PRESET_NAMES = "draft, fast, standard, high, max (from the fastest to the best) or paper"
 CAMERA_FILES = "transforms.json, a COLMAP model, cameras.json, or a folder of these"
 COLORS: Mapping[str, Color] = {
     "black": (0.0, 0.0, 0.0),
@@ -53,7 +53,7 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
         "default": "0.1,0.01,0.001",
         "help": "ratios of Gaussians to keep (default 0.1,0.01,0.001)",
     },
-    "--preset": {"metavar": "NAME", "help": f"preset: {PRESETS} (default standard)"},
+    "--preset": {"metavar": "NAME", "help": f"preset: {PRESET_NAMES} (default standard)"},
     "--ckpt": {
         "metavar": "NAME",
         "default": "auto",
