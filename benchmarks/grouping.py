@@ -10,12 +10,10 @@ from torch import Tensor
 
 import cvtgs
 from cvtgs import cells, cvt
-from cvtgs.mergenet import MergeNet
-from cvtgs.progress import silent
-from cvtgs.report import StageClock
-from cvtgs.stages import Reference, make_reference
-from cvtgs.stages.merging import merge_groups
-from cvtgs.stages.run import finished
+from cvtgs.mergenet import MergeNet, correct_cells
+from cvtgs.pipeline import merge_cells
+from cvtgs.train.merged import MergedScene, merge_scene
+from cvtgs.validity import standardized
 
 
 def nearest_groups(points: Float[Tensor, "n d"], count: int, *, seed: int) -> Int[Tensor, "n"]:
@@ -86,7 +84,7 @@ def grouped_simplifier(
         count = cvtgs.target_count(len(scene), rho)
         all_members = config.merge.model_copy(update={"representatives": False})
         whole = config.model_copy(update={"merge": all_members})
-        reference = make_reference(scene, count, whole)
+        reference = merge_scene(scene, count, whole)
         rows = reference.partition.order.sort().values  # those that passed the filter
         labels = nearest_groups(reference.scene.means[rows], count, seed=config.seed)
         local = cells.Partition.from_labels(labels, count)
@@ -97,7 +95,7 @@ def grouped_simplifier(
 
 
 def regroup(
-    reference: Reference,
+    reference: MergedScene,
     partition: cells.Partition,
     config: cvtgs.SimplifyConfig,
     *,
@@ -108,14 +106,22 @@ def regroup(
     With the partition of the reference itself this gives what ``Simplifier`` gives.
     """
     scene = reference.scene
-    merged, shown, neighbors = merge_groups(
+    merged = merge_cells(
         scene,
         partition,
         config.merge,
         areas=scene.areas,
-        with_neighbors=net is not None,
         backend=cvt.nearest_backend(config.cvt.backend, scene.device)[0],
-        on_cells=lambda _: None,
+        with_network=net is not None,
     )
-    regrouped = Reference(scene, merged, shown, neighbors, reference.light)
-    return finished(regrouped, net, clock=StageClock(silent, scene.device))
+    if net is None:
+        return standardized(merged.scene)
+    corrected = correct_cells(
+        net,
+        scene,
+        merged.scene,
+        merged.partition,
+        neighbors=merged.neighbors,
+        visibility=reference.visibility,
+    )
+    return standardized(corrected)

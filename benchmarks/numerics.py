@@ -20,10 +20,10 @@ from benchmarks.processes import machine
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.cells import Partition, gather_members, mean_and_covariance, merge_cells
 from cvtgs.cvt import embed, nearest_neighbors, tessellate
-from cvtgs.filters import invalid_rows
 from cvtgs.math import parameters
 from cvtgs.math.frames import morton_order, robust_frame
 from cvtgs.mergenet import correct_cells
+from cvtgs.validity import invalid_rows
 from cvtgs.views import automatic_views
 
 COUNT = 2000

@@ -23,7 +23,7 @@ def simplifier(preset: str, device: str = "cpu") -> Simplifier:
 
 def coarsen_light(monkeypatch: pytest.MonkeyPatch) -> None:
     """Look through a grid of 16 voxels a side, not 128, which takes most of the time here."""
-    monkeypatch.setattr(import_module("cvtgs.cvt.openness"), "HALF_GRID", 8)
+    monkeypatch.setattr(import_module("cvtgs.analysis.visibility"), "HALF_GRID", 8)
 
 
 def ball(count: int, dtype: torch.dtype, *, seed: int = 0) -> GaussianScene:

@@ -3,13 +3,8 @@
 import pytest
 import torch
 
-from cvtgs.filters import (
-    flyaway_rows,
-    invalid_rows,
-    standardized,
-    visible_rows,
-    with_finite_opacities,
-)
+from cvtgs.filters import flyaway_rows, visible_rows
+from cvtgs.validity import invalid_rows, standardized, with_finite_opacities
 from scenes import random_scene, same_bits
 
 NAN, INF = float("nan"), float("inf")

@@ -15,17 +15,19 @@ TEXTS = {path: path.read_text(encoding="utf-8") for path in FILES}
 
 # A file imports only from lower levels, or from inside its own package: the ranks of the design,
 # refined where one of a rank needs another. `math` raises the errors of `errors`, `report` shows
-# the plan of `effects`, so each stands above what it needs; `info` combines stages as `simplify`
-# does; `devices` (names of devices) and `cameras` (data) stand as low as their imports allow.
+# the effect plan of `analysis`, so each stands above what it needs; `devices` (names of devices)
+# and `cameras` (data) stand as low as their imports allow.
 LEVELS = [
     {"errors", "progress"},
     {"math", "devices", "plots", "counts", "boxes"},
     {"config", "scene", "cameras"},
-    {"effects"},
-    {"report", "io", "filters", "cvt", "cells", "synthetic", "rendering", "losses"},
-    {"mergenet", "views"},
-    {"stages", "refinement"},
-    {"simplify", "info", "evaluation"},
+    {"validity", "io", "synthetic", "rendering", "losses"},
+    {"views"},
+    {"analysis"},
+    {"filters", "cvt", "cells", "report"},
+    {"mergenet"},
+    {"pipeline", "refinement"},
+    {"simplifier", "info", "evaluation"},
     {"budget", "tradeoff", "levels", "outofcore"},
     {"train"},
     {"cli"},
@@ -36,7 +38,7 @@ RANKS = {name: rank for rank, level in enumerate(LEVELS) for name in level}
 # Packages that any file may import, and the only places that may import others.
 EVERYWHERE = {"torch", "numpy", "jaxtyping", "pydantic"}
 OWNERS = {
-    "scipy": ("cvt/nearest_scipy.py", "budget/fit.py"),
+    "scipy": ("cvt/nearest.py", "budget/fit.py"),
     "plyfile": "io/ply/read.py",
     "tomli_w": "config/simplify.py",
     "rich": "cli/",
@@ -108,7 +110,7 @@ def test_rank_test_can_fail():
     path = SOURCE / "cvt" / "new.py"
     text = """
 from cvtgs import cells, math
-from cvtgs.simplify import Simplifier
+from cvtgs.simplifier import Simplifier
 def late():
     import cvtgs.elsewhere
 from cvtgs.cvt.lloyd import lloyd
@@ -117,7 +119,7 @@ if TYPE_CHECKING:
 """
     assert broken_ranks(path, text) == [
         "cvt/new.py imports cvtgs.cells",
-        "cvt/new.py imports cvtgs.simplify.Simplifier",
+        "cvt/new.py imports cvtgs.simplifier.Simplifier",
         "cvt/new.py imports cvtgs.elsewhere",
     ]
 
@@ -140,7 +142,7 @@ def test_the_front_page_imports_nothing_of_the_house():
 
 def test_owner_test_can_fail():
     text = "import scipy.spatial\nimport attrs, torch, rich\nfrom cvtgs import math\nimport ast"
-    assert strangers_in(SOURCE / "cvt" / "nearest_scipy.py", text) == ["attrs", "rich"]
+    assert strangers_in(SOURCE / "cvt" / "nearest.py", text) == ["attrs", "rich"]
     assert strangers_in(SOURCE / "cli" / "main.py", text) == ["attrs", "scipy"]
 
 
@@ -178,7 +180,7 @@ def test_no_name_that_means_everything():
 
 @pytest.mark.parametrize(
     "statement",
-    ["import cvtgs", "import cvtgs.simplify", "import cvtgs; cvtgs.Simplifier; cvtgs.load"],
+    ["import cvtgs", "import cvtgs.simplifier", "import cvtgs; cvtgs.Simplifier; cvtgs.load"],
 )
 def test_imports_are_light(statement):
     heavy = f"print(*sorted({set(HEAVY)!r} & set(sys.modules)))"

@@ -7,11 +7,12 @@ import torch
 
 import cvtgs
 from cvtgs import Simplifier
+from cvtgs.analysis import analyze
 from cvtgs.cli.main import main
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
 from cvtgs.levels import LevelsIndex, level_names, write_levels
+from cvtgs.pipeline import reduce_scene
 from cvtgs.report import StageClock
-from cvtgs.stages import PreparedScene, run_levels
 from scenes import random_scene, same_bits
 
 RHOS = [0.2, 0.04, 0.004]
@@ -35,7 +36,7 @@ def test_counts_are_exact_and_in_the_order_of_the_ratios(scene, simplifier, rhos
         assert level.report.output_count == level.report.target_count == len(level.scene)
         assert level.report.rho == pytest.approx(rho)
         assert level.report.shortfall == ""
-        assert len(cvtgs.filters.invalid_rows(level.scene)) == 0
+        assert len(cvtgs.validity.invalid_rows(level.scene)) == 0
 
 
 @pytest.mark.parametrize("config", ["standard", "paper", "draft"])
@@ -58,20 +59,18 @@ def test_errors_grow_and_all_rows_have_none(scene, simplifier):
 
 
 def test_coarse_cells_consist_of_whole_fine_ones(scene):
-    found = []
-    config = cvtgs.SimplifyConfig()
-
-    def clock():
-        return StageClock(lambda event: None, scene.device)
-
-    prepared = PreparedScene(scene, config, net=None)
-    sizes = run_levels(prepared, [600, 60], clock=clock, on_grouping=found.append)
-    fine, coarse = (grouping.partition for grouping in found)
+    config, clock = cvtgs.SimplifyConfig(), StageClock(lambda event: None, scene.device)
+    analysis = analyze(scene, config)
+    finest = reduce_scene(scene, analysis, 600, config, net=None, clock=clock)
+    coarser = reduce_scene(scene, analysis, 60, config, net=None, clock=clock, finest=finest)
+    fine, coarse = finest.grouping.partition, coarser.grouping.partition
     label = torch.full((len(scene),), -1)
     label[coarse.order] = torch.repeat_interleave(coarse.counts)
     for _, cell in fine.chunks(1):
         assert len(set(label[cell.order].tolist())) == len(cell)
-    assert [size.nested for size in sizes] == [False, True]
+    levels = cvtgs.Simplifier(None, device="cpu").levels(scene, [600 / len(scene), 60 / len(scene)])
+    assert [level.nested for level in levels] == [False, True]
+    assert same_bits(levels[1].scene, coarser.scene)
 
 
 def test_invalid_rows_are_counted_once_in_every_report(simplifier):

@@ -9,6 +9,9 @@ import pytest
 import cvtgs
 
 NAMES = {
+    "concatenate",
+    "pipeline",
+    "validity",
     "evaluation",
     "refinement",
     "rendering",
@@ -32,7 +35,7 @@ NAMES = {
     "cells",
     "cvt",
     "describe",
-    "effects",
+    "analysis",
     "errors",
     "evaluate",
     "filters",
@@ -57,23 +60,55 @@ NAMES = {
 }
 
 STAGES = {
+    "analysis": {
+        "BAND_LOSS",
+        "DUPLICATE_SHARE",
+        "FULLY_UNBOUNDED_SHARE",
+        "UNBOUNDED_DISTANCE",
+        "UNBOUNDED_SHARE",
+        "BandsEffect",
+        "Effect",
+        "EffectPlan",
+        "GradedEffect",
+        "SceneAnalysis",
+        "add_depths",
+        "ambient_visibility",
+        "analyze",
+        "apparent_areas",
+        "band_losses",
+        "drop_mip_tag",
+        "drop_unused_bands",
+        "duplicate_share",
+        "empty_depth_grid",
+        "far_share",
+        "measure_visibility",
+        "perspective_falloff",
+        "plan_effects",
+        "restore_columns",
+        "select_columns",
+        "visibility_at",
+        "visibility_grid",
+        "with_haze",
+    },
     "views": {"automatic_views", "mixed_views", "views_from_anywhere"},
     "cvt": {
         "LloydResult",
         "Tessellation",
-        "add_depths",
-        "depth_sums",
+        "NearestSite",
+        "centroids",
+        "choose_search",
+        "choose_seeds",
         "embed",
-        "falloff",
+        "gaussian_weights",
+        "nearest_several",
+        "sample_points",
+        "weighted_sums",
         "fill_empty_cells",
-        "light_at",
-        "light_of",
         "lloyd",
         "nearest_backend",
         "nearest_neighbors",
         "nearest_scipy",
         "nearest_torch",
-        "ambient_visibility",
         "stratified_seeds",
         "tessellate",
         "tessellation_weights",
@@ -246,8 +281,8 @@ def test_every_error_is_also_the_builtin_it_specialises():
 
 def test_an_unknown_name_is_an_error():
     with pytest.raises(AttributeError) as caught:
-        cvtgs.simplifier  # noqa: B018
-    assert str(caught.value) == "module 'cvtgs' has no attribute 'simplifier'"
+        cvtgs.simplifies  # noqa: B018
+    assert str(caught.value) == "module 'cvtgs' has no attribute 'simplifies'"
 
 
 def test_version():

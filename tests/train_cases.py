@@ -117,7 +117,7 @@ def bits_of_case(case: Case) -> dict[str, Any]:
         "part": (bits(case.part.order), bits(case.part.offsets)),
         "partition": (bits(reference.partition.order), bits(reference.partition.offsets)),
         "neighbors": bits(reference.neighbors),
-        "light": bits(reference.light.float()),
+        "light": bits(reference.visibility.float()),
         "seen": {name: bits(getattr(seen, name)) for name in type(seen).__slots__},
     }
 

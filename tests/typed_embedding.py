@@ -15,7 +15,7 @@ from cvtgs.cvt import Tessellation
 from cvtgs.evaluation import Evaluation, EvaluationSettings
 from cvtgs.mergenet import MergeNet, load_checkpoint
 from cvtgs.refinement import Refined
-from cvtgs.simplify import Level
+from cvtgs.report import Level
 
 
 class Bar:

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.filters import invalid_rows, standardized
 from cvtgs.scene import GaussianScene
+from cvtgs.validity import invalid_rows, standardized
 
 
 def usable(scene: GaussianScene, count: int) -> GaussianScene:

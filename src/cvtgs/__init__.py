@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cvtgs import (
+        analysis,
         boxes,
         budget,
         cells,
         cvt,
-        effects,
         errors,
         evaluation,
         filters,
@@ -28,16 +28,19 @@ if TYPE_CHECKING:
         math,
         mergenet,
         outofcore,
+        pipeline,
         refinement,
         rendering,
         synthetic,
         tradeoff,
         train,
+        validity,
         views,
     )
+    from cvtgs.analysis import EffectPlan
     from cvtgs.cameras import Cameras
     from cvtgs.config import PRESETS, SimplifyConfig
-    from cvtgs.effects import EffectPlan
+    from cvtgs.counts import target_count
     from cvtgs.errors import CvtgsError
     from cvtgs.evaluation import evaluate
     from cvtgs.info import SceneInfo, describe
@@ -45,9 +48,9 @@ if TYPE_CHECKING:
     from cvtgs.progress import ProgressEvent, ProgressListener
     from cvtgs.refinement import refine
     from cvtgs.rendering import Rendering, render
-    from cvtgs.report import SimplifyReport
-    from cvtgs.scene import GaussianScene
-    from cvtgs.simplify import Level, Prepared, Simplified, Simplifier, target_count
+    from cvtgs.report import Level, Simplified, SimplifyReport
+    from cvtgs.scene import GaussianScene, concatenate
+    from cvtgs.simplifier import Prepared, Simplifier
 
 __version__ = "0.1.0"
 
@@ -55,7 +58,7 @@ _HOME = {
     "Cameras": "cvtgs.cameras",
     "PRESETS": "cvtgs.config",
     "SimplifyConfig": "cvtgs.config",
-    "EffectPlan": "cvtgs.effects",
+    "EffectPlan": "cvtgs.analysis",
     "CvtgsError": "cvtgs.errors",
     "SceneInfo": "cvtgs.info",
     "describe": "cvtgs.info",
@@ -72,13 +75,16 @@ _HOME = {
     "Rendering": "cvtgs.rendering",
     "SimplifyReport": "cvtgs.report",
     "GaussianScene": "cvtgs.scene",
-    "Level": "cvtgs.simplify",
-    "Prepared": "cvtgs.simplify",
-    "Simplified": "cvtgs.simplify",
-    "Simplifier": "cvtgs.simplify",
-    "target_count": "cvtgs.simplify",
+    "concatenate": "cvtgs.scene",
+    "Level": "cvtgs.report",
+    "Prepared": "cvtgs.simplifier",
+    "Simplified": "cvtgs.report",
+    "Simplifier": "cvtgs.simplifier",
+    "target_count": "cvtgs.counts",
 }
 _MODULES = (
+    "pipeline",
+    "validity",
     "rendering",
     "refinement",
     "evaluation",
@@ -86,7 +92,7 @@ _MODULES = (
     "boxes",
     "cells",
     "cvt",
-    "effects",
+    "analysis",
     "errors",
     "filters",
     "budget",
@@ -116,12 +122,13 @@ __all__ = [
     "Simplifier",
     "SimplifyConfig",
     "SimplifyReport",
+    "analysis",
     "boxes",
     "budget",
     "cells",
+    "concatenate",
     "cvt",
     "describe",
-    "effects",
     "errors",
     "evaluate",
     "evaluation",
@@ -135,6 +142,7 @@ __all__ = [
     "math",
     "mergenet",
     "outofcore",
+    "pipeline",
     "refine",
     "refinement",
     "render",
@@ -145,6 +153,7 @@ __all__ = [
     "to_dict",
     "tradeoff",
     "train",
+    "validity",
     "views",
 ]
 

@@ -105,3 +105,30 @@ def inside(boxes: Sequence[Box], means: Float[Tensor, "n 3"]) -> Bool[Tensor, "n
         low, high = (means.new_tensor(corner) for corner in (box.min, box.max))
         found |= ((means >= low) & (means <= high)).all(dim=1)
     return found
+
+
+def check_mask(keep: Tensor, count: int) -> None:
+    """Refuse what is not a mask of so many Gaussians.
+
+    Args:
+        keep: The mask.
+        count: Number of Gaussians of the scene.
+
+    Raises:
+        InvalidArgumentError: It has another shape or dtype.
+    """
+    if not isinstance(keep, Tensor) or keep.dtype != torch.bool or keep.shape != (count,):
+        shape = f"{keep.dtype} {tuple(keep.shape)}" if isinstance(keep, Tensor) else repr(keep)
+        raise InvalidArgumentError(
+            f"keep must be a boolean tensor of shape ({count},), found {shape[:80]}."
+        )
+
+
+def check_room(kept: int, *, target: int, total: int) -> None:
+    """Check that protected Gaussians leave something of the target for the rest."""
+    needed = kept + (1 if kept < total else 0)
+    if kept and min(target, total) < needed:
+        raise InvalidArgumentError(
+            f"{kept} Gaussians are to be kept as they are, so at least {needed} of the {total} "
+            f"must be left (rho {needed / total:.4g} or more); asked for {target}."
+        )

@@ -42,6 +42,24 @@ def target_count(total: int, rho: float | None, *, count: int | None = None) -> 
     return math.ceil(Fraction(str(float(rho or 0.0))) * total)
 
 
+def shortfall(valid: int, total: int, target: int) -> str:
+    """Return why fewer Gaussians come out than asked for, or an empty text.
+
+    Args:
+        valid: Number of valid Gaussians.
+        total: Number of Gaussians.
+        target: Number of Gaussians to keep.
+
+    Returns:
+        One sentence without its full stop.
+
+    Example:
+        >>> shortfall(9, 10, 10)
+        'only 9 of 10 Gaussians are valid'
+    """
+    return f"only {valid} of {total} Gaussians are valid" if valid < target else ""
+
+
 def shared_out(total: int, shares: Sequence[float], *, rooms: Sequence[int]) -> list[int]:
     """Split a count in proportion to shares, by largest remainder, within what there is room for.
 

@@ -1,62 +1,73 @@
-"""Which Gaussians enter the tessellation, and the mass that is left out."""
+"""The filter: faint Gaussians and flyaways that are left out before the tessellation."""
 
 import math
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.math import parameters
+from cvtgs.analysis import SceneAnalysis, perspective_falloff
+from cvtgs.config import FilterConfig
+from cvtgs.math.parameters import divide
 from cvtgs.scene import GaussianScene
 
+FLYAWAY_RADII = 100.0
+"""In robust radii: no sky lies so far."""
 
-def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
-    """Find the rows that no renderer can draw.
 
-    NaN or infinite means, scales and SH coefficients, NaN opacities, and quaternions that are
-    zero, NaN or infinite are invalid. Scales beyond float32 count as infinite, and those of
-    minus infinity, which are 0, are invalid too. Infinite opacity logits are valid.
+class FilteredRows(NamedTuple):
+    """The Gaussians that enter the tessellation.
+
+    Attributes:
+        rows: ``(k,)`` their row numbers, ascending.
+        left_out: Number of the others.
+        left_out_mass_share: Their share of the mass.
+    """
+
+    rows: Int[Tensor, "k"]
+    left_out: int
+    left_out_mass_share: float
+
+
+def filter_rows(
+    scene: GaussianScene, analysis: SceneAnalysis, target: int, config: FilterConfig
+) -> FilteredRows:
+    """Leave out faint Gaussians and flyaways, but never so many that fewer than the target stay.
+
+    Faint Gaussians all go, unless they are the haze of the scene: then only the faintest do.
 
     Args:
-        scene: Any scene.
+        scene: The Gaussians, with valid rows.
+        analysis: Their areas, and whether the scene has haze.
+        target: Number of Gaussians that must stay.
+        config: Thresholds.
 
     Returns:
-        One mask per attribute that has bad rows; empty for a clean scene.
-
-    Example:
-        >>> from cvtgs.synthetic import scene
-        >>> invalid_rows(scene("object", 10, sh_degree=0, seed=0))
-        {}
+        The rows that stay, and what is left out.
     """
-    masks = {
-        "means": ~_finite(scene.means),
-        "quats": ~_finite(scene.quats) | (scene.quats == 0).all(dim=1),
-        "log_scales": ~_finite(scene.log_scales) | (scene.log_scales > MAX_LOG_SCALE).any(dim=1),
-        "logit_opacities": scene.logit_opacities.isnan(),
-        "sh0": ~_finite(scene.sh0),
-        "shN": ~_finite(scene.shN),
-    }
-    return {name: mask for name, mask in masks.items() if bool(mask.any())}
-
-
-def valid_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
-    """Return which rows renderers can draw.
-
-    Args:
-        scene: Any scene.
-
-    Returns:
-        Mask of the valid rows.
-
-    Example:
-        >>> from cvtgs.synthetic import scene
-        >>> bool(valid_rows(scene("object", 10, sh_degree=0, seed=0)).all())
-        True
-    """
-    valid = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
-    for mask in invalid_rows(scene).values():
-        valid &= ~mask
-    return valid
+    opacities = scene.opacities
+    keep, share = opacities >= config.min_opacity, config.max_mass_share
+    if not analysis.plan.haze.active:
+        share = 1.0
+    if analysis.plan.haze.active or int(keep.sum()) < target:
+        keep = visible_rows(
+            opacities,
+            analysis.apparent_areas * opacities,
+            min_opacity=config.min_opacity,
+            max_mass_share=share,
+            at_least=target,
+        )
+    masses = analysis.areas * opacities
+    if config.max_flyaway_share > 0.0:
+        distances = analysis.frame.distances(scene.means)
+        if float(distances.amax()) > FLYAWAY_RADII:
+            seen = masses * perspective_falloff(scene.means, analysis.frame)
+            fewer = keep & ~flyaway_rows(distances, seen, max_share=config.max_flyaway_share)
+            keep = fewer if int(fewer.sum()) >= target else keep
+    left_out = ~keep
+    mass_share = divide(masses[left_out].sum(), masses.sum())
+    return FilteredRows(keep.nonzero()[:, 0], int(left_out.sum()), float(mass_share))
 
 
 def visible_rows(
@@ -133,69 +144,3 @@ def flyaway_rows(
     found = torch.zeros(len(distances), dtype=torch.bool, device=distances.device)
     found[far[lost <= max_share * masses.double().sum()]] = True
     return found
-
-
-FLYAWAY_RADII = 100.0
-"""In robust radii: no sky lies so far."""
-
-
-def with_finite_opacities(scene: GaussianScene) -> GaussianScene:
-    """Replace infinite opacity logits, which are valid input, by the largest finite ones.
-
-    Args:
-        scene: A scene with valid rows.
-
-    Returns:
-        The scene itself if there is nothing to replace.
-
-    Example:
-        >>> from cvtgs.synthetic import scene as make
-        >>> scene = make("object", 10, sh_degree=0, seed=0)
-        >>> with_finite_opacities(scene) is scene
-        True
-    """
-    logits = scene.logit_opacities
-    infinite = logits.isinf()
-    if not bool(infinite.any()):
-        return scene
-    finite = torch.where(infinite, parameters.clamp_logits(logits), logits)
-    return scene.with_tensors({"logit_opacities": finite}, scene.extras)
-
-
-def standardized(scene: GaussianScene) -> GaussianScene:
-    """Bring opacities strictly inside (0, 1) and quaternions to unit length.
-
-    Args:
-        scene: A scene with valid rows.
-
-    Returns:
-        A scene in which rows that were so already are unchanged, bit for bit.
-
-    Example:
-        >>> from cvtgs.synthetic import scene as make
-        >>> scene = make("object", 10, sh_degree=0, seed=0)
-        >>> bool((standardized(scene).quats == scene.quats).all())
-        True
-    """
-    squared_norms = scene.quats.double().square().sum(dim=1)
-    is_unit = ((squared_norms - 1).abs() <= UNIT_TOLERANCE)[:, None]
-    quats = torch.where(is_unit, scene.quats, parameters.normalize_quats(scene.quats))
-    logits = parameters.clamp_logits(scene.logit_opacities)
-    return scene.with_tensors({"quats": quats, "logit_opacities": logits}, scene.extras)
-
-
-UNIT_TOLERANCE = 1e-5
-"""Quaternions whose squared length is this near 1 count as unit quaternions."""
-
-
-MAX_LOG_SCALE = math.log(torch.finfo(torch.float32).max)
-"""The logarithm of the largest scale that files and renderers, which hold float32, can express."""
-
-
-def _finite(values: Tensor) -> Tensor:
-    """Return the rows without NaN or infinity, without an array of booleans per value.
-
-    A finite number times 0 is 0, any other is NaN, and a sum with a NaN is NaN.
-    """
-    flat = values.flatten(start_dim=1)
-    return torch.cat([(part * 0).sum(dim=1) == 0 for part in flat.split(1 << 16)])

@@ -5,13 +5,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.analysis import EffectPlan, analyze, select_columns
 from cvtgs.config import SimplifyConfig
-from cvtgs.effects import EffectPlan, limited
 from cvtgs.errors import InvalidSceneError
-from cvtgs.filters import invalid_rows
 from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
-from cvtgs.stages.outlook import look_at_scene
+from cvtgs.validity import invalid_rows
 
 FAINT = 0.1
 """Opacities below this are counted as faint: the filter of CVT-GS would drop them."""
@@ -92,9 +91,9 @@ def describe(scene: GaussianScene, config: SimplifyConfig | None = None) -> Scen
         raise InvalidSceneError(f"none of the {len(scene)} Gaussians is valid.")
     valid = scene.select(~bad) if invalid else scene
     config = config or SimplifyConfig()
-    outlook = look_at_scene(limited(valid, config.effects), config, with_light=False)
-    frame, opacities = outlook.frame, valid.opacities
-    masses = outlook.areas * opacities
+    analysis = analyze(select_columns(valid, config.effects), config)
+    frame, opacities = analysis.frame, valid.opacities
+    masses = analysis.areas * opacities
     faint = opacities < FAINT
     total = masses.sum()
     return SceneInfo(
@@ -114,7 +113,7 @@ def describe(scene: GaussianScene, config: SimplifyConfig | None = None) -> Scen
         antialiased=scene.antialiased,
         comments=scene.comments,
         extra_columns=tuple(scene.extras),
-        plan=outlook.plan,
+        plan=analysis.plan,
     )
 
 

@@ -4,13 +4,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import pydantic
 import torch
 
+from cvtgs.analysis import EffectPlan
 from cvtgs.config import SimplifyConfig
-from cvtgs.effects import EffectPlan
 from cvtgs.progress import ProgressEvent, ProgressListener
+from cvtgs.scene import GaussianScene
 
 
 class _Record(pydantic.BaseModel):
@@ -68,7 +70,33 @@ class RefineReport(_Record):
     cost: StageCost
 
 
-class SimplifyReport(_Record):
+class CellStatistics(_Record):
+    """What the filter left out, and what the cells of a tessellation are like.
+
+    Attributes:
+        filtered_count: Faint Gaussians and flyaways that were left out of the tessellation.
+        filtered_mass_share: Their share of the mass.
+        single_member_cells: Cells of one Gaussian, or with one of theirs as representative: it is
+            kept as it is.
+        largest_cell: Members of the largest cell.
+        refilled_cells: Cells that were empty after Lloyd and took a Gaussian from another.
+        energies: Energy of the tessellation before every Lloyd iteration, over the Gaussians that
+            Lloyd samples, in squared robust radii.
+        energy: The same of the final cells, over all Gaussians.
+        backend: What searched the nearest site.
+    """
+
+    filtered_count: int = 0
+    filtered_mass_share: float = 0.0
+    single_member_cells: int = 0
+    largest_cell: int = 0
+    refilled_cells: int = 0
+    energies: tuple[float, ...] = ()
+    energy: float = 0.0
+    backend: str = "none"
+
+
+class SimplifyReport(CellStatistics):
     """What a simplification did.
 
     Attributes:
@@ -80,20 +108,11 @@ class SimplifyReport(_Record):
             row with several bad attributes counts once for each.
         invalid_count: Rows that were dropped.
         shortfall: Why ``output_count`` is below ``target_count``, else empty.
-        filtered_count: Faint Gaussians that were left out of the tessellation.
-        filtered_mass_share: Their share of the mass.
         kept_count: Protected Gaussians, which were kept as they are.
         blocks: Blocks of space that were simplified one by one; 1 for the scene in one piece.
         resumed_blocks: Those of them that were done already when this run started.
-        single_member_cells: Cells of one Gaussian, or shown by one of theirs: it is kept as it is.
-        largest_cell: Members of the largest cell.
-        refilled_cells: Cells that were empty after Lloyd and took a Gaussian from another.
         mass_in: Opacity times mean projected area of the input, squared scene units.
         mass_out: The same of the output.
-        energies: Energy of the tessellation before every move of Lloyd, over the Gaussians that
-            Lloyd looked at, in squared robust radii.
-        energy: The same of the final cells, over all Gaussians.
-        backend: What searched the nearest site.
         checkpoint: What corrected the merged Gaussians: a shipped name, a file, or ``none``.
         device: Where it ran.
         plan: The effects that the scene called for.
@@ -109,19 +128,11 @@ class SimplifyReport(_Record):
     invalid_rows: dict[str, int] = {}
     invalid_count: int = 0
     shortfall: str = ""
-    filtered_count: int = 0
-    filtered_mass_share: float = 0.0
     kept_count: int = 0
     blocks: int = 1
     resumed_blocks: int = 0
-    single_member_cells: int = 0
-    largest_cell: int = 0
-    refilled_cells: int = 0
     mass_in: float = 0.0
     mass_out: float = 0.0
-    energies: tuple[float, ...] = ()
-    energy: float = 0.0
-    backend: str = "none"
     checkpoint: str = "none"
     device: str = "cpu"
     plan: EffectPlan | None = None
@@ -141,6 +152,35 @@ class SimplifyReport(_Record):
             JSON text that ends with a line break.
         """
         return self.model_dump_json(indent=2) + "\n"
+
+
+class Simplified(NamedTuple):
+    """A small scene, and how it was made.
+
+    Attributes:
+        scene: The small scene.
+        report: Counts, mass, energies, and the cost of every stage.
+    """
+
+    scene: GaussianScene
+    report: SimplifyReport
+
+
+class Level(NamedTuple):
+    """One size of a scene, of several.
+
+    Attributes:
+        scene: The small scene.
+        report: What was done, and what it cost beyond what finer sizes had cost already.
+        geometric_error: Root mean square distance from Gaussians to the small ones that replace
+            them, weighted by apparent mass; scene units.
+        nested: Whether every cell consists of whole cells of the finest size.
+    """
+
+    scene: GaussianScene
+    report: SimplifyReport
+    geometric_error: float
+    nested: bool
 
 
 class StageClock:

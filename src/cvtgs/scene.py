@@ -1,6 +1,6 @@
 """GaussianScene: the only thing that travels between the stages."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import MappingProxyType
@@ -36,7 +36,7 @@ class GaussianScene:
     """A 3D Gaussian Splatting scene of ``n`` Gaussians, as files and optimisers store it.
 
     Values are not checked, only shapes, dtypes and devices: a scene may hold the NaN rows of the
-    file that it came from. :func:`cvtgs.filters.invalid_rows` tells which rows are not usable.
+    file that it came from. :func:`cvtgs.validity.invalid_rows` tells which rows are not usable.
 
     Attributes:
         means: ``(n, 3)`` centres, scene units.
@@ -205,6 +205,31 @@ class GaussianScene:
             f"GaussianScene({len(self):,} Gaussians, SH degree {self.sh_degree}, "
             f"{str(self.dtype).removeprefix('torch.')}, {self.device})"
         )
+
+
+def concatenate(scenes: Sequence[GaussianScene]) -> GaussianScene:
+    """Return the Gaussians of several scenes as one scene.
+
+    Args:
+        scenes: At least one, of the same SH degree, dtype, device and extra columns; comments and
+            layout are those of the first.
+
+    Returns:
+        All Gaussians, in the order of the scenes.
+
+    Raises:
+        InvalidSceneError: The scenes do not fit together.
+    """
+    first, *others = scenes
+    if not others:
+        return first
+    if any(set(other.extras) != set(first.extras) for other in others):
+        raise InvalidSceneError("scenes to join must have the same extra columns.")
+    tensors = [scene.tensors() for scene in scenes]
+    return first.with_tensors(
+        {name: torch.cat([each[name] for each in tensors]) for name in tensors[0]},
+        {name: torch.cat([scene.extras[name] for scene in scenes]) for name in first.extras},
+    )
 
 
 def _check(scene: GaussianScene) -> None:

@@ -11,7 +11,7 @@ import lpips_cases
 from benchmarks import ablation, scoring
 from benchmarks.grouping import grouped_simplifier, nearest_groups, regroup
 from cvtgs.mergenet import load_checkpoint
-from cvtgs.stages import make_reference
+from cvtgs.train.merged import merge_scene
 
 JUDGE = """
 import json, sys
@@ -88,7 +88,7 @@ def test_coincident_points_are_grouped_too():
 @pytest.mark.parametrize("preset", ablation.PRESETS)
 def test_groups_are_merged_as_the_stages_merge_cells(scene, preset):
     config, net = cvtgs.SimplifyConfig.from_preset(preset), load_checkpoint(preset).net
-    reference = make_reference(scene, 100, config)
+    reference = merge_scene(scene, 100, config)
     small = regroup(reference, reference.partition, config, net=net)
     wanted = cvtgs.Simplifier(preset, device="cpu").simplify(scene, count=100)
     for name, values in wanted.tensors().items():

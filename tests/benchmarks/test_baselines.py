@@ -13,7 +13,7 @@ from benchmarks.baselines import BASELINES, baseline, light_gaussian, pup_3dgs
 from benchmarks.baselines.__main__ import main
 from cvtgs.cameras import Cameras
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.filters import invalid_rows
+from cvtgs.validity import invalid_rows
 from render_cases import one_camera
 from scenes import random_scene
 

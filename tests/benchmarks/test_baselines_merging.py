@@ -11,7 +11,7 @@ import cvtgs
 import oracles
 from baseline_cases import gaussians
 from benchmarks.baselines import baseline, ghap, nano_gs
-from cvtgs.filters import standardized
+from cvtgs.validity import standardized
 from scenes import random_scene
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import cvtgs
+from cvtgs.analysis import analyze
 from cvtgs.budget import find_count
 from cvtgs.budget.bisect import CLOSE, smallest_enough
 from cvtgs.budget.judge import HELDOUT_SEED, Judge
@@ -114,16 +115,13 @@ def test_the_full_scene_is_rendered_once(full, views, simplifier, monkeypatch):
 
 
 def test_the_scene_is_looked_at_once(full, views, simplifier, monkeypatch):
-    from cvtgs.stages import prepared  # noqa: PLC0415 (to be changed here)
-
     looks = []
 
     def counting(scene, *arguments, **choices):
         looks.append(len(scene))
-        return look(scene, *arguments, **choices)
+        return analyze(scene, *arguments, **choices)
 
-    look = prepared.look
-    monkeypatch.setattr(prepared, "look", counting)
+    monkeypatch.setattr("cvtgs.simplifier.analyze", counting)
     found = find_count(full, psnr=22.0, simplifier=simplifier, heldout=views)
     assert looks == [len(full)]
     assert len(found.tried) > 2

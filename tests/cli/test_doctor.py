@@ -71,7 +71,7 @@ def test_a_default_path_that_fails_ends_with_1(capsys, monkeypatch):
     def broken(*words: object, **settings: object) -> None:
         raise RuntimeError("no kernel image is available\nand much more")
 
-    monkeypatch.setattr("cvtgs.simplify.Simplifier.run", broken)
+    monkeypatch.setattr("cvtgs.simplifier.Simplifier.run", broken)
     assert main(["doctor", "--device", "cpu"]) == 1
     captured = capsys.readouterr()
     assert captured.err == (

@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from cvtgs.cvt import embed, falloff, tessellation_weights
+from cvtgs.analysis import perspective_falloff
+from cvtgs.cvt import embed, tessellation_weights
 from cvtgs.math.frames import RobustFrame, robust_frame
 
 FRAME = RobustFrame(center=torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), radius=2.0)
@@ -13,7 +14,7 @@ FRAME = RobustFrame(center=torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), r
 
 def test_falloff_beyond_the_radius_is_the_inverse_square():
     means = torch.tensor([[1.0, 0, 0], [2.9, 0, 0], [1, 4, 0], [1, 0, -20]])
-    assert falloff(means, FRAME).tolist() == pytest.approx([1.0, 1.0, 0.25, 0.01])
+    assert perspective_falloff(means, FRAME).tolist() == pytest.approx([1.0, 1.0, 0.25, 0.01])
 
 
 def test_weights_have_mean_one():
@@ -97,7 +98,7 @@ def test_opacities_and_areas_of_zero_weigh_the_same():
 def test_flyaways_weigh_nothing_from_the_middle():
     means = torch.randn(100, 3, generator=torch.Generator().manual_seed(0))
     means[0] = 1e30
-    factors = falloff(means, robust_frame(means))
+    factors = perspective_falloff(means, robust_frame(means))
     assert 0 <= float(factors[0]) < 1e-50
     assert bool(factors.isfinite().all())
 

@@ -9,8 +9,9 @@ import torch
 import cvtgs
 import hard_cases
 from cvtgs.errors import DroppedDataWarning
-from cvtgs.filters import flyaway_rows, invalid_rows, standardized, visible_rows
+from cvtgs.filters import flyaway_rows, visible_rows
 from cvtgs.math.frames import robust_frame
+from cvtgs.validity import invalid_rows, standardized
 from hard_cases import CASES, each_case
 from hard_scenes import (
     ball,

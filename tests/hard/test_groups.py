@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from cvtgs.analysis import ambient_visibility, perspective_falloff
 from cvtgs.config import SimplifyConfig
 from cvtgs.cvt import (
-    ambient_visibility,
     embed,
-    falloff,
     nearest_neighbors,
     nearest_scipy,
     nearest_torch,
@@ -19,7 +18,7 @@ from cvtgs.cvt import (
     tessellate,
     tessellation_weights,
 )
-from cvtgs.cvt.distinct import distinct_rows, runs_of_equal
+from cvtgs.cvt.coincident import distinct_rows, runs_of_equal
 from cvtgs.math.frames import morton_order, robust_frame
 from hard_cases import CASES, each_case
 from hard_scenes import devices, dtypes, presets, valid_rows
@@ -50,7 +49,7 @@ def test_space_and_weights_are_finite(make, device, dtype):
     if dtype == torch.float32:  # it is the same in float64, and takes longest
         light = ambient_visibility(scene.means, scene.masses, frame)
         assert bool(((light >= 0) & (light <= 1)).all())
-    far = falloff(scene.means, frame)
+    far = perspective_falloff(scene.means, frame)
     assert bool(((far >= 0) & (far <= 1)).all())
     for contraction in (0.0, 0.5, 1.0):
         points = embed(scene.means, scene.sh0, frame=frame, contraction=contraction, color=0.05)
@@ -124,7 +123,7 @@ def test_coincident_sites_are_searched_once(search, monkeypatch):
     sites = torch.tensor([[1.0, 2.0, 3.0]]).repeat(1000, 1)
     sites[700] = 0.0
     seen = []
-    for module, name in (("nearest_scipy", "build_tree"), ("nearest_torch", "_nearest_of_blocks")):
+    for module, name in (("nearest", "build_tree"), ("nearest_torch", "_nearest_of_blocks")):
         home = import_module(f"cvtgs.cvt.{module}")
         honest = getattr(home, name)
 
@@ -140,7 +139,7 @@ def test_coincident_sites_are_searched_once(search, monkeypatch):
 
 
 def test_coincident_sites_are_apart_for_the_tree_of_neighbours(monkeypatch):
-    home, seen = import_module("cvtgs.cvt.neighbors"), []
+    home, seen = import_module("cvtgs.cvt.nearest"), []
     honest = home.build_tree
     monkeypatch.setattr(home, "build_tree", lambda sites: seen.append(sites) or honest(sites))
     far = 3e38 * torch.tensor([[1.0, -1.0, 1.0]])  # their extent is beyond float32

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from cvtgs import GaussianScene
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError
-from cvtgs.filters import invalid_rows
 from cvtgs.rendering import render
+from cvtgs.validity import invalid_rows
 from hard_cases import CASES
 from hard_scenes import coarsen_light, presets, simplifier, valid_rows
 from render_cases import around

@@ -86,7 +86,7 @@ def test_the_total_is_exact_and_the_output_is_an_ordinary_scene(source, tmp_path
     small = cvtgs.load(tmp_path / "out.ply")
     assert len(small) == report.output_count == cvtgs.target_count(6000, rho)
     assert small.comments == cvtgs.load(source).comments
-    assert not cvtgs.filters.invalid_rows(small)
+    assert not cvtgs.validity.invalid_rows(small)
     assert [path.name for path in tmp_path.iterdir()] == ["out.ply"]
 
 
@@ -151,7 +151,7 @@ def test_invalid_rows_and_flyaways_do_not_disturb(tmp_path):
     with pytest.warns(UserWarning, match="dropped 1 of 2000"):
         report = simplify_file(tmp_path / "in.ply", tmp_path / "out.ply", 0.1, blocks=4)
     assert (report.output_count, report.invalid_count) == (200, 1)
-    assert not cvtgs.filters.invalid_rows(cvtgs.load(tmp_path / "out.ply"))
+    assert not cvtgs.validity.invalid_rows(cvtgs.load(tmp_path / "out.ply"))
 
 
 @pytest.mark.parametrize("count", [1, 3])

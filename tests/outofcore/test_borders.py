@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import cvtgs
-from cvtgs import Simplifier, cells, cvt, filters
-from cvtgs.cvt.neighbors import nearest_several
+from cvtgs import Simplifier, cells, cvt, validity
+from cvtgs.cvt import nearest_several
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.io.ply import open_rows
 from cvtgs.io.tensors import map_tensors
@@ -16,8 +16,8 @@ from cvtgs.outofcore import simplify_file
 from cvtgs.outofcore.borders import Across, Reach, bounds_of, halo, nearest_anywhere
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.merging import read_cells
-from cvtgs.stages import join_scenes
-from cvtgs.stages.merging import shape_cells
+from cvtgs.pipeline import shape_merged
+from cvtgs.scene import concatenate
 from cvtgs.views import automatic_views
 from scenes import same_bits
 
@@ -217,16 +217,15 @@ def test_axes_and_width_are_those_of_one_piece(job):
         torch.repeat_interleave(torch.arange(TARGET), sizes), TARGET
     )
     neighbors = cvt.nearest_neighbors(merged.means, 8, backend="scipy")
-    wanted = shape_cells(merged, partition, neighbors, job.config.merge)
+    wanted = shape_merged(merged, partition, neighbors, job.config.merge)
     assert bool((wide.log_scales != merged.log_scales).any())
     assert same_bits(wide, wanted)
 
 
 def test_the_network_corrects_as_in_one_piece(job):
     members = [read_cells(job, block) for block in job.busy()]
-    scene, light = members[0].scene, torch.cat([one.light for one in members])
-    for one in members[1:]:
-        scene = join_scenes(scene, one.scene)
+    light = torch.cat([one.light for one in members])
+    scene = concatenate([one.scene for one in members])
     counts = torch.cat([one.partition.counts for one in members])
     firsts = torch.tensor([0, *[len(one.scene) for one in members]]).cumsum(0)
     pairs = list(zip(members, firsts[:-1], strict=True))
@@ -245,7 +244,7 @@ def test_the_network_corrects_as_in_one_piece(job):
     assert int((lone >= 0).sum()) > 0
     wide = scene_of_all(job, job.wide_path)
     neighbors = cvt.nearest_neighbors(wide.means, 8, backend="scipy")
-    wanted = filters.standardized(
+    wanted = validity.standardized(
         correct_cells(job.network.net, scene, wide, shown, neighbors=neighbors, visibility=light)
     )
     small = [cvtgs.load(job.small_path(block)) for block in job.busy()]

@@ -49,7 +49,7 @@ def test_invalid_rows_stay_and_do_no_harm():
     assert report.gain > 0
     rows = torch.arange(3)
     assert same_bits(scene.select(rows), small.select(rows))
-    assert cvtgs.filters.invalid_rows(scene.select(torch.arange(3, 500))) == {}
+    assert cvtgs.validity.invalid_rows(scene.select(torch.arange(3, 500))) == {}
 
 
 def test_invalid_rows_of_the_full_scene_are_left_out():
@@ -75,7 +75,7 @@ def test_gradients_that_are_not_finite_are_survived(monkeypatch):
     monkeypatch.setattr(descent, "relative_loss", sometimes_nan)
     scene, report = refine(discolored(full), full, steps=40, config=quick())
     assert report.gain > 0.5
-    assert cvtgs.filters.invalid_rows(scene) == {}
+    assert cvtgs.validity.invalid_rows(scene) == {}
 
 
 def test_rho_1_is_perfect_already():

@@ -7,9 +7,9 @@ import torch
 
 import cvtgs
 from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.analysis import analyze
 from cvtgs.cli.main import main
 from cvtgs.errors import CheckpointError, ConfigError, InvalidArgumentError
-from cvtgs.filters import standardized
 from cvtgs.mergenet import (
     Architecture,
     CheckpointInfo,
@@ -18,8 +18,10 @@ from cvtgs.mergenet import (
     load_checkpoint,
     save_checkpoint,
 )
+from cvtgs.pipeline import reduce_scene
 from cvtgs.report import StageClock
-from cvtgs.stages import PreparedScene, make_reference
+from cvtgs.train.merged import merge_scene
+from cvtgs.validity import standardized
 from mergenet_cases import lively_net
 from scenes import random_scene, same_bits
 
@@ -67,7 +69,7 @@ def test_none_merges_by_moments_alone(preset, how):
     assert simplifier.checkpoint is None
     assert report.checkpoint == "none"
     assert [stage.stage for stage in report.stages][-1] == "merge"
-    reference = make_reference(scene, 30, SimplifyConfig.from_preset(preset))
+    reference = merge_scene(scene, 30, SimplifyConfig.from_preset(preset))
     assert same_bits(small, reference.merged)
 
 
@@ -134,26 +136,27 @@ def test_the_reference_is_what_the_network_is_given(lively):
     """Correcting the reference by hand gives what the stages give."""
     scene, config = random_scene(300), SimplifyConfig()
     net = load_checkpoint(lively).net
-    reference = make_reference(scene, 30, config)
+    reference = merge_scene(scene, 30, config)
     clock = StageClock(lambda event: None, torch.device("cpu"))
-    small, _ = PreparedScene(scene, config, net=net).run(30, clock=clock)
+    analysis = analyze(scene, config, with_visibility=True)
+    small = reduce_scene(scene, analysis, 30, config, net=net, clock=clock).scene
     by_hand = correct_cells(
         net,
         reference.scene,
         reference.merged,
         reference.partition,
         neighbors=reference.neighbors,
-        visibility=reference.light,
+        visibility=reference.visibility,
     )
     assert reference.neighbors.shape == (30, 8)
-    assert reference.light.shape == (300,)
+    assert reference.visibility.shape == (300,)
     assert same_bits(standardized(by_hand), small)
 
 
 @pytest.mark.parametrize("target", [10, 11])
 def test_a_reference_needs_fewer_cells_than_gaussians(target):
     with pytest.raises(InvalidArgumentError) as caught:
-        make_reference(random_scene(10), target, SimplifyConfig())
+        merge_scene(random_scene(10), target, SimplifyConfig())
     assert str(caught.value) == f"target must be below the 10 valid Gaussians, found {target}."
 
 

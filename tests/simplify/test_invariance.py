@@ -18,7 +18,6 @@ import sys
 import pytest
 import torch
 
-import cvtgs
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from scenes import assert_same_gaussians, moved, random_scene, same_bits
 
@@ -37,7 +36,7 @@ def ckpt(request, monkeypatch) -> str | None:
     """No network, or the shipped one in a scene where everything is seen freely."""
     if request.param is not None:
         even = lambda means, masses, frame: torch.ones(len(means), dtype=torch.float64)  # noqa: E731
-        monkeypatch.setattr(cvtgs.cvt, "ambient_visibility", even)
+        monkeypatch.setattr("cvtgs.analysis.analyze.ambient_visibility", even)
     return request.param
 
 

@@ -4,8 +4,8 @@ import torch
 
 from cvtgs.config import SimplifyConfig
 from cvtgs.mergenet import correct_cells
-from cvtgs.stages import make_reference
 from cvtgs.train.cases import refer_case
+from cvtgs.train.merged import merge_scene
 from mergenet_cases import fields_of, lively_net
 from scenes import random_scene, same_bits
 from train_cases import bits, bits_of_case, small_net, small_scene, some_case
@@ -14,7 +14,7 @@ from train_cases import bits, bits_of_case, small_net, small_scene, some_case
 def test_a_case_is_the_reference_and_its_cells_of_several():
     scene, config = random_scene(200), SimplifyConfig()
     case = refer_case("box", scene, 0.31, config)
-    reference = make_reference(scene, 62, config)
+    reference = merge_scene(scene, 62, config)
     counts = reference.partition.counts
     assert case.name == "box at 0.31"
     assert len(case.reference.merged) == 62
@@ -61,7 +61,7 @@ def test_corrected_is_what_the_simplifier_does():
         reference.merged,
         reference.partition,
         neighbors=reference.neighbors,
-        visibility=reference.light,
+        visibility=reference.visibility,
     )
     for name, values in wanted.tensors().items():
         torch.testing.assert_close(getattr(corrected, name), values, rtol=1e-5, atol=1e-5)
@@ -111,7 +111,7 @@ def test_moving_takes_everything_along():
     moved = some_case().to(torch.device("meta"))
     reference, seen = moved.reference, moved.descriptors
     tensors = [moved.cells, moved.part.order, moved.part.offsets, reference.neighbors]
-    tensors += [reference.light, reference.partition.order, reference.partition.offsets]
+    tensors += [reference.visibility, reference.partition.order, reference.partition.offsets]
     tensors += [*reference.scene.tensors().values(), *reference.merged.tensors().values()]
     tensors += [getattr(seen, name) for name in type(seen).__slots__]
     assert {tensor.device.type for tensor in tensors} == {"meta"}

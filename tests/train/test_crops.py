@@ -9,9 +9,9 @@ from torch import Tensor
 
 from cvtgs import GaussianScene
 from cvtgs.rendering import render
-from cvtgs.stages import Reference
 from cvtgs.train.cases import Case, make_case
 from cvtgs.train.crops import TILE, Crops, crop_cells
+from cvtgs.train.merged import MergedScene
 from mergenet_cases import Case as Cells
 from mergenet_cases import case_of, fields_of, lively_net
 from scenes import covariances_of, random_scene
@@ -22,7 +22,7 @@ SIDE = 4
 
 def as_case(cells: Cells) -> Case:
     light = cells.visibility.to(cells.scene.dtype)
-    reference = Reference(cells.scene, cells.merged, cells.part, cells.neighbors, light)
+    reference = MergedScene(cells.scene, cells.merged, cells.part, cells.neighbors, light)
     several = cells.part.counts > 1
     rows = several.nonzero()[:, 0]
     return make_case("made", 0.1, reference, rows, cells.part.select(several))

@@ -7,9 +7,9 @@ import torch
 
 import cvtgs
 from cvtgs.errors import ConfigError, FileFormatError
-from cvtgs.filters import invalid_rows
 from cvtgs.train import DataConfig, find_sources
 from cvtgs.train.scenes import VALIDATION_SEED, cut_block, perturb
+from cvtgs.validity import invalid_rows
 from scenes import covariances_of, random_scene, same_bits
 from train_cases import small_scene, tiny_data, write_scenes
 

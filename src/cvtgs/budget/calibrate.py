@@ -9,10 +9,11 @@ import torch
 from cvtgs.budget.cost_model import CostModel, Measurement
 from cvtgs.budget.work import Work
 from cvtgs.config import PRESETS, RefineConfig, Section, SimplifyConfig
+from cvtgs.counts import target_count
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import StageCost
 from cvtgs.scene import GaussianScene
-from cvtgs.simplify import Simplifier, target_count
+from cvtgs.simplifier import Simplifier
 from cvtgs.synthetic import scene as make
 
 STAGE = "calibrate"

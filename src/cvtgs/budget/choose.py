@@ -8,9 +8,9 @@ from cvtgs.budget.cost_model import CostModel
 from cvtgs.budget.remember import cost_model
 from cvtgs.budget.work import Work
 from cvtgs.config import SimplifyConfig
+from cvtgs.counts import target_count
 from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.scene import GaussianScene
-from cvtgs.simplify import target_count
 
 MARGIN = 1.3
 """Predictions are right to 30 %: a preset fits if this many times its prediction does."""

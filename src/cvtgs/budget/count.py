@@ -12,9 +12,9 @@ from cvtgs.budget.judge import Judge, Quality
 from cvtgs.cameras import Cameras
 from cvtgs.errors import GoalError
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.report import SimplifyReport
+from cvtgs.report import Simplified, SimplifyReport
 from cvtgs.scene import GaussianScene
-from cvtgs.simplify import Simplified, Simplifier
+from cvtgs.simplifier import Simplifier
 
 STAGE = "search"
 

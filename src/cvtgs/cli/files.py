@@ -9,7 +9,7 @@ from cvtgs.cli.display import file_size
 from cvtgs.cli.options import AddParser, add_options, read_scene, read_settings
 
 if TYPE_CHECKING:
-    from cvtgs.effects import Effect
+    from cvtgs.analysis import Effect
     from cvtgs.info import SceneInfo
 
 
@@ -63,7 +63,7 @@ def _rows(facts: "SceneInfo", path: Path) -> list[tuple[str, str]]:
 
 
 def _effect_text(effect: "Effect") -> str:
-    from cvtgs.effects import BandsEffect
+    from cvtgs.analysis import BandsEffect
 
     state, figures = "on " if effect.active else "off", f"{effect.figure:.3g}"
     if isinstance(effect, BandsEffect) and effect.bands:

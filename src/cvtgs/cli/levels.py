@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation
     from cvtgs.levels import LevelsIndex
     from cvtgs.progress import ProgressListener
+    from cvtgs.report import Level
     from cvtgs.scene import GaussianScene
-    from cvtgs.simplify import Level
 
 
 def add_levels(add_parser: AddParser) -> None:
@@ -93,7 +93,7 @@ def _score(
     from cvtgs.devices import chosen_device
 
     device = chosen_device(options.device)
-    full = scene.select(cvtgs.filters.valid_rows(scene)).to(device)
+    full = scene.select(cvtgs.validity.valid_rows(scene)).to(device)
     return cvtgs.evaluate(
         full,
         {name: level.scene.to(device) for name, level in zip(names, levels, strict=True)},

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from cvtgs.config import SimplifyConfig
     from cvtgs.report import SimplifyReport
     from cvtgs.scene import GaussianScene
-    from cvtgs.simplify import Simplifier
+    from cvtgs.simplifier import Simplifier
 
 STARTED = time.perf_counter()
 """When this process started, about: a time budget counts from here."""

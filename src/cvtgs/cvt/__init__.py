@@ -1,35 +1,45 @@
-"""Weighted centroidal Voronoi tessellation: weights, embedding, seeds, Lloyd, search."""
+"""Weighted centroidal Voronoi tessellation of Gaussians as points: embedding, weights, cells."""
 
-from cvtgs.cvt.density import falloff, tessellation_weights
-from cvtgs.cvt.embedding import embed
-from cvtgs.cvt.lloyd import LloydResult, lloyd, weighted_centroids
-from cvtgs.cvt.nearest import nearest_backend
-from cvtgs.cvt.nearest_scipy import nearest_scipy
+from cvtgs.cvt.coincident import NearestSite
+from cvtgs.cvt.embedding import embed, gaussian_weights, tessellation_weights
+from cvtgs.cvt.nearest import nearest_backend, nearest_neighbors, nearest_scipy, nearest_several
 from cvtgs.cvt.nearest_torch import nearest_torch
-from cvtgs.cvt.neighbors import nearest_neighbors
-from cvtgs.cvt.openness import add_depths, ambient_visibility, depth_sums, light_at, light_of
 from cvtgs.cvt.seeding import stratified_seeds, weighted_seeds
-from cvtgs.cvt.tessellate import Tessellation, fill_empty_cells, tessellate
+from cvtgs.cvt.tessellate import (
+    LloydResult,
+    Tessellation,
+    centroids,
+    choose_search,
+    choose_seeds,
+    fill_empty_cells,
+    lloyd,
+    sample_points,
+    tessellate,
+    weighted_centroids,
+    weighted_sums,
+)
 
 __all__ = [
     "LloydResult",
+    "NearestSite",
     "Tessellation",
-    "add_depths",
-    "ambient_visibility",
-    "depth_sums",
+    "centroids",
+    "choose_search",
+    "choose_seeds",
     "embed",
-    "falloff",
     "fill_empty_cells",
-    "light_at",
-    "light_of",
+    "gaussian_weights",
     "lloyd",
     "nearest_backend",
     "nearest_neighbors",
     "nearest_scipy",
+    "nearest_several",
     "nearest_torch",
+    "sample_points",
     "stratified_seeds",
     "tessellate",
     "tessellation_weights",
     "weighted_centroids",
     "weighted_seeds",
+    "weighted_sums",
 ]

@@ -1,10 +1,20 @@
-"""The space in which Gaussians are near or far: position, and a little colour."""
+"""Points of the tessellation: the space in which Gaussians lie, and what each of them weighs."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import SH_C0
+
+CHUNK = 1 << 16
+"""Gaussians that are embedded together, to bound memory."""
+
+FARTHEST = 1e30
+"""In robust radii: flyaways beyond are placed here, so that no float32 overflows."""
+
+COLOR_HEADROOM = 0.5
+"""Colours brighter than 1 plus this are treated as equally bright."""
 
 
 def embed(
@@ -15,7 +25,7 @@ def embed(
     contraction: float = 0.0,
     color: float = 0.0,
 ) -> Float[Tensor, "n d"]:
-    """Place Gaussians in the space of the tessellation.
+    """Embed Gaussians in the space of the tessellation: position, and a little colour.
 
     Args:
         means: Positions, scene units.
@@ -38,19 +48,69 @@ def embed(
     for start in range(0, len(means), CHUNK):
         part = slice(start, start + CHUNK)
         local = means[part]
-        place = frame.contract(local, contraction) if contraction else frame.normalize(local)
-        points[part, :3] = place.clamp_(-FARTHEST, FARTHEST)
+        position = frame.contract(local, contraction) if contraction else frame.normalize(local)
+        points[part, :3] = position.clamp_(-FARTHEST, FARTHEST)
         if sh0 is not None and colored:
             rgb = (SH_C0 * sh0[part, 0].double()).clamp(-0.5, 0.5 + COLOR_HEADROOM)
             points[part, 3:] = color * rgb
     return points
 
 
-CHUNK = 1 << 16
-"""Gaussians that are placed together, to bound memory."""
+def gaussian_weights(
+    opacities: Float[Tensor, "n"], areas: Float[Tensor, "n"], area_power: float
+) -> Float[Tensor, "n"]:
+    """Return opacity times area to a power: 0 is the opacity as in CVT-GS, 1 the mass.
 
-FARTHEST = 1e30
-"""In robust radii: flyaways beyond are placed here, so that no float32 overflows."""
+    The mass says how much of an image a Gaussian paints. A power below 1 gives small Gaussians,
+    which carry fine texture, more cells at the cost of large, smooth surfaces.
 
-COLOR_HEADROOM = 0.5
-"""Colours brighter than 1 plus this are treated as equally bright."""
+    Args:
+        opacities: Opacities.
+        areas: Mean projected areas, any unit.
+        area_power: The power, at least 0.
+
+    Returns:
+        Weights in float64.
+
+    Example:
+        >>> gaussian_weights(torch.tensor([0.5]), torch.tensor([4.0]), 0.5).tolist()
+        [1.0]
+    """
+    weights = opacities.double()
+    return weights * areas**area_power if area_power else weights
+
+
+def tessellation_weights(
+    opacities: Float[Tensor, "n"],
+    areas: Float[Tensor, "n"],
+    *,
+    area_power: float,
+    floor: float,
+) -> Float[Tensor, "n"]:
+    """Return the weight of every Gaussian.
+
+    The weights of :func:`gaussian_weights` with mean 1, none below a floor.
+
+    Args:
+        opacities: Opacities.
+        areas: Mean projected areas, any unit, possibly as they look from the middle.
+        area_power: The weight is the opacity times the area to this power; 0 as in CVT-GS.
+        floor: No weight is below this share of the mean weight.
+
+    Returns:
+        Weights in float64 with mean 1 (before the floor); all 1 if all would be 0.
+
+    Example:
+        >>> tessellation_weights(
+        ...     torch.tensor([0.5, 0.5]), torch.tensor([1.0, 3.0]).double(),
+        ...     area_power=1.0, floor=0.0,
+        ... ).tolist()
+        [0.5, 1.5]
+    """
+    largest_area = areas.amax().clamp_min(torch.finfo(torch.float64).tiny)
+    raw = gaussian_weights(opacities, areas / largest_area, area_power)
+    largest = raw.amax()
+    if not bool(largest > 0):
+        return torch.ones_like(raw)
+    scaled = raw / largest
+    return (scaled / scaled.mean()).clamp_min(floor)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cvt.distinct import distinct_rows
+from cvtgs.cvt.coincident import distinct_rows
 from cvtgs.math.frames import morton_order
 
 POINT_BLOCK = 32

@@ -1,4 +1,4 @@
-"""The whole tessellation: seeds, Lloyd, labels, and no empty cell."""
+"""Weighted centroidal Voronoi tessellation: seeds, Lloyd's algorithm, labels, no empty cell."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,12 +8,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.config import TessellationConfig
-from cvtgs.cvt.lloyd import lloyd
-from cvtgs.cvt.nearest import NearestSite, nearest_backend
-from cvtgs.cvt.places import once_per_place
+from cvtgs.cvt.coincident import NearestSite, search_once_per_position
+from cvtgs.cvt.nearest import nearest_backend
 from cvtgs.cvt.seeding import stratified_seeds, weighted_seeds
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.math.segments import segment_argmax, sort_by_label
+from cvtgs.math.segments import segment_argmax, segment_sum, sort_by_label
 
 MIN_SAMPLES = 1 << 15
 """Lloyd never looks at fewer points than this to save time; so few cost next to nothing."""
@@ -79,9 +78,9 @@ def tessellate(
         raise InvalidArgumentError(
             f"count must be between 1 and the number of points, {len(points)}; found {count}."
         )
-    backend, nearest = search_of(config, points.device, has_duplicates=has_duplicates)
-    seeds = first_seeds(weights, count, config=config, seed=seed)
-    sample, sample_weights = sampled(points, weights, config.samples_per_site * count)
+    backend, nearest = choose_search(config, points.device, has_duplicates=has_duplicates)
+    seeds = choose_seeds(weights, count, config=config, seed=seed)
+    sample, sample_weights = sample_points(points, weights, config.samples_per_site * count)
     settled = lloyd(
         sample,
         sample_weights,
@@ -104,15 +103,15 @@ def tessellate(
     )
 
 
-def search_of(
+def choose_search(
     config: TessellationConfig, device: torch.device, *, has_duplicates: bool
 ) -> tuple[str, NearestSite]:
     """Choose what searches the nearest site."""
     backend, nearest = nearest_backend(config.backend, device)
-    return backend, once_per_place(nearest) if has_duplicates else nearest
+    return backend, search_once_per_position(nearest) if has_duplicates else nearest
 
 
-def first_seeds(
+def choose_seeds(
     weights: Float[Tensor, "n"], count: int, *, config: TessellationConfig, seed: int
 ) -> Int[Tensor, "m"]:
     """Choose the points at which sites start."""
@@ -121,7 +120,7 @@ def first_seeds(
     return stratified_seeds(weights, count)[0]
 
 
-def sampled(
+def sample_points(
     points: Float[Tensor, "n d"], weights: Float[Tensor, "n"], size: int
 ) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k"]]:
     """Take fewer points, which stand for all by weight, if that saves at least half of them."""
@@ -138,7 +137,7 @@ def fill_empty_cells(
     squared: Float[Tensor, "n"],
     count: int,
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"], int]:
-    """Return every empty cell one point: those that cost most where they are.
+    """Move one point into every empty cell: those that cost most where they are.
 
     Each cell keeps its cheapest point, so no cell becomes empty, and a point in a cell of its
     own costs nothing, so the energy never rises.
@@ -175,3 +174,113 @@ def fill_empty_cells(
     labels, squared = labels.clone(), squared.clone()
     labels[moved], squared[moved] = empty, 0.0
     return labels, squared, len(empty)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LloydResult:
+    """Where the sites ended.
+
+    Attributes:
+        sites: ``(m, d)`` sites.
+        energies: ``sum w |x - site|^2`` before each move, in the order of iterations.
+    """
+
+    sites: Float[Tensor, "m d"]
+    energies: tuple[float, ...]
+
+
+def lloyd(
+    points: Float[Tensor, "n d"],
+    weights: Float[Tensor, "n"],
+    sites: Float[Tensor, "m d"],
+    *,
+    nearest: NearestSite,
+    iterations: int,
+    tolerance: float,
+    on_iteration: Callable[[int], None] = lambda done: None,
+) -> LloydResult:
+    """Move sites to the weighted centroids of their Voronoi cells (Lloyd 1982).
+
+    A site without points stays where it is, so the energy never rises.
+
+    Args:
+        points: Positions.
+        weights: Weights, at least 0.
+        sites: Where to start.
+        nearest: Search of the nearest site.
+        iterations: Moves at most.
+        tolerance: Stops when the energy fell by less than this share since the last move.
+        on_iteration: Told how many moves are done.
+
+    Returns:
+        The moved sites and the energies.
+
+    Example:
+        >>> from cvtgs.cvt import nearest_torch
+        >>> points = torch.tensor([[0.0], [1.0], [8.0]])
+        >>> lloyd(
+        ...     points, torch.ones(3), points[[0, 2]], nearest=nearest_torch,
+        ...     iterations=2, tolerance=0.0,
+        ... ).sites.tolist()
+        [[0.5], [8.0]]
+    """
+    energies: list[float] = []
+    sites = sites.double()
+    for done in range(iterations):
+        labels, squared = nearest(points, sites)
+        energies.append(float((weights * squared).sum()))
+        if done > 0 and energies[-2] - energies[-1] <= tolerance * energies[-2]:
+            break
+        sites = weighted_centroids(points, weights, labels, sites)
+        on_iteration(done + 1)
+    return LloydResult(sites=sites, energies=tuple(energies))
+
+
+def weighted_centroids(
+    points: Float[Tensor, "n d"],
+    weights: Float[Tensor, "n"],
+    labels: Int[Tensor, "n"],
+    fallback: Float[Tensor, "m d"],
+) -> Float[Tensor, "m d"]:
+    """Average the points of every label.
+
+    Args:
+        points: Positions.
+        weights: Weights, at least 0.
+        labels: Label of every point, 0 to m - 1.
+        fallback: Result for labels without points or without weight.
+
+    Returns:
+        Weighted means in float64.
+
+    Example:
+        >>> weighted_centroids(
+        ...     torch.tensor([[0.0], [1.0]]), torch.tensor([1.0, 3.0]), torch.tensor([0, 0]),
+        ...     torch.tensor([[7.0], [7.0]]),
+        ... ).tolist()
+        [[0.75], [7.0]]
+    """
+    totals, sums = weighted_sums(points, weights, labels, len(fallback))
+    return centroids(totals, sums, fallback)
+
+
+def weighted_sums(
+    points: Float[Tensor, "n d"],
+    weights: Float[Tensor, "n"],
+    labels: Int[Tensor, "n"],
+    count: int,
+) -> tuple[Float[Tensor, "m"], Float[Tensor, "m d"]]:
+    """Add up the points of every label."""
+    order, offsets = sort_by_label(labels, count)
+    weights = weights[order].double()
+    axes = [segment_sum(column[order].double() * weights, offsets) for column in points.unbind(1)]
+    return segment_sum(weights, offsets), torch.stack(axes, dim=1)
+
+
+def centroids(
+    totals: Float[Tensor, "m"], sums: Float[Tensor, "m d"], fallback: Float[Tensor, "m d"]
+) -> Float[Tensor, "m d"]:
+    """Divide sums of points by their weight."""
+    filled = totals > 0
+    means = sums / totals.where(filled, 1.0)[:, None]
+    return torch.where(filled[:, None], means, fallback)

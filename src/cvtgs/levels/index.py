@@ -6,8 +6,8 @@ import pydantic
 import torch
 
 from cvtgs.evaluation import SceneScores
+from cvtgs.report import Level
 from cvtgs.scene import GaussianScene
-from cvtgs.simplify import Level
 
 Corner = tuple[float, float, float]
 

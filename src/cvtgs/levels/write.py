@@ -7,7 +7,7 @@ from pathlib import Path
 from cvtgs.evaluation import Evaluation
 from cvtgs.io import atomic_output, check_output, check_save, save
 from cvtgs.levels.index import LevelEntry, LevelsIndex
-from cvtgs.simplify import Level
+from cvtgs.report import Level
 
 INDEX_NAME = "levels.json"
 """Name of the index beside the levels."""

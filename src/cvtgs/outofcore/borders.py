@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cvt.nearest import NearestSite
-from cvtgs.cvt.neighbors import nearest_several
+from cvtgs.cvt import NearestSite, nearest_several
 
 RUN = 1 << 9
 """Points that are compared with a block together, before each of them is."""

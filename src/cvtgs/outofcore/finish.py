@@ -17,8 +17,8 @@ from cvtgs.io.tensors import map_tensors
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.survey import Survey
 from cvtgs.report import SimplifyReport, StageClock
-from cvtgs.simplify import Simplifier
-from cvtgs.stages import join_scenes
+from cvtgs.scene import concatenate
+from cvtgs.simplifier import Simplifier
 
 
 def join_blocks(
@@ -33,10 +33,7 @@ def join_blocks(
         return
     scenes = [load(path) for path in smalls]
     scenes[:0] = [job.source.scene(rows) for rows in _kept(job)]
-    joined = scenes[0]
-    for scene in scenes[1:]:
-        joined = join_scenes(joined, scene)
-    save(joined, output, overwrite=overwrite)
+    save(concatenate(scenes), output, overwrite=overwrite)
 
 
 def _energy_of_light(job: Job, busy: Sequence[int]) -> float:

@@ -11,9 +11,9 @@ from typing import Any, Self
 import torch
 
 import cvtgs
+from cvtgs.analysis import EffectPlan
 from cvtgs.boxes import Box
 from cvtgs.config import SimplifyConfig
-from cvtgs.effects import EffectPlan
 from cvtgs.errors import FileFormatError, InputNotFoundError
 from cvtgs.io import atomic_output
 from cvtgs.io.ply import PlyRows

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from cvtgs import cells, cvt, filters
+from cvtgs import cells, cvt, validity
+from cvtgs.analysis import drop_unused_bands, restore_columns, select_columns
 from cvtgs.devices import one_thread
-from cvtgs.effects import limited, restored, trimmed
 from cvtgs.io import atomic_output, save
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.mergenet import correct_cells
@@ -19,8 +19,8 @@ from cvtgs.outofcore.borders import bounds_of, halo
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.rows import read_members
 from cvtgs.outofcore.sites import neighbors_of
+from cvtgs.pipeline import merge_members, neighbor_count, shape_merged
 from cvtgs.scene import GaussianScene
-from cvtgs.stages.merging import merge_members, neighbors_asked, shape_cells
 
 EXTRA = "extra/"
 """Columns beyond the standard ones are stored under this."""
@@ -80,7 +80,7 @@ def widen(job: Job, block: int) -> None:
     if path.exists():
         return
     own, _ = map_tensors(job.merged_path(block))
-    near = neighbors_asked(job.config.merge, with_network=job.has_network)
+    near = neighbor_count(job.config.merge, with_network=job.has_network)
     backend, _ = cvt.nearest_backend(job.config.cvt.backend, own["means"].device)
     others = neighbors_of(job, block, job.merged_path, name="means")
     strangers = halo(own["means"], others, count=near, backend=backend)
@@ -89,7 +89,7 @@ def widen(job: Job, block: int) -> None:
     # It is asked how many members there are, not which.
     offsets = torch.nn.functional.pad(own["sizes"].cumsum(0), (1, 0))
     shown = cells.Partition(order=own["sizes"][:0], offsets=offsets)
-    wide = shape_cells(around.scene, shown, neighbors, job.config.merge)
+    wide = shape_merged(around.scene, shown, neighbors, job.config.merge)
     shapes = {"quats": wide.quats, "log_scales": wide.log_scales}
     tensors = own | {name: values[: around.own] for name, values in shapes.items()}
     save_tensors(path, tensors | {"neighbors": neighbors, "strangers": strangers}, {})
@@ -118,7 +118,7 @@ def finish(job: Job, block: int) -> None:
         )
     tensors = {name: values[: around.own] for name, values in small.tensors().items()}
     small = scene.with_tensors(tensors, under_prefix(EXTRA, own))
-    small = restored(filters.standardized(small), original, survey.plan)
+    small = restore_columns(validity.standardized(small), original, survey.plan)
     labels, _ = map_tensors(job.labels_path(block))
     facts = {
         "single_member_cells": int((shown.counts == 1).sum()),
@@ -144,9 +144,9 @@ def read_cells(job: Job, block: int) -> Block:
     """Read the Gaussians in the cells of a block."""
     survey, targets = job.read_survey()
     rows, labels = read_members(job, block)
-    original = limited(rows.scene, job.config.effects)
+    original = select_columns(rows.scene, job.config.effects)
     partition = cells.Partition.from_labels(labels, targets[block])
-    return Block(original, trimmed(original, survey.plan), rows.light, partition)
+    return Block(original, drop_unused_bands(original, survey.plan), rows.light, partition)
 
 
 def _around(job: Job, block: int, strangers: Tensor, path: Callable[[int], Path]) -> Around:

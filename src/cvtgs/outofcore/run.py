@@ -7,7 +7,7 @@ from functools import partial
 
 import torch
 
-from cvtgs.boxes import Box
+from cvtgs.boxes import Box, check_room
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, target_count
 from cvtgs.devices import one_thread
@@ -24,8 +24,7 @@ from cvtgs.outofcore.turns import Workers, do_all, group_blocks, this_process, t
 from cvtgs.outofcore.work import look, simplify_whole, sort_into_blocks
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport, StageClock
-from cvtgs.simplify import Simplifier
-from cvtgs.stages import check_room
+from cvtgs.simplifier import Simplifier
 
 RANGE_ROWS = 1 << 26
 """Rows of the file that one process looks at in one go."""

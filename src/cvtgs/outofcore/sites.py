@@ -8,17 +8,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cvtgs.cvt.lloyd import centroids, weighted_sums
-from cvtgs.cvt.tessellate import fill_empty_cells, first_seeds, sampled, search_of
+from cvtgs.analysis import SceneAnalysis
+from cvtgs.cvt import (
+    centroids,
+    choose_search,
+    choose_seeds,
+    fill_empty_cells,
+    gaussian_weights,
+    sample_points,
+    weighted_sums,
+)
 from cvtgs.devices import one_thread
 from cvtgs.io import atomic_output
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.outofcore.borders import Across, Nearest, bounds_of, nearest_anywhere
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.rows import CELL, cut_pieces, read_rows, record_type
-from cvtgs.outofcore.survey import raw_weights
-from cvtgs.stages.outlook import Outlook
-from cvtgs.stages.placing import places_of, rows_along_curve
+from cvtgs.pipeline import curve_order, embed_rows
 
 
 @one_thread()
@@ -34,8 +40,8 @@ def place(job: Job, block: int) -> None:
     if target == 0:
         save_tensors(job.sample_path(block), {"order": order}, {})
         return
-    seeds = first_seeds(weights, target, config=choices, seed=job.config.seed)
-    sample, shares = sampled(points, weights, choices.samples_per_site * target)
+    seeds = choose_seeds(weights, target, config=choices, seed=job.config.seed)
+    sample, shares = sample_points(points, weights, choices.samples_per_site * target)
     save_tensors(job.sample_path(block), {"order": order, "points": sample, "weights": shares}, {})
     _save_sites(job, 0, block, points[seeds].double())
 
@@ -106,19 +112,23 @@ def _points(job: Job, block: int, order: Tensor | None = None) -> tuple[Tensor, 
     """Return the Gaussians of a block along a curve: rows, places in the tessellation, weights."""
     survey, targets = job.read_survey()
     scene, seen, light = read_rows(job, block, is_slim=True)
-    outlook = Outlook(survey.frame, seen, seen, light, survey.plan)
+    known = SceneAnalysis(
+        frame=survey.frame, areas=seen, apparent_areas=seen, visibility=light, plan=survey.plan
+    )
     if order is None:
-        order = rows_along_curve(scene, torch.arange(len(scene)), outlook).int()
+        everything = torch.arange(len(scene))
+        masses = seen * scene.opacities
+        order = curve_order(scene, everything, survey.frame, masses=masses).int()
     rows = order.long()
-    points = places_of(scene, rows, outlook, sum(targets), job.config)
-    weights = raw_weights(scene.opacities[rows], seen[rows], survey.power)
+    points = embed_rows(scene, rows, known, sum(targets), job.config)
+    weights = gaussian_weights(scene.opacities[rows], seen[rows], survey.power)
     return order, points, (weights / survey.unit).clamp_min(job.config.cvt.weight_floor)
 
 
 def _search(job: Job, turn: int, block: int, points: Tensor) -> tuple[int, Nearest]:
     """Return the number of sites of a block, and the nearest site of every point."""
     survey, targets = job.read_survey()
-    _, nearest = search_of(
+    _, nearest = choose_search(
         job.config.cvt, points.device, has_duplicates=survey.plan.duplicates.active
     )
     sites = points[:0].double()

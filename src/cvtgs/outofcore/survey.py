@@ -7,16 +7,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs import cvt, filters
+from cvtgs import analysis as an
+from cvtgs import cvt, filters, validity
+from cvtgs.analysis import EffectPlan, SceneAnalysis, analyze, apparent_areas, select_columns
 from cvtgs.boxes import Box, inside
 from cvtgs.config import SimplifyConfig
-from cvtgs.effects import EffectPlan, limited
 from cvtgs.io.ply import PlyRows
 from cvtgs.math.frames import RobustFrame
 from cvtgs.outofcore.cuts import Cuts, cut_space
 from cvtgs.scene import GaussianScene
-from cvtgs.stages.entering import entering_rows
-from cvtgs.stages.outlook import Outlook, as_seen, look_at_scene
 
 SAMPLE = 1 << 18
 """Gaussians that stand for all where frame, plan and cuts are found."""
@@ -87,23 +86,23 @@ def take_sample(source: PlyRows) -> GaussianScene:
         stop = min(start + CHUNK * step, source.count)
         parts.append(source.scene(source.read(start, stop, step)))
     whole = _joined(parts)
-    return whole.select(filters.valid_rows(whole))
+    return whole.select(validity.valid_rows(whole))
 
 
 def add_up(
     source: PlyRows, frame: RobustFrame, boxes: tuple[Box, ...], start: int, stop: int
 ) -> Depths:
     """Look at some rows."""
-    sums = cvt.depth_sums(torch.device("cpu"))
+    sums = an.empty_depth_grid(torch.device("cpu"))
     mass, seen_mass, valid, kept, far = 0.0, 0.0, 0, 0, [torch.zeros(0, dtype=torch.float64)]
     for first in range(start, stop, CHUNK):
         scene = source.scene(source.read(first, min(first + CHUNK, stop)))
-        rows = filters.valid_rows(scene)
+        rows = validity.valid_rows(scene)
         if not bool(rows.all()):
             scene = scene.select(rows)
         masses = scene.masses
-        cvt.add_depths(sums, scene.means, masses, frame)
-        seen = masses * cvt.falloff(scene.means, frame)
+        an.add_depths(sums, scene.means, masses, frame)
+        seen = masses * an.perspective_falloff(scene.means, frame)
         far.append(seen[frame.distances(scene.means) > filters.FLYAWAY_RADII])
         mass, seen_mass = mass + float(masses.sum()), seen_mass + float(seen.sum())
         valid += len(scene)
@@ -140,30 +139,30 @@ def survey(
     A block gets half its measure from the number of Gaussians and half from their weight, so it
     has at most twice the mean of either.
     """
-    light = cvt.light_of(depths.sums)
-    small = limited(sample, config.effects)
-    outlook = look_at_scene(small, config, with_light=False)
-    here = cvt.light_at(light, small.means, frame)
-    seen = as_seen(outlook.areas, small.means, here, frame=frame, config=config.cvt)
-    outlook = Outlook(frame, outlook.areas, seen, here, outlook.plan)
+    light = an.visibility_grid(depths.sums)
+    small = select_columns(sample, config.effects)
+    first = analyze(small, config)
+    here = an.visibility_at(light, small.means, frame)
+    seen = apparent_areas(first.areas, small.means, here, frame=frame, config=config.cvt)
+    known = SceneAnalysis(
+        frame=frame, areas=first.areas, apparent_areas=seen, visibility=here, plan=first.plan
+    )
     rows = depths.valid - depths.kept
     if boxes:
         free = (~inside(boxes, small.means)).nonzero()[:, 0]
         if len(free):
-            small, outlook = small.select(free), outlook.select(free)
+            small, known = small.select(free), known.select(free)
     stands_for = rows / max(1, len(small))
     entering = torch.arange(len(small))
     faintest, lightest = 0.0, -1.0
     if with_filter:
         least = min(len(small), -int(-target // stands_for))
-        no_flyaways = config.model_copy(
-            update={"filter": config.filter.model_copy(update={"max_flyaway_share": 0.0})}
-        )
-        entering, _ = entering_rows(small, outlook, least, no_flyaways)
+        no_flyaways = config.filter.model_copy(update={"max_flyaway_share": 0.0})
+        entering = filters.filter_rows(small, known, least, no_flyaways).rows
         faintest = min(float(small.opacities[entering].amin()), config.filter.min_opacity)
         lightest = _lightest_flyaway(depths, config.filter.max_flyaway_share)
-    power = outlook.area_power(config.cvt)
-    weights = raw_weights(small.opacities, outlook.seen_areas, power)[entering]
+    power = known.area_power(config.cvt)
+    weights = cvt.gaussian_weights(small.opacities, known.apparent_areas, power)[entering]
     unit = float(weights.mean()) or 1.0
     floor = unit * config.cvt.weight_floor
     weights = weights.clamp_min(floor)
@@ -173,7 +172,7 @@ def survey(
     places = frame.contract(small.means[entering])
     return Survey(
         frame=frame,
-        plan=outlook.plan,
+        plan=known.plan,
         light=light,
         faintest=faintest,
         lightest=lightest,
@@ -186,14 +185,6 @@ def survey(
         rows=rows,
         kept=depths.kept,
     )
-
-
-def raw_weights(
-    opacities: Float[Tensor, "n"], areas: Float[Tensor, "n"], power: float
-) -> Float[Tensor, "n"]:
-    """Weigh Gaussians as :func:`cvtgs.cvt.tessellation_weights` does, without its scaling."""
-    weights = opacities.double()
-    return weights * areas**power if power else weights
 
 
 def _lightest_flyaway(depths: Depths, share: float) -> float:

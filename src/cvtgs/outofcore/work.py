@@ -7,21 +7,26 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvtgs import cvt, filters
+from cvtgs import cvt, filters, validity
+from cvtgs.analysis import (
+    SceneAnalysis,
+    apparent_areas,
+    perspective_falloff,
+    select_columns,
+    visibility_at,
+)
 from cvtgs.boxes import inside
 from cvtgs.config import SimplifyConfig
 from cvtgs.devices import one_thread
-from cvtgs.effects import limited
 from cvtgs.math.frames import RobustFrame
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.merging import save_block
 from cvtgs.outofcore.rows import LIGHT, SEEN, read_rows, record_type
-from cvtgs.outofcore.survey import CHUNK, Depths, Survey, add_up, raw_weights
+from cvtgs.outofcore.survey import CHUNK, Depths, Survey, add_up
+from cvtgs.pipeline import reduce_scene
 from cvtgs.progress import silent
 from cvtgs.report import StageClock
 from cvtgs.scene import GaussianScene
-from cvtgs.stages import Outlook, run_stages
-from cvtgs.stages.outlook import as_seen
 
 
 @one_thread()
@@ -45,12 +50,12 @@ def sort_into_blocks(job: Job, part: tuple[int, int, int]) -> tuple[list[int], l
     for start in range(first, last, CHUNK):
         records = job.source.read(start, min(start + CHUNK, last))
         scene = job.source.scene(records)
-        valid = filters.valid_rows(scene)
+        valid = validity.valid_rows(scene)
         protected = valid & inside(job.boxes, scene.means) if job.boxes else ~valid & valid
         _append_kept(job, number, records, scene, protected)
         places = (valid & ~protected).nonzero()[:, 0]
         light, seen, places = _entering(survey, job.config, scene, places)
-        weights = raw_weights(scene.opacities[places], seen, survey.power)
+        weights = cvt.gaussian_weights(scene.opacities[places], seen, survey.power)
         weights = weights.clamp_min(survey.floor)
         cells = (weights / survey.step).clamp_max(1.0) if survey.step > 0 else weights * 0 + 1
         points = survey.frame.contract(scene.means[places])
@@ -74,13 +79,20 @@ def simplify_whole(job: Job, block: int) -> None:
     if job.small_path(block).exists():
         return
     scene, seen, light = read_rows(job, block)
-    scene = limited(scene, job.config.effects)
-    outlook = Outlook(survey.frame, scene.areas, seen, light, survey.plan)
+    scene = select_columns(scene, job.config.effects)
+    known = SceneAnalysis(
+        frame=survey.frame,
+        areas=scene.areas,
+        apparent_areas=seen,
+        visibility=light,
+        plan=survey.plan,
+    )
     checkpoint = job.network
     net = None if checkpoint is None else checkpoint.net.to(scene.dtype)
     clock, config = StageClock(silent, scene.device), without_filter(job.config)
-    small, facts = run_stages(scene, targets[block], config, net=net, clock=clock, outlook=outlook)
-    facts = {name: value for name, value in facts.items() if name != "plan"}
+    reduced = reduce_scene(scene, known, targets[block], config, net=net, clock=clock)
+    small = reduced.scene
+    facts = reduced.statistics().model_dump() | {"mass_out": float(small.masses.sum())}
     save_block(job, block, small, {"input_count": len(scene), "facts": facts})
 
 
@@ -96,12 +108,12 @@ def _entering(
     """Return light, area as seen and row of the Gaussians that are not left out."""
     means, opacities = scene.means[rows], scene.opacities[rows]
     areas = scene.select(rows).areas
-    light = cvt.light_at(survey.light, means, survey.frame)
-    seen = as_seen(areas, means, light, frame=survey.frame, config=config.cvt)
+    light = visibility_at(survey.light, means, survey.frame)
+    seen = apparent_areas(areas, means, light, frame=survey.frame, config=config.cvt)
     enters = opacities >= survey.faintest
     if survey.lightest >= 0.0:
         far = survey.frame.distances(means) > filters.FLYAWAY_RADII
-        mass = areas * opacities * cvt.falloff(means, survey.frame)
+        mass = areas * opacities * perspective_falloff(means, survey.frame)
         enters &= ~(far & (mass <= survey.lightest))
     return light[enters], seen[enters], rows[enters]
 
@@ -121,7 +133,7 @@ def _append_kept(
     if not bool(protected.any()):
         return
     kept = records[protected.numpy()]
-    logits = filters.with_finite_opacities(scene.select(protected)).logit_opacities
+    logits = validity.with_finite_opacities(scene.select(protected)).logit_opacities
     kept["opacity"] = logits.numpy()
     with job.kept_path(number).open("ab") as file:
         file.write(kept.tobytes())

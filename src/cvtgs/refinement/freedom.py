@@ -4,11 +4,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.cvt import ambient_visibility, nearest_backend
-from cvtgs.filters import valid_rows
+from cvtgs.analysis import ambient_visibility
+from cvtgs.cvt import nearest_backend
 from cvtgs.math.frames import robust_frame
 from cvtgs.math.parameters import divide
 from cvtgs.scene import GaussianScene
+from cvtgs.validity import valid_rows
 
 
 @torch.no_grad()

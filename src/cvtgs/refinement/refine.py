@@ -8,7 +8,6 @@ from cvtgs.cameras import Cameras
 from cvtgs.config import RefineConfig
 from cvtgs.devices import chosen_device
 from cvtgs.errors import InvalidSceneError
-from cvtgs.filters import valid_rows
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.refinement.budget import Budget, check_budget
 from cvtgs.refinement.freedom import freedom
@@ -19,6 +18,7 @@ from cvtgs.refinement.variables import changed_count
 from cvtgs.rendering.backends import choose_backend
 from cvtgs.report import RefineReport, SimplifyReport, StageClock
 from cvtgs.scene import GaussianScene
+from cvtgs.validity import valid_rows
 
 STAGE = "refine"
 

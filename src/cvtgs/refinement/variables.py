@@ -5,9 +5,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.config import Rates
-from cvtgs.filters import standardized, valid_rows, with_finite_opacities
 from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
+from cvtgs.validity import standardized, valid_rows, with_finite_opacities
 
 _BETAS = (0.6, 0.99)
 _LEAST_ROOT = 1e-15

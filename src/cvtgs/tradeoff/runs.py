@@ -8,17 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cvtgs.config import PRESETS
+from cvtgs.counts import target_count
 from cvtgs.errors import ConfigError, InvalidArgumentError, RunError
 from cvtgs.progress import ProgressEvent, ProgressListener
 from cvtgs.report import SimplifyReport
-from cvtgs.simplify import target_count
 from cvtgs.tradeoff.processes import ProcessCost, run_process
 from cvtgs.tradeoff.results import Failure
 
 STAGE = "simplify"
 WARNING = "cvtgs: warning: "
 
-START = "import cvtgs.cli.main, cvtgs.config, cvtgs.io, cvtgs.mergenet, cvtgs.simplify"
+START = "import cvtgs.cli.main, cvtgs.config, cvtgs.io, cvtgs.mergenet, cvtgs.simplifier"
 """What every process does before it reads a scene."""
 
 

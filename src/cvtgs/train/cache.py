@@ -16,9 +16,9 @@ from cvtgs.cells import Descriptors, Partition
 from cvtgs.config import SimplifyConfig
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
-from cvtgs.stages import Reference
 from cvtgs.train.cases import Case, refer_case
 from cvtgs.train.config import TrainConfig
+from cvtgs.train.merged import MergedScene
 from cvtgs.train.scenes import Source
 from cvtgs.train.views import Views, look_at_scene
 
@@ -115,7 +115,7 @@ def _packed_cases(cases: Iterable[Case | None]) -> dict[str, Tensor]:
         reference, prefix = case.reference, f"{place}/"
         if place == 0:
             tensors |= add_prefix("scene/", reference.scene.tensors())
-            tensors["light"] = reference.light.to(torch.float32)
+            tensors["light"] = reference.visibility.to(torch.float32)
             if reference.scene.antialiased:
                 tensors["antialiased"] = torch.ones(1)
         tensors |= add_prefix(prefix + "merged/", reference.merged.tensors())
@@ -153,12 +153,12 @@ def _case(name: str, scene: GaussianScene, light: Tensor, tensors: Mapping[str, 
     return Case(
         scene_name=name,
         ratio=float(tensors["ratio"]),
-        reference=Reference(
+        reference=MergedScene(
             scene=scene,
             merged=GaussianScene(**under_prefix("merged/", tensors), comments=scene.comments),
             partition=partition,
             neighbors=tensors["neighbors"].long(),
-            light=light,
+            visibility=light,
         ),
         cells=several.nonzero()[:, 0],
         part=partition.select(several),

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from cvtgs.cells import Descriptors, Partition, describe_cells
 from cvtgs.config import SimplifyConfig
+from cvtgs.counts import target_count
 from cvtgs.mergenet import Residuals, compose
 from cvtgs.scene import GaussianScene
-from cvtgs.simplify import target_count
-from cvtgs.stages import Reference, make_reference
+from cvtgs.train.merged import MergedScene, merge_scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -29,7 +29,7 @@ class Case:
 
     scene_name: str
     ratio: float
-    reference: Reference
+    reference: MergedScene
     cells: Int[Tensor, "r"]
     part: Partition
     descriptors: Descriptors
@@ -74,12 +74,12 @@ class Case:
         reference, part = self.reference, self.part
         if reference.scene.device == device:
             return self
-        moved = Reference(
+        moved = MergedScene(
             scene=reference.scene.to(device),
             merged=reference.merged.to(device),
             partition=reference.partition.to(device),
             neighbors=reference.neighbors.to(device),
-            light=reference.light.to(device),
+            visibility=reference.visibility.to(device),
         )
         return Case(
             scene_name=self.scene_name,
@@ -92,7 +92,7 @@ class Case:
 
 
 def make_case(
-    scene_name: str, ratio: float, reference: Reference, cells: Tensor, part: Partition
+    scene_name: str, ratio: float, reference: MergedScene, cells: Tensor, part: Partition
 ) -> Case:
     """Describe some cells of a reference."""
     described = describe_cells(
@@ -102,7 +102,7 @@ def make_case(
         cells=cells,
         neighbors=reference.neighbors[cells],
         sizes=reference.partition.counts,
-        visibility=reference.light,
+        visibility=reference.visibility,
     )
     return Case(
         scene_name=scene_name,
@@ -121,7 +121,7 @@ def refer_case(
     target = target_count(len(scene), ratio)
     if target >= len(scene):
         return None
-    reference = make_reference(scene, target, config)
+    reference = merge_scene(scene, target, config)
     several = reference.partition.counts > 1
     cells = several.nonzero()[:, 0]
     if not len(cells):

@@ -10,12 +10,12 @@ import torch
 
 from cvtgs import synthetic
 from cvtgs.errors import ConfigError
-from cvtgs.filters import valid_rows
 from cvtgs.io import load
 from cvtgs.math import parameters
 from cvtgs.math.parameters import positive_log
 from cvtgs.scene import GaussianScene
 from cvtgs.train.config import DataConfig
+from cvtgs.validity import valid_rows
 
 VALIDATION_SEED = 1_000_000
 """Generated scenes for validation have seeds from here on."""

@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.errors import InvalidSceneError
-from cvtgs.filters import valid_rows, with_finite_opacities
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.scene import GaussianScene
+from cvtgs.validity import valid_rows, with_finite_opacities
 from cvtgs.views.orientation import find_up
 from cvtgs.views.voxels import Voxels, voxels_of
 

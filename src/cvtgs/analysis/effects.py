@@ -4,14 +4,14 @@ import pydantic
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.config import SimplifyConfig
-from cvtgs.effects.figures import (
+from cvtgs.analysis.measures import (
     UNBOUNDED_DISTANCE,
     band_losses,
     duplicate_share,
     faint_share,
     far_share,
 )
+from cvtgs.config import SimplifyConfig
 from cvtgs.math.frames import RobustFrame
 from cvtgs.scene import GaussianScene
 

@@ -1,4 +1,4 @@
-"""Limits: the part of a scene that is computed with, and how the rest comes back."""
+"""Which columns of a scene are computed with, and how the others come back."""
 
 from dataclasses import replace
 
@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.analysis.effects import EffectPlan
 from cvtgs.config import EffectsConfig
-from cvtgs.effects.plan import EffectPlan
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import ANTIALIASED_TAG, FLAT_LOG_SCALE, GaussianScene
 
 
-def limited(scene: GaussianScene, choices: EffectsConfig) -> GaussianScene:
+def select_columns(scene: GaussianScene, choices: EffectsConfig) -> GaussianScene:
     """Leave out what was switched off, before the scene is looked at.
 
     Args:
@@ -26,9 +26,9 @@ def limited(scene: GaussianScene, choices: EffectsConfig) -> GaussianScene:
     Example:
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 10, sh_degree=3, seed=0)
-        >>> limited(scene, EffectsConfig(sh=1)).sh_degree
+        >>> select_columns(scene, EffectsConfig(sh=1)).sh_degree
         1
-        >>> limited(scene, EffectsConfig()) is scene
+        >>> select_columns(scene, EffectsConfig()) is scene
         True
     """
     if choices.sh != "auto":
@@ -38,7 +38,7 @@ def limited(scene: GaussianScene, choices: EffectsConfig) -> GaussianScene:
     return scene
 
 
-def trimmed(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
+def drop_unused_bands(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
     """Leave out the SH bands that a scene does not call for.
 
     Args:
@@ -47,22 +47,22 @@ def trimmed(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
 
     Returns:
         The scene with the other bands, which are copied if there are any, and tagged as
-        :func:`imaged` does; itself if that changes nothing.
+        :func:`drop_mip_tag` does; itself if that changes nothing.
 
     Example:
-        >>> from cvtgs.effects import plan_effects
+        >>> from cvtgs.analysis import plan_effects
         >>> from cvtgs.math.frames import robust_frame
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 10, sh_degree=2, seed=0)
         >>> dull = scene.with_tensors({"shN": torch.zeros_like(scene.shN)}, {})
         >>> plan = plan_effects(dull, dull.masses, frame=robust_frame(dull.means))
-        >>> trimmed(dull, plan).sh_degree
+        >>> drop_unused_bands(dull, plan).sh_degree
         0
     """
-    return imaged(_of_degree(scene, plan.sh.degree), plan)
+    return drop_mip_tag(_of_degree(scene, plan.sh.degree), plan)
 
 
-def imaged(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
+def drop_mip_tag(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
     """Take the tag of antialiasing off a scene, if images of it are to be taken without.
 
     Args:
@@ -74,14 +74,14 @@ def imaged(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
 
     Example:
         >>> from cvtgs.config import SimplifyConfig
-        >>> from cvtgs.effects import plan_effects
+        >>> from cvtgs.analysis import plan_effects
         >>> from cvtgs.math.frames import robust_frame
         >>> from cvtgs.synthetic import scene as make
         >>> scene = replace(make("object", 10, sh_degree=0, seed=0), comments=(ANTIALIASED_TAG,))
         >>> config = SimplifyConfig(effects=EffectsConfig(mip="off"))
         >>> frame = robust_frame(scene.means)
         >>> plan = plan_effects(scene, scene.masses, frame=frame, config=config)
-        >>> scene.antialiased, imaged(scene, plan).antialiased
+        >>> scene.antialiased, drop_mip_tag(scene, plan).antialiased
         (True, False)
     """
     if plan.mip.active or not scene.antialiased:
@@ -90,7 +90,7 @@ def imaged(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
     return replace(scene, comments=tuple(c for c in scene.comments if tag not in c.lower()))
 
 
-def restored(small: GaussianScene, scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
+def restore_columns(small: GaussianScene, scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
     """Make a small scene of the same kind as the one that it was made from.
 
     Args:
@@ -103,12 +103,12 @@ def restored(small: GaussianScene, scene: GaussianScene, plan: EffectPlan) -> Ga
         left out, and no third scale if its Gaussians have two.
 
     Example:
-        >>> from cvtgs.effects import plan_effects
+        >>> from cvtgs.analysis import plan_effects
         >>> from cvtgs.math.frames import robust_frame
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 10, sh_degree=3, seed=0)
         >>> plan = plan_effects(scene, scene.masses, frame=robust_frame(scene.means))
-        >>> restored(limited(scene, EffectsConfig(sh=0)), scene, plan).sh_degree
+        >>> restore_columns(select_columns(scene, EffectsConfig(sh=0)), scene, plan).sh_degree
         3
     """
     changes = {}

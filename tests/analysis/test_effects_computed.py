@@ -1,19 +1,19 @@
 """What a scene does not call for is not computed, and forcing it on changes nothing."""
 
 import math
+from importlib import import_module
 
 import pytest
 import torch
 
 import cvtgs
-from cvtgs import GaussianScene, Simplifier, SimplifyConfig, filters
+from cvtgs import GaussianScene, Simplifier, SimplifyConfig, filters, pipeline, simplifier
 from cvtgs.cells import descriptors
 from cvtgs.cvt import nearest
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.mergenet import MergeNet
 from cvtgs.scene import ANTIALIASED_TAG
-from cvtgs.stages import outlook, run
 from scenes import random_scene, same_bits
 
 PRESETS = ("standard", "paper")
@@ -49,9 +49,11 @@ def test_empty_bands_are_neither_merged_nor_predicted(above, preset, monkeypatch
     scene = with_zero_bands(random_scene(400, degree=3), above)
     bare = scene.with_tensors({"shN": scene.shN[:, : REST_COUNTS[above]]}, {})
     seen = []
-    original = run.merge_groups
+    original = pipeline.merge_cells
     monkeypatch.setattr(
-        run, "merge_groups", lambda valid, *a, **k: seen.append(valid) or original(valid, *a, **k)
+        pipeline,
+        "merge_cells",
+        lambda valid, *a, **k: seen.append(valid) or original(valid, *a, **k),
     )
     small, report = run_with(scene, preset=preset)
     assert [valid.sh_degree for valid in seen] == [above]
@@ -196,7 +198,7 @@ def test_without_duplicates_nothing_is_compared(monkeypatch):
     scene = scene.select(torch.cat([torch.arange(400), torch.arange(2)]))  # too few to pay
     forced = run_with(scene, effects={"duplicates": "on"})
     assert forced.report.plan.duplicates.active
-    monkeypatch.setattr("cvtgs.cvt.places.first_of_each", refuse)
+    monkeypatch.setattr("cvtgs.cvt.coincident.first_of_each", refuse)
     assert same_bits(run_with(scene).scene, forced.scene)
 
 
@@ -211,7 +213,7 @@ def test_columns_only_where_there_are_some():
 
 
 def test_no_image_is_taken_unless_the_preset_asks(monkeypatch):
-    monkeypatch.setattr(outlook, "look_at_images", refuse)
+    monkeypatch.setattr(simplifier, "measure_visibility", refuse)
     scene = random_scene(100)
     run_with(scene)
     run_with(scene, visibility={"views": 4}, effects={"visibility": "off"})
@@ -224,9 +226,10 @@ def test_no_image_is_taken_unless_the_preset_asks(monkeypatch):
 def test_images_are_compensated_as_planned_and_the_tag_stays(is_tagged, choice, monkeypatch):
     scene = random_scene(100)
     scene, taken = tagged(scene) if is_tagged else scene, []
-    original = outlook.contributions
+    module = import_module("cvtgs.analysis.analyze")
+    original = module.contributions
     monkeypatch.setattr(
-        outlook,
+        module,
         "contributions",
         lambda scene, *a, **k: taken.append(scene.antialiased) or original(scene, *a, **k),
     )

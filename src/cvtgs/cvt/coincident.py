@@ -1,10 +1,14 @@
-"""Sites that coincide, which no search tree can tell apart."""
+"""Points and sites that coincide, which no search tree can tell apart."""
 
 import math
+from collections.abc import Callable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+NearestSite = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Takes points ``(n, d)`` and sites ``(m, d)``, returns labels and squared distances ``(n,)``."""
 
 
 def runs_of_equal(
@@ -36,3 +40,24 @@ def distinct_rows(sites: Float[Tensor, "m d"]) -> Int[Tensor, "k"] | None:
         return None
     order, ranks = runs
     return torch.sort(order[ranks == 0]).values
+
+
+def search_once_per_position(nearest: NearestSite) -> NearestSite:
+    """Search for each position only once, with the same answers."""
+
+    def search(points: Tensor, sites: Tensor) -> tuple[Tensor, Tensor]:
+        is_first = first_of_each(points)
+        labels, squared = nearest(points[is_first], sites)
+        numbers = is_first.cumsum(0) - 1
+        return labels[numbers], squared[numbers]
+
+    return search
+
+
+def first_of_each(points: Float[Tensor, "n d"]) -> Bool[Tensor, "n"]:
+    """Return which points differ from the one before."""
+    first = torch.ones(len(points), dtype=torch.bool, device=points.device)
+    first[1:] = points[1:, 0] != points[:-1, 0]
+    maybe = (~first).nonzero()[:, 0]
+    first[maybe] = (points[maybe] != points[maybe - 1]).any(dim=1)
+    return first

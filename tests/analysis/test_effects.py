@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from cvtgs import EffectPlan, GaussianScene, SimplifyConfig
-from cvtgs.effects import (
+from cvtgs.analysis import (
     BAND_LOSS,
     DUPLICATE_SHARE,
     UNBOUNDED_DISTANCE,

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from cvtgs.analysis import ambient_visibility
 from cvtgs.math.frames import RobustFrame
 
 ORIGIN = torch.zeros(3, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Openness: how freely a Gaussian can be seen from nearby, without rendering an image."""
+"""Ambient visibility: how freely a Gaussian can be seen from nearby, without rendering."""
 
 import torch
 from jaxtyping import Float, Int
@@ -13,14 +13,14 @@ HALF_GRID = 64
 """Voxels from the middle of the grid to its border."""
 
 REACH = 6
-"""Voxels that are looked through in each direction."""
+"""Voxels whose depth counts in each direction."""
 
 MAX_DEPTH = 1e6
 FIXED_POINT = 2**20
 
 SLAB = 32
 CHUNK = 1 << 16
-"""Gaussians that are looked at together, to bound memory."""
+"""Gaussians of one pass, to bound memory."""
 
 
 def ambient_visibility(
@@ -28,11 +28,10 @@ def ambient_visibility(
 ) -> Float[Tensor, "n"]:
     """Return how freely every Gaussian can be seen from a quarter of a robust radius around it.
 
-    What lies inside a solid, or behind a surface that nobody passes, takes a share of the cells
-    and is never seen. Masses are summed over voxels, which gives the optical depth of a voxel;
-    the light that reaches a Gaussian through the next voxels is averaged over the six directions
-    of the axes. The reach is short on purpose: the walls of a room stay open to the inside, and
-    haze stays open everywhere. This is our own rule, not part of CVT-GS.
+    What lies inside a solid takes a share of the cells and is never seen. Masses are summed over
+    voxels, which gives the optical depth of a voxel; the transmittance of the next voxels is
+    averaged over the six directions of the axes. The reach is short: the walls of a room stay
+    visible from the inside, and haze from everywhere. This is our own rule, not part of CVT-GS.
 
     Args:
         means: Positions, scene units.
@@ -48,14 +47,14 @@ def ambient_visibility(
         >>> ambient_visibility(torch.zeros(1, 3), torch.ones(1).double(), frame).tolist()
         [1.0]
     """
-    sums = depth_sums(means.device)
-    places = add_depths(sums, means, masses, frame)
-    light = light_of(sums)
-    del sums
-    return torch.cat([light[place.long()] for place in places.split(CHUNK)]).double()
+    depths = empty_depth_grid(means.device)
+    voxels = add_depths(depths, means, masses, frame)
+    visibility = visibility_grid(depths)
+    del depths
+    return torch.cat([visibility[part.long()] for part in voxels.split(CHUNK)]).double()
 
 
-def depth_sums(device: torch.device) -> Int[Tensor, "voxels"]:
+def empty_depth_grid(device: torch.device) -> Int[Tensor, "voxels"]:
     """Return an empty grid of optical depths, for :func:`add_depths`.
 
     Args:
@@ -65,7 +64,7 @@ def depth_sums(device: torch.device) -> Int[Tensor, "voxels"]:
         Zeros, in whole numbers: parts of a scene add up to the same grid in any order.
 
     Example:
-        >>> int(depth_sums(torch.device("cpu")).sum())
+        >>> int(empty_depth_grid(torch.device("cpu")).sum())
         0
     """
     return torch.zeros((2 * HALF_GRID) ** 3 + 1, dtype=torch.int64, device=device)
@@ -89,65 +88,66 @@ def add_depths(
         The voxel of each Gaussian, int32.
 
     Example:
-        >>> sums = depth_sums(torch.device("cpu"))
+        >>> sums = empty_depth_grid(torch.device("cpu"))
         >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
         >>> place = add_depths(sums, torch.zeros(1, 3), torch.ones(1).double(), frame)
-        >>> light_of(sums)[place.long()].tolist()
+        >>> visibility_grid(sums)[place.long()].tolist()
         [1.0]
     """
-    places = torch.empty(len(means), dtype=torch.int32, device=means.device)
+    voxels = torch.empty(len(means), dtype=torch.int32, device=means.device)
     for start in range(0, len(means), CHUNK):
         part = slice(start, start + CHUNK)
-        place, shrinkage = _places(means[part], frame)
-        places[part] = place.to(torch.int32)
+        voxel, shrinkage = _voxels_of(means[part], frame)
+        voxels[part] = voxel.to(torch.int32)
         depths = masses[part] * (shrinkage / (frame.radius * VOXEL)).square()
         # Whole numbers add up to the same sum in any order, so every device gives the same.
         whole = (depths.clamp_max(MAX_DEPTH) * FIXED_POINT).round().to(torch.int64)
-        sums.index_add_(0, place, whole)
-    return places
+        sums.index_add_(0, voxel, whole)
+    return voxels
 
 
-def light_of(sums: Int[Tensor, "voxels"]) -> Float[Tensor, "voxels"]:
-    """Return the light in every voxel of a finished grid.
+def visibility_grid(sums: Int[Tensor, "voxels"]) -> Float[Tensor, "voxels"]:
+    """Return the ambient visibility of every voxel of a finished grid.
 
     Args:
-        sums: What :func:`add_depths` has added up.
+        sums: What :func:`add_depths` summed.
 
     Returns:
         Numbers from 0 to 1 in float32; the last is that of everything beyond the grid, 1.
 
     Example:
-        >>> float(light_of(depth_sums(torch.device("cpu"))).amin())
+        >>> float(visibility_grid(empty_depth_grid(torch.device("cpu"))).amin())
         1.0
     """
     size = 2 * HALF_GRID
     grid = (sums[:-1].to(torch.float32) / FIXED_POINT).reshape(size, size, size)
-    return torch.nn.functional.pad(_light(grid).flatten(), (0, 1), value=1.0)
+    return torch.nn.functional.pad(_visible_through(grid).flatten(), (0, 1), value=1.0)
 
 
-def light_at(
-    light: Float[Tensor, "voxels"], means: Float[Tensor, "n 3"], frame: RobustFrame
+def visibility_at(
+    grid: Float[Tensor, "voxels"], means: Float[Tensor, "n 3"], frame: RobustFrame
 ) -> Float[Tensor, "n"]:
-    """Look up how freely Gaussians can be seen.
+    """Look up the ambient visibility of Gaussians.
 
     Args:
-        light: What :func:`light_of` gives.
+        grid: What :func:`visibility_grid` returns.
         means: Positions, scene units.
         frame: Centre and radius of the scene.
 
     Returns:
-        What :func:`ambient_visibility` gives for the whole scene.
+        What :func:`ambient_visibility` returns for the whole scene.
 
     Example:
         >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
-        >>> light_at(light_of(depth_sums(torch.device("cpu"))), torch.zeros(1, 3), frame).tolist()
+        >>> grid = visibility_grid(empty_depth_grid(torch.device("cpu")))
+        >>> visibility_at(grid, torch.zeros(1, 3), frame).tolist()
         [1.0]
     """
-    parts = [light[_places(part, frame)[0]] for part in means.split(CHUNK)]
-    return torch.cat([light[:0], *parts]).double()
+    parts = [grid[_voxels_of(part, frame)[0]] for part in means.split(CHUNK)]
+    return torch.cat([grid[:0], *parts]).double()
 
 
-def _places(
+def _voxels_of(
     means: Float[Tensor, "n 3"], frame: RobustFrame
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
     """Return the voxel of each position, and how much smaller things are there when contracted."""
@@ -160,17 +160,17 @@ def _places(
     return torch.where(inside, (i * size + j) * size + k, size**3), shrinkage
 
 
-def _light(grid: Float[Tensor, "g g g"]) -> Float[Tensor, "g g g"]:
-    """Average the light that comes through the next voxels in the six directions."""
-    light = torch.zeros_like(grid)
+def _visible_through(grid: Float[Tensor, "g g g"]) -> Float[Tensor, "g g g"]:
+    """Average the transmittance of the next voxels in the six directions."""
+    visible = torch.zeros_like(grid)
     for axis in range(3):
         across = 1 if axis == 0 else 0  # slabs of another axis, to bound memory
-        slabs = zip(grid.split(SLAB, across), light.split(SLAB, across), strict=True)
+        slabs = zip(grid.split(SLAB, across), visible.split(SLAB, across), strict=True)
         for slab, target in slabs:
             through = torch.exp(-_windows(slab, axis))
             target.add_(through.narrow(axis, 0, len(grid)))
             target.add_(through.narrow(axis, REACH + 1, len(grid)))
-    return light.div_(6)
+    return visible.div_(6)
 
 
 def _windows(slab: Float[Tensor, "a b c"], axis: int) -> Float[Tensor, "d e f"]:
@@ -181,3 +181,21 @@ def _windows(slab: Float[Tensor, "a b c"], axis: int) -> Float[Tensor, "d e f"]:
     for start in range(1, REACH):
         sums.add_(padded.narrow(axis, start, count))
     return sums
+
+
+def perspective_falloff(means: Float[Tensor, "n 3"], frame: RobustFrame) -> Float[Tensor, "n"]:
+    """Return how much smaller a far Gaussian appears from the middle of the scene.
+
+    Args:
+        means: Positions, scene units.
+        frame: Centre and radius of the scene.
+
+    Returns:
+        ``1 / max(1, d / R)^2`` in float64, with d the distance to the centre.
+
+    Example:
+        >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
+        >>> perspective_falloff(torch.tensor([[2.0, 0, 0]]), frame).tolist()
+        [0.25]
+    """
+    return frame.distances(means).clamp_min_(1.0).pow_(-2)

@@ -1,0 +1,161 @@
+"""SceneAnalysis: all that the stages need to know of a scene, computed once."""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs.analysis.columns import drop_mip_tag
+from cvtgs.analysis.effects import EffectPlan, plan_effects, with_haze
+from cvtgs.analysis.visibility import ambient_visibility, perspective_falloff
+from cvtgs.cameras import Cameras
+from cvtgs.config import SimplifyConfig, TessellationConfig
+from cvtgs.math.frames import RobustFrame, robust_frame
+from cvtgs.math.parameters import divide
+from cvtgs.rendering import contributions
+from cvtgs.scene import GaussianScene
+from cvtgs.views import mixed_views
+
+MIN_OPACITY = 1e-6
+"""Opacities below count as this where something is divided by them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SceneAnalysis:
+    """What is known of the valid Gaussians of a scene.
+
+    Attributes:
+        frame: Robust centre and radius of the scene.
+        areas: ``(n,)`` mean projected areas, squared scene units, float64.
+        apparent_areas: ``(n,)`` the same as they count in images: smaller for what is far from the
+            middle or enclosed by others.
+        visibility: ``(n,)`` ambient visibility of every Gaussian, 0 (enclosed) to 1 (free);
+            empty if neither weights nor the network use it.
+        plan: The effects that the scene calls for.
+    """
+
+    frame: RobustFrame
+    areas: Float[Tensor, "n"]
+    apparent_areas: Float[Tensor, "n"]
+    visibility: Float[Tensor, "n_or_0"]
+    plan: EffectPlan
+
+    def select(self, rows: Tensor) -> Self:
+        """Return the analysis of some Gaussians.
+
+        Args:
+            rows: Row numbers.
+
+        Returns:
+            Their values; frame and plan are still those of the whole scene.
+        """
+        return replace(
+            self,
+            areas=self.areas[rows],
+            apparent_areas=self.apparent_areas[rows],
+            visibility=self.visibility[rows] if len(self.visibility) else self.visibility,
+        )
+
+    def area_power(self, config: TessellationConfig) -> float:
+        """Return the power of the area in the weight: the more unbounded the scene, the flatter.
+
+        Args:
+            config: The powers for bounded and for unbounded scenes.
+
+        Returns:
+            A value between the two.
+        """
+        strength = self.plan.unbounded.strength
+        return (1 - strength) * config.area_power + strength * config.unbounded_area_power
+
+
+def analyze(
+    scene: GaussianScene, config: SimplifyConfig, *, with_visibility: bool = False
+) -> SceneAnalysis:
+    """Analyze a scene without rendering it.
+
+    Args:
+        scene: The Gaussians, with valid rows.
+        config: Every choice.
+        with_visibility: Whether a network will ask for the ambient visibility.
+
+    Returns:
+        Frame, areas, visibility and effect plan.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> analysis = analyze(make("object", 100, sh_degree=0, seed=0), SimplifyConfig())
+        >>> analysis.plan.unbounded.active, len(analysis.areas)
+        (False, 100)
+    """
+    frame, areas = robust_frame(scene.means), scene.areas
+    masses = areas * scene.opacities
+    visibility = masses[:0]
+    if with_visibility or config.cvt.hidden_share < 1.0:
+        visibility = ambient_visibility(scene.means, masses, frame)
+    apparent = apparent_areas(areas, scene.means, visibility, frame=frame, config=config.cvt)
+    plan = plan_effects(
+        scene,
+        masses,
+        apparent * scene.opacities,
+        frame=frame,
+        two_scales=scene.has_two_scales,
+        config=config,
+    )
+    return SceneAnalysis(
+        frame=frame, areas=areas, apparent_areas=apparent, visibility=visibility, plan=plan
+    )
+
+
+def apparent_areas(
+    areas: Float[Tensor, "n"],
+    means: Float[Tensor, "n 3"],
+    visibility: Float[Tensor, "n"],
+    *,
+    frame: RobustFrame,
+    config: TessellationConfig,
+) -> Float[Tensor, "n"]:
+    """Return areas as they count in images, smaller for what is far from the middle or enclosed."""
+    apparent = areas
+    if config.perspective:
+        apparent = apparent * perspective_falloff(means, frame)
+    if config.hidden_share < 1.0:
+        apparent = apparent * (config.hidden_share + (1 - config.hidden_share) * visibility)
+    return apparent
+
+
+def measure_visibility(
+    scene: GaussianScene,
+    analysis: SceneAnalysis,
+    config: SimplifyConfig,
+    *,
+    cameras: Cameras | None = None,
+) -> SceneAnalysis:
+    """Correct apparent areas by what every Gaussian contributes to images of the scene.
+
+    Args:
+        scene: The Gaussians, with valid rows.
+        analysis: Their analysis so far.
+        config: Every choice; ``config.visibility`` says how many images, and how far they count.
+        cameras: Cameras to render from; None finds views.
+
+    Returns:
+        The analysis with other apparent areas, and haze decided by them.
+    """
+    choices = config.visibility
+    if cameras is None:
+        views = mixed_views(scene, choices.views, size=choices.size, seed=config.seed)
+    else:
+        longer = max(cameras.width, cameras.height)
+        views = cameras.spread(choices.views).fitted(min(choices.size, longer))
+    rendered = contributions(drop_mip_tag(scene, analysis.plan), views)
+    opacities, apparent = scene.opacities, analysis.apparent_areas
+    masses = (apparent * opacities).double()
+    if float(rendered.sum()) > 0.0:
+        total, all_rendered = masses.sum(), rendered.sum()
+        trust = 1.0 - choices.mass_share
+        blended = choices.mass_share * masses + trust * rendered * (total / all_rendered)
+        apparent = divide(blended, opacities.double().clamp_min(MIN_OPACITY)).to(apparent.dtype)
+    plan = with_haze(analysis.plan, opacities, apparent * opacities, config=config)
+    return replace(analysis, apparent_areas=apparent, plan=plan)

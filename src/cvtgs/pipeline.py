@@ -1,0 +1,382 @@
+"""The method from top to bottom: filter, group, merge, correct.
+
+A scene in one piece, levels, protected regions and the out-of-core run call these functions.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cvtgs import cells, cvt
+from cvtgs.analysis import (
+    SceneAnalysis,
+    drop_unused_bands,
+    restore_columns,
+)
+from cvtgs.config import MergeConfig, SimplifyConfig
+from cvtgs.filters import FilteredRows, filter_rows
+from cvtgs.math.frames import RobustFrame, morton_order
+from cvtgs.math.segments import segment_ids
+from cvtgs.mergenet import MergeNet, correct_cells
+from cvtgs.report import CellStatistics, StageClock
+from cvtgs.scene import GaussianScene
+from cvtgs.validity import standardized, with_finite_opacities
+
+NEIGHBORS = 8
+"""Cells around a cell that may cover its ends, and that the network sees."""
+
+CHUNK = 1 << 18
+"""Gaussians whose distance is measured together, to bound memory."""
+
+COLOR_CELLS = 10_000
+"""The number of cells that ``cvt.color`` is meant for."""
+
+
+class Grouping(NamedTuple):
+    """Which Gaussians form which cell, and how good the tessellation is.
+
+    Attributes:
+        partition: Rows of the scene that make up every cell.
+        weights: ``(m,)`` summed weights of the members of every cell.
+        refilled: Cells that were empty after Lloyd and took a Gaussian from another.
+        energies: Energy before every Lloyd iteration, over the Gaussians that Lloyd samples.
+        energy: Energy of the final cells, over all Gaussians.
+        backend: Name of the nearest-site search.
+    """
+
+    partition: cells.Partition
+    weights: Float[Tensor, "m"]
+    refilled: int
+    energies: tuple[float, ...]
+    energy: float
+    backend: str
+
+
+class Merged(NamedTuple):
+    """One Gaussian per cell, not yet corrected by the network.
+
+    Attributes:
+        scene: The merged Gaussians, in the order of the cells.
+        partition: The members that each of them stands for: one where a representative was kept.
+        neighbors: ``(m, k)`` nearest other cells; k is 0 if neither inflation nor a network asks.
+    """
+
+    scene: GaussianScene
+    partition: cells.Partition
+    neighbors: Int[Tensor, "m k"]
+
+
+class Reduced(NamedTuple):
+    """A small scene before it is reported.
+
+    Attributes:
+        scene: The small scene.
+        filtered: What entered the tessellation; None if all Gaussians are kept.
+        grouping: The cells; None if all Gaussians are kept.
+        merged: One Gaussian per cell before the network; None if all Gaussians are kept.
+    """
+
+    scene: GaussianScene
+    filtered: FilteredRows | None = None
+    grouping: Grouping | None = None
+    merged: Merged | None = None
+
+    def statistics(self) -> CellStatistics:
+        """Return what the report says about the filter and the cells.
+
+        Returns:
+            Counts and energies; zeros if all Gaussians are kept.
+        """
+        if self.filtered is None or self.grouping is None or self.merged is None:
+            return CellStatistics()
+        return CellStatistics(
+            filtered_count=self.filtered.left_out,
+            filtered_mass_share=self.filtered.left_out_mass_share,
+            single_member_cells=int((self.merged.partition.counts == 1).sum()),
+            largest_cell=int(self.grouping.partition.counts.amax()),
+            refilled_cells=self.grouping.refilled,
+            energies=self.grouping.energies,
+            energy=self.grouping.energy,
+            backend=self.grouping.backend,
+        )
+
+
+def reduce_scene(
+    scene: GaussianScene,
+    analysis: SceneAnalysis,
+    target: int,
+    config: SimplifyConfig,
+    *,
+    net: MergeNet | None,
+    clock: StageClock,
+    finest: Reduced | None = None,
+) -> Reduced:
+    """Run all stages that follow the analysis: filter, tessellate, merge, correct.
+
+    Args:
+        scene: The Gaussians, with valid rows, on the device to compute on.
+        analysis: What is known of them.
+        target: Number of Gaussians to keep.
+        config: Every choice.
+        net: Corrects merged Gaussians, on the same device; None for no correction.
+        clock: Measures each stage.
+        finest: A finer size of the same scene, whose cells are grouped; None groups Gaussians.
+
+    Returns:
+        The small scene, with its cells.
+    """
+    if target >= len(scene):
+        return Reduced(with_finite_opacities(scene))
+    used = drop_unused_bands(scene, analysis.plan)
+    iterations = config.cvt.iterations + 1
+    if finest is None or finest.merged is None or finest.grouping is None:
+        with clock.stage("filter"):
+            filtered = filter_rows(used, analysis, target, config.filter)
+        with clock.stage("tessellate", iterations) as advance:
+            rows = filtered.rows
+            grouping = group_rows(used, rows, analysis, target, config, on_iteration=advance)
+    else:
+        filtered = finest.filtered or FilteredRows(finest.grouping.partition.order, 0, 0.0)
+        with clock.stage("tessellate", iterations) as advance:
+            fine, cells_of = finest.merged.scene, finest.grouping
+            grouping = group_cells(fine, cells_of, analysis, target, config, on_iteration=advance)
+    with clock.stage("merge", target) as advance:
+        merged = merge_cells(
+            used,
+            grouping.partition,
+            config.merge,
+            areas=analysis.areas,
+            backend=grouping.backend,
+            with_network=net is not None,
+            on_cells=advance,
+        )
+    small = merged.scene
+    if net is not None:
+        with clock.stage("network", target) as advance:
+            small = correct_cells(
+                net,
+                used,
+                small,
+                merged.partition,
+                neighbors=merged.neighbors,
+                visibility=analysis.visibility,
+                on_cells=advance,
+            )
+    small = restore_columns(standardized(small), scene, analysis.plan)
+    return Reduced(small, filtered, grouping, merged)
+
+
+def group_rows(
+    scene: GaussianScene,
+    rows: Int[Tensor, "k"],
+    analysis: SceneAnalysis,
+    target: int,
+    config: SimplifyConfig,
+    *,
+    on_iteration: Callable[[int], None] = lambda done: None,
+) -> Grouping:
+    """Group Gaussians into the cells of a weighted centroidal Voronoi tessellation.
+
+    Args:
+        scene: The Gaussians.
+        rows: Which of them, after the filter.
+        analysis: Frame, apparent areas and effect plan.
+        target: Number of cells, at most k.
+        config: Weights, space, seeding and iterations (``config.cvt``), and the seed.
+        on_iteration: Called with the number of finished Lloyd iterations.
+
+    Returns:
+        The cells.
+    """
+    masses = analysis.apparent_areas[rows] * scene.opacities[rows]
+    rows = rows[curve_order(scene, rows, analysis.frame, masses=masses)]
+    weights = cvt.tessellation_weights(
+        scene.opacities[rows],
+        analysis.apparent_areas[rows],
+        area_power=analysis.area_power(config.cvt),
+        floor=config.cvt.weight_floor,
+    )
+    points = embed_rows(scene, rows, analysis, target, config)
+    tessellation = cvt.tessellate(
+        points,
+        weights,
+        target,
+        config=config.cvt,
+        seed=config.seed,
+        has_duplicates=analysis.plan.duplicates.active,
+        on_iteration=on_iteration,
+    )
+    return _grouping(tessellation, rows, tessellation.labels, weights, target)
+
+
+def group_cells(
+    merged: GaussianScene,
+    grouping: Grouping,
+    analysis: SceneAnalysis,
+    target: int,
+    config: SimplifyConfig,
+    *,
+    on_iteration: Callable[[int], None] = lambda done: None,
+) -> Grouping:
+    """Group the cells of a finer size into coarser ones, so that levels are nested.
+
+    Args:
+        merged: The merged Gaussians of the finer size.
+        grouping: The cells of the finer size.
+        analysis: Frame and effect plan of the scene.
+        target: Number of cells, at most that of the finer size.
+        config: As for :func:`group_rows`.
+        on_iteration: Called with the number of finished Lloyd iterations.
+
+    Returns:
+        Cells that consist of whole finer cells; members are Gaussians of the scene.
+    """
+    fine = torch.arange(len(merged), device=merged.device)
+    masses = grouping.weights * merged.opacities
+    rows = curve_order(merged, fine, analysis.frame, masses=masses)
+    points, weights = embed_rows(merged, rows, analysis, target, config), grouping.weights[rows]
+    tessellation = cvt.tessellate(
+        points, weights, target, config=config.cvt, seed=config.seed, on_iteration=on_iteration
+    )
+    coarse = torch.empty_like(tessellation.labels)
+    coarse[rows] = tessellation.labels
+    members = grouping.partition
+    labels = torch.repeat_interleave(coarse, members.counts)
+    return _grouping(tessellation, members.order, labels, weights, target)
+
+
+def _grouping(
+    tessellation: cvt.Tessellation, rows: Tensor, labels: Tensor, weights: Tensor, target: int
+) -> Grouping:
+    """Collect the rows of every label; labels and memory of the tessellation are not kept."""
+    local = cells.Partition.from_labels(labels, target)
+    return Grouping(
+        partition=cells.Partition(order=rows[local.order], offsets=local.offsets),
+        weights=torch.bincount(tessellation.labels, weights),
+        refilled=tessellation.refilled,
+        energies=tessellation.energies,
+        energy=tessellation.energy,
+        backend=tessellation.backend,
+    )
+
+
+def merge_cells(
+    scene: GaussianScene,
+    partition: cells.Partition,
+    config: MergeConfig,
+    *,
+    areas: Float[Tensor, "n"],
+    backend: str,
+    with_network: bool,
+    on_cells: Callable[[int], None] = lambda done: None,
+) -> Merged:
+    """Merge every cell into one Gaussian, align its axes, and inflate what must cover its cell.
+
+    Args:
+        scene: The Gaussians.
+        partition: Rows of every cell.
+        config: How a cell becomes one Gaussian.
+        areas: Mean projected areas of the Gaussians.
+        backend: What searches the neighbours.
+        with_network: Whether a network will ask for the neighbours.
+        on_cells: Called with the number of finished cells.
+
+    Returns:
+        One Gaussian per cell.
+    """
+    merged, shown = merge_members(scene, partition, config, areas=areas, on_cells=on_cells)
+    near = neighbor_count(config, with_network=with_network)
+    neighbors = cvt.nearest_neighbors(merged.means, near, backend=backend)
+    return Merged(shape_merged(merged, shown, neighbors, config), shown, neighbors)
+
+
+def merge_members(
+    scene: GaussianScene,
+    partition: cells.Partition,
+    config: MergeConfig,
+    *,
+    areas: Float[Tensor, "n"],
+    on_cells: Callable[[int], None] = lambda done: None,
+) -> tuple[GaussianScene, cells.Partition]:
+    """Merge every cell by its members alone; also return the members that each stands for."""
+    merged = cells.merge_cells(scene, partition, config=config, on_cells=on_cells)
+    if not config.representatives:
+        return merged, partition
+    return cells.keep_representatives(scene, merged, partition, areas=areas)
+
+
+def neighbor_count(config: MergeConfig, *, with_network: bool) -> int:
+    """Return how many neighbours inflation or a network asks for; 0 if neither does."""
+    inflates = config.inflation > 0.0 or config.covered_inflation > 0.0
+    return NEIGHBORS if inflates or with_network else 0
+
+
+def shape_merged(
+    merged: GaussianScene,
+    shown: cells.Partition,
+    neighbors: Int[Tensor, "m k"],
+    config: MergeConfig,
+) -> GaussianScene:
+    """Align axes and inflate; merged Gaussians beyond the partition are neighbours only."""
+    merged = cells.align_axes(merged, shown, neighbors)
+    if config.inflation == 0.0 and config.covered_inflation == 0.0:
+        return merged
+    return cells.inflate_cells(
+        merged, shown, neighbors, everywhere=config.inflation, covered=config.covered_inflation
+    )
+
+
+def curve_order(
+    scene: GaussianScene,
+    rows: Int[Tensor, "k"],
+    frame: RobustFrame,
+    *,
+    masses: Float[Tensor, "k"],
+) -> Int[Tensor, "k"]:
+    """Return the order of Gaussians along a Morton curve, ties by mass.
+
+    The curve runs through contracted space: it stays fine where the bulk is, whatever flies away.
+    """
+    points = cvt.embed(scene.means[rows], frame=frame, contraction=1.0)
+    return morton_order(points, ties=masses)
+
+
+def embed_rows(
+    scene: GaussianScene,
+    rows: Int[Tensor, "k"],
+    analysis: SceneAnalysis,
+    target: int,
+    config: SimplifyConfig,
+) -> Float[Tensor, "k d"]:
+    """Embed Gaussians in the space of the tessellation; colour counts more with fewer cells."""
+    return cvt.embed(
+        scene.means[rows],
+        scene.sh0[rows],
+        frame=analysis.frame,
+        contraction=analysis.plan.unbounded.strength,
+        color=config.cvt.color * (target / COLOR_CELLS) ** config.cvt.color_power,
+    )
+
+
+def geometric_error(
+    scene: GaussianScene,
+    small: GaussianScene,
+    partition: cells.Partition,
+    *,
+    masses: Float[Tensor, "n"],
+) -> float:
+    """Return the root mean square distance from Gaussians to those that replace them.
+
+    Masses weigh the mean; the distance is in scene units.
+    """
+    squares, total = 0.0, 0.0
+    ids = segment_ids(partition.offsets)
+    for rows, cell in zip(partition.order.split(CHUNK), ids.split(CHUNK), strict=True):
+        shifts = scene.means[rows].double() - small.means[cell].double()
+        squares += float((masses[rows] * shifts.square().sum(dim=1)).sum())
+        total += float(masses[rows].sum())
+    return math.sqrt(squares / total) if total > 0.0 else 0.0

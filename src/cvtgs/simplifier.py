@@ -1,0 +1,395 @@
+"""Simplifier: the one call that users make; what it runs stands in :mod:`cvtgs.pipeline`."""
+
+import copy
+import os
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from cvtgs.analysis import (
+    SceneAnalysis,
+    analyze,
+    drop_mip_tag,
+    drop_unused_bands,
+    measure_visibility,
+    restore_columns,
+    select_columns,
+)
+from cvtgs.boxes import check_mask, check_room
+from cvtgs.cameras import Cameras
+from cvtgs.config import SimplifyConfig
+from cvtgs.counts import shortfall, target_count
+from cvtgs.devices import chosen_device, resolve_device
+from cvtgs.errors import ConfigError, InvalidArgumentError
+from cvtgs.mergenet import SHIPPED, Checkpoint, load_checkpoint
+from cvtgs.pipeline import Reduced, geometric_error, reduce_scene
+from cvtgs.progress import ProgressListener, silent
+from cvtgs.report import Level, Simplified, SimplifyReport, StageClock
+from cvtgs.scene import GaussianScene, concatenate
+from cvtgs.validity import (
+    CheckedScene,
+    check_rows,
+    standardized,
+    valid_rows,
+    with_finite_opacities,
+)
+
+NESTED_FROM = 4
+"""A level is made of finer cells only where there are, on average, so many of them in a cell."""
+
+
+class Simplifier:
+    """Makes scenes smaller: N Gaussians in, exactly ``ceil(rho * N)`` standard Gaussians out.
+
+    Args:
+        ckpt: MergeNet checkpoint: ``standard`` or ``paper``, which come with the package, or a
+            file; ``auto`` is the shipped one that fits the configuration's preset, ``None``
+            merges by moments alone.
+        config: A configuration, or the name of a preset; None is the preset of the checkpoint.
+        device: Where to compute: ``auto`` stays where the scene is, but takes CUDA for scenes on
+            the CPU if there is one; or any torch device. The result is where the scene was.
+        listener: Called with progress events.
+
+    Raises:
+        CheckpointError: The checkpoint cannot be used.
+        ConfigError: There is no such preset, or it has no network but a checkpoint is given.
+        DeviceError: There is no such device.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 1000, sh_degree=1, seed=0)
+        >>> Simplifier("standard", device="cpu").simplify(scene, 0.01)
+        GaussianScene(10 Gaussians, SH degree 1, float32, cpu)
+    """
+
+    def __init__(
+        self,
+        ckpt: str | os.PathLike[str] | None = "auto",
+        *,
+        config: SimplifyConfig | str | None = None,
+        device: str | torch.device = "auto",
+        listener: ProgressListener = silent,
+    ) -> None:
+        if isinstance(config, str):
+            config = SimplifyConfig.from_preset(config)
+        self.checkpoint = _checkpoint(ckpt, config)
+        self.config = config or SimplifyConfig.from_preset(
+            "standard" if self.checkpoint is None else self.checkpoint.info.preset
+        )
+        self._device = resolve_device(device)
+        self._listener = listener
+
+    def simplify(
+        self,
+        scene: GaussianScene,
+        rho: float | None = None,
+        *,
+        count: int | None = None,
+        cameras: Cameras | None = None,
+        keep: Bool[Tensor, "n"] | None = None,
+    ) -> GaussianScene:
+        """Make a scene smaller.
+
+        Args:
+            scene: The scene; it is not changed.
+            rho: Ratio of Gaussians to keep, in (0, 1].
+            count: Number of Gaussians to keep, instead of ``rho``.
+            cameras: Cameras for presets that render the scene; None finds views.
+            keep: Mask of Gaussians that are kept as they are; they count, and come first.
+
+        Returns:
+            A scene of exactly ``ceil(rho * N)`` (or ``count``) Gaussians; fewer only if so many
+            rows are invalid. With ``rho = 1``, the scene's own valid rows.
+
+        Raises:
+            InvalidArgumentError: Ratio or count is out of range, or both or neither are given.
+            InvalidSceneError: The scene has no valid row.
+        """
+        return self.run(scene, rho, count=count, cameras=cameras, keep=keep).scene
+
+    def run(
+        self,
+        scene: GaussianScene,
+        rho: float | None = None,
+        *,
+        count: int | None = None,
+        cameras: Cameras | None = None,
+        keep: Bool[Tensor, "n"] | None = None,
+    ) -> Simplified:
+        """Make a scene smaller, and report; arguments and errors as for :meth:`simplify`.
+
+        Returns:
+            The scene and the report.
+        """
+        return self.prepare(scene, cameras=cameras).run(rho, count=count, keep=keep)
+
+    def levels(
+        self,
+        scene: GaussianScene,
+        rhos: Sequence[float],
+        *,
+        cameras: Cameras | None = None,
+    ) -> tuple[Level, ...]:
+        """Make a scene smaller in several sizes, in little more time than the finest takes.
+
+        The finest size is what :meth:`run` returns, bit for bit. Cells of a coarser one consist of
+        whole cells of the finest, where it is at least four times as coarse.
+
+        Args:
+            scene: The scene; it is not changed.
+            rhos: Ratios of Gaussians to keep, in (0, 1], in any order.
+            cameras: Cameras for presets that render the scene; None finds views.
+
+        Returns:
+            One level per ratio, in the order of the ratios; each of exactly ``ceil(rho * N)``.
+
+        Raises:
+            InvalidArgumentError: A ratio is out of range, or there is none.
+            InvalidSceneError: The scene has no valid row.
+
+        Example:
+            >>> from cvtgs.synthetic import scene as make
+            >>> levels = Simplifier(device="cpu").levels(make("object", 1000), [0.1, 0.01])
+            >>> [len(level.scene) for level in levels]
+            [100, 10]
+        """
+        return self.prepare(scene, cameras=cameras).levels(rhos)
+
+    def prepare(self, scene: GaussianScene, *, cameras: Cameras | None = None) -> "Prepared":
+        """Get ready to make a scene smaller again and again, for a slider or a search.
+
+        What does not depend on the number of Gaussians is done in the first run only.
+
+        Args:
+            scene: The scene; it is not changed, and must not be while this is used.
+            cameras: Cameras for presets that render the scene; None finds views.
+
+        Returns:
+            The prepared scene.
+
+        Example:
+            >>> from cvtgs.synthetic import scene as make
+            >>> prepared = Simplifier(device="cpu").prepare(make("object", 1000))
+            >>> [len(prepared.run(count=count).scene) for count in (10, 20)]
+            [10, 20]
+        """
+        device = chosen_device(self._device or "auto", scene.device)
+        return Prepared(
+            scene,
+            self.config,
+            checkpoint=self.checkpoint,
+            device=device,
+            cameras=cameras,
+            listener=self._listener,
+        )
+
+
+class Prepared:
+    """A scene to be made smaller again and again; what does not depend on the count is done once.
+
+    :meth:`Simplifier.prepare` makes these. Every run gives the bits of :meth:`Simplifier.run`;
+    the report of the first one has the stages that are shared.
+
+    Args:
+        scene: The scene as it came.
+        config: Every choice.
+        checkpoint: What corrects merged Gaussians; None for no network.
+        device: Where to compute.
+        cameras: Cameras for presets that render the scene; None finds views.
+        listener: Called with progress events.
+    """
+
+    def __init__(
+        self,
+        scene: GaussianScene,
+        config: SimplifyConfig,
+        *,
+        checkpoint: Checkpoint | None,
+        device: torch.device,
+        cameras: Cameras | None = None,
+        listener: ProgressListener = silent,
+    ) -> None:
+        self._scene, self._config, self._checkpoint = scene, config, checkpoint
+        self._used = select_columns(scene, config.effects).to(device)
+        self._device, self._cameras, self._listener = device, cameras, listener
+        self._net = None
+        if checkpoint is not None:
+            self._net = copy.deepcopy(checkpoint.net).to(device=device, dtype=scene.dtype)
+        self._checked: CheckedScene | None = None
+        self._analysis: SceneAnalysis | None = None
+
+    def run(
+        self,
+        rho: float | None = None,
+        *,
+        count: int | None = None,
+        keep: Bool[Tensor, "n"] | None = None,
+    ) -> Simplified:
+        """Make the scene smaller, and report; arguments and errors as for :meth:`Simplifier.run`.
+
+        Returns:
+            The scene and the report.
+        """
+        target = target_count(len(self._scene), rho, count=count)
+        clock = StageClock(self._listener, self._device)
+        if keep is not None:
+            check_mask(keep, len(self._scene))
+        valid = self._check(clock).scene
+        analysis = self._analyze(target, clock)
+        if keep is None or not bool(keep.any()):
+            reduced = self._reduce(valid, analysis, target, clock)
+            return self._result(reduced, analysis, target, clock)
+        keep = keep.to(valid.device)
+        kept = keep if len(keep) == len(valid) else keep[valid_rows(self._used)]
+        check_room(int(kept.sum()), target=target, total=len(valid))
+        first, rest = kept.nonzero()[:, 0], (~kept).nonzero()[:, 0]
+        protected = with_finite_opacities(valid.select(first))
+        if target >= len(valid):
+            others = Reduced(with_finite_opacities(valid.select(rest)))
+        else:
+            part, room = analysis.select(rest), target - len(protected)
+            others = self._reduce(valid.select(rest), part, room, clock)
+        reduced = others._replace(scene=concatenate([protected, others.scene]))
+        return self._result(reduced, analysis, target, clock, kept_count=len(protected))
+
+    def levels(self, rhos: Sequence[float]) -> tuple[Level, ...]:
+        """Make the scene smaller in several sizes; see :meth:`Simplifier.levels`.
+
+        Returns:
+            One level per ratio, in the order of the ratios.
+        """
+        targets = [target_count(len(self._scene), rho) for rho in rhos]
+        if not targets:
+            raise InvalidArgumentError("levels need at least one ratio, found none.")
+        found: dict[int, Level] = {}
+        finest: Reduced | None = None
+        for target in sorted(set(targets), reverse=True):
+            clock = StageClock(self._listener, self._device)
+            valid = self._check(clock).scene
+            analysis = self._analyze(target, clock)
+            nested = finest is not None and NESTED_FROM * target <= len(finest.scene)
+            start = finest if nested else None
+            reduced = self._reduce(valid, analysis, target, clock, finest=start)
+            error = 0.0
+            if reduced.grouping is not None:
+                finest = finest or reduced
+                masses = analysis.apparent_areas * valid.opacities
+                partition = reduced.grouping.partition
+                error = geometric_error(valid, reduced.scene, partition, masses=masses)
+            result = self._result(reduced, analysis, target, clock)
+            found[target] = Level(*result, error, nested)
+        return tuple(found[target] for target in targets)
+
+    def _check(self, clock: StageClock) -> CheckedScene:
+        if self._checked is None:
+            with clock.stage("check"):
+                self._checked = check_rows(self._used)
+        return self._checked
+
+    def _analyze(self, target: int, clock: StageClock) -> SceneAnalysis:
+        """Analyze the valid rows, once; a scene that stays whole needs its effect plan only."""
+        if self._analysis is not None:
+            return self._analysis
+        valid = self._check(clock).scene
+        is_whole = target >= len(valid)
+        with clock.stage("plan"):
+            with_visibility = self._net is not None and not is_whole
+            analysis = analyze(valid, self._config, with_visibility=with_visibility)
+        if is_whole:
+            return analysis
+        if analysis.plan.visibility.active:
+            with clock.stage("visibility"):
+                analysis = measure_visibility(valid, analysis, self._config, cameras=self._cameras)
+        self._analysis = analysis
+        return analysis
+
+    def _reduce(
+        self,
+        scene: GaussianScene,
+        analysis: SceneAnalysis,
+        target: int,
+        clock: StageClock,
+        *,
+        finest: Reduced | None = None,
+    ) -> Reduced:
+        if target >= len(scene):
+            is_whole = target == len(self._scene)
+            return Reduced(with_finite_opacities(scene) if is_whole else standardized(scene))
+        config, net = self._config, self._net
+        return reduce_scene(scene, analysis, target, config, net=net, clock=clock, finest=finest)
+
+    def _result(
+        self,
+        reduced: Reduced,
+        analysis: SceneAnalysis,
+        target: int,
+        clock: StageClock,
+        *,
+        kept_count: int = 0,
+    ) -> Simplified:
+        """Report, restore what was not computed with, and refine if the configuration says so."""
+        checked, scene = self._check(clock), self._scene
+        report = SimplifyReport(
+            input_count=len(scene),
+            output_count=len(reduced.scene),
+            target_count=target,
+            rho=target / len(scene),
+            invalid_rows=checked.invalid_rows,
+            invalid_count=checked.invalid_count,
+            shortfall=shortfall(len(checked.scene), len(scene), target),
+            kept_count=kept_count,
+            mass_in=float((analysis.areas * checked.scene.opacities).sum()),
+            mass_out=float(reduced.scene.masses.sum()),
+            checkpoint="none" if self._checkpoint is None else self._checkpoint.name,
+            device=str(self._device),
+            plan=analysis.plan,
+            stages=tuple(clock.costs),
+            config=self._config,
+            **reduced.statistics().model_dump(),
+        )
+        small = restore_columns(reduced.scene, scene, analysis.plan).to(scene.device)
+        result = Simplified(small, report)
+        if not self._config.refine.enabled or len(small) == len(scene):
+            return result
+        return self._refine(result, analysis)
+
+    def _refine(self, result: Simplified, analysis: SceneAnalysis) -> Simplified:
+        from cvtgs.refinement import join_reports, refine  # noqa: PLC0415 (most never need it)
+
+        choices, plan, kept = self._config.effects, analysis.plan, result.report.kept_count
+        reduce_bands = drop_mip_tag if kept else drop_unused_bands
+        small, full = (
+            reduce_bands(select_columns(scene, choices), plan)
+            for scene in (result.scene, self._scene)
+        )
+        refined = refine(
+            small,
+            full,
+            cameras=self._cameras,
+            config=self._config.refine,
+            seed=self._config.seed,
+            device=self._device,
+            frozen=kept,
+            listener=self._listener,
+        )
+        restored = restore_columns(refined.scene, self._scene, plan)
+        return Simplified(restored, join_reports(result.report, refined))
+
+
+def _checkpoint(
+    ckpt: str | os.PathLike[str] | None, config: SimplifyConfig | None
+) -> Checkpoint | None:
+    if ckpt is None:
+        return None
+    if config is not None and not config.merge.network:
+        if ckpt == "auto":
+            return None
+        raise ConfigError(
+            f"merge.network is false, so ckpt must be None or auto; found {os.fspath(ckpt)!r}."
+        )
+    if ckpt == "auto":
+        preset = "standard" if config is None else config.preset
+        return load_checkpoint(preset if preset in SHIPPED else "standard")
+    return load_checkpoint(ckpt)

@@ -1,0 +1,170 @@
+"""Which rows renderers can draw, and how valid input becomes standard Gaussians."""
+
+import math
+import warnings
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from cvtgs.errors import DroppedDataWarning, InvalidSceneError
+from cvtgs.math import parameters
+from cvtgs.scene import GaussianScene
+
+UNIT_TOLERANCE = 1e-5
+"""Quaternions whose squared length is this near 1 count as unit quaternions."""
+
+MAX_LOG_SCALE = math.log(torch.finfo(torch.float32).max)
+"""The logarithm of the largest scale that files and renderers, which hold float32, can express."""
+
+
+class CheckedScene(NamedTuple):
+    """The valid rows of a scene, and how many others there were.
+
+    Attributes:
+        scene: The valid Gaussians.
+        invalid_rows: Rows that were dropped, by the attribute that is NaN, infinite or zero.
+        invalid_count: Rows that were dropped.
+    """
+
+    scene: GaussianScene
+    invalid_rows: dict[str, int]
+    invalid_count: int
+
+
+def check_rows(scene: GaussianScene) -> CheckedScene:
+    """Drop rows with NaN, infinite or zero values where there must be none, and warn.
+
+    Args:
+        scene: The Gaussians.
+
+    Returns:
+        The valid rows, and what was dropped.
+
+    Raises:
+        InvalidSceneError: No row is valid.
+    """
+    if len(scene) == 0:
+        raise InvalidSceneError("a scene needs at least one Gaussian to be simplified; found none.")
+    invalid = invalid_rows(scene)
+    if not invalid:
+        return CheckedScene(scene, {}, 0)
+    dropped = torch.stack(list(invalid.values())).any(dim=0)
+    count = int(dropped.sum())
+    reasons = {name: int(mask.sum()) for name, mask in invalid.items()}
+    text = ", ".join(f"{name} {number}" for name, number in reasons.items())
+    if count == len(scene):
+        raise InvalidSceneError(
+            f"none of the {len(scene)} Gaussians is valid; "
+            f"found NaN, infinite or zero values in {text}."
+        )
+    warnings.warn(
+        f"dropped {count} of {len(scene)} Gaussians with NaN, infinite or zero values ({text}).",
+        DroppedDataWarning,
+        stacklevel=2,
+    )
+    return CheckedScene(scene.select(~dropped), reasons, count)
+
+
+def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
+    """Find the rows that no renderer can draw.
+
+    NaN or infinite means, scales and SH coefficients, NaN opacities, and quaternions that are
+    zero, NaN or infinite are invalid. Scales beyond float32 count as infinite, and those of
+    minus infinity, which are 0, are invalid too. Infinite opacity logits are valid.
+
+    Args:
+        scene: Any scene.
+
+    Returns:
+        One mask per attribute that has bad rows; empty for a clean scene.
+
+    Example:
+        >>> from cvtgs.synthetic import scene
+        >>> invalid_rows(scene("object", 10, sh_degree=0, seed=0))
+        {}
+    """
+    masks = {
+        "means": ~_finite(scene.means),
+        "quats": ~_finite(scene.quats) | (scene.quats == 0).all(dim=1),
+        "log_scales": ~_finite(scene.log_scales) | (scene.log_scales > MAX_LOG_SCALE).any(dim=1),
+        "logit_opacities": scene.logit_opacities.isnan(),
+        "sh0": ~_finite(scene.sh0),
+        "shN": ~_finite(scene.shN),
+    }
+    return {name: mask for name, mask in masks.items() if bool(mask.any())}
+
+
+def valid_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
+    """Return which rows renderers can draw.
+
+    Args:
+        scene: Any scene.
+
+    Returns:
+        Mask of the valid rows.
+
+    Example:
+        >>> from cvtgs.synthetic import scene
+        >>> bool(valid_rows(scene("object", 10, sh_degree=0, seed=0)).all())
+        True
+    """
+    valid = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
+    for mask in invalid_rows(scene).values():
+        valid &= ~mask
+    return valid
+
+
+def with_finite_opacities(scene: GaussianScene) -> GaussianScene:
+    """Replace infinite opacity logits, which are valid input, by the largest finite ones.
+
+    Args:
+        scene: A scene with valid rows.
+
+    Returns:
+        The scene itself if there is nothing to replace.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 10, sh_degree=0, seed=0)
+        >>> with_finite_opacities(scene) is scene
+        True
+    """
+    logits = scene.logit_opacities
+    infinite = logits.isinf()
+    if not bool(infinite.any()):
+        return scene
+    finite = torch.where(infinite, parameters.clamp_logits(logits), logits)
+    return scene.with_tensors({"logit_opacities": finite}, scene.extras)
+
+
+def standardized(scene: GaussianScene) -> GaussianScene:
+    """Bring opacities strictly inside (0, 1) and quaternions to unit length.
+
+    Args:
+        scene: A scene with valid rows.
+
+    Returns:
+        A scene in which rows that were so already are unchanged, bit for bit.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 10, sh_degree=0, seed=0)
+        >>> bool((standardized(scene).quats == scene.quats).all())
+        True
+    """
+    squared_norms = scene.quats.double().square().sum(dim=1)
+    is_unit = ((squared_norms - 1).abs() <= UNIT_TOLERANCE)[:, None]
+    quats = torch.where(is_unit, scene.quats, parameters.normalize_quats(scene.quats))
+    logits = parameters.clamp_logits(scene.logit_opacities)
+    return scene.with_tensors({"quats": quats, "logit_opacities": logits}, scene.extras)
+
+
+def _finite(values: Tensor) -> Tensor:
+    """Return the rows without NaN or infinity, without an array of booleans per value.
+
+    A finite number times 0 is 0, any other is NaN, and a sum with a NaN is NaN.
+    """
+    flat = values.flatten(start_dim=1)
+    return torch.cat([(part * 0).sum(dim=1) == 0 for part in flat.split(1 << 16)])
