@@ -3,11 +3,14 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import pytest
 import torch
 
 import oracles
-from cvtgs import CvtgsError, GaussianScene, load
+from cvtgs import CvtgsError, GaussianScene, load, load_cameras
+from cvtgs.errors import FileFormatError
 from cvtgs.scene import ANTIALIASED_TAG
 from format_oracles import Splat
 from scenes import moved, random_scene
@@ -29,6 +32,14 @@ def refusal(path: Path) -> str | None:
     except CvtgsError as error:
         return str(error)
     return None
+
+
+def camera_refusal(path: Path, error: type[CvtgsError] = FileFormatError, **arguments: Any) -> str:
+    """Return what reading damaged cameras says."""
+    with pytest.raises(error) as caught:
+        load_cameras(path, **arguments)
+    assert type(caught.value) is error
+    return str(caught.value)
 
 
 def nearest_rows(scene: GaussianScene, other: GaussianScene) -> GaussianScene:

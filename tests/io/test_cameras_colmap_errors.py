@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from camera_errors import text_of
 from camera_files import colmap_bin, colmap_txt, inria, write_json
 from cvtgs.errors import (
     DroppedDataWarning,
@@ -18,6 +17,7 @@ from cvtgs.errors import (
     InputNotFoundError,
 )
 from cvtgs.io import load_cameras
+from format_cases import camera_refusal
 
 CAMERAS_TXT: Mapping[str, tuple[str, str]] = {
     "few words": (
@@ -59,7 +59,7 @@ def test_colmap_cameras_txt(case, tmp_path) -> None:
     line, wanted = CAMERAS_TXT[case]
     path = tmp_path / "cameras.txt"
     path.write_text(f"# a comment\n\n{line}\n")
-    assert text_of(tmp_path) == f"{path}: line 3: {wanted}"
+    assert camera_refusal(tmp_path) == f"{path}: line 3: {wanted}"
 
 
 IMAGES_TXT: Mapping[str, tuple[str, str]] = {
@@ -100,7 +100,7 @@ def test_colmap_images_txt(case, tmp_path) -> None:
     lines, wanted = IMAGES_TXT[case]
     path = tmp_path / "images.txt"
     path.write_text(f"# a comment\n{lines}\n")
-    assert text_of(tmp_path) == f"{path}: {wanted}"
+    assert camera_refusal(tmp_path) == f"{path}: {wanted}"
 
 
 def packed_cameras(count: int = 1, model: int = 1, **changes: Any) -> bytes:
@@ -177,7 +177,7 @@ def test_colmap_binary(case, tmp_path) -> None:
     colmap_bin(tmp_path)
     path = tmp_path / f"{name}.bin"
     path.write_bytes(data)
-    assert text_of(tmp_path) == f"{path}: {wanted}"
+    assert camera_refusal(tmp_path) == f"{path}: {wanted}"
 
 
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
@@ -198,22 +198,22 @@ def test_any_damage_gives_cameras_or_one_sentence(name, tmp_path) -> None:
 
 
 def test_what_is_not_there(tmp_path) -> None:
-    assert text_of(tmp_path, InputNotFoundError) == (
+    assert camera_refusal(tmp_path, InputNotFoundError) == (
         f"{tmp_path}: the folder must hold transforms.json, transforms_train.json, "
         f"transforms_test.json, a COLMAP model in sparse/0, sparse or itself, or cameras.json; "
         f"found none of them."
     )
     for name in ("no.json", "no"):
-        assert text_of(tmp_path / name, InputNotFoundError) == (
+        assert camera_refusal(tmp_path / name, InputNotFoundError) == (
             f"{tmp_path / name}: the file to read must exist, found none."
         )
     colmap_bin(tmp_path)
     (tmp_path / "cameras.bin").unlink()
-    assert text_of(tmp_path, InputNotFoundError) == (
+    assert camera_refusal(tmp_path, InputNotFoundError) == (
         f"{tmp_path / 'cameras.bin'}: the file to read must exist, found none."
     )
     (tmp_path / "points.ply").write_bytes(b"ply\n")
-    assert text_of(tmp_path / "points.ply") == (
+    assert camera_refusal(tmp_path / "points.ply") == (
         f"{tmp_path / 'points.ply'}: a file of cameras must be JSON (.json) or of a COLMAP model "
         f"(cameras.bin, images.bin, cameras.txt, images.txt), found neither."
     )
@@ -221,14 +221,14 @@ def test_what_is_not_there(tmp_path) -> None:
 
 def test_what_cannot_be_read(tmp_path) -> None:
     os.mkfifo(tmp_path / "pipe.json")
-    assert text_of(tmp_path / "pipe.json", InputError) == (
+    assert camera_refusal(tmp_path / "pipe.json", InputError) == (
         f"{tmp_path / 'pipe.json'}: must be a regular file, found a device or a pipe."
     )
     if os.geteuid() == 0:
         pytest.skip("root may read everything")
     path = write_json(tmp_path / "cameras.json", inria())
     path.chmod(0)
-    assert text_of(path, InputError) == (
+    assert camera_refusal(path, InputError) == (
         f"{path}: the file must be readable, found: permission denied."
     )
 

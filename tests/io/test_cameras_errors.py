@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from camera_errors import text_of
 from camera_files import inria, transforms, write_json
 from cvtgs.errors import (
     InputNotFoundError,
     InvalidArgumentError,
 )
+from format_cases import camera_refusal
 
 
 def put(*keys: Any, value: Any) -> Callable[[Any], None]:
@@ -106,7 +106,7 @@ def test_transforms(case, tmp_path) -> None:
     document = copy.deepcopy(transforms())
     change(document)
     path = write_json(tmp_path / "transforms.json", document)
-    found = text_of(path)
+    found = camera_refusal(path)
     assert found.startswith(f"{path}:{wanted}")
     assert found.endswith(".")
     assert "\n" not in found
@@ -115,24 +115,28 @@ def test_transforms(case, tmp_path) -> None:
 def test_splits_of_transforms(tmp_path) -> None:
     document = {**transforms(), "train_filenames": ["images/frame_01.jpg", "images/none.jpg"]}
     path = write_json(tmp_path / "transforms.json", document)
-    assert text_of(path, split="train") == (
+    assert camera_refusal(path, split="train") == (
         f"{path}: row 1 of 'train_filenames' must be the 'file_path' of a frame, "
         f"found 'images/none.jpg'."
     )
-    assert text_of(path, split="test") == f"{path}: 'test_filenames' must be a list, found none."
+    assert (
+        camera_refusal(path, split="test")
+        == f"{path}: 'test_filenames' must be a list, found none."
+    )
     write_json(path, {**document, "train_filenames": []})
     assert (
-        text_of(path, split="train") == f"{path}: must hold at least one train camera, found none."
+        camera_refusal(path, split="train")
+        == f"{path}: must hold at least one train camera, found none."
     )
     write_json(path, transforms(rows=[3]))
-    assert text_of(tmp_path, split="train") == (
+    assert camera_refusal(tmp_path, split="train") == (
         f"{tmp_path}: must hold at least one train camera, found none."
     )
-    assert text_of(tmp_path, InvalidArgumentError, split="val") == (
+    assert camera_refusal(tmp_path, InvalidArgumentError, split="val") == (
         "split must be 'train', 'test' or None, found 'val'."
     )
     path.rename(tmp_path / "transforms_train.json")
-    assert text_of(tmp_path, InputNotFoundError, split="test") == (
+    assert camera_refusal(tmp_path, InputNotFoundError, split="test") == (
         f"{tmp_path / 'transforms_test.json'}: the file to read must exist, found none."
     )
 
@@ -142,13 +146,13 @@ def test_image_sizes_that_are_not_there(tmp_path) -> None:
     del document["w"]
     document["frames"][0]["file_path"] = "r_0"
     path = write_json(tmp_path / "transforms.json", document)
-    assert text_of(path) == (
+    assert camera_refusal(path) == (
         f"{path}: frame 0: 'w' and 'h' must be given here or for the whole file, or the image "
         f"must be there; found neither them nor {tmp_path / 'r_0'}."
     )
     for content in (b"\xff\xd8\xff" + bytes(100), b"\x89PNG"):
         (tmp_path / "r_0.png").write_bytes(content)
-        assert text_of(path) == (
+        assert camera_refusal(path) == (
             f"{tmp_path / 'r_0.png'}: must be a PNG file, since its size is not among the cameras; "
             f"found another format. Give 'w' and 'h' in the file of the cameras."
         )
@@ -180,7 +184,7 @@ def test_inria(case, tmp_path) -> None:
     entries = inria()
     change(entries)
     path = write_json(tmp_path / "cameras.json", entries)
-    assert text_of(path) == f"{path}: {wanted}"
+    assert camera_refusal(path) == f"{path}: {wanted}"
 
 
 JSON: Mapping[str, tuple[bytes, str]] = {
@@ -209,11 +213,11 @@ def test_json(case, tmp_path) -> None:
     data, wanted = JSON[case]
     path = tmp_path / "cameras.json"
     path.write_bytes(data)
-    assert text_of(path) == f"{path}: {wanted}"
+    assert camera_refusal(path) == f"{path}: {wanted}"
 
 
 def test_json_without_end(tmp_path) -> None:
     path = tmp_path / "cameras.json"
     for data in (b"[" * 1_000_000, b"[" + b"9" * 10_000 + b"]"):
         path.write_bytes(data)
-        assert text_of(path).startswith(f"{path}: must be plain JSON, found: ")
+        assert camera_refusal(path).startswith(f"{path}: must be plain JSON, found: ")

@@ -24,7 +24,7 @@ Bytes = NDArray[np.uint8]
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 HALF_RANGE = np.float32(np.sqrt(0.5))
-"""No other component is larger than this."""
+"""Largest magnitude of a component of a unit quaternion other than the largest."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,7 +40,7 @@ class Arrays:
 
 
 def arrays_of(scene: GaussianScene, *, sh_degree: int = 3) -> Arrays:
-    """Return what a compact format can hold of a scene: the rows that are numbers."""
+    """Return the rows of a scene that a compact format can hold."""
     rows = writable_rows(scene)
     if not bool(rows.any()):
         raise InvalidSceneError(
@@ -63,7 +63,7 @@ def arrays_of(scene: GaussianScene, *, sh_degree: int = 3) -> Arrays:
 
 
 def scene_of(arrays: Arrays, *, antialiased: bool = False) -> GaussianScene:
-    """Make a scene of what a reader found."""
+    """Build a scene."""
 
     def tensor(values: Floats) -> Tensor:
         return torch.from_numpy(np.require(values, np.float32, ["C", "W"]))
@@ -120,7 +120,7 @@ def sh0_of_colors(colors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 def drop_largest(
     quats: Float[np.ndarray, "n 4"],
 ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """Leave out the largest component, after making it positive."""
+    """Remove the largest component, after making it positive."""
     rows = np.arange(len(quats))
     largest = np.abs(quats).argmax(axis=1)
     signs = np.where(quats[rows, largest] < 0, -1, 1).astype(quats.dtype)
@@ -131,7 +131,7 @@ def drop_largest(
 def restore_largest(
     largest: Int[np.ndarray, "n"], others: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 4"]:
-    """Put the largest component back, the inverse of :func:`drop_largest`."""
+    """Insert the largest component again, the inverse of :func:`drop_largest`."""
     quats = np.empty((len(others), 4), others.dtype)
     rows = np.arange(len(others))
     quats[rows[:, None], _OTHERS[largest]] = others

@@ -112,7 +112,7 @@ def _target(path: str | os.PathLike[str]) -> Path:
 
 
 def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
-    """Return the finished file its name."""
+    """Move the finished file to its name."""
     if overwrite:
         if target.exists():
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
@@ -171,7 +171,7 @@ def _is(path: Path, empty: os.stat_result) -> bool:
 
 
 def _concerns(error: OSError, temporary: Path) -> bool:
-    """Return errors of this output from those that the caller's code ran into elsewhere."""
+    """Return whether an error is about this output, not about other files of the caller."""
     if error.filename is None:
         return True
     return Path(os.fsdecode(error.filename)).parent == temporary.parent

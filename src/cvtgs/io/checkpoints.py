@@ -75,7 +75,7 @@ def _unpickled(path: Path) -> Any:
 
 
 class _IgnoredType:
-    """Stands in for the types of numpy numbers."""
+    """A stand-in for the types of numpy numbers."""
 
     def __init__(self, *_: Any) -> None:
         pass
@@ -85,7 +85,7 @@ class _IgnoredType:
 
 
 def _ignored_number(module: str) -> Any:
-    """Stand in for the maker of numpy numbers, which lives in another module since numpy 2."""
+    """Build a stand-in for the maker of numpy numbers, whose module was renamed in numpy 2."""
 
     def scalar(*_: Any) -> float:
         return 0.0
@@ -96,9 +96,9 @@ def _ignored_number(module: str) -> Any:
 
 @contextmanager
 def _numpy_numbers_ignored() -> Iterator[None]:
-    """Let torch's restricted reader pass the learning rates that schedulers leave behind.
+    """Let torch's restricted reader ignore numpy numbers: learning rates of schedulers.
 
-    They are numpy numbers, which it refuses. It gets makers of nothing by the same names instead.
+    It refuses them otherwise. Stand-ins of the same names build nothing.
     """
     stand_ins = [
         _ignored_number("numpy.core.multiarray"),

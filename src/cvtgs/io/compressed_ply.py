@@ -28,19 +28,18 @@ from cvtgs.io.ply.header import (
     Element,
     Header,
     header_bytes,
-    is_compressed_ply,
     read_header,
     row_dtype,
 )
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 
-__all__ = ["is_compressed_ply", "read_compressed_ply", "write_compressed_ply"]
+__all__ = ["read_compressed_ply", "write_compressed_ply"]
 
 Rows = NDArray[Any]
 
 _CHUNK_ROWS = 256
-"""So many Gaussians share the ranges of a chunk."""
+"""Gaussians that share the ranges of a chunk."""
 
 _RANGES = tuple(
     f"{end}_{name}"
@@ -259,7 +258,7 @@ def _packed(
 def _fractions(
     values: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "c 6"]]:
-    """Report where values lie between the least and the largest of their chunk, and give these."""
+    """Return where values lie between the least and largest of their chunk, and these two."""
     starts = np.arange(0, len(values), _CHUNK_ROWS)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     size = np.diff(np.append(starts, len(values)))
@@ -275,7 +274,7 @@ def _rest_bytes(rest: Float[np.ndarray, "n k"]) -> UInt8[np.ndarray, "n k"]:
 def _pack(
     fractions: Float[np.ndarray, "n k"], bits: tuple[int, ...], *, high: UInt32[np.ndarray, "n"]
 ) -> UInt32[np.ndarray, "n"]:
-    """Put fractions side by side into 32 bits."""
+    """Pack fractions side by side into 32 bits."""
     words = high
     for column, size in zip(fractions.T, bits, strict=True):
         most = (1 << size) - 1
@@ -285,7 +284,7 @@ def _pack(
 
 
 def _unpack(words: UInt32[np.ndarray, "n"], bits: tuple[int, ...]) -> Float[np.ndarray, "n k"]:
-    """Take fractions out of 32 bits, the inverse of :func:`_pack`."""
+    """Unpack fractions from 32 bits, the inverse of :func:`_pack`."""
     fractions = np.empty((len(words), len(bits)), np.float32)
     shift = sum(bits)
     for column, size in enumerate(bits):

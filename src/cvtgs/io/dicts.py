@@ -22,6 +22,10 @@ _TENSORS = {
     "shN": "shN",
     "features_rest": "shN",
 }
+_KNOWN = (
+    "means, quats, scales, opacities, sh0 (or features_dc) and, above SH degree 0, "
+    "shN (or features_rest)"
+)
 
 
 def from_dict(
@@ -55,7 +59,8 @@ def from_dict(
         ([0.0, 0.0, 0.0], [0.0, 0.0])
     """
     tensors = {name: _as_tensor(key, mapping[key]) for name, key in _keys(mapping).items()}
-    dtype = _common_dtype(tensors)
+    double = any(tensor.dtype == torch.float64 for tensor in tensors.values())
+    dtype = torch.float64 if double else torch.float32
     tensors = {name: tensor.to(dtype) for name, tensor in tensors.items()}
     if tensors["sh0"].ndim == 2:
         tensors["sh0"] = tensors["sh0"][:, None, :]
@@ -64,8 +69,11 @@ def from_dict(
     if "shN" not in tensors:
         tensors["shN"] = tensors["means"].new_zeros(len(tensors["means"]), 0, 3)
     if activated:
-        tensors["log_scales"] = _stored_scales(tensors["log_scales"])
-        tensors["logit_opacities"] = _stored_opacities(tensors["logit_opacities"])
+        scales, opacities = tensors["log_scales"], tensors["logit_opacities"]
+        _check_values("scales", scales < 0, required="at least 0")
+        _check_values("opacities", (opacities < 0) | (opacities > 1), required="from 0 to 1")
+        tensors["log_scales"] = parameters.positive_log(scales)
+        tensors["logit_opacities"] = parameters.logit_from_opacity(opacities)
     return GaussianScene(**tensors, extras={}, comments=(), layout=())
 
 
@@ -107,7 +115,7 @@ def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
             continue
         name = _TENSORS.get(key.removeprefix(prefix))
         if name is None:
-            raise InvalidSceneError(f"the names must be {_known()}, found {key!r}.")
+            raise InvalidSceneError(f"the names must be {_KNOWN}, found {key!r}.")
         if name in keys:
             raise InvalidSceneError(
                 f"a dictionary must give {name} once, found {keys[name]!r} and {key!r}."
@@ -120,26 +128,19 @@ def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
     ]
     if missing:
         raise InvalidSceneError(
-            f"a dictionary must hold {_known()}, found none named {', '.join(missing)}."
+            f"a dictionary must hold {_KNOWN}, found none named {', '.join(missing)}."
         )
     return keys
 
 
 def _prefix(mapping: Mapping[str, Any]) -> str:
-    """Return what stands before ``means``, up to a dot."""
+    """Return the common prefix of the names: what stands before ``means``."""
     found = [key for key in mapping if key == "means" or key.endswith(".means")]
     if len(found) > 1:
         raise InvalidSceneError(
             f"a dictionary must give means once, found {' and '.join(map(repr, found))}."
         )
     return found[0].removesuffix("means") if found else ""
-
-
-def _known() -> str:
-    return (
-        "means, quats, scales, opacities, sh0 (or features_dc) and, above SH degree 0, "
-        "shN (or features_rest)"
-    )
 
 
 def _as_tensor(key: str, value: Tensor | NDArray[Any]) -> Tensor:
@@ -152,21 +153,6 @@ def _as_tensor(key: str, value: Tensor | NDArray[Any]) -> Tensor:
             f"found {getattr(value, 'dtype', type(value).__name__)}."
         )
     return value.detach()
-
-
-def _common_dtype(tensors: Mapping[str, Tensor]) -> torch.dtype:
-    double = any(tensor.dtype == torch.float64 for tensor in tensors.values())
-    return torch.float64 if double else torch.float32
-
-
-def _stored_scales(scales: Tensor) -> Tensor:
-    _check_values("scales", scales < 0, required="at least 0")
-    return parameters.positive_log(scales)
-
-
-def _stored_opacities(opacities: Tensor) -> Tensor:
-    _check_values("opacities", (opacities < 0) | (opacities > 1), required="from 0 to 1")
-    return parameters.logit_from_opacity(opacities)
 
 
 def _check_values(name: str, wrong: Tensor, *, required: str) -> None:

@@ -19,7 +19,7 @@ _STEP = re.compile(r"step-(\d{1,18})\.ckpt")
 
 @contextmanager
 def open_input(path: Path) -> Iterator[BinaryIO]:
-    """Open a regular file, and translate what the system says while it is read."""
+    """Open a regular file; what the system refuses, also while it is read, is an InputError."""
     try:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):  # opening a pipe would wait for ever
@@ -41,14 +41,8 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
         raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
 
 
-def read_bytes(path: Path) -> bytes:
-    """Read a whole file."""
-    with open_input(path) as file:
-        return file.read()
-
-
 def is_file(path: Path) -> bool:
-    """Report whether a file is there, also where its folder may not be looked into."""
+    """Return whether there is a file; False where its folder may not be read."""
     return os.path.isfile(path)  # noqa: PTH113 (Path.is_file raises without permission)
 
 
@@ -123,7 +117,7 @@ def _scenes(folder: Path) -> Iterator[Path]:
 
 
 def _numbered(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
-    """Return what is numbered in a folder, the largest number first."""
+    """Return the numbered entries of a folder, the largest number first."""
     if not folder.is_dir():
         return []
     matches = [(pattern.fullmatch(part.name), part) for part in folder.iterdir()]

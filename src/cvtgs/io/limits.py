@@ -40,7 +40,7 @@ class FormatLimits:
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Least and largest value of a tensor, by its name."""
     largest_coordinate: Callable[[GaussianScene], float] | None = None
-    """Gives the largest coordinate that a file of a scene holds; None if any fits."""
+    """Computes the largest coordinate that a file of a scene holds; None if any fits."""
     changed: tuple[str, ...]
     """What is rounded or reordered."""
 

@@ -49,7 +49,7 @@ def save_tensors(
 
 
 def map_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read tensors from a file without loading what is not looked at."""
+    """Map the tensors of a file; their pages are read when they are used."""
     from safetensors import SafetensorError, safe_open  # noqa: PLC0415
 
     if not Path(path).is_file():
@@ -63,12 +63,12 @@ def map_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[s
 
 
 def add_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Put tensors under a common name, to store several groups in one file."""
+    """Add a prefix to names, to store several groups of tensors in one file."""
     return {prefix + name: values for name, values in tensors.items()}
 
 
 def under_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Take the tensors of one group, the inverse of :func:`add_prefix`."""
+    """Return the tensors of one group, the inverse of :func:`add_prefix`."""
     return {
         name.removeprefix(prefix): values
         for name, values in tensors.items()

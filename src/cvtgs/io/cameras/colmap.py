@@ -68,7 +68,7 @@ _OTHERS = {
 
 
 def is_colmap(folder: Path) -> bool:
-    """Report whether a folder holds a sparse model."""
+    """Return whether a folder holds a sparse model."""
     return any(is_file(folder / f"images.{suffix}") for suffix in ("bin", "txt"))
 
 
@@ -103,7 +103,7 @@ def _views(images: Sequence[_Image], lenses: Mapping[int, Lens], path: Path) -> 
 
 
 def _checked_image(name: str, camera: int, *, pose: Sequence[float], where: str) -> _Image:
-    """Make an image; poses that are none are errors."""
+    """Build an image; poses that are none are errors."""
     if not all(map(math.isfinite, pose)) or not any(pose[:4]):
         raise FileFormatError(
             f"{where}: the pose must be finite with a quaternion other than 0, "
@@ -121,7 +121,7 @@ def _model_name(number: int) -> str:
 
 
 def _find_model(name: str, where: str) -> _Model:
-    """Look a model up."""
+    """Return a camera model by its name."""
     if name not in _MODELS:
         raise FileFormatError(
             f"{where}: the camera model must be one of {', '.join(_MODELS)}, found {name}; "
@@ -133,7 +133,7 @@ def _find_model(name: str, where: str) -> _Model:
 def _lens_of(
     model: _Model, parameters: Sequence[float], *, width: int, height: int, where: str
 ) -> Lens:
-    """Take the pinhole part of a camera."""
+    """Return the pinhole part of a camera."""
     focals, rest = parameters[: model.focals], parameters[model.focals :]
     cx, cy, *distortion = rest
     for value in distortion:

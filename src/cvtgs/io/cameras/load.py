@@ -1,4 +1,4 @@
-"""Load cameras; what lies at the path says which format it is."""
+"""Read cameras; the files at the path say which format it is."""
 
 import os
 from pathlib import Path
@@ -9,7 +9,7 @@ from cvtgs.io.cameras.views import SPLITS, Split, View, hold_out, to_cameras
 from cvtgs.io.files import is_file
 
 _COLMAP_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
-_LOOKED_FOR = (
+_KNOWN_FILES = (
     "transforms.json, transforms_train.json, transforms_test.json, a COLMAP model in sparse/0, "
     "sparse or itself, or cameras.json"
 )
@@ -88,7 +88,7 @@ def _folder_views(folder: Path, split: Split | None) -> list[View]:
             return hold_out(colmap_views(model), split)
     if is_file(folder / "cameras.json"):
         return _file_views(folder / "cameras.json", split)
-    raise InputNotFoundError(f"{folder}: the folder must hold {_LOOKED_FOR}; found none of them.")
+    raise InputNotFoundError(f"{folder}: the folder must hold {_KNOWN_FILES}; found none of them.")
 
 
 def _file_views(path: Path, split: Split | None) -> list[View]:

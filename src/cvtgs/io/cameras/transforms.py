@@ -161,7 +161,7 @@ def _view(content: Any, document: _Transforms, *, path: Path, where: str) -> Vie
 
 
 def _lens(frame: _Frame, document: _Transforms, *, path: Path, where: str) -> Lens:
-    """Take each number from the frame, else from the whole file, else from the image size."""
+    """Build a lens: each number of the frame, else of the file, else from the image size."""
     width, height = _size(frame, document, path=path, where=where)
     levels: _Levels = ((frame, where), (document, str(path)))
     fx, fy = _focal(levels, "x", pixels=width), _focal(levels, "y", pixels=height)
@@ -230,7 +230,7 @@ def _png_size(path: Path) -> tuple[int, int]:
 
 
 def _listed(views: Sequence[View], names: Sequence[Any] | None, key: str, path: Path) -> list[View]:
-    """Take the frames that the file itself lists, in the order of the frames."""
+    """Return the views that the file lists under a key, in the order of the frames."""
     if names is None:
         raise FileFormatError(f"{path}: {key!r} must be a list, found none.")
     known = {PurePosixPath(view.name) for view in views}

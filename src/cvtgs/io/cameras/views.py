@@ -83,7 +83,7 @@ def viewmat_of_pose(
 
 
 def hold_out(views: Sequence[View], split: Split | None) -> list[View]:
-    """Take every 8th view in the order of names for testing, as Mip-NeRF 360 and 3DGS do."""
+    """Return a split: every 8th view by name is for testing, as in Mip-NeRF 360 and 3DGS."""
     if split is None:
         return list(views)
     by_name = sorted(range(len(views)), key=lambda row: views[row].name)
@@ -92,7 +92,7 @@ def hold_out(views: Sequence[View], split: Split | None) -> list[View]:
 
 
 def to_cameras(views: Sequence[View], path: str) -> Cameras:
-    """Bring views to the most frequent image size, and warn of distortion once."""
+    """Build cameras of the most frequent image size, and warn of distortion once."""
     sizes = Counter((view.lens.width, view.lens.height) for view in views)
     (width, height), _ = sizes.most_common(1)[0]
     _warn_of_distortion(views, path)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, BinaryIO, Literal, NoReturn, get_args
+from typing import Any, BinaryIO, Literal, get_args
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ Layout = tuple[tuple[str, str], ...]
 MAX_HEADER_BYTES = 1 << 20
 """Longer headers are refused; a 3DGS header has about two thousand bytes."""
 
-_STRANGERS = MappingProxyType(
+_OTHER_FILES = MappingProxyType(
     {
         b"\x1f\x8b": "a gzip file; unpack it first",
         b"PK\x03\x04": "a zip archive; unpack it first",
@@ -117,19 +117,13 @@ class Element:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Header:
-    """What a PLY header says.
-
-    Attributes:
-        encoding: How the file stores numbers.
-        elements: The tables, in file order.
-        comments: Comment lines, wherever they stood, in order.
-        data_offset: Where the first row starts, in bytes.
-    """
+    """What a PLY header says; tables and comments in the order of the file."""
 
     encoding: Encoding
     elements: tuple[Element, ...]
     comments: tuple[str, ...]
     data_offset: int
+    """Where the first row starts, in bytes."""
 
 
 def read_header(file: BinaryIO, path: str) -> Header:
@@ -160,7 +154,10 @@ def read_header(file: BinaryIO, path: str) -> Header:
             case ["property", kind, name] if tables and kind in TYPE_NAMES and _is_name(name):
                 tables[-1][2].append(Property(name=name, type=TYPE_NAMES[kind]))
             case _:
-                _refuse(path, number, line)
+                raise FileFormatError(
+                    f"{path}: line {number} of the PLY header must be a valid format, element, "
+                    f"property or comment line, found {line.strip()[:80]!r}."
+                )
     if encoding is None:
         raise FileFormatError(f"{path}: the PLY header must have a format line, found none.")
     elements = tuple(
@@ -177,8 +174,8 @@ def read_header(file: BinaryIO, path: str) -> Header:
 
 
 def _kind_of(block: bytes) -> str:
-    """Report what a file is that is no PLY file, as far as its first bytes tell."""
-    for start, found in _STRANGERS.items():
+    """Return what a file is instead of a PLY file, judged by its first bytes."""
+    for start, found in _OTHER_FILES.items():
         if block.startswith(start):
             return found
     return repr(block[:8])
@@ -220,19 +217,12 @@ def _is_count(text: str) -> bool:
 
 
 def _is_name(text: str) -> bool:
-    """Return whether a name can stand in a sentence; real ones have some twenty letters."""
+    """Return whether a name is short enough for an error text; real ones have some 20 letters."""
     return len(text) <= _MAX_NAME_LETTERS
 
 
 def _is_list(length: str, kind: str) -> bool:
     return kind in TYPE_NAMES and TYPE_NAMES.get(length, "float") not in FLOAT_TYPES
-
-
-def _refuse(path: str, number: int, line: str) -> NoReturn:
-    raise FileFormatError(
-        f"{path}: line {number} of the PLY header must be a valid format, element, property or "
-        f"comment line, found {line.strip()[:80]!r}."
-    )
 
 
 def _check_unique(elements: tuple[Element, ...], path: str) -> None:
@@ -254,14 +244,7 @@ def _check_unique(elements: tuple[Element, ...], path: str) -> None:
 
 
 def is_compressed_ply(path: Path) -> bool:
-    """Return by its header whether a PLY file is a compressed one, whatever its name.
-
-    Args:
-        path: A file.
-
-    Returns:
-        Whether its vertices are packed; False if it cannot be read.
-    """
+    """Return whether a PLY file has packed vertices, whatever its name; False if unreadable."""
     try:
         with open_input(path) as file:
             elements = read_header(file, str(path)).elements

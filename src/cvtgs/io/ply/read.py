@@ -258,8 +258,7 @@ class _CleanStream(io.BufferedIOBase):
         file.seek(header.data_offset)
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read at most what is there; a negative length comes from a damaged list."""
-        if size is None or size < 0:
+        if size is None or size < 0:  # of a damaged list
             raise ValueError("a list cannot have a negative length")
         data = self._pending.read(size)
         if data or size == 0:
@@ -268,28 +267,22 @@ class _CleanStream(io.BufferedIOBase):
         return data.translate(_NOT_ASCII) if self._is_text else data
 
     def read1(self, size: int = -1, /) -> bytes:
-        """Read as :meth:`read` does."""
         return self.read(size)
 
     def readable(self) -> bool:
-        """Report yes."""
         return True
 
     def seekable(self) -> bool:
-        """Report yes."""
         return True
 
     def tell(self) -> int:
-        """Return the position in the real file."""
         return self._file.tell()
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Move in the real file."""
         return self._file.seek(offset, whence)
 
     def fileno(self) -> int:
-        """Return the real file, for memory mapping."""
-        return self._file.fileno()
+        return self._file.fileno()  # for memory mapping
 
 
 def _explain(error: Any, elements: tuple[Element, ...], path: str) -> str:

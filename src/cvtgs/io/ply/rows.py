@@ -71,7 +71,7 @@ class PlyRows:
 
 
 def open_rows(path: str | os.PathLike[str]) -> PlyRows:
-    """Look at a PLY file without reading its rows.
+    """Open a PLY file without reading its rows.
 
     Args:
         path: The file.
@@ -111,7 +111,7 @@ def join_plys(
     *,
     before: Sequence[NDArray[Any]] = (),
 ) -> int:
-    """Put the rows of PLY files behind one another; memory is one buffer.
+    """Write the rows of PLY files behind one another; memory is one buffer.
 
     Args:
         paths: Files that :func:`cvtgs.save` has written, with the same columns and comments; at

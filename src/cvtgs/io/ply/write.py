@@ -118,7 +118,9 @@ def _output_layout(scene: GaussianScene) -> Layout:
     """
     _check_names(scene)
     slots = standard_slots(scene.shN.shape[1])
-    base = dict(scene.layout) or dict.fromkeys(_inria_names(list(slots)), _float_type(scene))
+    float_type = "double" if scene.dtype == torch.float64 else "float"
+    x, y, z, *others = slots
+    base = dict(scene.layout) or dict.fromkeys([x, y, z, *NORMALS, *others], float_type)
     if "scale_2" not in base:
         del slots["scale_2"]
     keeps_types = dtype_of(tuple(base.items())) == scene.dtype
@@ -126,38 +128,25 @@ def _output_layout(scene: GaussianScene) -> Layout:
     for name, kind in base.items():
         if name in slots:
             usable = keeps_types and kind in FLOAT_TYPES
-            kept.append((name, kind if usable else _float_type(scene)))
+            kept.append((name, kind if usable else float_type))
         elif name in scene.extras:
             kept.append((name, _extra_type(name, scene.extras[name], kind)))
         elif name in NORMALS:
             kept.append((name, kind))
     names = {name for name, _ in kept}
-    missing = [(name, _float_type(scene)) for name in slots if name not in names]
-    at = _end_of_colours([name for name, _ in kept])
+    missing = [(name, float_type) for name in slots if name not in names]
+    colours = [
+        i
+        for i, (name, _) in enumerate(kept)
+        if name.startswith("f_dc_") or rest_index(name) is not None
+    ]
+    end = max(colours, default=len(kept) - 1) + 1  # view-dependent colours belong behind these
     added = [
         (name, _extra_type(name, column, None))
         for name, column in scene.extras.items()
         if name not in names
     ]
-    return tuple(kept[:at] + missing + kept[at:] + added)
-
-
-def _inria_names(standard: list[str]) -> list[str]:
-    return [*standard[:3], *NORMALS, *standard[3:]]
-
-
-def _float_type(scene: GaussianScene) -> str:
-    return "double" if scene.dtype == torch.float64 else "float"
-
-
-def _end_of_colours(names: list[str]) -> int:
-    """Find where view-dependent colours belong: behind the last colour, else at the end."""
-    colours = [
-        i
-        for i, name in enumerate(names)
-        if name.startswith("f_dc_") or rest_index(name) is not None
-    ]
-    return max(colours, default=len(names) - 1) + 1
+    return tuple(kept[:end] + missing + kept[end:] + added)
 
 
 def _check_names(scene: GaussianScene) -> None:

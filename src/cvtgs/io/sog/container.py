@@ -21,7 +21,7 @@ PALETTE_COLUMNS = 64
 """Entries of the SH palette in a row of its image."""
 
 Reader = Callable[[str, int], bytes]
-"""Gives the content of a file by its name, unless it is longer than so many bytes."""
+"""Reads a file by its name; one of more than this many bytes is an error."""
 
 
 def open_container(path: Path) -> AbstractContextManager[Reader]:

@@ -6,13 +6,10 @@ No other file imports zstandard.
 import struct
 import warnings
 import zlib
-from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from numpy.typing import NDArray
 
 from cvtgs.errors import DroppedDataWarning, FileFormatError, MissingDependencyError
 from cvtgs.io.arrays import HALF_RANGE, Arrays, logits_of_bytes, restore_largest, scene_of
@@ -28,6 +25,9 @@ from cvtgs.io.spz.layout import (
     turn_axes,
 )
 from cvtgs.scene import GaussianScene
+
+Blocks = dict[str, UInt8[np.ndarray, "b"]]
+"""Bytes by name: means, opacities, colors, log_scales, quats, sh."""
 
 _GZIP = b"\x1f\x8b"
 _MOST_BITS = 24
@@ -71,7 +71,7 @@ def read_spz(path: Path, *, axes: Axes = "RUB") -> GaussianScene:
     return scene_of(arrays, antialiased=header.antialiased)
 
 
-def _unpack(header: SpzHeader, blocks: Mapping[str, UInt8[np.ndarray, "b"]]) -> Arrays:
+def _unpack(header: SpzHeader, blocks: Blocks) -> Arrays:
     n = header.count
     rest = blocks["sh"].reshape(n, STORED_REST_COUNTS[header.sh_degree], 3)[:, :15]
     return Arrays(
@@ -107,15 +107,7 @@ def _quats(stored: UInt8[np.ndarray, "n b"]) -> Float[np.ndarray, "n 4"]:
     return np.roll(restore_largest((words >> 30).astype(np.int64), others), 1, axis=1)
 
 
-class SpzFile(NamedTuple):
-    """An ``.spz`` file in parts."""
-
-    header: SpzHeader
-    blocks: dict[str, UInt8[np.ndarray, "b"]]
-    """Bytes by name: means, opacities, colors, log_scales, quats, sh."""
-
-
-def _read_blocks(path: Path) -> SpzFile:
+def _read_blocks(path: Path) -> tuple[SpzHeader, Blocks]:
     """Read and decompress a file."""
     with open_input(path) as file:
         content = file.read()
@@ -129,7 +121,7 @@ def _read_blocks(path: Path) -> SpzFile:
     )
 
 
-def _read_gzip(content: bytes, path: Path) -> SpzFile:
+def _read_gzip(content: bytes, path: Path) -> tuple[SpzHeader, Blocks]:
     stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     try:
         header = _header(stream.decompress(content, HEADER.size), path, versions=(1, 2, 3))
@@ -142,8 +134,12 @@ def _read_gzip(content: bytes, path: Path) -> SpzFile:
         raise FileFormatError(f"{path}: must be whole gzip, found damage: {error}.") from error
     if len(payload) < wanted:
         raise _too_short(path, header, wanted, f"{len(payload):,}")
+    if surplus and header.flags & EXTENSIONS_FLAG:  # nothing says where they end
+        raise FileFormatError(
+            f"{path}: an .spz file of version {header.version} must have no extensions, found "
+            f"some; write it as version 4."
+        )
     if surplus:
-        _refuse_shifted(header, path)
         warnings.warn(
             f"{path}: left out what stands behind the {header.count:,} Gaussians that the header "
             f"promises.",
@@ -152,19 +148,12 @@ def _read_gzip(content: bytes, path: Path) -> SpzFile:
         )
     elif not stream.eof:
         raise FileFormatError(f"{path}: must be whole gzip, found it cut short.")
-    return SpzFile(header, _split(np.frombuffer(payload, np.uint8), header))
+    ends = np.cumsum(list(header.sizes.values()))[:-1]
+    blocks = np.split(np.frombuffer(payload, np.uint8), ends)
+    return header, dict(zip(header.sizes, blocks, strict=True))
 
 
-def _refuse_shifted(header: SpzHeader, path: Path) -> None:
-    """Refuse extensions before version 4, since nothing says where they end."""
-    if header.flags & EXTENSIONS_FLAG:
-        raise FileFormatError(
-            f"{path}: an .spz file of version {header.version} must have no extensions, found "
-            f"some; write it as version 4."
-        )
-
-
-def _read_version_4(content: bytes, path: Path) -> SpzFile:
+def _read_version_4(content: bytes, path: Path) -> tuple[SpzHeader, Blocks]:
     header = _header(content[: HEADER.size], path, versions=(4,))
     sizes = {name: size for name, size in header.sizes.items() if size}
     start = int.from_bytes(content[_TABLE_START], "little")
@@ -187,7 +176,7 @@ def _read_version_4(content: bytes, path: Path) -> SpzFile:
             )
         blocks[name] = _unzstd(content[at : at + packed], size, f"{path}: block {name!r}")
         at += packed
-    return SpzFile(header, blocks)
+    return header, blocks
 
 
 def _header(start: bytes, path: Path, *, versions: tuple[int, ...]) -> SpzHeader:
@@ -219,11 +208,6 @@ def _header(start: bytes, path: Path, *, versions: tuple[int, ...]) -> SpzHeader
         flags=flags,
         streams=streams,
     )
-
-
-def _split(payload: NDArray[np.uint8], header: SpzHeader) -> dict[str, NDArray[np.uint8]]:
-    ends = np.cumsum(list(header.sizes.values()))[:-1]
-    return dict(zip(header.sizes, np.split(payload, ends), strict=True))
 
 
 def _too_short(path: Path, header: SpzHeader, wanted: int, found: str) -> FileFormatError:
