@@ -10,6 +10,7 @@ import nox
 nox.options.sessions = ["lint", "tests", "readme"]
 nox.options.error_on_missing_interpreters = True
 CONSTRAINTS = ("-c", str(Path("constraints.txt").resolve()))
+PARALLEL = ("-n", "auto", "--dist", "worksteal")
 WHEEL_TESTS = (
     "tests/test_public_names.py",
     "tests/test_typing.py",
@@ -34,11 +35,16 @@ def lint(session: nox.Session) -> None:
 
 @nox.session
 def tests(session: nox.Session) -> None:
-    """Unit, property and documentation tests, with coverage."""
+    """Unit, property and documentation tests, a process per core, with coverage."""
     session.install(*CONSTRAINTS, "-e", ".[test]")
-    session.run("coverage", "run", "-m", "pytest", *session.posargs)
-    session.run("coverage", "combine")
-    session.run("coverage", "report")
+    session.run("pytest", *PARALLEL, "--cov", *session.posargs)
+
+
+@nox.session(reuse_venv=True)
+def quick(session: nox.Session) -> None:
+    """All tests but the slow ones: two minutes on two cores."""
+    session.install(*CONSTRAINTS, "-e", ".[test]")
+    session.run("pytest", *PARALLEL, "-m", "not slow", *session.posargs)
 
 
 @nox.session
@@ -97,7 +103,7 @@ def wheel(session: nox.Session) -> None:
         session.run("cvtgs", "doctor", "--device", "cpu")
         patterns = session.posargs or WHEEL_TESTS
         words = [str(path) for pattern in patterns for path in sorted(Path().glob(pattern))]
-        session.run("pytest", *words, "--ignore=tests/test_house.py")
+        session.run("pytest", *PARALLEL, *words, "--ignore=tests/test_house.py")
 
 
 @nox.session

@@ -1,8 +1,8 @@
 """An easy scene, ways to spoil it, and what every result of a hard one is checked for."""
 
 import math
+from collections.abc import Callable
 from functools import cache
-from importlib import import_module
 
 import pytest
 import torch
@@ -11,8 +11,10 @@ from torch import Tensor
 from cvtgs import GaussianScene, Simplifier
 
 dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["32", "64"])
-devices = pytest.mark.parametrize("device", ["cpu", *["cuda"] * torch.cuda.is_available()])
-presets = pytest.mark.parametrize("preset", ["standard", "paper"])
+PRESETS = ("standard", "paper")
+DEVICES = ("cpu", *["cuda"] * torch.cuda.is_available())
+devices = pytest.mark.parametrize("device", DEVICES)
+presets = pytest.mark.parametrize("preset", PRESETS)
 
 
 @cache
@@ -21,9 +23,10 @@ def simplifier(preset: str, device: str = "cpu") -> Simplifier:
     return Simplifier(config=preset, device=device)
 
 
-def coarsen_light(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Look through a grid of 16 voxels a side, not 128, which takes most of the time here."""
-    monkeypatch.setattr(import_module("cvtgs.analysis.visibility"), "HALF_GRID", 8)
+def valid_case(make: Callable[..., GaussianScene], count: int, dtype: torch.dtype) -> GaussianScene:
+    """The rows of a case that a renderer can draw."""
+    scene = make(count, dtype)
+    return scene.select(valid_rows(scene))
 
 
 def ball(count: int, dtype: torch.dtype, *, seed: int = 0) -> GaussianScene:

@@ -13,17 +13,11 @@ from cvtgs.filters import flyaway_rows, visible_rows
 from cvtgs.math.frames import robust_frame
 from cvtgs.validity import invalid_rows, standardized
 from hard_cases import CASES, each_case
-from hard_scenes import (
-    ball,
-    changed,
-    devices,
-    dtypes,
-    simplifier,
-    valid_rows,
-)
+from hard_scenes import DEVICES, ball, changed, dtypes, simplifier, valid_rows
 from scenes import assert_standard, same_bits
 
 COUNT = 60
+pytestmark = pytest.mark.usefixtures("coarse_light")
 
 
 def test_every_case_is_in_the_catalogue_and_says_where_it_is_from():
@@ -40,8 +34,29 @@ def test_every_case_is_in_the_catalogue_and_says_where_it_is_from():
 
 @dtypes
 @each_case
-def test_cases_are_what_they_say(make, dtype):
+def test_each_case(make, dtype, subtests, tmp_path):
+    """Files keep it, filters find what is wrong with it, and results go through files."""
     scene = make(COUNT, dtype)
+    with subtests.test("cases are what they say"):
+        check_that_it_is_what_it_says(make, scene, dtype)
+    with subtests.test("files keep every bit"):
+        check_that_files_keep_every_bit(scene, tmp_path)
+    with subtests.test("results go through files"):
+        preset = "standard" if dtype == torch.float32 else "paper"
+        check_that_results_go_through_files(make, scene, preset, tmp_path)
+    valid = scene.select(valid_rows(scene))
+    with subtests.test("only what flew away is a flyaway"):
+        check_that_only_what_flew_away_is_a_flyaway(make, valid)
+    for device in DEVICES:
+        with subtests.test("invalid rows are found by their property", device=device):
+            check_that_invalid_rows_are_found(make, scene, device)
+        with subtests.test("what the filter leaves out is bounded", device=device):
+            check_that_what_the_filter_leaves_out_is_bounded(valid.to(device))
+        with subtests.test("valid rows become standard and keep what they are", device=device):
+            check_that_valid_rows_become_standard(valid.to(device))
+
+
+def check_that_it_is_what_it_says(make, scene, dtype):
     assert scene.dtype == dtype
     assert len(scene) == {"one": 1, "two": 2, "three": 3}.get(make.__name__, COUNT)
     spoiled = make.__name__.startswith("nan_") or make.__name__ == "zero_quaternions"
@@ -50,10 +65,7 @@ def test_cases_are_what_they_say(make, dtype):
         assert make is CASES["ball"] or not same_bits(scene, ball(COUNT, dtype)) or scene.comments
 
 
-@dtypes
-@each_case
-def test_files_keep_every_bit(make, dtype, tmp_path):
-    scene = make(COUNT, dtype)
+def check_that_files_keep_every_bit(scene, tmp_path):
     cvtgs.save(scene, tmp_path / "case.ply")
     read = cvtgs.load(tmp_path / "case.ply")
     assert same_bits(read, scene)
@@ -64,13 +76,8 @@ def test_files_keep_every_bit(make, dtype, tmp_path):
     assert (tmp_path / "again.ply").read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("preset", "dtype"), [("standard", torch.float32), ("paper", torch.float64)]
-)
-@each_case
-def test_results_go_through_files(make, dtype, preset, tmp_path):
+def check_that_results_go_through_files(make, scene, preset, tmp_path):
     """Results of 2DGS files lose their third scale, with a warning, for the file has none."""
-    scene = make(COUNT, dtype)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DroppedDataWarning)
         small = simplifier(preset).simplify(scene, 0.2)
@@ -105,11 +112,7 @@ def test_half_precision_becomes_float32_without_rounding():
 # Filters
 
 
-@dtypes
-@devices
-@each_case
-def test_invalid_rows_are_found_by_their_property(make, device, dtype):
-    scene = make(COUNT, dtype)
+def check_that_invalid_rows_are_found(make, scene, device):
     found = invalid_rows(scene.to(device))
     bad = torch.stack([*found.values(), torch.zeros(len(scene), device=device) > 0]).any(dim=0)
     assert torch.equal(bad.cpu(), ~valid_rows(scene))
@@ -118,12 +121,7 @@ def test_invalid_rows_are_found_by_their_property(make, device, dtype):
     assert list(found) == names
 
 
-@dtypes
-@devices
-@each_case
-def test_what_the_filter_leaves_out_is_bounded(make, device, dtype):
-    scene = make(COUNT, dtype)
-    scene = scene.select(valid_rows(scene)).to(device)
+def check_that_what_the_filter_leaves_out_is_bounded(scene):
     opacities, masses = scene.opacities, scene.masses
     for share, at_least in ((1.0, 1), (1.0, len(scene)), (0.01, 1), (0.01, len(scene) // 2 + 1)):
         keep = visible_rows(
@@ -135,11 +133,7 @@ def test_what_the_filter_leaves_out_is_bounded(make, device, dtype):
             assert float(masses[~keep].sum()) <= share * float(masses.sum())
 
 
-@dtypes
-@each_case
-def test_only_what_flew_away_is_a_flyaway(make, dtype):
-    scene = make(COUNT, dtype)
-    scene = scene.select(valid_rows(scene))
+def check_that_only_what_flew_away_is_a_flyaway(make, scene):
     distances = robust_frame(scene.means).distances(scene.means)
     assert bool(distances.isfinite().all())
     seen = scene.masses * distances.clamp_min(1).pow(-2)
@@ -159,12 +153,7 @@ def test_equally_faint_gaussians_go_by_mass_not_by_row():
     assert float(scene.masses[~keeps[0]].amax()) <= float(scene.masses[keeps[0]].amin())
 
 
-@dtypes
-@devices
-@each_case
-def test_valid_rows_become_standard_and_keep_what_they_are(make, device, dtype):
-    scene = make(COUNT, dtype)
-    scene = scene.select(valid_rows(scene)).to(device)
+def check_that_valid_rows_become_standard(scene):
     small = standardized(scene)
     assert_standard(small)
     for name in ("means", "log_scales", "sh0", "shN"):

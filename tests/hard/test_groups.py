@@ -21,16 +21,11 @@ from cvtgs.cvt import (
 from cvtgs.cvt.coincident import distinct_rows, runs_of_equal
 from cvtgs.math.frames import morton_order, robust_frame
 from hard_cases import CASES, each_case
-from hard_scenes import devices, dtypes, presets, valid_rows
+from hard_scenes import DEVICES, PRESETS, dtypes, valid_case
 
 COUNT = 60
 SEARCHES = {"scipy": nearest_scipy, "torch": nearest_torch}
 searches = pytest.mark.parametrize("search", SEARCHES.values(), ids=SEARCHES)
-
-
-def valid_scene(make, dtype, device="cpu"):
-    scene = make(COUNT, dtype)
-    return scene.select(valid_rows(scene)).to(device)
 
 
 def squared_distances(points, sites):
@@ -40,13 +35,28 @@ def squared_distances(points, sites):
 
 
 @dtypes
-@devices
 @each_case
-def test_space_and_weights_are_finite(make, device, dtype):
-    scene = valid_scene(make, dtype, device)
+def test_each_case(make, dtype, subtests):
+    """Its space and weights are finite, its cells not empty, and what is nearest is the nearest."""
+    scene = valid_case(make, COUNT, dtype)
+    for device in DEVICES:
+        with subtests.test("space and weights are finite", device=device):
+            check_that_space_and_weights_are_finite(scene.to(device))
+        for preset in PRESETS:
+            with subtests.test("cells have members, energies fall", device=device, preset=preset):
+                check_that_cells_have_members_and_energies_fall(scene.to(device), preset)
+    points = embed(scene.means, frame=robust_frame(scene.means))
+    for name, search in SEARCHES.items():
+        with subtests.test("the nearest site is the nearest", search=name):
+            check_that_the_nearest_site_is_the_nearest(points, search)
+        with subtests.test("neighbours are the nearest others", search=name):
+            check_that_neighbours_are_the_nearest_others(points, name)
+
+
+def check_that_space_and_weights_are_finite(scene):
     frame = robust_frame(scene.means)
     assert frame.radius > 0
-    if dtype == torch.float32:  # it is the same in float64, and takes longest
+    if scene.dtype == torch.float32:  # it is the same in float64, and takes longest
         light = ambient_visibility(scene.means, scene.masses, frame)
         assert bool(((light >= 0) & (light <= 1)).all())
     far = perspective_falloff(scene.means, frame)
@@ -62,12 +72,7 @@ def test_space_and_weights_are_finite(make, device, dtype):
         assert float(weights.amax()) > 0
 
 
-@presets
-@dtypes
-@devices
-@each_case
-def test_every_cell_gets_a_member_and_lloyd_never_loses(make, device, dtype, preset):
-    scene = valid_scene(make, dtype, device)
+def check_that_cells_have_members_and_energies_fall(scene, preset):
     frame = robust_frame(scene.means)
     points = embed(scene.means, frame=frame)
     order = morton_order(points)
@@ -86,12 +91,7 @@ def test_every_cell_gets_a_member_and_lloyd_never_loses(make, device, dtype, pre
             assert all(after <= before + rounding for before, after in pairwise(energies))
 
 
-@searches
-@dtypes
-@each_case
-def test_the_nearest_site_is_the_nearest(make, dtype, search):
-    scene = valid_scene(make, dtype)
-    points = embed(scene.means, frame=robust_frame(scene.means))
+def check_that_the_nearest_site_is_the_nearest(points, search):
     sites = points[::3]
     labels, squared = search(points, sites)
     every = squared_distances(points, sites)
@@ -100,12 +100,7 @@ def test_the_nearest_site_is_the_nearest(make, dtype, search):
     np.testing.assert_allclose(squared.numpy(), own, rtol=1e-12, atol=0)
 
 
-@pytest.mark.parametrize("backend", SEARCHES)
-@dtypes
-@each_case
-def test_neighbours_are_the_nearest_others(make, dtype, backend):
-    scene = valid_scene(make, dtype)
-    sites = embed(scene.means, frame=robust_frame(scene.means))
+def check_that_neighbours_are_the_nearest_others(sites, backend):
     found = nearest_neighbors(sites, 8, backend=backend)
     assert found.shape == (len(sites), min(8, len(sites) - 1))
     assert not bool((found == torch.arange(len(sites))[:, None]).any())

@@ -1,6 +1,7 @@
 """Merging given cells of hard scenes, with and without a network, and the network's gradients."""
 
 import math
+from copy import deepcopy
 
 import pytest
 import torch
@@ -10,18 +11,13 @@ from cvtgs import render
 from cvtgs.cells import Partition, merge_cells
 from cvtgs.config import SimplifyConfig
 from hard_cases import CASES, each_case
-from hard_scenes import devices, dtypes, presets, simplifier, valid_rows
+from hard_scenes import DEVICES, PRESETS, dtypes, simplifier, valid_case
 from mergenet_cases import Case, case_of, features_of, lively_net
 from render_cases import around
 from scenes import assert_same_gaussians, assert_standard, covariances_of, moved, oracle_rows
 
 COUNT = 60
 EPSILON = {torch.float32: 1.2e-7, torch.float64: 2.3e-16}
-
-
-def valid_scene(make, dtype, device="cpu"):
-    scene = make(COUNT, dtype)
-    return scene.select(valid_rows(scene)).to(device)
 
 
 def labels_of(scene):
@@ -36,35 +32,43 @@ def merged(scene, config):
     return merge_cells(scene, Partition.from_labels(labels, int(labels.amax()) + 1), config=config)
 
 
-def config_of(preset):
-    return SimplifyConfig.from_preset(preset).merge
-
-
-def case_of_cells(make, dtype, device="cpu") -> Case:
-    scene = valid_scene(make, dtype, device)
+def case_of_cells(scene, device) -> Case:
     case = case_of(scene.to("cpu"), labels_of(scene).cpu())
     if device == "cpu":
         return case
     part = case.part.to(torch.device(device))
     there = case.neighbors.to(device), case.visibility.to(device)
-    return Case(scene, case.merged.to(device), part, *there)
+    return Case(scene.to(device), case.merged.to(device), part, *there)
 
 
-@presets
 @dtypes
-@devices
 @each_case
-def test_cells_equal_the_oracle(make, device, dtype, preset):
+def test_each_case_without_a_network(make, dtype, subtests):
+    scene = valid_case(make, COUNT, dtype)
+    bounded = scene if make is not CASES["far_flyaways"] else CASES["flyaways"](COUNT, dtype)
+    for preset in PRESETS:
+        config = SimplifyConfig.from_preset(preset).merge
+        for device in DEVICES:
+            with subtests.test("cells equal the oracle", device=device, preset=preset):
+                check_that_cells_equal_the_oracle(make, bounded.to(device), config)
+            with subtests.test("merged cells are standard", device=device, preset=preset):
+                check_that_merged_cells_are_standard(scene.to(device), config)
+        with subtests.test("the order of members changes nothing", preset=preset):
+            check_that_the_order_of_members_changes_nothing(scene, config)
+        if dtype == torch.float64:
+            with subtests.test("moments move with the scene", preset=preset):
+                check_that_moments_move_with_the_scene(scene, config)
+
+
+def check_that_cells_equal_the_oracle(make, scene, config):
     """To what float32 and float64 hold: of positions, of the cell's own size, of colours.
 
     The oracle takes areas from eigenvalues, and so loses needles to 1e-4, and cells of 1e30.
     """
-    if make.__name__ == "far_flyaways":
-        make = CASES["flyaways"]
-    scene, config = valid_scene(make, dtype, device), config_of(preset)
     small, labels = merged(scene, config).to("cpu"), labels_of(scene).cpu()
     scene, matrices = scene.to("cpu"), covariances_of(small)
-    tolerance = 200 * EPSILON[dtype] + 2e-12  # eigenvalues are floored at 1e-12 of the largest
+    epsilon = EPSILON[scene.dtype]
+    tolerance = 200 * epsilon + 2e-12  # eigenvalues are floored at 1e-12 of the largest
     tolerance += 1e-4 * (make.__name__ == "needles")
     for cell in range(len(small)):
         rows = (labels == cell).nonzero()[:, 0].tolist()
@@ -72,7 +76,7 @@ def test_cells_equal_the_oracle(make, device, dtype, preset):
             oracle_rows(scene, rows), area_power=config.area_power, opacity=config.opacity
         )
         size = math.sqrt(float(wanted.covariance.max()))
-        place = tolerance * size + EPSILON[dtype] * float(scene.means[rows].abs().amax())
+        place = tolerance * size + epsilon * float(scene.means[rows].abs().amax())
         assert small.means[cell].tolist() == pytest.approx(wanted.mean, abs=place)
         worst = (matrices[cell] - torch.from_numpy(wanted.covariance)).abs().amax()
         assert float(worst) <= 3 * tolerance * size * size * max(1, abs(math.log(size)))
@@ -85,41 +89,29 @@ def test_cells_equal_the_oracle(make, device, dtype, preset):
         )
 
 
-@presets
-@dtypes
-@devices
-@each_case
-def test_merged_cells_are_standard(make, device, dtype, preset):
-    scene = valid_scene(make, dtype, device)
+def check_that_merged_cells_are_standard(scene, config):
     counts = torch.bincount(labels_of(scene))
     assert int((counts == 1).sum()) >= min(2, len(scene))
-    assert_standard(merged(scene, config_of(preset)).select(counts > 1))
+    assert_standard(merged(scene, config).select(counts > 1))
 
 
-@presets
-@each_case
-def test_moments_move_with_the_scene(make, preset):
+def check_that_moments_move_with_the_scene(scene, config):
     """Any turn, a shift by twice the size of the scene and another unit, to 1e-4, in float64."""
-    scene, config = valid_scene(make, torch.float64), config_of(preset)
     extent = float((scene.means - scene.means.median(dim=0).values).abs().median()) or 1.0
     motion = {"quat": (0.9, 0.1, -0.3, 0.2), "scale": 1e3, "shift": (2e3 * extent, 0.0, -extent)}
     small = merged(scene, config)
     assert_same_gaussians(merged(moved(scene, **motion), config), moved(small, **motion))
 
 
-@presets
-@dtypes
-@each_case
-def test_the_order_of_members_changes_nothing(make, dtype, preset):
+def check_that_the_order_of_members_changes_nothing(scene, config):
     """To 1e-4 of the size of each cell: sums of other orders round otherwise."""
-    scene, config = valid_scene(make, dtype), config_of(preset)
     labels = labels_of(scene)
     shuffle = torch.randperm(len(scene), generator=torch.Generator().manual_seed(3))
     other = scene.select(shuffle)
     part = Partition.from_labels(labels[shuffle], int(labels.amax()) + 1)
     first, second = merged(scene, config), merge_cells(other, part, config=config)
     sizes = first.scales.double().amax(dim=1, keepdim=True)
-    slack = 1e-4 * sizes + 2 * EPSILON[dtype] * scene.means.double().abs().amax()
+    slack = 1e-4 * sizes + 2 * EPSILON[scene.dtype] * scene.means.double().abs().amax()
     assert bool(((first.means - second.means).abs() <= slack).all())
     ours, theirs = covariances_of(first), covariances_of(second)
     assert bool(((ours - theirs).abs().amax(dim=(1, 2)) <= 1e-4 * sizes[:, 0].square()).all())
@@ -131,25 +123,31 @@ def test_the_order_of_members_changes_nothing(make, dtype, preset):
 
 
 @dtypes
-@devices
 @each_case
-def test_what_the_network_sees_is_bounded(make, device, dtype):
-    seen = case_of_cells(make, dtype, device).describe()
+def test_each_case_with_a_network(make, dtype, subtests):
+    scene = valid_case(make, COUNT, dtype)
+    for device in DEVICES:
+        case = case_of_cells(scene, device)
+        with subtests.test("what the network sees is bounded", device=device):
+            check_that_what_the_network_sees_is_bounded(case)
+        for preset in PRESETS:
+            with subtests.test("corrected cells are near", device=device, preset=preset):
+                net = deepcopy(simplifier(preset, device).checkpoint.net).to(dtype)
+                check_that_corrected_cells_are_finite_and_near_the_reference(case, net)
+        with subtests.test("gradients are finite", device=device):
+            check_that_gradients_are_finite(case, lively_net(dtype).to(device))
+
+
+def check_that_what_the_network_sees_is_bounded(case):
+    seen = case.describe()
     for name, values in {**features_of(seen), "positions": seen.positions}.items():
         assert bool(values.isfinite().all()), name
         assert values.numel() == 0 or float(values.abs().amax()) <= 50, name
 
 
-@presets
-@dtypes
-@devices
-@each_case
-def test_corrected_cells_are_finite_and_near_the_reference(make, device, dtype, preset):
+def check_that_corrected_cells_are_finite_and_near_the_reference(case, net):
     """Log scales change by as much as the network promises at most, logits by 2."""
-    case = case_of_cells(make, dtype, device)
-    net = simplifier(preset, device).checkpoint.net.to(dtype)
     small = case.correct(net)
-    simplifier(preset, device).checkpoint.net.to(torch.float32)
     several = case.part.counts > 1
     for name, values in small.tensors().items():
         assert bool(values[several].isfinite().all()), name
@@ -159,15 +157,12 @@ def test_corrected_cells_are_finite_and_near_the_reference(make, device, dtype, 
     change = (small.logit_opacities - case.merged.logit_opacities)[several].abs()
     assert several.sum() == 0 or float(growth.amax()) <= limit + 1e-4
     assert several.sum() == 0 or float(change.amax()) <= 2 + 1e-4
-    if len(case.scene) > 3 and dtype == torch.float64:
+    if len(case.scene) > 3 and case.scene.dtype == torch.float64:
         assert float(growth.amax()) > 1e-6
 
 
-@dtypes
-@devices
-@each_case
-def test_gradients_through_network_and_images_are_finite(make, device, dtype):
-    case, net = case_of_cells(make, dtype, device), lively_net(dtype).to(device)
+def check_that_gradients_are_finite(case, net):
+    """Through network and images."""
     middle = case.merged.means.median(dim=0).values.cpu().double()
     cameras = around(1, 16, 12, 16.0)
     viewmats = cameras.viewmats.clone()

@@ -3,6 +3,7 @@
 import math
 import warnings
 from dataclasses import replace
+from itertools import product
 
 import pytest
 import torch
@@ -17,16 +18,17 @@ from cvtgs.rendering import render
 from cvtgs.views import automatic_views
 from hard_cases import CASES, each_case
 from hard_scenes import (
+    DEVICES,
+    PRESETS,
     ball,
-    coarsen_light,
-    devices,
     dtypes,
     presets,
     simplifier,
+    valid_case,
     valid_rows,
 )
 from refine_cases import quick
-from render_cases import backends
+from render_cases import BACKENDS
 from scenes import assert_standard, same_bits
 
 COUNT = 60
@@ -47,14 +49,7 @@ CHANCE = {
 }
 
 
-@pytest.fixture(autouse=True)
-def coarse_light(monkeypatch):
-    coarsen_light(monkeypatch)
-
-
-def valid_case(make, dtype, count=COUNT):
-    scene = make(count, dtype)
-    return scene.select(valid_rows(scene))
+pytestmark = pytest.mark.usefixtures("coarse_light")
 
 
 def ring(scene, count=3):
@@ -83,8 +78,23 @@ def scores(scene, small, cameras):
 
 @dtypes
 @each_case
-def test_views_look_at_what_is_there(make, dtype):
+def test_each_case(make, dtype, subtests):
+    """Its views, its images by every backend, its scores, and two steps of refinement."""
     scene = make(COUNT, dtype)
+    with subtests.test("views look at what is there"):
+        check_that_views_look_at_what_is_there(make, scene)
+    for device, backend in product(DEVICES, BACKENDS):
+        if device == "cpu" or backend != "numba":  # which renders on the CPU
+            with subtests.test("images and gradients are finite", device=device, backend=backend):
+                check_that_images_and_gradients_are_finite(make, scene, device, backend)
+    with subtests.test("scores are numbers for both presets"):
+        check_that_scores_are_numbers(scene.select(valid_rows(scene)))
+    for device in DEVICES:
+        with subtests.test("two steps of refinement leave a standard scene", device=device):
+            check_that_refinement_leaves_a_standard_scene(make, scene.to(device), device)
+
+
+def check_that_views_look_at_what_is_there(make, scene):
     cameras = automatic_views(scene, 3, width=32, height=24)
     assert len(cameras) == 3
     assert bool(cameras.viewmats.isfinite().all())
@@ -103,14 +113,7 @@ def test_views_of_one_place_stand_back():
         assert bool((distances > 2.5 * widths.median()).all())
 
 
-@backends
-@dtypes
-@devices
-@each_case
-def test_images_and_their_gradients_are_finite(make, device, dtype, backend):
-    if device != "cpu" and backend == "numba":
-        pytest.skip("numba renders on the CPU")
-    scene = make(COUNT, dtype)
+def check_that_images_and_gradients_are_finite(make, scene, device, backend):
     leaves = {k: v.clone().to(device).requires_grad_() for k, v in scene.tensors().items()}
     valid = scene.select(valid_rows(scene))
     cameras = ring(valid, 1)
@@ -130,27 +133,25 @@ def test_images_and_their_gradients_are_finite(make, device, dtype, backend):
     assert not painted or bool(leaves["sh0"].grad.any())
 
 
-@dtypes
-@each_case
-def test_scores_are_numbers_for_both_presets(make, dtype):
-    scene = valid_case(make, dtype)
+def check_that_scores_are_numbers(scene):
     cameras = automatic_views(scene, 2, width=24, height=24)
-    small = {p: simplifier(p).simplify(scene, 0.2) for p in ("standard", "paper")}
+    small = {preset: simplifier(preset).simplify(scene, 0.2) for preset in PRESETS}
     assert all(score > 5 for score in scores(scene, small, cameras))
 
 
-@presets
 @each_case
-def test_images_are_no_worse_than_mass_pruning(make, preset):
+def test_images_are_no_worse_than_mass_pruning(make, subtests):
     """By automatic views, at a fifth; PSNR is capped at 50 dB."""
     if make.__name__ in CHANCE:
         pytest.skip(CHANCE[make.__name__])
-    scene = valid_case(make, torch.float32, 200)
+    scene = valid_case(make, 200, torch.float32)
     count = max(1, len(scene) // 5)
-    ours = simplifier(preset).simplify(scene, count=count)
+    small = {preset: simplifier(preset).simplify(scene, count=count) for preset in PRESETS}
     cameras = automatic_views(scene, 4, width=48, height=48)
-    found = scores(scene, {"ours": ours, "pruned": keep_most_mass(scene, count)}, cameras)
-    assert found[0] >= found[1], found
+    *found, pruned = scores(scene, small | {"pruned": keep_most_mass(scene, count)}, cameras)
+    for preset, ours in zip(PRESETS, found, strict=True):
+        with subtests.test("ours are no worse", preset=preset):
+            assert ours >= pruned
 
 
 @pytest.mark.parametrize("name", ["needles", "points"])
@@ -159,7 +160,7 @@ def test_what_is_thinner_than_a_pixel_is_shown_right_without_dilation(name):
 
     Not those of ``paper``, whose opacity knows no area: its needles become opaque balls.
     """
-    scene = replace(valid_case(CASES[name], torch.float32, 200), comments=("SplatRenderMode: mip",))
+    scene = replace(valid_case(CASES[name], 200, torch.float32), comments=("SplatRenderMode: mip",))
     ours = simplifier("standard").simplify(scene, 0.2)
     cameras = automatic_views(scene, 4, width=48, height=48)
     found = scores(scene, {"ours": ours, "pruned": keep_most_mass(scene, 40)}, cameras)
@@ -173,7 +174,7 @@ def test_what_is_thinner_than_a_pixel_is_hardly_worse_than_pruned(name, gap):
     Pruning keeps the largest of all, a cell its own largest: that is the rest. ``paper`` keeps the
     moments.
     """
-    scene = valid_case(CASES[name], torch.float32, 200)
+    scene = valid_case(CASES[name], 200, torch.float32)
     ours = simplifier("standard").simplify(scene, 0.2)
     cameras = automatic_views(scene, 4, width=48, height=48)
     found = scores(scene, {"ours": ours, "pruned": keep_most_mass(scene, 40)}, cameras)
@@ -183,7 +184,7 @@ def test_what_is_thinner_than_a_pixel_is_hardly_worse_than_pruned(name, gap):
 @presets
 def test_each_of_two_clusters_is_no_worse_than_pruned(preset):
     """Seen from nearby, one of them at a time."""
-    scene = valid_case(CASES["two_clusters"], torch.float64, 400)
+    scene = valid_case(CASES["two_clusters"], 400, torch.float64)
     ours, pruned = simplifier(preset).simplify(scene, 0.2), keep_most_mass(scene, 80)
     for start in (0, 1):
         cameras = ring(scene.select(torch.arange(start, 400, 2)))
@@ -193,7 +194,7 @@ def test_each_of_two_clusters_is_no_worse_than_pruned(preset):
 
 @presets
 def test_georeferenced_scenes_are_no_worse_by_cameras_in_float64(preset):
-    scene = valid_case(CASES["georeferenced"], torch.float64, 200)
+    scene = valid_case(CASES["georeferenced"], 200, torch.float64)
     ours, pruned = simplifier(preset).simplify(scene, 0.2), keep_most_mass(scene, 40)
     found = scores(scene, {"ours": ours, "pruned": pruned}, ring(scene))
     assert found[0] >= found[1] + 3, found
@@ -202,7 +203,7 @@ def test_georeferenced_scenes_are_no_worse_by_cameras_in_float64(preset):
 @presets
 def test_huge_colours_hide_no_worse(preset):
     """Clipped colours are chance; what hides the background is not."""
-    scene = valid_case(CASES["huge_colours"], torch.float32, 200)
+    scene = valid_case(CASES["huge_colours"], 200, torch.float32)
     cameras = ring(scene)
     truth, ours, pruned = (
         render(s, cameras).alpha
@@ -211,11 +212,7 @@ def test_huge_colours_hide_no_worse(preset):
     assert (ours - truth).square().mean() <= (pruned - truth).square().mean()
 
 
-@dtypes
-@devices
-@each_case
-def test_two_steps_of_refinement_leave_a_standard_scene(make, device, dtype):
-    scene = make(COUNT, dtype).to(device)
+def check_that_refinement_leaves_a_standard_scene(make, scene, device):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DroppedDataWarning)
         small = simplifier("standard", device).simplify(scene, 0.2)

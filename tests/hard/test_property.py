@@ -12,7 +12,7 @@ from cvtgs.errors import DroppedDataWarning, InvalidSceneError
 from cvtgs.rendering import render
 from cvtgs.validity import invalid_rows
 from hard_cases import CASES
-from hard_scenes import coarsen_light, presets, simplifier, valid_rows
+from hard_scenes import presets, simplifier, valid_rows
 from render_cases import around
 from scenes import assert_same_gaussians, assert_standard
 
@@ -28,9 +28,7 @@ SETTINGS = hypothesis.settings(
 )
 
 
-@pytest.fixture(autouse=True)
-def coarse_light(monkeypatch):
-    coarsen_light(monkeypatch)
+pytestmark = pytest.mark.usefixtures("coarse_light")
 
 
 @st.composite

@@ -23,12 +23,14 @@ from cvtgs.errors import DroppedDataWarning
 from cvtgs.views import automatic_views
 from hard_cases import CASES, each_case
 from hard_scenes import (
+    DEVICES,
+    PRESETS,
     changed,
-    coarsen_light,
     devices,
     dtypes,
     presets,
     simplifier,
+    valid_case,
     valid_rows,
 )
 from scenes import assert_same_gaussians, assert_standard, moved
@@ -37,104 +39,94 @@ COUNT = 60
 LUCK = ("flyaways", "far_flyaways", "two_clusters", "crowd_beside_loners")
 
 
-@pytest.fixture(autouse=True)
-def coarse_light(monkeypatch):
-    coarsen_light(monkeypatch)
+pytestmark = pytest.mark.usefixtures("coarse_light")
 
 
 def counts_for(total):
     return sorted({1, max(1, total // 5), max(1, total - 1), total})
 
 
-def case(name_or_make, count=COUNT):
-    make = CASES.get(name_or_make, name_or_make)
-    scene = make(count, torch.float64)
-    return scene.select(valid_rows(scene))
-
-
 def moments_only(preset):
     return Simplifier(None, config=preset, device="cpu")
 
 
-@presets
-@dtypes
-@devices
-@each_case
-def test_exact_count_finite_output_sane_report_one_warning(make, device, dtype, preset):
-    scene = make(COUNT, dtype).to(device)
-    valid = int(valid_rows(scene).sum())
-    for count in counts_for(len(scene)):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            small, report = simplifier(preset, device).run(scene, count=count)
-        assert [w.category for w in caught] == [DroppedDataWarning] * (valid < len(scene))
-        assert len(small) == report.output_count == min(count, valid)
-        assert (small.dtype, small.device, small.comments) == (dtype, scene.device, scene.comments)
-        assert small.layout == scene.layout
-        assert report.invalid_count == len(scene) - valid
-        assert (report.shortfall == "") == (count <= valid)
-        if count < len(scene):
-            assert_standard(small)
-        else:  # the scene's own rows
-            assert torch.equal(small.means, scene.means[valid_rows(scene)])
-        masses = report.mass_in, report.mass_out, report.energy, *report.energies
-        assert all(math.isfinite(mass) and mass >= 0 for mass in masses)
-        assert 0 <= report.filtered_mass_share <= 1
+def run_and_watch(scene, preset, device, count):
+    """Return scene and report, and what was warned about."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        small, report = simplifier(preset, device).run(scene, count=count)
+    return small, report, [warning.category for warning in caught]
 
 
-@presets
 @dtypes
 @each_case
-def test_the_order_of_the_rows_changes_nothing(make, dtype, preset):
-    """Not even where all rows tie: of coincident, equal and equally faint ones mass decides."""
+def test_each_case_to_every_count_and_in_another_order(make, dtype, subtests):
     scene = make(COUNT, dtype)
+    fifth = max(1, len(scene) // 5)
+    for device in DEVICES:
+        there = scene.to(device)
+        for preset in PRESETS:
+            found = {
+                count: run_and_watch(there, preset, device, count)
+                for count in counts_for(len(scene))
+            }
+            for count, (small, report, warned) in found.items():
+                name = "exact count, finite output, sane report, one warning"
+                with subtests.test(name, device=device, preset=preset, count=count):
+                    assert warned == [DroppedDataWarning] * (not valid_rows(scene).all())
+                    check_result(there, small, report, count)
+            if device == "cpu":
+                with subtests.test("the order of the rows changes nothing", preset=preset):
+                    check_another_order(scene, preset, fifth, found[fifth][0])
+
+
+def check_result(scene, small, report, count):
+    valid = int(valid_rows(scene).sum())
+    assert len(small) == report.output_count == min(count, valid)
+    assert (small.dtype, small.device) == (scene.dtype, scene.device)
+    assert (small.comments, small.layout) == (scene.comments, scene.layout)
+    assert report.invalid_count == len(scene) - valid
+    assert (report.shortfall == "") == (count <= valid)
+    if count < len(scene):
+        assert_standard(small)
+    else:  # the scene's own rows
+        assert torch.equal(small.means, scene.means[valid_rows(scene)])
+    masses = report.mass_in, report.mass_out, report.energy, *report.energies
+    assert all(math.isfinite(mass) and mass >= 0 for mass in masses)
+    assert 0 <= report.filtered_mass_share <= 1
+
+
+def check_another_order(scene, preset, count, small):
+    """Not even where all rows tie: of coincident, equal and equally faint ones mass decides."""
     shuffle = torch.randperm(len(scene), generator=torch.Generator().manual_seed(1))
-    count = max(1, len(scene) // 5)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DroppedDataWarning)
-        first, second = (
-            simplifier(preset).simplify(s, count=count) for s in (scene, scene.select(shuffle))
-        )
-    assert_same_gaussians(first, second)
+    other = run_and_watch(scene.select(shuffle), preset, "cpu", count)[0]
+    assert_same_gaussians(small, other)
 
 
-@presets
 @each_case
-@pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_the_unit_changes_nothing(make, scale, preset):
-    if make.__name__ == "denormals" and scale < 1:
-        pytest.skip("numbers below the smallest normal one lose their digits")
-    if make.__name__ == "isotropic_cells":
-        pytest.skip("points between two sites: see test_even_cells_give_the_same_image")
-    scene = case(make)
+def test_each_case_moved(make, subtests):
+    """In float64: in another unit, shifted by twice the size of the scene, and turned."""
+    scene = valid_case(make, COUNT, torch.float64)
     count = max(1, len(scene) // 5)
-    run = simplifier(preset)
-    assert_same_gaussians(
-        run.simplify(moved(scene, scale=scale), count=count),
-        moved(run.simplify(scene, count=count), scale=scale),
-    )
-
-
-@presets
-@each_case
-def test_a_shift_changes_nothing(make, preset):
-    """By twice the size of the scene, in float64."""
-    if make.__name__ == "isotropic_cells":
-        pytest.skip("points between two sites: see test_even_cells_give_the_same_image")
-    scene = case(make)
     extent = float((scene.means - scene.means.median(dim=0).values).abs().median()) or 1.0
-    shift, count = (2 * extent, -extent, 0.3 * extent), max(1, len(scene) // 5)
-    run = simplifier(preset)
-    assert_same_gaussians(
-        run.simplify(moved(scene, shift=shift), count=count),
-        moved(run.simplify(scene, count=count), shift=shift),
-    )
+    motions = [{"scale": 1e3}, {"shift": (2 * extent, -extent, 0.3 * extent)}]
+    if make.__name__ != "denormals":  # below the smallest normal number digits are lost
+        motions.append({"scale": 1e-3})
+    if make.__name__ == "isotropic_cells":  # points between two sites: see the next test
+        motions = []
+    for preset in PRESETS:
+        run = simplifier(preset)
+        small = run.simplify(scene, count=count)
+        for motion in motions:
+            with subtests.test("unit and shift change nothing", preset=preset, **motion):
+                found = run.simplify(moved(scene, **motion), count=count)
+                assert_same_gaussians(found, moved(small, **motion))
+        with subtests.test("a turn gives cells as good", preset=preset):
+            check_a_turn(make, preset)
 
 
-@presets
-@each_case
-def test_a_turn_gives_cells_as_good(make, preset):
-    scene = case(make, 300)
+def check_a_turn(make, preset):
+    scene = valid_case(make, 300, torch.float64)
     count = max(1, len(scene) // 5)
     first, second = (
         moments_only(preset).run(s, count=count).report
@@ -149,7 +141,7 @@ def test_a_turn_gives_cells_as_good(make, preset):
 @pytest.mark.parametrize("name", ["isotropic_cells", "giants"])
 def test_even_cells_give_the_same_image(name, preset):
     """To 25 dB, while single Gaussians differ by as much as the network may change them."""
-    scene = case(name, 300)
+    scene = valid_case(CASES[name], 300, torch.float64)
     there = moved(scene, shift=(1.0, 2.0, -3.0))
     views = automatic_views(scene, 2, width=32, height=32, seed=0)
     first = simplifier(preset).simplify(scene, 0.2)

@@ -1,0 +1,49 @@
+"""Every way of simplifying gives what ``digests.json`` holds; ``python tests/digests.py`` says so.
+
+The same bits, where processor and libraries compute as those of the table did; elsewhere as many
+Gaussians, and sums of every tensor that are nearly the same.
+"""
+
+import json
+
+import pytest
+import torch
+
+import digests
+
+RECORDED = json.loads(digests.FILE.read_text(encoding="utf-8"))
+DEAR = ("large", "high", "max", "block")
+CASES = [
+    pytest.param(name, marks=[pytest.mark.slow] * any(word in name for word in DEAR))
+    for name in digests.CASES
+]
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def assert_nearly(found, wanted):
+    """Where one seed is another, one cell in a hundred may be."""
+    assert found["counts"] == wanted["counts"]
+    assert found["figures"] == pytest.approx(wanted["figures"], rel=0.05, abs=0.1)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_way_gives_what_it_gave(name):
+    found, wanted = digests.measure(name), RECORDED["cases"][name]
+    assert_nearly(found, wanted)
+    if digests.canary() == RECORDED["canary"]:
+        assert found["digest"] == wanted["digest"]
+
+
+def test_the_table_holds_all_cases_and_comparisons_can_fail():
+    assert set(RECORDED["cases"]) == set(digests.CASES)
+    wanted = RECORDED["cases"]["room standard 0.1"]
+    for other in ("room standard 0.01", "haze standard 0.1", "room paper 0.1"):
+        with pytest.raises(AssertionError):
+            assert_nearly(RECORDED["cases"][other], wanted)
