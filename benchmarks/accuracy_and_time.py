@@ -24,7 +24,7 @@ from benchmarks.scoring import (
     scoring_parser,
 )
 from cvtgs.plots import Panel, Series, line_chart
-from cvtgs.tradeoff.chart import ticks
+from cvtgs.tradeoff.files import ticks
 
 PRESETS: Mapping[str, Mapping[str, str]] = {name: {"preset": name} for name in cvtgs.PRESETS}
 

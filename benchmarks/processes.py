@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cvtgs.errors import RunError
-from cvtgs.tradeoff.processes import run_process
+from cvtgs.tradeoff.runs import run_process
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

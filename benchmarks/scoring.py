@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
 
-from torch import Tensor
-
 import cvtgs
 from cvtgs.errors import FileFormatError
-from cvtgs.evaluation import EvaluationSettings, LpipsWeights, evaluate, load_lpips, lpips
+from cvtgs.evaluation import LpipsWeights, load_lpips
+from cvtgs.evaluation import scorer as scorers
 from cvtgs.views import automatic_views
 
 VIEWS = 8
@@ -24,7 +23,6 @@ SIZE = 400
 """What cvtgs' own renderer looks at: automatic views, and pixels on each side."""
 
 RATIOS = (0.1, 0.01, 0.001)
-FULL = "full scene"
 MEAN = "mean"
 
 
@@ -125,33 +123,16 @@ def own_scorer(weights: LpipsWeights | None) -> Scorer:
     """Score by cvtgs' own renderer and views."""
 
     def score(full: cvtgs.GaussianScene, small: Sequence[cvtgs.GaussianScene]) -> list[Quality]:
-        named = {str(number): scene for number, scene in enumerate(small)}
-        distances: dict[str, list[float]] = {name: [] for name in (FULL, *named)}
-        truth: list[Tensor] = []
-
-        def look(view: int, name: str, image: Tensor) -> None:
-            if weights is None:
-                return
-            if name == FULL:
-                truth[:] = [image[None]]
-            found = lpips(image[None], truth[0], network=weights.network, weights=weights)
-            distances[name].append(float(found))
-
-        found = evaluate(
-            full,
-            named,
-            automatic_views(full, VIEWS, width=SIZE, height=SIZE),
-            reference_name=FULL,
-            settings=EvaluationSettings(lpips="off"),
-            on_image=look,
-        )
+        cameras = automatic_views(full, VIEWS, width=SIZE, height=SIZE)
+        scorer = scorers.Scorer(full, cameras.singles(), metrics=scorers.Metrics(lpips=weights))
+        found = [scorers.scene_scores("", len(scene), scorer.score(scene)) for scene in small]
         return [
             Quality(
                 psnr=scores.psnr.mean,
                 ssim=scores.ssim.mean,
-                lpips=mean_or_none(distances[scores.name] or [None]),
+                lpips=scores.lpips.mean if scores.lpips else None,
             )
-            for scores in found.scenes
+            for scores in found
         ]
 
     return score

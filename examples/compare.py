@@ -7,7 +7,7 @@ import argparse
 from pathlib import Path
 
 import cvtgs
-from cvtgs.evaluation import EvaluationSettings, compare, write_exhibition
+from cvtgs.evaluation import EvaluationSettings, compare, write_comparison
 
 
 def main() -> None:
@@ -29,7 +29,7 @@ def main() -> None:
     comparison = compare(scene, small, views, settings=EvaluationSettings(lpips="off"))
     for scores in comparison.evaluation.scenes:
         print(f"{scores.name:<10} {scores.psnr.mean:6.2f} dB, SSIM {scores.ssim.mean:.3f}")
-    write_exhibition(comparison, options.output, overwrite=True)
+    write_comparison(comparison, options.output, overwrite=True)
 
 
 if __name__ == "__main__":

@@ -22,12 +22,12 @@ LEVELS = [
     {"math", "devices", "plots", "counts", "boxes"},
     {"config", "scene", "cameras"},
     {"validity", "io", "synthetic", "rendering", "losses"},
-    {"views"},
+    {"views", "evaluation"},
     {"analysis"},
     {"filters", "cvt", "cells", "report"},
     {"mergenet"},
     {"pipeline", "refinement"},
-    {"simplifier", "info", "evaluation"},
+    {"simplifier", "info"},
     {"budget", "tradeoff", "levels", "outofcore"},
     {"train"},
     {"cli"},
@@ -38,20 +38,21 @@ RANKS = {name: rank for rank, level in enumerate(LEVELS) for name in level}
 # Packages that any file may import, and the only places that may import others.
 EVERYWHERE = {"torch", "numpy", "jaxtyping", "pydantic"}
 OWNERS = {
-    "scipy": ("cvt/nearest.py", "budget/fit.py"),
+    "scipy": ("cvt/nearest.py", "budget/costs.py"),
     "plyfile": "io/ply/read.py",
     "tomli_w": "config/simplify.py",
     "rich": "cli/",
     "kornia": "losses.py",
     "numba": "rendering/compiled.py",
     "gsplat": "rendering/gsplat_backend.py",
-    "PIL": ("evaluation/images.py", "io/sog/container.py"),
+    "PIL": ("evaluation/comparison_files.py", "evaluation/images.py", "io/sog/container.py"),
+    "jinja2": "evaluation/page.py",
     "zstandard": "io/spz/read.py",
     "safetensors": "io/tensors.py",
     "matplotlib": "plots.py",
     "distributed": "outofcore/distributed.py",
 }
-HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "matplotlib", "distributed")
+HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "jinja2", "matplotlib", "distributed")
 
 
 def relative(path: Path) -> str:

@@ -146,7 +146,7 @@ STAGES = {
         "lpips",
         "psnr",
         "ssim",
-        "write_exhibition",
+        "write_comparison",
     },
     "mergenet": {
         "SHIPPED",

@@ -90,6 +90,14 @@ class Cameras:
         names = tuple(self.names[row] for row in rows.tolist()) if self.names else ()
         return replace(self, viewmats=self.viewmats[rows], Ks=self.Ks[rows], names=names)
 
+    def singles(self) -> list[Self]:
+        """Return each camera by itself.
+
+        Returns:
+            One :class:`Cameras` per camera, in order.
+        """
+        return [self.select(torch.tensor([row])) for row in range(len(self))]
+
     def to(self, device: torch.device | str) -> Self:
         """Move the cameras to a device.
 

@@ -11,15 +11,12 @@ import torch
 
 from cvtgs.analysis import EffectPlan
 from cvtgs.config import SimplifyConfig
+from cvtgs.config.base import Record
 from cvtgs.progress import ProgressEvent, ProgressListener
 from cvtgs.scene import GaussianScene
 
 
-class _Record(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
-
-
-class StageCost(_Record):
+class StageCost(Record):
     """What one stage cost.
 
     Attributes:
@@ -38,7 +35,7 @@ class StageCost(_Record):
     peak_device_memory_bytes: int = 0
 
 
-class RefineReport(_Record):
+class RefineReport(Record):
     """What a refinement did.
 
     Attributes:
@@ -70,7 +67,7 @@ class RefineReport(_Record):
     cost: StageCost
 
 
-class CellStatistics(_Record):
+class CellStatistics(Record):
     """What the filter left out, and what the cells of a tessellation are like.
 
     Attributes:
@@ -125,7 +122,7 @@ class SimplifyReport(CellStatistics):
     output_count: int
     target_count: int
     rho: float
-    invalid_rows: dict[str, int] = {}
+    invalid_rows: dict[str, int] = pydantic.Field(default_factory=dict)
     invalid_count: int = 0
     shortfall: str = ""
     kept_count: int = 0

@@ -9,8 +9,13 @@ import torch
 import cvtgs
 from cvtgs.analysis import analyze
 from cvtgs.budget import find_count
-from cvtgs.budget.bisect import CLOSE, smallest_enough
-from cvtgs.budget.judge import HELDOUT_SEED, Judge
+from cvtgs.budget.count import (
+    CLOSE,
+    HELDOUT_SEED,
+    heldout_quality,
+    heldout_scorer,
+    smallest_enough,
+)
 from cvtgs.errors import DroppedDataWarning, GoalError, InvalidArgumentError
 from cvtgs.progress import silent
 from cvtgs.views import automatic_views
@@ -93,7 +98,8 @@ def test_a_goal_is_reached_and_fewer_did_not(full, views, simplifier, goal):
 
 def test_the_scores_are_those_of_an_evaluation(full, views, simplifier):
     small = simplifier.simplify(full, 0.2)
-    quality = Judge(full, views, listener=silent).score(small)
+    scorer = heldout_scorer(full, views, listener=silent)
+    quality = heldout_quality(scorer, small, count=len(small))
     settings = cvtgs.evaluation.EvaluationSettings(lpips="off")
     wanted = cvtgs.evaluation.evaluate(full, {"small": small}, views, settings=settings).scenes[0]
     assert quality.psnr == pytest.approx(wanted.psnr.mean, abs=1e-4)
@@ -101,15 +107,15 @@ def test_the_scores_are_those_of_an_evaluation(full, views, simplifier):
 
 
 def test_the_full_scene_is_rendered_once(full, views, simplifier, monkeypatch):
-    from cvtgs.budget import judge  # noqa: PLC0415 (to be changed here)
+    from cvtgs.evaluation import scorer  # noqa: PLC0415 (to be changed here)
 
     sizes = []
 
-    def counting(scene, camera):
+    def counting(scene, camera, **choices):
         sizes.append(len(scene))
-        return cvtgs.rendering.render(scene, camera)
+        return cvtgs.rendering.render(scene, camera, **choices)
 
-    monkeypatch.setattr(judge, "render", counting)
+    monkeypatch.setattr(scorer, "render", counting)
     find_count(full, psnr=22.0, simplifier=simplifier, heldout=views)
     assert sizes.count(len(full)) == len(views)
 

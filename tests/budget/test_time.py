@@ -9,9 +9,17 @@ import pytest
 
 import cvtgs
 from cvtgs.budget import CostModel, Work, choose_preset, cost_model
-from cvtgs.budget.calibrate import CANDIDATES, SHORT, Trial, calibrate, measured_seconds
-from cvtgs.budget.fit import fit_rates
-from cvtgs.budget.remember import STALE_SECONDS, cache_folder, is_known
+from cvtgs.budget.calibrate import (
+    CANDIDATES,
+    SHORT,
+    STALE_SECONDS,
+    Trial,
+    cache_folder,
+    calibrate,
+    is_calibrated,
+    measured_seconds,
+)
+from cvtgs.budget.costs import fit_rates
 from cvtgs.errors import ConfigError, DeviceError, GoalError, InvalidArgumentError
 
 TRIALS = [
@@ -215,9 +223,9 @@ class Calibration:
 def test_it_is_measured_once_and_remembered(model, tmp_path):
     calibration = Calibration(model)
     folder = tmp_path / "cache"
-    assert not is_known("cpu", folder=folder)
+    assert not is_calibrated("cpu", folder=folder)
     assert cost_model("cpu", calibration=calibration, folder=folder) == model
-    assert is_known("cpu", folder=folder)
+    assert is_calibrated("cpu", folder=folder)
     assert cost_model("cpu", calibration=calibration, folder=folder) == model
     assert calibration.calls == 1
     cost_model("cpu", recalibrate=True, calibration=calibration, folder=folder)

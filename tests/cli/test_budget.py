@@ -39,7 +39,7 @@ def measured(monkeypatch) -> list[bool]:
         return MODEL
 
     monkeypatch.setattr(cvtgs.budget, "cost_model", known)
-    monkeypatch.setattr("cvtgs.budget.remember.is_known", lambda device: len(asked) > 0)
+    monkeypatch.setattr("cvtgs.budget.calibrate.is_calibrated", lambda device: len(asked) > 0)
     monkeypatch.setattr("cvtgs.cli.simplify.time.perf_counter", lambda: STARTED)
     return asked
 
@@ -139,7 +139,7 @@ def test_a_budget_knows_what_else_is_set(scene, monkeypatch, words, settings, pr
     rates = {"fast": nothing, "standard": nothing | slow}
     model = CostModel(rates=rates)
     monkeypatch.setattr(cvtgs.budget, "cost_model", lambda *_, **__: model)
-    monkeypatch.setattr("cvtgs.budget.remember.is_known", lambda device: True)
+    monkeypatch.setattr("cvtgs.budget.calibrate.is_calibrated", lambda device: True)
     monkeypatch.setattr("cvtgs.cli.simplify.time.perf_counter", lambda: STARTED)
     budget = options("--rho", "0.1", "--time-budget", "5s", *words)
     check_goals(budget)

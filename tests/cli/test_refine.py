@@ -72,8 +72,8 @@ def test_bad_numbers_are_found_before_the_work(tmp_path, capsys, words, text):
 
 
 def test_an_interrupt_leaves_nothing(source, tmp_path, capsys, monkeypatch):
-    descent = import_module("cvtgs.refinement.optimize")
-    honest, calls = descent.relative_loss, []
+    module = import_module("cvtgs.refinement.optimize")
+    honest, calls = module.relative_loss, []
 
     def interrupted(image, target, **weights):
         calls.append(1)
@@ -81,7 +81,7 @@ def test_an_interrupt_leaves_nothing(source, tmp_path, capsys, monkeypatch):
             os.kill(os.getpid(), signal.SIGINT)
         return honest(image, target, **weights)
 
-    monkeypatch.setattr(descent, "relative_loss", interrupted)
+    monkeypatch.setattr(module, "relative_loss", interrupted)
     words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.1"]
     words += ["--report", str(tmp_path / "report.json"), "--refine-steps", "50"]
     assert main(words) == 130

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,14 +20,12 @@ from cvtgs.evaluation import (
     lpips,
     psnr,
     ssim,
-    write_exhibition,
+    write_comparison,
 )
-from cvtgs.evaluation.error_maps import ERROR_SCALE, error_map
-from cvtgs.evaluation.images import encode, read_image
-from cvtgs.evaluation.judge import Judge
-from cvtgs.evaluation.labels import megabytes
-from cvtgs.evaluation.page import comparison_page
-from cvtgs.evaluation.sheet import contact_sheet, error_sheet
+from cvtgs.evaluation.comparison_files import bytes_text, contact_sheet, error_sheet
+from cvtgs.evaluation.images import ERROR_SCALE, encode, error_map, read_image
+from cvtgs.evaluation.page import comparison_page, render_template
+from cvtgs.evaluation.scorer import Metrics
 from cvtgs.rendering import render
 from cvtgs.views import automatic_views
 from lpips_cases import random_images, random_weights
@@ -70,10 +69,19 @@ def test_scores_are_those_of_the_metrics(scene, small, cameras):
     assert evaluation.views == ("view 1", "view 2", "view 3")
 
 
-def test_the_full_scene_is_rendered_once_per_view(scene, small, cameras):
+def test_the_full_scene_is_rendered_once_per_view(scene, small, cameras, monkeypatch):
+    from cvtgs.evaluation import scorer  # noqa: PLC0415 (to be changed here)
+
     seen = []
-    evaluate(scene, small, cameras, settings=OFF, on_image=lambda v, n, p: seen.append((v, n)))
-    assert seen == [(view, name) for view in range(3) for name in ("full", "0.1", "0.01")]
+
+    def counting(scene, camera, **choices):
+        seen.append((camera.view_names, len(scene)))
+        return render(scene, camera, **choices)
+
+    monkeypatch.setattr(scorer, "render", counting)
+    named = replace(cameras, names=("a", "b", "c"))
+    evaluate(scene, small, named, settings=OFF)
+    assert seen == [((view,), count) for view in "abc" for count in (3000, 300, 30)]
 
 
 def test_progress_counts_images(scene, small, cameras):
@@ -201,7 +209,7 @@ def test_the_page_holds_everything_and_needs_nothing(comparison):
 
 
 def test_hostile_names_stay_text(scene, cameras):
-    name = '</script><b onclick="x">{{SCRIPT}}'
+    name = '</script><b onclick="x">{{ script }}'
     page = comparison_page(
         compare(scene, {name: scene}, cameras, reference_name="<i>&", settings=OFF)
     )
@@ -219,7 +227,7 @@ def test_pages_are_kept_small(comparison):
 
 def test_files_are_replaced_only_when_asked(comparison, tmp_path):
     folder = tmp_path / "new" / "page"
-    paths = write_exhibition(comparison, folder)
+    paths = write_comparison(comparison, folder)
     assert sorted(path.name for path in folder.iterdir()) == [
         "errors.png",
         "index.html",
@@ -227,20 +235,29 @@ def test_files_are_replaced_only_when_asked(comparison, tmp_path):
     ]
     first = paths[-1].read_bytes()
     with pytest.raises(FileExistsError, match=r"index\.html.*--overwrite"):
-        write_exhibition(comparison, folder)
-    write_exhibition(comparison, folder, overwrite=True)
+        write_comparison(comparison, folder)
+    write_comparison(comparison, folder, overwrite=True)
     assert paths[-1].read_bytes() == first
     (tmp_path / "file").write_text("")
     with pytest.raises(cvtgs.errors.OutputError, match="cannot be made"):
-        write_exhibition(comparison, tmp_path / "file" / "page")
+        write_comparison(comparison, tmp_path / "file" / "page")
 
 
 def test_lpips_is_a_third_number_where_there_are_weights():
     weights = random_weights("alex")
-    image, truth = (images[0] for images in random_images(64, 64))
-    found = Judge(weights=weights).compare(image, truth)
-    wanted = lpips(image[None], truth[None], network="alex", weights=weights)
-    assert found == [*Judge(weights=None).compare(image, truth), float(wanted)]
+    image, truth = random_images(64, 64)
+    found = Metrics(lpips=weights).compare(image, truth)
+    wanted = lpips(image, truth, network="alex", weights=weights)
+    assert found == Metrics().compare(image, truth)._replace(lpips=float(wanted))
+
+
+def test_templates_escape_what_they_show():
+    assert render_template("<b>{{ name }}</b>", name="<i>&'\"") == (
+        "<b>&lt;i&gt;&amp;&#39;&#34;</b>"
+    )
+    shown = render_template("{{ data | tojson }}", data={"name": "</script>&"})
+    assert "<" not in shown
+    assert json.loads(shown) == {"name": "</script>&"}
 
 
 def test_cameras_without_names_have_no_photographs(tmp_path):
@@ -258,4 +275,4 @@ def test_a_photograph_that_cannot_be_opened_is_an_error(tmp_path):
     ("count", "text"), [(999, "999 B"), (250_000_000, "250 MB"), (5 * 10**12, "5000 GB")]
 )
 def test_bytes_in_words(count, text):
-    assert megabytes(count) == text
+    assert bytes_text(count) == text

@@ -2,6 +2,7 @@
 
 import math
 import os
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -95,7 +96,7 @@ def test_a_package_without_backbone_says_how_to_get_it(tmp_path, monkeypatch) ->
 
 def test_without_weights(monkeypatch) -> None:
     monkeypatch.delenv(LPIPS_VARIABLE, raising=False)
-    monkeypatch.setattr("cvtgs.evaluation.lpips_package.find_spec", lambda name: None)
+    monkeypatch.setattr(sys.modules["cvtgs.evaluation.lpips"], "find_spec", lambda name: None)
     first, second = random_images(31, 31)
     with pytest.raises(MissingDependencyError) as error:
         lpips(first, second)

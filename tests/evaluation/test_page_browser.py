@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import cvtgs
-from cvtgs.evaluation import EvaluationSettings, compare, write_exhibition
+from cvtgs.evaluation import EvaluationSettings, compare, write_comparison
 from cvtgs.views import automatic_views
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -44,7 +44,7 @@ def page(tmp_path_factory):
         settings=EvaluationSettings(lpips="off"),
     )
     folder = tmp_path_factory.mktemp("page")
-    write_exhibition(comparison, folder)
+    write_comparison(comparison, folder)
     return folder / "index.html", comparison.evaluation
 
 

@@ -65,14 +65,14 @@ def test_invalid_rows_of_the_full_scene_are_left_out():
 
 def test_gradients_that_are_not_finite_are_survived(monkeypatch):
     full = full_scene()
-    descent = import_module("cvtgs.refinement.optimize")
-    honest, calls = descent.relative_loss, []
+    module = import_module("cvtgs.refinement.optimize")
+    honest, calls = module.relative_loss, []
 
     def sometimes_nan(image, target, **weights):
         calls.append(1)
         return honest(image, target, **weights) * (math.nan if len(calls) % 2 else 1.0)
 
-    monkeypatch.setattr(descent, "relative_loss", sometimes_nan)
+    monkeypatch.setattr(module, "relative_loss", sometimes_nan)
     scene, report = refine(discolored(full), full, steps=40, config=quick())
     assert report.gain > 0.5
     assert cvtgs.validity.invalid_rows(scene) == {}

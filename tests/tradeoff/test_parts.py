@@ -17,12 +17,16 @@ from cvtgs.errors import ConfigError, InvalidArgumentError, RunError
 from cvtgs.evaluation import Evaluation, EvaluationSettings, SceneScores, Score, compare
 from cvtgs.report import SimplifyReport, StageCost
 from cvtgs.tradeoff import Failure, Measured, Tradeoff, TradeoffResult, on_front, write_tradeoff
-from cvtgs.tradeoff.chart import ticks, tradeoff_chart
-from cvtgs.tradeoff.measure import with_fronts
-from cvtgs.tradeoff.processes import run_process
-from cvtgs.tradeoff.runs import WARNING, _pass_on, tasks_of
-from cvtgs.tradeoff.summary import foreword
-from cvtgs.tradeoff.table import cells, heading, how_measured
+from cvtgs.tradeoff.files import (
+    cells,
+    heading,
+    how_measured,
+    page_summary,
+    ticks,
+    tradeoff_chart,
+)
+from cvtgs.tradeoff.results import with_fronts
+from cvtgs.tradeoff.runs import WARNING, pass_warnings_on, run_process, tasks_of
 from cvtgs.views import automatic_views
 
 
@@ -158,17 +162,17 @@ def test_words_of_the_table():
 def test_warnings_of_processes_are_passed_on_once():
     errors = f"{WARNING}dropped 3 rows.\nsome noise\n{WARNING}dropped 3 rows.\n"
     with pytest.warns(UserWarning, match=r"^dropped 3 rows\.$") as caught:
-        _pass_on(errors, set())
+        pass_warnings_on(errors, set())
     assert len(caught) == 1
 
 
 def test_the_page_part_is_escaped_and_names_failures():
     made = tradeoff(*MADE, failures=(Failure(name="max 0.1", reason="a < b."),))
-    html = foreword(made, None)
+    html = page_summary(made, None)
     assert "<img" not in html
     assert "max 0.1 failed: a &lt; b." in html
     assert html.count('class="best"') == 6
-    assert 'src="data:image/png;base64,' in foreword(made, b"png")
+    assert 'src="data:image/png;base64,' in page_summary(made, b"png")
 
 
 def test_round_numbers_on_the_axis():
@@ -262,7 +266,7 @@ def test_tasks_are_checked():
 def test_an_interrupt_ends_the_process_too(tmp_path):
     note = tmp_path / "pid"
     inner = f"import os, pathlib, time; pathlib.Path({str(note)!r}).write_text(str(os.getpid()))"
-    outer = "import signal, sys; from cvtgs.tradeoff.processes import run_process;"
+    outer = "import signal, sys; from cvtgs.tradeoff.runs import run_process;"
     outer += "signal.signal(signal.SIGINT, signal.default_int_handler);"  # ignored in background
     outer += "run_process("
     outer += f"[sys.executable, '-c', {inner + '; time.sleep(120)'!r}])"

@@ -1,10 +1,9 @@
-"""Goals instead of knobs: a time to keep, or a quality to reach."""
+"""Settings from goals: a time budget, or a quality to reach."""
 
+from cvtgs.budget.calibrate import cost_model
 from cvtgs.budget.choose import Choice, choose_preset
-from cvtgs.budget.cost_model import CostModel
+from cvtgs.budget.costs import CostModel, Work
 from cvtgs.budget.count import Found, Tried, find_count
-from cvtgs.budget.remember import cost_model
-from cvtgs.budget.work import Work
 
 __all__ = [
     "Choice",

@@ -1,15 +1,27 @@
-"""Measure what the presets cost on this machine, on a few small generated scenes."""
+"""Measure the cost of the presets on this machine once, and keep it in the user's cache."""
 
+import hashlib
+import json
+import os
+import platform
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
 
 import torch
 
-from cvtgs.budget.cost_model import CostModel, Measurement
-from cvtgs.budget.work import Work
+import cvtgs
+from cvtgs.budget.costs import CostModel, Measurement, Work
 from cvtgs.config import PRESETS, RefineConfig, Section, SimplifyConfig
+from cvtgs.config.base import Record
 from cvtgs.counts import target_count
+from cvtgs.devices import chosen_device, device_name
+from cvtgs.errors import OutputError
+from cvtgs.io import atomic_output
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import StageCost
 from cvtgs.scene import GaussianScene
@@ -23,17 +35,36 @@ PATIENCE_SECONDS = 1.0
 
 MOST_REPEATS = 3
 
+MOST_START_SECONDS = 1.0
+"""What takes longer to load was compiled, which happens once in the life of an installation."""
+
+CANDIDATES = tuple(name for name in PRESETS if name != "paper")
+"""Presets to choose from; ``paper`` is there to compare with."""
+
+SHORT = (
+    {"views": 3, "steps": 8, "batch": 8, "heldout": 4},
+    {"views": 6, "steps": 16, "batch": 16, "heldout": 4},
+)
+"""Images and refinements are cut to so many, in turn: their cost grows with their number."""
+
+RENDERERS = ("gsplat", "numba")
+"""Packages that render faster than torch; importing one to ask takes longer than many a run."""
+
+VERSION: Literal[2] = 2
+"""Of the file; raised when features change, so that older files are measured again."""
+
+STALE_SECONDS = 90 * 24 * 3600.0
+"""Machines change: drivers, limits, neighbours."""
+
+StageSeconds = Callable[[SimplifyConfig, GaussianScene, int], Mapping[str, float]]
+"""Returns the seconds by stage of a simplification of a scene to so many Gaussians."""
+
+Calibration = Callable[[], CostModel]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """A generated scene and how far to simplify it.
-
-    Attributes:
-        kind: Kind of the scene.
-        count: Its Gaussians.
-        sh_degree: Degree of its colours.
-        ratios: Ratios to keep.
-    """
+    """A generated scene, and the ratios to simplify it to."""
 
     kind: str
     count: int
@@ -48,31 +79,117 @@ TRIALS = (
 )
 """Small and large, with few and many colours, a few and many cells: no two alike."""
 
-CANDIDATES = tuple(name for name in PRESETS if name != "paper")
-"""Presets to choose from; ``paper`` is there to compare with."""
 
-SHORT = (
-    {"views": 3, "steps": 8, "batch": 8, "heldout": 4},
-    {"views": 6, "steps": 16, "batch": 16, "heldout": 4},
-)
-"""Images and refinements are cut to so many, in turn: what they cost grows with their number."""
+class CachedModel(Record, allow_inf_nan=False):
+    """The content of the file."""
 
-MOST_START_SECONDS = 1.0
-"""What takes longer to load was compiled, which happens once in the life of an installation."""
-
-StageSeconds = Callable[[SimplifyConfig, GaussianScene, int], Mapping[str, float]]
-"""Gives the seconds by stage of a simplification of a scene to so many Gaussians."""
+    version: Literal[2]
+    key: dict[str, str]
+    made: float
+    model: CostModel
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Task:
-    preset: str
-    config: SimplifyConfig
-    scene: GaussianScene
-    count: int
+def cost_model(
+    device: str | torch.device = "auto",
+    *,
+    recalibrate: bool = False,
+    calibration: Calibration | None = None,
+    folder: Path | None = None,
+    listener: ProgressListener = silent,
+) -> CostModel:
+    """Return the cost of presets on this machine; the first call measures and caches it.
 
-    def seconds(self, run: StageSeconds) -> Mapping[str, float]:
-        return run(self.config, self.scene, self.count)
+    It is measured again when the machine, the device, the number of threads, the versions of torch
+    or cvtgs, or the presets are others, after 90 days, and when the file is damaged. Where nothing
+    can be written, it is measured for this call only.
+
+    Args:
+        device: Where presets compute.
+        recalibrate: Whether to measure again in any case.
+        calibration: Measures; None for the real one, which takes about a minute.
+        folder: Where to cache; None for ``cvtgs`` in the user's cache folder.
+        listener: Called after each measurement.
+
+    Returns:
+        The model.
+
+    Raises:
+        DeviceError: There is no such device.
+
+    Example:
+        >>> import tempfile
+        >>> rates = {"standard": {"check": {"in": 1e-6, "in_values": 0.0}}}
+        >>> with tempfile.TemporaryDirectory() as name:
+        ...     model = cost_model(calibration=lambda: CostModel(rates=rates), folder=Path(name))
+        >>> model.presets
+        ('standard',)
+    """
+    where = chosen_device(device)
+    key = machine_key(where)
+    path = _cache_path(key, folder)
+    known = None if recalibrate else _read_cached(path, key)
+    if known is not None:
+        return known
+    model = calibration() if calibration else calibrate(measured_seconds(where), listener=listener)
+    record = CachedModel(version=VERSION, key=key, made=time.time(), model=model)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_output(path, overwrite=True) as file:
+            file.write(record.model_dump_json(indent=2).encode())
+    except (OSError, OutputError):
+        pass  # the next process measures again
+    return model
+
+
+def is_calibrated(device: str | torch.device = "auto", *, folder: Path | None = None) -> bool:
+    """Report whether the cost model of this machine is cached."""
+    key = machine_key(chosen_device(device))
+    return _read_cached(_cache_path(key, folder), key) is not None
+
+
+def machine_key(device: torch.device) -> dict[str, str]:
+    """Return everything that seconds depend on."""
+    presets = {name: SimplifyConfig.from_preset(name).model_dump(mode="json") for name in PRESETS}
+    return {
+        "system": f"{platform.system()} {platform.machine()}",
+        "processor": device_name(torch.device("cpu")),
+        "cores": str(os.cpu_count()),
+        "threads": str(torch.get_num_threads()),
+        "device": "cpu" if device.type == "cpu" else device_name(device),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "cvtgs": cvtgs.__version__,
+        "renderers": ", ".join(name for name in RENDERERS if find_spec(name)),
+        "presets": _digest(presets),
+    }
+
+
+def cache_folder() -> Path:
+    """Return the folder of cvtgs in the user's cache."""
+    named = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+    if named:
+        return Path(named) / "cvtgs"
+    home = Path(os.path.expanduser("~"))  # noqa: PTH111 (Path.home() fails where there is none)
+    return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "cvtgs"
+
+
+def _cache_path(key: Mapping[str, str], folder: Path | None) -> Path:
+    return (folder or cache_folder()) / f"cost-{_digest(key)}.json"
+
+
+def _digest(value: object) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _read_cached(path: Path, key: Mapping[str, str]) -> CostModel | None:
+    """Read the model; None if there is none, or one that is damaged, stale, or of other things."""
+    try:
+        record = CachedModel.model_validate_json(path.read_bytes())
+    except (OSError, ValueError):
+        return None
+    fresh = 0 <= time.time() - record.made < STALE_SECONDS
+    complete = record.model.presets == CANDIDATES
+    return record.model if fresh and complete and record.key == key else None
 
 
 def measured_seconds(device: str | torch.device) -> StageSeconds:
@@ -89,7 +206,7 @@ def measured_seconds(device: str | torch.device) -> StageSeconds:
 
 
 def undisturbed_seconds(cost: StageCost) -> float:
-    """Return what a stage takes where no other program is in its way.
+    """Return the seconds of a stage without those that other programs took.
 
     A stage on the CPU computes all the time and reads no file, so it cannot take longer than its
     processor seconds; what is beyond them went to other programs.
@@ -107,76 +224,61 @@ def calibrate(
     clock: Callable[[], float] = time.perf_counter,
     listener: ProgressListener = silent,
 ) -> CostModel:
-    """Measure presets on generated scenes, and fit what they cost.
+    """Measure presets on generated scenes, and fit their cost.
 
     Every preset is run once to load what it needs. Then every trial is measured up to three times,
     once if that takes long; of each stage the fastest counts, since other programs only ever make
-    a stage slower. Presets that take images take only a few here.
+    a stage slower. Presets that use images get only a few here, and those that differ in nothing
+    but the number of images are measured once.
     """
-    alike = _alike(presets)
-    tasks = _tasks(list(dict.fromkeys(alike.values())), trials)
+    first: dict[SimplifyConfig, str] = {}
+    measured_as = {
+        preset: first.setdefault(
+            _shortened(preset, SHORT[0]).model_copy(update={"preset": ""}), preset
+        )
+        for preset in presets
+    }
+    scenes = [make(trial.kind, trial.count, sh_degree=trial.sh_degree) for trial in trials]
+    tasks = [
+        (preset, _shortened(preset, SHORT[number % len(SHORT)]), scene, target_count(len(scene), r))
+        for scene, trial in zip(scenes, trials, strict=True)
+        for number, r in enumerate(trial.ratios)
+        for preset in first.values()
+    ]
     total = MOST_REPEATS * len(tasks)
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
-    loaded: dict[str, float] = {}
-    for task in tasks:
-        if task.preset not in loaded:
-            loaded[task.preset] = sum(task.seconds(run).values())
+    loading = [
+        sum(run(config, scene, count).values())
+        for _, config, scene, count in tasks[: len(first)]  # every preset once
+    ]
     best: list[dict[str, float]] = [{} for _ in tasks]
     spent = [0.0 for _ in tasks]
     for number in range(total):
         row = number % len(tasks)
         if spent[row] <= PATIENCE_SECONDS:
             begin = clock()
-            for stage, seconds in tasks[row].seconds(run).items():
+            _, config, scene, count = tasks[row]
+            for stage, seconds in run(config, scene, count).items():
                 best[row][stage] = min(seconds, best[row].get(stage, seconds))
             spent[row] += clock() - begin
         listener(ProgressEvent(stage=STAGE, done=number + 1, total=total))
-    for task, stages in zip(tasks, best, strict=True):
-        if task.scene is tasks[0].scene and task.count == tasks[0].count:
-            excess = loaded[task.preset] - sum(stages.values())
-            loaded[task.preset] = min(max(excess, 0.0), MOST_START_SECONDS)
-    measured = {preset: _of(kind, tasks, best) for preset, kind in alike.items()}
-    return CostModel.fit(measured, _starts(presets, loaded))
+    measured: dict[str, list[Measurement]] = {preset: [] for preset in first.values()}
+    for (preset, config, scene, count), stages in zip(tasks, best, strict=True):
+        work = Work.of(scene, count)
+        measured[preset].append(Measurement(work=work, config=config, seconds=stages))
+    # What a new process loads: the first preset shows it, and the first with images.
+    starts = {False: 0.0, True: 0.0}
+    for preset, seconds, stages in reversed(list(zip(first.values(), loading, best, strict=False))):
+        excess = min(max(seconds - sum(stages.values()), 0.0), MOST_START_SECONDS)
+        starts[_uses_images(preset)] = excess
+    return CostModel.fit(
+        {preset: measured[same] for preset, same in measured_as.items()},
+        {name: starts[False] + starts[True] * _uses_images(name) for name in presets},
+    )
 
 
-def _of(
-    preset: str, tasks: Sequence[_Task], seconds: Sequence[Mapping[str, float]]
-) -> list[Measurement]:
-    return [
-        Measurement(work=Work.of(task.scene, task.count), config=task.config, seconds=stages)
-        for task, stages in zip(tasks, seconds, strict=True)
-        if task.preset == preset
-    ]
-
-
-def _alike(presets: Sequence[str]) -> dict[str, str]:
-    """Return for every preset the first that differs from it only in its number of images."""
-    first: dict[SimplifyConfig, str] = {}
-    for preset in presets:
-        first.setdefault(_cut(preset, SHORT[0]).model_copy(update={"preset": ""}), preset)
-    return {
-        preset: first[_cut(preset, SHORT[0]).model_copy(update={"preset": ""})]
-        for preset in presets
-    }
-
-
-def _tasks(presets: Sequence[str], trials: Sequence[Trial]) -> list[_Task]:
-    scenes = [make(trial.kind, trial.count, sh_degree=trial.sh_degree) for trial in trials]
-    return [
-        _Task(
-            preset=preset,
-            config=_cut(preset, SHORT[number % len(SHORT)]),
-            scene=scene,
-            count=target_count(len(scene), rho),
-        )
-        for scene, trial in zip(scenes, trials, strict=True)
-        for number, rho in enumerate(trial.ratios)
-        for preset in presets
-    ]
-
-
-def _cut(preset: str, short: Mapping[str, int]) -> SimplifyConfig:
-    """Return a preset that takes only a few images and steps, if it takes any."""
+def _shortened(preset: str, short: Mapping[str, int]) -> SimplifyConfig:
+    """Return a preset with only a few images and steps, if it has any."""
     config = SimplifyConfig.from_preset(preset)
     changes: dict[str, Section] = {}
     if config.uses_renders:
@@ -188,13 +290,6 @@ def _cut(preset: str, short: Mapping[str, int]) -> SimplifyConfig:
     return config.model_copy(update=changes)
 
 
-def _starts(presets: Sequence[str], loading: Mapping[str, float]) -> dict[str, float]:
-    """Return what a new process loads: the first preset shows it, and the first with images."""
-    plain = next((s for name, s in loading.items() if not _takes_images(name)), 0.0)
-    images = next((s for name, s in loading.items() if _takes_images(name)), 0.0)
-    return {name: plain + images * _takes_images(name) for name in presets}
-
-
-def _takes_images(preset: str) -> bool:
+def _uses_images(preset: str) -> bool:
     config = SimplifyConfig.from_preset(preset)
     return config.uses_renders or config.refine.enabled

@@ -4,9 +4,8 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from cvtgs.budget.cost_model import CostModel
-from cvtgs.budget.remember import cost_model
-from cvtgs.budget.work import Work
+from cvtgs.budget.calibrate import cost_model
+from cvtgs.budget.costs import CostModel, Work
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import target_count
 from cvtgs.errors import GoalError, InvalidArgumentError
@@ -21,7 +20,7 @@ class Choice(NamedTuple):
 
     Attributes:
         preset: Its name.
-        seconds: What it will take, by prediction.
+        seconds: How long it will take, predicted.
     """
 
     preset: str
@@ -40,17 +39,16 @@ def choose_preset(
     """Choose the best preset whose simplification ends in time.
 
     The presets are ordered from the fastest to the best; ``paper``, which is there to compare
-    with, is never chosen. To keep its word, a preset fits only if 1.3 times its predicted seconds
-    do.
+    with, is never chosen. A preset fits only if 1.3 times its predicted seconds do.
 
     Args:
         work: The scene, or its size; a size knows its target, and takes no ratio and no count.
         seconds: Wall-clock seconds from the scene in memory to the small scene in memory.
         rho: Ratio of Gaussians to keep, in (0, 1].
         count: Number of Gaussians to keep, instead of ``rho``.
-        settings: What is changed of every preset, texts by dotted key, for example
+        settings: Changes of every preset, texts by dotted key, for example
             ``{"visibility.views": "0"}``.
-        model: What presets cost; None for :func:`cvtgs.budget.cost_model`, which measures it once
+        model: The cost of presets; None for :func:`cvtgs.budget.cost_model`, which measures it once
             on this machine.
 
     Returns:

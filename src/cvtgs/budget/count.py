@@ -1,27 +1,40 @@
-"""The smallest number of Gaussians that looks as good as asked."""
+"""Find the smallest number of Gaussians that reaches a quality."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
-from cvtgs.budget.bisect import smallest_enough
-from cvtgs.budget.goal import Goal, check_target
-from cvtgs.budget.judge import Judge, Quality
 from cvtgs.cameras import Cameras
-from cvtgs.errors import GoalError
+from cvtgs.errors import GoalError, InvalidArgumentError
+from cvtgs.evaluation.scorer import Metrics, Scorer, scene_scores
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import Simplified, SimplifyReport
 from cvtgs.scene import GaussianScene
 from cvtgs.simplifier import Simplifier
+from cvtgs.views import automatic_views
 
 STAGE = "search"
+
+HELDOUT_SEED = 307
+"""Other views than those of evaluations, and than those that presets and refinements use."""
+
+VIEWS, WIDTH, HEIGHT = 8, 640, 480
+"""As many and as large as ``cvtgs evaluate`` takes: scores depend on the size of images."""
+
+MOST_PSNR = 60.0
+"""Images that are closer than this count as equal, dB."""
 
 MOST_SHARE = 0.9
 """Scenes that keep more are not worth their loss: the full scene is hardly larger."""
 
 MOST_TRIES = 16
+
+CLOSE = 1.03
+"""The search ends when a number that is enough and one that is not are closer than this factor."""
+
+_FIRST_SHARE, _STEP, _SHORTEST = 0.1, 8.0, 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,8 +43,8 @@ class Tried:
 
     Attributes:
         count: The number.
-        psnr: What it reached, dB, at most 60.
-        ssim: What it reached.
+        psnr: Mean PSNR over the held-out views, dB, at most 60 each.
+        ssim: Mean SSIM over them.
     """
 
     count: int
@@ -44,7 +57,7 @@ class Found(NamedTuple):
 
     Attributes:
         scene: The scene.
-        report: How it came about.
+        report: The report of its simplification.
         psnr: Its mean PSNR over the held-out views, dB, at most 60 each.
         ssim: Its mean SSIM over them.
         tried: Everything that was tried, in that order.
@@ -55,6 +68,43 @@ class Found(NamedTuple):
     psnr: float
     ssim: float
     tried: tuple[Tried, ...]
+
+
+class Target(NamedTuple):
+    """The quality to reach.
+
+    Attributes:
+        metric: ``psnr`` or ``ssim``.
+        value: dB or similarity.
+    """
+
+    metric: Literal["psnr", "ssim"]
+    value: float
+
+    def of(self, tried: Tried) -> float:
+        """Return the value of the metric."""
+        return tried.psnr if self.metric == "psnr" else tried.ssim
+
+    def text(self, value: float) -> str:
+        """Write a value of the metric."""
+        return f"{value:.2f} dB" if self.metric == "psnr" else f"SSIM {value:.4f}"
+
+
+def checked_target(psnr: float | None, *, ssim: float | None) -> Target:
+    """Return the quality to reach; refuse what no scene can have."""
+    if psnr is not None and ssim is None:
+        if not 0 < psnr <= MOST_PSNR:
+            raise InvalidArgumentError(
+                f"the PSNR to reach must be above 0 and at most {MOST_PSNR:g} dB, found {psnr!r}."
+            )
+        return Target("psnr", psnr)
+    if ssim is not None and psnr is None:
+        if not 0 < ssim < 1:
+            raise InvalidArgumentError(
+                f"the SSIM to reach must be above 0 and below 1, found {ssim!r}."
+            )
+        return Target("ssim", ssim)
+    raise InvalidArgumentError("give either psnr or ssim, not both and not neither.")
 
 
 def find_count(
@@ -69,8 +119,8 @@ def find_count(
 ) -> Found:
     """Find the smallest number of Gaussians that reaches a quality, to 3 %.
 
-    Quality is measured over eight automatic views that no preset looks at. The full scene is
-    rendered, checked and looked at once; a search takes six to ten simplifications. Where
+    Quality is measured over eight automatic views that no preset uses. The full scene is
+    rendered, checked and analyzed once; a search takes six to ten simplifications. Where
     quality does not rise with every Gaussian, a smaller number than the one that is found may
     do by chance.
 
@@ -81,9 +131,9 @@ def find_count(
         psnr: Mean PSNR to reach, dB, above 0 and at most 60.
         ssim: Mean SSIM to reach instead, above 0 and below 1.
         simplifier: Makes the small scenes; None for the standard one.
-        cameras: From where presets that look at the scene do so; None finds views.
+        cameras: Views for presets that use images of the scene; None finds views.
         heldout: Other views to measure over.
-        listener: Told about every try.
+        listener: Called after every try.
 
     Returns:
         The scene, and what was tried.
@@ -102,56 +152,90 @@ def find_count(
         >>> found.psnr >= 18 and len(found.scene) < 400
         True
     """
-    goal = check_target(psnr, ssim=ssim)
-    judge = Judge(scene, heldout, listener=listener)
+    target = checked_target(psnr, ssim=ssim)
+    scorer = heldout_scorer(scene, heldout, listener=listener)
     prepared = (simplifier or Simplifier()).prepare(scene, cameras=cameras)
+    tried: list[Tried] = []
+    best: tuple[Simplified, Tried] | None = None
 
-    def make(count: int) -> Simplified:
-        return prepared.run(count=count)
-
-    search = _Search(make, judge, goal, total=len(scene))
-    most = max(1, math.floor(MOST_SHARE * len(scene)))
-    listener(ProgressEvent(stage=STAGE, done=0, total=MOST_TRIES))
-    tries = smallest_enough(search.reach, goal.wanted, most=most)
-    for done, (count, value) in enumerate(islice(tries, MOST_TRIES), start=1):
-        note = f"{count:,}: {goal.text(value)}"
-        listener(ProgressEvent(stage=STAGE, done=done, total=MOST_TRIES, note=note))
-    listener(ProgressEvent(stage=STAGE, done=MOST_TRIES, total=MOST_TRIES))
-    return search.answer()
-
-
-class _Search:
-    """What was tried, and the best of it."""
-
-    def __init__(
-        self, make: Callable[[int], Simplified], judge: Judge, goal: Goal, *, total: int
-    ) -> None:
-        self._make, self._judge, self._goal, self._total = make, judge, goal, total
-        self._tried: list[Tried] = []
-        self._best: tuple[Simplified, Quality] | None = None
-
-    def reach(self, count: int) -> float:
-        """Try a number of Gaussians."""
-        made = self._make(count)
-        quality = self._judge.score(made.scene)
-        self._tried.append(Tried(count=count, psnr=quality.psnr, ssim=quality.ssim))
-        value = self._goal.of(quality)
-        fewest = len(self._best[0].scene) if self._best else math.inf
-        if value >= self._goal.wanted and len(made.scene) < fewest:
-            self._best = made, quality
+    def reach(count: int) -> float:
+        nonlocal best
+        made = prepared.run(count=count)
+        tried.append(heldout_quality(scorer, made.scene, count=count))
+        value = target.of(tried[-1])
+        if value >= target.value and (best is None or len(made.scene) < len(best[0].scene)):
+            best = made, tried[-1]
         return value
 
-    def answer(self) -> Found:
-        """Return the smallest scene that is good enough."""
-        if self._best is None:
-            best = max(self._tried, key=self._value)
-            reached = self._goal.text(self._value(best))
-            raise GoalError(
-                f"no smaller scene reaches {self._goal.text(self._goal.wanted)}: the best that "
-                f"was tried, {best.count:,} of {self._total:,} Gaussians, reaches {reached}."
-            )
-        made, quality = self._best
-        return Found(made.scene, made.report, quality.psnr, quality.ssim, tuple(self._tried))
+    most = max(1, math.floor(MOST_SHARE * len(scene)))
+    tries = islice(smallest_enough(reach, target.value, most=most), MOST_TRIES)
+    listener(ProgressEvent(stage=STAGE, done=0, total=MOST_TRIES))
+    for done, (count, value) in enumerate(tries, start=1):
+        note = f"{count:,}: {target.text(value)}"
+        listener(ProgressEvent(stage=STAGE, done=done, total=MOST_TRIES, note=note))
+    listener(ProgressEvent(stage=STAGE, done=MOST_TRIES, total=MOST_TRIES))
+    if best is None:
+        nearest = max(tried, key=target.of)
+        raise GoalError(
+            f"no smaller scene reaches {target.text(target.value)}: the best that was tried, "
+            f"{nearest.count:,} of {len(scene):,} Gaussians, reaches "
+            f"{target.text(target.of(nearest))}."
+        )
+    (small, report), quality = best
+    return Found(small, report, quality.psnr, quality.ssim, tuple(tried))
 
-    def _value(self, tried: Tried) -> float:
-        return self._goal.of(Quality(tried.psnr, tried.ssim))
+
+def heldout_scorer(
+    full: GaussianScene, cameras: Cameras | None, *, listener: ProgressListener
+) -> Scorer:
+    """Render the full scene from held-out views, automatic ones if none are given."""
+    if cameras is None:
+        cameras = automatic_views(full, VIEWS, width=WIDTH, height=HEIGHT, seed=HELDOUT_SEED)
+    total = len(cameras)
+    return Scorer(
+        full,
+        cameras.singles(),
+        metrics=Metrics(most_psnr=MOST_PSNR),
+        progress=lambda done: listener(ProgressEvent(stage="look", done=done, total=total)),
+    )
+
+
+def heldout_quality(scorer: Scorer, small: GaussianScene, *, count: int) -> Tried:
+    """Score a small scene over the held-out views."""
+    scores = scene_scores("", len(small), scorer.score(small))
+    return Tried(count=count, psnr=scores.psnr.mean, ssim=scores.ssim.mean)
+
+
+def smallest_enough(
+    reach: Callable[[int], float], wanted: float, *, most: int
+) -> Iterator[tuple[int, float]]:
+    """Find the smallest number whose value reaches what is wanted.
+
+    Values should rise with the number; about linearly with its logarithm needs the fewest tries.
+    The search starts at a tenth, steps by a factor of eight until it has an end that is enough and
+    one that is not, and then interpolates on logarithms, but never leaves more than 85 % of the
+    bracket (regula falsi held to bisection's guarantee, as Dekker 1969).
+    """
+    low, low_value = 0, -math.inf
+    high, high_value = most + 1, math.inf
+    count = max(1, min(most, round(_FIRST_SHARE * most)))
+    while True:
+        value = reach(count)
+        yield count, value
+        if value >= wanted:
+            high, high_value = count, value
+        else:
+            low, low_value = count, value
+        if high - low <= 1 or (low > 0 and high <= most and high <= CLOSE * low):
+            return
+        if high > most:
+            count = min(most, math.ceil(_STEP * low))
+        elif low == 0:
+            count = max(1, int(high / _STEP))
+        else:
+            start, end = math.log(low), math.log(high)
+            rise = high_value - low_value
+            share = (wanted - low_value) / rise if 0 < rise < math.inf else 0.5
+            share = min(max(share, _SHORTEST), 1 - _SHORTEST)
+            count = round(math.exp(start + share * (end - start)))
+            count = min(max(count, low + 1), high - 1)

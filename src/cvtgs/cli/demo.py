@@ -78,7 +78,7 @@ def demo(options: argparse.Namespace) -> None:
             settings=cvtgs.evaluation.EvaluationSettings(lpips="off"),
             listener=listener,
         )
-        cvtgs.evaluation.write_exhibition(
+        cvtgs.evaluation.write_comparison(
             comparison, options.output, overwrite=True, listener=listener
         )
     if not options.quiet:

@@ -48,9 +48,8 @@ def render(options: argparse.Namespace) -> None:
     import torch
 
     from cvtgs.devices import chosen_device
-    from cvtgs.evaluation.compare import as_bytes
     from cvtgs.evaluation.comparison_files import make_folder
-    from cvtgs.evaluation.images import encode
+    from cvtgs.evaluation.images import as_bytes, encode
 
     check_view_options(options)
     scene = cvtgs.io.load(options.input).to(chosen_device(options.device))
@@ -214,10 +213,10 @@ def add_compare(add_parser: AddParser) -> None:
 
 def compare(options: argparse.Namespace) -> None:
     """Run ``cvtgs compare``."""
-    from cvtgs.evaluation.comparison_files import check_exhibition
+    from cvtgs.evaluation.comparison_files import check_comparison_files
 
     check_view_options(options)
-    check_exhibition(options.output, overwrite=options.overwrite)
+    check_comparison_files(options.output, overwrite=options.overwrite)
     scenes = _read_scenes(options)
     with progress_bars(quiet=options.quiet) as listener:
         comparison = cvtgs.evaluation.compare(
@@ -229,7 +228,7 @@ def compare(options: argparse.Namespace) -> None:
             settings=evaluation_settings(options),
             listener=listener,
         )
-        paths = cvtgs.evaluation.write_exhibition(
+        paths = cvtgs.evaluation.write_comparison(
             comparison, options.output, overwrite=options.overwrite, listener=listener
         )
     if not options.quiet:
@@ -295,7 +294,7 @@ def tradeoff(options: argparse.Namespace) -> None:
 
 
 def _print_tradeoff(tradeoff: "Tradeoff") -> None:
-    from cvtgs.tradeoff.table import MARK_MEANS, cells, heading, how_measured
+    from cvtgs.tradeoff.files import MARK_MEANS, cells, heading, how_measured
 
     for rho in tradeoff.ratios:
         print(heading(tradeoff, rho))

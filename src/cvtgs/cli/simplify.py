@@ -233,11 +233,11 @@ def check_goals(options: argparse.Namespace) -> None:
     if options.time_budget is not None:
         read_seconds(options.time_budget)
     if _has_target(options):
-        from cvtgs.budget.goal import check_target
+        from cvtgs.budget.count import checked_target
 
         if options.keep is not None:
             raise InvalidArgumentError("--keep needs --rho or --count.")
-        check_target(options.target_psnr, ssim=options.target_ssim)
+        checked_target(options.target_psnr, ssim=options.target_ssim)
     if options.time_budget is None:
         if options.recalibrate:
             raise InvalidArgumentError("--recalibrate goes with --time-budget.")
@@ -278,7 +278,7 @@ def choose_preset(
     listener: ProgressListener,
 ) -> ChosenPreset:
     """Choose the best preset that fits into the rest of the time budget."""
-    from cvtgs.budget.remember import is_known
+    from cvtgs.budget.calibrate import is_calibrated
 
     budget, spent = read_seconds(options.time_budget), time.perf_counter() - STARTED
     if budget <= spent:
@@ -286,7 +286,7 @@ def choose_preset(
             f"no preset fits into {budget:g} s: starting and reading took {spent:.1f} s."
         )
     target = cvtgs.target_count(len(scene), options.rho, count=options.count)
-    again = options.recalibrate or not is_known(options.device)
+    again = options.recalibrate or not is_calibrated(options.device)
     if again and not options.quiet:
         print("cvtgs: measuring this machine once, about a minute", file=sys.stderr)
     model = cvtgs.budget.cost_model(options.device, recalibrate=again, listener=listener)

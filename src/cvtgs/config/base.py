@@ -1,4 +1,4 @@
-"""What all configurations share: sections that refuse unknown keys, files, error texts."""
+"""What configurations and reports share: strict models, TOML files, error texts."""
 
 import tomllib
 from pathlib import Path
@@ -10,6 +10,12 @@ from cvtgs.errors import ConfigError
 
 MOST_PROBLEMS = 4
 """A sentence about some settings names no more problems."""
+
+
+class Record(pydantic.BaseModel):
+    """What was measured or done: frozen; infinite numbers are strings in JSON."""
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 
 
 class Section(pydantic.BaseModel):

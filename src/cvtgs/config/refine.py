@@ -1,4 +1,4 @@
-"""RefineConfig: every choice that a refinement makes."""
+"""RefineConfig: every choice of a refinement."""
 
 from typing import Annotated
 
@@ -39,18 +39,18 @@ class RefineConfig(Section):
             simplification is not refined.
         rates: Steps at the start.
         half_after: Steps after which they are half as long; after n times as many, 1 / (n + 1).
-        squared: Weight of the logarithm of the squared error.
-        image: Weight of the logarithm of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) + 0.2
-            gradient``.
+        mse_weight: Weight of the logarithm of the mean squared error.
+        image_weight: Weight of the logarithm of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) +
+            0.2 gradient``.
         size: Longer side of the images, pixels.
         batch: Views that are found together: a quarter automatic ones, half from anywhere around,
             a quarter from anywhere near, within the scene too.
-        steps_per_image: Steps for every new image of the full scene; the others look again at
-            one that is there.
+        steps_per_image: Steps for every new image of the full scene; the others take one that
+            was rendered before.
         images: Images that are kept at most, 8 bytes per pixel each.
         heldout: Views that decide what is kept, and are never learnt from.
-        check_every: Steps between two looks at them.
-        patience: Looks without a new best after which the refinement ends.
+        check_every: Steps between two checks of them.
+        patience: Checks without a new best after which the refinement ends.
 
     Example:
         >>> RefineConfig(size=128).rates.means
@@ -61,8 +61,8 @@ class RefineConfig(Section):
     seconds: float = pydantic.Field(default=0.0, ge=0.0)
     rates: Rates = Rates()
     half_after: Count = 100
-    squared: Rate = 0.5
-    image: Rate = 0.5
+    mse_weight: Rate = 0.5
+    image_weight: Rate = 0.5
     size: int = pydantic.Field(default=256, ge=16)
     batch: int = pydantic.Field(default=32, ge=4)
     steps_per_image: Count = 1

@@ -1,4 +1,4 @@
-"""Images of a full scene and of simplified ones, side by side, with their scores."""
+"""Scores and images of simplified scenes next to the full one, and to photographs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,18 +9,28 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.evaluation.evaluate import evaluate
-from cvtgs.evaluation.scores import Evaluation, SceneScores
-from cvtgs.evaluation.settings import EvaluationSettings
-from cvtgs.progress import ProgressListener, silent
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.evaluation.images import as_bytes
+from cvtgs.evaluation.report import Evaluation, SceneScores
+from cvtgs.evaluation.scorer import (
+    EvaluationSettings,
+    ImageScores,
+    chosen_metrics,
+    render_view,
+    scene_scores,
+)
+from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.scene import GaussianScene
+
+STAGE = "evaluate"
+"""The stage of the progress events; a step is an image."""
 
 Images = UInt8[np.ndarray, "c h w 3"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Comparison:
-    """What people look at: images, scores and sizes.
+    """Images, scores and sizes of a full scene and of simplified ones.
 
     Attributes:
         evaluation: The scores.
@@ -46,6 +56,54 @@ class Comparison:
         return self.evaluation.reference_count / max(1, scores.count)
 
 
+def evaluate(
+    reference: GaussianScene,
+    small: Mapping[str, GaussianScene],
+    cameras: Cameras,
+    *,
+    reference_name: str = "full",
+    photographs: Float[Tensor, "c h w 3"] | None = None,
+    settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
+    listener: ProgressListener = silent,
+) -> Evaluation:
+    """Score simplified scenes by images.
+
+    Every view of the full scene is rendered once, whatever the number of small ones. Memory:
+    what :func:`cvtgs.rendering.render` needs, and two images.
+
+    Args:
+        reference: The full scene.
+        small: Simplified scenes by name.
+        cameras: From where to look.
+        reference_name: Name of the full scene.
+        photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too.
+        settings: Background, which LPIPS, and what renders.
+        listener: Called after each image.
+
+    Returns:
+        The scores, per view and on average.
+
+    Raises:
+        InvalidArgumentError: There is no camera, two scenes share a name, or the photographs
+            have another shape than the images.
+        DeviceError: The backend does not work on a scene's device.
+        MissingDependencyError: The backend's package or the chosen LPIPS is missing.
+
+    Example:
+        >>> from cvtgs.views import automatic_views
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 500, sh_degree=0)
+        >>> cameras = automatic_views(scene, 2, width=32, height=24)
+        >>> settings = EvaluationSettings(lpips="off")
+        >>> evaluate(scene, {"same": scene}, cameras, settings=settings).scenes[0].psnr.mean
+        inf
+    """
+    scenes = _named_scenes(reference, small, reference_name)
+    return _score_images(
+        scenes, cameras, photographs=photographs, settings=settings, listener=listener
+    )
+
+
 def compare(
     reference: GaussianScene,
     small: Mapping[str, GaussianScene],
@@ -56,7 +114,7 @@ def compare(
     settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
     listener: ProgressListener = silent,
 ) -> Comparison:
-    """Take images of a full scene and of simplified ones, and score them.
+    """Score simplified scenes by images, and keep the images.
 
     Memory: ``3 c h w`` bytes per scene, and what :func:`cvtgs.evaluation.evaluate` needs.
 
@@ -67,7 +125,7 @@ def compare(
         reference_name: Name of the full scene.
         sizes: Bytes of the files, by name.
         settings: Background, which LPIPS, and what renders.
-        listener: Told about each image.
+        listener: Called after each image.
 
     Returns:
         The images and the scores.
@@ -75,7 +133,7 @@ def compare(
     Raises:
         InvalidArgumentError: There is no camera, or two scenes share a name.
         DeviceError: The backend does not work on a scene's device.
-        MissingDependencyError: The backend's package or the LPIPS asked for is missing.
+        MissingDependencyError: The backend's package or the chosen LPIPS is missing.
 
     Example:
         >>> from cvtgs.views import automatic_views
@@ -85,27 +143,83 @@ def compare(
         >>> compare(scene, {"same": scene}, cameras).full.shape
         (2, 24, 32, 3)
     """
+    scenes = _named_scenes(reference, small, reference_name)
     shape = (len(cameras), cameras.height, cameras.width, 3)
-    images = {name: np.zeros(shape, np.uint8) for name in (reference_name, *small)}
-
-    def keep(view: int, name: str, image: Float[Tensor, "h w 3"]) -> None:
-        images[name][view] = as_bytes(image)
-
-    evaluation = evaluate(
-        reference,
-        small,
-        cameras,
-        reference_name=reference_name,
-        settings=settings,
-        listener=listener,
-        on_image=keep,
-    )
+    images = {name: np.zeros(shape, np.uint8) for name in scenes}
+    evaluation = _score_images(scenes, cameras, images=images, settings=settings, listener=listener)
     full = images.pop(reference_name)
     return Comparison(evaluation=evaluation, full=full, small=images, sizes=dict(sizes or {}))
 
 
-def as_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Round colours to 8 bits."""
-    rounded = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8)
-    array: UInt8[np.ndarray, "h w 3"] = rounded.cpu().numpy()
-    return array
+def _named_scenes(
+    reference: GaussianScene, small: Mapping[str, GaussianScene], reference_name: str
+) -> dict[str, GaussianScene]:
+    if reference_name in small:
+        raise InvalidArgumentError(
+            f"the scenes must have different names; {reference_name!r} is that of the full scene."
+        )
+    return {reference_name: reference, **small}
+
+
+@torch.no_grad()
+def _score_images(
+    scenes: Mapping[str, GaussianScene],
+    cameras: Cameras,
+    *,
+    photographs: Float[Tensor, "c h w 3"] | None = None,
+    images: Mapping[str, Images] | None = None,
+    settings: EvaluationSettings,
+    listener: ProgressListener,
+) -> Evaluation:
+    """Score all scenes against the first, view by view; fill ``images`` where they are given."""
+    if len(cameras) == 0:
+        raise InvalidArgumentError("an evaluation needs at least one camera, found none.")
+    wanted = (len(cameras), cameras.height, cameras.width, 3)
+    if photographs is not None and tuple(photographs.shape) != wanted:
+        raise InvalidArgumentError(
+            f"photographs must have shape {wanted}, found {tuple(photographs.shape)}."
+        )
+    metrics = chosen_metrics(settings.lpips, (cameras.width, cameras.height))
+    (reference_name, reference), *_ = scenes.items()
+    against_full: dict[str, list[ImageScores]] = {name: [] for name in scenes}
+    against_photographs: dict[str, list[ImageScores]] = {name: [] for name in scenes}
+    total, done, backend = len(cameras) * len(scenes), 0, ""
+    listener(ProgressEvent(stage=STAGE, done=0, total=total))
+    for view in range(len(cameras)):
+        camera = cameras.select(torch.tensor([view]))
+        truth = reference.means.new_zeros(0)
+        for name, scene in scenes.items():
+            rendered = render_view(scene, camera, backend=settings.backend)
+            backend = rendered.backend
+            background = scene.means.new_tensor(settings.background)
+            image = rendered.over(background).clamp(0, 1)
+            if images is not None:
+                images[name][view] = as_bytes(image[0])
+            if name == reference_name:
+                truth = image
+            else:
+                against_full[name].append(metrics.compare(image, truth))
+            if photographs is not None:
+                found = metrics.compare(image, photographs[view : view + 1])
+                against_photographs[name].append(found)
+            done += 1
+            listener(ProgressEvent(stage=STAGE, done=done, total=total))
+    del against_full[reference_name]
+    return Evaluation(
+        reference=reference_name,
+        reference_count=len(reference),
+        views=cameras.view_names,
+        width=cameras.width,
+        height=cameras.height,
+        backend=backend,
+        lpips_network=metrics.lpips.network if metrics.lpips else None,
+        lpips_note=metrics.note,
+        scenes=tuple(
+            scene_scores(name, len(scenes[name]), rows) for name, rows in against_full.items()
+        ),
+        photographs=tuple(
+            scene_scores(name, len(scenes[name]), rows)
+            for name, rows in against_photographs.items()
+            if rows
+        ),
+    )

@@ -1,22 +1,35 @@
-"""The files of a comparison: a page, a contact sheet and the error maps."""
+"""The files of a comparison: a page, a contact sheet and a sheet of error maps."""
 
+import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import UInt8
 
 from cvtgs.errors import OutputError
-from cvtgs.evaluation.compare import Comparison
-from cvtgs.evaluation.images import encode
+from cvtgs.evaluation.compare import Comparison, Images
+from cvtgs.evaluation.images import ERROR_SCALE, encode, error_colors, error_map, resized
 from cvtgs.evaluation.page import comparison_page
-from cvtgs.evaluation.sheet import contact_sheet, error_sheet
+from cvtgs.evaluation.report import SceneScores
 from cvtgs.io import atomic_output, check_output
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
+
+if TYPE_CHECKING:
+    from PIL.ImageFont import FreeTypeFont, ImageFont
 
 PAGE, SHEET, ERRORS = "index.html", "sheet.png", "errors.png"
 STAGE = "write pages"
 
+_PAPER, _INK, _FADED = (250, 250, 249), (28, 28, 30), (110, 110, 115)
+_LONGEST_TILE, _SHEET_WIDTH = 360, 2800
+_GAP, _MARGIN, _SIDE, _HEAD, _FOOT = 8, 28, 230, 44, 64
+_NAME, _TEXT = 20, 15
 
-def check_exhibition(folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+
+def check_comparison_files(folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
     """Make the folder and check that the files could be written, before the work begins."""
     make_folder(folder)
     for name in (PAGE, SHEET, ERRORS):
@@ -32,7 +45,7 @@ def make_folder(folder: str | os.PathLike[str]) -> None:
         raise OutputError(f"{os.fspath(folder)}: cannot be made: {reason}.") from error
 
 
-def write_exhibition(
+def write_comparison(
     comparison: Comparison,
     folder: str | os.PathLike[str],
     *,
@@ -45,7 +58,7 @@ def write_exhibition(
         comparison: Images and scores, at least one simplified scene.
         folder: Where to write; made if it is missing.
         overwrite: Whether existing files may be replaced.
-        listener: Told about each file.
+        listener: Called after each file.
 
     Returns:
         The paths of the files.
@@ -63,10 +76,10 @@ def write_exhibition(
         >>> views = automatic_views(scene, 2, width=32, height=24)
         >>> comparison = compare(scene, {"same": scene}, views)
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     [path.name for path in write_exhibition(comparison, folder)]
+        ...     [path.name for path in write_comparison(comparison, folder)]
         ['sheet.png', 'errors.png', 'index.html']
     """
-    check_exhibition(folder, overwrite=overwrite)
+    check_comparison_files(folder, overwrite=overwrite)
     makers: dict[str, Callable[[], bytes]] = {
         SHEET: lambda: encode(contact_sheet(comparison), "png"),
         ERRORS: lambda: encode(error_sheet(comparison), "png"),
@@ -80,3 +93,119 @@ def write_exhibition(
             file.write(content)
         listener(ProgressEvent(stage=STAGE, done=done, total=len(makers)))
     return paths
+
+
+class _Row(NamedTuple):
+    """What one row of a sheet shows: a name with lines of text, and an image per view."""
+
+    name: str
+    lines: Sequence[str]
+    images: Images
+    captions: Sequence[str] = ()
+
+
+def contact_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
+    """Draw all views of all scenes: a row per scene, the full one first, a column per view."""
+    evaluation = comparison.evaluation
+    size = bytes_text(comparison.sizes.get(evaluation.reference))
+    full = [f"{evaluation.reference_count:,} Gaussians", size]
+    rows = [_Row(evaluation.reference, full, comparison.full)]
+    rows += [
+        _small_row(comparison, scores, comparison.small[scores.name])
+        for scores in evaluation.scenes
+    ]
+    return _draw_sheet(comparison, rows)
+
+
+def error_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
+    """Draw where every small image differs from the full one, with a legend of the colours."""
+    rows = []
+    for scores in comparison.evaluation.scenes:
+        pairs = zip(comparison.full, comparison.small[scores.name], strict=True)
+        maps = np.stack([error_map(one, other) for one, other in pairs])
+        rows.append(_small_row(comparison, scores, maps))
+    return _draw_sheet(comparison, rows, legend=True)
+
+
+def _small_row(comparison: Comparison, scores: SceneScores, images: Images) -> _Row:
+    lines = [
+        f"{scores.count:,} Gaussians",
+        _ratio_text(comparison.ratio(scores)),
+        bytes_text(comparison.sizes.get(scores.name)),
+        f"PSNR {_psnr_text(scores.psnr.mean)}",
+        f"SSIM {scores.ssim.mean:.3f}",
+        f"LPIPS {scores.lpips.mean:.3f}" if scores.lpips else "",
+    ]
+    return _Row(scores.name, lines, images, [_psnr_text(value) for value in scores.psnr.views])
+
+
+def _draw_sheet(
+    comparison: Comparison, rows: Sequence[_Row], *, legend: bool = False
+) -> UInt8[np.ndarray, "y x 3"]:
+    """Draw rows of tiles with their texts, under the names of the views."""
+    from PIL import Image, ImageDraw, ImageFont  # noqa: PLC0415 (takes time to load)
+
+    views, height, width, _ = comparison.full.shape
+    longest = min(_LONGEST_TILE, (_SHEET_WIDTH - _SIDE) / views - _GAP)
+    factor = min(1.0, longest / max(width, height))
+    tile = max(1, round(factor * width)), max(1, round(factor * height))
+    line = 1.45 * _TEXT
+    row_height = max(tile[1] + round(1.6 * _TEXT), round(7.5 * line)) + _GAP
+    lefts = [_MARGIN + _SIDE + view * (max(tile[0], 90) + _GAP) for view in range(views + 1)]
+    bottom = _MARGIN + _HEAD + len(rows) * row_height
+    size = lefts[-1] + _MARGIN, bottom + _MARGIN + legend * _FOOT
+    sheet = Image.new("RGB", size, _PAPER)
+    draw = ImageDraw.Draw(sheet)
+    large, small = ImageFont.load_default(_NAME), ImageFont.load_default(_TEXT)
+    for left, view in zip(lefts, comparison.evaluation.views, strict=False):
+        draw.text((left, _MARGIN), _shortened(view, tile[0], small), _FADED, small)
+    for number, row in enumerate(rows):
+        top = _MARGIN + _HEAD + number * row_height
+        draw.text((_MARGIN, top), _shortened(row.name, _SIDE - 20, large), _INK, large)
+        for place, text in enumerate(filter(None, row.lines)):
+            draw.text((_MARGIN, top + 1.5 * _NAME + place * line), text, _FADED, small)
+        for left, image in zip(lefts, row.images, strict=False):
+            sheet.paste(Image.fromarray(resized(image, tile)), (left, top))
+        for left, caption in zip(lefts, row.captions, strict=False):
+            draw.text((left, top + tile[1] + 4), caption, _FADED, small)
+    if legend:
+        width, height, left, top = 320, 14, lefts[0], bottom + 16
+        ramp = np.linspace(0, ERROR_SCALE, width, dtype=np.float32)[None].repeat(height, axis=0)
+        sheet.paste(Image.fromarray(error_colors(ramp)), (left, top))
+        draw.text((_MARGIN, top - 3), "RMS difference", _INK, small)
+        for step in range(4):
+            text = f"{step / 3 * ERROR_SCALE:.1f}{' +' if step == 3 else ''}"
+            place = left + step / 3 * width - (0 if step == 0 else 12)
+            draw.text((place, top + height + 5), text, _FADED, small)
+    return np.asarray(sheet)
+
+
+def _shortened(text: str, width: int, font: "FreeTypeFont | ImageFont") -> str:
+    """Shorten a text in the middle until it fits a width."""
+    shown = text
+    while len(shown) > 4 and font.getlength(shown) > width:
+        keep = len(shown) - 2
+        shown = f"{text[: keep // 2]}…{text[-(keep - keep // 2 - 1) :]}"
+    return shown
+
+
+def _psnr_text(value: float) -> str:
+    return "equal" if math.isinf(value) else f"{value:.2f} dB"
+
+
+def bytes_text(count: int | None) -> str:
+    """Return a number of bytes in decimal units; an empty text for None."""
+    if count is None:
+        return ""
+    value, unit = float(count), "B"
+    for larger in ("kB", "MB", "GB"):
+        if value < 1000:
+            break
+        value, unit = value / 1000, larger
+    return f"{value:.0f} {unit}" if unit == "B" or value >= 100 else f"{value:.1f} {unit}"
+
+
+def _ratio_text(ratio: float) -> str:
+    if abs(ratio - 1) < 0.005:
+        return "as many"
+    return f"{ratio:,.0f} times fewer" if ratio >= 10 else f"{ratio:.3g} times fewer"

@@ -1,20 +1,49 @@
-"""Image files and lettering; the only file that knows Pillow, and it imports it when needed."""
+"""Images of 8 bits: encoding, resizing, reading, and the colours of differences."""
 
 import io
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from cvtgs.errors import FileFormatError, InputError
 
 Encoding = Literal["png", "webp"]
 
+ERROR_SCALE = 0.3
+"""The difference that gets the brightest colour; larger ones get it too."""
+
+# Ten steps of "magma" (van der Walt and Smith 2015, CC0): equal steps look equally different.
+_MAGMA = (
+    (0, 0, 4),
+    (24, 15, 62),
+    (69, 16, 119),
+    (114, 31, 129),
+    (159, 47, 127),
+    (205, 64, 113),
+    (241, 96, 93),
+    (253, 149, 103),
+    (254, 201, 141),
+    (252, 253, 191),
+)
+
+CSS_GRADIENT = f"linear-gradient(90deg, {', '.join(f'rgb({r} {g} {b})' for r, g, b in _MAGMA)})"
+"""The colours of differences from left to right."""
+
+
+def as_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Round colours to 8 bits."""
+    rounded = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8)
+    array: UInt8[np.ndarray, "h w 3"] = rounded.cpu().numpy()
+    return array
+
 
 def encode(image: UInt8[np.ndarray, "h w 3"], encoding: Encoding, *, quality: int = 82) -> bytes:
     """Write an image to bytes."""
-    from PIL import Image  # noqa: PLC0415 (loads in its time)
+    from PIL import Image  # noqa: PLC0415 (takes time to load)
 
     settings: dict[str, Any] = {"png": {}, "webp": {"quality": quality}}[encoding]
     file = io.BytesIO()
@@ -23,7 +52,7 @@ def encode(image: UInt8[np.ndarray, "h w 3"], encoding: Encoding, *, quality: in
 
 
 def resized(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> np.ndarray:
-    """Scale an image, smoothly in both directions."""
+    """Resize an image to a width and height by Lanczos interpolation."""
     from PIL import Image  # noqa: PLC0415
 
     if (image.shape[1], image.shape[0]) == size:
@@ -34,7 +63,7 @@ def resized(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> np.ndar
 def read_image(
     path: Path, size: tuple[int, int], background: tuple[float, float, float]
 ) -> Float[np.ndarray, "h w 3"]:
-    """Read a photograph at a size."""
+    """Read an image at a width and height, over a background."""
     from PIL import Image, UnidentifiedImageError  # noqa: PLC0415
 
     try:
@@ -53,13 +82,17 @@ def read_image(
     return colors.astype(np.float32)
 
 
-def lettering(text: str, size: float) -> UInt8[np.ndarray, "h w"]:
-    """Draw a line of text."""
-    from PIL import Image, ImageDraw, ImageFont  # noqa: PLC0415
+def error_map(
+    one: UInt8[np.ndarray, "h w 3"], other: UInt8[np.ndarray, "h w 3"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Show the root mean square difference over the channels as colours."""
+    difference = (one.astype(np.float32) - other.astype(np.float32)) / 255
+    return error_colors(np.sqrt(np.square(difference).mean(axis=2)))
 
-    font = ImageFont.load_default(size)
-    left, _, right, _ = font.getbbox(text)
-    height = round(1.35 * size)
-    canvas = Image.new("L", (max(1, round(right - left) + 2), height))
-    ImageDraw.Draw(canvas).text((1 - left, 0.05 * size), text, fill=255, font=font)
-    return np.asarray(canvas)
+
+def error_colors(differences: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the colours of differences."""
+    positions = np.linspace(0, 1, len(_MAGMA))
+    steps, values = np.asarray(_MAGMA, dtype=np.float32), differences / ERROR_SCALE
+    channels = [np.interp(values, positions, steps[:, channel]) for channel in range(3)]
+    return np.stack(channels, axis=2).round().astype(np.uint8)

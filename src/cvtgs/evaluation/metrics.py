@@ -27,7 +27,8 @@ def psnr(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tens
         [20.0]
     """
     check_pair(a, b)
-    return torch.stack([_psnr(one, other) for one, other in zip(a, b, strict=True)])
+    pairs = zip(a.split(1), b.split(1), strict=True)
+    return torch.stack([pair_psnr(one, other) for one, other in pairs]).to(a.dtype)
 
 
 @torch.no_grad()
@@ -61,6 +62,7 @@ def ssim(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tens
     return torch.cat([mean_ssim(one, other) for one, other in pairs])
 
 
-def _psnr(one: Float[Tensor, "h w 3"], other: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    mean_square = (one.clamp(0, 1) - other.clamp(0, 1)).square().mean()
-    return -10 * torch.log10(mean_square)
+def pair_psnr(one: Float[Tensor, "1 h w 3"], other: Float[Tensor, "1 h w 3"]) -> Float[Tensor, ""]:
+    """Compute the PSNR of two images; the mean of the squares is taken in float64."""
+    errors = one.clamp(0, 1) - other.clamp(0, 1)
+    return -10 * torch.log10(errors.double().square().mean())

@@ -1,19 +1,16 @@
 """One self-contained HTML page to look at a comparison: no network, no other file."""
 
 import base64
-import html
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
-from cvtgs.evaluation.compare import Comparison, Images
-from cvtgs.evaluation.error_maps import ERROR_SCALE, css_gradient, error_map
-from cvtgs.evaluation.images import encode, resized
-from cvtgs.evaluation.scores import SceneScores
+from cvtgs.evaluation.compare import Comparison
+from cvtgs.evaluation.images import CSS_GRADIENT, ERROR_SCALE, encode, error_map, resized
 
 MOST_BYTES = 7_500_000
 """Pages are kept below this: images are compressed harder, and then made smaller."""
@@ -22,51 +19,62 @@ _TRIES = ((84, 1.0), (72, 1.0), (55, 1.0), (55, 0.7), (45, 0.5), (35, 0.35), (30
 
 
 def comparison_page(
-    comparison: Comparison, *, foreword: str = "", most_bytes: int = MOST_BYTES
+    comparison: Comparison, *, summary: str = "", most_bytes: int = MOST_BYTES
 ) -> str:
-    """Write the page.
+    """Return the page, with a summary of :func:`render_template` above the images.
 
     It has a divider between the full and a simplified scene, a chooser of scene and view, counts,
     bytes and scores, and maps of the differences. ``#view=2&small=1&split=30&error=1`` at the end
     of its address chooses what it shows first.
     """
+    parts = files("cvtgs.evaluation") / "page_parts"
+    texts = {
+        name: (parts / f"page.{name}").read_text(encoding="utf-8").strip()
+        for name in ("html", "css", "js")
+    }
     page = ""
     for quality, factor in _TRIES:
-        page = _page(comparison, quality, factor, foreword=foreword)
+        page = render_template(
+            texts["html"],
+            title=f"{comparison.evaluation.reference}: before and after",
+            style=texts["css"],
+            script=texts["js"],
+            gradient=CSS_GRADIENT,
+            error_scale=f"{ERROR_SCALE:g}",
+            summary=summary,
+            data=_page_data(comparison, quality, factor),
+        )
         if len(page) <= most_bytes:
             break
     return page
 
 
-def _page(comparison: Comparison, quality: int, factor: float, *, foreword: str) -> str:
-    title = html.escape(f"{comparison.evaluation.reference}: before and after")
-    parts = {
-        "TITLE": title,
-        "STYLE": _part("page.css"),
-        "GRADIENT": css_gradient(),
-        "ERROR_SCALE": f"{ERROR_SCALE:g}",
-        "SCRIPT": _part("page.js"),
-        "SHEET": "" if foreword else " The same images are in sheet.png, next to it.",
-        "FOREWORD": foreword,
-        "DATA": _for_script(_data(comparison, quality, factor)),
-    }
-    page = _part("page.html")
-    for name, content in parts.items():  # the data, which may hold anything, comes last
-        page = page.replace("{{" + name + "}}", content)
-    return page
+def render_template(template: str, **values: Any) -> str:
+    """Fill in an HTML template of Jinja; values are escaped unless it marks them as safe."""
+    from jinja2 import Environment, StrictUndefined  # noqa: PLC0415 (takes time to load)
+
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    return environment.from_string(template).render(values)
 
 
-def _part(name: str) -> str:
-    return (files("cvtgs.evaluation") / "page_parts" / name).read_text(encoding="utf-8").strip()
-
-
-def _for_script(data: dict[str, Any]) -> str:
-    """Write JSON that cannot end the script element that holds it."""
-    return json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-
-
-def _data(comparison: Comparison, quality: int, factor: float) -> dict[str, Any]:
+def _page_data(comparison: Comparison, quality: int, factor: float) -> dict[str, Any]:
+    """Return what the script of the page reads."""
     evaluation = comparison.evaluation
+    small = []
+    for scores in evaluation.scenes:
+        images = comparison.small[scores.name]
+        errors = map(error_map, comparison.full, images)
+        small.append(
+            {
+                **json.loads(scores.model_dump_json()),  # which writes infinity as text
+                "bytes": comparison.sizes.get(scores.name),
+                "images": _data_urls(images, quality, factor),
+                "errors": _data_urls(errors, quality - 10, factor),
+            }
+        )
     return {
         "backend": evaluation.backend,
         "width": evaluation.width,
@@ -78,32 +86,18 @@ def _data(comparison: Comparison, quality: int, factor: float) -> dict[str, Any]
             "count": evaluation.reference_count,
             "bytes": comparison.sizes.get(evaluation.reference),
         },
-        "full": list(_addresses(comparison.full, quality, factor)),
-        "small": [_small(comparison, scores, quality, factor) for scores in evaluation.scenes],
+        "full": _data_urls(comparison.full, quality, factor),
+        "small": small,
     }
 
 
-def _small(
-    comparison: Comparison, scores: SceneScores, quality: int, factor: float
-) -> dict[str, Any]:
-    images = comparison.small[scores.name]
-    return {
-        **json.loads(scores.model_dump_json()),  # which writes infinity as text
-        "bytes": comparison.sizes.get(scores.name),
-        "images": list(_addresses(images, quality, factor)),
-        "errors": list(_addresses(_errors(comparison.full, images), quality - 10, factor)),
-    }
-
-
-def _errors(full: Images, small: Images) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    return (error_map(one, other) for one, other in zip(full, small, strict=True))
-
-
-def _addresses(
+def _data_urls(
     images: Iterable[UInt8[np.ndarray, "h w 3"]], quality: int, factor: float
-) -> Iterator[str]:
+) -> list[str]:
+    urls = []
     for image in images:
         height, width, _ = image.shape
         size = max(1, round(factor * width)), max(1, round(factor * height))
         content = encode(resized(image, size), "webp", quality=quality)
-        yield "data:image/webp;base64," + base64.b64encode(content).decode()
+        urls.append("data:image/webp;base64," + base64.b64encode(content).decode())
+    return urls

@@ -2,9 +2,9 @@
 
 from typing import Self
 
-import pydantic
 import torch
 
+from cvtgs.config.base import Record
 from cvtgs.evaluation import SceneScores
 from cvtgs.report import Level
 from cvtgs.scene import GaussianScene
@@ -12,11 +12,7 @@ from cvtgs.scene import GaussianScene
 Corner = tuple[float, float, float]
 
 
-class _Record(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
-
-
-class LevelEntry(_Record):
+class LevelEntry(Record):
     """One level.
 
     Attributes:
@@ -81,7 +77,7 @@ class LevelEntry(_Record):
         )
 
 
-class LevelsIndex(_Record):
+class LevelsIndex(Record):
     """All levels of a scene, as ``levels.json`` holds them.
 
     Attributes:

@@ -1,104 +1,109 @@
-"""Images of the full scene: some to learn from, rendered when needed, and some that decide."""
+"""The views and images of a refinement: some to learn from, and others that are held out."""
 
 import random
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.config import RefineConfig
-from cvtgs.refinement.looking import Outlook
-from cvtgs.rendering import render
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.evaluation.scorer import ViewImage, render_view
+from cvtgs.losses import SSIM_WINDOW
 from cvtgs.scene import GaussianScene
+from cvtgs.views import mixed_views
 
-BEST_PSNR = 60.0
-"""Images that are nearer to each other count as equal, dB."""
+HELDOUT_SEED = 101
+"""Added to the seed: held-out views are others than those of evaluations and of training."""
+
+TRAINING_SEED = 211
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Image:
-    """One image of the full scene; the background is left open.
+class RefineViews:
+    """The views of a refinement.
 
     Attributes:
-        camera: From where.
-        rgb: ``(1, h, w, 3)`` colours over black.
-        alpha: ``(1, h, w)`` opacity.
+        heldout: Single cameras of one size, which decide what is kept.
+        training: Single cameras to learn from.
+        endless: Whether there are always more of them.
     """
 
-    camera: Cameras
-    rgb: Float[Tensor, "1 h w 3"]
-    alpha: Float[Tensor, "1 h w"]
-
-    def over(self, background: Float[Tensor, "3"]) -> Float[Tensor, "1 h w 3"]:
-        """Put the image over a background."""
-        rgb, alpha = self.rgb.to(background.dtype), self.alpha.to(background.dtype)
-        return rgb + (1 - alpha)[..., None] * background
+    heldout: tuple[Cameras, ...]
+    training: Iterator[Cameras]
+    endless: bool
 
 
-@torch.no_grad()
-def take_image(full: GaussianScene, camera: Cameras) -> Image:
-    """Render the full scene once."""
-    found = render(full, camera)
-    return Image(camera=camera, rgb=found.rgb, alpha=found.alpha)
+def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> RefineViews:
+    """Find views of a scene: a quarter automatic ones, the others from anywhere."""
+
+    def batch(number: int, seed: int) -> list[Cameras]:
+        return mixed_views(full, number, size=config.size, seed=seed).singles()
+
+    def training() -> Iterator[Cameras]:
+        for number in count():
+            views = batch(config.batch, seed + TRAINING_SEED + number)
+            random.Random(seed + number).shuffle(views)
+            yield from views
+
+    heldout = tuple(batch(config.heldout, seed + HELDOUT_SEED))
+    return RefineViews(heldout=heldout, training=training(), endless=True)
+
+
+def split_views(cameras: Cameras, *, config: RefineConfig, seed: int) -> RefineViews:
+    """Split given cameras into some that are held out, spread evenly, and the others."""
+    if len(cameras) < 2:
+        raise InvalidArgumentError(
+            f"a refinement needs at least 2 cameras, one of them to be held out; found "
+            f"{len(cameras)}."
+        )
+    side = min(config.size, max(cameras.width, cameras.height))
+    views = cameras.fitted(side, least=SSIM_WINDOW).singles()
+    number = max(1, min(config.heldout, len(views) // 8))
+    held = {(2 * k + 1) * len(views) // (2 * number) for k in range(number)}
+    others = [view for row, view in enumerate(views) if row not in held]
+    random.Random(seed).shuffle(others)
+    return RefineViews(
+        heldout=tuple(views[row] for row in sorted(held)), training=iter(others), endless=False
+    )
 
 
 class ImageBuffer:
-    """Images to learn from: a new one now and then, else one that is there.
+    """Images to learn from: now and then a new one, else one that was rendered before.
 
     Memory: 8 bytes per pixel of at most ``config.images`` images; of one, if every step has a
     new one.
     """
 
     def __init__(
-        self, full: GaussianScene, outlook: Outlook, *, config: RefineConfig, seed: int
+        self, full: GaussianScene, views: RefineViews, *, config: RefineConfig, seed: int
     ) -> None:
-        always_new = outlook.endless and config.steps_per_image == 1
+        always_new = views.endless and config.steps_per_image == 1
         self._full = full
-        self._cameras = outlook.learning
+        self._cameras = views.training
         self._steps_per_image = config.steps_per_image
-        self._most = 1 if always_new else config.images
-        self._dice = random.Random(seed)
-        self._kept: list[Image] = []
+        self._capacity = 1 if always_new else config.images
+        self._rng = random.Random(seed)
+        self._kept: list[ViewImage] = []
         self._drawn = 0
-        self.taken = 0
+        self.rendered = 0
 
-    def draw(self) -> Image:
-        """Return an image to learn from."""
-        is_turn = self._drawn % self._steps_per_image == 0
+    def draw(self) -> ViewImage:
+        """Return an image to learn from, in half precision."""
+        is_due = self._drawn % self._steps_per_image == 0
         self._drawn += 1
-        camera = next(self._cameras, None) if is_turn else None
+        camera = next(self._cameras, None) if is_due else None
         if camera is None:
-            return self._dice.choice(self._kept)
-        if len(self._kept) == self._most:
-            self._kept.pop(self._dice.randrange(len(self._kept)))
-        image = take_image(self._full, camera)
-        self._kept.append(Image(camera=camera, rgb=image.rgb.half(), alpha=image.alpha.half()))
-        self.taken += 1
+            return self._rng.choice(self._kept)
+        if len(self._kept) == self._capacity:
+            self._kept.pop(self._rng.randrange(len(self._kept)))
+        self._kept.append(render_view(self._full, camera).half())
+        self.rendered += 1
         return self._kept[-1]
 
-    def draw_color(self) -> Float[Tensor, "3"]:
-        """Return a background."""
-        return self._full.means.new_tensor([self._dice.random() for _ in range(3)])
-
-
-@torch.no_grad()
-def scores(scene: GaussianScene, images: tuple[Image, ...]) -> Float[Tensor, "p"]:
-    """Return how near a scene comes to each image of the full one."""
-    values = []
-    for image in images:
-        found = take_image(scene, image.camera)
-        for shade in (0.0, 1.0):
-            background = scene.means.new_full((3,), shade)
-            error = found.over(background).clamp(0, 1) - image.over(background).clamp(0, 1)
-            values.append(-10 * torch.log10(error.double().square().mean()))
-    return torch.stack(values).clamp(max=BEST_PSNR)
-
-
-def best_counted(first: Float[Tensor, "p"]) -> float:
-    """Return the PSNR beyond which an image counts no further: 10 dB above the median.
-
-    Else the one view that shows an even wall, at 50 dB, decides for all others.
-    """
-    return min(BEST_PSNR, float(first.median()) + 10.0)
+    def draw_background(self) -> Float[Tensor, "3"]:
+        """Return a random color."""
+        return self._full.means.new_tensor([self._rng.random() for _ in range(3)])

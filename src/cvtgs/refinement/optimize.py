@@ -1,23 +1,38 @@
-"""The steps of a refinement, and what of them is kept."""
+"""The optimization of a scene: learning rates per Gaussian, steps of Adam, and what is kept."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.config import RefineConfig
+from cvtgs.analysis import ambient_visibility
+from cvtgs.config import Rates, RefineConfig
+from cvtgs.cvt import nearest_backend
+from cvtgs.evaluation.scorer import Scorer
 from cvtgs.losses import relative_loss
-from cvtgs.refinement.budget import Budget
-from cvtgs.refinement.images import BEST_PSNR, Image, ImageBuffer, best_counted, scores
-from cvtgs.refinement.variables import Variables
+from cvtgs.math import parameters
+from cvtgs.math.frames import robust_frame
+from cvtgs.math.parameters import divide
+from cvtgs.progress import ProgressEvent, ProgressListener
+from cvtgs.refinement.images import ImageBuffer
+from cvtgs.refinement.limits import Limits
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
+from cvtgs.validity import standardized, valid_rows, with_finite_opacities
+
+STAGE = "refine"
+
+MOST_PSNR = 60.0
+"""Images that are nearer to each other count as equal, dB."""
+
+_BETAS = (0.6, 0.99)
+_LEAST_ROOT = 1e-15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Descent:
-    """What came out.
+class Optimized:
+    """The result of an optimization.
 
     Attributes:
         scene: The best scene, by held-out images; what came in if none was better.
@@ -32,50 +47,194 @@ class Descent:
     stopped: str
 
 
-def descend(
+def optimize(
     small: GaussianScene,
-    album: ImageBuffer,
-    heldout: tuple[Image, ...],
+    images: ImageBuffer,
+    scorer: Scorer,
     *,
-    budget: Budget,
+    limits: Limits,
     config: RefineConfig,
-    freedom: Float[Tensor, "n"],
-    tell: Callable[[float], None],
-) -> Descent:
-    """Move the Gaussians of a scene towards images of the full one, one image per step."""
-    budget.begin()
-    first = scores(small, heldout)
-    limit = best_counted(first)
-    best, before = small, float(first.clamp(max=limit).mean())
-    budget.end("check")
-    variables = Variables(small, config.rates, freedom=freedom)
-    after, waited = before, 0
-    stopped = "perfect" if float(first.amin()) >= BEST_PSNR else budget.spent()
+    learning_rate_scale: Float[Tensor, "n"],
+    listener: ProgressListener,
+) -> Optimized:
+    """Fit the Gaussians of a scene to images of the full one, one image per step."""
+    limits.begin()
+    first = heldout_psnr(small, scorer)
+    cap = psnr_cap(first)
+    best, before = small, float(first.clamp(max=cap).mean())
+    limits.end("check")
+    optimizer = SceneOptimizer(small, config.rates, learning_rate_scale=learning_rate_scale)
+    after, checks_without_gain = before, 0
+    stopped = "perfect" if float(first.amin()) >= MOST_PSNR else limits.reached()
     while not stopped:
-        factor = 1 / (1 + budget.steps / config.half_after)
-        budget.begin()
-        _step(variables, album, config=config, factor=factor)
-        budget.end("step")
-        stopped = budget.spent()
-        if stopped or budget.steps % config.check_every == 0:
-            found = variables.result()
-            reached = float(scores(found, heldout).clamp(max=limit).mean())
-            budget.end("check")
-            waited = 0 if reached > after else waited + 1
-            best, after = (found, reached) if reached > after else (best, after)
-            stopped = stopped or ("patience" if waited >= config.patience else budget.spent())
-        tell(after - before)
-    return Descent(scene=best, before=before, after=after, stopped=stopped)
+        factor = 1 / (1 + limits.steps / config.half_after)
+        limits.begin()
+        # A random background: a wrong opacity shows over some color.
+        target, background = images.draw(), images.draw_background()
+        image = render(optimizer.scene(), target.camera, background=background).rgb
+        loss = relative_loss(
+            image,
+            target.over(background),
+            squared_weight=config.mse_weight,
+            image_weight=config.image_weight,
+        )
+        optimizer.step(loss, factor=factor)
+        limits.end("step")
+        stopped = limits.reached()
+        if stopped or limits.steps % config.check_every == 0:
+            scene = optimizer.result()
+            score = float(heldout_psnr(scene, scorer).clamp(max=cap).mean())
+            limits.end("check")
+            if score > after:
+                best, after, checks_without_gain = scene, score, 0
+            else:
+                checks_without_gain += 1
+            if not stopped:
+                is_stuck = checks_without_gain >= config.patience
+                stopped = "patience" if is_stuck else limits.reached()
+        note = f"{after - before:+.2f} dB"
+        listener(ProgressEvent(stage=STAGE, done=limits.done, total=limits.total, note=note))
+    return Optimized(scene=best, before=before, after=after, stopped=stopped)
 
 
-def _step(variables: Variables, album: ImageBuffer, *, config: RefineConfig, factor: float) -> None:
-    """Look at one image, over a random background: a wrong opacity shows over some."""
-    target, background = album.draw(), album.draw_color()
-    image = render(variables.scene(), target.camera, background=background).rgb
-    loss = relative_loss(
-        image,
-        target.over(background),
-        squared_weight=config.squared,
-        image_weight=config.image,
-    )
-    variables.step(loss, factor=factor)
+def heldout_psnr(scene: GaussianScene, scorer: Scorer) -> Float[Tensor, "p"]:
+    """Return the PSNR of each held-out image, dB, in float64."""
+    return torch.tensor([image.psnr for image in scorer.score(scene)], dtype=torch.float64)
+
+
+def psnr_cap(first: Float[Tensor, "p"]) -> float:
+    """Return the PSNR beyond which an image counts no further: 10 dB above the median.
+
+    Else the one view that shows an even wall, at 50 dB, decides for all others.
+    """
+    return min(MOST_PSNR, float(first.median()) + 10.0)
+
+
+class SceneOptimizer:
+    """A scene as a start plus changes, and the optimizer of the changes.
+
+    A step of Adam (Kingma and Ba 2015, as ``SparseAdam`` does it) moves only the Gaussians that an
+    image shows: all others have no gradient, keep their momentum for later, and stay as they are.
+    Memory: five times the scene.
+    """
+
+    def __init__(
+        self, scene: GaussianScene, rates: Rates, *, learning_rate_scale: Float[Tensor, "n"]
+    ) -> None:
+        self._scene = scene
+        # Finite opacities and unit quaternions, which render to the same.
+        start = with_finite_opacities(scene).tensors()
+        self._start = start | {"quats": parameters.normalize_quats(start["quats"])}
+        self._units = _units(scene, learning_rate_scale)
+        self._changes = {
+            name: torch.zeros_like(tensor, requires_grad=True)
+            for name, tensor in self._start.items()
+        }
+        self._rates = {
+            name: rate
+            for name, rate in rates.model_dump().items()
+            if rate > 0 and self._start[name].numel()
+        }
+        self._moved = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
+        groups = [
+            {"params": [self._changes[name]], "lr": rate} for name, rate in self._rates.items()
+        ]
+        self._adam = (
+            torch.optim.SparseAdam(groups, betas=_BETAS, eps=_LEAST_ROOT) if groups else None
+        )
+
+    def scene(self) -> GaussianScene:
+        """Return the scene, differentiable in the changes."""
+        tensors = {
+            name: start + self._changes[name] * self._units[name]
+            for name, start in self._start.items()
+        }
+        return self._scene.with_tensors(tensors, self._scene.extras)
+
+    def step(self, loss: Tensor, *, factor: float) -> None:
+        """Move every Gaussian that has a finite gradient which is not zero."""
+        if self._adam is None or not loss.requires_grad:
+            return
+        changes = [self._changes[name] for name in self._rates]
+        gradients = torch.autograd.grad(loss, changes, materialize_grads=True)
+        rows = _rows_to_move(gradients)
+        for group, rate, change, gradient in zip(
+            self._adam.param_groups, self._rates.values(), changes, gradients, strict=True
+        ):
+            group["lr"] = factor * rate
+            largest = 0.5 * torch.finfo(gradient.dtype).max ** 0.5  # else its square overflows
+            change.grad = torch.sparse_coo_tensor(
+                rows[None],
+                gradient[rows].clamp(-largest, largest),
+                change.shape,
+                is_coalesced=True,
+                check_invariants=True,
+            )
+        self._adam.step()
+        self._moved[rows] = True
+
+    @torch.no_grad()
+    def result(self) -> GaussianScene:
+        """Return the scene as it would be saved."""
+        now = standardized(self.scene())
+        moved = self._moved & valid_rows(now)
+        tensors = {
+            name: torch.where(_like(moved, old), now.tensors()[name], old)
+            for name, old in self._scene.tensors().items()
+        }
+        return self._scene.with_tensors(tensors, self._scene.extras)
+
+
+def _units(scene: GaussianScene, scale: Float[Tensor, "n"]) -> dict[str, Tensor]:
+    """Return the length of one unit of change; positions use the mean standard deviation."""
+    widths = torch.where(scale > 0, torch.exp(scene.log_scales).mean(dim=1), 0.0)
+    units = {name: _like(scale, tensor) for name, tensor in scene.tensors().items()}
+    return units | {"means": (scale * widths)[:, None]}
+
+
+def _rows_to_move(gradients: tuple[Tensor, ...]) -> Tensor:
+    some = torch.zeros(len(gradients[0]), dtype=torch.bool, device=gradients[0].device)
+    finite = ~some
+    for gradient in gradients:
+        flat = gradient.reshape(len(gradient), -1)
+        some |= (flat != 0).any(dim=1)
+        finite &= flat.isfinite().all(dim=1)
+    return (some & finite).nonzero()[:, 0]
+
+
+def _like(values: Float[Tensor, "n"], tensor: Tensor) -> Tensor:
+    """Give values per Gaussian as many dimensions as a tensor."""
+    return values.reshape(-1, *[1] * (tensor.ndim - 1))
+
+
+@torch.no_grad()
+def learning_rate_scales(small: GaussianScene, full: GaussianScene) -> Float[Tensor, "n"]:
+    """Return the factor of the learning rates of each Gaussian, from 0 to 1.
+
+    What is enclosed moves less (:func:`cvtgs.analysis.ambient_visibility`): it may be all that is
+    visible from elsewhere. A Gaussian that is still what it was in the full scene moves by the
+    share of the mass around it that is not its own: where it represents itself alone it is right
+    from everywhere, and whatever a few images gain by moving it is lost in others. Invalid rows
+    do not move.
+    """
+    valid = valid_rows(small)
+    some = small.select(valid)
+    visibility = ambient_visibility(some.means, some.masses, robust_frame(some.means))
+    scales = torch.zeros_like(small.logit_opacities)
+    scales[valid] = (visibility * (1.0 - _own_mass_shares(some, full))).to(small.dtype)
+    return scales
+
+
+def _own_mass_shares(small: GaussianScene, full: GaussianScene) -> Float[Tensor, "n"]:
+    """Return the share of the nearest mass that is the Gaussian's own; 0 if it has changed."""
+    _, nearest = nearest_backend("auto", small.device)
+    labels, _ = nearest(full.means, small.means)
+    same = torch.ones_like(labels, dtype=torch.bool)
+    for name in ("means", "log_scales", "logit_opacities", "sh0"):
+        before, now = getattr(full, name), getattr(small, name)
+        same &= (before == now[labels]).reshape(len(full), -1).all(dim=1)
+    labels, masses, same = labels.cpu(), full.masses.double().cpu(), same.cpu()
+    around = torch.bincount(labels, masses, minlength=len(small))
+    own = torch.zeros_like(around)
+    own.scatter_reduce_(0, labels[same], masses[same], "amax")
+    return divide(own, around).clamp(0.0, 1.0).to(small.device)

@@ -2,8 +2,7 @@
 
 from cvtgs.tradeoff.files import write_tradeoff
 from cvtgs.tradeoff.measure import Measured, measure_tradeoff
-from cvtgs.tradeoff.pareto import on_front
-from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult
+from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult, on_front
 
 __all__ = [
     "Failure",

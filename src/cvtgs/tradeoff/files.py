@@ -1,28 +1,69 @@
 """The files of a tradeoff: tables for programs, a plot, and a page to look at."""
 
+import base64
+import math
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from cvtgs.errors import MissingDependencyError
-from cvtgs.evaluation.comparison_files import PAGE, make_folder
-from cvtgs.evaluation.page import comparison_page
+from cvtgs.evaluation.comparison_files import PAGE, bytes_text, make_folder
+from cvtgs.evaluation.page import comparison_page, render_template
 from cvtgs.io import atomic_output, check_output
+from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.tradeoff.chart import tradeoff_chart
 from cvtgs.tradeoff.measure import Measured
-from cvtgs.tradeoff.summary import foreword
+from cvtgs.tradeoff.results import Tradeoff, TradeoffResult
 
 CSV, JSON, PLOT = "tradeoff.csv", "tradeoff.json", "tradeoff.png"
 STAGE = "write pages"
 
+WIDTH, HEIGHT = 1200, 560
+"""Pixels of the plot."""
+
+DIGITS = ((1, 2, 3, 5, 7), (1, 2, 5), (1,))
+MOST_TICKS = 12
+"""More numbers run into each other."""
+
+MARK = "*"
+MARK_MEANS = "* no other preset is as good in less time, with as many Gaussians"
+
+SUMMARY = """\
+<section class="tradeoff">
+<h2>What more time buys</h2>
+{% if chart %}
+<img class="chart" src="data:image/png;base64,{{ chart }}" alt="PSNR and SSIM over seconds, a line \
+per ratio; the table has the same numbers">
+{% endif %}
+<div class="scroller"><table id="tradeoff">
+<thead><tr>{% for name in headings %}<th>{{ name }}</th>{% endfor %}</tr></thead>
+{% for title, rows in groups %}
+<tbody><tr><th class="group" colspan="{{ headings | length }}">{{ title }}</th></tr>
+{% for row in rows %}
+<tr><th>{{ row[0] }}</th>
+{%- for text in row[1:] %}
+<td{% if text.endswith(mark) %} class="best"{% endif %}>{{ text }}</td>
+{%- endfor %}
+</tr>
+{% endfor %}
+</tbody>
+{% endfor %}
+</table></div>
+<p class="note">{{ mark_means }}. {{ how_measured }}</p>
+{% for failure in failures %}
+<p class="note">{{ failure.name }} failed: {{ failure.reason }}</p>
+{% endfor %}
+</section>
+"""
+
 
 class Written(NamedTuple):
-    """What was written.
+    """The files that were written.
 
     Attributes:
         paths: The files.
-        note: What is missing and why; empty if nothing is.
+        note: Which file is missing and why; empty if none is.
     """
 
     paths: tuple[Path, ...]
@@ -50,13 +91,13 @@ def write_tradeoff(
     Without matplotlib, the plot is left out.
 
     Args:
-        measured: What was measured.
+        measured: The measurements.
         folder: Where to write; made if it is missing.
         overwrite: Whether existing files may be replaced.
-        listener: Told about each file.
+        listener: Called after each file.
 
     Returns:
-        The paths of the files, and what is missing.
+        The paths of the files, and which is missing.
 
     Raises:
         OutputExistsError: A file exists and may not be replaced.
@@ -64,8 +105,12 @@ def write_tradeoff(
     """
     check_tradeoff_files(folder, overwrite=overwrite)
     tradeoff = measured.tradeoff
-    chart, note = _chart(measured)
-    page = comparison_page(measured.comparison, foreword=foreword(tradeoff, chart))
+    chart, note = None, ""
+    try:
+        chart = tradeoff_chart(tradeoff)
+    except MissingDependencyError as error:
+        note = str(error)
+    page = comparison_page(measured.comparison, summary=page_summary(tradeoff, chart))
     contents = {
         CSV: tradeoff.to_csv().encode(),
         JSON: tradeoff.to_json().encode(),
@@ -80,8 +125,115 @@ def write_tradeoff(
     return Written(tuple(kept), note)
 
 
-def _chart(measured: Measured) -> tuple[bytes | None, str]:
-    try:
-        return tradeoff_chart(measured.tradeoff), ""
-    except MissingDependencyError as error:
-        return None, str(error)
+def tradeoff_chart(tradeoff: Tradeoff) -> bytes:
+    """Draw PSNR and SSIM over seconds, a line per ratio through the runs that none beats."""
+    seconds = [result.seconds for result in tradeoff.results]
+    panels = []
+    for metric in ("psnr", "ssim"):
+        series = []
+        for rho in tradeoff.ratios:
+            results = [result for result in tradeoff.results if result.rho == rho]
+            results.sort(key=lambda result: result.seconds)
+            series.append(
+                Series(
+                    name=f"rho {rho:g}",
+                    x=[max(result.seconds, 1e-3) for result in results],
+                    y=[result.psnr if metric == "psnr" else result.ssim for result in results],
+                    markers=True,
+                    labels=[result.preset for result in results],
+                    aside=[metric not in result.fronts for result in results],
+                )
+            )
+        panels.append(
+            Panel(
+                series=series,
+                title=metric.upper(),
+                x_label="seconds of the whole process",
+                y_label="PSNR, dB" if metric == "psnr" else "SSIM",
+                x_ticks=ticks(min(seconds), max(seconds)),
+                log_x=True,
+            )
+        )
+    return line_chart(panels, width=WIDTH, height=HEIGHT)
+
+
+def ticks(low: float, high: float) -> Sequence[float]:
+    """Return round numbers for a logarithmic axis: 1, 2, 3, 5, 7 and their tenfolds, or fewer."""
+    for digits in DIGITS:
+        found = _round_numbers(max(low, 1e-3), max(high, 1e-3), digits)
+        if len(found) <= MOST_TICKS:
+            break
+    return found
+
+
+def _round_numbers(low: float, high: float, digits: Sequence[int]) -> Sequence[float]:
+    decades = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)
+    steps = [float(f"{digit}e{decade}") for decade in decades for digit in digits]
+    first = max((step for step in steps if step <= low), default=steps[0])
+    last = min((step for step in steps if step >= high), default=steps[-1])
+    return [step for step in steps if first <= step <= last]
+
+
+def page_summary(tradeoff: Tradeoff, chart: bytes | None) -> str:
+    """Return the plot and the table as HTML."""
+    headings = list(cells(tradeoff, tradeoff.results[0]))
+    groups = []
+    for rho in tradeoff.ratios:
+        rows = [cells(tradeoff, result) for result in tradeoff.results if result.rho == rho]
+        texts = [[row[name].strip() for name in headings] for row in rows]
+        groups.append((heading(tradeoff, rho), texts))
+    return render_template(
+        SUMMARY,
+        chart=base64.b64encode(chart).decode() if chart else "",
+        headings=headings,
+        groups=groups,
+        mark=MARK,
+        mark_means=MARK_MEANS,
+        how_measured=how_measured(tradeoff),
+        failures=tradeoff.failures,
+    )
+
+
+def cells(tradeoff: Tradeoff, result: TradeoffResult) -> Mapping[str, str]:
+    """Return a result as texts, by the headings of the table."""
+    stages = {f"{name}, s": _seconds(result.stage_seconds.get(name)) for name in tradeoff.stages}
+    measured = tradeoff.evaluation.lpips_network is not None
+    distance = {"LPIPS": _score(result, "lpips", result.lpips, 4)} if measured else {}
+    return {
+        "preset": result.preset,
+        "start, s": _seconds(tradeoff.start_seconds),
+        **stages,
+        "read, write, s": _seconds(tradeoff.rest_seconds(result)),
+        "all, s": _seconds(result.seconds),
+        "PSNR, dB": _score(result, "psnr", result.psnr, 2),
+        "SSIM": _score(result, "ssim", result.ssim, 4),
+        **distance,
+        "file": bytes_text(result.bytes),
+        "memory": bytes_text(result.peak_memory_bytes) if result.peak_memory_bytes else "",
+    }
+
+
+def heading(tradeoff: Tradeoff, rho: float) -> str:
+    """Return the heading of a ratio."""
+    count = max(result.count for result in tradeoff.results if result.rho == rho)
+    return f"rho {rho:g}: {count:,} of {tradeoff.source_count:,} Gaussians"
+
+
+def how_measured(tradeoff: Tradeoff) -> str:
+    """Report where and how this was measured."""
+    seen = tradeoff.evaluation
+    return (
+        f"{len(seen.views)} views of {seen.width} x {seen.height} pixels, rendered by "
+        f"{seen.backend}. Every run is a process of its own on {tradeoff.machine}. "
+        f"{seen.lpips_sentence}"
+    ).rstrip()
+
+
+def _seconds(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
+
+
+def _score(result: TradeoffResult, metric: str, value: float | None, digits: int) -> str:
+    if value is None:
+        return ""
+    return f"{value:.{digits}f}{MARK if metric in result.fronts else ' '}"

@@ -1,4 +1,4 @@
-"""The public entry: a scene in, what every preset costs and gives on it out."""
+"""Measure cost and quality of every preset on one scene."""
 
 import os
 import platform
@@ -18,19 +18,18 @@ from cvtgs.evaluation import Comparison, EvaluationSettings, SceneScores, compar
 from cvtgs.io import load
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.scene import GaussianScene
-from cvtgs.tradeoff.pareto import on_front
-from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult
+from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult, with_fronts
 from cvtgs.tradeoff.runs import Run, run_tasks, start_seconds, tasks_of
 from cvtgs.views import automatic_views
 
 RATIOS = (0.1, 0.01, 0.001)
 
 CameraChoice = Callable[[GaussianScene], Cameras]
-"""Says from where to look at a scene."""
+"""Returns the views of a scene."""
 
 
 class Measured(NamedTuple):
-    """What was measured, and what it looks like.
+    """The measurements, and images of the scenes.
 
     Attributes:
         tradeoff: Costs and scores.
@@ -52,10 +51,10 @@ def measure_tradeoff(
     folder: str | os.PathLike[str] | None = None,
     listener: ProgressListener = silent,
 ) -> Measured:
-    """Simplify a file by several presets, and say what each costs and gives.
+    """Simplify a file by several presets, and measure cost and quality of each.
 
     Every run is a process of its own, ``cvtgs simplify``, so that seconds and memory are those
-    that users see. Then all results are looked at from the same views. A run that fails is
+    that users see. Then all results are rendered from the same views. A run that fails is
     warned about and listed; the others go on.
 
     Memory: here, what :func:`cvtgs.evaluation.compare` needs; the processes need theirs one after
@@ -65,12 +64,12 @@ def measure_tradeoff(
         source: The full scene.
         presets: Names; None for all, from the fastest to the best.
         ratios: Ratios of Gaussians to keep, each in (0, 1].
-        cameras: From where to look at it.
+        cameras: Returns the views of it.
         settings: Background, which LPIPS, and what renders.
         device: Where to compute: ``auto``, ``cpu`` or ``cuda``.
         folder: Keep the results there, as ``fast_0.01.ply``, replacing what has that name; None
             keeps none.
-        listener: Told about each run and image.
+        listener: Called after each run and image.
 
     Returns:
         Costs, scores and images.
@@ -101,7 +100,10 @@ def measure_tradeoff(
         done = list(run_tasks(source, tasks, place, device=device, listener=listener))
         runs = [one for one in done if isinstance(one, Run)]
         failures = tuple(one for one in done if isinstance(one, Failure))
-        _tell(failures, none_left=not runs)
+        if failures and not runs:
+            raise RunError(f"every run failed; {failures[0].name}: {failures[0].reason}")
+        for failure in failures:
+            warnings.warn(f"{failure.name} failed: {failure.reason}", UserWarning, stacklevel=2)
         sizes = {run.task.name: run.path.stat().st_size for run in runs}
         name = Path(source).name
         comparison = compare(
@@ -122,7 +124,8 @@ def measure_tradeoff(
         source_count=len(full),
         source_bytes=comparison.sizes[name],
         start_seconds=start,
-        machine=_machine(where),
+        machine=f"{device_name(where)}, {os.cpu_count()} cores, "
+        f"Python {platform.python_version()}, torch {torch.__version__}",
         evaluation=comparison.evaluation,
         results=tuple(with_fronts(results)),
         failures=failures,
@@ -139,13 +142,6 @@ def _folder(wanted: str | os.PathLike[str] | None) -> Iterator[Path]:
         yield Path(name)
 
 
-def _tell(failures: Sequence[Failure], *, none_left: bool) -> None:
-    if failures and none_left:
-        raise RunError(f"every run failed; {failures[0].name}: {failures[0].reason}")
-    for failure in failures:
-        warnings.warn(f"{failure.name} failed: {failure.reason}", UserWarning, stacklevel=3)
-
-
 def _result(run: Run, scores: SceneScores, size: int) -> TradeoffResult:
     return TradeoffResult(
         name=run.task.name,
@@ -159,29 +155,4 @@ def _result(run: Run, scores: SceneScores, size: int) -> TradeoffResult:
         ssim=scores.ssim.mean,
         lpips=None if scores.lpips is None else scores.lpips.mean,
         report=run.report,
-    )
-
-
-def with_fronts(results: Sequence[TradeoffResult]) -> Iterator[TradeoffResult]:
-    """Mark the results that no other of the same ratio beats in seconds and a metric."""
-    fronts: dict[str, list[str]] = {result.name: [] for result in results}
-    for rho in dict.fromkeys(result.rho for result in results):
-        same = [result for result in results if result.rho == rho]
-        seconds = [result.seconds for result in same]
-        for metric, gains in (
-            ("psnr", [result.psnr for result in same]),
-            ("ssim", [result.ssim for result in same]),
-            ("lpips", [-result.lpips for result in same if result.lpips is not None]),
-        ):
-            if len(gains) == len(same):
-                for result, best in zip(same, on_front(seconds, gains), strict=True):
-                    fronts[result.name] += [metric] * best
-    for result in results:
-        yield result.model_copy(update={"fronts": tuple(fronts[result.name])})
-
-
-def _machine(device: torch.device) -> str:
-    return (
-        f"{device_name(device)}, {os.cpu_count()} cores, Python {platform.python_version()}, "
-        f"torch {torch.__version__}"
     )

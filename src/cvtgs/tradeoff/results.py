@@ -1,26 +1,22 @@
-"""What every preset costs and gives on one scene."""
+"""The results of a tradeoff: cost and quality of every preset on one scene."""
 
 import csv
 import io
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 
-import pydantic
-
-from cvtgs.evaluation.scores import Evaluation
+from cvtgs.config.base import Record
+from cvtgs.evaluation import Evaluation
 from cvtgs.report import SimplifyReport
 
 
-class _Record(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
-
-
-class TradeoffResult(_Record):
-    """What one run of one preset cost and gave.
+class TradeoffResult(Record):
+    """Cost and quality of one run of one preset.
 
     Attributes:
         name: Preset and ratio, for example ``fast 0.01``; the name in the evaluation, too.
         preset: Name of the preset.
-        rho: Ratio that was asked for.
+        rho: Ratio that was given.
         count: Gaussians that came out.
         bytes: Size of the file that came out.
         seconds: Wall-clock seconds of the whole process, from its start to its end.
@@ -29,7 +25,7 @@ class TradeoffResult(_Record):
         ssim: Mean over the views.
         lpips: Mean over the views; None if it was not measured.
         fronts: Metrics by which no other run of this ratio beats it: ``psnr``, ``ssim``, ``lpips``.
-        report: What was done, with seconds and peak memory per stage.
+        report: The report of the simplification, with seconds and peak memory per stage.
     """
 
     name: str
@@ -51,7 +47,7 @@ class TradeoffResult(_Record):
         return {stage.stage: stage.seconds for stage in self.report.stages}
 
 
-class Failure(_Record):
+class Failure(Record):
     """A run that failed.
 
     Attributes:
@@ -63,18 +59,18 @@ class Failure(_Record):
     reason: str
 
 
-class Tradeoff(_Record):
-    """What every preset costs and gives on one scene.
+class Tradeoff(Record):
+    """Cost and quality of every preset on one scene.
 
     Attributes:
         source: Name of the file of the full scene.
         source_count: Its Gaussians.
         source_bytes: Its size.
-        start_seconds: What every process costs before it reads: Python, torch and cvtgs start.
+        start_seconds: Seconds of every process before it reads: Python, torch and cvtgs start.
         machine: Where this was measured.
         evaluation: From where images were taken, and the scores per view.
         results: One per ratio and preset, ratio by ratio.
-        failures: Runs that gave nothing.
+        failures: Runs that failed.
     """
 
     source: str
@@ -152,3 +148,45 @@ class Tradeoff(_Record):
             "lpips": result.lpips,
             "fronts": " ".join(result.fronts),
         }
+
+
+def on_front(costs: Sequence[float], gains: Sequence[float]) -> tuple[bool, ...]:
+    """Report which of several choices are on the Pareto front: those that no other beats.
+
+    One beats another if it costs no more and gains no less, and is better in one of the two.
+
+    Args:
+        costs: Less is better.
+        gains: As many; more is better, and NaN is never on the front.
+
+    Returns:
+        Whether each is on the front.
+
+    Example:
+        >>> on_front([1.0, 2.0, 3.0], [20.0, 19.0, 25.0])
+        (True, False, True)
+    """
+    pairs = list(zip(costs, gains, strict=True))
+    return tuple(
+        not math.isnan(gain)
+        and not any(c <= cost and g >= gain and (c, g) != (cost, gain) for c, g in pairs)
+        for cost, gain in pairs
+    )
+
+
+def with_fronts(results: Sequence[TradeoffResult]) -> Iterator[TradeoffResult]:
+    """Mark the results that no other of the same ratio beats in seconds and a metric."""
+    fronts: dict[str, list[str]] = {result.name: [] for result in results}
+    for rho in dict.fromkeys(result.rho for result in results):
+        same = [result for result in results if result.rho == rho]
+        seconds = [result.seconds for result in same]
+        for metric, gains in (
+            ("psnr", [result.psnr for result in same]),
+            ("ssim", [result.ssim for result in same]),
+            ("lpips", [-result.lpips for result in same if result.lpips is not None]),
+        ):
+            if len(gains) == len(same):
+                for result, best in zip(same, on_front(seconds, gains), strict=True):
+                    fronts[result.name] += [metric] * best
+    for result in results:
+        yield result.model_copy(update={"fronts": tuple(fronts[result.name])})

@@ -1,6 +1,7 @@
 """One process per preset and ratio, so that seconds and memory are those that a user sees."""
 
 import os
+import subprocess
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -12,7 +13,6 @@ from cvtgs.counts import target_count
 from cvtgs.errors import ConfigError, InvalidArgumentError, RunError
 from cvtgs.progress import ProgressEvent, ProgressListener
 from cvtgs.report import SimplifyReport
-from cvtgs.tradeoff.processes import ProcessCost, run_process
 from cvtgs.tradeoff.results import Failure
 
 STAGE = "simplify"
@@ -21,10 +21,48 @@ WARNING = "cvtgs: warning: "
 START = "import cvtgs.cli.main, cvtgs.config, cvtgs.io, cvtgs.mergenet, cvtgs.simplifier"
 """What every process does before it reads a scene."""
 
+# A process inherits the peak of the one that starts it, so a small one must start it. It hears of
+# an interrupt and waits for its child, which hears of it too; an order to end is passed on.
+LAUNCHER = """
+import signal, subprocess, sys, time
+signal.signal(signal.SIGINT, lambda *_: None)
+start = time.perf_counter()
+process = subprocess.Popen(sys.argv[1:])
+signal.signal(signal.SIGTERM, lambda *_: process.terminate())
+code = process.wait()
+wall = time.perf_counter() - start
+try:
+    import resource
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    user, peak = usage.ru_utime, usage.ru_maxrss
+except ImportError:
+    user = peak = 0
+sys.stdout.write(f"\\n{code} {user} {wall} {peak}\\n")
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProcessCost:
+    """The cost and the output of one process.
+
+    Attributes:
+        wall_seconds: Time from its start to its end.
+        user_seconds: Processor time outside the kernel.
+        peak_memory_bytes: Its largest resident size; 0 where the system does not tell (Windows).
+        output: What it wrote to stdout.
+        errors: What it wrote to stderr.
+    """
+
+    wall_seconds: float
+    user_seconds: float
+    peak_memory_bytes: int
+    output: str
+    errors: str
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """What one process is to do.
+    """A preset and a ratio to run.
 
     Attributes:
         preset: Name of the preset.
@@ -47,13 +85,13 @@ class Task:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """What one process did.
+    """A finished run.
 
     Attributes:
-        task: What it was to do.
-        path: What it wrote.
-        cost: What it cost.
-        report: What it said.
+        task: Its preset and ratio.
+        path: The file that it wrote.
+        cost: The cost of its process.
+        report: The report of the simplification.
     """
 
     task: Task
@@ -90,7 +128,7 @@ def run_tasks(
     listener: ProgressListener,
 ) -> Iterator[Run | Failure]:
     """Run every task in a process of its own, one after the other."""
-    heard: set[str] = set()
+    warned: set[str] = set()
     for done, task in enumerate(tasks):
         listener(ProgressEvent(stage=STAGE, done=done, total=len(tasks), note=task.name))
         try:
@@ -98,7 +136,7 @@ def run_tasks(
         except RunError as error:
             yield Failure(name=task.name, reason=str(error))
         else:
-            _pass_on(run.cost.errors, heard)
+            pass_warnings_on(run.cost.errors, warned)
             yield run
     listener(ProgressEvent(stage=STAGE, done=len(tasks), total=len(tasks)))
 
@@ -121,13 +159,51 @@ def run_task(
 
 
 def start_seconds() -> float:
-    """Measure what a process costs before it reads a scene."""
+    """Measure the seconds of a process before it reads a scene."""
     return run_process([sys.executable, "-c", START]).wall_seconds
 
 
-def _pass_on(errors: str, heard: set[str]) -> None:
-    """Report what a process warned of, once for all processes."""
+def pass_warnings_on(errors: str, warned: set[str]) -> None:
+    """Repeat the warnings of a process, each once for all processes."""
     for line in errors.splitlines():
-        if line.startswith(WARNING) and line not in heard:
-            heard.add(line)
+        if line.startswith(WARNING) and line not in warned:
+            warned.add(line)
             warnings.warn(line.removeprefix(WARNING), UserWarning, stacklevel=2)
+
+
+def run_process(command: Sequence[str]) -> ProcessCost:
+    r"""Run a command to its end and measure it.
+
+    If this call is interrupted, the process is ended first.
+    """
+    launcher = [sys.executable, "-S", "-c", LAUNCHER, *command]
+    with subprocess.Popen(launcher, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        try:
+            written = process.communicate()
+        except BaseException:
+            process.terminate()
+            process.communicate()
+            raise
+    output, errors = (part.decode(errors="replace") for part in written)
+    output, _, line = output.rstrip("\n").rpartition("\n")
+    try:
+        code, user, wall, peak = (float(word) for word in line.split())
+    except ValueError:
+        raise RunError(f"{command[0]} could not be started: {_last_line(errors)}.") from None
+    if code < 0:
+        raise RunError(f"it was ended by signal {-code:.0f}; 9 often means that memory ran out.")
+    if code:
+        raise RunError(_last_line(errors) or f"it ended with exit code {code:.0f}.")
+    unit = 1 if sys.platform == "darwin" else 1024
+    return ProcessCost(
+        wall_seconds=wall,
+        user_seconds=user,
+        peak_memory_bytes=int(peak) * unit,
+        output=output,
+        errors=errors,
+    )
+
+
+def _last_line(errors: str) -> str:
+    lines = [line for line in errors.splitlines() if line.strip()]
+    return lines[-1].removeprefix("cvtgs: error: ") if lines else ""

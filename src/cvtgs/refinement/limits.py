@@ -1,13 +1,14 @@
-"""When a refinement has to stop: after so many steps, or so many seconds."""
+"""When a refinement stops: after so many steps, or so many seconds."""
 
 import math
 import time
+from typing import Literal
 
 from cvtgs.errors import InvalidArgumentError
 
 
-def check_budget(seconds: float | None, *, steps: int | None) -> None:
-    """Refuse times and numbers of steps that cannot be."""
+def check_limits(seconds: float | None, *, steps: int | None) -> None:
+    """Refuse seconds and steps that are not positive."""
     if seconds is not None and not 0 < seconds < math.inf:
         raise InvalidArgumentError(
             f"the seconds to refine for must be above 0 and finite, found {seconds!r}."
@@ -19,8 +20,8 @@ def check_budget(seconds: float | None, *, steps: int | None) -> None:
         )
 
 
-class Budget:
-    """Counts steps and seconds, and knows how long one more round may take."""
+class Limits:
+    """Counts steps and seconds, and decides whether one more step fits."""
 
     def __init__(self, seconds: float | None, *, steps: int | None) -> None:
         self._start = time.perf_counter()
@@ -41,27 +42,27 @@ class Budget:
         return max(min(int(self.share() * self.total), self.total - 1), min(self.steps, 1))
 
     def share(self) -> float:
-        """Return how much of the budget is used up."""
+        """Return which share of the steps or seconds is used up."""
         of_steps = self.steps / self._steps if self._steps else 0.0
         elapsed = time.perf_counter() - self._start if self._seconds else 0.0
         return min(1.0, max(of_steps, elapsed / self._seconds if self._seconds else 0.0))
 
     def begin(self) -> None:
-        """Start to measure a round."""
+        """Start to measure a step or check."""
         self._last = time.perf_counter()
 
-    def end(self, kind: str) -> None:
-        """Measure what was done since the last call."""
+    def end(self, kind: Literal["step", "check"]) -> None:
+        """Measure the time since the last call, and count a step."""
         now = time.perf_counter()
         self._slowest[kind] = max(self._slowest[kind], now - self._last)
         self._last = now
         self.steps += kind == "step"
 
-    def spent(self) -> str:
-        """Report what is used up.
+    def reached(self) -> str:
+        """Return what is used up: ``steps``, ``time``, or nothing.
 
-        Time is, where one more step and one more check, as slow as the slowest so far, would not
-        fit.
+        The time is, where one more step and one more check, as slow as the slowest so far, would
+        not fit.
         """
         if self._steps is not None and self.steps >= self._steps:
             return "steps"

@@ -1,4 +1,4 @@
-"""How far each Gaussian may move: not at all where it is right from everywhere."""
+"""The learning rate scale of each Gaussian: 0 where it is right from everywhere."""
 
 import math
 
@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from cvtgs import GaussianScene
+from cvtgs.analysis import ambient_visibility
 from cvtgs.math.frames import robust_frame
 from cvtgs.refinement import refine
-from cvtgs.refinement.freedom import freedom
+from cvtgs.refinement.optimize import learning_rate_scales
 from refine_cases import discolored, full_scene, quick, small_scene
 from scenes import random_scene, same_bits
 
@@ -21,37 +22,37 @@ def with_one_far_away(scene: GaussianScene, one: GaussianScene) -> GaussianScene
     )
 
 
-def light_on(scene: GaussianScene) -> torch.Tensor:
+def visibility_of(scene: GaussianScene) -> torch.Tensor:
     return ambient_visibility(scene.means, scene.masses, robust_frame(scene.means)).float()
 
 
-def test_what_stands_for_itself_alone_does_not_move():
+def test_what_represents_itself_alone_does_not_move():
     full, one = full_scene(300), full_scene(1, seed=1)
     small = with_one_far_away(full.select(torch.arange(40)), one)
-    factors = freedom(small, with_one_far_away(full, one))
+    factors = learning_rate_scales(small, with_one_far_away(full, one))
     assert factors[-1] == 0.0
-    assert float(factors[:-1].median()) > 0.1  # pruned: they stand for others, too
+    assert float(factors[:-1].median()) > 0.1  # pruned: they represent others, too
 
 
-def test_copies_of_one_gaussian_share_what_it_stands_for():
+def test_copies_of_one_gaussian_share_what_it_represents():
     full = full_scene(300)
     twice = full.select(torch.arange(300).repeat(2))
-    assert not freedom(full, full).any()
-    torch.testing.assert_close(freedom(full, twice), 0.5 * light_on(full))
+    assert not learning_rate_scales(full, full).any()
+    torch.testing.assert_close(learning_rate_scales(full, twice), 0.5 * visibility_of(full))
 
 
 @pytest.mark.parametrize("name", ["means", "log_scales", "logit_opacities", "sh0"])
 def test_what_was_changed_moves_as_it_is_seen(name):
     full = full_scene(300)
     changed = full.with_tensors({name: full.tensors()[name] + 1e-3}, {})
-    torch.testing.assert_close(freedom(changed, full), light_on(changed))
+    torch.testing.assert_close(learning_rate_scales(changed, full), visibility_of(changed))
 
 
 def test_what_cannot_be_drawn_does_not_move():
     full = random_scene(50)
     means = full.means.clone()
     means[3], means[7] = math.nan, 0.1
-    factors = freedom(full.with_tensors({"means": means}, {}), full)
+    factors = learning_rate_scales(full.with_tensors({"means": means}, {}), full)
     assert factors[3] == 0.0
     assert factors[7] > 0.0
 
@@ -62,7 +63,7 @@ def test_a_refinement_leaves_exact_ones_alone_and_moves_merged_ones():
     exact = (small.means[:, None] == full.means).all(dim=2).any(dim=1)
     sh0 = torch.where(exact[:, None, None], small.sh0 - 0.5, small.sh0)
     small = small.with_tensors({"sh0": sh0}, {})
-    free = freedom(small, full) > 0
+    free = learning_rate_scales(small, full) > 0
     scene, report = refine(small, full, steps=40, config=quick())
     assert 0 < int((~free).sum()) < len(small)
     assert same_bits(scene.select(~free), small.select(~free))

@@ -4,19 +4,14 @@ import math
 from collections.abc import Sequence
 from typing import Self
 
-import pydantic
-
-from cvtgs.evaluation.lpips_network import LpipsNetwork
+from cvtgs.config.base import Record
+from cvtgs.evaluation.lpips import LpipsNetwork
 
 NOT_ASKED_FOR = "not asked for"
 """Why LPIPS is missing where that is no news."""
 
 
-class _Record(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
-
-
-class Score(_Record):
+class Score(Record):
     """One metric.
 
     Attributes:
@@ -44,7 +39,7 @@ class Score(_Record):
         return cls(mean=math.fsum(values) / len(values), views=tuple(values))
 
 
-class SceneScores(_Record):
+class SceneScores(Record):
     """How close the images of one scene come to others.
 
     Attributes:
@@ -62,8 +57,8 @@ class SceneScores(_Record):
     lpips: Score | None = None
 
 
-class Evaluation(_Record):
-    """What an evaluation found.
+class Evaluation(Record):
+    """Scores of simplified scenes, and how they were measured.
 
     Attributes:
         reference: Name of the full scene.
@@ -92,7 +87,7 @@ class Evaluation(_Record):
 
     @property
     def lpips_sentence(self) -> str:
-        """Which network LPIPS has, or why it is missing; empty if nobody asked for it."""
+        """Which network LPIPS has, or why it is missing; empty if it was turned off."""
         if self.lpips_network:
             return f"LPIPS with the network {self.lpips_network}."
         if self.lpips_note and self.lpips_note != NOT_ASKED_FOR:

@@ -1,0 +1,244 @@
+"""CostModel: the seconds of a simplification, predicted from its size and configuration."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import pydantic
+
+from cvtgs.config import SimplifyConfig
+from cvtgs.config.base import Record
+from cvtgs.cvt.tessellate import MIN_SAMPLES
+from cvtgs.errors import ConfigError
+from cvtgs.scene import GaussianScene
+
+VISIBILITY, NETWORK, REFINE = "visibility", "network", "refine"
+
+FEATURES: Mapping[str, tuple[str, ...]] = {
+    "check": ("in", "in_values"),
+    "plan": ("once", "in"),
+    "filter": ("in",),
+    "tessellate": ("once", "in", "search"),
+    "merge": ("once", "in", "in_values", "out", "out_values"),
+    VISIBILITY: ("once", "view_pixels", "views_in"),
+    REFINE: ("images_in", "look_pixels", "looks_out"),
+    NETWORK: ("once", "in", "in_values", "out", "out_values"),
+}
+"""The amounts that the seconds of a stage are linear in."""
+
+OTHER_FEATURES = ("once", "in", "out")
+"""The same for stages that are not listed there."""
+
+SHARE_OF_A_STEP = 0.2
+"""An image without gradients costs this share of a step."""
+
+STEPS_OF_A_BATCH = 2.0
+"""To find views, however many at once, costs as much as so many steps."""
+
+LEAST_SECONDS = 2e-3
+"""Seconds below which a difference does not count in a fit."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Work:
+    """The size of a simplification.
+
+    Attributes:
+        count: Gaussians in, N.
+        target: Gaussians out, M.
+        colors: Colour coefficients of a Gaussian: 3, 12, 27 or 48.
+    """
+
+    count: int
+    target: int
+    colors: int = 3
+
+    @classmethod
+    def of(cls, scene: GaussianScene, target: int) -> Self:
+        """Return the size of the simplification of a scene.
+
+        Args:
+            scene: The scene.
+            target: Gaussians to keep.
+
+        Returns:
+            The size.
+
+        Example:
+            >>> from cvtgs.synthetic import scene as make
+            >>> Work.of(make("object", 100, sh_degree=1), 10)
+            Work(count=100, target=10, colors=12)
+        """
+        return cls(count=len(scene), target=target, colors=3 * (scene.sh_degree + 1) ** 2)
+
+    def features(self, stage: str, config: SimplifyConfig) -> dict[str, float]:
+        """Return the amounts that the seconds of a stage are linear in.
+
+        Args:
+            stage: Name of the stage.
+            config: Every choice of the simplification.
+
+        Returns:
+            Amounts by name.
+        """
+        sample = config.cvt.samples_per_site * self.target
+        sample = max(sample, MIN_SAMPLES) if sample else self.count
+        sample = self.count if sample >= self.count // 2 else sample
+        searched = self.count + config.cvt.iterations * sample
+        visibility, refine = config.visibility, config.refine
+        new_images = math.ceil(refine.steps / refine.steps_per_image)
+        checks = 1 + math.ceil(refine.steps / refine.check_every)
+        renders = refine.steps + SHARE_OF_A_STEP * refine.heldout * checks
+        renders += STEPS_OF_A_BATCH * (1 + math.ceil(new_images / refine.batch))
+        amounts = {
+            "once": 1.0,
+            "in": float(self.count),
+            "in_values": float(self.count * self.colors),
+            "out": float(self.target),
+            "out_values": float(self.target * self.colors),
+            "view_pixels": float(visibility.views * visibility.size**2),
+            "views_in": float(visibility.views * self.count),
+            "images_in": (refine.heldout + new_images) * self.count,
+            "look_pixels": renders * refine.size**2,
+            "looks_out": renders * self.target,
+            "search": searched * math.log2(self.target + 2),
+        }
+        return {name: amounts[name] for name in FEATURES.get(stage, OTHER_FEATURES)}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measurement:
+    """The cost of one simplification.
+
+    Attributes:
+        work: Its size.
+        config: Its configuration.
+        seconds: Wall-clock seconds by stage.
+    """
+
+    work: Work
+    config: SimplifyConfig
+    seconds: Mapping[str, float]
+
+
+class CostModel(Record, allow_inf_nan=False):
+    """The cost of presets on one machine: seconds = sum of rates times amounts, stage by stage.
+
+    Attributes:
+        rates: Seconds per unit, by preset, stage and feature.
+        starts: Seconds that the first simplification of a process takes on top, by preset:
+            libraries are loaded.
+    """
+
+    rates: dict[str, dict[str, dict[str, pydantic.NonNegativeFloat]]]
+    starts: dict[str, pydantic.NonNegativeFloat] = pydantic.Field(default_factory=dict)
+
+    @classmethod
+    def fit(
+        cls,
+        measured: Mapping[str, Sequence[Measurement]],
+        starts: Mapping[str, float] | None = None,
+    ) -> Self:
+        """Fit the rates to measurements.
+
+        Args:
+            measured: Measurements of simplifications of different sizes, by preset.
+            starts: Seconds that the first simplification of a process takes on top.
+
+        Returns:
+            The model.
+        """
+        rates: dict[str, dict[str, dict[str, float]]] = {}
+        for preset, some in measured.items():
+            stages = dict.fromkeys(stage for one in some for stage in one.seconds)
+            rates[preset] = {
+                stage: fit_rates(
+                    [one.work.features(stage, one.config) for one in some],
+                    [one.seconds.get(stage, 0.0) for one in some],
+                )
+                for stage in stages
+            }
+        return cls(rates=rates, starts=dict(starts or {}))
+
+    @property
+    def presets(self) -> tuple[str, ...]:
+        """The presets that were measured."""
+        return tuple(self.rates)
+
+    def stage_seconds(
+        self, preset: str, work: Work, *, config: SimplifyConfig | None = None
+    ) -> dict[str, float]:
+        """Predict the cost of each stage.
+
+        A stage that the preset does not have, but the configuration does, costs what it costs in
+        the best preset that has it.
+
+        Args:
+            preset: Name of the preset.
+            work: Size of the simplification.
+            config: The preset with other settings changed; None for the preset as it is.
+
+        Returns:
+            Wall-clock seconds by stage.
+
+        Raises:
+            ConfigError: The preset was not measured.
+        """
+        if preset not in self.rates:
+            raise ConfigError(
+                f"preset must be one of {', '.join(self.rates)}, whose cost was measured; "
+                f"found {preset!r}."
+            )
+        config = config or SimplifyConfig.from_preset(preset)
+        optional = {
+            VISIBILITY: config.uses_renders,
+            NETWORK: config.merge.network,
+            REFINE: config.refine.enabled,
+        }
+        known = {stage: rates for name in self.rates for stage, rates in self.rates[name].items()}
+        seconds = {}
+        for stage, rates in (known | self.rates[preset]).items():
+            if optional.get(stage, stage in self.rates[preset]):
+                amounts = work.features(stage, config)
+                seconds[stage] = sum(rate * amounts[name] for name, rate in rates.items())
+        limit = config.refine.seconds
+        if REFINE in seconds and limit:
+            seconds[REFINE] = min(seconds[REFINE], limit) if config.refine.steps else limit
+        return seconds
+
+    def seconds(self, preset: str, work: Work, *, config: SimplifyConfig | None = None) -> float:
+        """Predict the cost of a simplification.
+
+        Args:
+            preset: Name of the preset.
+            work: Size of the simplification.
+            config: The preset with other settings changed; None for the preset as it is.
+
+        Returns:
+            Wall-clock seconds of the first simplification of a process, from the scene in memory
+            to the small scene in memory.
+
+        Raises:
+            ConfigError: The preset was not measured.
+        """
+        stages = self.stage_seconds(preset, work, config=config)
+        return self.starts.get(preset, 0.0) + sum(stages.values())
+
+
+def fit_rates(rows: Sequence[Mapping[str, float]], seconds: Sequence[float]) -> dict[str, float]:
+    """Compute the cost of each feature, so that the sums come close to what was measured.
+
+    Non-negative least squares (Lawson and Hanson 1974) of relative errors: no rate is negative,
+    so no prediction for more work is below one for less.
+    """
+    from scipy.optimize import nnls  # noqa: PLC0415 (heavy, and only for a calibration)
+
+    names = list(rows[0])
+    amounts = np.array([[row[name] for name in names] for row in rows], dtype=np.float64)
+    measured = np.array(seconds, dtype=np.float64)
+    weights = 1 / np.maximum(measured, LEAST_SECONDS)
+    scales = np.maximum(amounts.max(axis=0), 1e-300)
+    rates, _ = nnls(amounts / scales * weights[:, None], measured * weights)
+    return dict(zip(names, (rates / scales).tolist(), strict=True))

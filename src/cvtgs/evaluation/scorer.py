@@ -1,0 +1,196 @@
+"""The scorer of evaluation, refinement and the search for a count: images in, metrics out."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs.cameras import Cameras
+from cvtgs.errors import CvtgsError, InvalidArgumentError
+from cvtgs.evaluation.lpips import LEAST_PIXELS, LpipsNetwork, LpipsWeights, load_lpips, lpips
+from cvtgs.evaluation.metrics import pair_psnr, ssim
+from cvtgs.evaluation.report import NOT_ASKED_FOR, SceneScores, Score
+from cvtgs.rendering import BackendName, render
+from cvtgs.scene import GaussianScene
+
+LpipsChoice = Literal["auto", "vgg", "alex", "off"]
+"""``auto``: VGG where its weights are, else Alex, else none."""
+
+Color = tuple[float, float, float]
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluationSettings:
+    """How images are rendered and scored.
+
+    Attributes:
+        background: Colour behind the scenes: red, green and blue in [0, 1].
+        lpips: Which LPIPS to measure: ``vgg``, ``alex``, ``off``, or ``auto``, which leaves it
+            out where there are no weights.
+        backend: What renders.
+
+    Example:
+        >>> EvaluationSettings(lpips="off").background
+        (0.0, 0.0, 0.0)
+    """
+
+    background: Color = BLACK
+    lpips: LpipsChoice = "auto"
+    backend: BackendName = "auto"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ViewImage:
+    """One image of a scene, without background.
+
+    Attributes:
+        camera: The single camera.
+        rgb: ``(1, h, w, 3)`` colours over black.
+        alpha: ``(1, h, w)`` opacity.
+        backend: What rendered.
+    """
+
+    camera: Cameras
+    rgb: Float[Tensor, "1 h w 3"]
+    alpha: Float[Tensor, "1 h w"]
+    backend: str
+
+    def over(self, background: Float[Tensor, "3"]) -> Float[Tensor, "1 h w 3"]:
+        """Composite the image over a background, in the dtype of the background."""
+        rgb, alpha = self.rgb.to(background.dtype), self.alpha.to(background.dtype)
+        return rgb + (1 - alpha)[..., None] * background
+
+    def half(self) -> Self:
+        """Return the image in half precision."""
+        return replace(self, rgb=self.rgb.half(), alpha=self.alpha.half())
+
+
+@torch.no_grad()
+def render_view(
+    scene: GaussianScene, camera: Cameras, *, backend: BackendName = "auto"
+) -> ViewImage:
+    """Render one view of a scene, without gradients."""
+    found = render(scene, camera, backend=backend)
+    return ViewImage(camera=camera, rgb=found.rgb, alpha=found.alpha, backend=found.backend)
+
+
+class ImageScores(NamedTuple):
+    """The metrics of one pair of images; None for those that are not computed."""
+
+    psnr: float
+    ssim: float | None
+    lpips: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Metrics:
+    """Which metrics to compute; the weights of LPIPS are read once.
+
+    Attributes:
+        ssim: Whether to compute SSIM.
+        lpips: Weights of LPIPS, None to leave it out.
+        note: Why LPIPS is left out.
+        most_psnr: Images that are closer than this count as this close, dB.
+    """
+
+    ssim: bool = True
+    lpips: LpipsWeights | None = None
+    note: str = NOT_ASKED_FOR
+    most_psnr: float = math.inf
+
+    def compare(
+        self, image: Float[Tensor, "1 h w 3"], truth: Float[Tensor, "1 h w 3"]
+    ) -> ImageScores:
+        """Score one image against what it should be."""
+        truth, weights = truth.to(image), self.lpips
+        return ImageScores(
+            psnr=min(float(pair_psnr(image, truth)), self.most_psnr),
+            ssim=float(ssim(image, truth)) if self.ssim else None,
+            lpips=float(lpips(image, truth, network=weights.network, weights=weights))
+            if weights
+            else None,
+        )
+
+
+def chosen_metrics(choice: LpipsChoice, size: tuple[int, int]) -> Metrics:
+    """Return PSNR, SSIM and the chosen LPIPS for images of a width and height."""
+    if choice == "off":
+        return Metrics()
+    if choice in ("vgg", "alex"):
+        return Metrics(lpips=load_lpips(choice), note="")
+    if choice != "auto":
+        raise InvalidArgumentError(f"lpips must be auto, vgg, alex or off, found {choice!r}.")
+    note = ""
+    networks: tuple[LpipsNetwork, ...] = ("vgg", "alex")
+    for network in networks:
+        if min(size) < LEAST_PIXELS[network]:
+            note = f"images of {size[0]} x {size[1]} pixels are too small for it"
+            continue
+        try:
+            return Metrics(lpips=load_lpips(network), note="")
+        except CvtgsError as error:
+            note = str(error).rstrip(".")
+    return Metrics(note=note)
+
+
+def scene_scores(name: str, count: int, rows: Sequence[ImageScores]) -> SceneScores:
+    """Average the scores of a scene, one row per view, of which SSIM was computed."""
+    psnrs, ssims, distances = zip(*rows, strict=True)
+    return SceneScores(
+        name=name,
+        count=count,
+        psnr=Score.of(psnrs),
+        ssim=Score.of(ssims),
+        lpips=None if None in distances else Score.of(distances),
+    )
+
+
+class Scorer:
+    """Scores scenes against images of a full one, each of which is rendered once.
+
+    Memory: ``12 b c h w`` bytes for ``c`` views over ``b`` backgrounds in float32.
+
+    Args:
+        full: The full scene.
+        cameras: Single cameras.
+        metrics: What to compute.
+        backgrounds: Every image is scored over each of these.
+        progress: Called with the number of views that are rendered.
+    """
+
+    def __init__(
+        self,
+        full: GaussianScene,
+        cameras: Iterable[Cameras],
+        *,
+        metrics: Metrics,
+        backgrounds: Sequence[Color] = (BLACK,),
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> None:
+        self._metrics = metrics
+        self._backgrounds = [full.means.new_tensor(color) for color in backgrounds]
+        self._truths: list[tuple[Cameras, list[Tensor]]] = []
+        for camera in cameras:
+            progress(len(self._truths))
+            self._truths.append((camera, self._images(full, camera)))
+        progress(len(self._truths))
+
+    def __len__(self) -> int:
+        return len(self._truths)
+
+    def score(self, scene: GaussianScene) -> list[ImageScores]:
+        """Score a scene, view by view and over every background."""
+        return [
+            self._metrics.compare(image, truth)
+            for camera, truths in self._truths
+            for image, truth in zip(self._images(scene, camera), truths, strict=True)
+        ]
+
+    def _images(self, scene: GaussianScene, camera: Cameras) -> list[Float[Tensor, "1 h w 3"]]:
+        image = render_view(scene, camera)
+        return [image.over(background).clamp(0, 1) for background in self._backgrounds]
