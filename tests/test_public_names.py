@@ -90,7 +90,7 @@ STAGES = {
         "visibility_grid",
         "with_haze",
     },
-    "views": {"automatic_views", "mixed_views", "views_from_anywhere"},
+    "views": {"automatic_views", "mixed_views", "random_views"},
     "cvt": {
         "LloydResult",
         "Tessellation",

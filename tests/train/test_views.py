@@ -7,7 +7,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.math.frames import robust_frame
 from cvtgs.rendering import render
 from cvtgs.train.views import Views, look_at_scene
-from cvtgs.views import automatic_views, views_from_anywhere
+from cvtgs.views import automatic_views, random_views
 from train_cases import bits_of_views, small_scene
 
 
@@ -43,7 +43,7 @@ def test_half_of_the_views_are_the_automatic_ones():
     scene = small_scene()
     views = look_at_scene(scene, 3, size=32, seed=2)
     usual = automatic_views(scene, 2, width=32, height=32, seed=2)
-    around = views_from_anywhere(scene, 1, size=32, seed=2)
+    around = random_views(scene, 1, size=32, seed=2)
     assert torch.equal(views.cameras.viewmats, torch.cat([usual.viewmats, around.viewmats]))
     assert torch.equal(views.cameras.Ks, torch.cat([usual.Ks, around.Ks]))
     assert views.rgb.shape == (3, 32, 32, 3)
@@ -67,10 +67,10 @@ def test_the_seed_decides_the_views():
     assert not torch.equal(first.cameras.viewmats, other.cameras.viewmats)
 
 
-def test_views_from_anywhere_look_at_the_middle_from_around():
+def test_random_views_look_at_the_middle_from_around():
     scene = small_scene()
     frame = robust_frame(scene.means[scene.opacities > 0.1])
-    cameras = views_from_anywhere(scene, 60, size=100, seed=0)
+    cameras = random_views(scene, 60, size=100, seed=0)
     steps = (cameras.centers - frame.center.float()) / float(frame.radius)
     distances = torch.linalg.vector_norm(steps, dim=1)
     assert 1.1 <= float(distances.amin()) < 1.4
@@ -88,13 +88,13 @@ def test_views_from_anywhere_look_at_the_middle_from_around():
 def test_a_faint_scene_can_be_looked_at_too():
     scene = small_scene(100)
     faint = scene.with_tensors({"logit_opacities": scene.logit_opacities * 0 - 5}, {})
-    assert len(views_from_anywhere(faint, 3, size=32, seed=0)) == 3
+    assert len(random_views(faint, 3, size=32, seed=0)) == 3
 
 
-def test_how_far_away_views_from_anywhere_are():
+def test_how_far_away_random_views_are():
     scene = small_scene()
     frame = robust_frame(scene.means[scene.opacities > 0.1])
-    cameras = views_from_anywhere(scene, 60, size=100, seed=0, reach=(0.2, 1.4))
+    cameras = random_views(scene, 60, size=100, seed=0, reach=(0.2, 1.4))
     steps = (cameras.centers - frame.center.float()) / float(frame.radius)
     distances = torch.linalg.vector_norm(steps, dim=1)
     assert 0.2 - 1e-4 <= float(distances.amin()) < 0.4

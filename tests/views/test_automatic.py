@@ -11,10 +11,10 @@ from cvtgs.evaluation import psnr
 from cvtgs.math import parameters
 from cvtgs.rendering import render
 from cvtgs.synthetic import KINDS
-from cvtgs.views import automatic_views, mixed_views, views_from_anywhere
-from cvtgs.views.automatic import _stands
-from cvtgs.views.probes import probe
-from cvtgs.views.survey import survey
+from cvtgs.views import automatic_views, mixed_views, random_views
+from cvtgs.views.automatic import choose_candidates
+from cvtgs.views.layout import find_layout
+from cvtgs.views.scoring import score_cameras
 from scenes import random_scene
 
 COUNT = 10_000
@@ -71,7 +71,7 @@ def test_views_of_every_kind(kind, turn):
     assert (ups(cameras) @ up > 0.5).all(), "images are upright"
     images = render(scene, cameras, depth=True)
     assert (images.alpha.mean(dim=(1, 2)) > 0.1).all(), "no image is empty"
-    radius = survey(scene).frame.radius
+    radius = find_layout(scene).frame.radius
     near = (images.alpha > 0.5) & (images.depth < 0.1 * radius)
     assert (near.float().mean(dim=(1, 2)) < 0.05).all(), "nothing is before the lens"
     assert (images.rgb.std(dim=(1, 2)).mean(dim=1) > 0.02).all(), "there is something to see"
@@ -79,11 +79,13 @@ def test_views_of_every_kind(kind, turn):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_only_the_room_is_seen_from_inside(kind):
-    known = survey(generated(kind))
-    stands = _stands(known, 4, size=(64, 48), turn=0.5)
-    assert stands.inside == (kind == "room")
-    distances = torch.linalg.vector_norm(stands.rounds[0].centers.double() - known.center, dim=1)
-    assert (distances < known.radius).all() == (kind == "room")
+    layout = find_layout(generated(kind))
+    candidates = choose_candidates(layout, 4, size=(64, 48), turn=0.5)
+    assert candidates.inside == (kind == "room")
+    distances = torch.linalg.vector_norm(
+        candidates.rounds[0].centers.double() - layout.center, dim=1
+    )
+    assert (distances < layout.radius).all() == (kind == "room")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -91,7 +93,7 @@ def test_flyaways_change_next_to_nothing(kind):
     scene = generated(kind)
     plain = automatic_views(scene, 4, width=32, height=24)
     strewn = automatic_views(with_flyaways(scene), 4, width=32, height=24)
-    radius = survey(scene).frame.radius
+    radius = find_layout(scene).frame.radius
     moves = torch.linalg.vector_norm(plain.centers - strewn.centers, dim=1)
     assert float(moves.median()) < 0.3 * radius
 
@@ -108,9 +110,9 @@ def test_a_camera_inside_of_a_floater_moves():
     again = automatic_views(blocked, 4, width=32, height=24)
     moves = torch.linalg.vector_norm(first.centers - again.centers, dim=1)
     assert float(moves[0]) > 0.4
-    known = survey(blocked)
-    reach = torch.linalg.vector_norm(again.centers.double() - known.center, dim=1)
-    assert bool(probe(known, again, reach=reach, inside=False).good.all())
+    layout = find_layout(blocked)
+    distances = torch.linalg.vector_norm(again.centers.double() - layout.center, dim=1)
+    assert bool(score_cameras(layout, again, distances=distances, inside=False).good.all())
 
 
 def test_a_wall_before_the_camera_makes_it_move():
@@ -188,10 +190,10 @@ def test_infinite_opacities_and_bad_rows_are_no_obstacle():
     "choose",
     [
         lambda scene: automatic_views(scene, 3, width=64, height=48),
-        lambda scene: views_from_anywhere(scene, 3, size=64, seed=0),
+        lambda scene: random_views(scene, 3, size=64, seed=0),
         lambda scene: mixed_views(scene, 4, size=64),
     ],
-    ids=["automatic", "anywhere", "mixed"],
+    ids=["automatic", "random", "mixed"],
 )
 def test_views_of_a_georeferenced_scene_are_those_of_the_scene_at_the_origin(dtype, choose):
     """At 6e6 float32 steps by 0.5: the scene is a kilometre large, and keeps these steps."""
@@ -227,10 +229,10 @@ def test_bad_arguments():
 def test_large_scenes_are_thinned_and_look_the_same(monkeypatch):
     """What stays is wider, so that it paints as much: an image of it, and its views, say so."""
     scene = cvtgs.synthetic.scene("courtyard", 6000, sh_degree=0, seed=3)
-    whole = survey(scene)
-    monkeypatch.setattr("cvtgs.views.survey.MOST_GAUSSIANS", 3000)
-    monkeypatch.setattr("cvtgs.views.survey._HEAVIEST", 500)
-    thinned = survey(scene)
+    whole = find_layout(scene)
+    monkeypatch.setattr("cvtgs.views.layout.SAMPLE_SIZE", 3000)
+    monkeypatch.setattr("cvtgs.views.layout._HEAVIEST", 500)
+    thinned = find_layout(scene)
     assert len(whole.sample) == 6000
     assert 2000 < len(thinned.sample) <= 3000
     torch.testing.assert_close(

@@ -136,7 +136,7 @@ def normalize_in_place(vector: Array) -> float:
 
 @serial
 def sigmoid(logit: float) -> float:
-    """Activate a logit within the limits of ``activations``."""
+    """Activate a logit within the limits of ``math.parameters``."""
     return 1 / (1 + math.exp(-min(max(logit, -LOGIT_LIMIT), LOGIT_LIMIT)))
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
-from cvtgs.views import automatic_views, views_from_anywhere
+from cvtgs.views import automatic_views, random_views
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,7 +48,7 @@ class Views:
 
 def look_at_scene(scene: GaussianScene, count: int, *, size: int, seed: int) -> Views:
     """Render a full scene once: every other view as people would look, the rest from anywhere."""
-    around = views_from_anywhere(scene, count // 2, size=size, seed=seed)
+    around = random_views(scene, count // 2, size=size, seed=seed)
     usual = automatic_views(scene, count - count // 2, width=size, height=size, seed=seed)
     cameras = Cameras(
         viewmats=torch.cat([usual.viewmats, around.viewmats]),

@@ -1,7 +1,6 @@
-"""From where to look at a scene of which nothing is known."""
+"""Cameras for scenes of which no cameras are known: automatic, random, and a mixture of both."""
 
-from cvtgs.views.anywhere import views_from_anywhere
 from cvtgs.views.automatic import automatic_views
-from cvtgs.views.mixed import mixed_views
+from cvtgs.views.mixed import mixed_views, random_views
 
-__all__ = ["automatic_views", "mixed_views", "views_from_anywhere"]
+__all__ = ["automatic_views", "mixed_views", "random_views"]

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from cvtgs.views.orientation import find_up
-from cvtgs.views.voxels import Voxels
+from cvtgs.views.up import Voxels, find_up
 
 
 @pytest.mark.parametrize("sense", [1.0, -1.0])

@@ -1,20 +1,37 @@
-"""Which way is up in a scene, as far as the scene tells."""
+"""The surfaces of a scene as voxels, and which way is up among them."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cvtgs.views.voxels import SIZE, Voxels
+from cvtgs.math import parameters
+from cvtgs.math.frames import RobustFrame
+from cvtgs.math.parameters import divide
+from cvtgs.math.segments import segment_sum
+from cvtgs.scene import GaussianScene
+
+VOXEL_SIZE = 0.1
+"""Edge of a voxel, in robust radii."""
+
+_EXTENT = 3.0
+"""Gaussians farther than this from the middle, in robust radii, are left out of the voxels."""
+
+_OPAQUE = 0.3
+"""A voxel whose Gaussians together hide less than this is empty."""
+
+_FAINT_SHARE = 0.1
+"""In faint scenes a voxel is empty below this share of what voxels hide on average, by mass."""
 
 _GUESSES = 256
 _REFINED = 24
 _MOST_VOXELS = 6000
-_THICKNESS = SIZE
+_THICKNESS = VOXEL_SIZE
 _ALIGNED = 0.85
 _LEAST_SCORE = 0.12
-"""What a ground must reach: its share of all voxels, times how round and how wide it is."""
+"""Least score of a ground: its share of all voxels, times how round and how wide it is."""
 
 _ONE_SIDED = 0.6
 """Up is not as usual only if the ground has so much more above it than below."""
@@ -31,6 +48,50 @@ _USUAL_COSINE = 0.85
 _SNAP_COSINE = 0.9954  # 5.5 degrees
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Voxels:
+    """Points on the surfaces of a scene; each stands for about the same area.
+
+    Attributes:
+        points: ``(v, 3)`` mean positions, in robust radii from the middle, float64.
+        normals: ``(v, 3)`` directions in which the Gaussians there are thinnest, unit length.
+    """
+
+    points: Float[Tensor, "v 3"]
+    normals: Float[Tensor, "v 3"]
+
+
+def voxelize(scene: GaussianScene, frame: RobustFrame) -> Voxels:
+    """Return the voxels of the Gaussians near the middle that are not empty."""
+    points = frame.normalize(scene.means)
+    near = (points.abs() < _EXTENT).all(dim=1)
+    part, points = scene.select(near), points[near]
+    cells = ((points + _EXTENT) / VOXEL_SIZE).long()
+    side = round(2 * _EXTENT / VOXEL_SIZE) + 1
+    keys = (cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]
+    order = torch.sort(keys, stable=True).indices
+    sizes = torch.unique_consecutive(keys[order], return_counts=True)[1]
+    offsets = torch.cat([sizes.new_zeros(1), sizes.cumsum(0)])
+    weights = part.opacities.double()[order]
+    hidden = (part.masses / (VOXEL_SIZE * frame.radius) ** 2)[order]
+    axes = _thinnest_axes(part)[order]
+    totals = segment_sum(weights, offsets)
+    means = segment_sum(weights[:, None] * points[order], offsets) / totals[:, None]
+    spreads = weights[:, None, None] * axes[:, :, None] * axes[:, None, :]
+    tensors = segment_sum(spreads.flatten(1), offsets).reshape(-1, 3, 3)
+    amounts = segment_sum(hidden, offsets)
+    typical = float(divide(amounts.square().sum(), amounts.sum()))
+    seen = amounts > min(_OPAQUE, _FAINT_SHARE * typical)
+    normals = torch.linalg.eigh(tensors[seen]).eigenvectors[:, :, 2]
+    return Voxels(points=means[seen], normals=normals)
+
+
+def _thinnest_axes(scene: GaussianScene) -> Float[Tensor, "n 3"]:
+    matrices = parameters.quats_to_matrices(parameters.normalize_quats(scene.quats.double()))
+    thinnest = scene.log_scales.argmin(dim=1)
+    return matrices.gather(2, thinnest[:, None, None].expand(-1, 3, 1))[:, :, 0]
+
+
 class _Plane(NamedTuple):
     normal: Tensor
     height: float
@@ -38,7 +99,7 @@ class _Plane(NamedTuple):
 
 
 def find_up(voxels: Voxels, far: Float[Tensor, "k 3"]) -> Float[Tensor, "3"]:
-    """Report which way is up.
+    """Return the direction that is up, as a unit vector.
 
     The axis is at right angles to the ground, the plane with the largest area; planes that lie
     as captures usually have it (y-down, then z-up) are preferred where areas are similar. Up is
@@ -56,7 +117,7 @@ def find_up(voxels: Voxels, far: Float[Tensor, "k 3"]) -> Float[Tensor, "3"]:
     at = ground.height * (1.0 if float(axis @ ground.normal) > 0 else -1.0)
     if len(far) and abs(float((far @ axis).mean())) > _SKY:
         return axis * torch.sign((far @ axis).mean())
-    return -axis if _stands_on_its_head(voxels.points @ axis, at) else axis
+    return -axis if _is_upside_down(voxels.points @ axis, at) else axis
 
 
 def _thinned(voxels: Voxels) -> Voxels:
@@ -121,15 +182,15 @@ def _bonus(normal: Tensor) -> float:
 
 
 def _usual_sense(axis: Tensor) -> Tensor:
-    """Return the axis the sense that captures usually have: -y, else +z."""
+    """Return the axis or its opposite, whichever captures usually have: -y, else +z."""
     cosines = axis.new_tensor(_USUAL) @ axis
     # At right angles to both, either sense is as good: +x.
     senses = torch.cat([cosines[cosines.abs().argmax()][None], axis[:1]])
     return axis * torch.sign(senses[senses.abs() > 0][0])
 
 
-def _stands_on_its_head(heights: Float[Tensor, "v"], ground: float) -> bool:
-    """Return whether the scene says clearly that up is the other way."""
+def _is_upside_down(heights: Float[Tensor, "v"], ground: float) -> bool:
+    """Return whether there is clear evidence that up is the other way."""
     low, high = heights.quantile(heights.new_tensor([0.01, 0.99])).tolist()
     opposite = low if abs(ground - high) < abs(ground - low) else high
     lid = float(((heights - opposite).abs() < _THICKNESS).double().mean())

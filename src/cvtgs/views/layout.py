@@ -1,4 +1,4 @@
-"""What automatic views know of a scene: where it is, how large, which way is up."""
+"""The layout of a scene: where its content is, how large it is, which way is up."""
 
 from dataclasses import dataclass
 
@@ -10,14 +10,13 @@ from cvtgs.errors import InvalidSceneError
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import valid_rows, with_finite_opacities
-from cvtgs.views.orientation import find_up
-from cvtgs.views.voxels import Voxels, voxels_of
+from cvtgs.views.up import Voxels, find_up, voxelize
 
-MOST_GAUSSIANS = 30_000
-"""Larger scenes are looked at through a sample of this many Gaussians."""
+SAMPLE_SIZE = 30_000
+"""Larger scenes are reduced to a sample of at most this many Gaussians."""
 
 _HEAVIEST = 5_000
-_MOST_PLACES = 100_000
+_MOST_POSITIONS = 100_000
 _VISIBLE = 0.1
 _BOUNDED = 3.2
 _FAR = 4.0
@@ -26,17 +25,17 @@ _EXTENT = (0.02, 0.98)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Survey:
-    """One look at a scene.
+class SceneLayout:
+    """Where the content of a scene is.
 
     Attributes:
         sample: The scene, or a sample of it that covers the same; SH degree 0, on the CPU.
         frame: Robust centre and radius of what is visible.
         voxels: The surfaces near the middle.
         up: Unit vector, float64.
-        bounded: Whether nearly all lies within about three robust radii: a thing, not a place.
-        center: Middle of what is to be shown, scene units, float64.
-        radius: Radius of what is to be shown, scene units.
+        bounded: Whether nearly all lies within about three robust radii: an object, not a place.
+        center: Middle of what views should show, scene units, float64.
+        radius: Radius of what views should show, scene units.
         height: Extent along ``up`` of what is near the middle, scene units.
     """
 
@@ -50,26 +49,26 @@ class Survey:
     height: float
 
 
-def survey(scene: GaussianScene) -> Survey:
-    """Look at a scene once.
+def find_layout(scene: GaussianScene) -> SceneLayout:
+    """Return the layout of a scene, from robust statistics of what is visible.
 
     Memory: a mask per attribute, and a sample of at most 30,000 Gaussians.
     """
     valid = _valid(scene)
-    sample, places = _sample(valid), _visible_places(valid)
-    frame = robust_frame(places)
-    voxels, local = voxels_of(sample, frame), frame.normalize(places)
+    sample, positions = _sample(valid), _visible_positions(valid)
+    frame = robust_frame(positions)
+    voxels, local = voxelize(sample, frame), frame.normalize(positions)
     distances = torch.linalg.vector_norm(local, dim=1)
     bounded = float(distances.quantile(0.97)) < _BOUNDED
     up = find_up(voxels, _far_directions(local, distances))
-    places = voxels.points if len(voxels.points) else local[:1]
-    low, high = places.quantile(places.new_tensor(_EXTENT), dim=0)
-    heights = (places @ up).quantile(places.new_tensor(_EXTENT))
+    positions = voxels.points if len(voxels.points) else local[:1]
+    low, high = positions.quantile(positions.new_tensor(_EXTENT), dim=0)
+    heights = (positions @ up).quantile(positions.new_tensor(_EXTENT))
     middle = 0.5 * (low + high) if bounded else torch.zeros_like(low)
-    spread = torch.linalg.vector_norm(places - middle, dim=1)
+    spread = torch.linalg.vector_norm(positions - middle, dim=1)
     radius = float(spread.quantile(0.98)) if bounded else 1.0
     width = 2 * float(sample.scales.amax(dim=1).median())  # where all centres are one, all there is
-    return Survey(
+    return SceneLayout(
         sample=sample,
         frame=frame,
         voxels=voxels,
@@ -90,29 +89,29 @@ def _valid(scene: GaussianScene) -> GaussianScene:
     return scene if bool(valid.all()) else scene.select(valid)
 
 
-def _visible_places(scene: GaussianScene) -> Float[Tensor, "k 3"]:
+def _visible_positions(scene: GaussianScene) -> Float[Tensor, "k 3"]:
     """Return the positions of every k-th Gaussian that is not faint; of any if all are."""
-    step = -(-len(scene) // _MOST_PLACES)
+    step = -(-len(scene) // _MOST_POSITIONS)
     means = scene.means[::step].cpu()
     visible = means[(scene.opacities[::step] > _VISIBLE).cpu()]
     return visible if len(visible) else means
 
 
 def _far_directions(
-    places: Float[Tensor, "k 3"], distances: Float[Tensor, "k"]
+    positions: Float[Tensor, "k 3"], distances: Float[Tensor, "k"]
 ) -> Float[Tensor, "f 3"]:
-    far = places[distances > _FAR]
-    few = len(far) < _FAR_SHARE * len(places)
+    far = positions[distances > _FAR]
+    few = len(far) < _FAR_SHARE * len(positions)
     return torch.nn.functional.normalize(far[:0] if few else far, dim=1)
 
 
 def _sample(scene: GaussianScene) -> GaussianScene:
-    """Keep the heaviest Gaussians and every k-th of the others, wider by as much as is missing."""
+    """Return the heaviest Gaussians and every k-th of the others, enlarged by what is missing."""
     plain = scene.with_tensors({"shN": scene.shN[:, :0]}, {})
-    if len(scene) > MOST_GAUSSIANS:
+    if len(scene) > SAMPLE_SIZE:
         heaviest_first = torch.sort(scene.masses, descending=True, stable=True).indices
         rest = torch.sort(heaviest_first[_HEAVIEST:]).values
-        step = -(-len(rest) // (MOST_GAUSSIANS - _HEAVIEST))
+        step = -(-len(rest) // (SAMPLE_SIZE - _HEAVIEST))
         rows = torch.cat([heaviest_first[:_HEAVIEST], rest[::step]])
         inflation = torch.zeros(len(rows), 1, dtype=scene.dtype, device=scene.device)
         inflation[_HEAVIEST:] = 0.5 * torch.log(inflation.new_tensor(len(rest) / len(rest[::step])))

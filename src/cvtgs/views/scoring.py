@@ -1,4 +1,4 @@
-"""Small images that tell whether a camera stands well."""
+"""Score candidate cameras by small images of what they see."""
 
 from dataclasses import dataclass
 
@@ -9,87 +9,95 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.math import parameters
 from cvtgs.rendering import render
-from cvtgs.views.survey import Survey
-from cvtgs.views.voxels import SIZE
+from cvtgs.views.layout import SceneLayout
+from cvtgs.views.up import VOXEL_SIZE
 
 PIXELS = 64
-"""Longer side of a probe."""
+"""Longer side of the small images."""
 
 _SOLID = 0.5
 _NEAR = 0.3
-"""What is nearer than this share of the way to what is to be shown stands in the way."""
+"""What is nearer than this share of the distance to what should be shown is an obstacle."""
 
 _MOST_NEAR = 0.08
 _MOST_BLOCKED = 0.3
 _LEAST_FILLED = {False: 0.12, True: 0.8}
-_HIDING = 0.25
-_WITHIN = 2.5
+_VISIBLE = 0.25
+_ENCLOSING = 2.5
 """Standard deviations within which a camera is inside of a Gaussian."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Verdicts:
-    """What probes say about cameras.
+class CameraScores:
+    """How good cameras are.
 
     Attributes:
-        good: ``(c,)`` which cameras stand well.
-        demerits: ``(c,)`` how badly they stand, to choose among bad ones; 0 is best.
-        seen: ``(c, v)`` which voxels of the survey each camera sees.
+        good: ``(c,)`` which cameras have an unobstructed view of the scene.
+        penalties: ``(c,)`` to choose among bad cameras; 0 is best.
+        visible: ``(c, v)`` which voxels of the layout each camera sees.
     """
 
     good: Bool[Tensor, "c"]
-    demerits: Float[Tensor, "c"]
-    seen: Bool[Tensor, "c v"]
+    penalties: Float[Tensor, "c"]
+    visible: Bool[Tensor, "c v"]
 
 
-def probe(known: Survey, cameras: Cameras, *, reach: Float[Tensor, "c"], inside: bool) -> Verdicts:
-    """Take small images and judge the cameras by them.
+def score_cameras(
+    layout: SceneLayout, cameras: Cameras, *, distances: Float[Tensor, "c"], inside: bool
+) -> CameraScores:
+    """Render small images and score the cameras by them.
 
-    A camera stands badly if it is inside of a Gaussian, if something near fills part of the
-    image or hides the middle, or if the image is empty.
+    A camera is bad if it is inside of a Gaussian, if something near fills part of the image or
+    hides the middle, or if the image is empty.
     """
     factor = PIXELS / max(cameras.width, cameras.height)
     small = cameras.resized(
         max(8, round(factor * cameras.width)), max(8, round(factor * cameras.height))
     )
-    images = render(known.sample, small, depth=True)
+    images = render(layout.sample, small, depth=True)
     depth = images.alpha.new_zeros(()) if images.depth is None else images.depth
-    near = (images.alpha > _HIDING) & (depth < _NEAR * reach.to(depth)[:, None, None])
+    near = (images.alpha > _VISIBLE) & (depth < _NEAR * distances.to(depth)[:, None, None])
     near_share = near.double().mean(dim=(1, 2))
     rows, columns = (slice(side // 4, side - side // 4) for side in (small.height, small.width))
-    halfway = (images.alpha > _SOLID) & (depth < 0.45 * reach.to(depth)[:, None, None])
+    halfway = (images.alpha > _SOLID) & (depth < 0.45 * distances.to(depth)[:, None, None])
     blocked = halfway[:, rows, columns].double().mean(dim=(1, 2))
     filled = images.alpha.double().mean(dim=(1, 2))
     lacking = (_LEAST_FILLED[inside] - filled).clamp_min(0)
-    swallowed = _swallowed(known, small)
-    good = (near_share <= _MOST_NEAR) & (blocked <= _MOST_BLOCKED) & (lacking == 0) & ~swallowed
-    demerits = 2 * near_share + blocked + 2 * lacking + swallowed.double()
-    return Verdicts(
-        good=good, demerits=demerits, seen=_seen(known, small, images.alpha, depth=depth)
+    enclosed = _inside_gaussians(layout, small)
+    good = (near_share <= _MOST_NEAR) & (blocked <= _MOST_BLOCKED) & (lacking == 0) & ~enclosed
+    penalties = 2 * near_share + blocked + 2 * lacking + enclosed.double()
+    return CameraScores(
+        good=good,
+        penalties=penalties,
+        visible=_visible_voxels(layout, small, images.alpha, depth=depth),
     )
 
 
-def _swallowed(known: Survey, cameras: Cameras) -> Bool[Tensor, "c"]:
+def _inside_gaussians(layout: SceneLayout, cameras: Cameras) -> Bool[Tensor, "c"]:
     """Return which cameras are inside of a Gaussian that hides something."""
-    sample = known.sample.select(known.sample.opacities > _HIDING)
+    sample = layout.sample.select(layout.sample.opacities > _VISIBLE)
     means = sample.means.double()
     largest = sample.scales.amax(dim=1)
     found = []
     for eye in cameras.centers.to(means):
         offsets = (eye - means).to(sample.dtype)
-        near = torch.linalg.vector_norm(offsets, dim=1) < _WITHIN * largest
+        near = torch.linalg.vector_norm(offsets, dim=1) < _ENCLOSING * largest
         frames = parameters.quats_to_matrices(parameters.normalize_quats(sample.quats[near]))
         local = (frames.transpose(1, 2) @ offsets[near][:, :, None])[:, :, 0]
         squares = (local / sample.scales[near].clamp_min(1e-12)).square().sum(dim=1)
-        found.append(bool((squares < _WITHIN**2).any()))
+        found.append(bool((squares < _ENCLOSING**2).any()))
     return torch.tensor(found)
 
 
-def _seen(
-    known: Survey, cameras: Cameras, alpha: Float[Tensor, "c h w"], *, depth: Float[Tensor, "c h w"]
+def _visible_voxels(
+    layout: SceneLayout,
+    cameras: Cameras,
+    alpha: Float[Tensor, "c h w"],
+    *,
+    depth: Float[Tensor, "c h w"],
 ) -> Bool[Tensor, "c v"]:
     """Return which voxels are in the images and not behind what the images show."""
-    points = known.frame.center + known.frame.radius * known.voxels.points
+    points = layout.frame.center + layout.frame.radius * layout.voxels.points
     rotations, shifts = cameras.viewmats[:, :3, :3].double(), cameras.viewmats[:, :3, 3].double()
     local = points @ rotations.transpose(1, 2) + shifts[:, None]
     projected = local @ cameras.Ks.double().transpose(1, 2)
@@ -100,5 +108,5 @@ def _seen(
     flat = (y * cameras.width + x).clamp(0, cameras.width * cameras.height - 1)
     surface = depth.flatten(1).double().gather(1, flat)
     solid = alpha.flatten(1).gather(1, flat) > _SOLID
-    slack = 1.5 * SIZE * known.frame.radius
+    slack = 1.5 * VOXEL_SIZE * layout.frame.radius
     return framed & (~solid | (local[:, :, 2] < 1.05 * surface + slack))

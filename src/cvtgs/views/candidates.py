@@ -1,4 +1,4 @@
-"""Where a camera might stand: around a thing or a place, or inside a room, with alternates."""
+"""Candidate cameras: around an object or a place, or inside a room, with alternates."""
 
 import math
 from dataclasses import dataclass
@@ -8,11 +8,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.views.survey import Survey
+from cvtgs.views.layout import SceneLayout
 
-_PER_SLOT_ELEVATIONS = (20.0, 35.0, 12.0, 28.0)
+_ELEVATIONS = (20.0, 35.0, 12.0, 28.0)
 _OUTSIDE = (
-    # turn (of a slot), further elevation (degrees), further distance (factor)
+    # turn (share of a slot), further elevation (degrees), factor of the distance
     (0.0, 0.0, 1.0),
     (0.0, 12.0, 1.0),
     (0.3, 4.0, 1.0),
@@ -27,7 +27,7 @@ _OUTSIDE = (
     (0.0, 50.0, 1.5),
 )
 _INSIDE = (
-    # turn (of a slot), share of the way to the wall behind, lift (of the height)
+    # turn (share of a slot), share of the distance to the wall behind, lift (share of the height)
     (0.0, 0.65, 0.0),
     (0.0, 0.75, 0.08),
     (0.3, 0.65, 0.04),
@@ -47,87 +47,96 @@ INSIDE_FIELD = 62.0
 """The same inside a room."""
 
 _PLACE_RADIUS = 0.95
-_THING_RADIUS = 1.0
+_OBJECT_RADIUS = 1.0
 _INSIDE_PITCH = -10.0
-_SHOULDERS = 0.15
-_WALL = 0.8  # of what is in a direction, the nearest part is furniture, the farthest stray
+_PATH_RADIUS = 0.15
+_WALL_QUANTILE = 0.8
+"""Of the surfaces in a direction, the nearest are furniture and the farthest stray."""
+
 _FARTHEST = 1.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Stands:
-    """Places to look from, in rounds: the first choice of every view, then its alternates.
+class CandidateCameras:
+    """Cameras in rounds: the first choice of every view, then its alternates.
 
     Attributes:
         inside: Whether they are inside a room.
         rounds: Cameras of one round; all rounds have one camera per view.
-        reach: Distance from each camera to what it is to show, scene units, one per round.
+        distances: From each camera to what it should show, scene units, one tensor per round.
     """
 
     inside: bool
     rounds: tuple[Cameras, ...]
-    reach: tuple[Float[Tensor, "c"], ...]
+    distances: tuple[Float[Tensor, "c"], ...]
 
 
-def outside_stands(known: Survey, count: int, *, size: tuple[int, int], turn: float) -> Stands:
-    """Stand around the scene at several heights and look at its middle."""
-    right, ahead = _level_axes(known.up)
-    shown = known.radius * (_THING_RADIUS if known.bounded else _PLACE_RADIUS)
+def outside_candidates(
+    layout: SceneLayout, count: int, *, size: tuple[int, int], turn: float
+) -> CandidateCameras:
+    """Return cameras around the scene at several heights that look at its middle."""
+    right, ahead = _level_axes(layout.up)
+    shown = layout.radius * (_OBJECT_RADIUS if layout.bounded else _PLACE_RADIUS)
     distance = shown / math.sin(math.radians(0.5 * OUTSIDE_FIELD))
-    elevations = [_PER_SLOT_ELEVATIONS[slot % len(_PER_SLOT_ELEVATIONS)] for slot in range(count)]
-    rounds, reaches = [], []
+    elevations = [_ELEVATIONS[slot % len(_ELEVATIONS)] for slot in range(count)]
+    rounds, distances = [], []
     for shift, lift, factor in _OUTSIDE:
         eyes = []
         for slot, elevation in enumerate(elevations):
             angle = 2 * math.pi * (slot + turn + shift) / count
             rise = math.radians(min(elevation + lift, 80.0))
             level = math.cos(angle) * right + math.sin(angle) * ahead
-            eyes.append(math.cos(rise) * level + math.sin(rise) * known.up)
+            eyes.append(math.cos(rise) * level + math.sin(rise) * layout.up)
         directions = torch.stack(eyes)
         rounds.append(
             _cameras(
-                known.center + distance * factor * directions,
+                layout.center + distance * factor * directions,
                 -directions,
-                known.up,
+                layout.up,
                 size=size,
                 field=OUTSIDE_FIELD,
             )
         )
-        reaches.append(torch.full((count,), distance * factor))
-    return Stands(inside=False, rounds=tuple(rounds), reach=tuple(reaches))
+        distances.append(torch.full((count,), distance * factor))
+    return CandidateCameras(inside=False, rounds=tuple(rounds), distances=tuple(distances))
 
 
-def inside_stands(
-    known: Survey, middle: Float[Tensor, "3"], count: int, *, size: tuple[int, int], turn: float
-) -> Stands:
-    """Stand in a room, back from its middle, and look across."""
-    right, ahead = _level_axes(known.up)
+def inside_candidates(
+    layout: SceneLayout,
+    middle: Float[Tensor, "3"],
+    count: int,
+    *,
+    size: tuple[int, int],
+    turn: float,
+) -> CandidateCameras:
+    """Return cameras in a room, back from its middle, that look across."""
+    right, ahead = _level_axes(layout.up)
     pitch = math.radians(_INSIDE_PITCH)
-    rounds, reaches = [], []
+    rounds, distances = [], []
     for shift, back, lift in _INSIDE:
         angles = [2 * math.pi * (slot + turn + shift) / count for slot in range(count)]
         level = torch.stack([math.cos(angle) * right + math.sin(angle) * ahead for angle in angles])
-        steps = back * _ways_to_walls(known, middle, -level)
-        eyes = middle - steps[:, None] * level + lift * known.height * known.up
-        directions = math.cos(pitch) * level + math.sin(pitch) * known.up
-        rounds.append(_cameras(eyes, directions, known.up, size=size, field=INSIDE_FIELD))
-        reaches.append(steps + 0.5 * known.frame.radius)
-    return Stands(inside=True, rounds=tuple(rounds), reach=tuple(reaches))
+        steps = back * _distances_to_walls(layout, middle, -level)
+        eyes = middle - steps[:, None] * level + lift * layout.height * layout.up
+        directions = math.cos(pitch) * level + math.sin(pitch) * layout.up
+        rounds.append(_cameras(eyes, directions, layout.up, size=size, field=INSIDE_FIELD))
+        distances.append(steps + 0.5 * layout.frame.radius)
+    return CandidateCameras(inside=True, rounds=tuple(rounds), distances=tuple(distances))
 
 
-def _ways_to_walls(
-    known: Survey, start: Float[Tensor, "3"], directions: Float[Tensor, "c 3"]
+def _distances_to_walls(
+    layout: SceneLayout, start: Float[Tensor, "3"], directions: Float[Tensor, "c 3"]
 ) -> Float[Tensor, "c"]:
-    """Return the distances to the walls, past what stands in the room, scene units."""
-    points = known.frame.center + known.frame.radius * known.voxels.points - start
+    """Return the distances to the walls behind the furniture, scene units."""
+    points = layout.frame.center + layout.frame.radius * layout.voxels.points - start
     along = directions @ points.T
     aside = (points.square().sum(dim=1) - along.square()).clamp_min(0).sqrt()
-    ahead = (along > 0) & (aside < _SHOULDERS * known.frame.radius)
-    ways = [
-        row[there].quantile(_WALL) if bool(there.any()) else row.new_zeros(())
+    ahead = (along > 0) & (aside < _PATH_RADIUS * layout.frame.radius)
+    distances = [
+        row[there].quantile(_WALL_QUANTILE) if bool(there.any()) else row.new_zeros(())
         for row, there in zip(along, ahead, strict=True)
     ]
-    return torch.stack(ways).clamp_max(_FARTHEST * known.frame.radius)
+    return torch.stack(distances).clamp_max(_FARTHEST * layout.frame.radius)
 
 
 def _level_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
