@@ -29,6 +29,9 @@ def cloud(kind: str, count: int, d: int, *, seed: int = 0) -> torch.Tensor:
     return points
 
 
+SIZES = [(1, 1), (1, 5), (5, 1), (127, 31), (128, 32), (129, 33), (500, 257), (1000, 999)]
+
+
 def brute_force(points: torch.Tensor, sites: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the smallest of all distances, summed as float64 squares (checked by an oracle)."""
     squared = (points.double()[:, None, :] - sites.double()[None, :, :]).square().sum(dim=2)
@@ -65,14 +68,13 @@ def test_known_points(backend):
 @both
 @dtypes
 @pytest.mark.parametrize("d", [1, 2, 3, 6])
-@pytest.mark.parametrize(
-    ("n", "m"), [(1, 1), (1, 5), (5, 1), (127, 31), (128, 32), (129, 33), (500, 257), (1000, 999)]
-)
-def test_shapes(backend, n, m, d, dtype):
-    points, sites = cloud("normal", n, d).to(dtype), cloud("normal", m, d, seed=1).to(dtype)
-    labels, squared = backend(points, sites)
-    assert labels.shape == squared.shape == (n,)
-    assert_nearest(points, sites, (labels, squared))
+def test_shapes(backend, d, dtype, subtests):
+    for n, m in SIZES:
+        with subtests.test(points=n, sites=m):
+            points, sites = cloud("normal", n, d).to(dtype), cloud("normal", m, d, seed=1).to(dtype)
+            labels, squared = backend(points, sites)
+            assert labels.shape == squared.shape == (n,)
+            assert_nearest(points, sites, (labels, squared))
 
 
 @both

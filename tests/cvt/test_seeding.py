@@ -45,23 +45,25 @@ def test_all_weight_zero_takes_points_evenly():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("total", "count"), SIZES)
-def test_seeds_are_distinct_and_exactly_as_many(total, count, kind):
-    weights = weights_of(kind, total)
-    for rows in (stratified_seeds(weights, count)[0], drawn(weights, count)):
-        assert rows.shape == (count,)
-        assert bool((rows.diff() > 0).all())
-        assert int(rows[0]) >= 0
-        assert int(rows[-1]) < total
+def test_seeds_are_distinct_and_exactly_as_many(kind, subtests):
+    for total, count in SIZES:
+        weights = weights_of(kind, total)
+        for rows in (stratified_seeds(weights, count)[0], drawn(weights, count)):
+            with subtests.test(total=total, count=count):
+                assert rows.shape == (count,)
+                assert bool((rows.diff() > 0).all())
+                assert int(rows[0]) >= 0
+                assert int(rows[-1]) < total
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("zero", "denormal")])
-@pytest.mark.parametrize(("total", "count"), SIZES)
-def test_shares_sum_to_all_weight(total, count, kind):
-    weights = weights_of(kind, total)
-    _, shares = stratified_seeds(weights, count)
-    assert bool((shares >= 0).all())
-    assert float(shares.sum()) == pytest.approx(float(weights.sum()), rel=1e-9)
+def test_shares_sum_to_all_weight(kind, subtests):
+    for total, count in SIZES:
+        weights = weights_of(kind, total)
+        _, shares = stratified_seeds(weights, count)
+        with subtests.test(total=total, count=count):
+            assert bool((shares >= 0).all())
+            assert float(shares.sum()) == pytest.approx(float(weights.sum()), rel=1e-9)
 
 
 def test_points_above_one_step_are_always_taken():

@@ -30,6 +30,7 @@ def run_limited(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 @linux
 def test_damaged_files_end_in_a_result_or_one_clear_sentence():
     done = run_limited(str(HERE / "fuzz_files.py"), "--count", "600", "--seed", "1")
@@ -85,6 +86,7 @@ LYING = {
 }
 
 
+@pytest.mark.slow
 @linux
 def test_lying_headers_take_no_memory_and_hangs_are_noticed(tmp_path):
     for name, data in LYING.items():

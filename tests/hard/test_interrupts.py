@@ -72,6 +72,7 @@ def old(request) -> bytes | None:
     return request.param
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 @pytest.mark.parametrize("name", WRITERS)
 def test_any_moment_leaves_the_old_file_or_none_or_the_new_one(tmp_path, name, number, old):

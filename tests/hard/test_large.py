@@ -28,6 +28,7 @@ def easy():
     return min(timed(runs.run, scene, 10_000)[1] for _ in range(2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["standard", "paper"])
 @pytest.mark.parametrize("name", ["coincident", "far_flyaways", "duplicates"])
 def test_no_case_takes_much_longer_than_an_easy_scene(name, preset, easy):
@@ -40,6 +41,7 @@ def test_no_case_takes_much_longer_than_an_easy_scene(name, preset, easy):
     assert seconds < 10 * easy + 1
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_equal_gaussians():
     """Equal in everything, colours too: not even those can part them."""
     scene = ball(1, torch.float32).select(torch.zeros(LARGE, dtype=torch.int64))
@@ -50,6 +52,7 @@ def test_a_hundred_thousand_equal_gaussians():
     torch.testing.assert_close(small.means, scene.means[:1000])
 
 
+@pytest.mark.slow
 def test_a_cell_of_a_million_beside_cells_of_one():
     """Its moments are those of float64 sums; the others keep their member bit for bit."""
     million = 1_000_000
@@ -72,6 +75,7 @@ def test_a_cell_of_a_million_beside_cells_of_one():
     assert_standard(small.select(torch.tensor([0])))
 
 
+@pytest.mark.slow
 def test_a_million_in_one_cell_by_the_whole_way():
     scene = CASES["crowd_beside_loners"](1_000_000, torch.float32)
     scene = scene.with_tensors({"shN": scene.shN[:, :0]}, {})

@@ -76,6 +76,7 @@ def scores(scene, small, cameras):
     return [min(50.0, s.psnr.mean) for s in found]
 
 
+@pytest.mark.slow
 @dtypes
 @each_case
 def test_each_case(make, dtype, subtests):
@@ -139,6 +140,7 @@ def check_that_scores_are_numbers(scene):
     assert all(score > 5 for score in scores(scene, small, cameras))
 
 
+@pytest.mark.slow
 @each_case
 def test_images_are_no_worse_than_mass_pruning(make, subtests):
     """By automatic views, at a fifth; PSNR is capped at 50 dB."""

@@ -58,6 +58,7 @@ def run_and_watch(scene, preset, device, count):
     return small, report, [warning.category for warning in caught]
 
 
+@pytest.mark.slow
 @dtypes
 @each_case
 def test_each_case_to_every_count_and_in_another_order(make, dtype, subtests):
@@ -103,6 +104,7 @@ def check_another_order(scene, preset, count, small):
     assert_same_gaussians(small, other)
 
 
+@pytest.mark.slow
 @each_case
 def test_each_case_moved(make, subtests):
     """In float64: in another unit, shifted by twice the size of the scene, and turned."""

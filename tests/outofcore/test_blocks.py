@@ -78,6 +78,7 @@ def test_coincident_points_lie_in_one_block():
     assert len(set(cut_space(points, torch.ones(10).double(), 4).blocks_of(points).tolist())) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("blocks", "rho"), [(1, 0.002), (5, 0.002), (2, 0.0501), (5, 0.6), (3, 1.0)]
 )
@@ -254,6 +255,7 @@ def test_less_memory_makes_more_blocks(source):
     assert block_count(rows, 600_100_000) > block_count(rows, 600_500_000) > 1
 
 
+@pytest.mark.slow
 def test_command(source, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("cvtgs.outofcore.memory.BASE_BYTES", 10)
     monkeypatch.setattr(

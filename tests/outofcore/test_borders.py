@@ -254,6 +254,7 @@ def test_the_network_corrects_as_in_one_piece(job):
         torch.testing.assert_close(found, values, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_seams_cost_less_than_a_tenth_of_a_decibel(tmp_path):
     """Means over counts: one of them alone moves by more than a seam may cost."""
     scene = cvtgs.synthetic.scene("object", 20_000, sh_degree=0, seed=3)

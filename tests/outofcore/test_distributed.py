@@ -30,6 +30,7 @@ def cluster():
         yield found
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_killed_worker_changes_nothing(cluster, source, tmp_path):
     from distributed import Client  # noqa: PLC0415 (optional)
@@ -61,6 +62,7 @@ def test_command(cluster, source, tmp_path):
     assert len(cvtgs.load(tmp_path / "out.ply")) == 200
 
 
+@pytest.mark.slow
 def test_without_the_package_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'cvtgs\[dask\]'"):

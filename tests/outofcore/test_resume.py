@@ -40,6 +40,7 @@ def kill_when(process, found):
     return False
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
 def test_a_killed_run_goes_on_with_the_blocks_that_are_missing(source, tmp_path):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
@@ -60,6 +61,7 @@ def test_a_killed_run_goes_on_with_the_blocks_that_are_missing(source, tmp_path)
     assert not folder.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
 @pytest.mark.parametrize("step", ["sums_02", "labels", "merged", "wide"])
 def test_a_run_killed_while_blocks_work_together_goes_on(source, tmp_path, step):
@@ -82,6 +84,7 @@ def test_a_run_killed_while_blocks_work_together_goes_on(source, tmp_path, step)
     assert output.read_bytes() == whole.read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
 def test_a_run_killed_before_all_blocks_were_cut_starts_over(source, tmp_path):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
@@ -103,6 +106,7 @@ def stop_in_blocks(event):
         raise StoppedError
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["rho", "blocks", "file", "config", "manifest"])
 def test_blocks_of_another_job_are_not_used(source, tmp_path, change):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"

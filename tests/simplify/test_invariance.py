@@ -177,6 +177,7 @@ for preset in ("standard", "paper"):
 """
 
 
+@pytest.mark.slow
 def test_same_bits_in_other_processes():
     here = os.path.dirname(__file__)  # noqa: PTH120 (an entry of a search path)
     found = []

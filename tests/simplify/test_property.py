@@ -62,6 +62,7 @@ def valid_mask(scene: GaussianScene) -> torch.Tensor:
 each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])
 
 
+@pytest.mark.slow
 @each_preset
 @hypothesis.given(scene=nasty_scenes(), share=st.floats(0.01, 1.0))
 @hypothesis.settings(
@@ -93,6 +94,7 @@ def test_nasty_scenes(preset, scene, share):
         assert bool(small.logit_opacities.isfinite().all())
 
 
+@pytest.mark.slow
 @each_preset
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e3])
