@@ -33,6 +33,7 @@ def scene_file(path: Path, count: int = 400) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_gsplat_checkpoint(tmp_path: Path) -> None:
     source, small = tmp_path / "ckpt_29999_rank0.pt", tmp_path / "small.pt"
     scene = cvtgs.synthetic.scene("object", 400, sh_degree=2, seed=0)
@@ -44,6 +45,7 @@ def test_gsplat_checkpoint(tmp_path: Path) -> None:
     assert len(cvtgs.load(small)) == 40
 
 
+@pytest.mark.slow
 def test_nerfstudio_run(tmp_path: Path) -> None:
     (tmp_path / "run" / "nerfstudio_models").mkdir(parents=True)
     scene = cvtgs.synthetic.scene("object", 400, sh_degree=1, seed=0)
@@ -52,6 +54,7 @@ def test_nerfstudio_run(tmp_path: Path) -> None:
     assert len(cvtgs.load(tmp_path / "small.spz")) == 40
 
 
+@pytest.mark.slow
 def test_inria_model(tmp_path: Path) -> None:
     model, small = inria_model(tmp_path / "model"), tmp_path / "small"
     run("inria_model.py", model, small, "--rho", "0.5")
@@ -60,6 +63,7 @@ def test_inria_model(tmp_path: Path) -> None:
     assert (small / "cfg_args").is_file()
 
 
+@pytest.mark.slow
 def test_simplify(tmp_path: Path) -> None:
     source, small = scene_file(tmp_path / "scene.ply"), tmp_path / "small.ply"
     printed = run("simplify.py", source, small, "--rho", 0.1, "--preset", "fast")
@@ -68,6 +72,7 @@ def test_simplify(tmp_path: Path) -> None:
     assert "tessellate is done" in printed
 
 
+@pytest.mark.slow
 def test_compare(tmp_path: Path) -> None:
     source, page = scene_file(tmp_path / "scene.ply"), tmp_path / "page"
     words = ("--rho", 0.1, "--presets", "draft", "fast", "--size", 64)
@@ -76,6 +81,7 @@ def test_compare(tmp_path: Path) -> None:
     assert [line.split()[0] for line in printed.splitlines()] == ["draft", "fast"]
 
 
+@pytest.mark.slow
 def test_custom_merge_keeps_labels_apart(tmp_path: Path) -> None:
     scene = cvtgs.synthetic.scene("object", 400, sh_degree=0, seed=0)
     label = (scene.means[:, 0] > scene.means[:, 0].median()).to(torch.int32)
@@ -90,6 +96,7 @@ def test_custom_merge_keeps_labels_apart(tmp_path: Path) -> None:
     assert merged.extras["share"].tolist() == pytest.approx(merged.extras["label"].tolist())
 
 
+@pytest.mark.slow
 def test_train_tiny(tmp_path: Path) -> None:
     checkpoint = tmp_path / "tiny.safetensors"
     printed = run("train_tiny.py", checkpoint, "--steps", 2, "--count", 300)
@@ -97,6 +104,7 @@ def test_train_tiny(tmp_path: Path) -> None:
     assert "300 -> 30 Gaussians" in printed
 
 
+@pytest.mark.slow
 def test_gsplat_loop() -> None:
     printed = run("gsplat_loop.py", "--count", 500, "--steps", 11, "--size", 48)
     losses = [float(line.split()[-1]) for line in printed.splitlines()]
@@ -104,6 +112,7 @@ def test_gsplat_loop() -> None:
     assert losses[-1] < losses[0]
 
 
+@pytest.mark.slow
 def test_levels(tmp_path: Path) -> None:
     source, folder = scene_file(tmp_path / "scene.ply"), tmp_path / "levels"
     run("levels.py", source, folder, "--rho", 0.25, 0.05, "--suffix", ".spz")
@@ -111,6 +120,7 @@ def test_levels(tmp_path: Path) -> None:
     assert len(cvtgs.load(folder / "level1.spz")) == 20
 
 
+@pytest.mark.slow
 def test_tradeoff(tmp_path: Path) -> None:
     source, page = scene_file(tmp_path / "scene.ply"), tmp_path / "page"
     words = ("--rho", 0.1, "--presets", "draft", "fast", "--size", 64)
@@ -119,6 +129,7 @@ def test_tradeoff(tmp_path: Path) -> None:
     assert [line.split()[0] for line in printed.splitlines()] == ["draft", "fast"]
 
 
+@pytest.mark.slow
 def test_every_example_is_run_and_short() -> None:
     text = Path(__file__).read_text(encoding="utf-8")
     for path in EXAMPLES.glob("*.py"):

@@ -104,6 +104,7 @@ def test_grouping_leaves_out_what_the_filter_leaves_out(scene):
     assert set(map(tuple, small.means.tolist())) == set(map(tuple, scene.means[:300].tolist()))
 
 
+@pytest.mark.slow
 def test_the_table_has_its_rows_and_the_folder_its_files(file, tmp_path, capsys):
     ablation.main([str(file), "--rho", "0.05", "-o", str(tmp_path / "new")])
     text = capsys.readouterr().out

@@ -34,6 +34,7 @@ def kept_places(small: cvtgs.GaussianScene) -> list[float]:
 # Every baseline
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BASELINES)
 @pytest.mark.parametrize("count", [1, 37, 300])
 def test_the_count_is_exact_and_all_are_valid_standard_gaussians(name, count):

@@ -47,6 +47,7 @@ def result(psnr: float, *, seconds: float = 2.0, lpips: float | None = None, cou
     )
 
 
+@pytest.mark.slow
 def test_methods_and_a_tool_are_run_judged_and_reported(file, tmp_path, capsys):
     (tmp_path / "first_rows.py").write_text(COPY)
     tool = f"copy={sys.executable} {tmp_path / 'first_rows.py'} {{IN}} {{OUT}} {{COUNT}} 1"
@@ -69,6 +70,7 @@ def test_methods_and_a_tool_are_run_judged_and_reported(file, tmp_path, capsys):
     assert (out / "compare.png").read_bytes()[1:4] == b"PNG"
 
 
+@pytest.mark.slow
 def test_the_table_has_what_the_baseline_itself_gives(file, capsys):
     compare.main([str(file), "--rho", "0.1", "--methods", "mass pruning"])
     full = cvtgs.load(file)
@@ -79,6 +81,7 @@ def test_the_table_has_what_the_baseline_itself_gives(file, capsys):
     ]
 
 
+@pytest.mark.slow
 def test_a_failing_tool_does_not_stop_the_others(file, tmp_path, capsys):
     broken = f"broken={sys.executable} -c raise({{COUNT}}) {{IN}} {{OUT}}"
     silent = f"silent={sys.executable} -c pass {{IN}} {{OUT}}"
@@ -92,6 +95,7 @@ def test_a_failing_tool_does_not_stop_the_others(file, tmp_path, capsys):
     assert "Failed:\n\n- broken, thing, 0.1\n- silent, thing, 0.1\n- missing, thing, 0.1" in text
 
 
+@pytest.mark.slow
 def test_another_judge_and_lpips(file, tmp_path, capsys):
     torch.save(dict(lpips_cases.random_state("alex")), tmp_path / "weights.pth")
     weights = str(tmp_path / "weights.pth")

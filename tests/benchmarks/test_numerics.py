@@ -7,6 +7,7 @@ from benchmarks import numerics
 from hard_cases import CASES
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_float32():
     found = numerics.figures(CASES["ball"], 200)
     assert 1 < found.condition < 1e4

@@ -168,6 +168,7 @@ def test_a_budget_that_is_too_short(scene, monkeypatch):
         choose_preset(options("--count", "10", "--time-budget", "5s"), scene, {}, silent)
 
 
+@pytest.mark.slow
 def test_a_target_is_searched_and_said(source, capsys, shown):
     small = simplified(source, "--target-psnr", "15")
     lines = capsys.readouterr().out.splitlines()

@@ -120,6 +120,7 @@ def test_the_parser_is_made_anew():
     assert build_parser() is not build_parser()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_leaves_no_output_behind(tmp_path, number, code):
     source = tmp_path / "in.ply"
@@ -154,6 +155,7 @@ def wait_for_handler(pid: int, number: int) -> None:
     raise TimeoutError("the process never caught the signal")
 
 
+@pytest.mark.slow
 def test_python_m_cvtgs_and_broken_pipe_do_not_trace_back():
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     result = run_cvtgs("info", "missing.ply", env=environment)

@@ -183,6 +183,7 @@ def test_error_maps_grow_brighter_with_the_error():
     assert error_map(black[:, :1], limit).tolist()[0][0] == pytest.approx([252, 253, 191], abs=6)
 
 
+@pytest.mark.slow
 def test_sheets_hold_every_image(comparison):
     sheet, errors = contact_sheet(comparison), error_sheet(comparison)
     assert sheet.dtype == errors.dtype == np.uint8

@@ -87,6 +87,7 @@ def text_of(html: str, name: str) -> str:
     return re.search(rf'id="{name}"[^>]*>([^<]*)<', html).group(1)
 
 
+@pytest.mark.slow
 def test_the_script_runs_and_shows_the_first_view(page):
     path, evaluation = page
     html = dom(path)
@@ -103,6 +104,7 @@ def test_the_script_runs_and_shows_the_first_view(page):
     assert "100 Gaussians · 6.8 kB · small_0.1.ply" in html
 
 
+@pytest.mark.slow
 def test_the_address_chooses_scene_view_and_divider(page):
     path, evaluation = page
     html = dom(path, "#view=2&small=2&split=30")
@@ -115,6 +117,7 @@ def test_the_address_chooses_scene_view_and_divider(page):
     assert re.search(r'<img id="small"[^>]*alt="view 2 of small_0.01.ply, 10 Gaussians"', html)
 
 
+@pytest.mark.slow
 def test_differences_and_equal_scenes_are_shown(page):
     path, _ = page
     html = dom(path, "#view=3&small=3&error=1")
@@ -125,6 +128,7 @@ def test_differences_and_equal_scenes_are_shown(page):
     assert "Where a_scene_with" in html
 
 
+@pytest.mark.slow
 def test_numbers_out_of_range_are_clamped(page):
     path, _ = page
     html = dom(path, "#view=99&small=-1&split=400&error=x")
@@ -132,11 +136,13 @@ def test_numbers_out_of_range_are_clamped(page):
     assert chosen == ["3", "1", "100", "0"]
 
 
+@pytest.mark.slow
 def test_the_page_fits_a_phone(page):
     path, _ = page
     assert layout_on_a_phone(path) == "390/390 390"
 
 
+@pytest.mark.slow
 def test_the_page_asks_for_nothing(page):
     """Its policy allows images inside the page only, and Chromium reports no breach of it."""
     path, _ = page
@@ -162,6 +168,7 @@ def test_the_page_asks_for_nothing(page):
     assert 'data-ready="yes"' in done.stdout.decode()
 
 
+@pytest.mark.slow
 def test_a_screenshot_shows_both_scenes(page):
     path, _ = page
     shot = path.parent / "shot.png"

@@ -94,6 +94,7 @@ def test_a_single_gaussian():
     assert refined.report.gain >= 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in cvtgs.synthetic.KINDS if kind != "object"])
 def test_other_kinds_of_scenes(kind):
     full = cvtgs.synthetic.scene(kind, 800, sh_degree=0, seed=1)
@@ -134,6 +135,7 @@ def test_infinite_logits():
     assert torch.equal(scene.logit_opacities[~changed], logits[~changed])
 
 
+@pytest.mark.slow
 def test_an_empty_background_stays_empty():
     full = full_scene(1500, degree=0)
     small = small_scene(full, 0.05)

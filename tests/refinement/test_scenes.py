@@ -30,6 +30,7 @@ def test_wrong_colours_are_mended():
     assert after < before
 
 
+@pytest.mark.slow
 def test_a_simplified_scene_gets_better_on_views_that_nobody_chose():
     full = full_scene(2000, degree=0)
     small = small_scene(full, 0.02)
@@ -104,6 +105,7 @@ def test_without_time_for_a_step_the_scene_comes_back():
     assert (refined.report.steps, refined.report.stopped) == (0, "time")
 
 
+@pytest.mark.slow
 def test_time_ends_it_before_the_steps():
     patient = quick(patience=10**6)
     full = full_scene()

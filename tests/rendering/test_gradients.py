@@ -72,6 +72,7 @@ def test_background_and_truncated_degree(backend):
     assert not leaves[1].grad[:, 3:].any()
 
 
+@pytest.mark.slow
 @backends
 def test_crop_of_a_scene_with_all_its_cut_offs(backend):
     """Cosine above 0.999 with central differences, over the entries that matter most."""
@@ -118,6 +119,7 @@ def test_backends_agree(dtype, comments):
         assert (ours - theirs).norm() <= allowed * theirs.norm(), name
 
 
+@pytest.mark.slow
 @backends
 def test_same_bits_twice_and_with_any_number_of_threads(backend):
     scene = random_scene(400, degree=2, size=0.2)

@@ -30,6 +30,7 @@ def page(tmp_path_factory):
     return write_tradeoff(measured, folder).paths[-1]
 
 
+@pytest.mark.slow
 def test_plot_table_and_slider_are_there(page):
     html = dom(page)
     assert attribute(html, "ready") == "yes"
@@ -40,10 +41,12 @@ def test_plot_table_and_slider_are_there(page):
     assert "50 Gaussians" in html
 
 
+@pytest.mark.slow
 def test_it_fits_a_phone(page):
     """The wide table scrolls inside its own box."""
     assert layout_on_a_phone(page) == "390/390 390"
 
 
+@pytest.mark.slow
 def test_it_asks_for_nothing(page):
     assert not re.search(r"https?://", page.read_text(encoding="utf-8"))

@@ -200,6 +200,7 @@ def measured() -> Measured:
     return Measured(tradeoff(*MADE), comparison)
 
 
+@pytest.mark.slow
 def test_files_are_written_completely_and_replaced_only_when_asked(measured, tmp_path):
     pytest.importorskip("matplotlib")
     paths, note = write_tradeoff(measured, tmp_path / "new")
@@ -262,6 +263,7 @@ def test_tasks_are_checked():
         tasks_of([], [0.1])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are those of POSIX")
 def test_an_interrupt_ends_the_process_too(tmp_path):
     note = tmp_path / "pid"

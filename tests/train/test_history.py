@@ -60,6 +60,7 @@ def test_json_and_back_keeps_every_digit():
     assert History.from_json(History().to_json()).validations == []
 
 
+@pytest.mark.slow
 @needs_matplotlib
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_curves_are_a_image(count):

@@ -56,6 +56,7 @@ def trained(request, tmp_path_factory) -> Trained:
     return Trained(config, history, TrainFiles.beside(name))
 
 
+@pytest.mark.slow
 def test_a_scene_never_learned_from_gains(trained):
     start, *later = trained.history.validations
     assert start.gains == {"exam": {0.06: 0.0}}

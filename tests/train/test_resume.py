@@ -69,6 +69,7 @@ def assert_same_files(first: Path, second: Path) -> None:
     assert ours.curves.read_bytes() == theirs.curves.read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_quick_curves")
 @pytest.mark.parametrize("kind", ["scene", "local"])
 @pytest.mark.parametrize("stops", [[1], [2], [1, 3, 4, 5]], ids=str)
@@ -184,6 +185,7 @@ def test_another_configuration_or_a_damaged_state_is_one_clear_error(scenes, cac
     assert path.read_bytes() == checkpoint
 
 
+@pytest.mark.slow
 @needs_matplotlib
 def test_the_curves_are_those_of_the_whole_training(scenes, cache, tmp_path):
     whole, cut = tmp_path / "whole.safetensors", tmp_path / "cut.safetensors"

@@ -60,6 +60,7 @@ def ups(cameras: cvtgs.Cameras) -> Tensor:
     return -cameras.viewmats[:, 1, :3].float()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("turn", TURNS)
 def test_views_of_every_kind(kind, turn):
@@ -88,6 +89,7 @@ def test_only_the_room_is_seen_from_inside(kind):
     assert (distances < layout.radius).all() == (kind == "room")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_flyaways_change_next_to_nothing(kind):
     scene = generated(kind)
