@@ -12,7 +12,7 @@ import cvtgs
 from cvtgs import cells, cvt
 from cvtgs.mergenet import MergeNet, correct_cells
 from cvtgs.pipeline import merge_cells
-from cvtgs.train.merged import MergedScene, merge_scene
+from cvtgs.train.cases import MergedScene, merge_scene
 from cvtgs.validity import standardized
 
 

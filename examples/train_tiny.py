@@ -39,7 +39,7 @@ def main() -> None:
 def tell(history: History) -> None:
     """Print the mean gain over scenes that are not learned from."""
     last = history.validations[-1]
-    print(f"step {last.step}: {last.score:+.3f} dB")
+    print(f"step {last.step}: {last.mean_gain:+.3f} dB")
 
 
 if __name__ == "__main__":

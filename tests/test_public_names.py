@@ -192,6 +192,7 @@ STAGES = {
     "synthetic": {"KINDS", "demo_scene", "scene"},
     "train": {
         "DataConfig",
+        "Gain",
         "History",
         "LossConfig",
         "Source",

@@ -15,8 +15,7 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import Architecture, MergeNet
 from cvtgs.train import DataConfig, History, Source, TrainConfig, TrainFiles, ViewsConfig, train
-from cvtgs.train.cases import Case, refer_case
-from cvtgs.train.views import Views, look_at_scene
+from cvtgs.train.cases import Case, TargetViews, make_case, render_views
 
 needs_matplotlib = pytest.mark.skipif(
     importlib.util.find_spec("matplotlib") is None, reason="matplotlib is optional"
@@ -71,10 +70,10 @@ def run(config: TrainConfig, name: Path, cache: Path | None = None, **options: A
     return train(config, TrainFiles.beside(name, cache), **options)
 
 
-def source_of(scene: GaussianScene, *, name: str = "made", validates: bool = False) -> Source:
+def source_of(scene: GaussianScene, *, name: str = "made", is_validation: bool = False) -> Source:
     """A source that is there already."""
     return Source(
-        name=name, identity=f"identity of {name}", validates=validates, make=lambda: scene
+        name=name, identity=f"identity of {name}", is_validation=is_validation, make=lambda: scene
     )
 
 
@@ -82,13 +81,13 @@ def some_case(
     count: int = 600, *, ratio: float = 0.05, seed: int = 0, preset: str = "standard"
 ) -> Case:
     config = SimplifyConfig.from_preset(preset)
-    case = refer_case("some", small_scene(count, seed=seed), ratio, config)
+    case = make_case("some", small_scene(count, seed=seed), ratio, config)
     assert case is not None
     return case
 
 
-def some_views(count: int = 600, *, seed: int = 0, size: int = 32) -> Views:
-    return look_at_scene(small_scene(count, seed=seed), 2, size=size, seed=0)
+def some_views(count: int = 600, *, seed: int = 0, size: int = 32) -> TargetViews:
+    return render_views(small_scene(count, seed=seed), 2, size=size, seed=0)
 
 
 def small_net(seed: int = 0) -> MergeNet:
@@ -122,7 +121,7 @@ def bits_of_case(case: Case) -> dict[str, Any]:
     }
 
 
-def bits_of_views(views: Views) -> dict[str, Any]:
+def bits_of_views(views: TargetViews) -> dict[str, Any]:
     cameras = views.cameras
     return {
         "cameras": (bits(cameras.viewmats), bits(cameras.Ks), cameras.width, cameras.height),

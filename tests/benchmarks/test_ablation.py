@@ -11,7 +11,7 @@ import lpips_cases
 from benchmarks import ablation, scoring
 from benchmarks.grouping import grouped_simplifier, nearest_groups, regroup
 from cvtgs.mergenet import load_checkpoint
-from cvtgs.train.merged import merge_scene
+from cvtgs.train.cases import merge_scene
 
 JUDGE = """
 import json, sys

@@ -9,7 +9,7 @@ import cvtgs
 from cvtgs.cli.main import main
 from cvtgs.errors import MissingDependencyError
 from cvtgs.mergenet import load_checkpoint, save_checkpoint
-from cvtgs.train import History, Validation
+from cvtgs.train import Gain, History, Validation
 from cvtgs.train import loop as train_loop
 from train_cases import needs_matplotlib, write_scenes
 
@@ -109,7 +109,7 @@ def test_the_worst_scene_is_told(capsys):
     from cvtgs.cli.train import print_validation  # noqa: PLC0415
 
     history = History()
-    gains = {"a": {0.1: 1.0, 0.01: 3.0}, "b": {0.1: -0.5}}
+    gains = (Gain("a", 0.1, 1.0), Gain("a", 0.01, 3.0), Gain("b", 0.1, -0.5))
     history.validations.append(Validation(step=7, loss=-1.23456, gains=gains))
     print_validation(history)
     assert capsys.readouterr().out == (

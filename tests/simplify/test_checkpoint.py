@@ -20,7 +20,7 @@ from cvtgs.mergenet import (
 )
 from cvtgs.pipeline import reduce_scene
 from cvtgs.report import StageClock
-from cvtgs.train.merged import merge_scene
+from cvtgs.train.cases import merge_scene
 from cvtgs.validity import standardized
 from mergenet_cases import lively_net
 from scenes import random_scene, same_bits

@@ -11,9 +11,8 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.errors import OutputError
 from cvtgs.scene import ANTIALIASED_TAG
 from cvtgs.train import Source, TrainConfig, ViewsConfig
-from cvtgs.train.cache import prepare
-from cvtgs.train.cases import refer_case
-from cvtgs.train.views import look_at_scene
+from cvtgs.train.cache import prepare_scene
+from cvtgs.train.cases import make_case, render_views
 from train_cases import (
     bits_of_case,
     bits_of_views,
@@ -57,10 +56,10 @@ def files_in(folder: Path) -> dict[str, int]:
 
 
 def test_a_scene_is_made_once(source, made, tmp_path):
-    first = prepare(source, config_of(), tmp_path)
+    first = prepare_scene(source, config_of(), tmp_path)
     assert made.count == 1
     files = files_in(tmp_path)
-    again = prepare(source, config_of(), tmp_path)
+    again = prepare_scene(source, config_of(), tmp_path)
     assert made.count == 1
     assert files_in(tmp_path) == files
     assert [bits_of_case(case) for case in again.cases] == [bits_of_case(c) for c in first.cases]
@@ -69,19 +68,22 @@ def test_a_scene_is_made_once(source, made, tmp_path):
 
 def test_what_is_cached_equals_what_is_fresh(source, made, tmp_path):
     config = config_of()
-    for prepared in (prepare(source, config, tmp_path), prepare(source, config, tmp_path)):
+    for prepared in (
+        prepare_scene(source, config, tmp_path),
+        prepare_scene(source, config, tmp_path),
+    ):
         assert prepared.name == "made"
         for ratio, case in zip(RATIOS, prepared.cases, strict=True):
-            fresh = refer_case("made", made.scene, ratio, SimplifyConfig())
+            fresh = make_case("made", made.scene, ratio, SimplifyConfig())
             assert bits_of_case(case) == bits_of_case(fresh)
         for place, (size, views) in enumerate(zip((32, 40), prepared.views, strict=True)):
-            fresh = look_at_scene(made.scene, 4, size=size, seed=place)
+            fresh = render_views(made.scene, 4, size=size, seed=place)
             assert bits_of_views(views) == bits_of_views(fresh)
 
 
 def test_scenes_for_validation_have_their_own_ratios_and_views(made, tmp_path):
-    source = replace(source_of(made.scene, validates=True), make=made)
-    prepared = prepare(source, config_of(), tmp_path)
+    source = replace(source_of(made.scene, is_validation=True), make=made)
+    prepared = prepare_scene(source, config_of(), tmp_path)
     assert [case.ratio for case in prepared.cases] == [0.3]
     assert [tuple(views.rgb.shape) for views in prepared.views] == [(2, 36, 36, 3)]
 
@@ -89,8 +91,8 @@ def test_scenes_for_validation_have_their_own_ratios_and_views(made, tmp_path):
 def test_learning_from_a_scene_that_validated_makes_new_images(source, made, tmp_path):
     """Also where both have the same ratios."""
     config = tiny_config(tiny_data(Path(), ratios=(0.2,), validation_ratios=(0.2,)))
-    prepare(replace(source, validates=True), config, tmp_path)
-    prepared = prepare(source, config, tmp_path)
+    prepare_scene(replace(source, is_validation=True), config, tmp_path)
+    prepared = prepare_scene(source, config, tmp_path)
     assert made.count == 2
     assert [len(views.cameras) for views in prepared.views] == [4, 4]
 
@@ -99,11 +101,11 @@ def test_what_cannot_be_simplified_has_no_cases(tmp_path):
     few = small_scene(300).select(torch.arange(3))
     scene = few.with_tensors({"log_scales": few.log_scales + 3}, {})  # they overlap: none is lone
     for _ in range(2):
-        prepared = prepare(source_of(scene), config_of(), tmp_path)
+        prepared = prepare_scene(source_of(scene), config_of(), tmp_path)
         assert [case.ratio for case in prepared.cases] == [0.2, 0.05]
     config = tiny_config(tiny_data(Path(), ratios=(0.9,)))
     for _ in range(2):
-        prepared = prepare(source_of(scene), config, tmp_path)
+        prepared = prepare_scene(source_of(scene), config, tmp_path)
         assert prepared.cases == ()
         assert len(prepared.views) == 2
 
@@ -121,10 +123,10 @@ def test_what_cannot_be_simplified_has_no_cases(tmp_path):
     ids=["seed", "preset", "ratios", "count", "sizes", "nothing that matters"],
 )
 def test_only_what_has_changed_is_made_anew(source, made, tmp_path, changes, images, cases):
-    prepare(source, config_of(), tmp_path)
+    prepare_scene(source, config_of(), tmp_path)
     before = files_in(tmp_path)
     assert len(before) == 2
-    prepare(source, config_of(**changes), tmp_path)
+    prepare_scene(source, config_of(**changes), tmp_path)
     after = files_in(tmp_path)
     new = sorted(after.keys() - before.keys())
     assert sum("-views-" in name for name in new) == images
@@ -134,8 +136,8 @@ def test_only_what_has_changed_is_made_anew(source, made, tmp_path, changes, ima
 
 
 def test_another_identity_is_another_scene(source, made, tmp_path):
-    prepare(source, config_of(), tmp_path)
-    prepare(replace(source, identity="another"), config_of(), tmp_path)
+    prepare_scene(source, config_of(), tmp_path)
+    prepare_scene(replace(source, identity="another"), config_of(), tmp_path)
     assert made.count == 2
     assert len(files_in(tmp_path)) == 4
 
@@ -152,13 +154,13 @@ DAMAGE = {
 
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
 def test_a_damaged_file_is_made_anew(source, made, tmp_path, damage):
-    first = prepare(source, config_of(), tmp_path)
+    first = prepare_scene(source, config_of(), tmp_path)
     wanted = [bits_of_case(case) for case in first.cases], [bits_of_views(v) for v in first.views]
     for path in tmp_path.iterdir():
         content = path.read_bytes()
         path.unlink()
         path.write_bytes(damage(content))
-        again = prepare(source, config_of(), tmp_path)
+        again = prepare_scene(source, config_of(), tmp_path)
         assert path.read_bytes() == content
         found = [bits_of_case(case) for case in again.cases]
         assert (found, [bits_of_views(views) for views in again.views]) == wanted
@@ -169,13 +171,13 @@ def test_an_antialiased_scene_stays_one(tmp_path):
     """Its merged Gaussians are rendered as it was."""
     scene = replace(small_scene(300), comments=(ANTIALIASED_TAG,))
     for _ in range(2):
-        case = prepare(source_of(scene), config_of(), tmp_path).cases[1]
+        case = prepare_scene(source_of(scene), config_of(), tmp_path).cases[1]
         assert case.reference.merged.antialiased
         assert bits_of_case(case) == bits_of_case(
-            refer_case("made", scene, RATIOS[1], SimplifyConfig())
+            make_case("made", scene, RATIOS[1], SimplifyConfig())
         )
 
 
 def test_a_folder_that_is_not_there_is_an_error(source, tmp_path):
     with pytest.raises(OutputError):
-        prepare(source, config_of(), tmp_path / "nowhere")
+        prepare_scene(source, config_of(), tmp_path / "nowhere")

@@ -1,19 +1,30 @@
-"""Cases: what a scene at a ratio holds, and what a network changes of it."""
+"""Cases: what a scene at a ratio holds, and what a network changes of it; target images."""
 
+import pytest
 import torch
 
+from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
+from cvtgs.math.frames import robust_frame
 from cvtgs.mergenet import correct_cells
-from cvtgs.train.cases import refer_case
-from cvtgs.train.merged import merge_scene
+from cvtgs.rendering import render
+from cvtgs.train.cases import TargetViews, make_case, merge_scene, render_views
+from cvtgs.views import automatic_views, random_views
 from mergenet_cases import fields_of, lively_net
 from scenes import random_scene, same_bits
-from train_cases import bits, bits_of_case, small_net, small_scene, some_case
+from train_cases import (
+    bits,
+    bits_of_case,
+    bits_of_views,
+    small_net,
+    small_scene,
+    some_case,
+)
 
 
 def test_a_case_is_the_reference_and_its_cells_of_several():
     scene, config = random_scene(200), SimplifyConfig()
-    case = refer_case("box", scene, 0.31, config)
+    case = make_case("box", scene, 0.31, config)
     reference = merge_scene(scene, 62, config)
     counts = reference.partition.counts
     assert case.name == "box at 0.31"
@@ -26,9 +37,9 @@ def test_a_case_is_the_reference_and_its_cells_of_several():
 
 def test_nothing_to_learn_is_no_case():
     scene, config = random_scene(20), SimplifyConfig()
-    assert refer_case("box", scene, 0.99, config) is None
-    assert refer_case("box", scene.select(torch.tensor([0])), 0.5, config) is None
-    assert refer_case("box", scene.select(torch.zeros(0, dtype=torch.int64)), 0.5, config) is None
+    assert make_case("box", scene, 0.99, config) is None
+    assert make_case("box", scene.select(torch.tensor([0])), 0.5, config) is None
+    assert make_case("box", scene.select(torch.zeros(0, dtype=torch.int64)), 0.5, config) is None
 
 
 def test_cells_of_one_only_are_no_case():
@@ -37,16 +48,16 @@ def test_cells_of_one_only_are_no_case():
     logits = torch.where(torch.arange(40) < 20, 3.0, -9.0)
     scene = scene.with_tensors({"logit_opacities": logits}, {})
     config = SimplifyConfig.from_mapping({"filter": {"max_mass_share": 1.0}})
-    assert refer_case("box", scene, 0.5, config) is None
+    assert make_case("box", scene, 0.5, config) is None
 
 
 def test_an_untrained_network_changes_no_bit():
     case = some_case()
     with torch.no_grad():
         residuals = small_net()(case.descriptors)
-    assert same_bits(case.corrected(residuals), case.reference.merged)
+    assert same_bits(case.correct_scene(residuals), case.reference.merged)
     before = case.reference.merged.select(case.cells).tensors()
-    for name, values in case.changed(residuals).items():
+    for name, values in case.correct_cells(residuals).items():
         assert bits(values) == bits(before[name])
 
 
@@ -54,7 +65,7 @@ def test_corrected_is_what_the_simplifier_does():
     case, net = some_case(), lively_net(torch.float32)
     reference = case.reference
     with torch.no_grad():
-        corrected = case.corrected(net(case.descriptors))
+        corrected = case.correct_scene(net(case.descriptors))
     wanted = correct_cells(
         net,
         reference.scene,
@@ -77,8 +88,8 @@ def test_some_cells_are_seen_as_among_all():
     every, few = net(case.descriptors), net(some.descriptors)
     for name in ("d_means", "d_log_scales", "d_rotvecs", "d_logit_opacities", "pair_colors"):
         torch.testing.assert_close(getattr(few, name), getattr(every, name)[rows])
-    changed = case.changed(every)
-    for name, values in some.changed(few).items():
+    changed = case.correct_cells(every)
+    for name, values in some.correct_cells(few).items():
         torch.testing.assert_close(values, changed[name][rows])
 
 
@@ -92,7 +103,7 @@ def test_gradients_flow_through_every_cell():
     residuals = net(case.descriptors)
     for values in fields_of(residuals).values():
         values.retain_grad()
-    corrected = case.corrected(residuals)
+    corrected = case.correct_scene(residuals)
     sum(values.sin().sum() for values in corrected.tensors().values()).backward()
     for values in fields_of(residuals).values():
         rows = values.grad.reshape(len(values), -1)
@@ -119,5 +130,95 @@ def test_moving_takes_everything_along():
 
 def test_the_same_scene_gives_the_same_bits():
     scene = small_scene(300)
-    first, again = (refer_case("one", scene, 0.1, SimplifyConfig()) for _ in range(2))
+    first, again = (make_case("one", scene, 0.1, SimplifyConfig()) for _ in range(2))
     assert bits_of_case(first) == bits_of_case(again)
+
+
+def numbered_views(size: int = 8) -> TargetViews:
+    """One image whose red tells the column and whose green tells the row."""
+    steps = torch.arange(size, dtype=torch.float16)
+    rgb = torch.zeros(1, size, size, 3, dtype=torch.float16)
+    rgb[..., 0], rgb[..., 1] = steps, steps[:, None]
+    intrinsics = torch.tensor([[[10.0, 0, size / 2], [0, 10.0, size / 2], [0, 0, 1]]])
+    cameras = Cameras(viewmats=torch.eye(4)[None], Ks=intrinsics, width=size, height=size)
+    return TargetViews(cameras=cameras, rgb=rgb, alpha=rgb[..., 0] / 10)
+
+
+def test_images_over_a_background():
+    views = numbered_views()
+    image = views.over(torch.tensor([1.0, 0.5, 0.0]))[0]
+    assert image.dtype == torch.float32
+    assert image[2, 5].tolist() == pytest.approx([5 + 0.5, 2 + 0.25, 0.0], abs=1e-3)
+    assert image[0, 0].tolist() == [1.0, 0.5, 0.0]
+
+
+def test_one_image_keeps_its_camera():
+    scene = small_scene()
+    views = render_views(scene, 3, size=32, seed=2)
+    one = views.select(1)
+    assert torch.equal(one.rgb[0], views.rgb[1])
+    assert torch.equal(one.alpha[0], views.alpha[1])
+    assert torch.equal(one.cameras.viewmats[0], views.cameras.viewmats[1])
+    assert len(one.cameras) == 1
+
+
+def test_half_of_the_views_are_the_automatic_ones():
+    scene = small_scene()
+    views = render_views(scene, 3, size=32, seed=2)
+    usual = automatic_views(scene, 2, width=32, height=32, seed=2)
+    around = random_views(scene, 1, size=32, seed=2)
+    assert torch.equal(views.cameras.viewmats, torch.cat([usual.viewmats, around.viewmats]))
+    assert torch.equal(views.cameras.Ks, torch.cat([usual.Ks, around.Ks]))
+    assert views.rgb.shape == (3, 32, 32, 3)
+    assert views.rgb.dtype == views.alpha.dtype == torch.float16
+    images = render(scene, views.cameras)
+    torch.testing.assert_close(views.rgb.float(), images.rgb, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(views.alpha.float(), images.alpha, rtol=1e-3, atol=1e-3)
+
+
+def test_one_view_is_an_automatic_one():
+    scene = small_scene()
+    usual = automatic_views(scene, 1, width=32, height=32, seed=0)
+    views = render_views(scene, 1, size=32, seed=0)
+    assert torch.equal(views.cameras.viewmats, usual.viewmats)
+
+
+def test_the_seed_decides_the_views():
+    scene = small_scene()
+    first, again, other = (render_views(scene, 2, size=32, seed=seed) for seed in (0, 0, 1))
+    assert bits_of_views(first) == bits_of_views(again)
+    assert not torch.equal(first.cameras.viewmats, other.cameras.viewmats)
+
+
+def test_random_views_look_at_the_middle_from_around():
+    scene = small_scene()
+    frame = robust_frame(scene.means[scene.opacities > 0.1])
+    cameras = random_views(scene, 60, size=100, seed=0)
+    steps = (cameras.centers - frame.center.float()) / float(frame.radius)
+    distances = torch.linalg.vector_norm(steps, dim=1)
+    assert 1.1 <= float(distances.amin()) < 1.4
+    assert 2.6 < float(distances.amax()) <= 3.0 + 1e-4
+    assert float(steps.amin(dim=0).amax()) < -1
+    assert float(steps.amax(dim=0).amin()) > 1
+    forward = cameras.viewmats[:, 2, :3]
+    # The target is within a quarter of a radius (a box of that side) around the middle.
+    off = steps - (steps * forward).sum(dim=1, keepdim=True) * forward
+    assert float(torch.linalg.vector_norm(off, dim=1).amax()) < 0.25
+    assert bool(((steps * forward).sum(dim=1) < 0).all())
+    assert cameras.Ks[0, 0, 0].item() == pytest.approx(50 / 0.46630766)
+
+
+def test_a_faint_scene_can_be_looked_at_too():
+    scene = small_scene(100)
+    faint = scene.with_tensors({"logit_opacities": scene.logit_opacities * 0 - 5}, {})
+    assert len(random_views(faint, 3, size=32, seed=0)) == 3
+
+
+def test_how_far_away_random_views_are():
+    scene = small_scene()
+    frame = robust_frame(scene.means[scene.opacities > 0.1])
+    cameras = random_views(scene, 60, size=100, seed=0, reach=(0.2, 1.4))
+    steps = (cameras.centers - frame.center.float()) / float(frame.radius)
+    distances = torch.linalg.vector_norm(steps, dim=1)
+    assert 0.2 - 1e-4 <= float(distances.amin()) < 0.4
+    assert 1.2 < float(distances.amax()) <= 1.4 + 1e-4

@@ -15,7 +15,7 @@ from cvtgs.errors import (
 )
 from cvtgs.mergenet import load_checkpoint
 from cvtgs.progress import ProgressEvent
-from cvtgs.train import History, TrainConfig, TrainFiles
+from cvtgs.train import Gain, History, TrainConfig, TrainFiles
 from cvtgs.train import loop as train_loop
 from train_cases import bits_of, run, tiny_config, tiny_data, write_scenes
 
@@ -41,7 +41,7 @@ def config_of(scenes: Path, **changes) -> TrainConfig:
 
 
 class Marks:
-    """Stands for ``scores``: gains as given, one per validation."""
+    """Stands for ``validation_psnr``: gains as given, one per validation."""
 
     def __init__(self, *gains: float) -> None:
         self.gains, self.nets = list(gains), []
@@ -69,7 +69,7 @@ def test_validations_before_every_so_many_steps_and_at_the_end(scenes, cache, tm
     history = run(config, tmp_path / "net.safetensors", cache, on_validation=watch)
     assert seen == [[0], [0, 2], [0, 2, 4], [0, 2, 4, 5]]
     first, *later = history.validations
-    assert first.gains == {"exam": {0.06: 0.0}}
+    assert first.gains == (Gain("exam", 0.06, 0.0),)
     assert math.isnan(first.loss)
     assert all(math.isfinite(entry.loss) for entry in later)
 
@@ -104,7 +104,7 @@ def test_torch_keeps_its_random_numbers(scenes, cache, tmp_path):
 
 def test_the_best_network_is_kept(scenes, cache, tmp_path, monkeypatch):
     marks = Marks(0.0, 0.5, 0.2, 0.4)
-    monkeypatch.setattr(train_loop, "scores", marks)
+    monkeypatch.setattr(train_loop, "validation_psnr", marks)
     path = tmp_path / "net.safetensors"
     history = run(config_of(scenes), path, cache)
     kept = load_checkpoint(path)
@@ -114,14 +114,14 @@ def test_the_best_network_is_kept(scenes, cache, tmp_path, monkeypatch):
 
 
 def test_patience_stops(scenes, cache, tmp_path, monkeypatch):
-    monkeypatch.setattr(train_loop, "scores", Marks(0.0, 0.5, 0.2, 0.4, 0.1, 0.9))
+    monkeypatch.setattr(train_loop, "validation_psnr", Marks(0.0, 0.5, 0.2, 0.4, 0.1, 0.9))
     config = config_of(scenes, steps=100, patience=2)
     history = run(config, tmp_path / "net.safetensors", cache)
     assert [entry.step for entry in history.validations] == [0, 2, 4, 6]
 
 
 def test_a_network_that_only_loses_leaves_the_untrained_one(scenes, cache, tmp_path, monkeypatch):
-    monkeypatch.setattr(train_loop, "scores", Marks(0.0, -0.5, -0.2, -0.1))
+    monkeypatch.setattr(train_loop, "validation_psnr", Marks(0.0, -0.5, -0.2, -0.1))
     path = tmp_path / "net.safetensors"
     run(config_of(scenes), path, cache)
     kept = load_checkpoint(path)

@@ -11,7 +11,7 @@ from cvtgs.evaluation import psnr
 from cvtgs.losses import image_loss
 from cvtgs.rendering import render
 from cvtgs.train import LossConfig
-from cvtgs.train.losses import local_loss, scene_loss, scores, view_loss
+from cvtgs.train.losses import local_loss, scene_loss, validation_psnr, view_loss
 from mergenet_cases import lively_net
 from train_cases import small_net, small_scene, some_case, some_views, tiny_config, tiny_data
 
@@ -48,9 +48,9 @@ def test_the_parts_add_up():
     image, target = images()
     error = (image - target).square().mean().item()
     other = image_loss(image, target).item()
-    for squared, image in ((0.5, 0.5), (1.0, 0.0), (0.0, 2.0), (0.0, 0.0)):
-        loss = view_loss(image, target, LossConfig(squared=squared, image=image)).item()
-        wanted = squared * math.log(error + 1e-5) + image * math.log(other + 1e-3)
+    for squared, weight in ((0.5, 0.5), (1.0, 0.0), (0.0, 2.0), (0.0, 0.0)):
+        loss = view_loss(image, target, LossConfig(squared=squared, image=weight)).item()
+        wanted = squared * math.log(error + 1e-5) + weight * math.log(other + 1e-3)
         assert loss == pytest.approx(wanted, rel=1e-4)
 
 
@@ -68,12 +68,12 @@ def test_twice_the_error_costs_the_same_wherever_one_starts():
 def test_an_untrained_network_has_the_loss_of_the_reference():
     """The same views over the same backgrounds, cut the same way, rendered here."""
     case, views, config = some_case(), some_views(size=40), config_of()
-    found = scene_loss(small_net(), case, views, config=config, dice=random.Random(3))
-    dice, losses = random.Random(3), []
+    found = scene_loss(small_net(), case, views, config=config, rng=random.Random(3))
+    rng, losses = random.Random(3), []
     for _ in range(config.views.per_step):
-        background = torch.tensor([dice.random() for _ in range(3)])
-        camera = views.cameras.select(torch.tensor([dice.randrange(len(views.cameras))]))
-        y, x = dice.randint(0, 40 - 32), dice.randint(0, 40 - 32)
+        background = torch.tensor([rng.random() for _ in range(3)])
+        camera = views.cameras.select(torch.tensor([rng.randrange(len(views.cameras))]))
+        y, x = rng.randint(0, 40 - 32), rng.randint(0, 40 - 32)
         before, full = (
             render(scene, camera, background=background).rgb[:, y : y + 32, x : x + 32]
             for scene in (case.reference.merged, small_scene())
@@ -83,14 +83,14 @@ def test_an_untrained_network_has_the_loss_of_the_reference():
 
 
 @pytest.mark.parametrize("kind", ["scene", "local"])
-def test_the_dice_decide_and_nothing_else(kind):
+def test_the_seed_decides_and_nothing_else(kind):
     case, views, config = some_case(), some_views(), config_of()
 
     def loss(seed: int) -> float:
-        dice = random.Random(seed)
+        rng = random.Random(seed)
         if kind == "local":
-            return local_loss(small_net(), case, config=config, dice=dice).item()
-        return scene_loss(small_net(), case, views, config=config, dice=dice).item()
+            return local_loss(small_net(), case, config=config, rng=rng).item()
+        return scene_loss(small_net(), case, views, config=config, rng=rng).item()
 
     assert loss(0) == loss(0)
     assert len({loss(seed) for seed in range(4)}) == 4
@@ -101,10 +101,10 @@ def test_changes_have_their_price(kind):
     case, views, net = some_case(), some_views(), lively_net(torch.float32)
 
     def loss(residual: float) -> float:
-        config, dice = config_of(residual=residual), random.Random(0)
+        config, rng = config_of(residual=residual), random.Random(0)
         if kind == "local":
-            return local_loss(net, case, config=config, dice=dice).item()
-        return scene_loss(net, case, views, config=config, dice=dice).item()
+            return local_loss(net, case, config=config, rng=rng).item()
+        return scene_loss(net, case, views, config=config, rng=rng).item()
 
     price = loss(2.0) - loss(0.0)
     assert 0 < price <= 2
@@ -116,11 +116,11 @@ def test_changes_have_their_price(kind):
 def test_gradients_reach_the_last_layers_of_a_new_network(kind):
     """They start at zero, and nothing below them can move before they do."""
     case, views, net, config = some_case(), some_views(), small_net(), config_of()
-    dice = random.Random(0)
+    rng = random.Random(0)
     if kind == "local":
-        local_loss(net, case, config=config, dice=dice).backward()
+        local_loss(net, case, config=config, rng=rng).backward()
     else:
-        scene_loss(net, case, views, config=config, dice=dice).backward()
+        scene_loss(net, case, views, config=config, rng=rng).backward()
     moved = {
         name.split(".")[0]
         for name, values in net.named_parameters()
@@ -132,30 +132,30 @@ def test_gradients_reach_the_last_layers_of_a_new_network(kind):
 
 def test_a_local_step_takes_no_more_cells_than_there_are():
     case = some_case().select(torch.arange(3))
-    loss = local_loss(small_net(), case, config=config_of(), dice=random.Random(0))
+    loss = local_loss(small_net(), case, config=config_of(), rng=random.Random(0))
     assert math.isfinite(loss.item())
 
 
 def test_an_untrained_network_gains_nothing():
-    before, after = scores(small_net(), some_case(), some_views())
+    before, after = validation_psnr(small_net(), some_case(), some_views())
     assert before == after
     assert 5 < before < 60
 
 
-def test_scores_are_those_of_the_images_over_grey():
+def test_validation_psnr_is_that_of_the_images_over_grey():
     case, views, net = some_case(), some_views(), lively_net(torch.float32)
-    before, after = scores(net, case, views)
+    before, after = validation_psnr(net, case, views)
     grey = torch.full((3,), 0.5)
     wanted = render(small_scene(), views.cameras, background=grey).rgb
     with torch.no_grad():
-        corrected = case.corrected(net(case.descriptors))
+        corrected = case.correct_scene(net(case.descriptors))
     for scene, found in ((case.reference.merged, before), (corrected, after)):
         rendered = render(scene, views.cameras, background=grey).rgb
         assert found == pytest.approx(psnr(rendered, wanted).mean().item(), abs=0.02)
     assert abs(after - before) > 0.05
 
 
-def test_scores_leave_no_gradient():
+def test_validation_psnr_leaves_no_gradient():
     net = lively_net(torch.float32)
-    scores(net, some_case(), some_views())
+    validation_psnr(net, some_case(), some_views())
     assert all(values.grad is None for values in net.parameters())

@@ -57,7 +57,7 @@ def interrupting(step: int):
 
 
 def rising(net, case, views) -> tuple[float, float]:
-    """Stands for ``scores``: every validation is the best so far."""
+    """Stands for ``validation_psnr``: every validation is the best so far."""
     return 20.0, 20.0 + float(net.decoder.weight.abs().sum())
 
 
@@ -87,7 +87,7 @@ def test_interrupted_anywhere_and_resumed(scenes, cache, tmp_path, kind, stops):
 
 
 @pytest.mark.usefixtures("_quick_curves")
-@pytest.mark.parametrize(("where", "count"), [("scores", 2), ("atomic_output", 3)])
+@pytest.mark.parametrize(("where", "count"), [("validation_psnr", 2), ("atomic_output", 3)])
 def test_interrupted_inside_a_validation(scenes, cache, tmp_path, monkeypatch, where, count):
     whole, cut = tmp_path / "whole.safetensors", tmp_path / "cut.safetensors"
     config, calls = config_of(scenes), []
@@ -113,7 +113,7 @@ def test_interrupted_between_checkpoint_and_state(scenes, cache, tmp_path, monke
     """The checkpoint is then newer than the state, and is written again."""
     whole, cut = tmp_path / "whole.safetensors", tmp_path / "cut.safetensors"
     config, calls = config_of(scenes), []
-    monkeypatch.setattr(train_loop, "scores", rising)
+    monkeypatch.setattr(train_loop, "validation_psnr", rising)
     run(config, whole, cache)
     true = train_loop.TrainState.save
 
@@ -156,13 +156,13 @@ def test_without_resume_a_training_starts_anew(scenes, cache, tmp_path):
 @pytest.mark.usefixtures("_quick_curves")
 def test_more_patience_lets_a_training_go_on(scenes, cache, tmp_path, monkeypatch):
     path, whole = tmp_path / "net.safetensors", tmp_path / "whole.safetensors"
-    true_scores = train_loop.scores
+    true_psnr = train_loop.validation_psnr
 
     def falling(net, case, views):
-        before, after = true_scores(net, case, views)
+        before, after = true_psnr(net, case, views)
         return before, before - abs(after - before)
 
-    monkeypatch.setattr(train_loop, "scores", falling)
+    monkeypatch.setattr(train_loop, "validation_psnr", falling)
     wanted = run(config_of(scenes), whole, cache)
     stopped = run(config_of(scenes, patience=1), path, cache)
     assert [entry.step for entry in stopped.validations] == [0, 2]

@@ -1,4 +1,4 @@
-"""The state of a training: what is saved is what goes on."""
+"""The state of a training: what is saved is what is resumed; its history, and how it is drawn."""
 
 import copy
 import json
@@ -11,10 +11,10 @@ import torch
 from cvtgs.errors import CheckpointError
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.mergenet import Architecture, MergeNet
-from cvtgs.train import LossConfig, TrainConfig, Validation
+from cvtgs.train import Gain, History, LossConfig, TrainConfig, Validation
 from cvtgs.train.state import AVERAGED_STEPS, TrainState
 from mergenet_cases import some_case
-from train_cases import bits_of, small_net
+from train_cases import bits_of, needs_matplotlib, small_net
 
 CONFIG = TrainConfig(steps=10, width=6, cell_width=10)
 
@@ -37,7 +37,7 @@ def stepped(state: TrainState, steps: int) -> TrainState:
 
 def saved(path: Path) -> Path:
     state = stepped(TrainState(small_net(), CONFIG), 3)
-    gains = {"room": {0.1: 0.1 + 0.2, 0.01: -1e-9}}
+    gains = (Gain("room", 0.1, 0.1 + 0.2), Gain("room", 0.01, -1e-9))
     state.history.validations.append(Validation(step=0, loss=math.nan, gains=gains))
     state.save(path, CONFIG)
     return path
@@ -57,7 +57,7 @@ def test_what_was_saved_is_taken_over(tmp_path):
     assert bits_of(state.mean_net.state_dict()) == bits_of(wanted.mean_net.state_dict())
     entry = state.history.validations[0]
     assert math.isnan(entry.loss)
-    assert entry.gains == {"room": {0.1: 0.1 + 0.2, 0.01: -1e-9}}
+    assert entry.gains == (Gain("room", 0.1, 0.1 + 0.2), Gain("room", 0.01, -1e-9))
 
 
 def test_going_on_gives_the_same_bits(tmp_path):
@@ -195,3 +195,70 @@ def test_a_damaged_file_is_one_clear_error(tmp_path, kind):
     with pytest.raises(CheckpointError) as caught:
         loaded(path)
     assert str(caught.value) == f"{path}: the state of the training is damaged."
+
+
+GAINS = (
+    Gain("room", 0.1, 1.0),
+    Gain("room", 0.01, 4.0),
+    Gain("tree", 0.1, -0.5),
+    Gain("tree", 0.01, 0.5),
+    Gain("dot", 0.1, 0.0),
+)
+
+
+def history_of(*gains: float) -> History:
+    history = History()
+    for number, gain in enumerate(gains):
+        loss = 1.0 / number if number else math.nan
+        history.validations.append(
+            Validation(step=10 * number, loss=loss, gains=(Gain("room", 0.1, gain),))
+        )
+    return history
+
+
+def test_the_gain_is_the_mean_over_scenes_and_ratios():
+    assert Validation(step=0, loss=1.0, gains=GAINS).mean_gain == pytest.approx(1.0)
+
+
+def test_gains_by_ratio_the_largest_first():
+    found = Validation(step=0, loss=1.0, gains=GAINS).by_ratio()
+    assert list(found.items()) == [(0.1, [1.0, -0.5, 0.0]), (0.01, [4.0, 0.5])]
+
+
+@pytest.mark.parametrize(
+    ("gains", "best", "since"),
+    [
+        ([0.0], 0, 0),
+        ([0.0, 1.0], 1, 0),
+        ([0.0, 1.0, 0.5, 0.9], 1, 2),
+        ([0.0, 1.0, 1.0], 1, 1),
+        ([0.0, -1.0, -2.0, -0.5], 0, 3),
+    ],
+)
+def test_the_best_is_the_first_of_the_largest_gains(gains, best, since):
+    history = history_of(*gains)
+    assert history.best() is history.validations[best]
+    assert history.since_best() == since
+
+
+def test_before_the_first_validation():
+    assert History().best() is None
+    assert History().since_best() == 0
+
+
+def test_json_and_back_keeps_every_digit():
+    history = history_of(0.0, 0.1 + 0.2, -1e-300)
+    history.validations.append(Validation(step=30, loss=1 / 3, gains=GAINS))
+    again = History.from_json(json.loads(json.dumps(history.to_json())))
+    assert repr(again.validations) == repr(history.validations)
+    assert again.to_json()[1:] == history.to_json()[1:]
+    assert History.from_json(History().to_json()).validations == []
+
+
+@pytest.mark.slow
+@needs_matplotlib
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_curves_are_an_image(count):
+    history = history_of(*range(count))
+    assert history.curves()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert history.curves() == history.curves()

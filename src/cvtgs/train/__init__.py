@@ -1,12 +1,13 @@
-"""Training of MergeNet: scenes, cases, losses, and a loop that can be interrupted."""
+"""Training of MergeNet: scenes, cases, losses, and a loop that can be resumed."""
 
 from cvtgs.train.config import DataConfig, LossConfig, TrainConfig, ViewsConfig
-from cvtgs.train.history import History, Validation
 from cvtgs.train.loop import TrainFiles, train
-from cvtgs.train.scenes import Source, find_sources
+from cvtgs.train.sources import Source, find_sources
+from cvtgs.train.state import Gain, History, Validation
 
 __all__ = [
     "DataConfig",
+    "Gain",
     "History",
     "LossConfig",
     "Source",

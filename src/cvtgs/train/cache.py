@@ -1,4 +1,4 @@
-"""Cache: what a training makes of each scene once is kept in files, and mapped when needed."""
+"""Cached training data: the images and cases of each scene, in files that are mapped."""
 
 import hashlib
 import json
@@ -16,60 +16,56 @@ from cvtgs.cells import Descriptors, Partition
 from cvtgs.config import SimplifyConfig
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
-from cvtgs.train.cases import Case, refer_case
+from cvtgs.train.cases import Case, MergedScene, TargetViews, make_case, render_views
 from cvtgs.train.config import TrainConfig
-from cvtgs.train.merged import MergedScene
-from cvtgs.train.scenes import Source
-from cvtgs.train.views import Views, look_at_scene
+from cvtgs.train.sources import Source
 
-Part = TypeVar("Part")
+Content = TypeVar("Content", TargetViews, Case)
 
 CACHE_VERSION = 3
-"""Part of the key of every file; to be raised when the content changes its meaning."""
+"""Part of the name of every file; to be raised when the meaning of the content changes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Prepared:
-    """All that a training needs of one scene.
+class TrainingScene:
+    """The data of one scene.
 
     Attributes:
         name: Name of the scene.
-        views: Images, one entry per size.
+        views: Images, one entry for each size.
         cases: The scene at several ratios.
     """
 
     name: str
-    views: tuple[Views, ...]
+    views: tuple[TargetViews, ...]
     cases: tuple[Case, ...]
 
 
-def prepare(source: Source, config: TrainConfig, folder: Path) -> Prepared:
-    """Return what a training needs of a scene, from the cache if it is there.
+def prepare_scene(source: Source, config: TrainConfig, folder: Path) -> TrainingScene:
+    """Return the data of a scene, from the cache if it is there.
 
-    Images and cases are kept in two files, so that trainings for other presets share images.
-    Memory: that of one scene while it is prepared; what comes from the cache is mapped.
+    Images and cases are in separate files, so that trainings for other presets share images.
+    Memory: that of one scene while it is prepared; cached tensors are mapped.
     """
     simplify = SimplifyConfig.from_preset(config.preset)
-    ratios = config.data.validation_ratios if source.validates else config.data.ratios
-    sizes = (config.views.validation_size,) if source.validates else config.views.sizes
-    count = config.views.validation_count if source.validates else config.views.count
+    ratios = config.data.validation_ratios if source.is_validation else config.data.ratios
+    sizes = (config.views.validation_size,) if source.is_validation else config.views.sizes
+    count = config.views.validation_count if source.is_validation else config.views.count
     scene = cache(source.make)
     views = _cached(
         folder / f"{source.name}-views-{_key(source, sizes, count, config.seed)}.safetensors",
         lambda: _packed_views(
-            look_at_scene(scene(), count, size=size, seed=config.seed + place)
-            for place, size in enumerate(sizes)
+            render_views(scene(), count, size=size, seed=config.seed + number)
+            for number, size in enumerate(sizes)
         ),
         _unpacked_views,
     )
     cases = _cached(
         folder / f"{source.name}-cases-{_key(source, ratios, simplify.model_dump())}.safetensors",
-        lambda: _packed_cases(
-            refer_case(source.name, scene(), ratio, simplify) for ratio in ratios
-        ),
+        lambda: _packed_cases(make_case(source.name, scene(), ratio, simplify) for ratio in ratios),
         partial(_unpacked_cases, source.name),
     )
-    return Prepared(name=source.name, views=views, cases=cases)
+    return TrainingScene(name=source.name, views=views, cases=cases)
 
 
 def _key(source: Source, *parts: Any) -> str:
@@ -80,9 +76,9 @@ def _key(source: Source, *parts: Any) -> str:
 def _cached(
     path: Path,
     make: Callable[[], dict[str, Tensor]],
-    unpack: Callable[[Mapping[str, Tensor]], tuple[Part, ...]],
-) -> tuple[Part, ...]:
-    """Unpack a file; make it first if it is missing or damaged."""
+    unpack: Callable[[Mapping[str, Tensor]], tuple[Content, ...]],
+) -> tuple[Content, ...]:
+    """Read a file; write it first if it is missing or damaged."""
     if path.is_file():
         try:
             return unpack(map_tensors(path)[0])
@@ -92,34 +88,39 @@ def _cached(
     return unpack(map_tensors(path)[0])
 
 
-def _packed_views(all_views: Iterable[Views]) -> dict[str, Tensor]:
+def _packed_views(all_views: Iterable[TargetViews]) -> dict[str, Tensor]:
     tensors: dict[str, Tensor] = {}
-    for place, views in enumerate(all_views):
+    for number, views in enumerate(all_views):
         tensors |= {
-            f"{place}/viewmats": views.cameras.viewmats,
-            f"{place}/Ks": views.cameras.Ks,
-            f"{place}/rgb": views.rgb,
-            f"{place}/alpha": views.alpha,
+            f"{number}/viewmats": views.cameras.viewmats,
+            f"{number}/Ks": views.cameras.Ks,
+            f"{number}/rgb": views.rgb,
+            f"{number}/alpha": views.alpha,
         }
     return tensors
 
 
-def _unpacked_views(tensors: Mapping[str, Tensor]) -> tuple[Views, ...]:
-    return tuple(_views(under_prefix(f"{place}/", tensors)) for place in range(_places(tensors)))
+def _unpacked_views(tensors: Mapping[str, Tensor]) -> tuple[TargetViews, ...]:
+    return tuple(
+        _views(under_prefix(f"{number}/", tensors)) for number in range(_entry_count(tensors))
+    )
 
 
 def _packed_cases(cases: Iterable[Case | None]) -> dict[str, Tensor]:
     tensors: dict[str, Tensor] = {}
-    some = (case for case in cases if case is not None)
-    for place, case in enumerate(some):
-        reference, prefix = case.reference, f"{place}/"
-        if place == 0:
+    for number, case in enumerate(case for case in cases if case is not None):
+        reference, prefix = case.reference, f"{number}/"
+        if number == 0:
             tensors |= add_prefix("scene/", reference.scene.tensors())
             tensors["light"] = reference.visibility.to(torch.float32)
             if reference.scene.antialiased:
                 tensors["antialiased"] = torch.ones(1)
         tensors |= add_prefix(prefix + "merged/", reference.merged.tensors())
-        tensors |= add_prefix(prefix + "seen/", _values(case.descriptors))
+        described = case.descriptors
+        tensors |= {
+            f"{prefix}seen/{field.name}": getattr(described, field.name)
+            for field in fields(described)
+        }
         tensors |= {
             prefix + "ratio": torch.tensor(case.ratio, dtype=torch.float64),
             prefix + "order": reference.partition.order.to(torch.int32),
@@ -130,7 +131,7 @@ def _packed_cases(cases: Iterable[Case | None]) -> dict[str, Tensor]:
 
 
 def _unpacked_cases(name: str, tensors: Mapping[str, Tensor]) -> tuple[Case, ...]:
-    count = _places(tensors)
+    count = _entry_count(tensors)
     if count == 0:
         return ()
     # Merged Gaussians must be rendered as their scene is.
@@ -138,11 +139,11 @@ def _unpacked_cases(name: str, tensors: Mapping[str, Tensor]) -> tuple[Case, ...
     scene = GaussianScene(**under_prefix("scene/", tensors), comments=comments)
     light = tensors["light"]
     return tuple(
-        _case(name, scene, light, under_prefix(f"{place}/", tensors)) for place in range(count)
+        _case(name, scene, light, under_prefix(f"{number}/", tensors)) for number in range(count)
     )
 
 
-def _places(tensors: Mapping[str, Tensor]) -> int:
+def _entry_count(tensors: Mapping[str, Tensor]) -> int:
     """Count the numbered entries."""
     return len({name.split("/")[0] for name in tensors if name.split("/")[0].isdecimal()})
 
@@ -166,13 +167,9 @@ def _case(name: str, scene: GaussianScene, light: Tensor, tensors: Mapping[str, 
     )
 
 
-def _views(tensors: Mapping[str, Tensor]) -> Views:
+def _views(tensors: Mapping[str, Tensor]) -> TargetViews:
     rgb = tensors["rgb"]
     cameras = Cameras(
         viewmats=tensors["viewmats"], Ks=tensors["Ks"], width=rgb.shape[2], height=rgb.shape[1]
     )
-    return Views(cameras=cameras, rgb=rgb, alpha=tensors["alpha"])
-
-
-def _values(descriptors: Descriptors) -> dict[str, Tensor]:
-    return {field.name: getattr(descriptors, field.name) for field in fields(descriptors)}
+    return TargetViews(cameras=cameras, rgb=rgb, alpha=tensors["alpha"])

@@ -1,30 +1,78 @@
-"""Cases: scenes at a ratio, as far as no training step changes them."""
+"""Training cases: scenes at a ratio, and images of full scenes as targets."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.analysis import analyze, drop_unused_bands, measure_visibility
+from cvtgs.cameras import Cameras
 from cvtgs.cells import Descriptors, Partition, describe_cells
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import target_count
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.filters import filter_rows
 from cvtgs.mergenet import Residuals, compose
+from cvtgs.pipeline import group_rows, merge_cells
+from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
-from cvtgs.train.merged import MergedScene, merge_scene
+from cvtgs.validity import check_rows, standardized
+from cvtgs.views import automatic_views, random_views
+
+
+class MergedScene(NamedTuple):
+    """The valid Gaussians of a scene, and one merged Gaussian per cell, before the network."""
+
+    scene: GaussianScene
+    merged: GaussianScene
+    partition: Partition
+    neighbors: Int[Tensor, "m k"]
+    visibility: Float[Tensor, "n"]
+
+
+def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> MergedScene:
+    """Run all stages before the network, with fewer cells than valid Gaussians."""
+    valid = check_rows(scene).scene
+    if target >= len(valid):
+        raise InvalidArgumentError(
+            f"target must be below the {len(valid)} valid Gaussians, found {target}."
+        )
+    analysis = analyze(valid, config, with_visibility=True)
+    if analysis.plan.visibility.active:
+        analysis = measure_visibility(valid, analysis, config)
+    valid = drop_unused_bands(valid, analysis.plan)
+    rows = filter_rows(valid, analysis, target, config.filter).rows
+    grouping = group_rows(valid, rows, analysis, target, config)
+    merged = merge_cells(
+        valid,
+        grouping.partition,
+        config.merge,
+        areas=analysis.areas,
+        backend=grouping.backend,
+        with_network=True,
+    )
+    return MergedScene(
+        valid,
+        standardized(merged.scene),
+        merged.partition,
+        merged.neighbors,
+        analysis.visibility,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Case:
-    """A scene at a ratio: its merged Gaussians, and what the network sees of them.
+    """A scene simplified to a ratio without a network, and the descriptors of its cells.
 
     Attributes:
         scene_name: Name of the scene.
-        ratio: Gaussians kept, as a share.
+        ratio: Share of Gaussians kept.
         reference: Scene, merged Gaussians, cells, neighbours.
-        cells: ``(r,)`` cells of several members: those that the network corrects.
+        cells: ``(r,)`` cells of several members, which the network corrects.
         part: Members of these cells.
-        descriptors: What the network sees of these cells.
+        descriptors: Input of the network for these cells.
     """
 
     scene_name: str
@@ -36,18 +84,18 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Scene and ratio."""
+        """Return scene and ratio."""
         return f"{self.scene_name} at {self.ratio:g}"
 
     def select(self, rows: Int[Tensor, "s"]) -> "Case":
-        """Take some of the cells, and describe them anew."""
+        """Return the case of some of the cells."""
         chosen = torch.zeros(len(self.cells), dtype=torch.bool, device=self.cells.device)
         chosen[rows] = True
         part = self.part.select(chosen)
-        return make_case(self.scene_name, self.ratio, self.reference, self.cells[chosen], part)
+        return describe_case(self.scene_name, self.ratio, self.reference, self.cells[chosen], part)
 
-    def changed(self, residuals: Residuals) -> dict[str, Tensor]:
-        """Change the cells, differentiably."""
+    def correct_cells(self, residuals: Residuals) -> dict[str, Tensor]:
+        """Return the tensors of the corrected cells, differentiably."""
         return compose(
             self.reference.scene,
             self.reference.merged,
@@ -57,10 +105,10 @@ class Case:
             residuals=residuals,
         )
 
-    def corrected(self, residuals: Residuals) -> GaussianScene:
-        """Return the whole small scene with its cells changed, differentiably."""
+    def correct_scene(self, residuals: Residuals) -> GaussianScene:
+        """Return the whole small scene with its cells corrected, differentiably."""
         merged = self.reference.merged
-        changed = self.changed(residuals)
+        changed = self.correct_cells(residuals)
         return merged.with_tensors(
             {
                 name: values.index_copy(0, self.cells, changed[name])
@@ -91,11 +139,11 @@ class Case:
         )
 
 
-def make_case(
+def describe_case(
     scene_name: str, ratio: float, reference: MergedScene, cells: Tensor, part: Partition
 ) -> Case:
-    """Describe some cells of a reference."""
-    described = describe_cells(
+    """Compute the descriptors of some cells."""
+    descriptors = describe_cells(
         reference.scene,
         reference.merged,
         part,
@@ -110,14 +158,14 @@ def make_case(
         reference=reference,
         cells=cells,
         part=part,
-        descriptors=described,
+        descriptors=descriptors,
     )
 
 
-def refer_case(
+def make_case(
     scene_name: str, scene: GaussianScene, ratio: float, config: SimplifyConfig
 ) -> Case | None:
-    """Simplify a scene without a network, and describe its cells."""
+    """Simplify a scene without a network; None if no cell has several members."""
     target = target_count(len(scene), ratio)
     if target >= len(scene):
         return None
@@ -126,4 +174,55 @@ def refer_case(
     cells = several.nonzero()[:, 0]
     if not len(cells):
         return None
-    return make_case(scene_name, ratio, reference, cells, reference.partition.select(several))
+    return describe_case(scene_name, ratio, reference, cells, reference.partition.select(several))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TargetViews:
+    """Images of a full scene, without a background.
+
+    Attributes:
+        cameras: Their cameras.
+        rgb: ``(c, h, w, 3)`` colours over black, half precision.
+        alpha: ``(c, h, w)`` opacity, half precision.
+    """
+
+    cameras: Cameras
+    rgb: Float[Tensor, "c h w 3"]
+    alpha: Float[Tensor, "c h w"]
+
+    def over(self, background: Float[Tensor, "3"]) -> Float[Tensor, "c h w 3"]:
+        """Return the images over a background."""
+        return self.rgb.float() + (1 - self.alpha.float())[..., None] * background
+
+    def select(self, row: int) -> "TargetViews":
+        """Return one of the images."""
+        rows = torch.tensor([row], device=self.cameras.Ks.device)
+        return TargetViews(
+            cameras=self.cameras.select(rows),
+            rgb=self.rgb[row : row + 1],
+            alpha=self.alpha[row : row + 1],
+        )
+
+    def to(self, device: torch.device) -> "TargetViews":
+        """Move the images to a device."""
+        return TargetViews(
+            cameras=self.cameras.to(device), rgb=self.rgb.to(device), alpha=self.alpha.to(device)
+        )
+
+
+def render_views(scene: GaussianScene, count: int, *, size: int, seed: int) -> TargetViews:
+    """Render a full scene: half from automatic cameras, half from random positions."""
+    around = random_views(scene, count // 2, size=size, seed=seed)
+    usual = automatic_views(scene, count - count // 2, width=size, height=size, seed=seed)
+    cameras = Cameras(
+        viewmats=torch.cat([usual.viewmats, around.viewmats]),
+        Ks=torch.cat([usual.Ks, around.Ks]),
+        width=size,
+        height=size,
+    )
+    with torch.no_grad():
+        images = render(scene, cameras)
+    return TargetViews(
+        cameras=cameras, rgb=images.rgb.cpu().half(), alpha=images.alpha.cpu().half()
+    )

@@ -1,4 +1,4 @@
-"""TrainConfig: every choice of a training, from a TOML file."""
+"""TrainConfig: the settings of a training, from a TOML file."""
 
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -13,23 +13,23 @@ Count = Annotated[int, pydantic.Field(ge=1)]
 
 
 class DataConfig(Section):
-    """Which scenes are learned from, and which decide when to stop.
+    """Scenes to train on, and scenes that decide when to stop.
 
     Attributes:
         folders: Folders of PLY files; relative ones start at the configuration file.
-        validation: Names of files (without .ply) that are never learned from; every fifth file,
-            from the second on, if none is named.
-        generated: Generated scenes of each kind to learn from.
-        generated_validation: Generated scenes of each kind that are never learned from.
+        validation: Names of files (without .ply) for validation only; every fifth file, from the
+            second on, if none is named.
+        generated: Generated training scenes of each kind.
+        generated_validation: Generated scenes of each kind for validation only.
         generated_counts: Gaussians of generated scenes, in turn.
         blocks: Compact pieces that are cut from each file that is larger than a piece.
         block_count: Gaussians of a piece.
         copies: Perturbed copies of each scene or piece: thinned, stretched, with other contrast
             and opacity.
-        ratios: Ratios to learn from.
-        validation_ratios: Ratios to validate with.
-        largest_case: Files with more Gaussians are learned from in pieces only, to bound the time
-            of a step.
+        ratios: Ratios to train at.
+        validation_ratios: Ratios to validate at.
+        largest_scene: Files with more Gaussians are used in pieces only, to bound the time of a
+            step.
     """
 
     folders: tuple[Path, ...] = ()
@@ -42,18 +42,18 @@ class DataConfig(Section):
     copies: int = pydantic.Field(default=0, ge=0)
     ratios: tuple[Ratio, ...] = (0.15, 0.06, 0.02, 0.008, 0.003, 0.001)
     validation_ratios: tuple[Ratio, ...] = (0.1, 0.01, 0.001)
-    largest_case: Count = 130_000
+    largest_scene: Count = 130_000
 
 
 class ViewsConfig(Section):
-    """How scenes are looked at: half of all views as people would, half from anywhere around.
+    """Images to train on: half from automatic cameras, half from random positions.
 
     Attributes:
-        count: Views of each scene at each size.
+        count: Images of each scene at each size.
         sizes: Sides of the square images, pixels.
-        per_step: Views that one step renders.
+        per_step: Images that one step renders.
         crop: Side of the random crop of each that is compared, pixels.
-        validation_count: Views of each validation scene.
+        validation_count: Images of each validation scene.
         validation_size: Side of their images, pixels.
     """
 
@@ -66,16 +66,16 @@ class ViewsConfig(Section):
 
 
 class LossConfig(Section):
-    """What is made small, a sum of logarithms and the cost of the changes.
+    """Weights of the loss, a sum of logarithms and the cost of the residuals.
 
     ``squared log(mse) + image log(loss of CVT-GS) + ssim log(1 - SSIM) + residual cost``.
-    Logarithms make every scene, ratio and view count the same, as their mean PSNR does.
+    Logarithms give every scene, ratio and view the same weight, as a mean of PSNR does.
 
     Attributes:
         squared: Weight of the squared error.
         image: Weight of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) + 0.2 gradient``.
         ssim: Weight of the structural dissimilarity, ``1 - SSIM``.
-        residual: Price of the changes.
+        residual: Weight of the size of the residuals.
     """
 
     squared: float = pydantic.Field(default=0.5, ge=0.0)
@@ -85,22 +85,22 @@ class LossConfig(Section):
 
 
 class TrainConfig(Section):
-    """Every choice of a training; frozen, unknown keys are errors.
+    """The settings of a training; frozen, unknown keys are errors.
 
     Attributes:
         kind: ``scene``: whole simplified scenes are rendered; ``local``: single cells.
         preset: The preset whose merged Gaussians the network learns to correct.
-        start: A checkpoint to start from; its widths and largest growth must be the same.
-        seed: Seed of all that is drawn.
+        start: Checkpoint to start from; its widths and largest growth must be the same.
+        seed: Seed of all random numbers.
         steps: Training steps.
-        learning_rate: Largest step of the optimiser (AdamW); it falls to zero along a cosine.
-        width: Units of the layers that see members and neighbours.
-        cell_width: Units of the layers that see cells.
-        largest_growth: Log scales change by this much at most.
+        learning_rate: Largest learning rate of AdamW; it falls to zero along a cosine.
+        width: Units of the layers for members and neighbours.
+        cell_width: Units of the layers for cells.
+        largest_growth: Largest change of a log scale.
         validate_every: Steps between validations.
-        patience: Validations without a new best after which training stops.
-        cells: Cells of one step of a ``local`` training.
-        note: A sentence about the training data, for the checkpoint.
+        patience: Validations without a new best before training stops.
+        cells: Cells in one step of a ``local`` training.
+        note: Sentence about the training data, for the checkpoint.
         data: Scenes.
         views: Images.
         loss: Loss.

@@ -1,4 +1,4 @@
-"""The training loop: steps, validations, files; the same answer whether interrupted or not."""
+"""The training loop: steps, validations, files; the same result whether interrupted or not."""
 
 import copy
 import math
@@ -15,29 +15,27 @@ from cvtgs.errors import ConfigError, MissingDependencyError, OutputError, Train
 from cvtgs.io import atomic_output
 from cvtgs.mergenet import Architecture, CheckpointInfo, MergeNet, load_checkpoint, save_checkpoint
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.train.cache import Prepared, prepare
-from cvtgs.train.cases import Case
+from cvtgs.train.cache import TrainingScene, prepare_scene
+from cvtgs.train.cases import Case, TargetViews
 from cvtgs.train.config import TrainConfig
-from cvtgs.train.history import History, Validation
-from cvtgs.train.losses import local_loss, scene_loss, scores
-from cvtgs.train.scenes import Source, find_sources
-from cvtgs.train.state import TrainState
-from cvtgs.train.views import Views
+from cvtgs.train.losses import local_loss, scene_loss, validation_psnr
+from cvtgs.train.sources import Source, find_sources
+from cvtgs.train.state import Gain, History, TrainState, Validation
 
 WARM_UP = 50
 """Steps in which the learning rate rises."""
 
 LARGEST_GRADIENT = 1.0
-"""Gradients are shortened to this length."""
+"""Gradients are scaled down to this norm."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainFiles:
-    """Where a training writes.
+    """Output files of a training.
 
     Attributes:
         checkpoint: The best network so far.
-        state: All that is needed to go on.
+        state: State to resume from.
         curves: An image of the history; there is none without matplotlib.
         cache: Folder of prepared scenes.
     """
@@ -81,26 +79,26 @@ def train(
 ) -> History:
     """Train a MergeNet.
 
-    Each step takes one scene at one ratio. Which, and from where it is seen, depends on the seed
-    and the number of the step only, so a training that is resumed gives the same bits as one
-    that was never interrupted. The network that is kept is a running mean over steps, at the
-    validation where it gained most.
+    Each step takes one scene at one ratio. The choice of scene, ratio and cameras depends only on
+    the seed and the number of the step, so a resumed training gives the same bits as an
+    uninterrupted one. The network that is kept is a running mean over steps, at the validation
+    where it gained most.
 
     Args:
-        config: Every choice.
+        config: The settings.
         files: Where to write; checkpoint, state and curves are replaced as training goes on.
-        resume: Whether to go on from ``files.state``, if there is one.
-        device: Where to train.
-        listener: Told about scenes that are prepared, and steps.
+        resume: Whether to resume from ``files.state``, if there is one.
+        device: Device to train on.
+        listener: Called for each prepared scene and each step.
         on_validation: Called after each validation.
 
     Returns:
         All validations.
 
     Raises:
-        ConfigError: There are no scenes to learn from or to validate with.
+        ConfigError: There are no scenes to train on or to validate with.
         CheckpointError: The start, or the state to resume, cannot be used.
-        TrainingError: The loss is not finite; the text says where, and which file is good.
+        TrainingError: The loss is not finite; the message names the scene and the last good file.
         OutputError: A file cannot be written.
 
     Example:
@@ -109,7 +107,7 @@ def train(
         >>> from cvtgs.train import DataConfig, ViewsConfig
         >>> with tempfile.TemporaryDirectory() as name:
         ...     folder = Path(name)
-        ...     for seed, file in enumerate(["lesson.ply", "exam.ply"]):
+        ...     for seed, file in enumerate(["training.ply", "exam.ply"]):
         ...         save(synthetic.scene("object", 300, sh_degree=0, seed=seed), folder / file)
         ...     data = DataConfig(
         ...         folders=(folder,), validation=("exam",), generated=0, generated_validation=0,
@@ -129,16 +127,16 @@ def train(
     if resume and files.state.is_file():
         state.load(files.state, config)
     _make_folder(files.cache)
-    lessons, exams = _prepare_all(sources, config, files.cache, listener)
+    cases, validation_scenes = _prepare_scenes(sources, config, files.cache, listener)
     if not state.history.validations:
-        _validate(state, exams, math.nan, config, files, device)
+        _validate(state, validation_scenes, math.nan, config, files, device)
         on_validation(state.history)
     losses: list[float] = []
     while state.step < config.steps and state.history.since_best() < config.patience:
-        losses.append(_step(state, lessons, config, files, device))
+        losses.append(_step(state, cases, config, files, device))
         listener(ProgressEvent(stage="train", done=state.step, total=config.steps))
         if state.step % config.validate_every == 0 or state.step == config.steps:
-            _validate(state, exams, sum(losses) / len(losses), config, files, device)
+            _validate(state, validation_scenes, sum(losses) / len(losses), config, files, device)
             on_validation(state.history)
             losses = []
     return state.history
@@ -171,41 +169,41 @@ def _make_folder(path: Path) -> None:
         raise OutputError(f"{path}: the cache must be a folder, found: {reason}.") from error
 
 
-def _prepare_all(
+def _prepare_scenes(
     sources: Sequence[Source], config: TrainConfig, cache: Path, listener: ProgressListener
-) -> tuple[list[tuple[Case, tuple[Views, ...]]], list[Prepared]]:
-    lessons, exams = [], []
+) -> tuple[list[tuple[Case, tuple[TargetViews, ...]]], list[TrainingScene]]:
+    cases, validation_scenes = [], []
     for number, source in enumerate(sources):
         listener(ProgressEvent(stage="prepare", done=number, total=len(sources)))
-        prepared = prepare(source, config, cache)
-        if source.validates:
-            exams.append(prepared)
+        scene = prepare_scene(source, config, cache)
+        if source.is_validation:
+            validation_scenes.append(scene)
         else:
-            lessons += [(case, prepared.views) for case in prepared.cases]
-    exams = [exam for exam in exams if exam.cases]
-    for found, text in ((lessons, "learn from"), (exams, "validate with")):
+            cases += [(case, scene.views) for case in scene.cases]
+    validation_scenes = [scene for scene in validation_scenes if scene.cases]
+    for found, text in ((cases, "learn from"), (validation_scenes, "validate with")):
         if not found:
             raise ConfigError(
                 f"data: the scenes to {text} are too small for their ratios: "
                 f"no cell has several members."
             )
     listener(ProgressEvent(stage="prepare", done=len(sources), total=len(sources)))
-    return lessons, exams
+    return cases, validation_scenes
 
 
 def _step(
     state: TrainState,
-    lessons: Sequence[tuple[Case, tuple[Views, ...]]],
+    cases: Sequence[tuple[Case, tuple[TargetViews, ...]]],
     config: TrainConfig,
     files: TrainFiles,
     device: torch.device,
 ) -> float:
-    dice = random.Random(f"{config.seed}/{state.step}")
-    case, views = dice.choice(lessons)
-    some_views = dice.choice(views)
+    rng = random.Random(f"{config.seed}/{state.step}")
+    case, views = rng.choice(cases)
+    some_views = rng.choice(views)
     for group in state.optimizer.param_groups:
         group["lr"] = _learning_rate(config, state.step)
-    loss = _loss(state.net, case.to(device), some_views.to(device), config, dice)
+    loss = _loss(state.net, case.to(device), some_views.to(device), config, rng)
     state.optimizer.zero_grad()
     loss.backward()
     length = torch.nn.utils.clip_grad_norm_(state.net.parameters(), LARGEST_GRADIENT)
@@ -223,11 +221,11 @@ def _step(
 
 
 def _loss(
-    net: MergeNet, case: Case, views: Views, config: TrainConfig, dice: random.Random
+    net: MergeNet, case: Case, views: TargetViews, config: TrainConfig, rng: random.Random
 ) -> Tensor:
     if config.kind == "local":
-        return local_loss(net, case, config=config, dice=dice)
-    return scene_loss(net, case, views, config=config, dice=dice)
+        return local_loss(net, case, config=config, rng=rng)
+    return scene_loss(net, case, views, config=config, rng=rng)
 
 
 def _learning_rate(config: TrainConfig, step: int) -> float:
@@ -237,20 +235,20 @@ def _learning_rate(config: TrainConfig, step: int) -> float:
 
 def _validate(
     state: TrainState,
-    exams: Sequence[Prepared],
+    validation_scenes: Sequence[TrainingScene],
     loss: float,
     config: TrainConfig,
     files: TrainFiles,
     device: torch.device,
 ) -> None:
-    gains: dict[str, dict[float, float]] = {}
-    for exam in exams:
-        views = exam.views[0].to(device)
-        for case in exam.cases:
-            before, after = scores(state.mean_net, case.to(device), views)
-            gains.setdefault(exam.name, {})[case.ratio] = after - before
+    gains = []
+    for scene in validation_scenes:
+        views = scene.views[0].to(device)
+        for case in scene.cases:
+            before, after = validation_psnr(state.mean_net, case.to(device), views)
+            gains.append(Gain(scene=scene.name, ratio=case.ratio, decibels=after - before))
     history = state.history
-    history.validations.append(Validation(step=state.step, loss=loss, gains=gains))
+    history.validations.append(Validation(step=state.step, loss=loss, gains=tuple(gains)))
     if history.since_best() == 0:
         with atomic_output(files.checkpoint, overwrite=True) as file:
             file.write(save_checkpoint(state.mean_net, _description(state, config)))

@@ -1,25 +1,174 @@
-"""State: all that a training needs to go on as if it had never stopped."""
+"""The state of a training, to be saved and resumed: networks, optimiser, and its validations."""
 
 import copy
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from statistics import mean
+from typing import Any, NamedTuple, Self
 
+import pydantic
 import torch
 from torch import Tensor
 
 from cvtgs.errors import CheckpointError
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.mergenet import MergeNet
+from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.train.config import TrainConfig
-from cvtgs.train.history import History
 
 AVERAGED_STEPS = 500
 """The network that is kept is a running mean over about this many steps."""
 
+CURVES: tuple[tuple[Callable[[list[float]], float], str], ...] = (
+    (mean, "mean gain, validation scenes"),
+    (min, "gain of the worst validation scene"),
+)
+"""Statistics of the gains of all scenes that are drawn, and their titles."""
+
+
+class Gain(NamedTuple):
+    """What the network gained on one validation scene at one ratio.
+
+    Attributes:
+        scene: Name of the scene.
+        ratio: Share of Gaussians kept.
+        decibels: PSNR with the network minus PSNR without it.
+    """
+
+    scene: str
+    ratio: float
+    decibels: float
+
+
+class Validation(NamedTuple):
+    """Gains of the running mean of the network on the validation scenes.
+
+    Attributes:
+        step: Number of steps before it.
+        loss: Mean training loss since the last validation; NaN before the first step.
+        gains: Gains by scene and ratio.
+    """
+
+    step: int
+    loss: float
+    gains: tuple[Gain, ...]
+
+    @property
+    def mean_gain(self) -> float:
+        """The mean gain over scenes and ratios, in decibels."""
+        return mean(gain.decibels for gain in self.gains)
+
+    def by_ratio(self) -> dict[float, list[float]]:
+        """Return the gains of all scenes, by ratio.
+
+        Returns:
+            Decibels by ratio, the largest ratio first.
+        """
+        ratios = sorted({gain.ratio for gain in self.gains}, reverse=True)
+        return {
+            ratio: [gain.decibels for gain in self.gains if gain.ratio == ratio] for ratio in ratios
+        }
+
+
+_VALIDATIONS = pydantic.TypeAdapter(list[Validation])
+
+
+class History:
+    """The validations of a training, in order.
+
+    Example:
+        >>> history = History()
+        >>> for step, decibels in ((0, 0.0), (500, 0.3), (1000, 0.2)):
+        ...     gains = (Gain(scene="room", ratio=0.1, decibels=decibels),)
+        ...     history.validations.append(Validation(step=step, loss=1.0, gains=gains))
+        >>> history.best().step, history.since_best()
+        (500, 1)
+    """
+
+    def __init__(self) -> None:
+        self.validations: list[Validation] = []
+
+    def best(self) -> Validation | None:
+        """Return the first validation with the largest mean gain.
+
+        Returns:
+            The validation, or None before the first.
+        """
+        return max(self.validations, key=lambda entry: entry.mean_gain, default=None)
+
+    def since_best(self) -> int:
+        """Count the validations after the best one.
+
+        Returns:
+            Their number.
+        """
+        best = self.best()
+        return 0 if best is None else len(self.validations) - 1 - self.validations.index(best)
+
+    def to_json(self) -> list[Any]:
+        """Return the validations as plain values.
+
+        Returns:
+            Lists, numbers and texts, for :meth:`from_json`.
+        """
+        values: list[Any] = _VALIDATIONS.dump_python(self.validations, mode="json")
+        return values
+
+    @classmethod
+    def from_json(cls, values: list[Any]) -> Self:
+        """Build a history from plain values.
+
+        Args:
+            values: Result of :meth:`to_json`.
+
+        Returns:
+            The history.
+
+        Raises:
+            ValueError: The values are not those of a history.
+        """
+        history = cls()
+        history.validations = _VALIDATIONS.validate_python(values)
+        return history
+
+    def curves(self) -> bytes:
+        """Draw the training loss, and the gains by ratio: their mean, and the smallest.
+
+        There must have been a validation.
+
+        Returns:
+            A PNG file.
+
+        Raises:
+            MissingDependencyError: matplotlib is missing.
+        """
+        steps = [entry.step for entry in self.validations]
+        losses = Panel(
+            series=[Series(name="loss", x=steps, y=[entry.loss for entry in self.validations])],
+            title="training loss",
+            x_label="step",
+        )
+        table = [entry.by_ratio() for entry in self.validations]
+        panels = [
+            Panel(
+                series=[
+                    Series(
+                        name=f"rho {ratio:g}", x=steps, y=[statistic(row[ratio]) for row in table]
+                    )
+                    for ratio in table[0]
+                ],
+                title=title,
+                x_label="step",
+                y_label="dB",
+            )
+            for statistic, title in CURVES
+        ]
+        return line_chart([losses, *panels], columns=3, width=1500, height=450)
+
 
 class TrainState:
-    """A network in training: its weights, their running mean, the optimiser, and the past."""
+    """A network in training: its weights, their running mean, the optimiser, the history."""
 
     def __init__(self, net: MergeNet, config: TrainConfig) -> None:
         self.net = net
@@ -31,11 +180,11 @@ class TrainState:
         self.step = 0
 
     def average(self) -> None:
-        """Let the running mean follow the weights."""
+        """Update the running mean of the weights."""
         share = 1 - min(1 - 1 / AVERAGED_STEPS, (self.step + 1) / (self.step + 10))
         with torch.no_grad():
-            for mean, now in zip(self.mean_net.parameters(), self.net.parameters(), strict=True):
-                mean.lerp_(now, share)
+            for average, now in zip(self.mean_net.parameters(), self.net.parameters(), strict=True):
+                average.lerp_(now, share)
 
     def save(self, path: Path, config: TrainConfig) -> None:
         """Write the state to a file."""
@@ -43,32 +192,33 @@ class TrainState:
         tensors |= add_prefix("mean/", self.mean_net.state_dict())
         for number, values in self.optimizer.state_dict()["state"].items():
             tensors |= add_prefix(f"optimizer/{number}/", values)
-        facts = {
+        record = {
             "step": self.step,
             "history": self.history.to_json(),
             "config": _fingerprint(config),
         }
-        save_tensors(path, tensors, {"state": json.dumps(facts)})
+        save_tensors(path, tensors, {"state": json.dumps(record)})
 
     def load(self, path: Path, config: TrainConfig) -> None:
-        """Take over a state that was saved."""
+        """Read the state from a file that :meth:`save` wrote."""
         try:
             tensors, metadata = map_tensors(path)
-            facts = json.loads(metadata["state"])
-            if facts["config"] != _fingerprint(config):
+            record = json.loads(metadata["state"])
+            if record["config"] != _fingerprint(config):
                 raise CheckpointError(
                     f"{path}: the state belongs to a training with another configuration; "
                     f"remove it, or train to another output."
                 )
-            self._fill(tensors, facts)
+            # Mapped tensors must not be written to: load_state_dict copies, the optimiser does not.
+            self._load_tensors({name: values.clone() for name, values in tensors.items()})
+            self.step = int(record["step"])
+            self.history = History.from_json(record["history"])
         except (KeyError, ValueError, TypeError, RuntimeError) as error:
             if isinstance(error, CheckpointError):
                 raise
             raise CheckpointError(f"{path}: the state of the training is damaged.") from error
 
-    def _fill(self, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
-        # Mapped tensors must not be written to: load_state_dict copies, the optimiser does not.
-        tensors = {name: values.clone() for name, values in tensors.items()}
+    def _load_tensors(self, tensors: dict[str, Tensor]) -> None:
         self.net.load_state_dict(under_prefix("net/", tensors))
         self.mean_net.load_state_dict(under_prefix("mean/", tensors))
         state = self.optimizer.state_dict()
@@ -76,9 +226,8 @@ class TrainState:
         kept = {number: under_prefix(f"optimizer/{number}/", tensors) for number in range(count)}
         state["state"] = {number: values for number, values in kept.items() if values}
         self.optimizer.load_state_dict(state)
-        self.step = int(facts["step"])
-        self.history = History.from_json(facts["history"])
 
 
 def _fingerprint(config: TrainConfig) -> dict[str, Any]:
+    """Return the settings that must be the same to resume."""
     return config.model_dump(mode="json", exclude={"note", "patience"})

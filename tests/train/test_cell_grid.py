@@ -1,4 +1,4 @@
-"""Crops: cells side by side, each in a tile of its own."""
+"""Cell grids: cells side by side, each in a tile of its own."""
 
 import random
 from itertools import pairwise
@@ -9,9 +9,8 @@ from torch import Tensor
 
 from cvtgs import GaussianScene
 from cvtgs.rendering import render
-from cvtgs.train.cases import Case, make_case
-from cvtgs.train.crops import TILE, Crops, crop_cells
-from cvtgs.train.merged import MergedScene
+from cvtgs.train.cases import Case, MergedScene, describe_case
+from cvtgs.train.losses import TILE, CellGrid, lay_out_cells
 from mergenet_cases import Case as Cells
 from mergenet_cases import case_of, fields_of, lively_net
 from scenes import covariances_of, random_scene
@@ -25,7 +24,7 @@ def as_case(cells: Cells) -> Case:
     reference = MergedScene(cells.scene, cells.merged, cells.part, cells.neighbors, light)
     several = cells.part.counts > 1
     rows = several.nonzero()[:, 0]
-    return make_case("made", 0.1, reference, rows, cells.part.select(several))
+    return describe_case("made", 0.1, reference, rows, cells.part.select(several))
 
 
 def twins(cells: int = 16) -> Case:
@@ -38,13 +37,13 @@ def twins(cells: int = 16) -> Case:
     return as_case(case_of(scene, torch.arange(cells).repeat(2), near=4))
 
 
-def cropped(case: Case, *, seed: int = 0, changed: dict[str, Tensor] | None = None) -> Crops:
+def grid_of(case: Case, *, seed: int = 0, changed: dict[str, Tensor] | None = None) -> CellGrid:
     same = case.reference.merged.select(case.cells).tensors()
-    return crop_cells(case, changed or same, dice=random.Random(seed))
+    return lay_out_cells(case, changed or same, rng=random.Random(seed))
 
 
-def image(scene: GaussianScene, crops: Crops) -> Tensor:
-    return render(scene, crops.camera, background=torch.zeros(3)).rgb[0]
+def image(scene: GaussianScene, grid: CellGrid) -> Tensor:
+    return render(scene, grid.camera, background=torch.zeros(3)).rgb[0]
 
 
 def sixteen(case: Case) -> Case:
@@ -60,67 +59,67 @@ def tile_of(number: int) -> tuple[slice, slice]:
 
 
 def test_equal_members_and_their_cell_look_the_same():
-    crops = cropped(twins())
-    members, merged = image(crops.members, crops), image(crops.merged, crops)
+    grid = grid_of(twins())
+    members, merged = image(grid.members, grid), image(grid.merged, grid)
     assert float(members.amax()) > 0.3
     assert float((members - merged).abs().mean()) < 0.01
 
 
 def test_what_is_not_changed_looks_the_same():
-    crops = cropped(twins())
-    assert torch.equal(image(crops.merged, crops), image(crops.corrected, crops))
+    grid = grid_of(twins())
+    assert torch.equal(image(grid.merged, grid), image(grid.corrected, grid))
 
 
 @pytest.mark.parametrize("count", [1, 2, 4, 5, 9, 10])
 def test_there_is_a_tile_for_every_cell(count):
     case = some_case(1500, ratio=0.1).select(torch.arange(count))
-    crops = cropped(case)
+    grid = grid_of(case)
     side = {1: 1, 2: 2, 4: 2, 5: 3, 9: 3, 10: 4}[count]
-    assert (crops.camera.width, crops.camera.height) == (side * TILE, side * TILE)
-    assert len(crops.merged) == len(crops.corrected) == count
-    assert len(crops.members) == len(case.part.order)
+    assert (grid.camera.width, grid.camera.height) == (side * TILE, side * TILE)
+    assert len(grid.merged) == len(grid.corrected) == count
+    assert len(grid.members) == len(case.part.order)
 
 
 def test_cells_lie_in_their_tiles_of_comparable_size():
-    crops = cropped(sixteen(some_case(1500, ratio=0.1)))
+    grid = grid_of(sixteen(some_case(1500, ratio=0.1)))
     numbers = torch.arange(SIDE * SIDE)
     middles = torch.stack([numbers % SIDE, numbers // SIDE], dim=1) + 0.5 - SIDE / 2
-    steps = crops.merged.means[:, :2] - middles
+    steps = grid.merged.means[:, :2] - middles
     assert float(steps.abs().amax()) <= 0.15 + 1e-5
     assert len({tuple(step) for step in steps.tolist()}) == SIDE * SIDE
-    largest = crops.merged.scales.amax(dim=1)
+    largest = grid.merged.scales.amax(dim=1)
     assert bool((largest > 0.7 / 7).all())
     assert bool((largest < 1.42 / 7).all())
 
 
 def test_a_cell_paints_its_own_tile():
     """Each cell rendered by itself: hardly anything of it falls into the tiles of others."""
-    crops = cropped(sixteen(some_case(1500, ratio=0.1)))
+    grid = grid_of(sixteen(some_case(1500, ratio=0.1)))
     for number in range(SIDE * SIDE):
-        light = image(crops.merged.select(torch.tensor([number])), crops).sum(dim=2)
+        light = image(grid.merged.select(torch.tensor([number])), grid).sum(dim=2)
         assert float(light[tile_of(number)].sum()) > 0.95 * float(light.sum()) > 0
 
 
 def test_members_stay_with_their_cell():
     case = sixteen(some_case(1500, ratio=0.1))
-    crops = cropped(case)
+    grid = grid_of(case)
     for number, (first, last) in enumerate(pairwise(case.part.offsets.tolist())):
-        steps = crops.members.means[first:last] - crops.merged.means[number]
-        reach = 4 * crops.merged.scales[number].amax()
+        steps = grid.members.means[first:last] - grid.merged.means[number]
+        reach = 4 * grid.merged.scales[number].amax()
         assert float(torch.linalg.vector_norm(steps, dim=1).median()) < reach
 
 
 def test_a_layout_turns_and_scales_and_nothing_else():
     """Distances over scales, shapes against one another, opacities and colours stay."""
     case = sixteen(some_case(1500, ratio=0.1))
-    crops, own = cropped(case), case.reference.merged.select(case.cells)
+    grid, own = grid_of(case), case.reference.merged.select(case.cells)
     members = case.reference.scene.select(case.part.order)
     ids = torch.repeat_interleave(torch.arange(len(own)), case.part.counts)
-    for before, after, rows in ((own, crops.merged, slice(None)), (members, crops.members, ids)):
-        zooms = (crops.merged.scales / own.scales)[:, 0][rows]
+    for before, after, rows in ((own, grid.merged, slice(None)), (members, grid.members, ids)):
+        zooms = (grid.merged.scales / own.scales)[:, 0][rows]
         torch.testing.assert_close(after.scales, before.scales * zooms[:, None])
         old = (before.means - own.means[rows]) * zooms[:, None]
-        new = after.means - crops.merged.means[rows]
+        new = after.means - grid.merged.means[rows]
         lengths = [torch.linalg.vector_norm(steps, dim=1) for steps in (old, new)]
         torch.testing.assert_close(*lengths, rtol=1e-3, atol=1e-4)
         seen = [
@@ -133,9 +132,9 @@ def test_a_layout_turns_and_scales_and_nothing_else():
         assert after.sh_degree == 0
 
 
-def test_the_dice_decide():
+def test_the_seed_decides():
     case = twins()
-    first, again, other = (cropped(case, seed=seed) for seed in (0, 0, 1))
+    first, again, other = (grid_of(case, seed=seed) for seed in (0, 0, 1))
     assert torch.equal(first.members.means, again.members.means)
     assert not torch.equal(first.members.means, other.members.means)
     assert not torch.equal(first.members.log_scales, other.members.log_scales)
@@ -146,15 +145,15 @@ def test_gradients_flow_into_what_is_changed(net):
     case = sixteen(some_case(1500, ratio=0.1))
     changed = {
         name: values.detach().requires_grad_()
-        for name, values in case.changed(net(case.descriptors)).items()
+        for name, values in case.correct_cells(net(case.descriptors)).items()
     }
-    crops = cropped(case, changed=changed)
-    (image(crops.corrected, crops) - image(crops.members, crops)).square().sum().backward()
+    grid = grid_of(case, changed=changed)
+    (image(grid.corrected, grid) - image(grid.members, grid)).square().sum().backward()
     for name in ("means", "quats", "log_scales", "logit_opacities", "sh0"):
         grad = changed[name].grad
         assert bool(grad.isfinite().all())
         assert float((grad.reshape(len(grad), -1) != 0).any(dim=1).double().mean()) > 0.9
-    assert not crops.members.means.requires_grad
+    assert not grid.members.means.requires_grad
 
 
 def test_gradients_flow_into_the_residuals():
@@ -162,8 +161,8 @@ def test_gradients_flow_into_the_residuals():
     residuals = net(case.descriptors)
     for values in fields_of(residuals).values():
         values.retain_grad()
-    crops = cropped(case, changed=case.changed(residuals))
-    (image(crops.corrected, crops) - image(crops.members, crops)).square().sum().backward()
+    grid = grid_of(case, changed=case.correct_cells(residuals))
+    (image(grid.corrected, grid) - image(grid.members, grid)).square().sum().backward()
     assert all(bool((values.grad != 0).any()) for values in fields_of(residuals).values())
 
 
@@ -175,6 +174,6 @@ def test_cells_of_any_size(log_scale):
     far = scene.with_tensors(
         {"means": scene.means * factor, "log_scales": scene.log_scales + log_scale}, {}
     )
-    crops = [cropped(as_case(case_of(one, torch.arange(12) % 4, near=3))) for one in (scene, far)]
-    images = [image(some.members, some) for some in crops]
+    grids = [grid_of(as_case(case_of(one, torch.arange(12) % 4, near=3))) for one in (scene, far)]
+    images = [image(some.members, some) for some in grids]
     torch.testing.assert_close(images[1], images[0], rtol=0, atol=2e-2)

@@ -1,4 +1,4 @@
-"""Scenes to learn from and to validate with: files, pieces of them, copies, generated ones."""
+"""Scenes to train on and to validate with: files, pieces of them, copies, generated ones."""
 
 import random
 from collections.abc import Callable, Iterator
@@ -18,31 +18,31 @@ from cvtgs.train.config import DataConfig
 from cvtgs.validity import valid_rows
 
 VALIDATION_SEED = 1_000_000
-"""Generated scenes for validation have seeds from here on."""
+"""First seed of generated scenes for validation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """A scene by name, made when it is needed.
+    """A named scene that is made when it is needed.
 
     Attributes:
         name: Unique name.
-        identity: A text that changes when the scene does.
-        validates: Whether it is for validation only.
-        make: Makes it.
+        identity: Text that changes when the scene does, part of the name of its cache.
+        is_validation: Whether it is for validation only.
+        make: Function that makes the scene.
     """
 
     name: str
     identity: str
-    validates: bool
+    is_validation: bool
     make: Callable[[], GaussianScene]
 
 
 def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
-    """List the scenes of a training, and make none of them yet.
+    """List the scenes of a training without making them.
 
     Args:
-        config: Which.
+        config: Which scenes.
         seed: Seed of pieces, copies and generated scenes.
 
     Returns:
@@ -50,7 +50,7 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
         generated ones.
 
     Raises:
-        ConfigError: A folder or a validation file is missing, or there is nothing to learn from
+        ConfigError: A folder or a validation file is missing, or there is nothing to train on
             or to validate with.
         FileFormatError: A file is no PLY file with Gaussians, or damaged.
 
@@ -69,8 +69,8 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
     sources = [*_from_files(files, held_out, config, seed), *_generated(config, seed)]
     if len({source.name for source in sources}) < len(sources):
         raise ConfigError("data.folders: two files have the same name.")
-    for validates, text in ((False, "learn from"), (True, "validate with")):
-        if not any(source.validates == validates for source in sources):
+    for is_validation, text in ((False, "learn from"), (True, "validate with")):
+        if not any(source.is_validation == is_validation for source in sources):
             raise ConfigError(f"data: there is no scene to {text}.")
     return sources
 
@@ -88,23 +88,23 @@ def _from_files(
     files: list[Path], held_out: set[str], config: DataConfig, seed: int
 ) -> Iterator[Source]:
     for path in files:
-        count = len(load(path))
+        count, file = len(load(path)), path.stat()
         whole = Source(
             name=path.stem,
-            identity=_identity(path),
-            validates=path.stem in held_out,
+            identity=f"{path.resolve()} {file.st_size} {file.st_mtime_ns}",
+            is_validation=path.stem in held_out,
             make=partial(_load_valid, path),
         )
-        if whole.validates:
+        if whole.is_validation:
             yield whole
             continue
-        originals = [whole] if count <= config.largest_case else []
+        originals = [whole] if count <= config.largest_scene else []
         yield from originals
         for number in range(config.blocks if count > config.block_count else 0):
             block = Source(
                 name=f"{path.stem}-block{number}",
                 identity=f"{whole.identity} block {config.block_count} {seed + number}",
-                validates=False,
+                is_validation=False,
                 make=partial(_block_of, whole, config.block_count, seed + number),
             )
             originals.append(block)
@@ -126,11 +126,6 @@ def _perturbed(source: Source, seed: str) -> GaussianScene:
     return perturb(source.make(), random.Random(seed))
 
 
-def _identity(path: Path) -> str:
-    facts = path.stat()
-    return f"{path.resolve()} {facts.st_size} {facts.st_mtime_ns}"
-
-
 def _copies(originals: list[Source], count: int, seed: int) -> Iterator[Source]:
     for original in originals:
         for number in range(count):
@@ -138,14 +133,14 @@ def _copies(originals: list[Source], count: int, seed: int) -> Iterator[Source]:
             yield Source(
                 name=name,
                 identity=f"{original.identity} copy {seed} {number}",
-                validates=False,
+                is_validation=False,
                 make=partial(_perturbed, original, f"{seed}/{name}"),
             )
 
 
 def _generated(config: DataConfig, seed: int) -> Iterator[Source]:
     counts = config.generated_counts
-    for validates, number, first in (
+    for is_validation, number, first in (
         (False, config.generated, 1000 * seed),
         (True, config.generated_validation, VALIDATION_SEED + 1000 * seed),
     ):
@@ -156,13 +151,13 @@ def _generated(config: DataConfig, seed: int) -> Iterator[Source]:
                 yield Source(
                     name=name,
                     identity=f"{name} {count} {degree}",
-                    validates=validates,
+                    is_validation=is_validation,
                     make=partial(synthetic.scene, kind, count, sh_degree=degree, seed=first + turn),
                 )
 
 
 def cut_block(scene: GaussianScene, count: int, *, seed: int) -> GaussianScene:
-    """Cut a compact piece out of a scene: a Gaussian, and those that are nearest to it."""
+    """Cut a compact piece out of a scene: a random Gaussian and its nearest ones."""
     if len(scene) <= count:
         return scene
     middle = scene.means[random.Random(seed).randrange(len(scene))]
@@ -170,27 +165,28 @@ def cut_block(scene: GaussianScene, count: int, *, seed: int) -> GaussianScene:
     return scene.select(distances.topk(count, largest=False).indices.sort().values)
 
 
-def perturb(scene: GaussianScene, dice: random.Random) -> GaussianScene:
-    """Make a scene that looks like another one: thinned, stretched, recoloured.
+def perturb(scene: GaussianScene, rng: random.Random) -> GaussianScene:
+    """Thin, stretch and recolour a scene.
 
-    Turning, moving or scaling a scene would teach nothing: descriptors do not change then.
+    Rotations, translations and uniform scales would add nothing: they leave descriptors as they
+    are.
     """
-    generator = torch.Generator().manual_seed(dice.getrandbits(62))
-    share = dice.uniform(0.4, 1.0)
+    generator = torch.Generator().manual_seed(rng.getrandbits(62))
+    share = rng.uniform(0.4, 1.0)
     kept = scene.select(torch.rand(len(scene), generator=generator) < share)
-    stretch = torch.tensor([dice.uniform(0.6, 1.5) for _ in range(3)], dtype=scene.dtype)
+    stretch = torch.tensor([rng.uniform(0.6, 1.5) for _ in range(3)], dtype=scene.dtype)
     wider = share ** (-1 / 3)
     quats = parameters.normalize_quats(kept.quats.double())
     shapes = parameters.build_covariances(kept.scales.double() * wider, quats)
     scales, turned = parameters.decompose_covariances(shapes * stretch[:, None] * stretch)
-    mix = torch.eye(3) * dice.uniform(0.5, 1.4) + 0.3 * torch.randn(3, 3, generator=generator)
+    mix = torch.eye(3) * rng.uniform(0.5, 1.4) + 0.3 * torch.randn(3, 3, generator=generator)
     mix = mix.to(scene.dtype)
     return kept.with_tensors(
         {
             "means": kept.means * stretch,
             "log_scales": positive_log(scales).to(scene.dtype),
             "quats": turned.to(scene.dtype),
-            "logit_opacities": kept.logit_opacities + dice.uniform(-1.0, 1.0),
+            "logit_opacities": kept.logit_opacities + rng.uniform(-1.0, 1.0),
             "sh0": kept.sh0 @ mix,
             "shN": kept.shN @ mix,
         },

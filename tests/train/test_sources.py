@@ -8,14 +8,14 @@ import torch
 import cvtgs
 from cvtgs.errors import ConfigError, FileFormatError
 from cvtgs.train import DataConfig, find_sources
-from cvtgs.train.scenes import VALIDATION_SEED, cut_block, perturb
+from cvtgs.train.sources import VALIDATION_SEED, cut_block, perturb
 from cvtgs.validity import invalid_rows
 from scenes import covariances_of, random_scene, same_bits
 from train_cases import small_scene, tiny_data, write_scenes
 
 
-def names_of(sources, *, validates: bool) -> list[str]:
-    return [source.name for source in sources if source.validates == validates]
+def names_of(sources, *, is_validation: bool) -> list[str]:
+    return [source.name for source in sources if source.is_validation == is_validation]
 
 
 def with_bad_rows(scene: cvtgs.GaussianScene) -> cvtgs.GaussianScene:
@@ -28,8 +28,8 @@ def test_folders_are_searched_to_the_bottom(tmp_path):
     write_scenes(tmp_path, ["b", "exam", "deep/er/a", "deep/c"], 50)
     (tmp_path / "notes.txt").write_text("no scene")
     sources = find_sources(tiny_data(tmp_path), seed=0)
-    assert names_of(sources, validates=False) == ["b", "c", "a"]
-    assert names_of(sources, validates=True) == ["exam"]
+    assert names_of(sources, is_validation=False) == ["b", "c", "a"]
+    assert names_of(sources, is_validation=True) == ["exam"]
 
 
 def test_sources_make_the_scenes_of_the_files(tmp_path):
@@ -41,8 +41,8 @@ def test_sources_make_the_scenes_of_the_files(tmp_path):
 def test_every_fifth_file_from_the_second_on_validates(tmp_path):
     write_scenes(tmp_path, list("abcdefgh"), 5)
     sources = find_sources(tiny_data(tmp_path, validation=()), seed=0)
-    assert names_of(sources, validates=True) == ["b", "g"]
-    assert names_of(sources, validates=False) == list("acdefh")
+    assert names_of(sources, is_validation=True) == ["b", "g"]
+    assert names_of(sources, is_validation=False) == list("acdefh")
 
 
 def test_several_folders_one_after_the_other(tmp_path):
@@ -59,7 +59,7 @@ def test_blocks_and_copies_of_what_is_learned_from(tmp_path):
     pieces = ["large", "large-block0", "large-block1"]
     wanted = [*pieces, *(f"{name}-copy0" for name in pieces), "small", "small-copy0"]
     assert list(sources) == ["exam", *wanted]
-    assert [name for name, source in sources.items() if source.validates] == ["exam"]
+    assert [name for name, source in sources.items() if source.is_validation] == ["exam"]
     counts = [len(sources[name].make()) for name in pieces]
     assert counts == [60, 40, 40]
     assert all(0 < len(source.make()) <= 60 for source in sources.values())
@@ -67,9 +67,9 @@ def test_blocks_and_copies_of_what_is_learned_from(tmp_path):
     assert not same_bits(*blocks)
 
 
-def test_files_above_the_largest_case_are_learned_from_in_pieces(tmp_path):
+def test_files_above_the_largest_scene_are_learned_from_in_pieces(tmp_path):
     write_scenes(tmp_path, ["exam", "large"], 60)
-    data = tiny_data(tmp_path, blocks=1, block_count=40, largest_case=59)
+    data = tiny_data(tmp_path, blocks=1, block_count=40, largest_scene=59)
     assert [source.name for source in find_sources(data, seed=0)] == ["exam", "large-block0"]
 
 
@@ -78,8 +78,8 @@ def test_generated_scenes_of_every_kind():
     data = DataConfig(generated=2, generated_validation=1, generated_counts=(50, 70))
     sources = find_sources(data, seed=4)
     first = VALIDATION_SEED + 4000
-    assert names_of(sources, validates=True) == [f"generated-{kind}-{first}" for kind in kinds]
-    assert names_of(sources, validates=False) == [
+    assert names_of(sources, is_validation=True) == [f"generated-{kind}-{first}" for kind in kinds]
+    assert names_of(sources, is_validation=False) == [
         f"generated-{kind}-{seed}" for seed in (4000, 4001) for kind in kinds
     ]
     assert [len(source.make()) for source in sources[:3]] == [50, 70, 50]
@@ -95,7 +95,9 @@ def test_names_and_identities_are_unique_and_depend_on_the_seed(tmp_path):
     assert len({source.name for source in first}) == len(first)
     assert len({source.identity for source in first}) == len(first)
     for one, two in zip(first, again, strict=True):
-        assert (one.name, one.identity, one.validates) == (two.name, two.identity, two.validates)
+        assert one.name == two.name
+        assert one.identity == two.identity
+        assert one.is_validation == two.is_validation
     changed = {source.identity for source in first} - {source.identity for source in other}
     # The second piece for seed 0 is the first one for seed 1.
     same = {"a", "b", "exam", "a-block1", "b-block1"}
@@ -192,7 +194,7 @@ def test_a_perturbed_scene_is_valid_and_another_one(seed):
     assert not torch.isin(other.sh0, scene.sh0).any()
 
 
-def test_the_dice_decide_what_is_perturbed():
+def test_the_seed_decides_what_is_perturbed():
     scene = small_scene(300)
     first, again, other = (perturb(scene, random.Random(seed)) for seed in (0, 0, 1))
     assert same_bits(first, again)
