@@ -1,8 +1,8 @@
 """Inflation: ``python -m docs.drawings.inflation docs/images/inflation.png``.
 
 Left: a row of opaque members in one dimension, what they paint together, and what the merged
-Gaussians of two cells paint with the moments of the cells and wider. Right: a generated
-object from moments alone and widened, over white, so that gaps show.
+Gaussians of two cells paint with their moments and inflated. Right: a generated object with
+moments only and inflated, over white, so that gaps show.
 """
 
 import argparse
@@ -27,10 +27,10 @@ def main() -> None:
     options = parser.parse_args()
     canvas, (left, middle, right) = figure(1, 3, width=10.4, height=3.7)
     draw_profile(left)
-    for axes, widened in ((middle, False), (right, True)):
-        axes.imshow(image_of_things(widened=widened))
+    for axes, inflated in ((middle, False), (right, True)):
+        axes.imshow(image_of_things(inflated=inflated))
         axes.set(xticks=[], yticks=[])
-        axes.set_title("widened" if widened else "moments only: gaps")
+        axes.set_title("inflated" if inflated else "moments only: gaps")
     save_small(canvas, options.output)
 
 
@@ -45,11 +45,11 @@ def draw_profile(axes: Axes) -> None:
     tau = -torch.log(torch.tensor(1 - OPACITY)) * WIDTH * MEMBERS / 2 / spread
     opacity = 1 - torch.exp(-tau)
     growth = 1 + opacity**2 * (torch.tensor(MEMBERS / 2).log10() / 2) * 0.5
-    for name, scale, style in (("moments", 1.0, "--"), ("widened", growth, "-")):
+    for name, scale, style in (("moments", 1.0, "--"), ("inflated", growth, "-")):
         painted = 1 - (1 - bells(x, middles, spread * scale, opacity)).prod(dim=0)
         axes.plot(x, painted, style, label=f"two merged Gaussians, {name}")
     axes.fill_between(x, together, color="0.85", label=f"{MEMBERS} members")
-    axes.set(xlabel="place", ylabel="opacity", ylim=(0, 1.45), yticks=[0, 0.5, 1])
+    axes.set(xlabel="position", ylabel="opacity", ylim=(0, 1.45), yticks=[0, 0.5, 1])
     axes.legend(loc="upper center", fontsize=8, frameon=False)
 
 
@@ -63,10 +63,10 @@ def bells(
     return opacity * torch.exp(-0.5 * ((x - centers[:, None]) / width) ** 2)
 
 
-def image_of_things(*, widened: bool) -> torch.Tensor:
+def image_of_things(*, inflated: bool) -> torch.Tensor:
     """Render an object by merged Gaussians without a network."""
     scene = cvtgs.synthetic.scene("object", 60_000, sh_degree=0, seed=4)
-    merge = {} if widened else {"inflation": 0.0, "covered_inflation": 0.0}
+    merge = {} if inflated else {"inflation": 0.0, "covered_inflation": 0.0}
     config = SimplifyConfig.from_mapping({"preset": "fast", "merge": merge | {"network": False}})
     small = cvtgs.Simplifier(None, config=config).simplify(scene, count=600)
     eye = torch.tensor([[2.2, -1.6, -2.2]])

@@ -1,7 +1,7 @@
-"""Reference against MergeNet: ``python -m docs.drawings.reference docs/images/reference.png``.
+"""Without and with MergeNet: ``python -m docs.drawings.reference docs/images/reference.png``.
 
-A generated courtyard of 100,000 Gaussians with 5,000 of them: by the moments of CVT-GS, by those of
-the preset ``standard``, and with the network of that preset; below, how far each is from the full.
+A generated courtyard of 100,000 Gaussians simplified to 5,000: by the moments of CVT-GS, by those
+of the preset ``standard``, and with its network; below, the differences to the full scene.
 """
 
 import argparse
@@ -26,7 +26,7 @@ def main() -> None:
     scenes = {
         "full": scene,
         "moments as in CVT-GS": cvtgs.Simplifier(None, config="paper").simplify(scene, RHO),
-        "reference of standard": cvtgs.Simplifier(None).simplify(scene, RHO),
+        "moments of standard": cvtgs.Simplifier(None).simplify(scene, RHO),
         "with MergeNet": cvtgs.Simplifier().simplify(scene, RHO),
     }
     with torch.no_grad():
