@@ -99,7 +99,7 @@ def describe_cells(
         neighbors: The nearest other cells of each of them.
         sizes: Number of members of every cell, of all cells.
         visibility: Ambient visibility of every Gaussian of the scene, 0 to 1
-            (:func:`cvtgs.cvt.ambient_visibility`).
+            (:func:`cvtgs.analysis.ambient_visibility`).
 
     Returns:
         The descriptors, in the dtype of the scene.

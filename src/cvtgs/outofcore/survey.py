@@ -28,7 +28,7 @@ class Depths(NamedTuple):
     """What one pass over some rows adds up.
 
     Attributes:
-        sums: The grid of optical depths (:func:`cvtgs.cvt.add_depths`).
+        sums: The grid of optical depths (:func:`cvtgs.analysis.add_depths`).
         mass: Opacity times area of all Gaussians, squared scene units.
         seen: The same as it looks from the middle.
         far: ``(f,)`` that of each Gaussian beyond 100 robust radii.
