@@ -99,7 +99,7 @@ def chart(
                     x=[watches[name].seconds(rho) for name in names],
                     y=[getattr(scores[name][number], metric) for name in names],
                     labels=names,
-                    aside=[name == "paper" for name in names],
+                    hollow=[name == "paper" for name in names],
                     markers=True,
                 )
             )

@@ -1,4 +1,4 @@
-"""Charts: PNG bytes of the asked size, and clear errors."""
+"""Charts: PNG bytes of the requested size, and clear errors."""
 
 import importlib.util
 import io
@@ -30,7 +30,7 @@ def shows(image: np.ndarray, color: str) -> bool:
 
 @needs_matplotlib
 @pytest.mark.parametrize("size", [(100, 100), (640, 333)])
-def test_the_bytes_are_a_png_of_the_asked_size(size):
+def test_the_bytes_are_a_png_of_the_requested_size(size):
     png = line_chart([Panel(series=[LOSS])], width=size[0], height=size[1])
     assert png[:8] == b"\x89PNG\r\n\x1a\n"
     assert struct.unpack(">II", png[16:24]) == size
@@ -126,9 +126,9 @@ def test_more_names_than_colours_and_styles_still_look_different():
     """The 25th line has the first colour and style again, but marks in another shape."""
     names = [str(number) for number in range(25)]
     panel = Panel(series=[Series(name=name, x=[0, 1], y=[1, 1]) for name in names])
-    looks = _styles([panel])
-    assert len({tuple(look.items()) for look in looks.values()}) == 25
-    assert looks["0"]["marker"] != looks["24"]["marker"]
+    styles = _styles([panel])
+    assert len({tuple(style.items()) for style in styles.values()}) == 25
+    assert styles["0"]["marker"] != styles["24"]["marker"]
     first, last = (
         line_chart([Panel(series=[*panel.series[:24], Series(name=name, x=[0, 1], y=[2, 3])])])
         for name in ("0", "24")
@@ -136,23 +136,23 @@ def test_more_names_than_colours_and_styles_still_look_different():
     assert first != last
 
 
-def test_more_names_than_looks_is_an_error():
+def test_more_names_than_styles_is_an_error():
     many = [Series(name=str(number), x=[0], y=[0]) for number in range(217)]
     with pytest.raises(InvalidArgumentError, match="at most 216 names apart, found 217"):
         line_chart([Panel(series=many)])
 
 
 @needs_matplotlib
-def test_points_aside_are_hollow_and_passed_by():
+def test_hollow_points_are_left_out_of_the_line():
     """A line through all three points would pass below the middle of the chart."""
-    line = Series(name="a", x=[0, 1, 2], y=[1, 0, 1], markers=True, aside=[False, True, False])
+    line = Series(name="a", x=[0, 1, 2], y=[1, 0, 1], markers=True, hollow=[False, True, False])
     drawn = pixels(line_chart([Panel(series=[line])], width=400, height=300))
     wanted = [int(COLORS[0][start : start + 2], 16) for start in (1, 3, 5)]
     blue = (drawn == wanted).all(axis=-1)
     rows = np.flatnonzero(blue.any(axis=1))
     middle = (rows.min() + rows.max()) // 2
     assert not blue[middle - 20 : middle + 20].any()
-    alone = Series(name="a", x=[1], y=[1], aside=[True])
+    alone = Series(name="a", x=[1], y=[1], hollow=[True])
     assert shows(pixels(line_chart([Panel(series=[alone])])), COLORS[0])
 
 
@@ -174,7 +174,7 @@ def test_labels_stand_next_to_their_points_and_not_on_one_another():
     ("more", "text"),
     [
         ({"labels": ["a"]}, "must have labels for all points or none; found 1 for 3."),
-        ({"aside": [True]}, "must have points aside for all points or none; found 1 for 3."),
+        ({"hollow": [True]}, "must have hollow flags for all points or none; found 1 for 3."),
     ],
 )
 def test_labels_for_some_points_are_an_error(more, text):

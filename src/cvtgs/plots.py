@@ -1,4 +1,4 @@
-"""Charts as PNG bytes; the only file that knows matplotlib, and it imports it when needed."""
+"""Draw charts as PNG bytes; the only file that imports matplotlib, and only when it draws."""
 
 import io
 import math
@@ -9,7 +9,7 @@ from typing import Any
 from cvtgs.errors import InvalidArgumentError, MissingDependencyError
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-"""Okabe and Ito 2008: told apart with any colour vision."""
+"""Okabe and Ito 2008: distinct with any colour vision."""
 
 STYLES = ("-", "--", ":")
 """Further series take the colours again, in the next style."""
@@ -20,7 +20,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<")
 DPI = 100
 SMALLEST_SIDE = 100
 
-_PLACES = (
+_LABEL_POSITIONS = (
     (0, 7, "center", "bottom"),
     (0, -7, "center", "top"),
     (7, 0, "left", "center"),
@@ -30,9 +30,9 @@ _PLACES = (
     (-6, 6, "right", "bottom"),
     (-6, -6, "right", "top"),
 )
-"""Where the label of a point may stand: how far right and up, and how it is aligned there."""
+"""Positions of a label near its point: points to the right and up, and alignments."""
 
-Box = tuple[float, float, float, float]
+Extents = tuple[float, float, float, float]
 """Left, lower, right and upper end in pixels."""
 
 
@@ -41,12 +41,12 @@ class Series:
     """One line.
 
     Attributes:
-        name: What the legend calls it; series of one name look alike in every panel.
-        x: Where its points are.
+        name: Its name in the legend; series of one name have one style in every panel.
+        x: Positions of its points.
         y: Their values; the line has gaps where they are not finite.
         markers: Whether its points are marked.
-        labels: What stands at each point; empty for nothing.
-        aside: Which points are hollow, and passed by by the line; empty for none.
+        labels: Text at each point; empty for none.
+        hollow: Which points are hollow and left out of the line; empty for none.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Series:
     y: Sequence[float]
     markers: bool = False
     labels: Sequence[str] = ()
-    aside: Sequence[bool] = ()
+    hollow: Sequence[bool] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,10 +63,10 @@ class Panel:
 
     Attributes:
         series: At least one.
-        title: Stands above.
+        title: Text above it.
         x_label: What x is, with its unit.
         y_label: What y is, with its unit.
-        x_ticks: Where to mark the x axis; empty leaves it to matplotlib.
+        x_ticks: Ticks of the x axis; chosen by matplotlib if empty.
         log_x: Whether the x axis is logarithmic.
         log_y: Whether the y axis is logarithmic.
     """
@@ -92,7 +92,7 @@ def line_chart(
 
     Args:
         panels: Row by row.
-        columns: Panels next to one another.
+        columns: Panels in a row.
         share_y: Whether the panels of a row have the same y axis.
         width: Pixels per row, at least 100.
         height: Rows, at least 100.
@@ -102,7 +102,7 @@ def line_chart(
 
     Raises:
         InvalidArgumentError: There is nothing to draw, a series has not as many x as y, labels
-            or points aside, there are more names than looks, the size is too small, or a value
+            or hollow flags, there are more names than styles, the size is too small, or a value
             does not fit its logarithmic axis.
         MissingDependencyError: matplotlib is not installed.
 
@@ -140,7 +140,7 @@ def line_chart(
 
 
 def _figure(width: float, height: float) -> Any:
-    """Make a figure that belongs to no window and no global list; inches."""
+    """Return a figure of a size in inches that belongs to no window and no global list."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 (optional)
         from matplotlib.figure import Figure  # noqa: PLC0415
@@ -155,33 +155,33 @@ def _figure(width: float, height: float) -> Any:
 
 
 def _styles(panels: Sequence[Panel]) -> dict[str, dict[str, str]]:
-    """Return every name a look of its own, in the order of appearance."""
+    """Return a style for every name, in the order of appearance."""
     names = dict.fromkeys(series.name for panel in panels for series in panel.series)
     most = len(COLORS) * len(STYLES) * len(MARKERS)
     if len(names) > most:
-        raise InvalidArgumentError(f"a chart tells at most {most} names apart, found {len(names)}.")
-    looks = [
+        raise InvalidArgumentError(f"a chart shows at most {most} names, found {len(names)}.")
+    styles = [
         {"color": color, "linestyle": style, "marker": marker}
         for marker in MARKERS
         for style in STYLES
         for color in COLORS
     ]
-    return dict(zip(names, looks, strict=False))
+    return dict(zip(names, styles, strict=False))
 
 
 def _draw(axes: Any, panel: Panel, styles: dict[str, dict[str, str]]) -> dict[str, Any]:
     lines = {}
     for series in panel.series:
-        look = dict(styles[series.name])
-        if not series.markers and len(series.y) > 1 and look["marker"] == MARKERS[0]:
-            del look["marker"]
-        aside = series.aside or [False] * len(series.y)
-        points = list(zip(series.x, map(_or_gap, series.y), aside, strict=True))
+        style = dict(styles[series.name])
+        if not series.markers and len(series.y) > 1 and style["marker"] == MARKERS[0]:
+            del style["marker"]
+        hollow = series.hollow or [False] * len(series.y)
+        points = list(zip(series.x, map(_or_gap, series.y), hollow, strict=True))
         x, y = _columns([point for point in points if not point[2]])
-        (lines[series.name],) = axes.plot(x, y, **look)
-        if any(aside):
-            look |= {"linestyle": "", "marker": styles[series.name]["marker"]}
-            axes.plot(*_columns([point for point in points if point[2]]), mfc="white", **look)
+        (lines[series.name],) = axes.plot(x, y, **style)
+        if any(hollow):
+            style |= {"linestyle": "", "marker": styles[series.name]["marker"]}
+            axes.plot(*_columns([point for point in points if point[2]]), mfc="white", **style)
     axes.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
     if panel.log_x:
         axes.set_xscale("log")
@@ -207,7 +207,7 @@ def _columns(points: Sequence[tuple[float, float, bool]]) -> tuple[list[float], 
 
 
 def _write_labels(axes: Any, panel: Panel) -> None:
-    """Write labels next to their points, where they hide least of points and other labels."""
+    """Write each label where it hides least of the points and of the other labels."""
     points = [
         (label, (x, y))
         for series in panel.series
@@ -216,37 +216,38 @@ def _write_labels(axes: Any, panel: Panel) -> None:
         )
         if math.isfinite(y)
     ]
-    middles = [axes.transData.transform(place) for _, place in points]
+    middles = [axes.transData.transform(point) for _, point in points]
     taken = [(x - 4, y - 4, x + 4, y + 4) for x, y in middles]
     frame = axes.get_window_extent().extents
-    for label, place in points:
+    for label, point in points:
         if label:
             text = axes.annotate(
-                label, place, xytext=(0, 0), textcoords="offset points", fontsize=8, color="#444444"
+                label, point, xytext=(0, 0), textcoords="offset points", fontsize=8, color="#444444"
             )
             text.set_bbox({"facecolor": "white", "alpha": 0.7, "linewidth": 0, "pad": 0.5})
             costs = [
-                _cost(_put(text, number), taken, frame) + number for number in range(len(_PLACES))
+                _cost(_put(text, number), taken, frame) + number
+                for number in range(len(_LABEL_POSITIONS))
             ]
             taken.append(_put(text, costs.index(min(costs))))
 
 
-def _put(text: Any, number: int) -> Box:
-    """Move a label to one of its places, and give its pixels there."""
-    right, up, horizontal, vertical = _PLACES[number]
+def _put(text: Any, number: int) -> Extents:
+    """Move a label to one of its positions, and return its pixels there."""
+    right, up, horizontal, vertical = _LABEL_POSITIONS[number]
     text.xyann = (right, up)
     text.set(horizontalalignment=horizontal, verticalalignment=vertical)
     x0, y0, x1, y1 = text.get_window_extent().extents
     return x0, y0, x1, y1
 
 
-def _cost(box: Box, taken: Sequence[Box], frame: Box) -> float:
-    """Return how much of others a label hides, and how much of it is outside, square pixels."""
+def _cost(box: Extents, taken: Sequence[Extents], frame: Extents) -> float:
+    """Return the area of others that a label hides, and of itself outside, in square pixels."""
     outside = _shared(box, box) - _shared(box, frame)
     return outside + sum(_shared(box, other) for other in taken)
 
 
-def _shared(one: Box, other: Box) -> float:
+def _shared(one: Extents, other: Extents) -> float:
     """Return the area that two boxes share, square pixels."""
     width = min(one[2], other[2]) - max(one[0], other[0])
     height = min(one[3], other[3]) - max(one[1], other[1])
@@ -276,7 +277,7 @@ def _check_series(series: Series, panel: Panel) -> None:
             f"series {series.name!r} must have as many x as y, and at least one; "
             f"found {len(series.x)} and {len(series.y)}."
         )
-    for name, number in (("labels", len(series.labels)), ("points aside", len(series.aside))):
+    for name, number in (("labels", len(series.labels)), ("hollow flags", len(series.hollow))):
         if number not in (0, len(series.x)):
             raise InvalidArgumentError(
                 f"series {series.name!r} must have {name} for all points or none; "

@@ -25,7 +25,7 @@ CAMERAS = Cameras(
 
 
 def python(program):
-    """Run a program in a fresh interpreter; give the lines that it prints."""
+    """Run a program in a fresh interpreter; return the lines that it prints."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     result = subprocess.run(
         [sys.executable, "-c", program],
@@ -121,7 +121,7 @@ def test_without_gsplat(monkeypatch):
 
 
 @pytest.mark.usefixtures("fresh_probe")
-def test_a_gsplat_that_fails_late_is_probed_once_and_its_first_line_told(monkeypatch):
+def test_a_gsplat_that_fails_late_is_probed_once_and_its_first_line_reported(monkeypatch):
     calls = []
 
     def rasterization(**_):
@@ -145,35 +145,38 @@ def test_a_gsplat_that_fails_late_is_probed_once_and_its_first_line_told(monkeyp
 
 @pytest.mark.parametrize("degree", [0, 2])
 @pytest.mark.parametrize("comments", [(), ("SplatRenderMode: mip",)], ids=["plain", "mip"])
-def test_what_gsplat_is_asked(monkeypatch, degree, comments):
+def test_arguments_of_gsplat(monkeypatch, degree, comments):
     """A stand-in for gsplat keeps its arguments; nothing here needs CUDA."""
-    asked = {}
+    arguments = {}
 
     def rasterization(**options):
-        asked.update(options)
+        arguments.update(options)
         layers = torch.arange(4.0).expand(1, 6, 8, 4)
         return layers, torch.full((1, 6, 8, 1), 0.5), {}
 
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
     scene = random_scene(5, degree=degree, dtype=torch.float64)
     scene = type(scene)(**scene.tensors(), comments=comments)
-    painting = gsplat_backend.rasterize(scene, CAMERAS, sh_degree=min(1, degree))
-    assert painting.rgb.dtype == torch.float64
-    assert painting.rgb[0, 0, 0].tolist() == [0, 1, 2]
-    assert painting.depth[0, 0, 0] == 3
-    assert painting.alpha[0, 0, 0] == 0.5
-    assert asked["colors"].shape == ((5, 4, 3) if degree else (5, 3))
-    assert asked["sh_degree"] == (1 if degree else None)
-    assert asked["rasterize_mode"] == ("antialiased" if comments else "classic")
-    assert (asked["near_plane"], asked["eps2d"], asked["packed"]) == (0.01, 0.3, False)
-    assert torch.equal(asked["scales"], scene.scales.float())
-    rotation, shift = asked["viewmats"][0, :3, :3].double(), asked["viewmats"][0, :3, 3].double()
+    output = gsplat_backend.rasterize(scene, CAMERAS, sh_degree=min(1, degree))
+    assert output.rgb.dtype == torch.float64
+    assert output.rgb[0, 0, 0].tolist() == [0, 1, 2]
+    assert output.depth[0, 0, 0] == 3
+    assert output.alpha[0, 0, 0] == 0.5
+    assert arguments["colors"].shape == ((5, 4, 3) if degree else (5, 3))
+    assert arguments["sh_degree"] == (1 if degree else None)
+    assert arguments["rasterize_mode"] == ("antialiased" if comments else "classic")
+    assert (arguments["near_plane"], arguments["eps2d"], arguments["packed"]) == (0.01, 0.3, False)
+    assert torch.equal(arguments["scales"], scene.scales.float())
+    rotation, shift = (
+        arguments["viewmats"][0, :3, :3].double(),
+        arguments["viewmats"][0, :3, 3].double(),
+    )
     wanted = scene.means @ CAMERAS.viewmats[0, :3, :3].double().T
     wanted = wanted + CAMERAS.viewmats[0, :3, 3].double()
     torch.testing.assert_close(
-        asked["means"].double() @ rotation.T + shift, wanted, rtol=0, atol=1e-5
+        arguments["means"].double() @ rotation.T + shift, wanted, rtol=0, atol=1e-5
     )
-    assert all(t.dtype == torch.float32 for t in asked.values() if isinstance(t, torch.Tensor))
+    assert all(t.dtype == torch.float32 for t in arguments.values() if isinstance(t, torch.Tensor))
 
 
 @pytest.mark.parametrize("backend", ["torch", *(["numba"] if find_spec("numba") else [])])

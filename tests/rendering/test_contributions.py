@@ -1,4 +1,4 @@
-"""Contributions: what every Gaussian paints of some images, and what presets make of it."""
+"""Contributions: the sums of each Gaussian's weights over images, and how presets use them."""
 
 import pytest
 import torch

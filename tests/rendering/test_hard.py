@@ -87,7 +87,7 @@ def test_hard_gaussians_have_finite_gradients(backend, dtype):
 
 
 @backends
-def test_rows_that_are_not_finite_paint_nothing(backend):
+def test_rows_that_are_not_finite_are_not_rendered(backend):
     good = random_scene(10, degree=0, size=0.3)
     for name in ("means", "quats", "log_scales", "logit_opacities"):
         for bad in (math.nan, math.inf):

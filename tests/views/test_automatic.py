@@ -229,7 +229,7 @@ def test_bad_arguments():
 
 
 def test_large_scenes_are_thinned_and_look_the_same(monkeypatch):
-    """What stays is wider, so that it paints as much: an image of it, and its views, say so."""
+    """The sample is enlarged, so that its masses and its views are those of the scene."""
     scene = cvtgs.synthetic.scene("courtyard", 6000, sh_degree=0, seed=3)
     whole = find_layout(scene)
     monkeypatch.setattr("cvtgs.views.layout.SAMPLE_SIZE", 3000)

@@ -1,4 +1,4 @@
-"""The backends: choose one by name, and what all of them take and give."""
+"""Choose a backend by name; the interface and the output that all backends share."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -63,7 +63,7 @@ def rasterize(
 
 
 def contributions(scene: GaussianScene, camera: Cameras) -> Tensor:
-    """Return the pixels that every Gaussian paints of one image."""
+    """Return every Gaussian's sum of weights ``alpha * T`` over one image."""
     return contributions_by_gradient(rasterize, scene, camera)
 
 

@@ -64,7 +64,7 @@ def render(
             that works on the scene's device.
         background: Colour behind everything, for all cameras or for each; black if None.
         sh_degree: Degree up to which colours depend on the direction; the scene's if None.
-        depth: Whether to give depths too.
+        depth: Whether to return depths too.
         listener: Called before the first camera and after each.
 
     Returns:

@@ -141,7 +141,7 @@ def tradeoff_chart(tradeoff: Tradeoff) -> bytes:
                     y=[result.psnr if metric == "psnr" else result.ssim for result in results],
                     markers=True,
                     labels=[result.preset for result in results],
-                    aside=[metric not in result.fronts for result in results],
+                    hollow=[metric not in result.fronts for result in results],
                 )
             )
         panels.append(
