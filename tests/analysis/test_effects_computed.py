@@ -8,7 +8,7 @@ import torch
 
 import cvtgs
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig, filters, pipeline, simplifier
-from cvtgs.cells import descriptors
+from cvtgs.cells import features
 from cvtgs.cvt import nearest
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import REST_COUNTS
@@ -260,8 +260,8 @@ def test_cells_of_one_member_are_not_shown_to_the_network(monkeypatch):
 
 
 def test_nothing_is_described_without_a_network(monkeypatch):
-    monkeypatch.setattr(descriptors, "describe_members", refuse)
-    monkeypatch.setattr("cvtgs.mergenet.correct.describe_members", refuse)
+    monkeypatch.setattr(features, "describe_members", refuse)
+    monkeypatch.setattr("cvtgs.mergenet.apply.describe_members", refuse)
     run_with(random_scene(100), merge={"network": False})
 
 

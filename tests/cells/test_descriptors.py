@@ -10,7 +10,7 @@ import mergenet_oracle as oracle
 import oracles
 from cvtgs import GaussianScene
 from cvtgs.cells import describe_cells
-from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES
+from cvtgs.cells.features import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES
 from mergenet_cases import (
     Case,
     assert_same_features,

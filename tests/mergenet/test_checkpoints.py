@@ -19,7 +19,7 @@ from cvtgs.mergenet import (
     load_checkpoint,
     save_checkpoint,
 )
-from cvtgs.mergenet.weights import LARGEST_FILE
+from cvtgs.mergenet.checkpoint import LARGEST_FILE
 from mergenet_cases import fields_of, lively_net, some_case
 
 SMALL = Architecture(width=2, cell_width=3)

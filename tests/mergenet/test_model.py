@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import mergenet_oracle as oracle
-from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES
+from cvtgs.cells.features import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES
 from cvtgs.mergenet import Architecture, MergeNet, Residuals
 from mergenet_cases import case_of, fields_of, lively_net, some_case, some_labels
 from scenes import random_scene

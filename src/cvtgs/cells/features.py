@@ -1,157 +1,400 @@
-"""Features: numbers that describe members, neighbours and cells, before they meet a network."""
+"""Descriptors: what MergeNet gets to see of a cell, nothing of which says where or how large it is.
 
-from typing import NamedTuple
+The values of one feature are one run of memory: sums of products over three components are then
+as fast as memory, and many times as fast as products of small matrices.
+"""
+
+from dataclasses import dataclass, fields
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cells.activated import ActivatedGaussians, contrasts_of, extents_in, places_in, take
+from cvtgs.cells.inflate import project_on_axes, side_cover
+from cvtgs.cells.partition import Partition
 from cvtgs.math import parameters
-from cvtgs.math.segments import segment_ids, segment_max, segment_sum
+from cvtgs.math.segments import gather_columns, segment_ids, segment_max, segment_sum
+from cvtgs.math.spherical_harmonics import SH_C0
+from cvtgs.scene import GaussianScene
 
-FARTHEST = 50.0
-"""All that is farther than this, in standard deviations, looks the same."""
+MEMBER_FEATURES = 19
+"""Numbers that describe a member to its cell."""
+
+PAIR_FEATURES = 18
+"""Numbers that describe a neighbour to a cell."""
+
+CELL_FEATURES = 19
+"""Numbers that describe a cell by itself."""
+
+LARGEST_DISTANCE = 50.0
+"""Features do not tell distances beyond this apart; in standard deviations."""
+
+LARGEST_POSITION, LARGEST_LOG = 1e4, 80.0
+"""Positions and scales are limited so that no product of them leaves float32."""
+
+LARGEST_CONTRAST = 1.0
+"""That of black and white: networks have hardly seen more, and take it for reasons to grow."""
 
 
-class SeenMembers(NamedTuple):
-    """Members as their cell sees them; the cells in those from ``counts``."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Descriptors:
+    """Some cells as a network sees them, in the dtype of the scene.
 
-    ids: Tensor
-    weights: Tensor
+    Every feature is relative to the merged Gaussian of the cell: in its frame, in its standard
+    deviations, and the same whichever way an axis points.
+
+    Attributes:
+        members: ``(n, 19)`` features of the members, those of one cell next to one another.
+        pairs: ``(m, k, 18)`` features of the neighbours of every cell.
+        cells: ``(m, 19)`` features of the cells.
+        weights: ``(n,)`` shares of the mass of the cell; those of one cell sum to 1.
+        offsets: ``(m + 1,)`` where each cell starts, and the end of the last one.
+        positions: ``(n, 3)`` where members are, from the centre of the cell, in its frame and in
+            its standard deviations.
+        pair_positions: ``(m, k, 3)`` the same of the neighbours.
+    """
+
+    members: Float[Tensor, "n d"]
+    pairs: Float[Tensor, "m k e"]
+    cells: Float[Tensor, "m c"]
+    weights: Float[Tensor, "n"]
+    offsets: Int[Tensor, "m_plus_1"]
+    positions: Float[Tensor, "n 3"]
+    pair_positions: Float[Tensor, "m k 3"]
+
+    def __len__(self) -> int:
+        """Return the number of cells."""
+        return len(self.cells)
+
+    def to(self, target: torch.device | torch.dtype) -> Self:
+        """Move the descriptors to a device, or convert them to another precision.
+
+        Args:
+            target: A device, or a dtype for all but ``offsets``.
+
+        Returns:
+            The descriptors there.
+        """
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        moves = {
+            name: value.to(target)
+            for name, value in values.items()
+            if isinstance(target, torch.device) or value.is_floating_point()
+        }
+        return type(self)(**(values | moves))
+
+
+class ActivatedGaussians(NamedTuple):
+    """Some Gaussians, activated, in the dtype of the scene."""
+
+    means: Tensor
+    rotations: Tensor
+    log_scales: Tensor
+    log_areas: Tensor
+    logits: Tensor
     opacities: Tensor
-    places: Tensor
+    colors: Tensor
+
+
+class RelativeGaussians(NamedTuple):
+    """Gaussians in the frame and the standard deviations of one merged Gaussian each."""
+
+    shifts: Tensor
+    positions: Tensor
     extents: Tensor
-    areas: Tensor
+    log_areas: Tensor
     contrasts: Tensor
-    lights: Tensor
+
+
+class NeighborContext(NamedTuple):
+    """Some merged Gaussians, the cover of both ends of their axes, and their neighbours.
+
+    ``cover_difference`` is the cover of the negative end less that of the positive one.
+    """
+
+    merged: ActivatedGaussians
+    cover: Tensor
+    cover_difference: Tensor
+    pairs: Tensor
+    positions: Tensor
+
+    def cut(self, run: slice) -> Self:
+        """Keep some consecutive cells."""
+        merged = ActivatedGaussians(*(values[run] for values in self.merged))
+        return type(self)(merged, *(values[run] for values in self[1:]))
+
+
+class CellTotals(NamedTuple):
+    """What the members of every cell give together; means are weighted by mass."""
+
     counts: Tensor
-    contrast: Tensor
-    light: Tensor
-    slope: Tensor
-    painted: Tensor
-    inner: Tensor
+    contrasts: Tensor
+    visibility: Tensor
+    visibility_gradients: Tensor
+    depths: Tensor
+    extents: Tensor
 
 
-def see_members(
-    members: ActivatedGaussians,
-    own: ActivatedGaussians,
-    offsets: Int[Tensor, "m_plus_1"],
-    lights: Float[Tensor, "n"],
-) -> SeenMembers:
-    """Express members by what their cell became."""
+def describe_cells(
+    scene: GaussianScene,
+    merged: GaussianScene,
+    part: Partition,
+    *,
+    cells: Int[Tensor, "m"],
+    neighbors: Int[Tensor, "m k"],
+    sizes: Int[Tensor, "m_all"],
+    visibility: Float[Tensor, "n_all"],
+) -> Descriptors:
+    """Describe some cells to their network.
+
+    After CVT-GS: position, size and direction of a member relative to its cell, its opacity, its
+    share of the mass, and how far its colour is from that of the cell. Ours differ: directions
+    are given by the extents along the axes of the cell (several quaternions say the same),
+    colours by their distance only; a cell knows its neighbours and which of its sides they
+    cover, and a member its ambient visibility.
+
+    Memory: about ``1.5 kB`` per member and per pair of neighbours.
+
+    Args:
+        scene: The Gaussians.
+        merged: One Gaussian per cell, of all cells.
+        part: Members of the cells to describe.
+        cells: Which cells those are.
+        neighbors: The nearest other cells of each of them.
+        sizes: Number of members of every cell, of all cells.
+        visibility: Ambient visibility of every Gaussian of the scene, 0 to 1
+            (:func:`cvtgs.analysis.ambient_visibility`).
+
+    Returns:
+        The descriptors, in the dtype of the scene.
+
+    Example:
+        >>> from cvtgs.cells import merge_cells
+        >>> from cvtgs.config import MergeConfig
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 5, sh_degree=0, seed=0)
+        >>> part = Partition.from_labels(torch.tensor([0, 0, 0, 1, 1]), 2)
+        >>> found = describe_cells(
+        ...     scene, merge_cells(scene, part, config=MergeConfig()), part,
+        ...     cells=torch.arange(2), neighbors=torch.tensor([[1], [0]]), sizes=part.counts,
+        ...     visibility=torch.ones(5),
+        ... )
+        >>> tuple(found.members.shape), tuple(found.pairs.shape), tuple(found.cells.shape)
+        ((5, 19), (2, 1, 18), (2, 19))
+    """
+    context = neighbor_context(merged, cells=cells, neighbors=neighbors, sizes=sizes)
+    return describe_members(scene, part, context=context, visibility=visibility)
+
+
+def neighbor_context(
+    scene: GaussianScene,
+    *,
+    cells: Int[Tensor, "m"],
+    neighbors: Int[Tensor, "m k"],
+    sizes: Int[Tensor, "m_all"],
+) -> NeighborContext:
+    """Describe the neighbours of some merged Gaussians, the same way as members.
+
+    Memory: about ``1 kB`` per neighbour.
+    """
+    others, shape = neighbors.flatten(), neighbors.shape
+    ids = torch.arange(len(cells), device=cells.device).repeat_interleave(shape[1])
+    merged, other = _activate(scene, cells), _activate(scene, others)
+    cover = side_cover(scene, cells, neighbors).to(merged.means.dtype)
+    difference = cover[:, :, 1] - cover[:, :, 0]
+    relative = _relate(merged, ids, other)
+    positions = relative.positions
+    back = _local_positions(other.rotations, other.log_scales, relative.shifts)
+    crowding = sizes[others].to(positions.dtype) / sizes[cells][ids].to(positions.dtype)
+    sides = difference.T.contiguous().index_select(1, ids).T
+    pairs = _columns(
+        *_distances(positions),
+        0.3 * relative.extents,
+        *_uncovered(positions / (1 + positions.abs()), sides),
+        _distance(back),
+        other.opacities,
+        0.2 * relative.log_areas,
+        0.2 * torch.log(crowding),
+        3 * relative.contrasts,
+        other.opacities * _density(back),
+        _density(positions),
+    )
+    return NeighborContext(
+        merged, cover, difference, pairs.unflatten(0, shape), positions.unflatten(0, shape)
+    )
+
+
+def describe_members(
+    scene: GaussianScene,
+    part: Partition,
+    *,
+    context: NeighborContext,
+    visibility: Float[Tensor, "n_all"],
+) -> Descriptors:
+    """Describe some cells whose neighbours are known, as :func:`describe_cells` does."""
+    offsets, rows = part.offsets, part.order
     ids = segment_ids(offsets)
-    cell = own.take(ids)
-    opacities = members.opacities
-    weights = _shares(members.log_areas + parameters.positive_log(opacities), offsets, ids)
-    contrasts = contrasts_of(members, cell)
-    places, extents = places_in(cell, members.means - cell.means), extents_in(cell, members)
-    areas = (members.log_areas - cell.log_areas).clamp(-14, 14)
-    totals = _total(
-        side_by_side(
-            weights * contrasts.square(),
-            weights * lights,
-            parameters.optical_depth_from_logit(members.logits) * torch.exp(areas),
-            weights[:, None] * torch.exp(2 * extents).clamp_max(4.0),
-        ),
-        offsets,
+    members = _activate(scene, rows)
+    relative = _relate(context.merged, ids, members)
+    visible = visibility.index_select(0, rows).to(members.means.dtype)
+    log_masses = members.log_areas + parameters.positive_log(members.opacities)
+    masses = torch.exp(log_masses - segment_max(log_masses, offsets).index_select(0, ids))
+    weights = masses / _sum(masses, offsets).index_select(0, ids)
+    totals = _total(members, relative, weights, visible, offsets=offsets, ids=ids)
+    sides = torch.cat([context.cover_difference.T, totals.visibility_gradients.T])
+    sides = sides.index_select(1, ids)
+    counts, contrasts, mean_visible = torch.stack(totals[:3]).index_select(1, ids)
+    positions = relative.positions
+    features = _columns(
+        *_distances(positions),
+        0.3 * relative.extents,
+        *_uncovered(positions.clamp(-4, 4), sides[:3].T),
+        0.3 * parameters.positive_log(weights * counts).clamp(-14, 14),
+        members.opacities,
+        0.2 * relative.log_areas,
+        3 * relative.contrasts,
+        0.5 * relative.contrasts / (contrasts + 0.02),
+        visible,
+        3 * (visible - mean_visible),
+        (sides[3:].T * positions).sum(dim=1).clamp(-3, 3),
     )
-    squares, light, painted = totals[:, :3].unbind(1)
-    lean = weights * (lights - light.index_select(0, ids))
-    return SeenMembers(
-        ids=ids,
+    return Descriptors(
+        members=features,
+        pairs=context.pairs,
+        cells=_cell_features(context, totals),
         weights=weights,
-        opacities=opacities,
-        places=places,
-        extents=extents,
-        areas=areas,
-        contrasts=contrasts,
-        lights=lights,
+        offsets=offsets,
+        positions=positions.clamp(-LARGEST_DISTANCE, LARGEST_DISTANCE),
+        pair_positions=context.positions.clamp(-LARGEST_DISTANCE, LARGEST_DISTANCE),
+    )
+
+
+def _activate(scene: GaussianScene, rows: Int[Tensor, "r"]) -> ActivatedGaussians:
+    means, quats, log_scales, colors = gather_columns(
+        rows, scene.means, scene.quats, scene.log_scales, scene.sh0[:, 0]
+    )
+    logits = parameters.clamp_logits(scene.logit_opacities.index_select(0, rows))
+    return ActivatedGaussians(
+        means=means,
+        rotations=parameters.quats_to_matrices(parameters.normalize_quats(quats)),
+        log_scales=log_scales,
+        log_areas=parameters.log_mean_projected_area(log_scales),
+        logits=logits,
+        opacities=torch.sigmoid(logits),
+        colors=colors * SH_C0,
+    )
+
+
+def _relate(
+    merged: ActivatedGaussians, ids: Int[Tensor, "n"], others: ActivatedGaussians
+) -> RelativeGaussians:
+    """Express each Gaussian in the frame of the merged one that ``ids`` gives."""
+    rotations = merged.rotations.permute(1, 2, 0).flatten(0, 1)
+    columns = [merged.means.T, rotations, merged.log_scales.T, merged.colors.T]
+    table = torch.cat([*columns, merged.log_areas[None]]).index_select(1, ids)
+    means, log_scales, colors = table[:3].T, table[12:15].T, table[15:18].T
+    rotations = table[3:12].unflatten(0, (3, 3)).permute(2, 0, 1)
+    shifts = others.means - means
+    largest = others.log_scales.amax(dim=1, keepdim=True)
+    scales = torch.exp(others.log_scales - largest)
+    x, y, z = (project_on_axes(rotations, others.rotations) * scales[:, None, :]).unbind(-1)
+    squares = x.square().addcmul_(y, y).addcmul_(z, z)
+    extents = 0.5 * parameters.positive_log(squares) + largest - log_scales
+    contrasts = (others.colors - colors).square().mean(dim=1).sqrt()
+    return RelativeGaussians(
+        shifts=shifts,
+        positions=_local_positions(rotations, log_scales, shifts),
+        extents=extents.clamp(-9, 9),
+        log_areas=(others.log_areas - table[18]).clamp(-14, 14),
+        contrasts=contrasts.clamp_max(LARGEST_CONTRAST),
+    )
+
+
+def _local_positions(rotations: Tensor, log_scales: Tensor, shifts: Tensor) -> Tensor:
+    """Express shifts in frames and in their standard deviations."""
+    turned = project_on_axes(rotations, shifts[:, :, None])[:, :, 0]
+    units = torch.exp((-log_scales).clamp(-LARGEST_LOG, LARGEST_LOG))
+    return (turned * units).clamp(-LARGEST_POSITION, LARGEST_POSITION)
+
+
+def _total(
+    members: ActivatedGaussians,
+    relative: RelativeGaussians,
+    weights: Float[Tensor, "n"],
+    visible: Float[Tensor, "n"],
+    *,
+    offsets: Int[Tensor, "m_plus_1"],
+    ids: Int[Tensor, "n"],
+) -> CellTotals:
+    """Sum over the members of every cell."""
+    depths = parameters.optical_depth_from_logit(members.logits) * torch.exp(relative.log_areas)
+    columns = _columns(
+        weights * relative.contrasts.square(),
+        weights * visible,
+        depths,
+        weights[:, None] * torch.exp(2 * relative.extents).clamp_max(4.0),
+    )
+    totals = _sum(columns, offsets)
+    squares, mean_visible, cell_depths = totals[:, :3].unbind(1)
+    lean = weights * (visible - mean_visible.index_select(0, ids))
+    return CellTotals(
         counts=offsets.diff().to(weights.dtype),
-        contrast=squares.sqrt(),
-        light=light,
-        slope=_total(lean[:, None] * places, offsets),
-        painted=painted,
-        inner=totals[:, 3:],
+        contrasts=squares.sqrt(),
+        visibility=mean_visible,
+        visibility_gradients=_sum(lean[:, None] * relative.positions, offsets),
+        depths=cell_depths,
+        extents=totals[:, 3:],
     )
 
 
-def member_features(seen: SeenMembers, bare: Float[Tensor, "m 3"]) -> Float[Tensor, "n d"]:
-    """Describe members: place, extent, side, share, opacity, area, contrast and light."""
-    ids, places = seen.ids, seen.places
-    share = parameters.positive_log(seen.weights * seen.counts.index_select(0, ids)).clamp(-14, 14)
-    towards_light = (take(seen.slope, ids) * places).sum(dim=1)
-    return side_by_side(
-        *distances(places),
-        0.3 * seen.extents,
-        *facing(places.clamp(-4, 4), take(bare, ids)),
-        0.3 * share,
-        seen.opacities,
-        0.2 * seen.areas,
-        3 * seen.contrasts,
-        0.5 * seen.contrasts / (seen.contrast.index_select(0, ids) + 0.02),
-        seen.lights,
-        3 * (seen.lights - seen.light.index_select(0, ids)),
-        towards_light.clamp(-3, 3),
-    )
-
-
-def cell_features(
-    own: ActivatedGaussians,
-    seen: SeenMembers,
-    sides: Float[Tensor, "m 3 2"],
-    pair_places: Float[Tensor, "m k 3"],
-) -> Float[Tensor, "m c"]:
-    """Describe cells: cover of the sides, share of inner extent, size, opacity, shape and light."""
-    painted = parameters.positive_log(seen.painted)
-    shape = own.log_scales
-    distances = pair_places.square().sum(dim=2).sqrt()
-    nearest = torch.nn.functional.pad(distances, (0, 1), value=FARTHEST).amin(dim=1)
-    return side_by_side(
-        sides.amin(dim=2),
-        sides.amax(dim=2),
-        seen.inner,
-        0.2 * torch.log(seen.counts),
-        own.opacities,
-        0.2 * own.logits,
-        0.3 * painted.clamp(-14, 14),
-        0.5 * (shape[:, 0] - shape[:, 1]).clamp(-8, 8),
-        0.3 * (shape[:, 1] - shape[:, 2]).clamp(-8, 8),
-        5 * seen.contrast,
-        seen.light,
-        torch.linalg.vector_norm(seen.slope, dim=1).clamp_max(3.0),
+def _cell_features(context: NeighborContext, totals: CellTotals) -> Float[Tensor, "m c"]:
+    """Describe cells: cover, inner extent, count, opacity, depth, shape, contrast, visibility."""
+    merged, log_scales = context.merged, context.merged.log_scales
+    distances = context.positions.square().sum(dim=2).sqrt()
+    nearest = torch.nn.functional.pad(distances, (0, 1), value=LARGEST_DISTANCE).amin(dim=1)
+    return _columns(
+        context.cover.amin(dim=2),
+        context.cover.amax(dim=2),
+        totals.extents,
+        0.2 * torch.log(totals.counts),
+        merged.opacities,
+        0.2 * merged.logits,
+        0.3 * parameters.positive_log(totals.depths).clamp(-14, 14),
+        0.5 * (log_scales[:, 0] - log_scales[:, 1]).clamp(-8, 8),
+        0.3 * (log_scales[:, 1] - log_scales[:, 2]).clamp(-8, 8),
+        5 * totals.contrasts,
+        totals.visibility,
+        torch.linalg.vector_norm(totals.visibility_gradients, dim=1).clamp_max(3.0),
         torch.log1p(nearest),
     )
 
 
-def _shares(logs: Tensor, offsets: Tensor, ids: Tensor) -> Tensor:
-    """Turn logarithms of masses into shares of the mass of the cell."""
-    masses = torch.exp(logs - segment_max(logs, offsets).index_select(0, ids))
-    return masses / _total(masses, offsets).index_select(0, ids)
-
-
-def _total(values: Tensor, offsets: Tensor) -> Tensor:
+def _sum(values: Tensor, offsets: Tensor) -> Tensor:
     """Sum over the members of every cell, in float64."""
     return segment_sum(values.double(), offsets).to(values.dtype)
 
 
-def side_by_side(*features: Tensor) -> Tensor:
-    """Make one column of each number, in memory column by column."""
+def _columns(*features: Tensor) -> Tensor:
+    """Join features, each a column or several, in memory column by column."""
     return torch.cat([part.T if part.ndim == 2 else part[None] for part in features]).T
 
 
-def distances(places: Tensor) -> tuple[Tensor, Tensor]:
+def _distances(positions: Tensor) -> tuple[Tensor, Tensor]:
     """Return distances along every axis and as a whole, compressed."""
-    return torch.log1p(places.abs().clamp_max(FARTHEST)), length(places)
+    return torch.log1p(positions.abs().clamp_max(LARGEST_DISTANCE)), _distance(positions)
 
 
-def length(places: Tensor) -> Tensor:
-    """Return distances, compressed."""
-    lengths = places.square().sum(dim=1).sqrt()
-    return torch.log1p(lengths.clamp_max(FARTHEST))
+def _distance(positions: Tensor) -> Tensor:
+    return torch.log1p(positions.square().sum(dim=1).sqrt().clamp_max(LARGEST_DISTANCE))
 
 
-def facing(places: Tensor, bare: Tensor) -> tuple[Tensor, Tensor]:
-    """Return whether places lie on the bare or on the covered side, by axis and as a whole."""
-    by_axis = 0.5 * bare * places
+def _uncovered(positions: Tensor, cover_difference: Tensor) -> tuple[Tensor, Tensor]:
+    """Return how far positions lie on the side of less cover, by axis and as a whole."""
+    by_axis = 0.5 * cover_difference * positions
     return by_axis, by_axis.sum(dim=1)
+
+
+def _density(positions: Tensor) -> Tensor:
+    """Return the unnormalised density of a Gaussian at positions in its standard deviations."""
+    return torch.exp(-0.5 * positions.square().sum(dim=1).clamp_max(60.0))

@@ -1,4 +1,4 @@
-"""Partition: which Gaussians make up which cell, as consecutive runs of row numbers."""
+"""Partition: the row numbers of the members of every cell, cell by cell."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Partition:
 
     @classmethod
     def from_labels(cls, labels: Int[Tensor, "n"], count: int) -> Self:
-        """Collect the members of every cell.
+        """Build the partition of labelled rows.
 
         Args:
             labels: Cell of every row, 0 to ``count - 1``.
@@ -78,11 +78,11 @@ class Partition:
         offsets = torch.nn.functional.pad(counts[cells].cumsum(0), (1, 0))
         return type(self)(order=self.order[members], offsets=offsets)
 
-    def keep_only(self, lone: Int[Tensor, "m"]) -> Self:
-        """Leave one member in some cells.
+    def keep_only(self, rows: Int[Tensor, "m"]) -> Self:
+        """Keep one member of some cells.
 
         Args:
-            lone: The row number of the member that stays; -1 leaves a cell as it is.
+            rows: The row number of the member to keep; -1 keeps all members of a cell.
 
         Returns:
             The partition of the same cells.
@@ -92,10 +92,10 @@ class Partition:
             >>> whole.keep_only(torch.tensor([-1, 2])).order.tolist()
             [1, 2]
         """
-        only = torch.repeat_interleave(lone, self.counts)
-        counts = torch.where(lone < 0, self.counts, 1)
-        offsets = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
-        return type(self)(order=self.order[(only < 0) | (only == self.order)], offsets=offsets)
+        counts = self.counts
+        kept = torch.repeat_interleave(rows, counts)
+        offsets = torch.nn.functional.pad(torch.where(rows < 0, counts, 1).cumsum(0), (1, 0))
+        return type(self)(order=self.order[(kept < 0) | (kept == self.order)], offsets=offsets)
 
     def cut(self, run: slice) -> Self:
         """Keep some consecutive cells.

@@ -1,4 +1,4 @@
-"""Reductions over consecutive runs of rows (CSR segments), deterministic on every device."""
+"""Consecutive runs of rows (CSR segments): gathering and deterministic reductions."""
 
 import math
 from typing import Any
@@ -28,6 +28,26 @@ def sort_by_label(
     order = torch.sort(labels.to(torch.int32), stable=True).indices
     ends = torch.bincount(labels, minlength=count).cumsum(0)
     return order, torch.nn.functional.pad(ends, (1, 0))
+
+
+def gather_columns(
+    rows: Int[Tensor, "r"], *tables: Float[Tensor, "n c"]
+) -> tuple[Float[Tensor, "r c"], ...]:
+    """Take rows that lie all over narrow tables.
+
+    Args:
+        rows: Row numbers.
+        tables: One or more tables of a few columns.
+
+    Returns:
+        The rows of every table; the values of one column are one run of memory, so that sums of
+        products over columns are as fast as memory.
+
+    Example:
+        >>> gather_columns(torch.tensor([2, 0]), torch.eye(3))[0].tolist()
+        [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+    """
+    return tuple(table.T.gather(1, rows.expand(table.shape[1], -1)).T for table in tables)
 
 
 def segment_sum(

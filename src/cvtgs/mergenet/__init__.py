@@ -1,15 +1,14 @@
-"""MergeNet: learned corrections of merged Gaussians; sees descriptors only."""
+"""MergeNet: learned corrections of merged Gaussians, predicted from descriptors alone."""
 
-from cvtgs.mergenet.compose import compose
-from cvtgs.mergenet.correct import correct_cells
-from cvtgs.mergenet.model import Architecture, MergeNet, Residuals
-from cvtgs.mergenet.weights import (
+from cvtgs.mergenet.apply import compose, correct_cells
+from cvtgs.mergenet.checkpoint import (
     SHIPPED,
     Checkpoint,
     CheckpointInfo,
     load_checkpoint,
     save_checkpoint,
 )
+from cvtgs.mergenet.model import Architecture, MergeNet, Residuals
 
 __all__ = [
     "SHIPPED",

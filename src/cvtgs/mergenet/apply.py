@@ -1,0 +1,181 @@
+"""Apply MergeNet: correct every cell of a scene by the residuals that the network predicts."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cvtgs.cells import Partition
+from cvtgs.cells.features import describe_members, neighbor_context
+from cvtgs.math import parameters
+from cvtgs.math.segments import segment_sum, segment_sum_of
+from cvtgs.mergenet.model import MergeNet, Residuals
+from cvtgs.scene import GaussianScene
+
+CHUNK_MEMBERS = 1 << 15
+"""Members and neighbours that are described together; each takes about ``2 kB``."""
+
+
+def correct_cells(
+    net: MergeNet,
+    scene: GaussianScene,
+    merged: GaussianScene,
+    partition: Partition,
+    *,
+    neighbors: Int[Tensor, "m k"],
+    visibility: Float[Tensor, "n"],
+    sizes: Int[Tensor, "m_all"] | None = None,
+    on_cells: Callable[[int], None] = lambda done: None,
+) -> GaussianScene:
+    """Correct every merged Gaussian of several members by a network.
+
+    Args:
+        net: The network, on the device of the scene.
+        scene: The Gaussians, with valid rows.
+        merged: One Gaussian per cell, those of the partition first; others that follow are only
+            neighbours.
+        partition: Members of the cells; cells of one member stay as they are.
+        neighbors: The nearest other cells of every cell of the partition.
+        visibility: Ambient visibility of every Gaussian of the scene, 0 to 1.
+        sizes: Number of members of every cell in ``merged``; None if all are in the partition.
+        on_cells: Called with the number of cells that are done.
+
+    Returns:
+        The scene with corrected Gaussians.
+
+    Example:
+        >>> from cvtgs.cells import merge_cells
+        >>> from cvtgs.config import MergeConfig
+        >>> from cvtgs.mergenet import Architecture
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 5, sh_degree=0, seed=0)
+        >>> cells = Partition.from_labels(torch.tensor([0, 0, 0, 1, 1]), 2)
+        >>> merged = merge_cells(scene, cells, config=MergeConfig())
+        >>> untrained = MergeNet(Architecture())
+        >>> corrected = correct_cells(
+        ...     untrained, scene, merged, cells,
+        ...     neighbors=torch.tensor([[1], [0]]), visibility=torch.ones(5),
+        ... )
+        >>> bool((corrected.means == merged.means).all())
+        True
+    """
+    counts, near = partition.counts, neighbors.shape[1]
+    sizes = counts if sizes is None else sizes
+    is_merged = counts > 1
+    cells = is_merged.nonzero()[:, 0]
+    several = partition.select(is_merged)
+    done = len(counts) - len(cells)
+    originals = merged.tensors()
+    tensors = {name: values.clone() for name, values in originals.items() if values.numel()}
+    step = max(1, CHUNK_MEMBERS // max(1, near))
+    with torch.no_grad():
+        for block in (slice(start, start + step) for start in range(0, len(cells), step)):
+            context = neighbor_context(
+                merged, cells=cells[block], neighbors=neighbors[cells[block]], sizes=sizes
+            )
+            for run, part in several.cut(block).chunks(CHUNK_MEMBERS, cell_cost=near):
+                rows = cells[block][run]
+                descriptors = describe_members(
+                    scene, part, context=context.cut(run), visibility=visibility
+                )
+                corrected = compose(
+                    scene,
+                    merged,
+                    part,
+                    cells=rows,
+                    neighbors=neighbors[rows],
+                    residuals=net(descriptors),
+                )
+                for name, values in tensors.items():
+                    values[rows] = corrected[name]
+                done += run.stop - run.start
+                on_cells(done)
+    # Near the limits of the dtype (a flyaway at 3e38) a correction may overflow.
+    tensors = {
+        name: torch.where(values.isfinite(), values, originals[name])
+        for name, values in tensors.items()
+    }
+    return merged.with_tensors(tensors, merged.extras)
+
+
+def compose(
+    scene: GaussianScene,
+    merged: GaussianScene,
+    part: Partition,
+    *,
+    cells: Int[Tensor, "m"],
+    neighbors: Int[Tensor, "m k"],
+    residuals: Residuals,
+) -> dict[str, Tensor]:
+    """Correct some merged Gaussians.
+
+    Centres move and shapes turn in the frame of each merged Gaussian; log scales and opacity
+    logits are added to; colours of every SH band mix in the differences of members and neighbours.
+    Residuals of zero give the merged Gaussians bit for bit. Differentiable in the residuals.
+
+    Args:
+        scene: The Gaussians.
+        merged: One Gaussian per cell, of all cells.
+        part: Members of the cells to correct.
+        cells: Which cells those are.
+        neighbors: The nearest other cells of each of them.
+        residuals: What to change of them.
+
+    Returns:
+        The standard tensors of these cells, by name.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 2, sh_degree=0, seed=0)
+        >>> merged, none = scene.select(torch.tensor([0])), torch.zeros(1, 3)
+        >>> residuals = Residuals(
+        ...     d_means=none, d_log_scales=none + 0.5, d_rotvecs=none, d_logit_opacities=none[:, 0],
+        ...     member_colors=torch.tensor([0.0, 1.0]), pair_colors=torch.zeros(1, 0),
+        ... )
+        >>> tensors = compose(
+        ...     scene, merged, Partition.from_labels(torch.tensor([0, 0]), 1),
+        ...     cells=torch.tensor([0]), neighbors=torch.zeros(1, 0, dtype=torch.int64),
+        ...     residuals=residuals,
+        ... )
+        >>> bool((tensors["log_scales"] == merged.log_scales + 0.5).all())
+        True
+        >>> bool(torch.isclose(tensors["sh0"][0], scene.sh0[1], atol=1e-6).all())
+        True
+    """
+    means, quats, log_scales, logits = (
+        values.index_select(0, cells)
+        for values in (merged.means, merged.quats, merged.log_scales, merged.logit_opacities)
+    )
+    axes = parameters.quats_to_matrices(parameters.normalize_quats(quats))
+    moves = torch.einsum("mij,mj->mi", axes, torch.exp(log_scales) * residuals.d_means)
+    tensors = {
+        "means": means + moves,
+        "quats": _rotate(quats, residuals.d_rotvecs),
+        "log_scales": log_scales + residuals.d_log_scales,
+        "logit_opacities": logits + residuals.d_logit_opacities,
+    }
+    ends = torch.arange(len(cells) + 1, device=cells.device) * neighbors.shape[1]
+    others, pair_shares = neighbors.flatten(), residuals.pair_colors.flatten()
+    member_totals = segment_sum(residuals.member_colors, part.offsets)[:, None, None]
+    pair_totals = segment_sum(pair_shares, ends)[:, None, None]
+    for name in ("sh0", "shN"):
+        table = getattr(merged, name)
+        bands = table.index_select(0, cells)
+        if bands.shape[1]:
+            # What sets members and neighbours apart from the cell, each by its share.
+            mixed = segment_sum_of(
+                getattr(scene, name), part.order, part.offsets, residuals.member_colors
+            )
+            borrowed = segment_sum_of(table, others, ends, pair_shares)
+            bands = bands + (mixed - bands * member_totals) + (borrowed - bands * pair_totals)
+        tensors[name] = bands
+    return tensors
+
+
+def _rotate(quats: Float[Tensor, "m 4"], rotvecs: Float[Tensor, "m 3"]) -> Float[Tensor, "m 4"]:
+    """Rotate about the own axes: the product with ``(1, v / 2)``, of the same length."""
+    half = rotvecs / 2
+    factor = torch.cat([torch.ones_like(half[:, :1]), half], dim=1)
+    length = torch.sqrt(1 + half.square().sum(dim=1, keepdim=True))
+    return parameters.multiply_quats(quats, factor) / length
