@@ -1,33 +1,25 @@
 """The page in a real browser: does its script run, does it fit a phone, is it quiet."""
 
 import re
-import shutil
 import subprocess
-from pathlib import Path
 
 import pytest
 
 import cvtgs
+from browser_cases import (
+    BROWSER,
+    QUIET,
+    attribute,
+    browse,
+    dom,
+    layout_on_a_phone,
+    needs_browser,
+    text_of,
+)
 from cvtgs.evaluation import EvaluationSettings, compare, write_comparison
 from cvtgs.views import automatic_views
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
-QUIET = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--disable-dev-shm-usage",
-    "--hide-scrollbars",
-)
-
-pytestmark = pytest.mark.skipif(
-    BROWSER is None, reason=f"needs one of {', '.join(BROWSERS)} on the PATH"
-)
+pytestmark = needs_browser
 
 
 @pytest.fixture(scope="module")
@@ -46,45 +38,6 @@ def page(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     write_comparison(comparison, folder)
     return folder / "index.html", comparison.evaluation
-
-
-def layout_on_a_phone(path: Path) -> str:
-    """A window cannot be as narrow as a phone, a frame can."""
-    holder = path.parent / "phone.html"
-    holder.write_text(
-        f'<iframe id="phone" src="{path.name}" style="width:390px;height:800px;border:0"></iframe>'
-        "<script>setTimeout(() => { const page = phone.contentDocument.documentElement;"
-        "document.documentElement.dataset.layout = page.dataset.layout + ' ' + "
-        "page.scrollWidth; }, 1500)</script>",
-        encoding="utf-8",
-    )
-    html = browse(holder, "", "--allow-file-access-from-files", "--dump-dom")
-    return attribute(html, "layout")
-
-
-def browse(path: Path, hash_: str, *arguments: str) -> str:
-    command = [
-        str(BROWSER),
-        *QUIET,
-        f"--user-data-dir={path.parent / 'profile'}",
-        "--virtual-time-budget=3000",
-        *arguments,
-        path.as_uri() + hash_,
-    ]
-    done = subprocess.run(command, capture_output=True, timeout=120, check=True)
-    return done.stdout.decode()
-
-
-def dom(path: Path, hash_: str = "", size: str = "1280,900") -> str:
-    return browse(path, hash_, f"--window-size={size}", "--dump-dom")
-
-
-def attribute(html: str, name: str) -> str:
-    return re.search(rf'<html[^>]* data-{name}="([^"]*)"', html).group(1)
-
-
-def text_of(html: str, name: str) -> str:
-    return re.search(rf'id="{name}"[^>]*>([^<]*)<', html).group(1)
 
 
 @pytest.mark.slow

@@ -3,16 +3,14 @@
 import re
 
 import pytest
-from test_page_browser import BROWSER, BROWSERS, attribute, dom, layout_on_a_phone
 
 import cvtgs
+from browser_cases import attribute, dom, layout_on_a_phone, needs_browser
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.tradeoff import measure_tradeoff, write_tradeoff
 from cvtgs.views import automatic_views
 
-pytestmark = pytest.mark.skipif(
-    BROWSER is None, reason=f"needs one of {', '.join(BROWSERS)} on the PATH"
-)
+pytestmark = needs_browser
 
 
 @pytest.fixture(scope="module")

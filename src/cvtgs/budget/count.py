@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import GoalError, InvalidArgumentError
-from cvtgs.evaluation.scorer import Metrics, Scorer, scene_scores
+from cvtgs.evaluation.scorer import MOST_PSNR, Metrics, Scorer, scene_scores
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import Simplified, SimplifyReport
 from cvtgs.scene import GaussianScene
@@ -22,9 +22,6 @@ HELDOUT_SEED = 307
 
 VIEWS, WIDTH, HEIGHT = 8, 640, 480
 """As many and as large as ``cvtgs evaluate`` takes: scores depend on the size of images."""
-
-MOST_PSNR = 60.0
-"""Images that are closer than this count as equal, dB."""
 
 MOST_SHARE = 0.9
 """Scenes that keep more are not worth their loss: the full scene is hardly larger."""

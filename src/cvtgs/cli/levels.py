@@ -50,7 +50,7 @@ def add_levels(add_parser: AddParser) -> None:
 
 def levels(options: argparse.Namespace) -> None:
     """Run ``cvtgs levels``."""
-    from cvtgs.levels.write import check_levels
+    from cvtgs.levels import check_levels
 
     check_view_options(options)
     rhos = sorted(read_ratios(options.rho), reverse=True)

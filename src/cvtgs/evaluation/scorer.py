@@ -23,6 +23,9 @@ LpipsChoice = Literal["auto", "vgg", "alex", "off"]
 Color = tuple[float, float, float]
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
+MOST_PSNR = 60.0
+"""Where scores are compared, images that are closer than this count as equal, dB."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationSettings:

@@ -9,7 +9,7 @@ from torch import Tensor
 from cvtgs.analysis import ambient_visibility
 from cvtgs.config import Rates, RefineConfig
 from cvtgs.cvt import nearest_backend
-from cvtgs.evaluation.scorer import Scorer
+from cvtgs.evaluation.scorer import MOST_PSNR, Scorer
 from cvtgs.losses import relative_loss
 from cvtgs.math import parameters
 from cvtgs.math.frames import robust_frame
@@ -22,9 +22,6 @@ from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, valid_rows, with_finite_opacities
 
 STAGE = "refine"
-
-MOST_PSNR = 60.0
-"""Images that are nearer to each other count as equal, dB."""
 
 _BETAS = (0.6, 0.99)
 _LEAST_ROOT = 1e-15

@@ -221,11 +221,11 @@ def heading(tradeoff: Tradeoff, rho: float) -> str:
 
 def how_measured(tradeoff: Tradeoff) -> str:
     """Report where and how this was measured."""
-    seen = tradeoff.evaluation
+    evaluation = tradeoff.evaluation
     return (
-        f"{len(seen.views)} views of {seen.width} x {seen.height} pixels, rendered by "
-        f"{seen.backend}. Every run is a process of its own on {tradeoff.machine}. "
-        f"{seen.lpips_sentence}"
+        f"{len(evaluation.views)} views of {evaluation.width} x {evaluation.height} pixels, "
+        f"rendered by {evaluation.backend}. Every run is a process of its own on "
+        f"{tradeoff.machine}. {evaluation.lpips_sentence}"
     ).rstrip()
 
 

@@ -2,11 +2,11 @@
 
 import os
 import platform
-import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import torch
@@ -14,7 +14,7 @@ import torch
 from cvtgs.cameras import Cameras
 from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import RunError
-from cvtgs.evaluation import Comparison, EvaluationSettings, SceneScores, compare
+from cvtgs.evaluation import Comparison, EvaluationSettings, compare
 from cvtgs.io import load
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.scene import GaussianScene
@@ -79,12 +79,11 @@ def measure_tradeoff(
         RunError: All runs failed.
 
     Example:
-        >>> import tempfile
         >>> from cvtgs.io import save
         >>> from cvtgs.synthetic import scene as make
         >>> def look(scene):
         ...     return automatic_views(scene, 2, width=32, height=24)
-        >>> with tempfile.TemporaryDirectory() as name:
+        >>> with TemporaryDirectory() as name:
         ...     path = Path(name) / "full.ply"
         ...     save(make("object", 500, sh_degree=0), path)
         ...     found = measure_tradeoff(path, presets=["standard"], ratios=[0.1], cameras=look)
@@ -95,7 +94,9 @@ def measure_tradeoff(
     where = chosen_device(device)
     full = load(source).to(where)
     views = cameras(full)
-    with _folder(folder) as place:
+    kept = None if folder is None else nullcontext(folder)
+    with kept or TemporaryDirectory(prefix="cvtgs-") as name:
+        place = Path(name)
         start = start_seconds()
         done = list(run_tasks(source, tasks, place, device=device, listener=listener))
         runs = [one for one in done if isinstance(one, Run)]
@@ -105,24 +106,36 @@ def measure_tradeoff(
         for failure in failures:
             warnings.warn(f"{failure.name} failed: {failure.reason}", UserWarning, stacklevel=2)
         sizes = {run.task.name: run.path.stat().st_size for run in runs}
-        name = Path(source).name
+        source_name = Path(source).name
         comparison = compare(
             full,
             {run.task.name: load(run.path).to(where) for run in runs},
             views,
-            reference_name=name,
-            sizes=sizes | {name: Path(source).stat().st_size},
+            reference_name=source_name,
+            sizes=sizes | {source_name: Path(source).stat().st_size},
             settings=settings,
             listener=listener,
         )
     results = [
-        _result(run, scores, sizes[run.task.name])
+        TradeoffResult(
+            name=run.task.name,
+            preset=run.task.preset,
+            rho=run.task.rho,
+            count=scores.count,
+            bytes=sizes[run.task.name],
+            seconds=run.cost.wall_seconds,
+            peak_memory_bytes=run.cost.peak_memory_bytes,
+            psnr=scores.psnr.mean,
+            ssim=scores.ssim.mean,
+            lpips=scores.lpips.mean if scores.lpips else None,
+            report=run.report,
+        )
         for run, scores in zip(runs, comparison.evaluation.scenes, strict=True)
     ]
     tradeoff = Tradeoff(
-        source=name,
+        source=source_name,
         source_count=len(full),
-        source_bytes=comparison.sizes[name],
+        source_bytes=comparison.sizes[source_name],
         start_seconds=start,
         machine=f"{device_name(where)}, {os.cpu_count()} cores, "
         f"Python {platform.python_version()}, torch {torch.__version__}",
@@ -131,28 +144,3 @@ def measure_tradeoff(
         failures=failures,
     )
     return Measured(tradeoff, comparison)
-
-
-@contextmanager
-def _folder(wanted: str | os.PathLike[str] | None) -> Iterator[Path]:
-    if wanted is not None:
-        yield Path(wanted)
-        return
-    with tempfile.TemporaryDirectory(prefix="cvtgs-") as name:
-        yield Path(name)
-
-
-def _result(run: Run, scores: SceneScores, size: int) -> TradeoffResult:
-    return TradeoffResult(
-        name=run.task.name,
-        preset=run.task.preset,
-        rho=run.task.rho,
-        count=scores.count,
-        bytes=size,
-        seconds=run.cost.wall_seconds,
-        peak_memory_bytes=run.cost.peak_memory_bytes,
-        psnr=scores.psnr.mean,
-        ssim=scores.ssim.mean,
-        lpips=None if scores.lpips is None else scores.lpips.mean,
-        report=run.report,
-    )
