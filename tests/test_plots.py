@@ -138,7 +138,7 @@ def test_more_names_than_colours_and_styles_still_look_different():
 
 def test_more_names_than_styles_is_an_error():
     many = [Series(name=str(number), x=[0], y=[0]) for number in range(217)]
-    with pytest.raises(InvalidArgumentError, match="at most 216 names apart, found 217"):
+    with pytest.raises(InvalidArgumentError, match="at most 216 names, found 217"):
         line_chart([Panel(series=many)])
 
 
