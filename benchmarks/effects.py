@@ -19,7 +19,7 @@ import torch
 import cvtgs
 from benchmarks.processes import machine, run_python
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
-from cvtgs.analysis import BAND_LOSS, measures
+from cvtgs.analysis import BAND_LOSS, band_losses, duplicate_share, far_share, plan_haze
 from cvtgs.evaluation import psnr
 from cvtgs.math.frames import robust_frame
 from cvtgs.scene import ANTIALIASED_TAG, FLAT_LOG_SCALE
@@ -213,10 +213,10 @@ def figure_table(count: int) -> str:
     scene = without_bands(count)
     frame, masses, opacities = robust_frame(scene.means), scene.masses, scene.opacities
     parts: Mapping[str, Callable[[], object]] = {
-        "sh": lambda: measures.band_losses(scene, enough=BAND_LOSS),
-        "unbounded": lambda: measures.far_share(scene.means, masses, frame),
-        "haze": lambda: measures.faint_share(opacities, masses, below=0.1),
-        "duplicates": lambda: measures.duplicate_share(scene.means, scene.sh0),
+        "sh": lambda: band_losses(scene, enough=BAND_LOSS),
+        "unbounded": lambda: far_share(frame.distances(scene.means), masses),
+        "haze": lambda: plan_haze(opacities, masses, config=SimplifyConfig()),
+        "duplicates": lambda: duplicate_share(scene.means, scene.sh0),
     }
     simplifier = Simplifier(device="cpu")
     whole = fastest(lambda: simplifier.simplify(scene, 0.05), runs=3)

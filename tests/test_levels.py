@@ -12,7 +12,7 @@ from cvtgs.cli.main import main
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
 from cvtgs.levels import LevelsIndex, level_names, write_levels
 from cvtgs.pipeline import reduce_scene
-from cvtgs.report import StageClock
+from cvtgs.progress import StageClock
 from scenes import random_scene, same_bits
 
 RHOS = [0.2, 0.04, 0.004]

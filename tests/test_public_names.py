@@ -88,7 +88,7 @@ STAGES = {
         "select_columns",
         "visibility_at",
         "visibility_grid",
-        "with_haze",
+        "plan_haze",
     },
     "views": {"automatic_views", "mixed_views", "random_views"},
     "cvt": {

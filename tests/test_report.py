@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from cvtgs import ProgressEvent, Simplifier, SimplifyConfig, SimplifyReport
-from cvtgs.progress import silent
-from cvtgs.report import StageClock, StageCost, peak_memory_bytes
+from cvtgs.progress import StageClock, StageCost, peak_memory_bytes, silent
 from scenes import random_scene
 
 CPU = torch.device("cpu")

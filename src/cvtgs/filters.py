@@ -46,7 +46,7 @@ def filter_rows(
     Returns:
         The rows that stay, and what is left out.
     """
-    opacities = scene.opacities
+    opacities = analysis.opacities
     keep, share = opacities >= config.min_opacity, config.max_mass_share
     if not analysis.plan.haze.active:
         share = 1.0
@@ -59,12 +59,11 @@ def filter_rows(
             at_least=target,
         )
     masses = analysis.areas * opacities
-    if config.max_flyaway_share > 0.0:
+    if config.max_flyaway_share > 0.0 and analysis.farthest > FLYAWAY_RADII:
         distances = analysis.frame.distances(scene.means)
-        if float(distances.amax()) > FLYAWAY_RADII:
-            seen = masses * perspective_falloff(scene.means, analysis.frame)
-            fewer = keep & ~flyaway_rows(distances, seen, max_share=config.max_flyaway_share)
-            keep = fewer if int(fewer.sum()) >= target else keep
+        seen = masses * perspective_falloff(distances)
+        fewer = keep & ~flyaway_rows(distances, seen, max_share=config.max_flyaway_share)
+        keep = fewer if int(fewer.sum()) >= target else keep
     left_out = ~keep
     mass_share = divide(masses[left_out].sum(), masses.sum())
     return FilteredRows(keep.nonzero()[:, 0], int(left_out.sum()), float(mass_share))

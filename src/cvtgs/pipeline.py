@@ -22,7 +22,8 @@ from cvtgs.filters import FilteredRows, filter_rows
 from cvtgs.math.frames import RobustFrame, morton_order
 from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import MergeNet, correct_cells
-from cvtgs.report import CellStatistics, StageClock
+from cvtgs.progress import StageClock
+from cvtgs.report import CellStatistics
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities
 
@@ -192,10 +193,10 @@ def group_rows(
     Returns:
         The cells.
     """
-    masses = analysis.apparent_areas[rows] * scene.opacities[rows]
+    masses = analysis.apparent_areas[rows] * analysis.opacities[rows]
     rows = rows[curve_order(scene, rows, analysis.frame, masses=masses)]
     weights = cvt.tessellation_weights(
-        scene.opacities[rows],
+        analysis.opacities[rows],
         analysis.apparent_areas[rows],
         area_power=analysis.area_power(config.cvt),
         floor=config.cvt.weight_floor,

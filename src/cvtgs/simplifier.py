@@ -25,8 +25,8 @@ from cvtgs.devices import chosen_device, resolve_device
 from cvtgs.errors import ConfigError, InvalidArgumentError
 from cvtgs.mergenet import SHIPPED, Checkpoint, load_checkpoint
 from cvtgs.pipeline import Reduced, geometric_error, reduce_scene
-from cvtgs.progress import ProgressListener, silent
-from cvtgs.report import Level, Simplified, SimplifyReport, StageClock
+from cvtgs.progress import ProgressListener, StageClock, silent
+from cvtgs.report import Level, Simplified, SimplifyReport
 from cvtgs.scene import GaussianScene, concatenate
 from cvtgs.validity import (
     CheckedScene,
@@ -275,7 +275,7 @@ class Prepared:
             error = 0.0
             if reduced.grouping is not None:
                 finest = finest or reduced
-                masses = analysis.apparent_areas * valid.opacities
+                masses = analysis.apparent_areas * analysis.opacities
                 partition = reduced.grouping.partition
                 error = geometric_error(valid, reduced.scene, partition, masses=masses)
             result = self._result(reduced, analysis, target, clock)
@@ -340,7 +340,7 @@ class Prepared:
             invalid_count=checked.invalid_count,
             shortfall=shortfall(len(checked.scene), len(scene), target),
             kept_count=kept_count,
-            mass_in=float((analysis.areas * checked.scene.opacities).sum()),
+            mass_in=float((analysis.areas * analysis.opacities).sum()),
             mass_out=float(reduced.scene.masses.sum()),
             checkpoint="none" if self._checkpoint is None else self._checkpoint.name,
             device=str(self._device),

@@ -1,6 +1,7 @@
 """What a scene calls for: the figures and the decisions."""
 
 import math
+from dataclasses import replace
 
 import pydantic
 import pytest
@@ -27,7 +28,11 @@ FRAME = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=2.0)
 
 def plan_of(scene: GaussianScene, **choices: object) -> EffectPlan:
     config = SimplifyConfig.from_mapping({"effects": choices})
-    return plan_effects(scene, scene.masses, frame=robust_frame(scene.means), config=config)
+    return plan_effects(scene, scene.masses, distances=distances_in(scene), config=config)
+
+
+def distances_in(scene: GaussianScene) -> torch.Tensor:
+    return robust_frame(scene.means).distances(scene.means)
 
 
 def with_sky(share: float) -> GaussianScene:
@@ -57,7 +62,7 @@ def with_bands(*sizes: float, count: int = 300) -> GaussianScene:
 def test_share_of_mass_beyond_known_points():
     """The border lies at three radii, which are six units here."""
     means = torch.tensor([[5.9, 0, 0], [0, 6.1, 0], [0, 0, 100.0]])
-    share = far_share(means, torch.tensor([5.0, 2.0, 3.0]), FRAME)
+    share = far_share(FRAME.distances(means), torch.tensor([5.0, 2.0, 3.0]))
     assert UNBOUNDED_DISTANCE == 3.0
     assert share == pytest.approx(0.5)
 
@@ -216,13 +221,12 @@ def test_haze_by_the_mass_of_the_faint(share):
 
 @pytest.mark.parametrize("two_scales", [False, True])
 def test_flat_where_a_file_has_two_scales(two_scales):
-    scene = random_scene(50)
-    frame = robust_frame(scene.means)
+    layout = (("scale_0", "float"), ("scale_1", "float")) if two_scales else ()
+    scene = replace(random_scene(50), layout=layout)
     for choice in ("auto", "off"):
         config = SimplifyConfig.from_mapping({"effects": {"flat": choice}})
-        effect = plan_effects(
-            scene, scene.masses, frame=frame, two_scales=two_scales, config=config
-        ).flat
+        far = distances_in(scene)
+        effect = plan_effects(scene, scene.masses, distances=far, config=config).flat
         assert effect.active is (two_scales and choice == "auto")
         assert effect.figure == two_scales
 
@@ -267,8 +271,8 @@ def test_images_only_where_they_are_asked_for(views, choice):
         {"visibility": {"views": views}, "effects": {"visibility": choice}}
     )
     scene = random_scene(50)
-    frame = robust_frame(scene.means)
-    effect = plan_effects(scene, scene.masses, frame=frame, config=config).visibility
+    far = distances_in(scene)
+    effect = plan_effects(scene, scene.masses, distances=far, config=config).visibility
     assert effect.active is (views > 0 and choice == "auto")
     assert effect.figure == views
 

@@ -14,7 +14,9 @@ FRAME = RobustFrame(center=torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), r
 
 def test_falloff_beyond_the_radius_is_the_inverse_square():
     means = torch.tensor([[1.0, 0, 0], [2.9, 0, 0], [1, 4, 0], [1, 0, -20]])
-    assert perspective_falloff(means, FRAME).tolist() == pytest.approx([1.0, 1.0, 0.25, 0.01])
+    assert perspective_falloff(FRAME.distances(means)).tolist() == pytest.approx(
+        [1.0, 1.0, 0.25, 0.01]
+    )
 
 
 def test_weights_have_mean_one():
@@ -98,7 +100,7 @@ def test_opacities_and_areas_of_zero_weigh_the_same():
 def test_flyaways_weigh_nothing_from_the_middle():
     means = torch.randn(100, 3, generator=torch.Generator().manual_seed(0))
     means[0] = 1e30
-    factors = perspective_falloff(means, robust_frame(means))
+    factors = perspective_falloff(robust_frame(means).distances(means))
     assert 0 <= float(factors[0]) < 1e-50
     assert bool(factors.isfinite().all())
 

@@ -59,7 +59,7 @@ def check_that_space_and_weights_are_finite(scene):
     if scene.dtype == torch.float32:  # it is the same in float64, and takes longest
         light = ambient_visibility(scene.means, scene.masses, frame)
         assert bool(((light >= 0) & (light <= 1)).all())
-    far = perspective_falloff(scene.means, frame)
+    far = perspective_falloff(frame.distances(scene.means))
     assert bool(((far >= 0) & (far <= 1)).all())
     for contraction in (0.0, 0.5, 1.0):
         points = embed(scene.means, scene.sh0, frame=frame, contraction=contraction, color=0.05)

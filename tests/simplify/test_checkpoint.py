@@ -19,7 +19,7 @@ from cvtgs.mergenet import (
     save_checkpoint,
 )
 from cvtgs.pipeline import reduce_scene
-from cvtgs.report import StageClock
+from cvtgs.progress import StageClock
 from cvtgs.train.cases import merge_scene
 from cvtgs.validity import standardized
 from mergenet_cases import lively_net

@@ -15,7 +15,8 @@ import torch
 import cvtgs
 from cvtgs.errors import ConfigError, InvalidArgumentError, RunError
 from cvtgs.evaluation import Evaluation, EvaluationSettings, SceneScores, Score, compare
-from cvtgs.report import SimplifyReport, StageCost
+from cvtgs.progress import StageCost
+from cvtgs.report import SimplifyReport
 from cvtgs.tradeoff import Failure, Measured, Tradeoff, TradeoffResult, on_front, write_tradeoff
 from cvtgs.tradeoff.files import (
     cells,

@@ -11,19 +11,17 @@ from cvtgs.analysis.effects import (
     BAND_LOSS,
     DUPLICATE_SHARE,
     FULLY_UNBOUNDED_SHARE,
+    UNBOUNDED_DISTANCE,
     UNBOUNDED_SHARE,
     BandsEffect,
     Effect,
     EffectPlan,
     GradedEffect,
-    plan_effects,
-    with_haze,
-)
-from cvtgs.analysis.measures import (
-    UNBOUNDED_DISTANCE,
     band_losses,
     duplicate_share,
     far_share,
+    plan_effects,
+    plan_haze,
 )
 from cvtgs.analysis.visibility import (
     add_depths,
@@ -58,9 +56,9 @@ __all__ = [
     "measure_visibility",
     "perspective_falloff",
     "plan_effects",
+    "plan_haze",
     "restore_columns",
     "select_columns",
     "visibility_at",
     "visibility_grid",
-    "with_haze",
 ]

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.analysis.columns import drop_mip_tag
-from cvtgs.analysis.effects import EffectPlan, plan_effects, with_haze
+from cvtgs.analysis.effects import EffectPlan, plan_effects, plan_haze
 from cvtgs.analysis.visibility import ambient_visibility, perspective_falloff
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig, TessellationConfig
@@ -27,6 +27,8 @@ class SceneAnalysis:
 
     Attributes:
         frame: Robust centre and radius of the scene.
+        farthest: Largest distance to the centre, in robust radii.
+        opacities: ``(n,)`` opacities in (0, 1).
         areas: ``(n,)`` mean projected areas, squared scene units, float64.
         apparent_areas: ``(n,)`` the same as they count in images: smaller for what is far from the
             middle or enclosed by others.
@@ -36,6 +38,8 @@ class SceneAnalysis:
     """
 
     frame: RobustFrame
+    farthest: float
+    opacities: Float[Tensor, "n"]
     areas: Float[Tensor, "n"]
     apparent_areas: Float[Tensor, "n"]
     visibility: Float[Tensor, "n_or_0"]
@@ -48,10 +52,11 @@ class SceneAnalysis:
             rows: Row numbers.
 
         Returns:
-            Their values; frame and plan are still those of the whole scene.
+            Their values; frame, farthest distance and plan are still those of the whole scene.
         """
         return replace(
             self,
+            opacities=self.opacities[rows],
             areas=self.areas[rows],
             apparent_areas=self.apparent_areas[rows],
             visibility=self.visibility[rows] if len(self.visibility) else self.visibility,
@@ -89,37 +94,45 @@ def analyze(
         >>> analysis.plan.unbounded.active, len(analysis.areas)
         (False, 100)
     """
-    frame, areas = robust_frame(scene.means), scene.areas
-    masses = areas * scene.opacities
+    frame, areas, opacities = robust_frame(scene.means), scene.areas, scene.opacities
+    distances, masses = frame.distances(scene.means), areas * opacities
     visibility = masses[:0]
     if with_visibility or config.cvt.hidden_share < 1.0:
         visibility = ambient_visibility(scene.means, masses, frame)
-    apparent = apparent_areas(areas, scene.means, visibility, frame=frame, config=config.cvt)
-    plan = plan_effects(
-        scene,
-        masses,
-        apparent * scene.opacities,
-        frame=frame,
-        two_scales=scene.has_two_scales,
-        config=config,
-    )
+    apparent = apparent_areas(areas, distances, visibility, config=config.cvt)
+    plan = plan_effects(scene, masses, apparent * opacities, distances=distances, config=config)
     return SceneAnalysis(
-        frame=frame, areas=areas, apparent_areas=apparent, visibility=visibility, plan=plan
+        frame=frame,
+        farthest=float(distances.amax()),
+        opacities=opacities,
+        areas=areas,
+        apparent_areas=apparent,
+        visibility=visibility,
+        plan=plan,
     )
 
 
 def apparent_areas(
     areas: Float[Tensor, "n"],
-    means: Float[Tensor, "n 3"],
+    distances: Float[Tensor, "n"],
     visibility: Float[Tensor, "n"],
     *,
-    frame: RobustFrame,
     config: TessellationConfig,
 ) -> Float[Tensor, "n"]:
-    """Return areas as they count in images, smaller for what is far from the middle or enclosed."""
+    """Return areas as they count in images, smaller for what is far from the middle or enclosed.
+
+    Args:
+        areas: Mean projected areas.
+        distances: Distances to the centre of the scene, in robust radii.
+        visibility: Ambient visibility; ignored if enclosed Gaussians count fully.
+        config: What counts.
+
+    Returns:
+        Areas, in the unit of ``areas``.
+    """
     apparent = areas
     if config.perspective:
-        apparent = apparent * perspective_falloff(means, frame)
+        apparent = apparent * perspective_falloff(distances)
     if config.hidden_share < 1.0:
         apparent = apparent * (config.hidden_share + (1 - config.hidden_share) * visibility)
     return apparent
@@ -150,12 +163,13 @@ def measure_visibility(
         longer = max(cameras.width, cameras.height)
         views = cameras.spread(choices.views).fitted(min(choices.size, longer))
     rendered = contributions(drop_mip_tag(scene, analysis.plan), views)
-    opacities, apparent = scene.opacities, analysis.apparent_areas
+    opacities, apparent = analysis.opacities, analysis.apparent_areas
     masses = (apparent * opacities).double()
     if float(rendered.sum()) > 0.0:
         total, all_rendered = masses.sum(), rendered.sum()
         trust = 1.0 - choices.mass_share
         blended = choices.mass_share * masses + trust * rendered * (total / all_rendered)
         apparent = divide(blended, opacities.double().clamp_min(MIN_OPACITY)).to(apparent.dtype)
-    plan = with_haze(analysis.plan, opacities, apparent * opacities, config=config)
+    haze = plan_haze(opacities, apparent * opacities, config=config)
+    plan = analysis.plan.model_copy(update={"haze": haze})
     return replace(analysis, apparent_areas=apparent, plan=plan)

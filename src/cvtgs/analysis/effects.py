@@ -1,18 +1,15 @@
-"""EffectPlan: which effects a scene calls for, and the figures that decided."""
+"""EffectPlan: which effects a scene calls for, and the figures that decide."""
+
+import math
 
 import pydantic
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.analysis.measures import (
-    UNBOUNDED_DISTANCE,
-    band_losses,
-    duplicate_share,
-    faint_share,
-    far_share,
-)
 from cvtgs.config import SimplifyConfig
-from cvtgs.math.frames import RobustFrame
+from cvtgs.math.parameters import divide, opacity_from_logit
+from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
 from cvtgs.scene import GaussianScene
 
 BAND_LOSS = 1e-5
@@ -26,6 +23,20 @@ FULLY_UNBOUNDED_SHARE = 0.1
 
 DUPLICATE_SHARE = 0.01
 """With more than this share of duplicates, it pays to search for each place only once."""
+
+UNBOUNDED_DISTANCE = 3.0
+"""In robust radii: what lies beyond is far away."""
+
+SAMPLE = 1 << 14
+"""Gaussians, spread over the rows, that are looked at first."""
+
+HASHED = 1 << 12
+"""Duplicates are counted among at least so many Gaussians."""
+
+CHUNK = 1 << 14
+
+LEAST_CONTRAST = 1e-6
+"""Scenes of one colour count as having this contrast."""
 
 
 class Effect(pydantic.BaseModel):
@@ -99,20 +110,18 @@ class EffectPlan(pydantic.BaseModel):
 def plan_effects(
     scene: GaussianScene,
     masses: Float[Tensor, "n"],
-    seen_masses: Float[Tensor, "n"] | None = None,
+    apparent_masses: Float[Tensor, "n"] | None = None,
     *,
-    frame: RobustFrame,
-    two_scales: bool = False,
+    distances: Float[Tensor, "n"],
     config: SimplifyConfig | None = None,
 ) -> EffectPlan:
-    """Look at a scene once and decide what it calls for.
+    """Decide which effects a scene calls for.
 
     Args:
         scene: The Gaussians, with valid rows.
         masses: Opacity times mean projected area of every Gaussian.
-        seen_masses: The same as they look in images; None for ``masses``.
-        frame: Centre and radius of the scene.
-        two_scales: Whether the file that the scene came from has no third scale (2DGS).
+        apparent_masses: The same with apparent areas; None for ``masses``.
+        distances: Distances to the centre of the scene, in robust radii.
         config: Choices that override the decisions, and the thresholds of the filter; None for
             the defaults.
 
@@ -120,57 +129,92 @@ def plan_effects(
         The plan.
 
     Example:
-        >>> from cvtgs.math.frames import robust_frame
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 100, sh_degree=0, seed=0)
-        >>> plan_effects(scene, scene.opacities, frame=robust_frame(scene.means)).extras.active
+        >>> plan_effects(scene, scene.masses, distances=torch.ones(100)).extras.active
         False
     """
     config = config or SimplifyConfig()
-    seen = masses if seen_masses is None else seen_masses
+    choices = config.effects
+    apparent = masses if apparent_masses is None else apparent_masses
+    far = far_share(distances, masses)
+    above = (far - UNBOUNDED_SHARE) / (FULLY_UNBOUNDED_SHARE - UNBOUNDED_SHARE)
+    beyond = f"share of mass beyond {UNBOUNDED_DISTANCE:g} robust radii"
+    unbounded = _by_share(far, choices.unbounded, UNBOUNDED_SHARE, beyond)
     return EffectPlan(
-        sh=_bands(scene, config),
-        mip=_mip(scene, config),
-        unbounded=_unbounded(far_share(scene.means, masses, frame), config),
-        haze=_haze(faint_share(scene.opacities, seen, below=config.filter.min_opacity), config),
-        flat=_flat(two_scales, config),
-        duplicates=_duplicates(duplicate_share(scene.means, scene.sh0), config),
-        extras=_extras(scene, config),
-        visibility=_visibility(config),
+        sh=_plan_bands(scene, choices.sh),
+        mip=Effect(
+            active=scene.antialiased and choices.mip != "off",
+            figure=float(scene.antialiased),
+            meaning="1 if the comment SplatRenderMode: mip is there, on at 1",
+            forced=choices.mip != "auto",
+        ),
+        unbounded=GradedEffect(
+            **unbounded.model_dump(),
+            strength=min(1.0, max(0.0, above)) if unbounded.active else 0.0,
+        ),
+        haze=plan_haze(scene.opacities, apparent, config=config),
+        flat=Effect(
+            active=scene.has_two_scales and choices.flat != "off",
+            figure=float(scene.has_two_scales),
+            meaning="1 if the file has two scales per Gaussian, on at 1",
+            forced=choices.flat != "auto",
+        ),
+        duplicates=_by_share(
+            duplicate_share(scene.means, scene.sh0),
+            choices.duplicates,
+            DUPLICATE_SHARE,
+            "share of Gaussians exactly where others of their colour are",
+        ),
+        extras=Effect(
+            active=bool(scene.extras),
+            figure=len(scene.extras),
+            meaning="columns beyond the standard ones, on above 0",
+            forced=choices.extras != "auto",
+        ),
+        visibility=Effect(
+            active=config.uses_renders,
+            figure=config.visibility.views,
+            meaning="images that the preset asks for, on above 0",
+            forced=choices.visibility != "auto",
+        ),
     )
 
 
-def with_haze(
-    plan: EffectPlan,
+def plan_haze(
     opacities: Float[Tensor, "n"],
-    seen_masses: Float[Tensor, "n"],
+    apparent_masses: Float[Tensor, "n"],
     *,
     config: SimplifyConfig,
-) -> EffectPlan:
-    """Decide on haze anew, once images have told what each Gaussian paints.
+) -> Effect:
+    """Decide whether faint Gaussians are the haze of a scene.
 
     Args:
-        plan: The plan so far.
         opacities: Opacities.
-        seen_masses: Masses as they look in images.
-        config: The threshold, and what overrides it.
+        apparent_masses: Masses as they count in images.
+        config: The thresholds of the filter, and what overrides the decision.
 
     Returns:
-        The plan with another figure for haze.
+        The effect.
     """
-    share = faint_share(opacities, seen_masses, below=config.filter.min_opacity)
-    return plan.model_copy(update={"haze": _haze(share, config)})
+    choice, most = config.effects.haze, config.filter.max_mass_share
+    masses, below = apparent_masses.double(), config.filter.min_opacity
+    share = float(divide((masses * (opacities < below)).sum(), masses.sum()))
+    return Effect(
+        active=share > most if choice == "auto" else choice == "on",
+        figure=share,
+        meaning=f"share of apparent mass with opacity below {below:g}, on above {most:g}",
+        forced=choice != "auto",
+    )
 
 
-def _bands(scene: GaussianScene, config: SimplifyConfig) -> BandsEffect:
-    choice = config.effects.sh
-    losses = band_losses(scene, enough=BAND_LOSS)
-    degree = scene.sh_degree
-    if choice == "auto":
+def _plan_bands(scene: GaussianScene, choice: str | int) -> BandsEffect:
+    losses, degree = band_losses(scene, enough=BAND_LOSS), scene.sh_degree
+    if isinstance(choice, int):
+        degree = min(degree, choice)
+    else:
         while degree > 0 and sum(losses[degree - 1 :]) <= BAND_LOSS:
             degree -= 1
-    else:
-        degree = min(degree, choice)
     return BandsEffect(
         active=degree > 0,
         figure=max(losses, default=0.0),
@@ -182,63 +226,7 @@ def _bands(scene: GaussianScene, config: SimplifyConfig) -> BandsEffect:
     )
 
 
-def _mip(scene: GaussianScene, config: SimplifyConfig) -> Effect:
-    return _tagged(
-        scene.antialiased,
-        config.effects.mip,
-        meaning="1 if the comment SplatRenderMode: mip is there",
-    )
-
-
-def _unbounded(share: float, config: SimplifyConfig) -> GradedEffect:
-    effect = _shared(
-        share,
-        config.effects.unbounded,
-        least=UNBOUNDED_SHARE,
-        meaning=f"share of mass beyond {UNBOUNDED_DISTANCE:g} robust radii",
-    )
-    above = (share - UNBOUNDED_SHARE) / (FULLY_UNBOUNDED_SHARE - UNBOUNDED_SHARE)
-    strength = min(1.0, max(0.0, above)) if effect.active else 0.0
-    return GradedEffect(**effect.model_dump(), strength=strength)
-
-
-def _haze(share: float, config: SimplifyConfig) -> Effect:
-    choice, most = config.effects.haze, config.filter.max_mass_share
-    return Effect(
-        active=share > most if choice == "auto" else choice == "on",
-        figure=share,
-        meaning=f"share of mass as seen with opacity below {config.filter.min_opacity:g}, "
-        f"on above {most:g}",
-        forced=choice != "auto",
-    )
-
-
-def _flat(two_scales: bool, config: SimplifyConfig) -> Effect:
-    return _tagged(
-        two_scales, config.effects.flat, meaning="1 if the file has two scales per Gaussian"
-    )
-
-
-def _duplicates(share: float, config: SimplifyConfig) -> Effect:
-    return _shared(
-        share,
-        config.effects.duplicates,
-        least=DUPLICATE_SHARE,
-        meaning="share of Gaussians exactly where others of their colour are",
-    )
-
-
-def _tagged(is_there: bool, choice: str, *, meaning: str) -> Effect:
-    """Decide on what a file says or does not, which cannot be forced on."""
-    return Effect(
-        active=is_there and choice != "off",
-        figure=float(is_there),
-        meaning=f"{meaning}, on at 1",
-        forced=choice != "auto",
-    )
-
-
-def _shared(share: float, choice: str, *, least: float, meaning: str) -> Effect:
+def _by_share(share: float, choice: str, least: float, meaning: str) -> Effect:
     """Decide on what needs a share above ``least``, or any share if it is forced on."""
     return Effect(
         active=share > (least if choice == "auto" else 0.0) and choice != "off",
@@ -248,19 +236,115 @@ def _shared(share: float, choice: str, *, least: float, meaning: str) -> Effect:
     )
 
 
-def _extras(scene: GaussianScene, config: SimplifyConfig) -> Effect:
-    return Effect(
-        active=bool(scene.extras),
-        figure=len(scene.extras),
-        meaning="columns beyond the standard ones, on above 0",
-        forced=config.effects.extras != "auto",
-    )
+def band_losses(scene: GaussianScene, *, enough: float) -> tuple[float, ...]:
+    """Return the most that leaving out a band of the spherical harmonics can change a colour.
+
+    A pixel mixes colours with weights that add up to 1 at most, so no pixel changes by more. By
+    the addition theorem (Unsöld 1927), a band of degree l with coefficients c changes a channel
+    by at most ``sqrt((2 l + 1) / (4 pi) sum c^2)``; the sum is over all channels here. That is
+    divided by the standard deviation of the constant colours, weighted by opacity, if it is below
+    1.
+
+    Args:
+        scene: The Gaussians, with valid rows.
+        enough: The search ends as soon as the highest band has this, since it and all below it
+            are needed then; the figures are those of the Gaussians that were looked at so far.
+
+    Returns:
+        One number for each degree above 0.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 100, sh_degree=1, seed=0)
+        >>> dull = scene.with_tensors({"shN": torch.zeros_like(scene.shN)}, {})
+        >>> band_losses(scene, enough=1e-4)[0] > 1e-4, band_losses(dull, enough=1e-4)
+        (True, (0.0,))
+    """
+    if scene.sh_degree == 0:
+        return ()
+    step = len(scene) // SAMPLE
+    spread = [scene.shN[::step]] if step > 1 else []
+    unit = min(1.0, max(_contrast(scene), LEAST_CONTRAST))
+    losses = [0.0] * scene.sh_degree
+    for part in (*spread, *scene.shN.split(CHUNK)):
+        found = (_largest_change(part, degree) / unit for degree in range(1, len(losses) + 1))
+        losses = [max(pair) for pair in zip(losses, found, strict=True)]
+        if losses[-1] >= enough:
+            break
+    return tuple(losses)
 
 
-def _visibility(config: SimplifyConfig) -> Effect:
-    return Effect(
-        active=config.uses_renders,
-        figure=config.visibility.views,
-        meaning="images that the preset asks for, on above 0",
-        forced=config.effects.visibility != "auto",
-    )
+def far_share(distances: Float[Tensor, "n"], masses: Float[Tensor, "n"]) -> float:
+    """Return the share of mass that lies far away.
+
+    Args:
+        distances: Distances to the centre of the scene, in robust radii.
+        masses: Masses.
+
+    Returns:
+        A number in [0, 1].
+
+    Example:
+        >>> far_share(torch.tensor([0.0, 9.0]), torch.tensor([1.0, 3.0]))
+        0.75
+    """
+    return float(divide((masses * (distances > UNBOUNDED_DISTANCE)).sum(), masses.sum()))
+
+
+def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) -> float:
+    """Return the share of Gaussians that lie exactly where another of the same colour does.
+
+    Large scenes are estimated from a sample by a hash of the position, which duplicates share.
+
+    Args:
+        means: Positions.
+        sh0: Constant colours.
+
+    Returns:
+        A number in [0, 1).
+
+    Example:
+        >>> duplicate_share(torch.zeros(4, 3), torch.zeros(4, 1, 3))
+        0.75
+    """
+    bits = max(0, math.floor(math.log2(max(1, len(means)) / HASHED)))
+    rows, hashes = [], []
+    for start in range(0, len(means), CHUNK << 2):
+        keys = _hash(means[start : start + (CHUNK << 2)])
+        chosen = (keys & ((1 << bits) - 1) == 0).nonzero()[:, 0]
+        rows.append(chosen + start)
+        hashes.append(keys[chosen])
+    sample = torch.cat(rows)
+    sample = sample[torch.sort(torch.cat(hashes), stable=True).indices]
+    if len(sample) == 0:
+        return 0.0
+    place, color = means[sample], sh0[sample, 0]
+    same = (place[1:] == place[:-1]).all(dim=1) & (color[1:] == color[:-1]).all(dim=1)
+    return float(same.sum()) / len(sample)
+
+
+def _largest_change(rest: Float[Tensor, "n k 3"], degree: int) -> float:
+    """Bound what a band changes a channel by; sums over whole rows are fast."""
+    band = rest[:, REST_COUNTS[degree - 1] : REST_COUNTS[degree]]
+    if band.numel() == 0:
+        return 0.0
+    squares = float(band.square().sum(dim=(1, 2)).amax())
+    return math.sqrt((2 * degree + 1) / (4 * math.pi) * squares)
+
+
+def _contrast(scene: GaussianScene) -> float:
+    """Return the standard deviation of the constant colours of some Gaussians."""
+    rows = slice(None, None, max(1, len(scene) // SAMPLE))
+    colors = SH_C0 * scene.sh0[rows, 0].double()
+    shares = opacity_from_logit(scene.logit_opacities[rows]).double()
+    shares = (shares / shares.sum())[:, None]
+    mean = (shares * colors).sum(dim=0)
+    return float((shares * (colors - mean).square()).sum(dim=0).mean().sqrt())
+
+
+def _hash(means: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+    """Mix the bits of positions; equal ones give equal numbers, which may be negative."""
+    whole = torch.int32 if means.dtype == torch.float32 else torch.int64
+    x, y, z = means.contiguous().view(whole).unbind(1)
+    mixed = x * 73856093 + y * 19349663 + z * 83492791  # wraps round
+    return mixed ^ (mixed >> 13)

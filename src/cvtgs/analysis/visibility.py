@@ -183,19 +183,17 @@ def _windows(slab: Float[Tensor, "a b c"], axis: int) -> Float[Tensor, "d e f"]:
     return sums
 
 
-def perspective_falloff(means: Float[Tensor, "n 3"], frame: RobustFrame) -> Float[Tensor, "n"]:
+def perspective_falloff(distances: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     """Return how much smaller a far Gaussian appears from the middle of the scene.
 
     Args:
-        means: Positions, scene units.
-        frame: Centre and radius of the scene.
+        distances: Distances to the centre of the scene, in robust radii.
 
     Returns:
-        ``1 / max(1, d / R)^2`` in float64, with d the distance to the centre.
+        ``1 / max(1, d)^2`` in float64.
 
     Example:
-        >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
-        >>> perspective_falloff(torch.tensor([[2.0, 0, 0]]), frame).tolist()
+        >>> perspective_falloff(torch.tensor([2.0]).double()).tolist()
         [0.25]
     """
-    return frame.distances(means).clamp_min_(1.0).pow_(-2)
+    return distances.clamp_min(1.0).pow_(-2)

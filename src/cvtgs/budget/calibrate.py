@@ -22,8 +22,7 @@ from cvtgs.counts import target_count
 from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import OutputError
 from cvtgs.io import atomic_output
-from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.report import StageCost
+from cvtgs.progress import ProgressEvent, ProgressListener, StageCost, silent
 from cvtgs.scene import GaussianScene
 from cvtgs.simplifier import Simplifier
 from cvtgs.synthetic import scene as make

@@ -11,7 +11,7 @@ from cvtgs.cli.options import AddParser, add_options
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import SceneScores
-    from cvtgs.report import StageCost
+    from cvtgs.progress import StageCost
 
 RATIOS = (0.1, 0.01, 0.001)
 VIEWS, WIDTH, HEIGHT = 8, 640, 480

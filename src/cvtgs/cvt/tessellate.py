@@ -12,7 +12,7 @@ from cvtgs.cvt.coincident import NearestSite, search_once_per_position
 from cvtgs.cvt.nearest import nearest_backend
 from cvtgs.cvt.seeding import stratified_seeds, weighted_seeds
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.math.segments import segment_argmax, segment_sum, sort_by_label
+from cvtgs.math.segments import label_sums, segment_argmax, sort_by_label
 
 MIN_SAMPLES = 1 << 15
 """Lloyd never looks at fewer points than this to save time; so few cost next to nothing."""
@@ -271,10 +271,10 @@ def weighted_sums(
     count: int,
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m d"]]:
     """Add up the points of every label."""
-    order, offsets = sort_by_label(labels, count)
-    weights = weights[order].double()
-    axes = [segment_sum(column[order].double() * weights, offsets) for column in points.unbind(1)]
-    return segment_sum(weights, offsets), torch.stack(axes, dim=1)
+    weights = weights.double()
+    columns = [weights, *(column.double() * weights for column in points.unbind(1))]
+    sums = label_sums(columns, labels, count)
+    return sums[:, 0], sums[:, 1:]
 
 
 def centroids(

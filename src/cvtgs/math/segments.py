@@ -1,6 +1,7 @@
 """Consecutive runs of rows (CSR segments): gathering and deterministic reductions."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -48,6 +49,30 @@ def gather_columns(
         [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
     """
     return tuple(table.T.gather(1, rows.expand(table.shape[1], -1)).T for table in tables)
+
+
+def label_sums(
+    columns: Sequence[Float[Tensor, "n"]], labels: Int[Tensor, "n"], count: int
+) -> Float[Tensor, "m k"]:
+    """Sum rows of one label, in the order of the rows, in float64.
+
+    Args:
+        columns: One tensor per column.
+        labels: Label of every row, 0 to ``count - 1``.
+        count: Number of labels, m.
+
+    Returns:
+        One row per label; a label without rows gives 0. Every device gives the same bits.
+
+    Example:
+        >>> label_sums([torch.tensor([1.0, 2.0, 4.0])], torch.tensor([1, 0, 1]), 2).tolist()
+        [[2.0], [5.0]]
+    """
+    if labels.device.type == "cpu":  # in order; CUDA would add in any
+        sums = [torch.bincount(labels, column.double(), minlength=count) for column in columns]
+        return torch.stack(sums, dim=1)
+    order, offsets = sort_by_label(labels, count)
+    return torch.stack([segment_sum(column.double()[order], offsets) for column in columns], dim=1)
 
 
 def segment_sum(

@@ -16,7 +16,8 @@ from cvtgs.io.ply import join_plys
 from cvtgs.io.tensors import map_tensors
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.survey import Survey
-from cvtgs.report import SimplifyReport, StageClock
+from cvtgs.progress import StageClock
+from cvtgs.report import SimplifyReport
 from cvtgs.scene import concatenate
 from cvtgs.simplifier import Simplifier
 

@@ -22,8 +22,8 @@ from cvtgs.outofcore.merging import finish
 from cvtgs.outofcore.survey import survey, take_sample, total
 from cvtgs.outofcore.turns import Workers, do_all, group_blocks, this_process, told
 from cvtgs.outofcore.work import look, simplify_whole, sort_into_blocks
-from cvtgs.progress import ProgressListener, silent
-from cvtgs.report import SimplifyReport, StageClock
+from cvtgs.progress import ProgressListener, StageClock, silent
+from cvtgs.report import SimplifyReport
 from cvtgs.simplifier import Simplifier
 
 RANGE_ROWS = 1 << 26

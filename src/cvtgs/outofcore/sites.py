@@ -113,7 +113,13 @@ def _points(job: Job, block: int, order: Tensor | None = None) -> tuple[Tensor, 
     survey, targets = job.read_survey()
     scene, seen, light = read_rows(job, block, is_slim=True)
     known = SceneAnalysis(
-        frame=survey.frame, areas=seen, apparent_areas=seen, visibility=light, plan=survey.plan
+        frame=survey.frame,
+        farthest=0.0,
+        opacities=scene.opacities,
+        areas=seen,
+        apparent_areas=seen,
+        visibility=light,
+        plan=survey.plan,
     )
     if order is None:
         everything = torch.arange(len(scene))

@@ -102,7 +102,7 @@ def add_up(
             scene = scene.select(rows)
         masses = scene.masses
         an.add_depths(sums, scene.means, masses, frame)
-        seen = masses * an.perspective_falloff(scene.means, frame)
+        seen = masses * an.perspective_falloff(frame.distances(scene.means))
         far.append(seen[frame.distances(scene.means) > filters.FLYAWAY_RADII])
         mass, seen_mass = mass + float(masses.sum()), seen_mass + float(seen.sum())
         valid += len(scene)
@@ -143,9 +143,16 @@ def survey(
     small = select_columns(sample, config.effects)
     first = analyze(small, config)
     here = an.visibility_at(light, small.means, frame)
-    seen = apparent_areas(first.areas, small.means, here, frame=frame, config=config.cvt)
+    far = frame.distances(small.means)
+    seen = apparent_areas(first.areas, far, here, config=config.cvt)
     known = SceneAnalysis(
-        frame=frame, areas=first.areas, apparent_areas=seen, visibility=here, plan=first.plan
+        frame=frame,
+        farthest=float(far.amax()),
+        opacities=first.opacities,
+        areas=first.areas,
+        apparent_areas=seen,
+        visibility=here,
+        plan=first.plan,
     )
     rows = depths.valid - depths.kept
     if boxes:

@@ -8,7 +8,7 @@ from typing import Protocol, TypeVar
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.merging import merge, widen
 from cvtgs.outofcore.sites import assign, move, place, settle
-from cvtgs.report import StageClock
+from cvtgs.progress import StageClock
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -24,8 +24,7 @@ from cvtgs.outofcore.merging import save_block
 from cvtgs.outofcore.rows import LIGHT, SEEN, read_rows, record_type
 from cvtgs.outofcore.survey import CHUNK, Depths, Survey, add_up
 from cvtgs.pipeline import reduce_scene
-from cvtgs.progress import silent
-from cvtgs.report import StageClock
+from cvtgs.progress import StageClock, silent
 from cvtgs.scene import GaussianScene
 
 
@@ -82,6 +81,8 @@ def simplify_whole(job: Job, block: int) -> None:
     scene = select_columns(scene, job.config.effects)
     known = SceneAnalysis(
         frame=survey.frame,
+        farthest=0.0,
+        opacities=scene.opacities,
         areas=scene.areas,
         apparent_areas=seen,
         visibility=light,
@@ -109,11 +110,12 @@ def _entering(
     means, opacities = scene.means[rows], scene.opacities[rows]
     areas = scene.select(rows).areas
     light = visibility_at(survey.light, means, survey.frame)
-    seen = apparent_areas(areas, means, light, frame=survey.frame, config=config.cvt)
+    distances = survey.frame.distances(means)
+    seen = apparent_areas(areas, distances, light, config=config.cvt)
     enters = opacities >= survey.faintest
     if survey.lightest >= 0.0:
-        far = survey.frame.distances(means) > filters.FLYAWAY_RADII
-        mass = areas * opacities * perspective_falloff(means, survey.frame)
+        far = distances > filters.FLYAWAY_RADII
+        mass = areas * opacities * perspective_falloff(distances)
         enters &= ~(far & (mass <= survey.lightest))
     return light[enters], seen[enters], rows[enters]
 

@@ -9,12 +9,12 @@ from cvtgs.config import RefineConfig
 from cvtgs.devices import chosen_device
 from cvtgs.errors import InvalidSceneError
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer
-from cvtgs.progress import ProgressListener, silent
+from cvtgs.progress import ProgressListener, StageClock, silent
 from cvtgs.refinement.images import ImageBuffer, generated_views, split_views
 from cvtgs.refinement.limits import Limits, check_limits
 from cvtgs.refinement.optimize import STAGE, learning_rate_scales, optimize
 from cvtgs.rendering.backends import choose_backend
-from cvtgs.report import RefineReport, SimplifyReport, StageClock
+from cvtgs.report import RefineReport, SimplifyReport
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import valid_rows
 
