@@ -1,10 +1,10 @@
 r"""Compare the presets, other methods and external tools: quality against seconds.
 
-``python -m benchmarks.compare SCENE.ply ... -o DIR`` follows the protocol of CVT-GS: every method
-gets the same scenes and the same number of Gaussians M, the same judge looks at what it writes, as
-it is, without fine-tuning, and its seconds are those of a process of its own, from its start over
-reading and writing to its end. Printed is one Markdown table, the mean over the scenes first; the
-folder gets that and a plot, anew after every scene.
+``python -m benchmarks.compare SCENE.ply ... -o DIR`` compares as CVT-GS does, but with images of
+the full scene instead of photographs: every method gets the same scenes and the same number of
+Gaussians M, and one scorer renders what it writes, without fine-tuning. Seconds are those of a
+separate process, with start, reading and writing. Output is one Markdown table, the mean over the
+scenes first; the folder gets that and a plot, updated after every scene.
 
 Methods are the presets of cvtgs, ``standard, no network``, the baselines of
 ``benchmarks.baselines``, and any tool that reads and writes PLY files:
