@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_io_checkpoints import splatfacto
-from test_io_folders import inria_model
 
 import cvtgs
+from tests.io.test_checkpoints import splatfacto
+from tests.io.test_files import inria_model
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
