@@ -1,6 +1,6 @@
 """Scenes as numpy arrays, and how compact formats store rotations, colours and opacities.
 
-The readers and writers of compact formats meet stored parameters only here.
+Readers and writers of compact formats convert stored parameters only here.
 """
 
 from dataclasses import dataclass

@@ -64,7 +64,7 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
 def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[BinaryIO]:
     """Open a file for writing that appears under its name only when it is complete.
 
-    What is written goes to a new file in the same directory, which takes the name at the end, in
+    The content goes to a new file in the same directory, which takes the name at the end, in
     one step. If the body raises anything, the new file is removed and an old one stays as it
     was. Symbolic links are followed; a replaced file keeps its permissions.
 

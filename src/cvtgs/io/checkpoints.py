@@ -41,7 +41,7 @@ def read_checkpoint(path: Path) -> GaussianScene:
 
 
 def _scene_tensors(content: Any, path: Path) -> tuple[dict[str, Tensor], bool]:
-    """Find the tensors, and say whether Splatfacto trained them."""
+    """Return the tensors, and whether they are of Splatfacto."""
     groups = content if isinstance(content, Mapping) else {}
     for group in ("splats", "pipeline"):
         state = groups.get(group)

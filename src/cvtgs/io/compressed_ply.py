@@ -120,7 +120,7 @@ def _ranges(chunks: Rows) -> Float[np.ndarray, "c 18"]:
 
 
 def _rest(rows: Rows | None, count: int) -> Float[np.ndarray, "n k 3"]:
-    """Decode bytes that stand for [-4, 4]; the outermost mean the ends, others their middle."""
+    """Decode bytes to [-4, 4]: 0 and 255 to the ends, others to the middles of their steps."""
     if rows is None:
         return np.empty((count, 0, 3), np.float32)
     names = rows.dtype.names or ()

@@ -40,7 +40,7 @@ def from_dict(
         mapping: ``means (n, 3)``, ``quats (n, 4)`` w first, ``scales (n, 3)``, ``opacities (n,)``
             or ``(n, 1)``, ``sh0 (n, 1, 3)`` or ``features_dc (n, 3)``, and ``shN (n, k, 3)`` or
             ``features_rest (n, k, 3)``, which may be missing. A common prefix such as
-            ``_model.gauss_params.`` is fine; names without it are then not looked at.
+            ``_model.gauss_params.`` is fine; names without it are then ignored.
         activated: Whether scales and opacities are what one sees (above 0; from 0 to 1) rather
             than logarithms and logits, which both models hold.
 

@@ -1,4 +1,4 @@
-"""Find and open the files of scenes and cameras, or say in one sentence why not."""
+"""Find and open the files of scenes and cameras; every failure is one clear sentence."""
 
 import os
 import re
@@ -49,7 +49,7 @@ def is_file(path: Path) -> bool:
 def scene_file(path: str | os.PathLike[str]) -> Path:
     """Find the file that holds the scene of a folder.
 
-    These are looked for, in this order:
+    It looks for these, in this order:
 
     - ``point_cloud/iteration_*/point_cloud.ply``, the largest iteration: a model of INRIA's code;
     - ``nerfstudio_models/step-*.ckpt`` or ``step-*.ckpt``, the largest step: a run of Splatfacto;
@@ -63,7 +63,7 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
         The file.
 
     Raises:
-        InputError: There is none of these in the folder, or it cannot be looked into.
+        InputError: There is none of these in the folder, or it cannot be read.
 
     Example:
         >>> scene_file("scene.ply").name

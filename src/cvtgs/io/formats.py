@@ -1,4 +1,4 @@
-"""Read and write scenes; the end of the file name says which format it is."""
+"""Read and write scenes in the format that the suffix of the file name chooses."""
 
 import os
 import warnings
@@ -30,7 +30,7 @@ _READERS: Mapping[str, str] = MappingProxyType(
         ".pt": "cvtgs.io.checkpoints:read_checkpoint",
     }
 )
-"""Readers by the end of the file name, of which the first that fits counts; loaded when needed."""
+"""Readers by suffix, of which the first that fits counts; imported when they are needed."""
 
 _WRITERS: Mapping[str, str] = MappingProxyType(
     {
@@ -56,7 +56,7 @@ def load(
     Unknown columns become extras; NaN and infinite values are returned as they are.
 
     Args:
-        path: The file; the end of its name says the format: ``.ply`` (plain, or compressed by
+        path: The file; its suffix chooses the format: ``.ply`` (plain, or compressed by
             PlayCanvas' tools), ``.spz``, ``.splat``, ``.sog`` or the ``meta.json`` of a SOG,
             ``.ckpt`` of nerfstudio's Splatfacto, ``.pt`` of gsplat's trainer. Of a folder, the
             scene that :func:`cvtgs.io.scene_file` finds.
@@ -92,13 +92,13 @@ def load(
     if sh_degree is not None and not 0 <= sh_degree < len(REST_COUNTS):
         raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {sh_degree!r}.")
     source = scene_file(path)
-    end = _end_of(source, _READERS) if is_file(source) else ".ply"  # which says what is wrong
-    if end.endswith(".ply"):
+    suffix = _suffix_of(source, _READERS) if is_file(source) else ".ply"  # whose reader raises
+    if suffix.endswith(".ply"):
         from cvtgs.io.ply.header import is_compressed_ply  # noqa: PLC0415 (loaded as readers are)
 
-        end = ".compressed.ply" if is_compressed_ply(source) else ".ply"
-    read: Callable[..., GaussianScene] = resolve_name(_READERS[end])
-    if end == ".ply":
+        suffix = ".compressed.ply" if is_compressed_ply(source) else ".ply"
+    read: Callable[..., GaussianScene] = resolve_name(_READERS[suffix])
+    if suffix == ".ply":
         return read(source, sh_degree=sh_degree, extras=extras).to(device)
     scene = read(source)
     if sh_degree is not None and sh_degree < scene.sh_degree:
@@ -112,13 +112,13 @@ def save(scene: GaussianScene, path: str | os.PathLike[str], *, overwrite: bool 
     """Write a scene to a file, completely or not at all.
 
     A scene that was loaded from a PLY is written to one with the properties, their order, types
-    and comments that it came with, so that ``load(save(scene))`` gives the same bits. The other
+    and comments of that file, so that ``load(save(scene))`` gives the same bits. The other
     formats round. What they cannot hold at all is warned about before anything is written
-    (:class:`cvtgs.errors.DroppedDataWarning`); :func:`cvtgs.io.losses` says it without writing.
+    (:class:`cvtgs.errors.DroppedDataWarning`); :func:`cvtgs.io.losses` reports it without writing.
 
     Args:
         scene: The scene, on any device.
-        path: The file to write; the end of its name says the format: ``.ply``,
+        path: The file to write; its suffix chooses the format: ``.ply``,
             ``.compressed.ply``, ``.spz``, ``.splat`` or ``.sog``.
         overwrite: Whether an existing file may be replaced.
 
@@ -139,7 +139,7 @@ def save(scene: GaussianScene, path: str | os.PathLike[str], *, overwrite: bool 
         ...     save(scene, Path(folder) / "two.ply")
         ...     save(scene, Path(folder) / "two.ply", overwrite=True)
     """
-    writer = _WRITERS[_end_of(path, _WRITERS)]
+    writer = _WRITERS[_suffix_of(path, _WRITERS)]
     check_output(path, overwrite)
     dropped = losses(scene, path).dropped
     if dropped:
@@ -158,7 +158,7 @@ def losses(scene: GaussianScene, path: str | os.PathLike[str]) -> Losses:
 
     Args:
         scene: The scene.
-        path: The file; only its name is looked at.
+        path: The file; only its name is used.
 
     Returns:
         What would be dropped, what rounded or reordered (nothing for a ``.ply``), how many
@@ -172,7 +172,7 @@ def losses(scene: GaussianScene, path: str | os.PathLike[str]) -> Losses:
         >>> losses(scene("object", 10, sh_degree=1, seed=0), "small.splat").dropped
         ('SH bands above degree 0 (the scene has degree 1)',)
     """
-    limits = FORMAT_LIMITS.get(_end_of(path, _WRITERS))
+    limits = FORMAT_LIMITS.get(_suffix_of(path, _WRITERS))
     if limits is None:
         return Losses(dropped=(), changed=(), count=len(scene), sh_degree=scene.sh_degree)
     return losses_within(scene, limits)
@@ -195,18 +195,18 @@ def check_save(path: str | os.PathLike[str], overwrite: bool = False) -> None:
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     check_save(Path(folder) / "new.ply")
     """
-    _end_of(path, _WRITERS)
+    _suffix_of(path, _WRITERS)
     check_output(path, overwrite)
 
 
-def _end_of(path: str | os.PathLike[str], known: Iterable[str]) -> str:
-    """Return the known end of a file name."""
+def _suffix_of(path: str | os.PathLike[str], known: Iterable[str]) -> str:
+    """Return the suffix of a file name, or the name, that chooses its format."""
     path = Path(path)
-    for end in known:
-        if path.name.lower().endswith(end):
-            return end
-    *ends, last = known
+    for suffix in known:
+        if path.name.lower().endswith(suffix):
+            return suffix
+    *others, last = known
     raise FileFormatError(
-        f"{path}: the file name must end in {', '.join(ends)} or {last}, "
+        f"{path}: the file name must end in {', '.join(others)} or {last}, "
         f"found {f'the suffix {path.suffix!r}' if path.suffix else 'no suffix'}."
     )

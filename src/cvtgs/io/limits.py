@@ -35,7 +35,7 @@ class FormatLimits:
 
     sh_degree: int
     antialiased: bool
-    """Whether they say that a scene was trained with anti-aliasing."""
+    """Whether they record that a scene was trained with anti-aliasing."""
     comments: bool = False
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Least and largest value of a tensor, by its name."""
@@ -110,7 +110,7 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
         ),
     }
 )
-"""Limits by the end of the file name; a ``.ply`` has none."""
+"""Limits by suffix; a ``.ply`` has none."""
 
 _VALUES = {
     "means": "centre",

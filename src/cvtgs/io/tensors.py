@@ -14,7 +14,7 @@ from cvtgs.io.atomic import atomic_output
 
 def pack_tensors(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
     """Return the bytes of a safetensors file; the same content gives the same bytes."""
-    from safetensors.torch import save  # noqa: PLC0415 (only those who need it load it)
+    from safetensors.torch import save  # noqa: PLC0415 (loaded when it is used)
 
     own = {name: values.detach().cpu().contiguous() for name, values in tensors.items()}
     content = save(own)

@@ -1,4 +1,4 @@
-"""What every camera format comes down to, and how it becomes cameras of one image size."""
+"""Views and lenses, which every camera format is read to, and the cameras built from them."""
 
 import warnings
 from collections import Counter

@@ -117,7 +117,7 @@ class Element:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Header:
-    """What a PLY header says; tables and comments in the order of the file."""
+    """A parsed header; elements and comments are in the order of the file."""
 
     encoding: Encoding
     elements: tuple[Element, ...]

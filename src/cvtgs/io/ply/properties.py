@@ -1,4 +1,4 @@
-"""INRIA's vertex properties: the one place where names in a PLY meet tensors of a scene."""
+"""INRIA's vertex properties: the only file that maps names in a PLY to tensors of a scene."""
 
 import re
 from collections.abc import Iterable
@@ -106,7 +106,7 @@ def check_size(header: Header, vertex: Element, *, path: str, size: int) -> None
 
 
 def layout_of(vertex: Element) -> Layout:
-    """Return the layout that a scene remembers.
+    """Return the layout that a scene keeps, to be written with it again.
 
     Lists are left out. Standard properties that the file stores as integers are ``float`` from
     here on, since merged values are not whole numbers.

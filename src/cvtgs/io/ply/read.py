@@ -43,8 +43,8 @@ _NOT_ASCII = bytes.maketrans(bytes(range(128, 256)), b"?" * 128)
 def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -> GaussianScene:
     """Read a scene from a PLY file of any encoding, property order and number type.
 
-    The common layout (binary little endian, vertices first) is memory-mapped, the rest goes
-    through plyfile; both give the same scene.
+    The common layout (binary little endian, vertices first) is memory-mapped, the rest is read
+    by plyfile; both give the same scene.
 
     Args:
         path: The file.

@@ -20,13 +20,13 @@ from cvtgs.scene import GaussianScene
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlyRows:
-    """The rows of a binary little endian PLY file, read when they are asked for.
+    """The rows of a binary little endian PLY file, read on demand.
 
     Attributes:
         path: The file.
         count: Number of rows.
         names: Names and numpy types of the columns.
-        layout: Names and PLY types, as a scene remembers them.
+        layout: Names and PLY types, as a scene keeps them.
         comments: Comment lines of the file.
         offset: Where the first row starts, in bytes.
     """
@@ -52,7 +52,7 @@ class PlyRows:
             step: Every how many rows.
 
         Returns:
-            A structured array; pages are read when they are looked at.
+            A structured array; pages are read when they are used.
         """
         place = self.offset + start * self.dtype.itemsize
         rows = np.memmap(self.path, self.dtype, "r", place, (stop - start,)).view(np.ndarray)

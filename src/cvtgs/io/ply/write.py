@@ -1,4 +1,4 @@
-"""Write a 3DGS scene to a PLY file, with the properties that it came with as far as they fit."""
+"""Write a 3DGS scene to a PLY file, with the properties of its source as far as they fit."""
 
 import warnings
 from typing import Any, BinaryIO
@@ -112,7 +112,7 @@ def _warn_of_flattened(scene: GaussianScene, layout: Layout) -> None:
 def _output_layout(scene: GaussianScene) -> Layout:
     """Return the properties to write.
 
-    A scene that was read keeps names, order and types. Where its layout does not fit any more,
+    A scene that was read keeps names, order and types. Where its layout no longer fits,
     the standard properties follow the scene (SH degree, dtype), columns that are gone are left
     out, and new extras are appended. A scene without a layout gets INRIA's.
     """
@@ -168,7 +168,7 @@ def _check_names(scene: GaussianScene) -> None:
 
 
 def _extra_type(name: str, column: Tensor, kind: str | None) -> str:
-    """Return the type that the column came with if it still holds every value, else its own."""
+    """Return the type of the column in the source if it holds every value, else its own."""
     if kind is not None and SCALARS[kind].dtype == column.dtype and _fits(column, kind):
         return kind
     if column.dtype == torch.int64:

@@ -14,7 +14,7 @@ _KNOTS = 4096
 
 
 class Codebook(NamedTuple):
-    """Numbers in ascending order, and which of them stands for each value."""
+    """Numbers in ascending order, and the index of the one that replaces each value."""
 
     codes: Float[np.ndarray, "256"]
     labels: UInt8[np.ndarray, "*n"]
@@ -54,16 +54,16 @@ def _first_codes(ordered: Float[np.ndarray, "n"]) -> Float[np.ndarray, "256"]:
 
 
 class Palette(NamedTuple):
-    """At most 65,536 rows that stand for many, and which of them stands for each."""
+    """At most 65,536 rows, and the index of the one that replaces each of the given rows."""
 
     entries: Float[np.ndarray, "p d"]
     labels: Int[np.ndarray, "n"]
 
 
 def palette(rows: Float[np.ndarray, "n d"], most: int = PALETTE) -> Palette:
-    """Find few rows that stand for many.
+    """Find a few rows that replace many.
 
-    Up to ``most`` rows stand for themselves. More are halved again and again, each group at the
+    Up to ``most`` rows are kept. More are halved again and again, each group at the
     mean of its most varied column (Wu 1991, in all groups at once); entries are means of groups.
     This takes seconds for a million rows, where k-means would take an hour on a CPU. Memory: three
     copies of the rows.

@@ -68,7 +68,7 @@ class _Palette(_TwoImages):
 
 
 class _Version2(_Root):
-    """Bytes stand for one of at most 256 numbers, the same in all channels."""
+    """Bytes index a codebook of at most 256 numbers, the same in all channels."""
 
     count: Whole
     means: _Means
@@ -106,7 +106,7 @@ class _PaletteRange(_TwoImages):
 
 
 class _Version1(_Root):
-    """Bytes stand for equal steps from a least to a largest number per channel."""
+    """Bytes are equal steps from a least to a largest number per channel."""
 
     means: _ShapedMeans
     scales: _ThreeRanges
@@ -117,7 +117,7 @@ class _Version1(_Root):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Meta:
-    """What the images of a SOG mean; tables say what the bytes of a channel stand for."""
+    """A checked ``meta.json``; tables give the value of each byte of a channel."""
 
     document: _Version1 | _Version2
     count: int
@@ -148,14 +148,14 @@ def read_sog(path: Path) -> GaussianScene:
         images = _Images(read=read, count=meta.count, path=path)
         means = _means(images, document.means)
         quats = _quats(images.rows(document.quats.files[0]))
-        log_scales = _looked_up(meta.scales, images.rows(document.scales.files[0]))
+        log_scales = _decoded(meta.scales, images.rows(document.scales.files[0]))
         colors = images.rows(document.sh0.files[0])
         arrays = Arrays(
             means=means,
             quats=quats,
             log_scales=log_scales,
             logit_opacities=_logits(colors[:, 3], meta),
-            sh0=_looked_up(meta.colors, colors),
+            sh0=_decoded(meta.colors, colors),
             shN=_rest(images, meta),
         )
     antialiased = document.model == "antialiased" or document.antialias is True
@@ -243,7 +243,7 @@ def _means(images: _Images, part: _Means) -> Float[np.ndarray, "n 3"]:
 
 
 def _quats(stored: UInt8[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Decode three components; the last byte says which is missing. Others mean no rotation."""
+    """Decode three components; the last byte is 252 plus the missing one, else no rotation."""
     tags = stored[:, 3].astype(np.int64) - _FIRST_TAG
     others = (stored[:, :3].astype(np.float32) / np.float32(127.5) - 1) * np.sqrt(np.float32(0.5))
     quats = restore_largest(np.maximum(tags, 0), others)
@@ -258,7 +258,7 @@ def _logits(stored: UInt8[np.ndarray, "n"], meta: _Meta) -> Float[np.ndarray, "n
     return logits
 
 
-def _looked_up(
+def _decoded(
     table: Float[np.ndarray, "3 256"], stored: UInt8[np.ndarray, "n 4"]
 ) -> Float[np.ndarray, "n 3"]:
     values: Float[np.ndarray, "n 3"] = table.astype(np.float32)[np.arange(3), stored[:, :3]]

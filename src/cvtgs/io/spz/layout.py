@@ -29,7 +29,7 @@ _SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.f
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpzHeader:
-    """What an ``.spz`` file of version 1 to 4 says of itself."""
+    """The header of an ``.spz`` file of version 1 to 4."""
 
     version: int
     count: int
