@@ -13,8 +13,8 @@ from pathlib import Path
 from statistics import mean
 
 import cvtgs
-from benchmarks.choices import CHOICES
-from benchmarks.scoring import (
+from benchmarks.quality import (
+    CHOICES,
     Quality,
     Simplify,
     configuration,

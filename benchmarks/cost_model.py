@@ -16,7 +16,7 @@ from operator import attrgetter
 from pathlib import Path
 
 import cvtgs
-from benchmarks.processes import machine
+from benchmarks.measuring import generated_scenes, machine
 from cvtgs.budget import CostModel, Work, cost_model
 from cvtgs.budget.calibrate import CANDIDATES, undisturbed_seconds
 from cvtgs.progress import StageCost
@@ -66,21 +66,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     model = cost_model(recalibrate=options.recalibrate)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        files = options.files or generated(folder, options.most)
+        scenes = [scene for scene in SCENES if scene[1] <= options.most]
+        files = options.files or generated_scenes(folder, scenes, seed=SEED)
         rows = [row for file in files for row in measured(file, folder, model, options)]
     print(f"{machine()}; {options.clock} seconds, the fastest of {options.runs} runs\n")
     print(report(rows))
-
-
-def generated(folder: Path, most: int) -> list[Path]:
-    """Write the scenes."""
-    paths = []
-    for kind, count, degree in SCENES:
-        if count <= most:
-            path = folder / f"{kind}_{count // 1000}k_sh{degree}.ply"
-            cvtgs.save(cvtgs.synthetic.scene(kind, count, sh_degree=degree, seed=SEED), path)
-            paths.append(path)
-    return paths
 
 
 def measured(file: Path, folder: Path, model: CostModel, options: argparse.Namespace) -> list[Row]:

@@ -8,7 +8,6 @@ import argparse
 import json
 import resource
 import tempfile
-import time
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,16 +16,14 @@ from typing import Any, NamedTuple
 import torch
 
 import cvtgs
-from benchmarks.processes import machine, run_python
+from benchmarks.measuring import fastest, machine, renew_tables, run_python
+from benchmarks.quality import score_views
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.analysis import BAND_LOSS, band_losses, duplicate_share, far_share, plan_haze
-from cvtgs.evaluation import psnr
 from cvtgs.math.frames import robust_frame
 from cvtgs.scene import ANTIALIASED_TAG, FLAT_LOG_SCALE
 from cvtgs.synthetic import scene as make
 from cvtgs.views import automatic_views
-
-MARKS = "<!-- tables: python -m benchmarks.effects -->", "<!-- end of tables -->"
 
 LOOK = {"visibility": {"views": 8}}
 
@@ -113,14 +110,7 @@ def main() -> None:
     if options.output is None:
         print(text)
     else:
-        renew(options.output, text)
-
-
-def renew(page: Path, text: str) -> None:
-    """Put text between the marks of a page."""
-    before, rest = page.read_text(encoding="utf-8").split(MARKS[0])
-    after = rest.split(MARKS[1])[1]
-    page.write_text(f"{before}{MARKS[0]}\n\n{text}\n{MARKS[1]}{after}", encoding="utf-8")
+        renew_tables(options.output, text, script="benchmarks.effects")
 
 
 def effect_table(options: argparse.Namespace) -> str:
@@ -158,7 +148,7 @@ def row(name: str, path: Path, options: argparse.Namespace, *, settings: Mapping
             old["peak"] = min(old["peak"], new["peak"])
     full = cvtgs.load(path)
     small = {choice: cvtgs.load(path.with_suffix(f".{choice}.ply")) for choice in found}
-    scores = scores_of(full, small)
+    scores = score_views(full, small, automatic_views(full, 4, width=400, height=300))
     change = max(
         float((tensor - small[choices[1]].tensors()[key]).abs().amax()) if tensor.numel() else 0.0
         for key, tensor in small["auto"].tensors().items()
@@ -170,20 +160,10 @@ def row(name: str, path: Path, options: argparse.Namespace, *, settings: Mapping
             "on" if found["auto"]["active"] else "off",
             " ".join(f"{found[choice]['seconds']:.2f}" for choice in choices),
             " ".join(f"{found[choice]['peak'] / 1e6:.0f}" for choice in choices),
-            " ".join(f"{scores[choice]:.2f}" for choice in choices),
+            " ".join(f"{scores[choice].psnr:.2f}" for choice in choices),
             f"{change:.1g} |",
         ]
     )
-
-
-@torch.no_grad()
-def scores_of(full: GaussianScene, small: Mapping[str, GaussianScene]) -> dict[str, float]:
-    cameras = automatic_views(full, 4, width=400, height=300)
-    truth = cvtgs.render(full, cameras).rgb.clamp(0, 1)
-    return {
-        choice: float(psnr(cvtgs.render(scene, cameras).rgb.clamp(0, 1), truth).mean())
-        for choice, scene in small.items()
-    }
 
 
 def run_child(
@@ -225,15 +205,6 @@ def figure_table(count: int) -> str:
         seconds = fastest(part, runs=9)
         lines.append(f"| {name} | {1e3 * seconds:.1f} | {seconds / whole:.2%} |")
     return "\n".join(lines) + "\n"
-
-
-def fastest(part: Callable[[], object], *, runs: int) -> float:
-    seconds = []
-    for _ in range(runs):
-        start = time.process_time()
-        part()
-        seconds.append(time.process_time() - start)
-    return min(seconds)
 
 
 if __name__ == "__main__":

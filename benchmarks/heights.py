@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 import cvtgs
-from benchmarks.scoring import scenes
+from benchmarks.quality import scenes
 from cvtgs.cameras import Cameras, look_at
+from cvtgs.evaluation import psnr
 from cvtgs.math.frames import robust_frame
 
 HEIGHTS = ((90, 1.5), (60, 1.2), (35, 1.6), (20, 1.2), (20, 2.8), (10, 2.2), (-15, 2.8), (-35, 2.0),
@@ -75,14 +76,8 @@ def scores(scene: cvtgs.GaussianScene, variant: str, cameras: list[Cameras], rho
     settings = dict(word.split("=", 1) for word in words)
     config = cvtgs.SimplifyConfig.compose(preset=preset, settings=settings)
     small = cvtgs.Simplifier(config=config).simplify(scene, rho)
-    found = []
-    for views in cameras:
-        error = cvtgs.render(small, views).rgb.clamp(0, 1) - cvtgs.render(scene, views).rgb.clamp(
-            0, 1
-        )
-        squares = error.double().square().mean(dim=(1, 2, 3)).clamp_min(1e-12)
-        found.append(-10 * torch.log10(squares).mean())
-    return torch.stack(found)
+    pairs = ([cvtgs.render(one, views).rgb for one in (small, scene)] for views in cameras)
+    return torch.stack([psnr(*(one.clamp(0, 1) for one in pair)).mean() for pair in pairs])
 
 
 if __name__ == "__main__":

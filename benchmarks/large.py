@@ -17,8 +17,8 @@ from statistics import mean
 import torch
 
 import cvtgs
-from benchmarks.processes import machine, run_python
-from cvtgs.evaluation import EvaluationSettings
+from benchmarks.measuring import machine, run_python
+from benchmarks.quality import score_views
 from cvtgs.outofcore import simplify_file
 from cvtgs.views import automatic_views
 
@@ -140,9 +140,7 @@ def scenes(options: argparse.Namespace) -> list[tuple[str, cvtgs.GaussianScene]]
 def scores(scene: cvtgs.GaussianScene, small: dict[str, cvtgs.GaussianScene]) -> dict[str, float]:
     """Return mean PSNR over automatic views."""
     cameras = automatic_views(scene, 6, width=400, height=300)
-    settings = EvaluationSettings(lpips="off")
-    found = cvtgs.evaluate(scene, small, cameras, settings=settings)
-    return {one.name: one.psnr.mean for one in found.scenes}
+    return {name: found.psnr for name, found in score_views(scene, small, cameras).items()}
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ catalogue of ``tests/hard_cases.py``.
 
 import argparse
 import sys
-import time
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -16,7 +15,7 @@ import torch
 from torch import Tensor
 
 import cvtgs
-from benchmarks.processes import machine
+from benchmarks.measuring import fastest, machine, renew_tables
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.cells import Partition, gather_members, mean_and_covariance, merge_cells
 from cvtgs.cvt import embed, nearest_neighbors, tessellate
@@ -28,7 +27,6 @@ from cvtgs.views import automatic_views
 
 COUNT = 2000
 TIMED = 20_000
-MARKS = "<!-- tables: python -m benchmarks.numerics -->", "<!-- end of tables -->"
 Cases = Mapping[str, Callable[[int, torch.dtype], GaussianScene]]
 
 
@@ -62,7 +60,7 @@ def main() -> None:
     if options.output is None:
         print(text)
     else:
-        renew(options.output, text)
+        renew_tables(options.output, text, script="benchmarks.numerics")
 
 
 def catalogue() -> Cases:
@@ -71,13 +69,6 @@ def catalogue() -> Cases:
     from hard_cases import CASES  # noqa: PLC0415 (found there only)
 
     return CASES
-
-
-def renew(page: Path, text: str) -> None:
-    """Put text between the marks of a page."""
-    before, rest = page.read_text(encoding="utf-8").split(MARKS[0])
-    after = rest.split(MARKS[1])[1]
-    page.write_text(f"{before}{MARKS[0]}\n\n{text}\n{MARKS[1]}{after}", encoding="utf-8")
 
 
 def error_table(cases: Cases, count: int) -> str:
@@ -112,14 +103,9 @@ def cpu_seconds(
     make: Callable[[int, torch.dtype], GaussianScene], count: int, preset: str
 ) -> float:
     scene, simplifier = make(count, torch.float32), Simplifier(config=preset, device="cpu")
-    found = []
-    for _ in range(2):
-        start = time.process_time()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of dropped rows
-            simplifier.simplify(scene, 0.1)
-        found.append(time.process_time() - start)
-    return min(found)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of dropped rows
+        return fastest(lambda: simplifier.simplify(scene, 0.1), runs=2)
 
 
 def figures(make: Callable[[int, torch.dtype], GaussianScene], count: int) -> Figures:

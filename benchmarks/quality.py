@@ -1,19 +1,261 @@
-"""PSNR, SSIM and LPIPS against the full scene, of every preset.
+"""PSNR, SSIM and LPIPS against the full scene, of every preset or of single choices.
 
-``python -m benchmarks.quality`` scores generated scenes with cvtgs' own renderer and views.
-Scenes of your own: name the files. LPIPS: ``--lpips WEIGHTS``. Another judge: ``--scorer "python
-score.py --json {full} {small}"``; it gets the full scene and the small ones, and prints a JSON
-list of objects with ``psnr``, ``ssim`` and perhaps ``lpips``, in that order.
+``python -m benchmarks.quality`` scores the presets on generated scenes with cvtgs' own renderer and
+views. Scenes of your own: name the files. LPIPS: ``--lpips WEIGHTS``. Another judge: ``--scorer
+"python score.py --json {full} {small}"``; it gets the full scene and the small ones, and prints a
+JSON list of objects with ``psnr``, ``ssim`` and perhaps ``lpips``, in that order.
+
+``--choices`` changes one choice of ``standard`` at a time instead; ``--set merge.network=false``
+measures the choices without a network, which was trained for all of them as they are.
 """
 
+import argparse
+import json
+import shlex
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import mean
+
 import cvtgs
-from benchmarks.scoring import markdown, measure, scoring_parser, variants_of
+from cvtgs.cameras import Cameras
+from cvtgs.errors import FileFormatError
+from cvtgs.evaluation import EvaluationSettings, LpipsWeights, load_lpips
+from cvtgs.evaluation import scorer as scorers
+from cvtgs.views import automatic_views
+
+VIEWS = 8
+SIZE = 400
+"""What cvtgs' own renderer looks at: automatic views, and pixels on each side."""
+
+RATIOS = (0.1, 0.01, 0.001)
+MEAN = "mean"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Quality:
+    """How close the images of a small scene come to those of the full one.
+
+    Attributes:
+        psnr: dB.
+        ssim: At most 1.
+        lpips: At least 0, less is better; None if it was not measured.
+    """
+
+    psnr: float
+    ssim: float
+    lpips: float | None = None
+
+
+Simplify = Callable[[cvtgs.GaussianScene, float], cvtgs.GaussianScene]
+"""Takes a scene and the ratio to keep."""
+
+Scorer = Callable[[cvtgs.GaussianScene, Sequence[cvtgs.GaussianScene]], list[Quality]]
+"""Takes the full scene and small ones."""
+
+Table = Mapping[str, Mapping[str, Sequence[Quality]]]
+"""One quality per ratio, by the name of the variant, by the name of the scene."""
+
+
+def scoring_parser(description: str | None) -> argparse.ArgumentParser:
+    """Make a parser that knows what to score, at which ratios, and by whom."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("files", nargs="*", type=Path, help="scenes; generated ones if none")
+    parser.add_argument("--rho", type=float, nargs="+", default=list(RATIOS))
+    parser.add_argument("--count", type=int, default=100_000, help="size of generated scenes")
+    parser.add_argument("--means", action="store_true", help="leave out the single scenes")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    judges = parser.add_mutually_exclusive_group()
+    judges.add_argument(
+        "--scorer", help="command with {full} and {small}; prints a JSON list with psnr and ssim"
+    )
+    judges.add_argument("--lpips", type=Path, help="weights file: measure LPIPS too")
+    return parser
+
+
+def configuration(options: argparse.Namespace, settings: Mapping[str, str]) -> cvtgs.SimplifyConfig:
+    """Put together what the command line sets, and ``settings``, which win; ``preset`` is one."""
+    values = {**dict(item.split("=", 1) for item in options.set), **settings}
+    return cvtgs.SimplifyConfig.compose(preset=values.pop("preset", None), settings=values)
+
+
+def variants_of(
+    options: argparse.Namespace, table: Mapping[str, Mapping[str, str]]
+) -> dict[str, Simplify]:
+    """Return a simplifier for every row of settings."""
+    return {
+        name: cvtgs.Simplifier(config=configuration(options, settings)).simplify
+        for name, settings in table.items()
+    }
+
+
+def measure(variants: Mapping[str, Simplify], options: argparse.Namespace) -> Iterator[Table]:
+    """Score every variant on every scene; give the table so far after each scene."""
+    score = make_scorer(options)
+    table: dict[str, dict[str, list[Quality]]] = {}
+    for name, scene in scenes(options.files, options.count):
+        small = [simplify(scene, rho) for simplify in variants.values() for rho in options.rho]
+        found = iter(score(scene, small))
+        table[name] = {variant: [next(found) for _ in options.rho] for variant in variants}
+        print(f"scored {name}: {len(scene)} Gaussians, {len(small)} small scenes", file=sys.stderr)
+        yield dict(table)
+
+
+def scenes(files: Sequence[Path], count: int) -> Iterator[tuple[str, cvtgs.GaussianScene]]:
+    """Return the scenes of the files, or one generated scene of each kind, with their names."""
+    stems = Counter(file.stem for file in files)
+    for file in files:
+        yield file.stem if stems[file.stem] == 1 else str(file), cvtgs.load(file)
+    for seed, kind in enumerate(() if files else cvtgs.synthetic.KINDS):
+        yield kind, cvtgs.synthetic.scene(kind, count, sh_degree=1, seed=seed)
+
+
+def make_scorer(options: argparse.Namespace) -> Scorer:
+    """Make what the options ask for; weights are read once."""
+    if options.scorer:
+        return command_scorer(options.scorer)
+    return own_scorer(None if options.lpips is None else any_lpips(options.lpips))
+
+
+def any_lpips(path: Path) -> LpipsWeights:
+    """Read LPIPS weights of whichever network the file holds."""
+    try:
+        return load_lpips("vgg", path)
+    except FileFormatError:
+        return load_lpips("alex", path)
+
+
+def own_scorer(weights: LpipsWeights | None) -> Scorer:
+    """Score by cvtgs' own renderer and views."""
+
+    def score(full: cvtgs.GaussianScene, small: Sequence[cvtgs.GaussianScene]) -> list[Quality]:
+        cameras = automatic_views(full, VIEWS, width=SIZE, height=SIZE)
+        scorer = scorers.Scorer(full, cameras.singles(), metrics=scorers.Metrics(lpips=weights))
+        found = [scorers.scene_scores("", len(scene), scorer.score(scene)) for scene in small]
+        return [
+            Quality(
+                psnr=scores.psnr.mean,
+                ssim=scores.ssim.mean,
+                lpips=scores.lpips.mean if scores.lpips else None,
+            )
+            for scores in found
+        ]
+
+    return score
+
+
+def score_views(
+    full: cvtgs.GaussianScene, small: Mapping[str, cvtgs.GaussianScene], cameras: Cameras
+) -> dict[str, Quality]:
+    """Return PSNR and SSIM of small scenes against the full one, means over the cameras."""
+    settings = EvaluationSettings(lpips="off")
+    found = cvtgs.evaluate(full, small, cameras, settings=settings)
+    return {one.name: Quality(psnr=one.psnr.mean, ssim=one.ssim.mean) for one in found.scenes}
+
+
+def command_scorer(template: str) -> Scorer:
+    """Score by a command, which gets files and prints JSON: ``psnr``, ``ssim``, maybe ``lpips``."""
+
+    def score(full: cvtgs.GaussianScene, small: Sequence[cvtgs.GaussianScene]) -> list[Quality]:
+        with tempfile.TemporaryDirectory() as folder:
+            paths = [Path(folder) / f"{number}.ply" for number in range(len(small) + 1)]
+            for scene, path in zip([full, *small], paths, strict=True):
+                cvtgs.save(scene, path)
+            first, *others = (shlex.quote(str(path)) for path in paths)
+            command = shlex.split(template.format(full=first, small=" ".join(others)))
+            output = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+        return [
+            Quality(psnr=entry["psnr"], ssim=entry["ssim"], lpips=entry.get("lpips"))
+            for entry in json.loads(output)
+        ]
+
+    return score
+
+
+def means(table: Table) -> dict[str, list[Quality]]:
+    """Average over the scenes: one quality per ratio, by variant."""
+    first, *_ = table.values()
+    return {
+        variant: [
+            Quality(
+                psnr=mean(quality.psnr for quality in column),
+                ssim=mean(quality.ssim for quality in column),
+                lpips=mean_or_none([quality.lpips for quality in column]),
+            )
+            for column in zip(*(rows[variant] for rows in table.values()), strict=True)
+        ]
+        for variant in first
+    }
+
+
+def mean_or_none(values: Sequence[float | None]) -> float | None:
+    """Average, if every value is known."""
+    known = [value for value in values if value is not None]
+    return mean(known) if len(known) == len(values) else None
+
+
+def markdown(table: Table, ratios: Sequence[float], *, means_only: bool = False) -> str:
+    """Return a Markdown table: the mean first, then scene by scene."""
+    heads = [f"{name} at {rho:g}" for rho in ratios for name in ("PSNR", "SSIM", "LPIPS")]
+    shown = {MEAN: means(table)} if means_only else {MEAN: means(table), **table}
+    lines = [
+        [scene, variant, *(cell for quality in row for cell in cells_of(quality))]
+        for scene, rows in shown.items()
+        for variant, row in rows.items()
+    ]
+    return markdown_rows(["scene", "variant", *heads], lines)
+
+
+def markdown_rows(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Lay out a Markdown table."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def cells_of(quality: Quality) -> tuple[str, str, str]:
+    """Return the text of three columns; a dash for what was not measured."""
+    distance = "-" if quality.lpips is None else f"{quality.lpips:.4f}"
+    return f"{quality.psnr:.2f}", f"{quality.ssim:.4f}", distance
+
+
+def powers(power: str) -> dict[str, str]:
+    return {"cvt.area_power": power, "cvt.unbounded_area_power": power}
+
+
+CHOICES: Mapping[str, Mapping[str, str]] = {
+    "standard": {},
+    "by position only": {"cvt.color": "0"},
+    "colour as for 10,000 cells": {"cvt.color_power": "0"},
+    "no perspective": {"cvt.perspective": "false"},
+    "no ambient visibility": {"cvt.hidden_share": "1"},
+    "weight by opacity (power 0)": powers("0"),
+    "weight power 0.5": powers("0.5"),
+    "weight power 0.8": powers("0.8"),
+    "weight power 1 everywhere": powers("1"),
+    "unbounded off": {"effects.unbounded": "off"},
+    "seeds only, no Lloyd": {"cvt.iterations": "0"},
+    "20 Lloyd iterations over all": {"cvt.iterations": "20", "cvt.samples_per_site": "0"},
+    "paper's filter": {"filter.max_mass_share": "1"},
+    "no filter": {"filter.max_mass_share": "0"},
+    "members weigh by opacity": {"merge.area_power": "0"},
+    "paper's opacity": {"merge.opacity": "union"},
+    "moments of all members": {"merge.representatives": "false"},
+    "no inflation": {"merge.inflation": "0", "merge.covered_inflation": "0"},
+    "inflation without neighbours": {"merge.inflation": "0.3", "merge.covered_inflation": "0"},
+    "paper": {"preset": "paper"},
+}
 
 
 def main() -> None:
-    options = scoring_parser(__doc__).parse_args()
-    variants = variants_of(options, {name: {"preset": name} for name in cvtgs.PRESETS})
-    *_, table = measure(variants, options)
+    parser = scoring_parser(__doc__)
+    parser.add_argument("--choices", action="store_true", help="one choice at a time")
+    options = parser.parse_args()
+    presets = {name: {"preset": name} for name in cvtgs.PRESETS}
+    *_, table = measure(variants_of(options, CHOICES if options.choices else presets), options)
     print(markdown(table, options.rho, means_only=options.means))
 
 

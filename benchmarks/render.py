@@ -18,8 +18,7 @@ from pathlib import Path
 import torch
 
 import cvtgs
-from benchmarks.processes import machine, run_python, spread
-from benchmarks.speed import generated_scenes
+from benchmarks.measuring import generated_scenes, machine, run_python, spread
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.rendering import BackendName, render
 

@@ -8,13 +8,12 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
 import cvtgs
-from benchmarks.processes import machine, run_python, spread
+from benchmarks.measuring import generated_scenes, machine, run_python, spread
 from cvtgs.math.frames import morton_order, robust_frame
 
 SCENES = (("courtyard", 1_000_000, 0), ("courtyard", 250_000, 2), ("courtyard", 400_000, 3))
@@ -36,15 +35,6 @@ def main() -> None:
         print(f"{machine()}, torch {torch.__version__}; rho {options.rho:g}, {options.runs} runs\n")
         measure_processes(files, Path(folder), options)
         measure_stages(files, options)
-
-
-def generated_scenes(folder: Path, scenes: Sequence[tuple[str, int, int]]) -> list[Path]:
-    files = []
-    for kind, count, degree in scenes:
-        path = folder / f"{kind}_{count // 1000}k_sh{degree}.ply"
-        cvtgs.save(cvtgs.synthetic.scene(kind, count, sh_degree=degree, seed=0), path)
-        files.append(path)
-    return files
 
 
 def measure_processes(files: list[Path], folder: Path, options: argparse.Namespace) -> None:

@@ -12,8 +12,8 @@ import torch
 import cvtgs
 from benchmarks.baselines.pruning import keep_most_mass
 from benchmarks.numerics import catalogue
+from benchmarks.quality import score_views
 from cvtgs import Simplifier, SimplifyConfig
-from cvtgs.evaluation import EvaluationSettings, evaluate
 from cvtgs.views import automatic_views
 
 MOMENTS = {"merge.representatives": "false"}
@@ -39,9 +39,8 @@ def main() -> None:
             count = math.floor(rho * len(scene))
             small = {text: simplified(scene, count, how) for text, how in VARIANTS.items()}
             small["mass pruning"] = keep_most_mass(scene, count)
-            settings = EvaluationSettings(lpips="off")
-            scores = evaluate(scene, small, cameras, settings=settings).scenes
-            cells = (f"{score.psnr.mean:.2f} dB / {score.ssim.mean:.3f}" for score in scores)
+            scores = score_views(scene, small, cameras).values()
+            cells = (f"{score.psnr:.2f} dB / {score.ssim:.3f}" for score in scores)
             print(f"| {name} | {rho:g} | " + " | ".join(cells) + " |")
 
 

@@ -24,8 +24,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from benchmarks.baselines.mixtures import covariances_of, from_moments
-from benchmarks.baselines.rows import usable
+from benchmarks.baselines.gaussians import covariances_of, from_moments, usable
 from cvtgs.scene import GaussianScene
 
 BLOCKS = 1024

@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.baselines.rows import keep_largest, usable
+from benchmarks.baselines.gaussians import keep_largest, usable
 from cvtgs.rendering import contributions
 from cvtgs.scene import GaussianScene
 from cvtgs.views import automatic_views

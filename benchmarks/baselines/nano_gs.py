@@ -29,8 +29,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from benchmarks.baselines.mixtures import covariances_of, from_moments
-from benchmarks.baselines.rows import usable
+from benchmarks.baselines.gaussians import covariances_of, from_moments, usable
 from cvtgs.filters import visible_rows
 from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene

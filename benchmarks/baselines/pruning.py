@@ -5,7 +5,7 @@ area of the one-sigma ellipsoid (Cauchy 1832: a quarter of its surface), which i
 paints, averaged over all directions, if nothing hides it.
 """
 
-from benchmarks.baselines.rows import keep_largest, usable
+from benchmarks.baselines.gaussians import keep_largest, usable
 from cvtgs.scene import GaussianScene
 
 

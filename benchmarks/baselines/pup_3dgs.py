@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from benchmarks.baselines.rows import keep_largest, usable
+from benchmarks.baselines.gaussians import keep_largest, usable
 from cvtgs.cameras import Cameras
 from cvtgs.rendering import BackendName, render
 from cvtgs.scene import GaussianScene

@@ -8,8 +8,8 @@ import torch
 
 import cvtgs
 import lpips_cases
-from benchmarks import ablation, scoring
-from benchmarks.grouping import grouped_simplifier, nearest_groups, regroup
+from benchmarks import ablation, quality
+from benchmarks.ablation import grouped_simplifier, nearest_groups, regroup
 from cvtgs.mergenet import load_checkpoint
 from cvtgs.train.cases import merge_scene
 
@@ -32,8 +32,8 @@ def file(scene, tmp_path):
 
 @pytest.fixture(autouse=True)
 def _small_images(monkeypatch):
-    monkeypatch.setattr(scoring, "VIEWS", 2)
-    monkeypatch.setattr(scoring, "SIZE", 48)
+    monkeypatch.setattr(quality, "VIEWS", 2)
+    monkeypatch.setattr(quality, "SIZE", 48)
 
 
 def groups_one_by_one(places: np.ndarray, seeds: list[int]) -> list[int]:
@@ -140,12 +140,12 @@ def test_another_judge_gets_every_small_scene(file, tmp_path, capsys):
 
 
 def test_means_are_over_scenes_and_unknown_lpips_stays_unknown():
-    low = scoring.Quality(psnr=20.0, ssim=0.5, lpips=0.2)
-    high = scoring.Quality(psnr=30.0, ssim=0.7)
+    low = quality.Quality(psnr=20.0, ssim=0.5, lpips=0.2)
+    high = quality.Quality(psnr=30.0, ssim=0.7)
     table = {"a": {"full": [low, low]}, "b": {"full": [high, low]}}
-    mixed, same = scoring.means(table)["full"]
-    assert mixed == scoring.Quality(psnr=25.0, ssim=0.6, lpips=None)
+    mixed, same = quality.means(table)["full"]
+    assert mixed == quality.Quality(psnr=25.0, ssim=0.6, lpips=None)
     assert same == low
-    assert scoring.markdown(table, [0.1, 0.01], means_only=True).splitlines()[-1] == (
+    assert quality.markdown(table, [0.1, 0.01], means_only=True).splitlines()[-1] == (
         "| mean | full | 25.00 | 0.6000 | - | 20.00 | 0.5000 | 0.2000 |"
     )

@@ -7,7 +7,7 @@ import torch
 
 import cvtgs
 import lpips_cases
-from benchmarks import compare, compare_report, scoring
+from benchmarks import compare, quality
 from benchmarks.baselines import BASELINES, baseline
 
 COPY = """
@@ -25,8 +25,8 @@ cvtgs.save(full.select(rows), sys.argv[2], overwrite=True)
 
 @pytest.fixture(autouse=True)
 def _small_images(monkeypatch):
-    monkeypatch.setattr(scoring, "VIEWS", 2)
-    monkeypatch.setattr(scoring, "SIZE", 48)
+    monkeypatch.setattr(quality, "VIEWS", 2)
+    monkeypatch.setattr(quality, "SIZE", 48)
 
 
 @pytest.fixture
@@ -41,9 +41,9 @@ def rows_of(text: str) -> list[list[str]]:
 
 
 def result(psnr: float, *, seconds: float = 2.0, lpips: float | None = None, count: int = 10):
-    quality = scoring.Quality(psnr=psnr, ssim=0.5, lpips=lpips)
-    return compare_report.Result(
-        quality=quality, wall_seconds=seconds, cpu_seconds=1.0, count=count, wanted=10
+    found = quality.Quality(psnr=psnr, ssim=0.5, lpips=lpips)
+    return compare.Result(
+        quality=found, wall_seconds=seconds, cpu_seconds=1.0, count=count, wanted=10
     )
 
 
@@ -74,10 +74,10 @@ def test_methods_and_a_tool_are_run_judged_and_reported(file, tmp_path, capsys):
 def test_the_table_has_what_the_baseline_itself_gives(file, capsys):
     compare.main([str(file), "--rho", "0.1", "--methods", "mass pruning"])
     full = cvtgs.load(file)
-    (quality,) = scoring.own_scorer(None)(full, [baseline("mass pruning")(full, 100)])
+    (found,) = quality.own_scorer(None)(full, [baseline("mass pruning")(full, 100)])
     assert rows_of(capsys.readouterr().out)[-1][2:4] == [
-        f"{quality.psnr:.2f}",
-        f"{quality.ssim:.4f}",
+        f"{found.psnr:.2f}",
+        f"{found.ssim:.4f}",
     ]
 
 
@@ -147,23 +147,23 @@ def test_means_are_over_scenes_and_a_failure_leaves_a_dash():
         "a": {"x": [result(20.0, lpips=0.1), result(30.0)], "y": [result(10.0), None]},
         "b": {"x": [result(30.0, seconds=4.0), result(30.0)], "y": [result(11.0), result(1.0)]},
     }
-    text = compare_report.markdown(table, [0.1, 0.01], means_only=True)
+    text = compare.markdown(table, [0.1, 0.01], means_only=True)
     assert rows_of(text)[2:] == [
         ["mean", "x", "25.00", "0.5000", "-", "3.0", "30.00", "0.5000", "-", "2.0"],
         ["mean", "y", "10.50", "0.5000", "-", "2.0", "-", "-", "-", "-"],
     ]
-    cpu = compare_report.markdown(table, [0.1, 0.01], means_only=True, clock="cpu")
+    cpu = compare.markdown(table, [0.1, 0.01], means_only=True, clock="cpu")
     assert rows_of(cpu)[2][5] == "1.0"
-    assert compare_report.failures(table, [0.1, 0.01]).splitlines()[2:] == ["- y, a, 0.01"]
-    assert compare_report.wrong_counts(table, [0.1, 0.01]) == ""
+    assert compare.failures(table, [0.1, 0.01]).splitlines()[2:] == ["- y, a, 0.01"]
+    assert compare.wrong_counts(table, [0.1, 0.01]) == ""
 
 
 def test_the_plot_shows_what_succeeded_everywhere(monkeypatch):
     table = {"a": {"x": [result(20.0), result(10.0)], "y": [result(9.0), None], "z": [None, None]}}
     drawn = []
-    monkeypatch.setattr(compare_report, "line_chart", lambda panels, **_: drawn.extend(panels))
-    compare_report.chart(table, [0.1, 0.01])
+    monkeypatch.setattr(compare, "line_chart", lambda panels, **_: drawn.extend(panels))
+    compare.chart(table, [0.1, 0.01])
     lines = {line.name: (line.x, line.y, line.markers) for line in drawn[0].series}
     assert lines == {"x": ([2.0, 2.0], [20.0, 10.0], True), "y": ([2.0], [9.0], True)}
     assert drawn[0].log_x
-    assert compare_report.chart({"a": {"z": [None]}}, [0.1]) is None
+    assert compare.chart({"a": {"z": [None]}}, [0.1]) is None

@@ -1,4 +1,4 @@
-"""What baselines start from and pruning ends with: rows of a scene."""
+"""Rows of a scene that baselines use and keep, and its Gaussians as densities."""
 
 from dataclasses import replace
 
@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import invalid_rows, standardized
 
@@ -34,3 +35,28 @@ def keep_largest(scene: GaussianScene, scores: Float[Tensor, "n"], *, count: int
     """Keep the rows with the largest scores, in their order; of equal ones the first."""
     best = torch.sort(scores, descending=True, stable=True).indices[:count]
     return scene.select(best.sort().values)
+
+
+def covariances_of(scene: GaussianScene) -> Float[Tensor, "n 3 3"]:
+    """Build covariances with positive eigenvalues: flat Gaussians get 1e-6 of their extent.
+
+    Without that no Kullback-Leibler divergence from a flat Gaussian would be finite. For the same
+    reason no scale is below 1e-30.
+    """
+    scales = torch.exp(scene.log_scales.double()).clamp_min(1e-30)
+    scales = torch.maximum(scales, 1e-6 * scales.amax(dim=1, keepdim=True))
+    return parameters.build_covariances(scales, scene.quats.double())
+
+
+def from_moments(
+    scene: GaussianScene,
+    means: Float[Tensor, "m 3"],
+    shapes: Float[Tensor, "m 3 3"],
+    appearance: dict[str, Tensor],
+) -> GaussianScene:
+    """Make Gaussians of moments and appearance, with the dtype and the comments of the scene."""
+    scales, quats = parameters.decompose_covariances(shapes)
+    tensors = {"means": means, "quats": quats, "log_scales": parameters.positive_log(scales)}
+    return scene.with_tensors(
+        {name: values.to(scene.dtype) for name, values in (tensors | appearance).items()}, {}
+    )

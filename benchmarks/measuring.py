@@ -1,0 +1,106 @@
+"""What benchmarks share: cost of processes and functions, generated files, tables of a page."""
+
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cvtgs
+from cvtgs.errors import RunError
+from cvtgs.io import atomic_output
+from cvtgs.tradeoff.runs import run_process
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cost:
+    """Cost of one process, its children not included.
+
+    Attributes:
+        user_seconds: Processor time outside the kernel.
+        wall_seconds: Time from start to end.
+        peak_bytes: Largest resident size.
+        output: Its standard output.
+    """
+
+    user_seconds: float
+    wall_seconds: float
+    peak_bytes: int
+    output: str
+
+
+def run_python(*arguments: str) -> Cost:
+    """Run this Python with arguments, and measure."""
+    return run([sys.executable, *arguments])
+
+
+def run(command: Sequence[str]) -> Cost:
+    """Run a command and measure it; a failure ends the benchmark."""
+    try:
+        cost = run_process(command)
+    except RunError as error:
+        raise SystemExit(f"{' '.join(command)} failed: {error}") from None
+    sys.stderr.write(cost.errors)
+    return Cost(
+        user_seconds=cost.user_seconds,
+        wall_seconds=cost.wall_seconds,
+        peak_bytes=cost.peak_memory_bytes,
+        output=cost.output,
+    )
+
+
+def fastest(run: Callable[[], object], *, runs: int) -> float:
+    """Return the smallest processor seconds of several runs."""
+    seconds = []
+    for _ in range(runs):
+        start = time.process_time()
+        run()
+        seconds.append(time.process_time() - start)
+    return min(seconds)
+
+
+def spread(values: Sequence[float]) -> str:
+    """Return median, smallest and largest."""
+    return f"{statistics.median(values):.2f} ({min(values):.2f}-{max(values):.2f})"
+
+
+def machine() -> str:
+    """Return the names of processor and Python."""
+    model = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    model = names[0] if names else model
+    return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}"
+
+
+def generated_scenes(
+    folder: Path, scenes: Sequence[tuple[str, int, int]], *, seed: int = 0
+) -> list[Path]:
+    """Write generated scenes of some kinds, counts and SH degrees; return their files."""
+    files = []
+    for kind, count, degree in scenes:
+        path = folder / f"{kind}_{count // 1000}k_sh{degree}.ply"
+        cvtgs.save(cvtgs.synthetic.scene(kind, count, sh_degree=degree, seed=seed), path)
+        files.append(path)
+    return files
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file, completely or not at all, and its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_output(path, overwrite=True) as file:
+        file.write(content)
+
+
+def renew_tables(page: Path, text: str, *, script: str) -> None:
+    """Replace the tables that a script made on a page."""
+    start, end = f"<!-- tables: python -m {script} -->", "<!-- end of tables -->"
+    before, rest = page.read_text(encoding="utf-8").split(start)
+    after = rest.split(end)[1]
+    page.write_text(f"{before}{start}\n\n{text}\n{end}{after}", encoding="utf-8")
