@@ -1,4 +1,4 @@
-"""Cameras: from where images of a scene are taken."""
+"""Pinhole cameras, and view matrices of cameras that look at points."""
 
 from dataclasses import dataclass, replace
 from typing import Self
@@ -79,7 +79,7 @@ class Cameras:
         return -(rotations.transpose(1, 2) @ shifts)[:, :, 0]
 
     def select(self, rows: Int[Tensor, "m"]) -> Self:
-        """Take some cameras.
+        """Return some of the cameras.
 
         Args:
             rows: Their numbers.
@@ -138,7 +138,7 @@ class Cameras:
         )
 
     def spread(self, count: int) -> Self:
-        """Take cameras spread evenly over their order.
+        """Return cameras spread evenly over their order.
 
         Args:
             count: How many, at least 1; all if there are no more.

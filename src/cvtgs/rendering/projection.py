@@ -190,7 +190,7 @@ def _offsets(means: Float[Tensor, "n 3"], camera: Pinhole) -> Float[Tensor, "n 3
 
 @torch.no_grad()
 def _candidates(scene: GaussianScene, camera: Pinhole) -> Tensor:
-    """Leave out what cannot be in the image, by a ball around each Gaussian."""
+    """Return the rows whose bounding ball touches the image, without faint and invalid ones."""
     rotation = scene.means.new_tensor(camera.rotation)
     x, y, z = (_offsets(scene.means, camera) @ rotation.T).unbind(1)
     steepest = sum(max(abs(low), abs(high)) ** 2 for low, high in camera.slopes)

@@ -104,7 +104,7 @@ def _render_one(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Float[
 def _assemble(
     tiles: Float[Tensor, "t side side 5"], lists: TileLists, size: tuple[int, int]
 ) -> Float[Tensor, "h w 5"]:
-    """Lay tiles side by side and cut off what hangs over the edges."""
+    """Join tiles to an image, without what lies beyond its edges."""
     down = len(tiles) // lists.across
     grid = tiles.unflatten(0, (down, lists.across)).transpose(1, 2)
     overhanging: Tensor = grid.reshape(down * lists.side, lists.across * lists.side, -1)
@@ -288,7 +288,7 @@ def composite_gradient(
 def _exponent_gradient(
     batch: TileBatch, of_log_alpha: Float[Tensor, "b k q"]
 ) -> Float[Tensor, "b k 6"]:
-    """Pass the gradient of the exponents on to centres, ellipses and log opacities."""
+    """Return the gradient by centres, ellipses and log opacities from that by the exponents."""
     _, _, square, shear, rest = batch.params[:, :, :5].unbind(2)
     per_row = of_log_alpha.unflatten(2, batch.along.shape[2:])
     zeroth, moments = per_row.sum(dim=3), per_row * batch.along
