@@ -16,7 +16,7 @@ from scenes import random_scene
 
 
 class Case(NamedTuple):
-    """Cells before their network sees them, and what it needs to see."""
+    """Cells before their network corrects them, and its inputs."""
 
     scene: GaussianScene
     merged: GaussianScene
@@ -60,14 +60,14 @@ class Case(NamedTuple):
         )
 
     def oracle_cells(self) -> list[oracle.Cell]:
-        members = oracle_kernels(self.scene)
-        merged = oracle_kernels(self.merged)
+        members = oracle_gaussians(self.scene)
+        merged = oracle_gaussians(self.merged)
         ends = self.part.offsets.tolist()
         return [
             oracle.Cell(
                 own=merged[cell],
                 members=[members[row] for row in self.part.order[start:end].tolist()],
-                lights=self.visibility[self.part.order[start:end]].tolist(),
+                visibilities=self.visibility[self.part.order[start:end]].tolist(),
                 others=[merged[other] for other in self.neighbors[cell].tolist()],
                 other_sizes=self.part.counts[self.neighbors[cell]].tolist(),
             )
@@ -75,7 +75,7 @@ class Case(NamedTuple):
         ]
 
 
-def oracle_kernels(scene: GaussianScene) -> list[oracle.Kernel]:
+def oracle_gaussians(scene: GaussianScene) -> list[oracle.Gaussian]:
     columns = zip(
         scene.means.tolist(),
         scene.quats.tolist(),
@@ -84,7 +84,7 @@ def oracle_kernels(scene: GaussianScene) -> list[oracle.Kernel]:
         scene.sh0[:, 0].tolist(),
         strict=True,
     )
-    return [oracle.kernel(*row) for row in columns]
+    return [oracle.gaussian(*row) for row in columns]
 
 
 def case_of(
@@ -95,7 +95,7 @@ def case_of(
     near: int = 8,
     config: MergeConfig | None = None,
 ) -> Case:
-    """Merge given cells; lights are strewn over 0 to 1 unless given."""
+    """Merge given cells; visibilities are random in 0 to 1 unless given."""
     part = Partition.from_labels(labels, int(labels.amax()) + 1)
     merged = merge_cells(scene, part, config=config or MergeConfig())
     if visibility is None:
@@ -147,7 +147,7 @@ def fields_of(residuals: Residuals) -> dict[str, Tensor]:
 
 
 def features_of(seen: Descriptors) -> dict[str, Tensor]:
-    """What must not change when the scene moves: all but places, whose signs follow the axes."""
+    """What must not change when the scene moves: all but positions, whose signs follow the axes."""
     return {name: getattr(seen, name) for name in ("members", "pairs", "cells", "weights")}
 
 

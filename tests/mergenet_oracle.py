@@ -1,4 +1,4 @@
-"""What MergeNet sees and does, cell by cell in float64; nothing here imports cvtgs."""
+"""Descriptors and MergeNet, cell by cell in float64; nothing here imports cvtgs."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ C0 = 0.28209479177387814
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Kernel:
+class Gaussian:
     """One Gaussian, activated; the axes are the columns of ``axes``."""
 
     mean: Array
@@ -38,7 +38,7 @@ class Kernel:
             ]
         )
 
-    def extents(self, other: "Kernel") -> list[float]:
+    def extents(self, other: "Gaussian") -> list[float]:
         """Logs of the standard deviations of another along the axes of this one, in its own."""
         lengths = [math.sqrt(axis @ other.covariance @ axis) for axis in self.axes.T]
         return [
@@ -46,18 +46,18 @@ class Kernel:
             for length, scale in zip(lengths, self.scales, strict=True)
         ]
 
-    def contrast(self, other: "Kernel") -> float:
+    def contrast(self, other: "Gaussian") -> float:
         return min(math.sqrt(float(np.mean((self.color - other.color) ** 2))), 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:
-    """What became of a cell, its members, how freely they are seen, and its neighbours."""
+    """A merged Gaussian, the members of its cell, their visibility, and its neighbours."""
 
-    own: Kernel
-    members: Sequence[Kernel]
-    lights: Sequence[float]
-    others: Sequence[Kernel]
+    own: Gaussian
+    members: Sequence[Gaussian]
+    visibilities: Sequence[float]
+    others: Sequence[Gaussian]
     other_sizes: Sequence[int]
 
     @property
@@ -66,8 +66,8 @@ class Cell:
         return [mass / math.fsum(masses) for mass in masses]
 
     @property
-    def light(self) -> float:
-        return math.fsum(w * light for w, light in zip(self.shares, self.lights, strict=True))
+    def visibility(self) -> float:
+        return math.fsum(w * v for w, v in zip(self.shares, self.visibilities, strict=True))
 
     @property
     def contrast(self) -> float:
@@ -75,16 +75,18 @@ class Cell:
         return math.sqrt(math.fsum(w * s for w, s in zip(self.shares, squares, strict=True)))
 
     @property
-    def slope(self) -> Array:
-        """Towards where members are seen more freely."""
+    def visibility_gradient(self) -> Array:
+        """The direction in which the visibility of members rises."""
         total = np.zeros(3)
-        for share, light, member in zip(self.shares, self.lights, self.members, strict=True):
-            total += share * (light - self.light) * self.own.locate(member.mean)
+        for share, visible, member in zip(
+            self.shares, self.visibilities, self.members, strict=True
+        ):
+            total += share * (visible - self.visibility) * self.own.locate(member.mean)
         return total
 
     @property
     def cover(self) -> Array:
-        """How opaquely neighbours paint three sigmas out, by axis, positive side first."""
+        """Opacity of neighbours three sigmas out, by axis, positive side first."""
         sides = np.zeros((3, 2))
         for axis in range(3):
             for side, sign in enumerate((1.0, -1.0)):
@@ -94,14 +96,14 @@ class Cell:
         return sides
 
 
-def kernel(
+def gaussian(
     mean: Sequence[float],
     quat: Sequence[float],
     log_scales: Sequence[float],
     logit: float,
     sh0: Sequence[float],
-) -> Kernel:
-    return Kernel(
+) -> Gaussian:
+    return Gaussian(
         mean=np.array(mean),
         axes=rotation(quat),
         scales=np.exp(np.array(log_scales)),
@@ -114,41 +116,43 @@ def clamp(value: float, limit: float) -> float:
     return min(max(value, -limit), limit)
 
 
-def bell(place: Array) -> float:
-    return math.exp(-0.5 * min(float(place @ place), 60.0))
+def bell(position: Array) -> float:
+    return math.exp(-0.5 * min(float(position @ position), 60.0))
 
 
-def squashed_length(place: Array) -> float:
-    return math.log1p(min(math.sqrt(float(place @ place)), 50.0))
+def squashed_length(position: Array) -> float:
+    return math.log1p(min(math.sqrt(float(position @ position)), 50.0))
 
 
-def distances(place: Array) -> list[float]:
-    return [*(math.log1p(min(abs(x), 50.0)) for x in place), squashed_length(place)]
+def distances(position: Array) -> list[float]:
+    return [*(math.log1p(min(abs(x), 50.0)) for x in position), squashed_length(position)]
 
 
-def facing(cell: Cell, place: Sequence[float]) -> list[float]:
-    """On the bare (positive) or on the covered side (negative), by axis and in all."""
-    sides = [0.5 * (minus - plus) * x for (plus, minus), x in zip(cell.cover, place, strict=True)]
+def uncovered(cell: Cell, position: Sequence[float]) -> list[float]:
+    """On the less (positive) or on the more covered side (negative), by axis and in all."""
+    sides = [
+        0.5 * (minus - plus) * x for (plus, minus), x in zip(cell.cover, position, strict=True)
+    ]
     return [*sides, math.fsum(sides)]
 
 
 def describe_members(cell: Cell) -> list[list[float]]:
     rows = []
-    for share, light, member in zip(cell.shares, cell.lights, cell.members, strict=True):
-        place, contrast = cell.own.locate(member.mean), member.contrast(cell.own)
+    for share, visible, member in zip(cell.shares, cell.visibilities, cell.members, strict=True):
+        position, contrast = cell.own.locate(member.mean), member.contrast(cell.own)
         rows.append(
             [
-                *distances(place),
+                *distances(position),
                 *(0.3 * extent for extent in cell.own.extents(member)),
-                *facing(cell, [clamp(x, 4.0) for x in place]),
+                *uncovered(cell, [clamp(x, 4.0) for x in position]),
                 0.3 * clamp(math.log(share * len(cell.members)), 14.0),
                 member.opacity,
                 0.2 * clamp(math.log(member.area / cell.own.area), 14.0),
                 3.0 * contrast,
                 0.5 * contrast / (cell.contrast + 0.02),
-                light,
-                3.0 * (light - cell.light),
-                clamp(float(cell.slope @ place), 3.0),
+                visible,
+                3.0 * (visible - cell.visibility),
+                clamp(float(cell.visibility_gradient @ position), 3.0),
             ]
         )
     return rows
@@ -157,19 +161,19 @@ def describe_members(cell: Cell) -> list[list[float]]:
 def describe_pairs(cell: Cell) -> list[list[float]]:
     rows = []
     for other, size in zip(cell.others, cell.other_sizes, strict=True):
-        place, back = cell.own.locate(other.mean), other.locate(cell.own.mean)
+        position, back = cell.own.locate(other.mean), other.locate(cell.own.mean)
         rows.append(
             [
-                *distances(place),
+                *distances(position),
                 *(0.3 * extent for extent in cell.own.extents(other)),
-                *facing(cell, [x / (1.0 + abs(x)) for x in place]),
+                *uncovered(cell, [x / (1.0 + abs(x)) for x in position]),
                 squashed_length(back),
                 other.opacity,
                 0.2 * clamp(math.log(other.area / cell.own.area), 14.0),
                 0.2 * math.log(size / len(cell.members)),
                 3.0 * other.contrast(cell.own),
                 other.opacity * bell(back),
-                bell(place),
+                bell(position),
             ]
         )
     return rows
@@ -194,9 +198,9 @@ def describe_cell(cell: Cell) -> list[float]:
         0.5 * clamp(logs[0] - logs[1], 8.0),
         0.3 * clamp(logs[1] - logs[2], 8.0),
         5.0 * cell.contrast,
-        cell.light,
-        min(float(np.linalg.norm(cell.slope)), 3.0),
-        min((squashed_length(place) for place in places), default=math.log1p(50.0)),
+        cell.visibility,
+        min(float(np.linalg.norm(cell.visibility_gradient)), 3.0),
+        min((squashed_length(position) for position in places), default=math.log1p(50.0)),
     ]
 
 
@@ -218,8 +222,8 @@ def gates(weights: Mapping[str, Array], name: str, own: Array, cell: Array) -> A
     return np.tanh(dense(weights, f"{name}.gates", silu(summed)))
 
 
-def twist(place: Array) -> Array:
-    x, y, z = place
+def twist(position: Array) -> Array:
+    x, y, z = position
     return np.array([y * z, x * z, x * y])
 
 
@@ -247,13 +251,13 @@ def predict(weights: Mapping[str, Array], cell: Cell) -> dict[str, Array]:
     of_pairs = [0.5 * gates(weights, "pair_gates", own, pooled) for own in pairs]
     shift, turn = np.zeros(3), np.zeros(3)
     for share, gate, member in zip(shares, of_members, cell.members, strict=True):
-        place = np.clip(cell.own.locate(member.mean), -50.0, 50.0)
-        shift += share * gate[0] * place
-        turn += share * gate[2:] * twist(np.clip(place, -5.0, 5.0))
+        position = np.clip(cell.own.locate(member.mean), -50.0, 50.0)
+        shift += share * gate[0] * position
+        turn += share * gate[2:] * twist(np.clip(position, -5.0, 5.0))
     for gate, other in zip(of_pairs, cell.others, strict=True):
-        place = np.clip(cell.own.locate(other.mean), -50.0, 50.0)
-        shift += gate[0] * place / len(of_pairs)
-        turn += 2.0 * gate[2:] * twist(place / (1.0 + np.abs(place))) / len(of_pairs)
+        position = np.clip(cell.own.locate(other.mean), -50.0, 50.0)
+        shift += gate[0] * position / len(of_pairs)
+        turn += 2.0 * gate[2:] * twist(position / (1.0 + np.abs(position))) / len(of_pairs)
     sizes = dense(weights, "decoder", pooled)
     return {
         "d_means": shift,

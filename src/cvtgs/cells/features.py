@@ -277,7 +277,7 @@ def _activate(scene: GaussianScene, rows: Int[Tensor, "r"]) -> ActivatedGaussian
     logits = parameters.clamp_logits(scene.logit_opacities.index_select(0, rows))
     return ActivatedGaussians(
         means=means,
-        rotations=parameters.quats_to_matrices(parameters.normalize_quats(quats)),
+        rotations=parameters.rotation_matrices(quats),
         log_scales=log_scales,
         log_areas=parameters.log_mean_projected_area(log_scales),
         logits=logits,

@@ -58,7 +58,7 @@ def align_axes(
     if len(rows) == 0 or neighbors.shape[1] == 0:
         return merged
     logs = log_scales[rows].double()
-    axes = parameters.quats_to_matrices(parameters.normalize_quats(merged.quats[rows].double()))
+    axes = parameters.rotation_matrices(merged.quats[rows].double())
     pulls = axes.mT @ _pulls(merged.means, rows, neighbors[rows]) @ axes
     # Logarithms, since axes of a needle are lost beside its length.
     pulled = torch.diag_embed(2 * (logs - logs[:, :1])) + NEIGHBOR_PULL * pulls * _open_pairs(logs)
@@ -197,5 +197,5 @@ def _frames(scene: GaussianScene, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]
     """Return centres, axes (columns) and scales of some Gaussians in float64."""
     tables = gather_columns(rows, scene.means, scene.quats, scene.log_scales)
     means, quats, log_scales = (values.double() for values in tables)
-    rotations = parameters.quats_to_matrices(parameters.normalize_quats(quats))
+    rotations = parameters.rotation_matrices(quats)
     return means, rotations, torch.exp(log_scales)

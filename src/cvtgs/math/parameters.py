@@ -222,6 +222,22 @@ def quats_to_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
     return torch.stack(entries).reshape(3, 3, -1).permute(2, 0, 1)
 
 
+def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
+    """Return the rotation matrices of quaternions of any length.
+
+    Args:
+        quats: Non-zero, finite quaternions, w first.
+
+    Returns:
+        Rotation matrices, in memory entry by entry.
+
+    Example:
+        >>> rotation_matrices(torch.tensor([[2.0, 0.0, 0.0, 0.0]]))[0].diagonal().tolist()
+        [1.0, 1.0, 1.0]
+    """
+    return quats_to_matrices(normalize_quats(quats))
+
+
 def matrices_to_quats(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
     """Return unit quaternions of rotation matrices, with w at least 0.
 

@@ -147,7 +147,7 @@ def compose(
         values.index_select(0, cells)
         for values in (merged.means, merged.quats, merged.log_scales, merged.logit_opacities)
     )
-    axes = parameters.quats_to_matrices(parameters.normalize_quats(quats))
+    axes = parameters.rotation_matrices(quats)
     moves = torch.einsum("mij,mj->mi", axes, torch.exp(log_scales) * residuals.d_means)
     tensors = {
         "means": means + moves,

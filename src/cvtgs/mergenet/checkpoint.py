@@ -1,4 +1,4 @@
-"""Checkpoints: a MergeNet and where it comes from, in one safetensors file."""
+"""Checkpoints: a MergeNet and a description of its training, in one safetensors file."""
 
 import hashlib
 import os
@@ -25,7 +25,7 @@ LARGEST_FILE = 1 << 26
 
 
 class CheckpointInfo(pydantic.BaseModel):
-    """What a checkpoint says about itself.
+    """Description of a checkpoint.
 
     Attributes:
         architecture: Shape of the network.
@@ -52,7 +52,7 @@ class Checkpoint:
 
     Attributes:
         net: The network, on the CPU, float32, without gradients.
-        info: What the file says about it.
+        info: The description in the file.
         name: Name of the shipped checkpoint, or path of the file.
         digest: SHA-256 of the weights and the description, hexadecimal.
     """
@@ -83,15 +83,15 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
     name = os.fspath(source)
     path = _shipped_path(name) if name in SHIPPED else Path(name)
     content = _read(path, name)
-    tensors, metadata = _parse(content, name)
-    info = _described(metadata, name)
+    tensors, metadata = _unpack(content, name)
+    info = _parse_info(metadata, name)
     digest = _digest(tensors, metadata["info"])
     if metadata.get("sha256") != digest:
         raise CheckpointError(
             f"{name}: the checkpoint is damaged: its content has the hash {digest[:12]}..., "
             f"it says {str(metadata.get('sha256'))[:12]}..."
         )
-    return Checkpoint(net=_filled(info, tensors, name), info=info, name=name, digest=digest)
+    return Checkpoint(net=_build_net(info, tensors, name), info=info, name=name, digest=digest)
 
 
 def save_checkpoint(net: MergeNet, info: CheckpointInfo) -> bytes:
@@ -101,7 +101,7 @@ def save_checkpoint(net: MergeNet, info: CheckpointInfo) -> bytes:
 
     Args:
         net: The network.
-        info: What to say about it.
+        info: Its description.
 
     Returns:
         A safetensors file, to be written with :func:`cvtgs.io.atomic_output`.
@@ -146,7 +146,7 @@ def _read(path: Path, name: str) -> bytes:
     )
 
 
-def _parse(content: bytes, name: str) -> tuple[dict[str, Tensor], dict[str, str]]:
+def _unpack(content: bytes, name: str) -> tuple[dict[str, Tensor], dict[str, str]]:
     try:
         tensors, metadata = unpack_tensors(content)
     except FileFormatError as error:
@@ -161,7 +161,7 @@ def _parse(content: bytes, name: str) -> tuple[dict[str, Tensor], dict[str, str]
     return tensors, metadata
 
 
-def _described(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
+def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
     version = metadata.get("format_version")
     if version not in {str(number) for number in range(1, FORMAT_VERSION + 1)}:
         raise CheckpointError(
@@ -187,7 +187,7 @@ def _described(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
     return info
 
 
-def _filled(info: CheckpointInfo, tensors: dict[str, Tensor], name: str) -> MergeNet:
+def _build_net(info: CheckpointInfo, tensors: dict[str, Tensor], name: str) -> MergeNet:
     net = MergeNet(info.architecture)
     wanted = {key: (values.shape, values.dtype) for key, values in net.state_dict().items()}
     found = {key: (values.shape, values.dtype) for key, values in tensors.items()}

@@ -1,4 +1,4 @@
-"""MergeNet: a small network, shared by all cells, that corrects how a cell becomes one Gaussian."""
+"""MergeNet: a small network, shared by all cells, that corrects their merged Gaussians."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from cvtgs.cells.features import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES, 
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
 
 LARGE_GROWTH = 0.6
-"""A large change of a log scale."""
+"""A large change of a log scale, for the cost of residuals."""
 
 LARGEST_LOGIT_CHANGE = 2.0
 """Opacity logits change by this much at most."""
@@ -30,8 +30,8 @@ class Architecture(pydantic.BaseModel):
         member_features: Numbers that describe a member.
         pair_features: Numbers that describe a neighbour.
         cell_features: Numbers that describe a cell.
-        width: Units of the layers that see members and neighbours.
-        cell_width: Units of the layers that see cells.
+        width: Units of the layers of members and neighbours.
+        cell_width: Units of the layers of cells.
         largest_growth: Log scales change by this much at most.
     """
 
@@ -47,15 +47,15 @@ class Architecture(pydantic.BaseModel):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Residuals:
-    """What MergeNet changes of the merged Gaussians; zeros change nothing.
+    """Changes of the merged Gaussians; zeros change nothing.
 
     Attributes:
         d_means: ``(m, 3)`` moves of the centres, in the frame and the standard deviations of each.
         d_log_scales: ``(m, 3)`` added to the log scales.
         d_rotvecs: ``(m, 3)`` rotation vectors in the frame of each, radians.
         d_logit_opacities: ``(m,)`` added to the opacity logits.
-        member_colors: ``(n,)`` how much of a member's difference in colour is added.
-        pair_colors: ``(m, k)`` how much of a neighbour's difference in colour is added.
+        member_colors: ``(n,)`` shares of the members' differences in colour that are added.
+        pair_colors: ``(m, k)`` shares of the neighbours' differences in colour that are added.
     """
 
     d_means: Float[Tensor, "m 3"]
@@ -66,10 +66,10 @@ class Residuals:
     pair_colors: Float[Tensor, "m k"]
 
     def cost(self) -> Float[Tensor, ""]:
-        """Return the mean square of all changes, each in units of a large one; training pays it.
+        """Return the mean square of all changes, each in units of a large one.
 
         Returns:
-            A number, 0 for no change.
+            A number that is part of the training loss; 0 for no change.
         """
         parts = [
             self.d_log_scales / LARGE_GROWTH,
@@ -85,10 +85,10 @@ class MergeNet(nn.Module):
 
     After CVT-GS: a pointwise network over members, pooled by mean, maximum and mass, and a
     decoder whose last layer starts at zero, so that an untrained network changes nothing. Ours
-    differs: neighbours are seen the same way as members; size and opacity come from the decoder,
-    but place, direction and colour are sums over members and neighbours of what sets them apart
-    from the cell, each times a gate that the network predicts. So the answer turns with the
-    scene, mixes the colours that are there, and any number of SH bands comes at no cost.
+    differs: neighbours are encoded the same way as members; size and opacity come from the decoder,
+    but position, rotation and colour are sums over members and neighbours of their differences
+    from the cell, each times a gate that the network predicts. So the residuals turn with the
+    scene, mix the colours that are there, and any number of SH bands comes at no cost.
 
     Args:
         architecture: Its shape.
@@ -113,13 +113,13 @@ class MergeNet(nn.Module):
         nn.init.zeros_(self.decoder.bias)
 
     def forward(self, descriptors: Descriptors) -> Residuals:
-        """Predict what to change.
+        """Predict the residuals of some cells.
 
         Args:
             descriptors: Any number of cells, each with at least one member.
 
         Returns:
-            Changes of each cell.
+            Residuals of each cell.
         """
         offsets, weights = descriptors.offsets, descriptors.weights
         ids, shape = segment_ids(offsets), descriptors.pairs.shape[:2]
@@ -137,8 +137,9 @@ class MergeNet(nn.Module):
         of_members = LARGEST_MEMBER_GATE * self.member_gates(members, cells, ids)
         pair_ids = torch.arange(len(cells), device=ids.device).repeat_interleave(shape[1])
         of_pairs = LARGEST_PAIR_GATE / max(1, shape[1]) * self.pair_gates(pairs, cells, pair_ids)
-        places, pair_positions = descriptors.positions, descriptors.pair_positions.flatten(0, 1)
-        pulls = segment_sum(_pulls(of_members, places, places.clamp(-5, 5)), offsets, weights)
+        positions = descriptors.positions
+        pair_positions = descriptors.pair_positions.flatten(0, 1)
+        pulls = segment_sum(_pulls(of_members, positions, positions.clamp(-5, 5)), offsets, weights)
         near = pair_positions / (1 + pair_positions.abs())
         others = _pulls(of_pairs, pair_positions, near).unflatten(0, shape).sum(dim=1)
         # Twice, so that neighbours may turn a cell as a gate of 1 does.
@@ -154,14 +155,14 @@ class MergeNet(nn.Module):
 
 
 class _SiLU(nn.Module):
-    """The activation of sums that nobody else needs: in place unless autograd keeps them."""
+    """SiLU, in place unless autograd keeps its input."""
 
     def forward(self, sums: Tensor) -> Tensor:
         return nn.functional.silu(sums, inplace=not sums.requires_grad)
 
 
 class _Gates(nn.Module):
-    """Gates between -1 and 1: for place, colour, and turns about three axes; zero at the start."""
+    """Gates between -1 and 1: of position, colour and rotation about three axes; 0 at first."""
 
     def __init__(self, width: int, cell_width: int) -> None:
         super().__init__()
@@ -172,10 +173,10 @@ class _Gates(nn.Module):
         nn.init.zeros_(self.gates.weight)
         nn.init.zeros_(self.gates.bias)
 
-    def forward(self, own: Tensor, cells: Tensor, ids: Int[Tensor, "n"]) -> Tensor:
+    def forward(self, inputs: Tensor, cells: Tensor, ids: Int[Tensor, "n"]) -> Tensor:
         of_cells = self.cell(cells) + self.own.bias
         # One product that adds in place of a product and two sums over all members.
-        hidden = self.activation(of_cells.index_select(0, ids).addmm_(own, self.own.weight.T))
+        hidden = self.activation(of_cells.index_select(0, ids).addmm_(inputs, self.own.weight.T))
         # Few gates of many: the product is faster with one gate of all in one run of memory.
         return torch.tanh(torch.addmm(self.gates.bias[:, None], self.gates.weight, hidden.T)).T
 
@@ -193,12 +194,12 @@ def _pool_pairs(pairs: Float[Tensor, "m k w"]) -> tuple[Tensor, Tensor]:
 
 
 def _pulls(
-    gates: Float[Tensor, "n 5"], places: Float[Tensor, "n 3"], levers: Float[Tensor, "n 3"]
+    gates: Float[Tensor, "n 5"], positions: Float[Tensor, "n 3"], levers: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 6"]:
-    """Return where each would move its cell, and how it would turn it about each axis.
+    """Return how far each moves its cell, and by how much it turns it about each axis.
 
-    What makes a cell turn about an axis is the product of the other two coordinates.
+    A cell turns about an axis by the product of the other two coordinates.
     """
     x, y, z = levers.unbind(1)
     twists = torch.stack([y * z, x * z, x * y])
-    return torch.cat([gates.T[:1] * places.T, gates.T[2:] * twists]).T
+    return torch.cat([gates.T[:1] * positions.T, gates.T[2:] * twists]).T

@@ -82,7 +82,7 @@ def _inside_gaussians(layout: SceneLayout, cameras: Cameras) -> Bool[Tensor, "c"
     for eye in cameras.centers.to(means):
         offsets = (eye - means).to(sample.dtype)
         near = torch.linalg.vector_norm(offsets, dim=1) < _ENCLOSING * largest
-        frames = parameters.quats_to_matrices(parameters.normalize_quats(sample.quats[near]))
+        frames = parameters.rotation_matrices(sample.quats[near])
         local = (frames.transpose(1, 2) @ offsets[near][:, :, None])[:, :, 0]
         squares = (local / sample.scales[near].clamp_min(1e-12)).square().sum(dim=1)
         found.append(bool((squares < _ENCLOSING**2).any()))

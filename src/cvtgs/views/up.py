@@ -87,7 +87,7 @@ def voxelize(scene: GaussianScene, frame: RobustFrame) -> Voxels:
 
 
 def _thinnest_axes(scene: GaussianScene) -> Float[Tensor, "n 3"]:
-    matrices = parameters.quats_to_matrices(parameters.normalize_quats(scene.quats.double()))
+    matrices = parameters.rotation_matrices(scene.quats.double())
     thinnest = scene.log_scales.argmin(dim=1)
     return matrices.gather(2, thinnest[:, None, None].expand(-1, 3, 1))[:, :, 0]
 

@@ -94,7 +94,7 @@ def _views(images: Sequence[_Image], lenses: Mapping[int, Lens], path: Path) -> 
             )
     quats = torch.tensor([image.quat for image in images], dtype=torch.float64).reshape(-1, 4)
     viewmats = np.tile(np.eye(4), (len(images), 1, 1))
-    viewmats[:, :3, :3] = parameters.quats_to_matrices(parameters.normalize_quats(quats)).numpy()
+    viewmats[:, :3, :3] = parameters.rotation_matrices(quats).numpy()
     viewmats[:, :3, 3] = np.array([image.translation for image in images]).reshape(-1, 3)
     return [
         View(name=image.name, viewmat=viewmat, lens=lenses[image.camera])
