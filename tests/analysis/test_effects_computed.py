@@ -198,7 +198,7 @@ def test_without_duplicates_nothing_is_compared(monkeypatch):
     scene = scene.select(torch.cat([torch.arange(400), torch.arange(2)]))  # too few to pay
     forced = run_with(scene, effects={"duplicates": "on"})
     assert forced.report.plan.duplicates.active
-    monkeypatch.setattr("cvtgs.cvt.coincident.first_of_each", refuse)
+    monkeypatch.setattr("cvtgs.cvt.nearest.first_of_each", refuse)
     assert same_bits(run_with(scene).scene, forced.scene)
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from cvtgs.cvt import lloyd, nearest_scipy, nearest_torch, weighted_centroids, weighted_seeds
-from cvtgs.cvt.seeding import stratified_seeds
+from cvtgs.cvt.tessellate import stratified_seeds
 from cvtgs.math.frames import morton_order
 
 BACKENDS = {"scipy": nearest_scipy, "torch": nearest_torch}

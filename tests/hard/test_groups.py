@@ -18,7 +18,7 @@ from cvtgs.cvt import (
     tessellate,
     tessellation_weights,
 )
-from cvtgs.cvt.coincident import distinct_rows, runs_of_equal
+from cvtgs.cvt.nearest import distinct_rows, runs_of_equal
 from cvtgs.math.frames import morton_order, robust_frame
 from hard_cases import CASES, each_case
 from hard_scenes import DEVICES, PRESETS, dtypes, valid_case
@@ -118,7 +118,7 @@ def test_coincident_sites_are_searched_once(search, monkeypatch):
     sites = torch.tensor([[1.0, 2.0, 3.0]]).repeat(1000, 1)
     sites[700] = 0.0
     seen = []
-    for module, name in (("nearest", "build_tree"), ("nearest_torch", "_nearest_of_blocks")):
+    for module, name in (("nearest", "build_tree"), ("nearest", "_nearest_of_blocks")):
         home = import_module(f"cvtgs.cvt.{module}")
         honest = getattr(home, name)
 

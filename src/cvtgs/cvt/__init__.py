@@ -1,10 +1,14 @@
 """Weighted centroidal Voronoi tessellation of Gaussians as points: embedding, weights, cells."""
 
-from cvtgs.cvt.coincident import NearestSite
 from cvtgs.cvt.embedding import embed, gaussian_weights, tessellation_weights
-from cvtgs.cvt.nearest import nearest_backend, nearest_neighbors, nearest_scipy, nearest_several
-from cvtgs.cvt.nearest_torch import nearest_torch
-from cvtgs.cvt.seeding import stratified_seeds, weighted_seeds
+from cvtgs.cvt.nearest import (
+    NearestSite,
+    nearest_backend,
+    nearest_neighbors,
+    nearest_scipy,
+    nearest_several,
+    nearest_torch,
+)
 from cvtgs.cvt.tessellate import (
     LloydResult,
     Tessellation,
@@ -14,8 +18,10 @@ from cvtgs.cvt.tessellate import (
     fill_empty_cells,
     lloyd,
     sample_points,
+    stratified_seeds,
     tessellate,
     weighted_centroids,
+    weighted_seeds,
     weighted_sums,
 )
 

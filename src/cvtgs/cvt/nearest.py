@@ -1,26 +1,37 @@
-"""Nearest sites and neighbours: the choice of a backend, and the search by scipy's k-d tree."""
+"""Nearest sites and neighbours: by scipy's k-d tree on the CPU, by torch blocks on any device."""
 
+import math
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.cvt.coincident import NearestSite, distinct_rows, runs_of_equal
-from cvtgs.cvt.nearest_torch import nearest_torch
 from cvtgs.errors import DeviceError
+from cvtgs.math.frames import morton_order
+
+NearestSite = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Takes points ``(n, d)`` and sites ``(m, d)``, returns labels and squared distances ``(n,)``."""
 
 CHUNK = 1 << 15
 """Points that a thread searches together, to bound memory."""
 
-MAX_ENTRIES = 1 << 23
-"""Largest number of distances held at one time by the torch search."""
-
 TINY_SHIFT = 1e-9
 """Coincident sites are parted by at most this share of the extent of all sites."""
+
+POINT_BLOCK = 32
+SITE_BLOCK = 16
+FIRST_BLOCKS = 4
+"""Blocks of sites that every block of points is compared with before others are ruled out."""
+
+MAX_ENTRIES = 1 << 23
+"""Largest number of distances held at one time (64 MiB in float64)."""
+
+UNKNOWN = torch.iinfo(torch.int64).max
 
 
 def nearest_backend(
@@ -173,3 +184,164 @@ def _by_comparison(
         for part in points.split(step)
     ]
     return torch.cat([one.indices for one in found]), torch.cat([one.values for one in found])
+
+
+def nearest_torch(
+    points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"]
+) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
+    """Find the nearest site of every point by comparing blocks that may be near one another.
+
+    Points and sites are cut into blocks along a Morton curve. The few nearest blocks of sites
+    give an upper bound for all points of a block; every other block whose bounding box is farther
+    is skipped. Distances are sums of squared differences in float64, so the result equals brute
+    force, and of equally near sites the first one is named. Memory beside input and result is
+    ``3 * MAX_ENTRIES`` numbers.
+
+    Args:
+        points: Positions; consecutive points should be neighbours, or hardly a block is skipped.
+        sites: Positions, at least one, on the same device.
+
+    Returns:
+        Labels and squared distances in float64.
+
+    Example:
+        >>> labels, squared = nearest_torch(torch.tensor([[0.9]]), torch.tensor([[0.0], [1.0]]))
+        >>> labels.tolist()
+        [1]
+    """
+    distinct = distinct_rows(sites)
+    if distinct is not None:  # no box can rule out one of several coincident sites
+        labels, squared = nearest_torch(points, sites[distinct])
+        return distinct[labels], squared
+    site_rows = _curve_order(sites)
+    site_blocks, site_ids = (
+        _blocks(sites[site_rows].double(), SITE_BLOCK),
+        _blocks(site_rows, SITE_BLOCK),
+    )
+    boxes = site_blocks.amin(dim=1), site_blocks.amax(dim=1)
+    point_blocks = _blocks(points, POINT_BLOCK)
+    step = max(1, MAX_ENTRIES // (len(site_blocks) + POINT_BLOCK * SITE_BLOCK))
+    parts = [
+        _nearest_of_blocks(chunk.double(), site_blocks, site_ids, boxes)
+        for chunk in point_blocks.split(step)
+    ]
+    labels = torch.cat([part[0] for part in parts]).flatten()[: len(points)]
+    squared = torch.cat([part[1] for part in parts]).flatten()[: len(points)]
+    return labels, squared
+
+
+def _nearest_of_blocks(
+    points: Float[Tensor, "b p d"],
+    site_blocks: Float[Tensor, "c s d"],
+    site_ids: Int[Tensor, "c s"],
+    boxes: tuple[Float[Tensor, "c d"], Float[Tensor, "c d"]],
+) -> tuple[Int[Tensor, "b p"], Float[Tensor, "b p"]]:
+    gaps = _box_gaps((points.amin(dim=1), points.amax(dim=1)), boxes)
+    first = gaps.topk(min(FIRST_BLOCKS, len(site_blocks)), dim=1, largest=False).indices
+    squared, labels = _nearest_in_pairs(points, site_blocks[first[:, 0]], site_ids[first[:, 0]])
+    for other in first[:, 1:].unbind(1):
+        found, names = _nearest_in_pairs(points, site_blocks[other], site_ids[other])
+        wins = (found < squared) | ((found == squared) & (names < labels))
+        squared, labels = torch.where(wins, found, squared), torch.where(wins, names, labels)
+    near = (gaps <= squared.amax(dim=1, keepdim=True)).scatter_(1, first, False)
+    pairs = near.nonzero().split(max(1, MAX_ENTRIES // (POINT_BLOCK * SITE_BLOCK)))
+    for block, other in (pair.unbind(1) for pair in pairs):
+        found, names = _nearest_in_pairs(points[block], site_blocks[other], site_ids[other])
+        best = squared.scatter_reduce(0, block[:, None].expand_as(found), found, "amin")
+        labels = torch.where(squared == best, labels, UNKNOWN)
+        names = torch.where(found == best[block], names, UNKNOWN)
+        labels = labels.scatter_reduce(0, block[:, None].expand_as(names), names, "amin")
+        squared = best
+    return labels, squared
+
+
+def _nearest_in_pairs(
+    points: Float[Tensor, "k p d"], sites: Float[Tensor, "k s d"], ids: Int[Tensor, "k s"]
+) -> tuple[Float[Tensor, "k p"], Int[Tensor, "k p"]]:
+    """Compare every point of a block with every site of the block that it is paired with."""
+    total = torch.zeros((), dtype=points.dtype, device=points.device)
+    for axis in range(points.shape[2]):
+        total = total + (points[:, :, None, axis] - sites[:, None, :, axis]).square()
+    squared = total.amin(dim=2)
+    is_best = total == squared[:, :, None]
+    names = torch.where(is_best, ids[:, None, :], UNKNOWN).amin(dim=2)
+    return squared, names
+
+
+def _box_gaps(
+    first: tuple[Float[Tensor, "b d"], Float[Tensor, "b d"]],
+    second: tuple[Float[Tensor, "c d"], Float[Tensor, "c d"]],
+) -> Float[Tensor, "b c"]:
+    """Return squared distances between bounding boxes, rounded down a little."""
+    (low, high), (other_low, other_high) = first, second
+    total = torch.zeros(len(low), len(other_low), dtype=low.dtype, device=low.device)
+    for axis in range(low.shape[1]):
+        above = other_low[None, :, axis] - high[:, None, axis]
+        below = low[:, None, axis] - other_high[None, :, axis]
+        total += torch.maximum(above, below).clamp_min_(0).square_()
+    return total * (1 - 8 * torch.finfo(total.dtype).eps)
+
+
+def _blocks(rows: Tensor, size: int) -> Tensor:
+    """Cut rows into blocks of one size; the last block repeats the last row."""
+    padding = math.ceil(len(rows) / size) * size - len(rows)
+    padded = torch.cat([rows, rows[-1:].expand(padding, *rows.shape[1:])])
+    return padded.reshape(-1, size, *rows.shape[1:])
+
+
+def _curve_order(sites: Float[Tensor, "m d"]) -> Int[Tensor, "m"]:
+    spatial = sites[:, :3]
+    missing = 3 - spatial.shape[1]
+    return morton_order(torch.nn.functional.pad(spatial, (0, missing)))
+
+
+def runs_of_equal(
+    sites: Float[Tensor, "m d"],
+) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]] | None:
+    """Bring coincident sites next to one another.
+
+    Sites are sorted by a sum of their coordinates, which is the same for equal ones. Where
+    different sites share a sum, some equal ones may stay apart; that costs time, not correctness.
+    """
+    keys = sites.new_zeros(len(sites), dtype=torch.float64)
+    for axis, column in enumerate(sites.unbind(1)):
+        keys += column.double() * math.sqrt(1 + axis)  # no common measure: sums rarely coincide
+    order = torch.sort(keys, stable=True).indices
+    repeated = torch.zeros(len(sites), dtype=torch.bool, device=sites.device)
+    candidates = (keys[order[1:]] == keys[order[:-1]]).nonzero()[:, 0]
+    repeated[candidates + 1] = (sites[order[candidates + 1]] == sites[order[candidates]]).all(dim=1)
+    if not bool(repeated.any()):
+        return None
+    places = torch.arange(len(sites), device=sites.device)
+    starts = torch.where(repeated, 0, places).cummax(0).values
+    return order, places - starts
+
+
+def distinct_rows(sites: Float[Tensor, "m d"]) -> Int[Tensor, "k"] | None:
+    """Return one row number for each place at which there are sites."""
+    runs = runs_of_equal(sites)
+    if runs is None:
+        return None
+    order, ranks = runs
+    return torch.sort(order[ranks == 0]).values
+
+
+def search_once_per_position(nearest: NearestSite) -> NearestSite:
+    """Search for each position only once, with the same answers."""
+
+    def search(points: Tensor, sites: Tensor) -> tuple[Tensor, Tensor]:
+        is_first = first_of_each(points)
+        labels, squared = nearest(points[is_first], sites)
+        numbers = is_first.cumsum(0) - 1
+        return labels[numbers], squared[numbers]
+
+    return search
+
+
+def first_of_each(points: Float[Tensor, "n d"]) -> Bool[Tensor, "n"]:
+    """Return which points differ from the one before."""
+    first = torch.ones(len(points), dtype=torch.bool, device=points.device)
+    first[1:] = points[1:, 0] != points[:-1, 0]
+    maybe = (~first).nonzero()[:, 0]
+    first[maybe] = (points[maybe] != points[maybe - 1]).any(dim=1)
+    return first
