@@ -40,6 +40,12 @@ def test_heavy_points_are_certain_and_the_rest_is_stratified():
     assert shares.tolist() == [2.0, 50.0, 2.0, 20.0]
 
 
+def test_a_point_of_one_and_a_half_steps_is_certain_and_stands_for_itself():
+    rows, shares = stratified_seeds(torch.tensor([1.0, 3.0, 1.0, 1.0, 1.0, 1.0]), 4)
+    assert rows.tolist() == [0, 1, 3, 5]
+    assert shares.tolist() == pytest.approx([5 / 3, 3.0, 5 / 3, 5 / 3])
+
+
 def test_all_weight_zero_takes_points_evenly():
     assert stratified_seeds(torch.zeros(9), 3)[0].tolist() == [1, 4, 7]
 
