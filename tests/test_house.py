@@ -1,6 +1,7 @@
 """The house rules, read from the source: who may import what, and how files look."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -172,6 +173,25 @@ def test_no_print_outside_cli_and_no_assert():
         )
     ]
     assert found == []
+
+
+def test_private_names_stay_in_their_file():
+    found = [
+        f"{relative(path)} imports {name}"
+        for path, text in TEXTS.items()
+        for name in imports_in(ast.parse(text))
+        if any(re.match(r"_(?!_)", part) for part in name.split(".")) and name.startswith("cvtgs")
+    ]
+    assert found == []
+
+
+def test_no_two_classes_share_a_name():
+    classes: dict[str, list[str]] = {}
+    for path, text in TEXTS.items():
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.ClassDef):
+                classes.setdefault(node.name, []).append(relative(path))
+    assert {name: paths for name, paths in classes.items() if len(paths) > 1} == {}
 
 
 def test_no_name_that_means_everything():
