@@ -1,4 +1,4 @@
-"""Score presets on a scene, without photographs, and make a page to look at them side by side.
+"""Score presets on a scene, without photographs, and make a page that shows them side by side.
 
 python examples/compare.py scene.ply page --rho 0.01 --presets draft standard high
 """
@@ -11,7 +11,7 @@ from cvtgs.evaluation import EvaluationSettings, compare, write_comparison
 
 
 def main() -> None:
-    """Simplify by every preset, look, score, write."""
+    """Simplify by every preset, score, write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("input", type=Path)
     parser.add_argument("output", type=Path, help="folder for index.html")

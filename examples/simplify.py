@@ -1,4 +1,4 @@
-"""Make a scene smaller, and say what was done.
+"""Make a scene smaller, and print what was done.
 
 python examples/simplify.py scene.ply small.ply --rho 0.01
 """
@@ -10,7 +10,7 @@ import cvtgs
 
 
 def main() -> None:
-    """Read, simplify, write, tell."""
+    """Read, simplify, write, print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("input", type=Path)
     parser.add_argument("output", type=Path)

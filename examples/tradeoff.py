@@ -1,4 +1,4 @@
-"""See what more time buys on a scene of yours: seconds against PSNR, preset by preset.
+"""Measure seconds against PSNR on a scene of yours, preset by preset.
 
 python examples/tradeoff.py scene.ply page --rho 0.01 --presets draft standard high
 """

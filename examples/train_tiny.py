@@ -30,13 +30,13 @@ def main() -> None:
         ),
         views=ViewsConfig(count=2, sizes=(64,), crop=64, validation_count=1, validation_size=64),
     )  # fmt: skip
-    train(config, TrainFiles.beside(options.checkpoint), on_validation=tell)
+    train(config, TrainFiles.beside(options.checkpoint), on_validation=show)
     scene = cvtgs.synthetic.scene("object", options.count, seed=99)
     small = cvtgs.Simplifier(options.checkpoint).simplify(scene, 0.1)
     print(f"{len(scene):,} -> {len(small):,} Gaussians with {options.checkpoint}")
 
 
-def tell(history: History) -> None:
+def show(history: History) -> None:
     """Print the mean gain over scenes that are not learned from."""
     last = history.validations[-1]
     print(f"step {last.step}: {last.mean_gain:+.3f} dB")

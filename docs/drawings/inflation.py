@@ -28,7 +28,7 @@ def main() -> None:
     canvas, (left, middle, right) = figure(1, 3, width=10.4, height=3.7)
     draw_profile(left)
     for axes, inflated in ((middle, False), (right, True)):
-        axes.imshow(image_of_things(inflated=inflated))
+        axes.imshow(render_object(inflated=inflated))
         axes.set(xticks=[], yticks=[])
         axes.set_title("inflated" if inflated else "moments only: gaps")
     save_small(canvas, options.output)
@@ -63,7 +63,7 @@ def bells(
     return opacity * torch.exp(-0.5 * ((x - centers[:, None]) / width) ** 2)
 
 
-def image_of_things(*, inflated: bool) -> torch.Tensor:
+def render_object(*, inflated: bool) -> torch.Tensor:
     """Render an object by merged Gaussians without a network."""
     scene = cvtgs.synthetic.scene("object", 60_000, sh_degree=0, seed=4)
     merge = {} if inflated else {"inflation": 0.0, "covered_inflation": 0.0}

@@ -33,7 +33,7 @@ def test_values_of_every_section(tmp_path):
         [views]
         sizes = [33]
         [loss]
-        residual = 0.125
+        residual_weight = 0.125
         """,
     )
     assert (config.kind, config.preset, config.steps) == ("local", "paper", 12)
@@ -41,7 +41,7 @@ def test_values_of_every_section(tmp_path):
     assert (config.data.generated, config.data.ratios) == (7, (0.5, 0.25))
     assert config.data.validation == ("a", "b")
     assert config.views.sizes == (33,)
-    assert config.loss.residual == 0.125
+    assert config.loss.residual_weight == 0.125
 
 
 def test_an_empty_file_is_the_default(tmp_path):
@@ -94,7 +94,10 @@ def test_a_configuration_is_frozen():
         ("learning_rate = nan", "learning_rate: input should be a finite number, found nan."),
         ("[data]\nratios = [0.1, 1.0]", "data.ratios.1: input should be less than 1, found 1.0."),
         ("[views]\nsizes = [0]", "views.sizes.0: input should be greater than or equal to 1"),
-        ("[loss]\nimage = -1", "loss.image: input should be greater than or equal to 0, found -1."),
+        (
+            "[loss]\nimage_weight = -1",
+            "loss.image_weight: input should be greater than or equal to 0, found -1.",
+        ),
     ],
 )
 def test_a_bad_setting_is_named_with_its_file(tmp_path, text, problem):

@@ -29,7 +29,7 @@ def images() -> tuple[torch.Tensor, torch.Tensor]:
 def test_a_known_loss():
     """All pixels are off by a tenth: a squared error of a hundredth."""
     target = torch.full((1, 12, 12, 3), 0.25)
-    config = LossConfig(squared=2.0, image=0.0)
+    config = LossConfig(mse_weight=2.0, image_weight=0.0)
     assert view_loss(target + 0.1, target, config).item() == pytest.approx(
         2 * math.log(0.01 + 1e-5), rel=1e-5
     )
@@ -38,7 +38,7 @@ def test_a_known_loss():
 def test_the_loss_of_equal_images_is_finite():
     target = torch.rand(1, 12, 12, 3, generator=torch.Generator().manual_seed(0))
     same = target.clone().requires_grad_()
-    loss = view_loss(same, target, LossConfig(squared=1.0, image=1.0))
+    loss = view_loss(same, target, LossConfig(mse_weight=1.0, image_weight=1.0))
     assert loss.item() == pytest.approx(math.log(1e-5) + math.log(1e-3), abs=1e-2)
     loss.backward()
     assert bool(same.grad.isfinite().all())
@@ -49,14 +49,14 @@ def test_the_parts_add_up():
     error = (image - target).square().mean().item()
     other = image_loss(image, target).item()
     for squared, weight in ((0.5, 0.5), (1.0, 0.0), (0.0, 2.0), (0.0, 0.0)):
-        loss = view_loss(image, target, LossConfig(squared=squared, image=weight)).item()
+        loss = view_loss(image, target, LossConfig(mse_weight=squared, image_weight=weight)).item()
         wanted = squared * math.log(error + 1e-5) + weight * math.log(other + 1e-3)
         assert loss == pytest.approx(wanted, rel=1e-4)
 
 
 def test_twice_the_error_costs_the_same_wherever_one_starts():
     image, target = images()
-    config = LossConfig(squared=1.0, image=0.0)
+    config = LossConfig(mse_weight=1.0, image_weight=0.0)
     losses = [
         view_loss(target + factor * (image - target), target, config).item()
         for factor in (0.5, 1.0, 2.0, 4.0)
@@ -101,7 +101,7 @@ def test_changes_have_their_price(kind):
     case, views, net = some_case(), some_views(), lively_net(torch.float32)
 
     def loss(residual: float) -> float:
-        config, rng = config_of(residual=residual), random.Random(0)
+        config, rng = config_of(residual_weight=residual), random.Random(0)
         if kind == "local":
             return local_loss(net, case, config=config, rng=rng).item()
         return scene_loss(net, case, views, config=config, rng=rng).item()

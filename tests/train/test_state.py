@@ -123,7 +123,7 @@ def test_the_running_mean_is_a_network_of_its_own():
         {"learning_rate": 0.1},
         {"kind": "local"},
         {"width": 7},
-        {"loss": LossConfig(residual=1.0)},
+        {"loss": LossConfig(residual_weight=1.0)},
     ],
     ids=lambda changes: next(iter(changes)),
 )

@@ -68,20 +68,21 @@ class ViewsConfig(Section):
 class LossConfig(Section):
     """Weights of the loss, a sum of logarithms and the cost of the residuals.
 
-    ``squared log(mse) + image log(loss of CVT-GS) + ssim log(1 - SSIM) + residual cost``.
+    ``mse_weight log(mse) + image_weight log(loss of CVT-GS) + ssim_weight log(1 - SSIM)
+    + residual_weight * size of the residuals``.
     Logarithms give every scene, ratio and view the same weight, as a mean of PSNR does.
 
     Attributes:
-        squared: Weight of the squared error.
-        image: Weight of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) + 0.2 gradient``.
-        ssim: Weight of the structural dissimilarity, ``1 - SSIM``.
-        residual: Weight of the size of the residuals.
+        mse_weight: Weight of the squared error.
+        image_weight: Weight of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) + 0.2 gradient``.
+        ssim_weight: Weight of the structural dissimilarity, ``1 - SSIM``.
+        residual_weight: Weight of the size of the residuals.
     """
 
-    squared: float = pydantic.Field(default=0.5, ge=0.0)
-    image: float = pydantic.Field(default=0.5, ge=0.0)
-    ssim: float = pydantic.Field(default=0.0, ge=0.0)
-    residual: float = pydantic.Field(default=0.0, ge=0.0)
+    mse_weight: float = pydantic.Field(default=0.5, ge=0.0)
+    image_weight: float = pydantic.Field(default=0.5, ge=0.0)
+    ssim_weight: float = pydantic.Field(default=0.0, ge=0.0)
+    residual_weight: float = pydantic.Field(default=0.0, ge=0.0)
 
 
 class TrainConfig(Section):

@@ -75,9 +75,9 @@ def view_loss(
     return relative_loss(
         image,
         target,
-        squared_weight=config.squared,
-        image_weight=config.image,
-        ssim_weight=config.ssim,
+        squared_weight=config.mse_weight,
+        image_weight=config.image_weight,
+        ssim_weight=config.ssim_weight,
     )
 
 
@@ -95,9 +95,9 @@ def validation_psnr(net: MergeNet, case: Case, views: TargetViews) -> tuple[floa
 
 
 def _residual_penalty(residuals: Residuals, config: LossConfig) -> Float[Tensor, ""]:
-    if not config.residual:
+    if not config.residual_weight:
         return residuals.d_logit_opacities.new_zeros(())
-    return config.residual * residuals.cost()
+    return config.residual_weight * residuals.cost()
 
 
 def _random_color(rng: random.Random, case: Case) -> Float[Tensor, "3"]:
