@@ -1,17 +1,32 @@
-"""Docstrings on their way from autodoc to Napoleon: facts about model fields, and plain colons."""
+"""Docstrings between autodoc and Napoleon: re-exported constants, model fields, plain colons."""
 
 import re
+import sys
 from typing import Any, TypeGuard
 
 import pydantic
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 from sphinx.application import Sphinx
+from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.typing import stringify_annotation
 
 FIELD = re.compile(r"^ {4}(\w+): ")
 BOUNDS = {"ge": "at least {}", "gt": "above {}", "le": "at most {}", "lt": "below {}"}
 BEFORE_NAPOLEON = 450
+
+
+def find_constant(
+    app: Sphinx, what: str, name: str, obj: object, options: Any, lines: list[str]
+) -> None:
+    """Take the docstring of a constant from the file of the package that defines it."""
+    package, _, constant = name.rpartition(".")
+    modules = (module for module in sorted(sys.modules) if module.startswith(package))
+    for module in modules if what == "data" else ():
+        found = ModuleAnalyzer.for_module(module).find_attr_docs().get(("", constant))
+        if found:
+            lines[:] = found
+            return
 
 
 def is_model(obj: object) -> TypeGuard[type[pydantic.BaseModel]]:
@@ -78,6 +93,7 @@ def without_signature(
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Listen to docstrings and signatures."""
+    app.connect("autodoc-process-docstring", find_constant, priority=BEFORE_NAPOLEON - 1)
     app.connect("autodoc-process-docstring", add_facts, priority=BEFORE_NAPOLEON)
     app.connect("autodoc-process-docstring", keep_colons, priority=BEFORE_NAPOLEON + 1)
     app.connect("autodoc-process-signature", without_signature)

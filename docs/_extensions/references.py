@@ -8,7 +8,6 @@ since Sphinx is nitpicky.
 import sys
 from collections.abc import Iterator
 from importlib import import_module
-from types import FunctionType
 from typing import Any
 
 from docutils import nodes
@@ -81,10 +80,7 @@ def documented_name(env: BuildEnvironment, package: str, name: str) -> str | Non
     for spelling in (f"{package}.{name}", own):
         if spelling in known:
             return spelling
-    if isinstance(value, type | FunctionType):
-        return None
-    inside = (one for one in known if one.startswith(f"{package}.") and one.endswith(f".{name}"))
-    return next(inside, None)
+    return None
 
 
 def public_names() -> Iterator[tuple[str, str]]:
