@@ -28,16 +28,16 @@ def balls(distance: float, *, size: float = 1.0) -> GaussianScene:
 
 
 def test_of_two_points_far_apart_the_one_that_shows_more_stays():
-    scene = random_scene(4, dtype=torch.float64)
-    means = 1e3 * torch.eye(4, 3).double()
-    sizes = torch.tensor([1.0, 2.0, 1.0, 1.1]).double().log()[:, None].expand(-1, 3)
-    logits = torch.tensor([2.0, 0.0, 2.0, 2.0]).double()
-    # a^2 A is 0.776, then 0.25 * 4 = 1; and 0.776, 0.939 in the other cell.
+    scene = random_scene(6, dtype=torch.float64)
+    means = 1e3 * torch.cat([torch.eye(3), -torch.eye(3)]).double()
+    sizes = torch.tensor([1.0, 2.0, 1.0, 1.1, 1.0, 2.0]).double().log()[:, None].expand(-1, 3)
+    logits = torch.tensor([2.0, 0.0, 2.0, 2.0, 2.0, -0.4]).double()
+    # a^2 A is 0.776, then 0.25 * 4 = 1; 0.776, 0.939; and 0.776, 0.644, of more mass.
     tensors = {"means": means, "log_scales": sizes, "logit_opacities": logits}
-    scene = scene.with_tensors(tensors, {"label": torch.arange(4)})
-    small, part = kept(scene, torch.tensor([0, 0, 1, 1]))
-    assert same_bits(small, scene.select(torch.tensor([1, 3])))
-    assert (part.order.tolist(), part.offsets.tolist()) == ([1, 3], [0, 1, 2])
+    scene = scene.with_tensors(tensors, {"label": torch.arange(6)})
+    small, part = kept(scene, torch.tensor([0, 0, 1, 1, 2, 2]))
+    assert same_bits(small, scene.select(torch.tensor([1, 3, 4])))
+    assert (part.order.tolist(), part.offsets.tolist()) == ([1, 3, 4], [0, 1, 2, 3])
 
 
 @pytest.mark.parametrize("unit", [1e-30, 1.0, 1e3, 1e30])
