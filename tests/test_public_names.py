@@ -182,8 +182,12 @@ STAGES = {
     },
     "levels": {"INDEX_NAME", "LevelEntry", "LevelsIndex", "level_names", "write_levels"},
     "outofcore": {
+        "ClusterWorkers",
+        "Workers",
         "available_memory",
         "block_count",
+        "check_config",
+        "connect",
         "needed_memory",
         "read_bytes",
         "simplify_distributed",

@@ -15,7 +15,7 @@ from cvtgs.errors import ConfigError, FileFormatError, InvalidArgumentError, Inv
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.io.ply import open_rows
 from cvtgs.outofcore import block_count, memory, read_bytes, simplify_file
-from cvtgs.outofcore.cuts import cut_space
+from cvtgs.outofcore.partition import partition_space
 from cvtgs.views import automatic_views
 from scenes import random_scene, same_bits
 
@@ -67,7 +67,7 @@ def test_blocks_have_equal_measure_whatever_flies_away(count):
     points = torch.randn(4000, 3, generator=g, dtype=torch.float64)
     points[:5] *= 1e12
     measure = torch.rand(4000, generator=g, dtype=torch.float64)
-    blocks = cut_space(points, measure, count).blocks_of(points)
+    blocks = partition_space(points, measure, count).blocks_of(points)
     sums = torch.bincount(blocks, measure, minlength=count)
     assert len(sums) == count
     assert float((sums / sums.sum() * count - 1).abs().max()) < 0.05
@@ -75,7 +75,10 @@ def test_blocks_have_equal_measure_whatever_flies_away(count):
 
 def test_coincident_points_lie_in_one_block():
     points = torch.zeros(10, 3).double()
-    assert len(set(cut_space(points, torch.ones(10).double(), 4).blocks_of(points).tolist())) == 1
+    assert (
+        len(set(partition_space(points, torch.ones(10).double(), 4).blocks_of(points).tolist()))
+        == 1
+    )
 
 
 @pytest.mark.slow
@@ -269,7 +272,7 @@ def test_command(source, tmp_path, capsys, monkeypatch):
     assert (report["output_count"], report["blocks"]) == (60, 7)
     assert main([*words, "--memory", "7MB"]) == 0
     assert "blocks" not in capsys.readouterr().out
-    monkeypatch.setattr("cvtgs.outofcore.memory.available_memory", lambda: 3_000_000)
+    monkeypatch.setattr("cvtgs.outofcore.available_memory", lambda: 3_000_000)
     assert main(words) == 0
     assert "In 5 blocks." in capsys.readouterr().out
     assert main([*words, "--memory", "2MB", "--preset", "max"]) == 1

@@ -63,14 +63,14 @@ def test_a_killed_run_goes_on_with_the_blocks_that_are_missing(source, tmp_path)
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
-@pytest.mark.parametrize("step", ["sums_02", "labels", "merged", "wide"])
+@pytest.mark.parametrize("step", ["sums_02", "labels", "merged", "inflated"])
 def test_a_run_killed_while_blocks_work_together_goes_on(source, tmp_path, step):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
     whole = tmp_path / "whole.ply"
     simplify_file(source, whole, 0.05, blocks=8)
     assert kill_when(start(source, output), lambda: len(list(folder.glob(f"{step}_*"))) >= 3)
     assert not output.exists()
-    names = ("sample", "sites", "sums", "labels", "merged", "wide")
+    names = ("sample", "sites", "sums", "labels", "merged", "inflated")
     files = [path for name in names for path in folder.glob(f"{name}_*")]
     done = {path: path.stat().st_mtime_ns for path in files}
     seen = {}

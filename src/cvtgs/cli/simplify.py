@@ -305,8 +305,7 @@ def choose_preset(
 def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int | None:
     """Return the memory for simplifying block by block; None if it is not needed or possible."""
     from cvtgs.io.ply import open_rows
-    from cvtgs.outofcore.memory import available_memory, block_count, read_bytes
-    from cvtgs.outofcore.run import check_config
+    from cvtgs.outofcore import available_memory, block_count, check_config, read_bytes
 
     names = ("target_psnr", "target_ssim", "time_budget", "cameras")
     excluded = [name for name in names if getattr(options, name) is not None]
@@ -335,8 +334,7 @@ def _simplify_blocks(
     listener: ProgressListener,
 ) -> "SimplifyReport":
     """Simplify a file block by block, in this process or on a cluster."""
-    from cvtgs.outofcore.distributed import connect, workers_of
-    from cvtgs.outofcore.turns import this_process
+    from cvtgs.outofcore import ClusterWorkers, connect
 
     client = None if options.scheduler is None else connect(options.scheduler)
     try:
@@ -348,7 +346,7 @@ def _simplify_blocks(
             memory=memory,
             boxes=() if options.keep is None else cvtgs.boxes.read_boxes(options.keep),
             simplifier=simplifier,
-            workers=this_process if client is None else workers_of(client),
+            workers=None if client is None else ClusterWorkers(client),
             overwrite=options.overwrite,
             listener=listener,
         )

@@ -1,12 +1,16 @@
-"""Scenes too large for one piece: blocks of space, one after the other or on many machines."""
+"""Scenes that do not fit into memory: blocks of space, one after the other or on a cluster."""
 
-from cvtgs.outofcore.distributed import simplify_distributed
+from cvtgs.outofcore.distributed import ClusterWorkers, connect, simplify_distributed
 from cvtgs.outofcore.memory import available_memory, block_count, needed_memory, read_bytes
-from cvtgs.outofcore.run import simplify_file
+from cvtgs.outofcore.run import Workers, check_config, simplify_file
 
 __all__ = [
+    "ClusterWorkers",
+    "Workers",
     "available_memory",
     "block_count",
+    "check_config",
+    "connect",
     "needed_memory",
     "read_bytes",
     "simplify_distributed",

@@ -1,29 +1,38 @@
-"""The job: everything that a process needs to work on a block, in a folder beside the output."""
+"""The job of an out-of-core run: all that a process needs, and where the files of blocks lie."""
 
 import hashlib
 import json
 import os
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
 
+import pydantic
 import torch
 
 import cvtgs
-from cvtgs.analysis import EffectPlan
 from cvtgs.boxes import Box
 from cvtgs.config import SimplifyConfig
-from cvtgs.errors import FileFormatError, InputNotFoundError
 from cvtgs.io import atomic_output
 from cvtgs.io.ply import PlyRows
-from cvtgs.io.tensors import map_tensors, save_tensors
-from cvtgs.math.frames import RobustFrame
 from cvtgs.mergenet import Checkpoint, load_checkpoint, save_checkpoint
-from cvtgs.outofcore.cuts import Cuts
-from cvtgs.outofcore.survey import Survey
+from cvtgs.outofcore.scan import RowRange, SceneScan, read_scan, write_scan
 
-_NUMBERS = ("faintest", "lightest", "unit", "floor", "step", "power", "mass", "rows", "kept")
+
+class Manifest(pydantic.BaseModel):
+    """What is written once all rows are sorted into blocks; from then on a job can be resumed.
+
+    Attributes:
+        key: Digest of all that the result depends on.
+        source: Path of the source.
+        targets: Number of Gaussians that each block keeps.
+    """
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
+
+    key: str
+    source: str
+    targets: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -31,14 +40,14 @@ class Job:
     """What is to be done, small enough to be sent to every process.
 
     Attributes:
-        folder: Where blocks lie; every process must see it.
+        folder: Folder of the files that blocks exchange; every process must see it.
         source: The file.
         target: Number of Gaussians to keep, those in boxes among them.
         blocks: Number of blocks.
-        boxes: What is protected.
+        boxes: Protected regions.
         config: Every choice.
-        has_network: Whether a checkpoint lies in the folder.
-        range_rows: Rows of the file that one process looks at in one go.
+        has_network: Whether the folder holds a checkpoint.
+        range_rows: Rows of the file that one process reads in one call.
     """
 
     folder: str
@@ -54,117 +63,98 @@ class Job:
         """Return the path of a file of the job."""
         return Path(self.folder) / name
 
-    def rows_path(self, block: int, part: int) -> Path:
-        """Return the file with the rows of a block that were found in one part of the source."""
-        return self.path(f"rows_{block:05d}_{part:05d}")
+    def rows_path(self, block: int, number: int) -> Path:
+        """Return the file with the rows of a block that come from one range of the source."""
+        return self.path(f"rows_{block:05d}_{number:05d}")
 
-    def kept_path(self, part: int) -> Path:
-        """Return the file with the protected rows of one part of the source."""
-        return self.path(f"kept_{part:05d}")
-
-    def small_path(self, block: int) -> Path:
-        """Return the file of a block that is done."""
-        return self.path(f"small_{block:05d}.ply")
-
-    def facts_path(self, block: int) -> Path:
-        """Return the file that says what was done to a block."""
-        return self.path(f"small_{block:05d}.json")
+    def kept_path(self, number: int) -> Path:
+        """Return the file with the protected rows of one range of the source."""
+        return self.path(f"kept_{number:05d}")
 
     def sample_path(self, block: int) -> Path:
-        """Return the file with the Gaussians of a block that Lloyd looks at."""
+        """Return the file with the curve order of a block, and the points that Lloyd samples."""
         return self.path(f"sample_{block:05d}")
 
-    def sites_path(self, turn: int, block: int) -> Path:
-        """Return the file with the sites of a block after some moves."""
-        return self.path(f"sites_{turn:02d}_{block:05d}")
+    def sites_path(self, iteration: int, block: int) -> Path:
+        """Return the file with the sites of a block after some iterations of Lloyd."""
+        return self.path(f"sites_{iteration:02d}_{block:05d}")
 
-    def sums_path(self, turn: int, block: int) -> Path:
-        """Return the file with what the Gaussians of a block add to sites, its own and others."""
-        return self.path(f"sums_{turn:02d}_{block:05d}")
+    def sums_path(self, iteration: int, block: int) -> Path:
+        """Return the file with the sums of the points of a block by site, own and remote."""
+        return self.path(f"sums_{iteration:02d}_{block:05d}")
 
     def labels_path(self, block: int) -> Path:
-        """Return the file with the cell of every Gaussian of a block, and how many went where."""
+        """Return the file with the own cell of every row, and how many rows go to other blocks."""
         return self.path(f"labels_{block:05d}")
 
     def sent_path(self, block: int) -> Path:
-        """Return the file with the rows of a block that went into cells of others."""
+        """Return the file with the rows of a block that belong to remote cells."""
         return self.path(f"sent_{block:05d}")
 
     def merged_path(self, block: int) -> Path:
         """Return the file with the merged Gaussians of a block."""
         return self.path(f"merged_{block:05d}")
 
-    def wide_path(self, block: int) -> Path:
-        """Return the file with the same ones widened, and with the neighbours of each."""
-        return self.path(f"wide_{block:05d}")
+    def inflated_path(self, block: int) -> Path:
+        """Return the file with the same Gaussians inflated, and with the neighbours of each."""
+        return self.path(f"inflated_{block:05d}")
 
-    def busy(self) -> list[int]:
-        """Return the blocks that keep something."""
-        return [block for block, target in enumerate(self.read_survey()[1]) if target]
+    def small_path(self, block: int) -> Path:
+        """Return the file of a finished block."""
+        return self.path(f"small_{block:05d}.ply")
 
-    def filled(self) -> list[int]:
-        """Return the blocks that have rows; some may be too light to keep anything."""
-        numbers = [number for number, _, _ in self.ranges()]
+    def report_path(self, block: int) -> Path:
+        """Return the file with the report of a finished block."""
+        return self.path(f"small_{block:05d}.json")
+
+    def ranges(self) -> list[RowRange]:
+        """Return the ranges of the source."""
+        total, step = self.source.count, self.range_rows
+        starts = range(0, total, step)
+        return [RowRange(k, start, min(start + step, total)) for k, start in enumerate(starts)]
+
+    @property
+    def targets(self) -> tuple[int, ...]:
+        """Number of Gaussians that each block keeps."""
+        return self._manifest().targets
+
+    def blocks_with_cells(self) -> list[int]:
+        """Return the blocks that keep at least one Gaussian."""
+        return [block for block, target in enumerate(self.targets) if target]
+
+    def blocks_with_rows(self) -> list[int]:
+        """Return the blocks that have rows; some may weigh too little to have cells."""
+        numbers = [rows.number for rows in self.ranges()]
         return [
             block
-            for block, target in enumerate(self.read_survey()[1])
+            for block, target in enumerate(self.targets)
             if target or any(self.rows_path(block, number).exists() for number in numbers)
         ]
 
-    def ranges(self) -> list[tuple[int, int, int]]:
-        """Return the parts of the source: number, first row, row after the last one."""
-        total, step = self.source.count, self.range_rows
-        starts = range(0, total, step)
-        return [(k, start, min(start + step, total)) for k, start in enumerate(starts)]
-
-    @property
-    def network(self) -> Checkpoint | None:
-        """The network of the job."""
+    def read_network(self) -> Checkpoint | None:
+        """Read the checkpoint of the job."""
         return load_checkpoint(self.path("network.safetensors")) if self.has_network else None
 
     def write_network(self, checkpoint: Checkpoint) -> None:
-        """Put the network where every process finds it."""
+        """Write the checkpoint where every process finds it."""
         with atomic_output(self.path("network.safetensors"), overwrite=True) as file:
             file.write(save_checkpoint(checkpoint.net, checkpoint.info))
 
-    def write_survey(self, survey: Survey, targets: list[int]) -> None:
-        """Put the survey, and what each block is to keep, where every process finds it."""
-        cuts = survey.cuts
-        numbers = {name: getattr(survey, name) for name in _NUMBERS}
-        numbers |= {"radius": survey.frame.radius, "targets": targets}
-        tensors = {
-            "center": survey.frame.center,
-            "light": survey.light,
-            "axes": cuts.axes,
-            "places": cuts.places,
-            "children": cuts.children,
-        }
-        described = {"plan": survey.plan.model_dump_json(), "numbers": json.dumps(numbers)}
-        save_tensors(self.path("survey.safetensors"), tensors, described)
+    def read_scan(self) -> SceneScan:
+        """Read what all blocks need of the whole scene."""
+        return read_scan(self.path("scan.safetensors"))
 
-    def read_survey(self) -> tuple[Survey, list[int]]:
-        """Return the survey, and what each block is to keep."""
-        tensors, described = map_tensors(self.path("survey.safetensors"))
-        numbers: dict[str, Any] = json.loads(described["numbers"])
-        names = ("axes", "places", "children")
-        cuts = Cuts(**{name: tensors[name] for name in names}, count=self.blocks)
-        radius, targets = numbers.pop("radius"), numbers.pop("targets")
-        found = Survey(
-            frame=RobustFrame(center=tensors["center"], radius=radius),
-            plan=EffectPlan.model_validate_json(described["plan"]),
-            light=tensors["light"],
-            cuts=cuts,
-            **numbers,
-        )
-        return found, targets
+    def write_scan(self, scan: SceneScan) -> None:
+        """Write the scan where every process finds it."""
+        write_scan(scan, self.path("scan.safetensors"))
 
     def key(self, checkpoint: Checkpoint | None) -> str:
-        """Name everything that the result depends on: file, choices, network, version."""
+        """Return a digest of all that the result depends on: file, choices, network, version."""
         path = Path(self.source.path)
         stat = path.stat()
         with path.open("rb") as file:
             header = file.read(self.source.offset)
-        said = {
+        inputs = {
             "file": [str(path.resolve()), stat.st_size, stat.st_mtime_ns],
             "header": hashlib.sha256(header).hexdigest(),
             "target": self.target,
@@ -175,31 +165,32 @@ class Job:
             "network": checkpoint and checkpoint.digest,
             "versions": [cvtgs.__version__, torch.__version__],
         }
-        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
-    def is_cut(self, key: str) -> bool:
-        """Return whether the folder holds all blocks of just this job."""
+    def can_resume(self, key: str) -> bool:
+        """Return whether the folder holds all rows of just this job, sorted into blocks."""
         try:
-            manifest = json.loads(self.path("manifest.json").read_text(encoding="utf-8"))
-            self.read_survey()
-        except (OSError, ValueError, KeyError, TypeError, InputNotFoundError, FileFormatError):
+            self.read_scan()
+            return self._manifest().key == key
+        except (OSError, ValueError, KeyError):
             return False
-        return isinstance(manifest, dict) and manifest.get("key") == key
 
     def start_over(self) -> None:
         """Make an empty folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
         Path(self.folder).mkdir()
 
-    def declare_cut(self, key: str) -> None:
-        """Report that all blocks are there: from now on the job can be resumed."""
-        source = asdict(self.source) | {"names": [], "layout": []}
-        text = json.dumps({"key": key, "blocks": self.blocks, "source": source}, indent=2)
+    def write_manifest(self, key: str, targets: list[int]) -> None:
+        """Write that all rows are sorted, and how many Gaussians each block keeps."""
+        manifest = Manifest(key=key, source=self.source.path, targets=tuple(targets))
         with atomic_output(self.path("manifest.json"), overwrite=True) as file:
-            file.write(text.encode())
+            file.write(manifest.model_dump_json(indent=2).encode())
 
-    @classmethod
-    def beside(cls, output: str | os.PathLike[str], **values: Any) -> Self:
-        """Return the job of an output; its folder lies beside it and is hidden."""
-        target = Path(os.path.realpath(output))
-        return cls(folder=str(target.with_name(f".{target.name}.blocks")), **values)
+    def _manifest(self) -> Manifest:
+        return Manifest.model_validate_json(self.path("manifest.json").read_bytes())
+
+
+def job_folder(output: str | os.PathLike[str]) -> str:
+    """Return the folder of the job of an output: hidden, beside it."""
+    target = Path(os.path.realpath(output))
+    return str(target.with_name(f".{target.name}.blocks"))

@@ -1,4 +1,4 @@
-"""How much memory there is, what a simplification takes, and how many blocks follow."""
+"""Memory: how much is free, how much a simplification takes, and how many blocks that makes."""
 
 import math
 import os
@@ -9,7 +9,7 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.ply import PlyRows
 
 BASE_BYTES = 600_000_000
-"""Interpreter, torch, network, the grid of depths, and one chunk of everything."""
+"""Interpreter, torch, network, the grid of depths, and one chunk of rows."""
 
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 
@@ -86,7 +86,7 @@ def needed_memory(source: PlyRows, rows: int) -> int:
 def block_count(source: PlyRows, memory: int) -> int:
     """Choose how many blocks fit into memory one after the other.
 
-    A block holds at most twice the mean number of rows (:func:`cvtgs.outofcore.survey.survey`).
+    A block holds at most twice the mean number of rows (:func:`cvtgs.outofcore.scan.scan_scene`).
 
     Args:
         source: The file.

@@ -1,4 +1,4 @@
-"""The rows of a block: as they were cut, and as the cells of the block want them."""
+"""Rows of the source: sorted into the files of blocks, and read back for a block and its cells."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,79 +9,172 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cvtgs import analysis, cvt, filters, validity
+from cvtgs.boxes import inside
+from cvtgs.config import TessellationConfig
+from cvtgs.devices import one_thread
+from cvtgs.io import atomic_output
 from cvtgs.io.ply import assemble
 from cvtgs.io.tensors import map_tensors
 from cvtgs.outofcore.job import Job
+from cvtgs.outofcore.scan import CHUNK, RowRange, SceneScan
 from cvtgs.scene import GaussianScene
 
-SEEN, LIGHT, CELL = "cvtgs_seen", "cvtgs_light", "cvtgs_cell"
-"""Columns of block files beyond those of the source: area as seen, light, and cell."""
+AREA, VISIBILITY, CELL = "cvtgs_apparent_area", "cvtgs_visibility", "cvtgs_cell"
+"""Columns of block files beyond those of the source."""
 
-CHUNK = 1 << 14
-"""Rows that are mapped together, and let go again."""
+MAPPED_ROWS = 1 << 14
+"""Rows that are mapped together, and released again."""
 
 
-class Rows(NamedTuple):
+class BlockRows(NamedTuple):
     """Gaussians of a block.
 
     Attributes:
         scene: The Gaussians.
-        seen: ``(n,)`` their areas as they look in images.
-        light: ``(n,)`` how freely each can be seen, 0 to 1.
+        apparent_areas: ``(n,)`` areas as they count in images.
+        visibility: ``(n,)`` ambient visibility, 0 to 1.
     """
 
     scene: GaussianScene
-    seen: Tensor
-    light: Tensor
+    apparent_areas: Tensor
+    visibility: Tensor
+
+
+class SortedCounts(NamedTuple):
+    """What a range of the source adds to every block.
+
+    Attributes:
+        rows: Number of Gaussians.
+        cells: Their weight in cells, none above 1.
+    """
+
+    rows: list[int]
+    cells: list[float]
+
+
+@one_thread()
+def sort_range(job: Job, rows: RowRange) -> SortedCounts:
+    """Write the rows of a range into one file per block; doing it again writes the same files."""
+    scan = job.read_scan()
+    for block in range(job.blocks):
+        job.rows_path(block, rows.number).unlink(missing_ok=True)
+    job.kept_path(rows.number).unlink(missing_ok=True)
+    row_counts = torch.zeros(job.blocks, dtype=torch.int64)
+    cell_counts = torch.zeros(job.blocks).double()
+    for start in range(rows.start, rows.stop, CHUNK):
+        records = job.source.read(start, min(start + CHUNK, rows.stop))
+        scene = job.source.scene(records)
+        valid = validity.valid_rows(scene)
+        protected = valid & inside(job.boxes, scene.means) if job.boxes else ~valid & valid
+        if bool(protected.any()):
+            _append_kept(job, rows.number, records, scene, protected)
+        chosen, areas, visibility = _filtered(
+            scan, job.config.cvt, scene, (valid & ~protected).nonzero()[:, 0]
+        )
+        weights = cvt.gaussian_weights(scene.opacities[chosen], areas, scan.area_power)
+        weights = weights.clamp_min(scan.min_weight)
+        per_cell = scan.cell_weight
+        cells = (weights / per_cell).clamp_max(1.0) if per_cell > 0 else torch.ones_like(weights)
+        blocks = scan.partition.blocks_of(scan.frame.contract(scene.means[chosen]))
+        added = torch.bincount(blocks, minlength=job.blocks)
+        row_counts += added
+        cell_counts += torch.bincount(blocks, cells, minlength=job.blocks)
+        order = torch.sort(blocks, stable=True).indices
+        table = np.empty(len(order), record_type(job))
+        numbers = chosen[order].numpy()
+        for name in records.dtype.names or ():
+            table[name] = records[name][numbers]
+        table[AREA], table[VISIBILITY] = areas[order].numpy(), visibility[order].numpy()
+        ends = added.cumsum(0).tolist()
+        for block, (end, count) in enumerate(zip(ends, added.tolist(), strict=True)):
+            if count:
+                with job.rows_path(block, rows.number).open("ab") as file:
+                    file.write(table[end - count : end].tobytes())
+    return SortedCounts(row_counts.tolist(), cell_counts.tolist())
+
+
+def _filtered(
+    scan: SceneScan, config: TessellationConfig, scene: GaussianScene, rows: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the rows that the filter does not leave out, their apparent area and visibility."""
+    means, opacities = scene.means[rows], scene.opacities[rows]
+    areas = scene.select(rows).areas
+    visibility = analysis.visibility_at(scan.visibility, means, scan.frame)
+    distances = scan.frame.distances(means)
+    apparent = analysis.apparent_areas(areas, distances, visibility, config=config)
+    stays = opacities >= scan.min_opacity
+    if scan.max_flyaway_mass >= 0.0:
+        far = distances > filters.FLYAWAY_RADII
+        masses = areas * opacities * analysis.perspective_falloff(distances)
+        stays &= ~(far & (masses <= scan.max_flyaway_mass))
+    return rows[stays], apparent[stays], visibility[stays]
+
+
+def _append_kept(
+    job: Job, number: int, records: NDArray[Any], scene: GaussianScene, protected: Tensor
+) -> None:
+    kept = records[protected.numpy()]
+    logits = validity.with_finite_opacities(scene.select(protected)).logit_opacities
+    kept["opacity"] = logits.numpy()
+    with job.kept_path(number).open("ab") as file:
+        file.write(kept.tobytes())
 
 
 def record_type(job: Job, *, with_cell: bool = False) -> np.dtype[Any]:
     """Return the type of a row in the files of a job."""
     more = [(CELL, "<i4")] if with_cell else []
-    return np.dtype([*job.source.names, (SEEN, "<f8"), (LIGHT, "<f4"), *more])
+    return np.dtype([*job.source.names, (AREA, "<f8"), (VISIBILITY, "<f4"), *more])
 
 
-def read_rows(job: Job, block: int, *, is_slim: bool = False) -> Rows:
-    """Read the rows that were cut into a block."""
-    counts = [count for _, count in _cut_files(job, block)]
-    return _assembled(job, cut_pieces(job, block), sum(counts), is_slim=is_slim)
+def read_rows(job: Job, block: int, *, is_slim: bool = False) -> BlockRows:
+    """Read the rows that were sorted into a block; slim ones have one colour, no extra columns."""
+    counts = [count for _, count in _row_files(job, block)]
+    return _assembled(job, _row_pieces(job, block), sum(counts), is_slim=is_slim)
 
 
-def read_members(job: Job, block: int) -> tuple[Rows, Tensor]:
-    """Read the rows that make up the cells of a block."""
+def read_members(job: Job, block: int) -> tuple[BlockRows, Tensor]:
+    """Read the rows in the cells of a block, and the cell of each."""
     labels = map_tensors(job.labels_path(block))[0]["labels"].long()
     stays = labels >= 0
-    arrived = list(_arrivals(job, block))
-    came = [torch.from_numpy(rows[CELL].astype(np.int64)) for rows in arrived]
+    received = list(_received(job, block))
+    cells = [torch.from_numpy(rows[CELL].astype(np.int64)) for rows in received]
 
     def pieces() -> Iterator[NDArray[Any]]:
         start = 0
-        for rows in cut_pieces(job, block):
+        for rows in _row_pieces(job, block):
             yield rows[stays[start : start + len(rows)].numpy()]
             start += len(rows)
-        yield from arrived
+        yield from received
 
-    count = int(stays.sum()) + sum(map(len, arrived))
+    count = int(stays.sum()) + sum(map(len, received))
     rows = _assembled(job, pieces(), count, is_slim=False)
-    return rows, torch.cat([labels[stays], *came])
+    return rows, torch.cat([labels[stays], *cells])
 
 
-def cut_pieces(job: Job, block: int) -> Iterator[NDArray[Any]]:
-    """Return the rows that were cut into a block piece by piece."""
-    for path, count in _cut_files(job, block):
-        yield from _mapped(path, record_type(job), 0, count)
+def send_rows(job: Job, block: int, owners: Tensor, labels: Tensor) -> Tensor:
+    """Write the rows that belong to remote cells; return how many go to each block."""
+    kind, parts, start = record_type(job, with_cell=True), [], 0
+    for rows in _row_pieces(job, block):
+        part = slice(start, start + len(rows))
+        leaves = (owners[part] >= 0).numpy()
+        table = np.empty(int(leaves.sum()), kind)
+        for name in rows.dtype.names or ():
+            table[name] = rows[name][leaves]
+        table[CELL] = labels[part].numpy()[leaves]
+        parts.append(table)
+        start += len(rows)
+    remote = owners[owners >= 0]
+    with atomic_output(job.sent_path(block), overwrite=True) as file:
+        order = torch.sort(remote, stable=True).indices
+        file.write(np.concatenate(parts)[order.numpy()].tobytes())
+    return torch.bincount(remote, minlength=job.blocks)
 
 
-def _cut_files(job: Job, block: int) -> list[tuple[Path, int]]:
-    size = record_type(job).itemsize
-    paths = [job.rows_path(block, number) for number, _, _ in job.ranges()]
-    return [(path, path.stat().st_size // size) for path in paths if path.exists()]
-
-
-def _arrivals(job: Job, block: int) -> Iterator[NDArray[Any]]:
-    """Return the rows that other blocks have sent."""
+def _received(job: Job, block: int) -> Iterator[NDArray[Any]]:
+    """Return the rows that other blocks have sent, piece by piece."""
     kind = record_type(job, with_cell=True)
-    for other in job.filled():
+    for other in job.blocks_with_rows():
         if other == block:
             continue
         sent = map_tensors(job.labels_path(other))[0]["sent"]
@@ -89,30 +182,43 @@ def _arrivals(job: Job, block: int) -> Iterator[NDArray[Any]]:
         yield from _mapped(job.sent_path(other), kind, start, count)
 
 
-def _assembled(job: Job, pieces: Iterator[NDArray[Any]], count: int, *, is_slim: bool) -> Rows:
-    seen, light = torch.empty(count).double(), torch.empty(count).double()
-    done = 0
+def _row_pieces(job: Job, block: int) -> Iterator[NDArray[Any]]:
+    """Return the rows that were sorted into a block, piece by piece."""
+    for path, count in _row_files(job, block):
+        yield from _mapped(path, record_type(job), 0, count)
 
-    def noted() -> Iterator[NDArray[Any]]:
-        nonlocal done
+
+def _row_files(job: Job, block: int) -> list[tuple[Path, int]]:
+    size = record_type(job).itemsize
+    paths = [job.rows_path(block, rows.number) for rows in job.ranges()]
+    return [(path, path.stat().st_size // size) for path in paths if path.exists()]
+
+
+def _mapped(path: Path, kind: np.dtype[Any], start: int, count: int) -> Iterator[NDArray[Any]]:
+    for first in range(start, start + count, MAPPED_ROWS):
+        shape = (min(MAPPED_ROWS, start + count - first),)
+        yield np.memmap(path, kind, "r", first * kind.itemsize, shape).view(np.ndarray)
+
+
+def _assembled(job: Job, pieces: Iterator[NDArray[Any]], count: int, *, is_slim: bool) -> BlockRows:
+    """Build a scene of pieces; their other columns are copied on the way."""
+    areas, visibility = torch.empty(count).double(), torch.empty(count).double()
+
+    def copied() -> Iterator[NDArray[Any]]:
+        start = 0
         for rows in pieces:
-            seen[done : done + len(rows)] = torch.from_numpy(rows[SEEN].copy())
-            light[done : done + len(rows)] = torch.from_numpy(rows[LIGHT].copy())
-            done += len(rows)
+            part = slice(start, start + len(rows))
+            areas[part] = torch.from_numpy(rows[AREA].copy())
+            visibility[part] = torch.from_numpy(rows[VISIBILITY].copy())
+            start += len(rows)
             yield rows
 
     scene = assemble(
-        noted(),
+        copied(),
         count=count,
         layout=job.source.layout,
         comments=job.source.comments,
         sh_degree=0 if is_slim else None,
         with_extras=not is_slim,
     )
-    return Rows(scene, seen, light)
-
-
-def _mapped(path: Path, kind: np.dtype[Any], start: int, count: int) -> Iterator[NDArray[Any]]:
-    for first in range(start, start + count, CHUNK):
-        shape = (min(CHUNK, start + count - first),)
-        yield np.memmap(path, kind, "r", first * kind.itemsize, shape).view(np.ndarray)
+    return BlockRows(scene, areas, visibility)

@@ -1,33 +1,72 @@
 """Simplify a file block by block: in bounded memory, resumable, on one machine or on many."""
 
+import math
 import os
 import shutil
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from cvtgs.boxes import Box, check_room
 from cvtgs.config import SimplifyConfig
-from cvtgs.counts import shared_out, target_count
+from cvtgs.counts import shared_out, shortfall, target_count
 from cvtgs.devices import one_thread
-from cvtgs.errors import ConfigError, InvalidArgumentError, InvalidSceneError
-from cvtgs.io import check_save
-from cvtgs.io.ply import open_rows
+from cvtgs.errors import (
+    ConfigError,
+    DroppedDataWarning,
+    InvalidArgumentError,
+    InvalidSceneError,
+)
+from cvtgs.io import atomic_output, check_save, load, save
+from cvtgs.io.ply import join_plys, open_rows
+from cvtgs.io.tensors import map_tensors
 from cvtgs.math.frames import robust_frame
-from cvtgs.outofcore.finish import join_blocks, report_of
-from cvtgs.outofcore.job import Job
+from cvtgs.outofcore.job import Job, job_folder
+from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
 from cvtgs.outofcore.memory import available_memory, block_count
-from cvtgs.outofcore.merging import finish
-from cvtgs.outofcore.survey import survey, take_sample, total
-from cvtgs.outofcore.turns import Workers, do_all, group_blocks, this_process, told
-from cvtgs.outofcore.work import look, simplify_whole, sort_into_blocks
+from cvtgs.outofcore.merge import BlockReport, correct, inflate, merge, simplify_block
+from cvtgs.outofcore.rows import SortedCounts, sort_range
+from cvtgs.outofcore.scan import RowRange, add_totals, read_sample, scan_range, scan_scene
 from cvtgs.progress import ProgressListener, StageClock, silent
 from cvtgs.report import SimplifyReport
+from cvtgs.scene import concatenate
 from cvtgs.simplifier import Simplifier
 
 RANGE_ROWS = 1 << 26
-"""Rows of the file that one process looks at in one go."""
+"""Rows of the file that one process reads in one call."""
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class Workers(Protocol):
+    """Calls a function for every item, in this process or in others."""
+
+    def __call__(
+        self, function: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterable[Result]:
+        """Call the function for every item.
+
+        Args:
+            function: A function that can be pickled.
+            items: Its arguments; the calls are independent.
+
+        Returns:
+            The results, in the order of the items.
+        """
+        ...
+
+
+def sequentially(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
+    """Call a function for one item after the other, in this process."""
+    yield from map(function, items)
 
 
 def simplify_file(  # noqa: PLR0913 (options by name)
@@ -40,7 +79,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     blocks: int | None = None,
     boxes: Sequence[Box] = (),
     simplifier: Simplifier | None = None,
-    workers: Workers = this_process,
+    workers: Workers | None = None,
     range_rows: int = RANGE_ROWS,
     overwrite: bool = False,
     listener: ProgressListener = silent,
@@ -49,8 +88,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
 
     The file is read in parts and sorted into blocks of space, which lie in a hidden folder beside
     the output; each block is simplified with its exact share of the Gaussians to keep. If this
-    is interrupted, the same call goes on with the blocks that are not done. The number of blocks,
-    not who works on them or when, decides the result.
+    is interrupted, the same call continues with the blocks that are not finished. The result
+    depends on the number of blocks, not on the workers or their order.
 
     Args:
         source: A binary PLY file.
@@ -61,16 +100,17 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         blocks: Number of blocks, instead of ``memory``.
         boxes: Gaussians with their centres in these are kept as they are, and come first.
         simplifier: Configuration and network; None for the defaults.
-        workers: What works on the blocks.
-        range_rows: Rows of the file that one process looks at in one go.
+        workers: Calls functions for ranges of the file and for blocks; None calls them here, one
+            after the other.
+        range_rows: Rows of the file that one process reads in one call.
         overwrite: Whether an existing output may be replaced.
-        listener: Told about progress.
+        listener: Called with progress events.
 
     Returns:
-        The report; facts of cells are those of all blocks, seconds those of every process.
+        The report; statistics of cells are those of all blocks, seconds those of every process.
 
     Raises:
-        ConfigError: The configuration looks at images of the scene, which needs all of it.
+        ConfigError: The configuration takes images of the scene, which needs all of it.
         InvalidArgumentError: Ratio, count or boxes cannot be met.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
@@ -87,13 +127,14 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         (20, 3)
     """
     simplifier = simplifier or Simplifier(device="cpu")
+    workers = workers or sequentially
     check_config(simplifier.config)
     check_save(output, overwrite=overwrite)
     rows = open_rows(source)
     target = target_count(rows.count, rho, count=count)
     wanted = blocks or block_count(rows, memory or available_memory())
-    job = Job.beside(
-        output,
+    job = Job(
+        folder=job_folder(output),
         source=rows,
         target=target,
         blocks=max(1, min(wanted, target)),
@@ -104,30 +145,36 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     )
     clock = StageClock(listener, torch.device("cpu"))
     key = job.key(simplifier.checkpoint)
-    if not job.is_cut(key):
+    if not job.can_resume(key):
         job.start_over()
         if simplifier.checkpoint is not None:
             job.write_network(simplifier.checkpoint)
         with one_thread():
-            _cut(job, workers, clock)
-        job.declare_cut(key)
-    found, _ = job.read_survey()
-    busy = job.busy()
-    resumed = sum(job.small_path(block).exists() for block in busy)
+            targets = _scan_and_sort(job, workers, clock)
+        job.write_manifest(key, targets)
+    with_cells = job.blocks_with_cells()
+    resumed = sum(job.small_path(block).exists() for block in with_cells)
     if job.blocks > 1:
-        group_blocks(job, workers, clock)
-    last = finish if job.blocks > 1 else simplify_whole
-    with clock.stage("blocks", len(busy)) as advance:
-        do_all(workers, partial(last, job), busy, advance)
-    with clock.stage("join"):
-        join_blocks(job, busy, output, overwrite=overwrite)
-    report = report_of(job, found, busy, simplifier=simplifier, clock=clock, resumed=resumed)
+        _tessellate_and_merge(job, workers, clock)
+    last = correct if job.blocks > 1 else simplify_block
+    with clock.stage("blocks", len(with_cells)) as advance:
+        _run_all(workers, partial(last, job), with_cells, advance)
+    with clock.stage("assemble"):
+        _assemble(job, output, overwrite=overwrite)
+    report = _report(job, simplifier, clock, resumed=resumed)
     shutil.rmtree(job.folder, ignore_errors=True)
     return report
 
 
 def check_config(config: SimplifyConfig) -> None:
-    """Refuse choices that need the whole scene in one piece."""
+    """Refuse a configuration that needs the whole scene in one piece.
+
+    Args:
+        config: Every choice.
+
+    Raises:
+        ConfigError: It takes images of the scene, or refines.
+    """
     if config.uses_renders or config.refine.enabled:
         raise ConfigError(
             "blocks need a preset that takes no images of the scene (draft, fast, standard, "
@@ -136,54 +183,156 @@ def check_config(config: SimplifyConfig) -> None:
         )
 
 
-def _cut(job: Job, workers: Workers, clock: StageClock) -> None:
-    """Look at the whole file, and sort its rows into blocks."""
+def _scan_and_sort(job: Job, workers: Workers, clock: StageClock) -> list[int]:
+    """Scan the file and sort its rows into blocks; return how many each block keeps."""
     ranges = job.ranges()
-    with clock.stage("survey", len(ranges)) as advance:
-        sample = take_sample(job.source)
+    with clock.stage("scan", len(ranges)) as advance:
+        sample = read_sample(job.source)
         if len(sample) == 0:
             raise InvalidSceneError(f"{job.source.path}: found no valid Gaussian.")
         frame = robust_frame(sample.means)
-        depths = total(told(workers(partial(look, job, frame), ranges), advance))
-        check_room(depths.kept, target=job.target, total=depths.valid)
-        if depths.kept == depths.valid:
+        scan_rows = partial(scan_range, job.source, frame, job.boxes)
+        totals = add_totals(_with_progress(workers(scan_rows, ranges), advance))
+        valid, kept = totals.valid_count, totals.kept_count
+        check_room(kept, target=job.target, total=valid)
+        if kept == valid:
             raise InvalidArgumentError(
-                f"all {depths.kept} valid Gaussians are to be kept as they are; none is left."
+                f"all {kept} valid Gaussians are to be kept as they are; none is left."
             )
-        rest = min(job.target, depths.valid) - depths.kept
-        found = survey(
+        rest = min(job.target, valid) - kept
+        scan = scan_scene(
             sample,
-            depths,
+            totals,
             boxes=job.boxes,
             target=max(1, rest),
             blocks=job.blocks,
             config=job.config,
             frame=frame,
         )
-    with clock.stage("cut", len(ranges)) as advance:
-        job.write_survey(found, [])
-        counts, shares = _sorted(job, workers, ranges, advance)
-        if sum(counts) < rest:  # the filter was too strict for so large a target
-            found = found._replace(faintest=0.0, lightest=-1.0)
-            job.write_survey(found, [])
-            counts, shares = _sorted(job, workers, ranges, advance)
-    occupied = sum(1 for count in counts if count)
+    with clock.stage("sort", len(ranges)) as advance:
+        job.write_scan(scan)
+        counts = _sort(job, workers, ranges, advance)
+        if sum(counts.rows) < rest:  # the filter was too strict for so large a target
+            job.write_scan(replace(scan, min_opacity=0.0, max_flyaway_mass=-1.0))
+            counts = _sort(job, workers, ranges, advance)
+    occupied = sum(1 for count in counts.rows if count)
     if rest < occupied:  # tiny targets: the heaviest blocks get one each
-        order = sorted(range(job.blocks), key=lambda block: -shares[block])
-        targets = [int(block in order[:rest]) for block in range(job.blocks)]
-    else:
-        targets = shared_out(rest, shares, rooms=counts)
-    job.write_survey(found, targets)
+        order = sorted(range(job.blocks), key=lambda block: -counts.cells[block])
+        return [int(block in order[:rest]) for block in range(job.blocks)]
+    return shared_out(rest, counts.cells, rooms=counts.rows)
 
 
-def _sorted(
-    job: Job,
+def _sort(
+    job: Job, workers: Workers, ranges: Sequence[RowRange], advance: Callable[[int], None]
+) -> SortedCounts:
+    rows, cells = [0] * job.blocks, [0.0] * job.blocks
+    for part in _with_progress(workers(partial(sort_range, job), ranges), advance):
+        rows = [a + b for a, b in zip(rows, part.rows, strict=True)]
+        cells = [a + b for a, b in zip(cells, part.cells, strict=True)]
+    return SortedCounts(rows, cells)
+
+
+def _tessellate_and_merge(job: Job, workers: Workers, clock: StageClock) -> None:
+    """Group the Gaussians of all blocks into cells, merge and inflate these.
+
+    Each step is done for all blocks before the next, so the result has no seams: the sites of
+    Lloyd move together, and neighbours are those of the whole scene.
+    """
+    blocks, iterations = job.blocks_with_rows(), job.config.cvt.iterations
+    with clock.stage("tessellate", (iterations + 2) * len(blocks)) as advance:
+
+        def run(step: Callable[[int], Result], nth: int) -> list[Result]:
+            first = nth * len(blocks)
+            return _run_all(workers, step, blocks, lambda done: advance(first + done))
+
+        run(partial(seed, job), 0)
+        moves, energy, least = 0, math.inf, 1.0 - job.config.cvt.tolerance
+        for iteration in range(iterations):
+            before, energy = energy, sum(run(partial(accumulate, job, iteration), iteration + 1))
+            if energy >= least * before:
+                break
+            move_sites(job, iteration)
+            moves = iteration + 1
+        run(partial(assign, job, moves), iterations + 1)
+    with_cells = job.blocks_with_cells()
+    for name, step in (("merge", merge), ("inflate", inflate)):
+        with clock.stage(name, len(with_cells)) as advance:
+            _run_all(workers, partial(step, job), with_cells, advance)
+
+
+def _run_all(
     workers: Workers,
-    ranges: Sequence[tuple[int, int, int]],
+    step: Callable[[int], Result],
+    blocks: Sequence[int],
     advance: Callable[[int], None],
-) -> tuple[list[int], list[float]]:
-    counts, shares = [0] * job.blocks, [0.0] * job.blocks
-    for rows, cells in told(workers(partial(sort_into_blocks, job), ranges), advance):
-        counts = [a + b for a, b in zip(counts, rows, strict=True)]
-        shares = [a + b for a, b in zip(shares, cells, strict=True)]
-    return counts, shares
+) -> list[Result]:
+    return list(_with_progress(workers(step, blocks), advance))
+
+
+def _with_progress(results: Iterable[Result], advance: Callable[[int], None]) -> Iterator[Result]:
+    """Return the results, and report how many there are so far."""
+    for done, result in enumerate(results, start=1):
+        yield result
+        advance(done)
+
+
+def _assemble(job: Job, output: str | os.PathLike[str], *, overwrite: bool) -> None:
+    """Write protected rows and blocks behind one another."""
+    blocks = [job.small_path(block) for block in job.blocks_with_cells()]
+    name = Path(output).name.lower()
+    if name.endswith(".ply") and not name.endswith(".compressed.ply"):
+        with atomic_output(output, overwrite=overwrite) as file:
+            join_plys(blocks, file, before=_kept_rows(job))
+        return
+    kept = [job.source.scene(rows) for rows in _kept_rows(job)]
+    save(concatenate([*kept, *map(load, blocks)]), output, overwrite=overwrite)
+
+
+def _kept_rows(job: Job) -> list[NDArray[Any]]:
+    """Map the protected rows of every range."""
+    paths = [job.kept_path(rows.number) for rows in job.ranges()]
+    return [np.memmap(path, job.source.dtype, "r") for path in paths if path.exists()]
+
+
+def _report(job: Job, simplifier: Simplifier, clock: StageClock, *, resumed: int) -> SimplifyReport:
+    """Add up the reports of all blocks."""
+    scan, with_cells = job.read_scan(), job.blocks_with_cells()
+    reports = [
+        BlockReport.model_validate_json(job.report_path(block).read_bytes()) for block in with_cells
+    ]
+    total, valid = job.source.count, scan.row_count + scan.kept_count
+    if valid < total:
+        warnings.warn(
+            f"dropped {total - valid} of {total} Gaussians with NaN, infinite or zero values.",
+            DroppedDataWarning,
+            stacklevel=3,
+        )
+    energy_elsewhere = sum(  # of Gaussians in blocks without cells, which have no report
+        float(map_tensors(job.labels_path(block))[0]["energy"])
+        for block in job.blocks_with_rows()
+        if block not in with_cells
+    )
+    kept_mass = sum(float(job.source.scene(rows).masses.sum()) for rows in _kept_rows(job))
+    return SimplifyReport(
+        input_count=total,
+        output_count=min(job.target, valid),
+        target_count=job.target,
+        rho=job.target / total,
+        invalid_count=total - valid,
+        shortfall=shortfall(valid, total, job.target),
+        filtered_count=scan.row_count - sum(report.input_count for report in reports),
+        kept_count=scan.kept_count,
+        single_member_cells=sum(report.single_member_cells for report in reports),
+        largest_cell=max((report.largest_cell for report in reports), default=0),
+        refilled_cells=sum(report.refilled_cells for report in reports),
+        mass_in=scan.mass,
+        mass_out=sum(report.mass_out for report in reports) + kept_mass,
+        energy=sum(report.energy for report in reports) + energy_elsewhere,
+        backend=reports[0].backend if reports else "none",
+        checkpoint="none" if simplifier.checkpoint is None else simplifier.checkpoint.name,
+        plan=scan.plan,
+        stages=tuple(clock.costs),
+        blocks=job.blocks,
+        resumed_blocks=resumed,
+        config=simplifier.config,
+    )

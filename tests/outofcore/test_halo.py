@@ -1,4 +1,4 @@
-"""Borders: what blocks compute together is what one piece computes, wherever space is cut."""
+"""The halo: what blocks compute together is what one piece computes, wherever space is cut."""
 
 import time
 
@@ -13,9 +13,9 @@ from cvtgs.io.ply import open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import correct_cells
 from cvtgs.outofcore import simplify_file
-from cvtgs.outofcore.borders import Across, Reach, bounds_of, halo, nearest_anywhere
-from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.merging import read_cells
+from cvtgs.outofcore.halo import Balls, OtherBlock, assign_points, bounding_box, halo_cells
+from cvtgs.outofcore.job import Job, job_folder
+from cvtgs.outofcore.merge import read_cells
 from cvtgs.pipeline import shape_merged
 from cvtgs.scene import concatenate
 from cvtgs.views import automatic_views
@@ -28,8 +28,8 @@ class StoppedError(Exception):
     """Ends a run from its listener."""
 
 
-def stop_before_join(event):
-    if event.stage == "join":
+def stop_before_assemble(event):
+    if event.stage == "assemble":
         raise StoppedError
 
 
@@ -45,10 +45,10 @@ def job(tmp_path_factory):
             folder / "out.ply",
             count=TARGET,
             blocks=BLOCKS,
-            listener=stop_before_join,
+            listener=stop_before_assemble,
         )
-    return Job.beside(
-        folder / "out.ply",
+    return Job(
+        folder=job_folder(folder / "out.ply"),
         source=open_rows(folder / "in.ply"),
         target=TARGET,
         blocks=BLOCKS,
@@ -60,7 +60,7 @@ def job(tmp_path_factory):
 
 
 def of_all(job, path, name):
-    return torch.cat([map_tensors(path(block))[0][name] for block in job.busy()])
+    return torch.cat([map_tensors(path(block))[0][name] for block in job.blocks_with_cells()])
 
 
 def scene_of_all(job, path):
@@ -69,8 +69,7 @@ def scene_of_all(job, path):
 
 
 def block_starts(job):
-    _, targets = job.read_survey()
-    return torch.tensor([0, *targets]).cumsum(0)
+    return torch.tensor([0, *job.targets]).cumsum(0)
 
 
 def random_blocks(count, dim, *, seed=0):
@@ -84,18 +83,18 @@ def random_blocks(count, dim, *, seed=0):
 
 def others_of(blocks, own):
     return [
-        Across(k, bounds_of(sites), lambda sites=sites: sites)
+        OtherBlock(k, bounding_box(sites), lambda sites=sites: sites)
         for k, (_, sites) in enumerate(blocks)
         if k != own
     ]
 
 
-def test_rows_within_reach_of_a_box_by_hand():
+def test_balls_that_touch_a_box_by_hand():
     points = torch.tensor([[0.0, 0.0], [0.0, 2.0], [5.0, 0.0]])
     box = torch.tensor([[1.0, -1.0], [2.0, 1.0]])
-    assert Reach.of(points, torch.tensor([1.5, 1.5, 9.5])).rows(box).tolist() == [0, 2]
-    assert Reach.of(points, torch.tensor([1.0, 2.5, 9.0])).rows(box).tolist() == [1]
-    assert len(Reach.of(points, torch.zeros(3)).rows(box)) == 0
+    assert Balls.around(points, torch.tensor([1.5, 1.5, 9.5])).touching(box).tolist() == [0, 2]
+    assert Balls.around(points, torch.tensor([1.0, 2.5, 9.0])).touching(box).tolist() == [1]
+    assert len(Balls.around(points, torch.zeros(3)).touching(box)) == 0
 
 
 @pytest.mark.parametrize("count", [1, 2, 7])
@@ -106,9 +105,7 @@ def test_the_nearest_site_is_found_in_any_block(count, dim):
     owners = torch.cat([torch.full((len(s),), k) for k, (_, s) in enumerate(blocks)])
     crossed = 0
     for own, (points, own_sites) in enumerate(blocks):
-        found = nearest_anywhere(
-            points, own_sites, others_of(blocks, own), nearest=cvt.nearest_scipy
-        )
+        found = assign_points(points, own_sites, others_of(blocks, own), nearest=cvt.nearest_scipy)
         distances = torch.cdist(points.double(), sites)
         wanted = owners[distances.argmin(dim=1)]
         assert torch.equal(torch.where(found.blocks < 0, own, found.blocks), wanted)
@@ -122,8 +119,8 @@ def test_the_nearest_site_is_found_in_any_block(count, dim):
 
 
 def test_equally_near_sites_stay_in_the_own_block():
-    others = [Across(3, torch.tensor([[2.0], [2.0]]), lambda: torch.tensor([[2.0]]))]
-    found = nearest_anywhere(
+    others = [OtherBlock(3, torch.tensor([[2.0], [2.0]]), lambda: torch.tensor([[2.0]]))]
+    found = assign_points(
         torch.tensor([[1.0]]), torch.zeros(1, 1).double(), others, nearest=cvt.nearest_scipy
     )
     assert found.blocks.tolist() == [-1]
@@ -159,7 +156,7 @@ def test_a_halo_holds_all_that_may_be_a_neighbour(count):
     centers = torch.cat([sites for _, sites in blocks])
     wanted = cvt.nearest_neighbors(centers, 8, backend="scipy")
     for own, (_, sites) in enumerate(blocks):
-        found = halo(sites, others_of(blocks, own), count=8, backend="scipy")
+        found = halo_cells(sites, others_of(blocks, own), count=8, backend="scipy")
         held = set((starts[found[:, 0]] + found[:, 1]).tolist())
         held |= set(range(int(starts[own]), int(starts[own + 1])))
         assert set(wanted[starts[own] : starts[own + 1]].flatten().tolist()) <= held
@@ -179,29 +176,30 @@ def test_sites_move_as_in_one_piece(job):
 
 
 def test_gaussians_go_to_cells_of_other_blocks(job):
-    labels = [map_tensors(job.labels_path(block))[0] for block in job.busy()]
+    labels = [map_tensors(job.labels_path(block))[0] for block in job.blocks_with_cells()]
     left = sum(int((one["labels"] < 0).sum()) for one in labels)
     assert left == sum(int(one["sent"].sum()) for one in labels) > COUNT // 50
-    survey, _ = job.read_survey()
+    scan = job.read_scan()
     sizes = of_all(job, job.merged_path, "sizes")
     assert (len(sizes), int(sizes.amin())) == (TARGET, 1)
-    members = sum(int(read_cells(job, block).partition.counts.sum()) for block in job.busy())
-    rows = sum(job.rows_path(block, 0).stat().st_size for block in job.busy())
+    blocks = job.blocks_with_cells()
+    members = sum(int(read_cells(job, block).partition.counts.sum()) for block in blocks)
+    rows = sum(job.rows_path(block, 0).stat().st_size for block in blocks)
     assert rows % members == 0  # every Gaussian is in one cell
-    assert members <= survey.rows
+    assert members <= scan.row_count
 
 
 def test_cells_have_the_neighbours_of_one_piece(job):
     merged = scene_of_all(job, job.merged_path)
     wanted = cvt.nearest_neighbors(merged.means, 8, backend="scipy")
     starts, crossed = block_starts(job), 0
-    for block in job.busy():
-        own, _ = map_tensors(job.wide_path(block))
-        strangers = own["strangers"]
+    for block in job.blocks_with_cells():
+        own, _ = map_tensors(job.inflated_path(block))
+        remote = own["remote"]
         numbers = torch.cat(
             [
                 torch.arange(len(own["means"])) + starts[block],
-                starts[strangers[:, 0]] + strangers[:, 1],
+                starts[remote[:, 0]] + remote[:, 1],
             ]
         )
         found = numbers[own["neighbors"]]
@@ -210,21 +208,21 @@ def test_cells_have_the_neighbours_of_one_piece(job):
     assert crossed > TARGET // 5
 
 
-def test_axes_and_width_are_those_of_one_piece(job):
-    merged, wide = scene_of_all(job, job.merged_path), scene_of_all(job, job.wide_path)
+def test_axes_and_inflation_are_those_of_one_piece(job):
+    merged, inflated = scene_of_all(job, job.merged_path), scene_of_all(job, job.inflated_path)
     sizes = of_all(job, job.merged_path, "sizes")
     partition = cells.Partition.from_labels(
         torch.repeat_interleave(torch.arange(TARGET), sizes), TARGET
     )
     neighbors = cvt.nearest_neighbors(merged.means, 8, backend="scipy")
     wanted = shape_merged(merged, partition, neighbors, job.config.merge)
-    assert bool((wide.log_scales != merged.log_scales).any())
-    assert same_bits(wide, wanted)
+    assert bool((inflated.log_scales != merged.log_scales).any())
+    assert same_bits(inflated, wanted)
 
 
 def test_the_network_corrects_as_in_one_piece(job):
-    members = [read_cells(job, block) for block in job.busy()]
-    light = torch.cat([one.light for one in members])
+    members = [read_cells(job, block) for block in job.blocks_with_cells()]
+    visibility = torch.cat([one.visibility for one in members])
     scene = concatenate([one.scene for one in members])
     counts = torch.cat([one.partition.counts for one in members])
     firsts = torch.tensor([0, *[len(one.scene) for one in members]]).cumsum(0)
@@ -233,22 +231,32 @@ def test_the_network_corrects_as_in_one_piece(job):
     partition = cells.Partition(
         order=order, offsets=torch.nn.functional.pad(counts.cumsum(0), (1, 0))
     )
-    lone = [map_tensors(job.merged_path(block))[0]["lone"] for block in job.busy()]
-    lone = torch.cat(
+    representatives = [
+        map_tensors(job.merged_path(block))[0]["representatives"]
+        for block in job.blocks_with_cells()
+    ]
+    representatives = torch.cat(
         [
             torch.where(rows < 0, -1, rows + first)
-            for rows, (_, first) in zip(lone, pairs, strict=True)
+            for rows, (_, first) in zip(representatives, pairs, strict=True)
         ]
     )
-    shown = partition.keep_only(lone)
-    assert int((lone >= 0).sum()) > 0
-    wide = scene_of_all(job, job.wide_path)
-    neighbors = cvt.nearest_neighbors(wide.means, 8, backend="scipy")
+    shown = partition.keep_only(representatives)
+    assert int((representatives >= 0).sum()) > 0
+    inflated = scene_of_all(job, job.inflated_path)
+    neighbors = cvt.nearest_neighbors(inflated.means, 8, backend="scipy")
     wanted = validity.standardized(
-        correct_cells(job.network.net, scene, wide, shown, neighbors=neighbors, visibility=light)
+        correct_cells(
+            job.read_network().net,
+            scene,
+            inflated,
+            shown,
+            neighbors=neighbors,
+            visibility=visibility,
+        )
     )
-    small = [cvtgs.load(job.small_path(block)) for block in job.busy()]
-    assert bool((wide.means != wanted.means).any())
+    small = [cvtgs.load(job.small_path(block)) for block in job.blocks_with_cells()]
+    assert bool((inflated.means != wanted.means).any())
     for name, values in wanted.tensors().items():
         found = torch.cat([one.tensors()[name] for one in small])
         torch.testing.assert_close(found, values, rtol=1e-4, atol=1e-5)

@@ -1,0 +1,160 @@
+"""The halo of a block: the nearest sites and cells of other blocks."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple, Self
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cvtgs.cvt import NearestSite, nearest_several
+from cvtgs.io.tensors import map_tensors
+from cvtgs.outofcore.job import Job
+
+RUN = 1 << 9
+"""Consecutive balls that are compared with a box together, before each of them is."""
+
+
+class OtherBlock(NamedTuple):
+    """Positions in another block, read only where they are needed.
+
+    Attributes:
+        number: Number of the block.
+        bounds: ``(2, d)`` bounding box of the positions.
+        load: Returns the ``(m, d)`` positions, at least one.
+    """
+
+    number: int
+    bounds: Tensor
+    load: Callable[[], Tensor]
+
+
+def other_blocks(
+    job: Job, block: int, path: Callable[[int], Path], *, name: str
+) -> Iterator[OtherBlock]:
+    """Return the other blocks that have cells; positions are the tensor ``name`` of their file."""
+    for other in job.blocks_with_cells():
+        if other != block:
+            tensors, _ = map_tensors(path(other))
+            yield OtherBlock(other, tensors["bounds"], partial(tensors.__getitem__, name))
+
+
+def bounding_box(points: Float[Tensor, "n d"]) -> Float[Tensor, "2 d"]:
+    """Return the least and the largest coordinates of points."""
+    return torch.stack([points.amin(dim=0), points.amax(dim=0)]).double()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Balls:
+    """Balls around points, within which something else may be nearer than what was found.
+
+    Attributes:
+        centers: ``(n, d)`` positions, best along a space-filling curve.
+        squared: ``(n,)`` squared radii.
+        run_boxes: ``(r, 2, d)`` bounding boxes of runs of consecutive centres.
+        run_squared: ``(r,)`` largest squared radius of each run.
+    """
+
+    centers: Float[Tensor, "n d"]
+    squared: Float[Tensor, "n"]
+    run_boxes: Float[Tensor, "r 2 d"]
+    run_squared: Float[Tensor, "r"]
+
+    @classmethod
+    def around(cls, centers: Float[Tensor, "n d"], squared: Float[Tensor, "n"]) -> Self:
+        """Build the balls and the boxes of their runs."""
+        lows = torch.stack([_run_maxima(-column) for column in centers.unbind(1)], dim=1)
+        highs = torch.stack([_run_maxima(column) for column in centers.unbind(1)], dim=1)
+        return cls(
+            centers=centers,
+            squared=squared,
+            run_boxes=torch.stack([-lows, highs], dim=1).double(),
+            run_squared=_run_maxima(squared),
+        )
+
+    def touching(self, box: Float[Tensor, "2 d"]) -> Int[Tensor, "k"]:
+        """Return the rows of the balls that reach into a box."""
+        low, high = box
+        gaps = torch.maximum(self.run_boxes[:, 0] - high, low - self.run_boxes[:, 1])
+        runs = (gaps.clamp_min(0.0).square().sum(dim=1) < self.run_squared).nonzero()[:, 0]
+        rows = (runs[:, None] * RUN + torch.arange(RUN)).flatten()
+        rows = rows[rows < len(self.centers)]
+        centers = self.centers[rows].double()
+        gaps = torch.maximum(centers - high, low - centers).clamp_min(0.0)
+        return rows[gaps.square().sum(dim=1) < self.squared[rows]]
+
+
+def _run_maxima(values: Float[Tensor, "n"]) -> Float[Tensor, "r"]:
+    """Return the largest value of every run."""
+    missing = -len(values) % RUN
+    padded = torch.cat([values, values[-1:].expand(missing)])
+    largest: Tensor = padded.unflatten(0, (-1, RUN)).amax(dim=1)
+    return largest
+
+
+class Assignment(NamedTuple):
+    """The nearest site of every point, in any block.
+
+    Attributes:
+        blocks: ``(n,)`` block of the site; -1 is the own block.
+        labels: ``(n,)`` number of the site in its block.
+        squared: ``(n,)`` squared distance to it, in float64.
+    """
+
+    blocks: Tensor
+    labels: Tensor
+    squared: Tensor
+
+
+def assign_points(
+    points: Float[Tensor, "n d"],
+    sites: Float[Tensor, "m d"],
+    others: Iterable[OtherBlock],
+    *,
+    nearest: NearestSite,
+) -> Assignment:
+    """Find the nearest site of every point among those of all blocks.
+
+    Only points that are nearer to the box of another block than to their site are searched there.
+    """
+    if len(sites):
+        labels, squared = nearest(points, sites)
+    else:
+        squared = torch.full_like(points[:, 0], torch.inf, dtype=torch.float64)
+        labels = torch.full_like(squared, -1, dtype=torch.int64)
+    blocks, balls = torch.full_like(labels, -1), Balls.around(points, squared)
+    labels, squared = labels.clone(), squared.clone()
+    for other in others:
+        rows = balls.touching(other.bounds)
+        if len(rows) == 0:
+            continue
+        remote, distances = nearest(points[rows], other.load())
+        closer = distances < squared[rows]
+        rows = rows[closer]
+        blocks[rows], labels[rows] = other.number, remote[closer]
+        squared[rows] = distances[closer]
+    return Assignment(blocks, labels, squared)
+
+
+def halo_cells(
+    centers: Float[Tensor, "m 3"], others: Iterable[OtherBlock], *, count: int, backend: str
+) -> Int[Tensor, "h 2"]:
+    """Return block and number of remote cells that may be among the nearest of an own cell."""
+    centers = centers.double()
+    if len(centers) > count:
+        _, distances = nearest_several(centers, centers, count + 1, backend=backend)
+        squared = distances[:, -1].square()
+    else:
+        squared = torch.full_like(centers[:, 0], torch.inf)
+    balls, found = Balls.around(centers, squared), [torch.zeros(0, 2, dtype=torch.int64)]
+    for other in others:
+        rows = balls.touching(other.bounds)
+        if len(rows) == 0:
+            continue
+        cells, distances = nearest_several(centers[rows], other.load(), count, backend=backend)
+        near = torch.unique(cells[distances.square() <= squared[rows][:, None]])
+        found.append(torch.stack([torch.full_like(near, other.number), near], dim=1))
+    return torch.cat(found)

@@ -1,0 +1,178 @@
+"""One tessellation over all blocks: seeds by block, then iterations of Lloyd across blocks."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from cvtgs.analysis import SceneAnalysis
+from cvtgs.cvt import (
+    centroids,
+    choose_search,
+    choose_seeds,
+    fill_empty_cells,
+    gaussian_weights,
+    sample_points,
+    weighted_sums,
+)
+from cvtgs.devices import one_thread
+from cvtgs.io.tensors import map_tensors, save_tensors
+from cvtgs.outofcore.halo import Assignment, assign_points, bounding_box, other_blocks
+from cvtgs.outofcore.job import Job
+from cvtgs.outofcore.rows import read_rows, send_rows
+from cvtgs.pipeline import curve_order, embed_rows
+
+
+class EmbeddedRows(NamedTuple):
+    """The Gaussians of a block in the space of the tessellation.
+
+    Attributes:
+        order: ``(n,)`` their rows along a Morton curve, int32.
+        points: ``(n, d)`` their positions in that order.
+        weights: ``(n,)`` their weights in that order.
+    """
+
+    order: Tensor
+    points: Tensor
+    weights: Tensor
+
+
+@one_thread()
+def seed(job: Job, block: int) -> None:
+    """Choose the first sites of a block, and the points that Lloyd samples.
+
+    A block without cells gets neither; its Gaussians go to other blocks.
+    """
+    if job.sites_path(0, block).exists():
+        return
+    order, points, weights = _embedded_rows(job, block)
+    config, target = job.config.cvt, job.targets[block]
+    if target == 0:
+        save_tensors(job.sample_path(block), {"order": order}, {})
+        return
+    seeds = choose_seeds(weights, target, config=config, seed=job.config.seed)
+    sample, shares = sample_points(points, weights, config.samples_per_site * target)
+    save_tensors(job.sample_path(block), {"order": order, "points": sample, "weights": shares}, {})
+    _save_sites(job, 0, block, points[seeds].double())
+
+
+@one_thread()
+def accumulate(job: Job, iteration: int, block: int) -> float:
+    """Sum the points of a block by their nearest site, own or remote; return their energy."""
+    if job.targets[block] == 0:
+        return 0.0
+    path = job.sums_path(iteration, block)
+    if path.exists():
+        return float(map_tensors(path)[0]["energy"])
+    tensors, _ = map_tensors(job.sample_path(block))
+    points, weights = tensors["points"], tensors["weights"]
+    count, found = _assign(job, iteration, block, points)
+    # Remote sites are numbered behind the own ones.
+    away = (found.blocks >= 0).nonzero()[:, 0]
+    pairs = torch.stack([found.blocks[away], found.labels[away]], dim=1)
+    remote, numbers = torch.unique(pairs, dim=0, return_inverse=True)
+    labels = found.labels.clone()
+    labels[away] = count + numbers
+    totals, sums = weighted_sums(points, weights, labels, count + len(remote))
+    energy = (weights * found.squared).sum()
+    result = {"totals": totals, "sums": sums, "remote": remote, "energy": energy}
+    save_tensors(path, result, {})
+    return float(energy)
+
+
+def move_sites(job: Job, iteration: int) -> None:
+    """Move the sites of all blocks to their centroids; holds one block and all remote sums."""
+    blocks = job.blocks_with_cells()
+    left = [block for block in blocks if not job.sites_path(iteration + 1, block).exists()]
+    if not left:
+        return
+    parts: dict[str, list[Tensor]] = {"remote": [], "totals": [], "sums": []}
+    for block in blocks:
+        tensors, _ = map_tensors(job.sums_path(iteration, block))
+        for name, values in parts.items():
+            values.append(tensors[name][len(tensors[name]) - len(tensors["remote"]) :])
+    remote, totals, sums = (torch.cat(values) for values in parts.values())
+    for block in left:
+        tensors, _ = map_tensors(job.sums_path(iteration, block))
+        sites = map_tensors(job.sites_path(iteration, block))[0]["sites"]
+        rows = (remote[:, 0] == block).nonzero()[:, 0]
+        numbers = remote[rows, 1]
+        total = tensors["totals"][: len(sites)].index_add(0, numbers, totals[rows])
+        summed = tensors["sums"][: len(sites)].index_add(0, numbers, sums[rows])
+        _save_sites(job, iteration + 1, block, centroids(total, summed, sites))
+
+
+@one_thread()
+def assign(job: Job, iterations: int, block: int) -> None:
+    """Write the cell of every Gaussian of a block, and the rows that belong to remote cells.
+
+    Every own site keeps at least one Gaussian of the block, so no cell is empty.
+    """
+    if job.labels_path(block).exists():
+        return
+    order = map_tensors(job.sample_path(block))[0]["order"]
+    order, points, weights = _embedded_rows(job, block, order)
+    count, found = _assign(job, iterations, block, points)
+    found, refilled = _fill_empty(found, count, weights)
+    energy = (weights * found.squared).sum()
+    rows = order.long()
+    owners, labels = torch.empty_like(rows), torch.empty_like(rows)
+    owners[rows], labels[rows] = found.blocks, found.labels
+    sent = send_rows(job, block, owners, labels)
+    labels = torch.where(owners < 0, labels, -1).int()
+    result = {"labels": labels, "sent": sent, "energy": energy, "refilled": torch.tensor(refilled)}
+    save_tensors(job.labels_path(block), result, {})
+
+
+def _embedded_rows(job: Job, block: int, order: Tensor | None = None) -> EmbeddedRows:
+    """Embed the Gaussians of a block; an order that is known is not computed again."""
+    scan = job.read_scan()
+    scene, areas, visibility = read_rows(job, block, is_slim=True)
+    analysis = SceneAnalysis(
+        frame=scan.frame,
+        farthest=0.0,  # flyaways are left out already
+        opacities=scene.opacities,
+        areas=areas[:0],  # the tessellation uses apparent areas only
+        apparent_areas=areas,
+        visibility=visibility,
+        plan=scan.plan,
+    )
+    if order is None:
+        everything = torch.arange(len(scene))
+        masses = areas * analysis.opacities
+        order = curve_order(scene, everything, scan.frame, masses=masses).int()
+    rows = order.long()
+    points = embed_rows(scene, rows, analysis, sum(job.targets), job.config)
+    weights = gaussian_weights(analysis.opacities[rows], areas[rows], scan.area_power)
+    weights = (weights / scan.mean_weight).clamp_min(job.config.cvt.weight_floor)
+    return EmbeddedRows(order, points, weights)
+
+
+def _assign(job: Job, iteration: int, block: int, points: Tensor) -> tuple[int, Assignment]:
+    """Return the number of own sites, and the nearest site of every point in any block."""
+    has_duplicates = job.read_scan().plan.duplicates.active
+    _, nearest = choose_search(job.config.cvt, points.device, has_duplicates=has_duplicates)
+    sites = points[:0].double()
+    if job.targets[block]:
+        sites = map_tensors(job.sites_path(iteration, block))[0]["sites"]
+    others = other_blocks(job, block, lambda other: job.sites_path(iteration, other), name="sites")
+    return len(sites), assign_points(points, sites, others, nearest=nearest)
+
+
+def _fill_empty(found: Assignment, count: int, weights: Tensor) -> tuple[Assignment, int]:
+    """Let every own site keep a point of its block; also return how many had none."""
+    if count == len(weights):  # then seeds were all points, in their order
+        own = torch.arange(count)
+        return Assignment(torch.full_like(own, -1), own, torch.zeros_like(found.squared)), 0
+    away = found.blocks >= 0
+    labels = torch.where(away, count, found.labels)
+    total = count + int(away.any())
+    labels, squared, refilled = fill_empty_cells(labels, weights, found.squared, total)
+    stays = labels < count
+    blocks = torch.where(stays, -1, found.blocks)
+    return Assignment(blocks, torch.where(stays, labels, found.labels), squared), refilled
+
+
+def _save_sites(job: Job, iteration: int, block: int, sites: Tensor) -> None:
+    tensors = {"sites": sites, "bounds": bounding_box(sites)}
+    save_tensors(job.sites_path(iteration, block), tensors, {})

@@ -1,0 +1,214 @@
+"""The cells of a block become Gaussians: merged, inflated, corrected, with remote neighbours."""
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import pydantic
+import torch
+from torch import Tensor
+
+from cvtgs import cells, cvt, validity
+from cvtgs.analysis import SceneAnalysis, drop_unused_bands, restore_columns, select_columns
+from cvtgs.devices import one_thread
+from cvtgs.io import atomic_output, save
+from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
+from cvtgs.mergenet import correct_cells
+from cvtgs.outofcore.halo import bounding_box, halo_cells, other_blocks
+from cvtgs.outofcore.job import Job
+from cvtgs.outofcore.rows import read_members, read_rows
+from cvtgs.pipeline import merge_members, neighbor_count, reduce_scene, shape_merged
+from cvtgs.progress import StageClock, silent
+from cvtgs.report import CellStatistics
+from cvtgs.scene import GaussianScene
+
+EXTRA = "extra/"
+"""Prefix of extra columns in files of tensors."""
+
+
+class BlockReport(CellStatistics):
+    """What was done to a block.
+
+    Attributes:
+        input_count: Gaussians in the cells of the block.
+        mass_out: Opacity times mean projected area of the result, squared scene units.
+    """
+
+    model_config = pydantic.ConfigDict(ser_json_inf_nan="constants")
+
+    input_count: int
+    mass_out: float
+
+
+class BlockCells(NamedTuple):
+    """The Gaussians in the cells of a block.
+
+    Attributes:
+        original: With all columns that are to be used.
+        scene: With the SH bands that are computed with.
+        visibility: ``(n,)`` ambient visibility, 0 to 1.
+        partition: Rows of every cell.
+    """
+
+    original: GaussianScene
+    scene: GaussianScene
+    visibility: Tensor
+    partition: cells.Partition
+
+
+class WithHalo(NamedTuple):
+    """The merged Gaussians of a block, followed by those of its halo.
+
+    Attributes:
+        scene: One Gaussian per cell; no extra columns.
+        sizes: ``(m + h,)`` members of each cell.
+        own_count: Number of own cells, m.
+    """
+
+    scene: GaussianScene
+    sizes: Tensor
+    own_count: int
+
+
+@one_thread()
+def merge(job: Job, block: int) -> None:
+    """Merge the cells of a block."""
+    if job.merged_path(block).exists():
+        return
+    _, scene, _, partition = read_cells(job, block)
+    merged, shown = merge_members(scene, partition, job.config.merge, areas=scene.areas)
+    first = shown.order[shown.offsets[:-1]]
+    more = {
+        "sizes": shown.counts,
+        "representatives": torch.where(shown.counts < partition.counts, first, -1),
+        "bounds": bounding_box(merged.means),
+    }
+    tensors = merged.tensors() | add_prefix(EXTRA, merged.extras) | more
+    save_tensors(job.merged_path(block), tensors, {})
+
+
+@one_thread()
+def inflate(job: Job, block: int) -> None:
+    """Find the neighbours of the cells of a block, align axes, and inflate."""
+    path = job.inflated_path(block)
+    if path.exists():
+        return
+    own, _ = map_tensors(job.merged_path(block))
+    near = neighbor_count(job.config.merge, with_network=job.has_network)
+    backend, _ = cvt.nearest_backend(job.config.cvt.backend, own["means"].device)
+    others = other_blocks(job, block, job.merged_path, name="means")
+    remote = halo_cells(own["means"], others, count=near, backend=backend)
+    merged, _, own_count = _with_halo(job, block, remote, job.merged_path)
+    neighbors = cvt.nearest_neighbors(merged.means, near, backend=backend)[:own_count]
+    # Only the number of members of a cell counts here, so their rows are left out.
+    offsets = torch.nn.functional.pad(own["sizes"].cumsum(0), (1, 0))
+    shown = cells.Partition(order=own["sizes"][:0], offsets=offsets)
+    inflated = shape_merged(merged, shown, neighbors, job.config.merge)
+    shapes = {
+        "quats": inflated.quats[:own_count],
+        "log_scales": inflated.log_scales[:own_count],
+    }
+    save_tensors(path, own | shapes | {"neighbors": neighbors, "remote": remote}, {})
+
+
+@one_thread()
+def correct(job: Job, block: int) -> None:
+    """Correct the cells of a block by the network, if there is one, and write the block."""
+    if job.small_path(block).exists():
+        return
+    original, scene, visibility, partition = read_cells(job, block)
+    own, _ = map_tensors(job.inflated_path(block))
+    shown = partition.keep_only(own["representatives"])
+    small, sizes, own_count = _with_halo(job, block, own["remote"], job.inflated_path)
+    checkpoint = job.read_network()
+    if checkpoint is not None:
+        small = correct_cells(
+            checkpoint.net.to(scene.dtype),
+            scene,
+            small,
+            shown,
+            neighbors=own["neighbors"],
+            visibility=visibility,
+            sizes=sizes,
+        )
+    tensors = {name: values[:own_count] for name, values in small.tensors().items()}
+    small = scene.with_tensors(tensors, under_prefix(EXTRA, own))
+    small = restore_columns(validity.standardized(small), original, job.read_scan().plan)
+    labels, _ = map_tensors(job.labels_path(block))
+    report = BlockReport(
+        input_count=len(scene),
+        mass_out=float(small.masses.sum()),
+        single_member_cells=int((shown.counts == 1).sum()),
+        largest_cell=int(partition.counts.amax()),
+        refilled_cells=int(labels["refilled"]),
+        energy=float(labels["energy"]),
+        backend=cvt.nearest_backend(job.config.cvt.backend, visibility.device)[0],
+    )
+    _write_block(job, block, small, report)
+
+
+@one_thread()
+def simplify_block(job: Job, block: int) -> None:
+    """Simplify the only block of a job as a scene in one piece, and write it."""
+    if job.small_path(block).exists():
+        return
+    scan = job.read_scan()
+    scene, apparent_areas, visibility = read_rows(job, block)
+    scene = select_columns(scene, job.config.effects)
+    analysis = SceneAnalysis(
+        frame=scan.frame,
+        farthest=0.0,  # flyaways are left out already
+        opacities=scene.opacities,
+        areas=scene.areas,
+        apparent_areas=apparent_areas,
+        visibility=visibility,
+        plan=scan.plan,
+    )
+    no_filter = {"min_opacity": 0.0, "max_flyaway_share": 0.0}  # rows are filtered when sorted
+    filter_config = job.config.filter.model_copy(update=no_filter)
+    config = job.config.model_copy(update={"filter": filter_config})
+    checkpoint = job.read_network()
+    net = None if checkpoint is None else checkpoint.net.to(scene.dtype)
+    clock = StageClock(silent, scene.device)
+    reduced = reduce_scene(scene, analysis, job.targets[block], config, net=net, clock=clock)
+    report = BlockReport(
+        input_count=len(scene),
+        mass_out=float(reduced.scene.masses.sum()),
+        **reduced.statistics().model_dump(),
+    )
+    _write_block(job, block, reduced.scene, report)
+
+
+def read_cells(job: Job, block: int) -> BlockCells:
+    """Read the Gaussians in the cells of a block."""
+    rows, labels = read_members(job, block)
+    original = select_columns(rows.scene, job.config.effects)
+    scene = drop_unused_bands(original, job.read_scan().plan)
+    partition = cells.Partition.from_labels(labels, job.targets[block])
+    return BlockCells(original, scene, rows.visibility, partition)
+
+
+def _with_halo(job: Job, block: int, remote: Tensor, path: Callable[[int], Path]) -> WithHalo:
+    """Read the merged Gaussians of a block, and the remote ones in the order of their blocks."""
+    own, _ = map_tensors(path(block))
+    names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN", "sizes")
+    parts = {name: [own[name]] for name in names}
+    for other in torch.unique(remote[:, 0]).tolist():
+        tensors, _ = map_tensors(path(other))
+        numbers = remote[remote[:, 0] == other, 1]
+        for name, values in parts.items():
+            values.append(tensors[name].index_select(0, numbers))
+    tensors = {name: torch.cat(values) for name, values in parts.items()}
+    sizes = tensors.pop("sizes")
+    scene = GaussianScene(**tensors, extras={}, comments=(), layout=())
+    return WithHalo(scene, sizes, len(own["sizes"]))
+
+
+def _write_block(job: Job, block: int, small: GaussianScene, report: BlockReport) -> None:
+    """Write a finished block: the report first, because its scene says that it is finished."""
+    with atomic_output(job.report_path(block), overwrite=True) as file:
+        file.write(report.model_dump_json().encode())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        save(small, job.small_path(block), overwrite=True)

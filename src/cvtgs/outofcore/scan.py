@@ -1,0 +1,266 @@
+"""The scan: what all blocks need of the whole scene, from a sample and one pass over the file."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple, get_type_hints
+
+import pydantic
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cvtgs import analysis, cvt, filters, validity
+from cvtgs.analysis import EffectPlan
+from cvtgs.boxes import Box, inside
+from cvtgs.config import SimplifyConfig
+from cvtgs.devices import one_thread
+from cvtgs.io.ply import PlyRows
+from cvtgs.io.tensors import map_tensors, save_tensors
+from cvtgs.math.frames import RobustFrame
+from cvtgs.outofcore.partition import KdPartition, partition_space
+from cvtgs.scene import GaussianScene, concatenate
+
+SAMPLE_ROWS = 1 << 18
+"""Gaussians that stand for all where frame, effect plan and partition are found."""
+
+CHUNK = 1 << 17
+"""Rows that are read together."""
+
+
+class RowRange(NamedTuple):
+    """Consecutive rows of the source, which one process reads in one call.
+
+    Attributes:
+        number: Number of the range.
+        start: First row.
+        stop: Row after the last one.
+    """
+
+    number: int
+    start: int
+    stop: int
+
+
+class RangeTotals(NamedTuple):
+    """Sums over the valid rows of a range.
+
+    Attributes:
+        depths: Grid of optical depths (:func:`cvtgs.analysis.add_depths`).
+        mass: Sum of opacity times mean projected area, squared scene units.
+        falloff_mass: Sum of the same times the perspective falloff.
+        far_masses: ``(f,)`` the latter of each Gaussian beyond the distance of flyaways.
+        valid_count: Number of valid rows.
+        kept_count: Number of those in boxes.
+    """
+
+    depths: Int[Tensor, "voxels"]
+    mass: float
+    falloff_mass: float
+    far_masses: Float[Tensor, "f"]
+    valid_count: int
+    kept_count: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SceneScan:
+    """What all blocks need of the whole scene.
+
+    Attributes:
+        frame: Robust centre and radius.
+        plan: The effects that the scene calls for.
+        visibility: Grid of ambient visibility (:func:`cvtgs.analysis.visibility_grid`).
+        min_opacity: The filter leaves out Gaussians of lower opacity.
+        max_flyaway_mass: It leaves out flyaways whose mass, with perspective falloff, is at most
+            this; -1 leaves out none.
+        mean_weight: Mean weight in the tessellation, before the floor.
+        min_weight: The floor of the weights.
+        cell_weight: Weight of one cell; a heavier Gaussian counts as one cell. 0 if all do.
+        area_power: Power of the area in the weight.
+        partition: The blocks, in contracted space.
+        mass: Opacity times mean projected area of all valid Gaussians, squared scene units.
+        row_count: Number of valid Gaussians outside boxes.
+        kept_count: Number of valid Gaussians in boxes.
+    """
+
+    frame: RobustFrame
+    plan: EffectPlan
+    visibility: Float[Tensor, "voxels"]
+    min_opacity: float
+    max_flyaway_mass: float
+    mean_weight: float
+    min_weight: float
+    cell_weight: float
+    area_power: float
+    partition: KdPartition
+    mass: float
+    row_count: int
+    kept_count: int
+
+
+def read_sample(source: PlyRows) -> GaussianScene:
+    """Read Gaussians at equal steps over the file; return the valid ones."""
+    step = max(1, source.count // SAMPLE_ROWS)
+    parts = []
+    for start in range(0, source.count, CHUNK * step):
+        stop = min(start + CHUNK * step, source.count)
+        parts.append(source.scene(source.read(start, stop, step)))
+    sample = concatenate(parts)
+    return sample.select(validity.valid_rows(sample))
+
+
+@one_thread()
+def scan_range(
+    source: PlyRows, frame: RobustFrame, boxes: tuple[Box, ...], rows: RowRange
+) -> RangeTotals:
+    """Sum optical depths, masses and counts over a range of the source."""
+    depths = analysis.empty_depth_grid(torch.device("cpu"))
+    mass, falloff_mass, valid_count, kept_count = 0.0, 0.0, 0, 0
+    far_masses = [torch.zeros(0, dtype=torch.float64)]
+    for start in range(rows.start, rows.stop, CHUNK):
+        scene = source.scene(source.read(start, min(start + CHUNK, rows.stop)))
+        valid = validity.valid_rows(scene)
+        if not bool(valid.all()):
+            scene = scene.select(valid)
+        masses = scene.masses
+        analysis.add_depths(depths, scene.means, masses, frame)
+        distances = frame.distances(scene.means)
+        seen = masses * analysis.perspective_falloff(distances)
+        far_masses.append(seen[distances > filters.FLYAWAY_RADII])
+        mass, falloff_mass = mass + float(masses.sum()), falloff_mass + float(seen.sum())
+        valid_count += len(scene)
+        kept_count += int(inside(boxes, scene.means).sum()) if boxes else 0
+    return RangeTotals(depths, mass, falloff_mass, torch.cat(far_masses), valid_count, kept_count)
+
+
+def add_totals(parts: Iterable[RangeTotals]) -> RangeTotals:
+    """Return the totals of all ranges; the grid of the first is added to in place."""
+    first, *others = parts
+    total, far_masses = first, [first.far_masses]
+    for part in others:
+        far_masses.append(part.far_masses)
+        total = total._replace(
+            depths=total.depths.add_(part.depths),
+            mass=total.mass + part.mass,
+            falloff_mass=total.falloff_mass + part.falloff_mass,
+            valid_count=total.valid_count + part.valid_count,
+            kept_count=total.kept_count + part.kept_count,
+        )
+    return total._replace(far_masses=torch.cat(far_masses))
+
+
+def scan_scene(
+    sample: GaussianScene,
+    totals: RangeTotals,
+    *,
+    boxes: tuple[Box, ...],
+    target: int,
+    blocks: int,
+    config: SimplifyConfig,
+    frame: RobustFrame,
+) -> SceneScan:
+    """Choose filter thresholds, scale of the weights and partition from the sample.
+
+    The measure of a block is half its number of Gaussians and half their weight, so none has
+    more than about twice the mean of either.
+    """
+    grid = analysis.visibility_grid(totals.depths)
+    sample = analysis.select_columns(sample, config.effects)
+    known = analysis.analyze(sample, config)
+    visibility = analysis.visibility_at(grid, sample.means, frame)
+    distances = frame.distances(sample.means)
+    apparent = analysis.apparent_areas(known.areas, distances, visibility, config=config.cvt)
+    known = replace(known, apparent_areas=apparent, visibility=visibility)
+    if boxes:
+        free = (~inside(boxes, sample.means)).nonzero()[:, 0]
+        if len(free):
+            sample, known = sample.select(free), known.select(free)
+    row_count = totals.valid_count - totals.kept_count
+    rows_per_sample = row_count / max(1, len(sample))
+    least = min(len(sample), -int(-target // rows_per_sample))
+    no_flyaways = config.filter.model_copy(update={"max_flyaway_share": 0.0})
+    rows = filters.filter_rows(sample, known, least, no_flyaways).rows
+    power = known.area_power(config.cvt)
+    weights = cvt.gaussian_weights(known.opacities, known.apparent_areas, power)[rows]
+    mean_weight = float(weights.mean()) or 1.0
+    min_weight = mean_weight * config.cvt.weight_floor
+    weights = weights.clamp_min(min_weight)
+    cell_weight = _cell_weight(weights, target / rows_per_sample)
+    cells = (weights / cell_weight).clamp_max(1.0) if cell_weight > 0 else torch.ones_like(weights)
+    measure = 0.5 / len(cells) + 0.5 * cells / cells.sum()
+    return SceneScan(
+        frame=frame,
+        plan=known.plan,
+        visibility=grid,
+        min_opacity=min(float(known.opacities[rows].amin()), config.filter.min_opacity),
+        max_flyaway_mass=_max_flyaway_mass(totals, config.filter.max_flyaway_share),
+        mean_weight=mean_weight,
+        min_weight=min_weight,
+        cell_weight=cell_weight,
+        area_power=power,
+        partition=partition_space(frame.contract(sample.means[rows]), measure, blocks),
+        mass=totals.mass,
+        row_count=row_count,
+        kept_count=totals.kept_count,
+    )
+
+
+def _max_flyaway_mass(totals: RangeTotals, max_share: float) -> float:
+    """Return the largest mass of a flyaway that is left out, -1 if none is."""
+    ascending = torch.sort(totals.far_masses).values
+    left_out = ascending[ascending.cumsum(0) <= max_share * totals.falloff_mass]
+    return float(left_out[-1]) if max_share > 0 and len(left_out) else -1.0
+
+
+def _cell_weight(weights: Float[Tensor, "n"], cells: float) -> float:
+    """Bisect for the weight w at which ``sum min(1, weights / w)`` is the number of cells."""
+    low, high = 0.0, float(weights.sum())
+    for _ in range(100):
+        middle = (low + high) / 2
+        if middle <= 0.0:
+            return 0.0
+        if float((weights / middle).clamp_max(1.0).sum()) > cells:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def write_scan(scan: SceneScan, path: Path) -> None:
+    """Write a scan: its tensors, and all else as JSON, each under its dotted name."""
+    tensors: dict[str, Tensor] = {}
+    texts: dict[str, str] = {}
+
+    def collect(name: str, value: Any) -> None:
+        if is_dataclass(value):
+            for field in fields(value):
+                collect(f"{name}.{field.name}", getattr(value, field.name))
+        elif isinstance(value, Tensor):
+            tensors[name] = value
+        elif isinstance(value, pydantic.BaseModel):
+            texts[name] = value.model_dump_json()
+        else:
+            texts[name] = json.dumps(value)
+
+    collect("scan", scan)
+    save_tensors(path, tensors, texts)
+
+
+_ADAPTERS = {kind: pydantic.TypeAdapter(kind) for kind in (float, int, EffectPlan)}
+
+
+def read_scan(path: Path) -> SceneScan:
+    """Read what :func:`write_scan` wrote."""
+    tensors, texts = map_tensors(path)
+
+    def build(name: str, kind: Any) -> Any:
+        if name in tensors:
+            return tensors[name]
+        if name in texts:
+            return _ADAPTERS[kind].validate_json(texts[name])
+        kinds = get_type_hints(kind)
+        return kind(**{key: build(f"{name}.{key}", kinds[key]) for key in kinds})
+
+    scan: SceneScan = build("scan", SceneScan)
+    return scan
