@@ -175,12 +175,11 @@ class Simplifier:
             >>> [len(prepared.run(count=count).scene) for count in (10, 20)]
             [10, 20]
         """
-        device = chosen_device(self._device or "auto", scene.device)
         return Prepared(
             scene,
             self.config,
             checkpoint=self.checkpoint,
-            device=device,
+            device=self._device,
             cameras=cameras,
             listener=self._listener,
         )
@@ -196,7 +195,7 @@ class Prepared:
         scene: The scene as it came.
         config: Every choice.
         checkpoint: What corrects merged Gaussians; None for no network.
-        device: Where to compute.
+        device: Where to compute; None chooses as ``auto`` does.
         cameras: Cameras for presets that render the scene; None finds views.
         listener: Called with progress events.
     """
@@ -207,16 +206,18 @@ class Prepared:
         config: SimplifyConfig,
         *,
         checkpoint: Checkpoint | None,
-        device: torch.device,
+        device: torch.device | None = None,
         cameras: Cameras | None = None,
         listener: ProgressListener = silent,
     ) -> None:
         self._scene, self._config, self._checkpoint = scene, config, checkpoint
-        self._used = select_columns(scene, config.effects).to(device)
-        self._device, self._cameras, self._listener = device, cameras, listener
+        self._cameras, self._listener = cameras, listener
+        self._device = chosen_device(device or "auto", scene.device)
+        self._used = select_columns(scene, config.effects).to(self._device)
         self._net = None
         if checkpoint is not None:
-            self._net = copy.deepcopy(checkpoint.net).to(device=device, dtype=scene.dtype)
+            net = copy.deepcopy(checkpoint.net)
+            self._net = net.to(device=self._device, dtype=scene.dtype)
         self._checked: CheckedScene | None = None
         self._analysis: SceneAnalysis | None = None
 
