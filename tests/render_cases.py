@@ -70,7 +70,7 @@ def scene_of(*rows, dtype=torch.float64, comments=()):
     )  # fmt: skip
 
 
-def oracle_images(scene, cameras):
+def oracle_images(scene, cameras, **options):
     gaussians = [
         oracle.Gaussian(
             mean=scene.means[row].tolist(),
@@ -91,6 +91,7 @@ def oracle_images(scene, cameras):
                 height=cameras.height,
             ),
             antialiased=scene.antialiased,
+            **options,
         )
         for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True)
     ]

@@ -90,7 +90,11 @@ def project(g: Gaussian, camera: Camera, *, antialiased: bool) -> Splat | None:
 
 
 def render(
-    gaussians: Sequence[Gaussian], camera: Camera, *, antialiased: bool = False
+    gaussians: Sequence[Gaussian],
+    camera: Camera,
+    *,
+    antialiased: bool = False,
+    max_alpha: float = 0.99,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return colours on black, alpha, and mean depth (0 where nothing is)."""
     splats = [project(g, camera, antialiased=antialiased) for g in gaussians]
@@ -102,7 +106,7 @@ def render(
             light = 1.0
             for s in seen:
                 way = np.array([column + 0.5 - s.center[0], row + 0.5 - s.center[1]])
-                hidden = min(0.99, s.opacity * math.exp(-0.5 * way @ s.conic @ way))
+                hidden = min(max_alpha, s.opacity * math.exp(-0.5 * way @ s.conic @ way))
                 if hidden < 1 / 255:
                     continue
                 if light * (1 - hidden) < 1e-4:

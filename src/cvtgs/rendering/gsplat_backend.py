@@ -1,9 +1,11 @@
 """The fast backend on CUDA: gsplat (Ye et al. 2024); the only file that imports it.
 
-Never run by this project's tests, which have no GPU: written against the documentation of
-gsplat 1.5. It differs from the rules of 3DGS in this: alpha is at most 0.999 instead of 0.99.
+Written against the documentation of gsplat 1.5.3. The tests have no GPU: they run it against a
+stand-in of the documented signature and arithmetic (tests/gsplat_stand_in.py). It differs from the
+rules of 3DGS in this: alpha is at most 0.999 instead of 0.99.
 """
 
+from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from typing import Any
@@ -15,13 +17,20 @@ from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError, MissingDependencyError
 from cvtgs.math.spherical_harmonics import REST_COUNTS, evaluate
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
+from cvtgs.rendering import torch_backend
 from cvtgs.rendering.backends import STAGE, RasterOutput, contributions_by_gradient
 from cvtgs.rendering.projection import DILATION, NEAR_PLANE, to_pinholes
 from cvtgs.scene import GaussianScene
 
+PROBE_TOLERANCE = 0.02
+"""Share of the largest value by which the image of the probe, and its gradient, may be off.
+
+Pixels where alpha is near 1/255, the cut-off, may differ; a shift by half a pixel changes a third.
+"""
+
 
 def require(device: torch.device) -> None:
-    """Check that this backend works on a device, by a tiny image.
+    """Check that this backend works on a device: it renders a Gaussian as the torch backend does.
 
     gsplat imports without CUDA and without a compiler, and fails only when it is used; it may
     also compile its kernels then, which takes minutes, once. The outcome is remembered.
@@ -112,29 +121,65 @@ def _gsplat() -> Any:
 
 @cache
 def _failure(device: str) -> str:
-    """Render one Gaussian and its gradient; say why that failed, or nothing if it did not."""
-    try:
-        gsplat = _gsplat()
-        means = torch.tensor([[0.0, 0.0, 1.0]], device=device, requires_grad=True)
-        colors, _, _ = gsplat.rasterization(
-            means=means,
-            quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device),
-            scales=torch.full((1, 3), 0.1, device=device),
-            opacities=torch.full((1,), 0.5, device=device),
-            colors=torch.ones(1, 3, device=device),
-            viewmats=torch.eye(4, device=device)[None],
-            Ks=torch.tensor([[[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]], device=device),
-            width=8,
-            height=8,
-            packed=False,
-        )
-        colors.sum().backward()
-        lit = float(colors.detach().amax())
-    except ImportError as error:
-        return f"it cannot be imported ({_first_line(error)})"
-    except Exception as error:  # whatever a build or a driver may raise
-        return f"it failed to render ({type(error).__name__}: {_first_line(error)})"
-    return "" if 0.4 < lit < 0.6 else f"it rendered {lit:.3g} where 0.5 was expected"
+    """Say why gsplat does not render as the torch backend does; nothing if it does.
+
+    The caller may have switched gradients off, so they are switched on here.
+    """
+    with torch.inference_mode(mode=False), torch.enable_grad():
+        image, gradient = _probe(_rasterize_by_torch, "cpu")
+        try:
+            _gsplat()
+            found_image, found_gradient = _probe(_rasterize_all, device)
+        except ImportError as error:
+            return f"it cannot be imported ({_first_line(error)})"
+        except Exception as error:  # whatever a build or a driver may raise
+            return f"it failed to render ({type(error).__name__}: {_first_line(error)})"
+    for name, found, wanted in (
+        ("image", found_image, image),
+        ("gradient", found_gradient, gradient),
+    ):
+        apart = float((found - wanted).abs().amax() / wanted.abs().amax())
+        if not apart < PROBE_TOLERANCE:  # also where it is not a number
+            return f"its {name} of one Gaussian differs by {apart:.0%} from that of backend 'torch'"
+    return ""
+
+
+def _probe(
+    rasterize_all: Callable[[GaussianScene, Cameras, int], tuple[Tensor, Tensor]],
+    device: str,
+) -> tuple[Tensor, Tensor]:
+    """Return an image of a Gaussian and a gradient of its mean, on the CPU.
+
+    Nothing in it is symmetric, so that shifted pixels, exchanged axes and another order of the
+    harmonics or the quaternion all show.
+    """
+    scene = GaussianScene(
+        means=torch.tensor([[0.05, -0.02, 1.0]]),
+        quats=torch.tensor([[0.9, 0.1, -0.2, 0.4]]),
+        log_scales=torch.tensor([[0.08, 0.16, 0.12]]).log(),
+        logit_opacities=torch.tensor([0.4]),
+        sh0=torch.tensor([[[1.0, 0.5, 0.1]]]),
+        shN=torch.tensor([[[0.3, 0.0, 0.1], [0.2, 0.4, 0.0], [0.0, 0.3, 0.2]]]),
+    ).to(device)
+    means = scene.means.requires_grad_()
+    cameras = Cameras(
+        viewmats=torch.eye(4)[None],
+        Ks=torch.tensor([[[8.0, 0, 3.7], [0, 9, 3.2], [0, 0, 1]]]),
+        width=8,
+        height=7,
+    ).to(device)
+    layers, alpha = rasterize_all(scene, cameras, 1)
+    image = torch.cat([layers, alpha], dim=-1)
+    ramp = torch.linspace(0, 1, image.numel(), device=image.device).reshape(image.shape)
+    (gradient,) = torch.autograd.grad((image * ramp).sum(), means)
+    return image.detach().cpu(), gradient.cpu()
+
+
+def _rasterize_by_torch(
+    scene: GaussianScene, cameras: Cameras, sh_degree: int
+) -> tuple[Tensor, Tensor]:
+    output = torch_backend.rasterize(scene, cameras, sh_degree=sh_degree)
+    return torch.cat([output.rgb, output.depth[..., None]], dim=-1), output.alpha[..., None]
 
 
 def _first_line(error: Exception) -> str:
