@@ -37,7 +37,7 @@ def lint(session: nox.Session) -> None:
 def tests(session: nox.Session) -> None:
     """Unit, property and documentation tests, a process per core, with coverage."""
     session.install(*CONSTRAINTS, "-e", ".[test]")
-    session.run("pytest", *PARALLEL, "--cov", *session.posargs)
+    session.run("pytest", *PARALLEL, "--cov=cvtgs", *session.posargs)
 
 
 @nox.session(reuse_venv=True)
