@@ -9,6 +9,7 @@ import time
 import pytest
 
 import cvtgs
+from cvtgs.io.tensors import save_tensors
 from cvtgs.outofcore import simplify_file
 
 CODE = """
@@ -107,7 +108,7 @@ def stop_in_blocks(event):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("change", ["rho", "blocks", "file", "config", "manifest"])
+@pytest.mark.parametrize("change", ["rho", "blocks", "file", "config", "manifest", "scan"])
 def test_blocks_of_another_job_are_not_used(source, tmp_path, change):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
     with pytest.raises(StoppedError):
@@ -118,6 +119,8 @@ def test_blocks_of_another_job_are_not_used(source, tmp_path, change):
         os.utime(source, ns=(0, 0))
     if change == "manifest":
         (folder / "manifest.json").write_text("[]")
+    if change == "scan":
+        save_tensors(folder / "scan.safetensors", {}, {})
     rho, blocks = (0.04 if change == "rho" else 0.05), (7 if change == "blocks" else 8)
     report = simplify_file(source, output, rho, blocks=blocks, simplifier=simplifier)
     assert report.resumed_blocks == 0

@@ -255,11 +255,11 @@ def read_scan(path: Path) -> SceneScan:
     tensors, texts = map_tensors(path)
 
     def build(name: str, kind: Any) -> Any:
-        if name in tensors:
-            return tensors[name]
-        if name in texts:
+        if kind in _ADAPTERS:
             return _ADAPTERS[kind].validate_json(texts[name])
-        kinds = get_type_hints(kind)
+        kinds = get_type_hints(kind) if is_dataclass(kind) else {}
+        if not kinds:
+            return tensors[name]
         return kind(**{key: build(f"{name}.{key}", kinds[key]) for key in kinds})
 
     scan: SceneScan = build("scan", SceneScan)
