@@ -1,4 +1,4 @@
-"""Blocks: exact counts, the same bits whoever does what when, seams, filters, awkward files."""
+"""Out-of-core runs: exact counts, the same bits in any order of work, seams, unusual files."""
 
 import json
 
@@ -101,7 +101,7 @@ def test_one_block_is_the_scene_in_one_piece(scene, source, tmp_path):
     assert same_bits(cvtgs.load(tmp_path / "out.ply"), whole)
 
 
-def test_who_works_on_what_and_when_does_not_matter(source, tmp_path):
+def test_the_order_of_work_does_not_matter(source, tmp_path):
     def backwards(function, items):
         results = {item: function(item) for item in reversed(items)}
         return [results[item] for item in items]
@@ -112,7 +112,7 @@ def test_who_works_on_what_and_when_does_not_matter(source, tmp_path):
     assert outputs[0].read_bytes() == outputs[1].read_bytes()
 
 
-def test_how_the_file_is_cut_into_ranges_hardly_matters(source, tmp_path):
+def test_the_size_of_ranges_does_not_matter(source, tmp_path):
     for name, rows in (("a.ply", 1 << 20), ("b.ply", 1777)):
         simplify_file(source, tmp_path / name, 0.05, blocks=3, range_rows=rows)
     assert same_bits(cvtgs.load(tmp_path / "a.ply"), cvtgs.load(tmp_path / "b.ply"))
@@ -164,7 +164,7 @@ def test_fewer_gaussians_than_blocks(source, tmp_path, count):
     assert (report.output_count, len(cvtgs.load(tmp_path / "out.ply"))) == (count, count)
 
 
-def test_blocks_that_keep_nothing_are_not_left_out(tmp_path):
+def test_gaussians_of_blocks_without_cells_are_merged(tmp_path):
     """Protected Gaussians take so many of the target that four of six blocks get none."""
     scene = random_scene(500, degree=0)
     scene = scene.with_tensors({"logit_opacities": torch.full((500,), 2.0)}, {})
@@ -180,7 +180,7 @@ def test_blocks_that_keep_nothing_are_not_left_out(tmp_path):
     assert report.energy > 0
 
 
-def test_a_filter_that_is_too_strict_gives_way(tmp_path):
+def test_a_filter_that_leaves_too_few_is_switched_off(tmp_path):
     """Nine tenths of the Gaussians are faint, and more are asked for than are not."""
     scene = random_scene(600, seed=5)
     logits = torch.where(torch.arange(600) % 10 == 0, 4.0, -8.0)
@@ -213,7 +213,7 @@ def test_extra_columns_and_other_formats(tmp_path):
         simplify_file(tmp_path / "in.splat", tmp_path / "no.ply", 0.5, blocks=3)
 
 
-def test_presets_that_look_at_images_are_refused(source, tmp_path):
+def test_presets_that_render_are_refused(source, tmp_path):
     for preset in ("high", "max"):
         simplifier = Simplifier(config=preset, device="cpu")
         with pytest.raises(ConfigError, match="blocks need a preset that takes no images"):

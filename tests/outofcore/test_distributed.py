@@ -1,4 +1,4 @@
-"""Blocks on a cluster of processes: the same bits, also when a worker dies in the middle."""
+"""Blocks on a cluster of processes: the same bits, also when a worker is killed."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""The halo: what blocks compute together is what one piece computes, wherever space is cut."""
+"""The halo: blocks give together what one piece gives, wherever they meet."""
 
 import time
 

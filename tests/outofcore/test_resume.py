@@ -1,4 +1,4 @@
-"""A run that is killed goes on where it was, or starts over; nothing is left behind."""
+"""A killed run continues with the missing steps, or starts over; no file is left behind."""
 
 import os
 import signal
@@ -43,7 +43,7 @@ def kill_when(process, found):
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
-def test_a_killed_run_goes_on_with_the_blocks_that_are_missing(source, tmp_path):
+def test_a_killed_run_continues_with_the_missing_blocks(source, tmp_path):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
     whole = tmp_path / "whole.ply"
     simplify_file(source, whole, 0.05, blocks=8)
@@ -65,7 +65,7 @@ def test_a_killed_run_goes_on_with_the_blocks_that_are_missing(source, tmp_path)
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
 @pytest.mark.parametrize("step", ["sums_02", "labels", "merged", "inflated"])
-def test_a_run_killed_while_blocks_work_together_goes_on(source, tmp_path, step):
+def test_a_run_killed_between_steps_of_all_blocks_continues(source, tmp_path, step):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
     whole = tmp_path / "whole.ply"
     simplify_file(source, whole, 0.05, blocks=8)
@@ -87,7 +87,7 @@ def test_a_run_killed_while_blocks_work_together_goes_on(source, tmp_path, step)
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
-def test_a_run_killed_before_all_blocks_were_cut_starts_over(source, tmp_path):
+def test_a_run_killed_before_all_rows_were_sorted_starts_over(source, tmp_path):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
     killed = kill_when(start(source, output), folder.exists)
     assert killed
