@@ -18,7 +18,7 @@ from cvtgs.analysis import (
     restore_columns,
 )
 from cvtgs.config import MergeConfig, SimplifyConfig
-from cvtgs.filters import FilteredRows, filter_rows
+from cvtgs.filters import filter_rows
 from cvtgs.math.frames import RobustFrame, morton_order
 from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import MergeNet, correct_cells
@@ -76,34 +76,15 @@ class Reduced(NamedTuple):
 
     Attributes:
         scene: The small scene.
-        filtered: What entered the tessellation; None if all Gaussians are kept.
+        statistics: What the report says about the filter and the cells.
         grouping: The cells; None if all Gaussians are kept.
         merged: One Gaussian per cell before the network; None if all Gaussians are kept.
     """
 
     scene: GaussianScene
-    filtered: FilteredRows | None = None
+    statistics: CellStatistics = CellStatistics()
     grouping: Grouping | None = None
     merged: Merged | None = None
-
-    def statistics(self) -> CellStatistics:
-        """Return what the report says about the filter and the cells.
-
-        Returns:
-            Counts and energies; zeros if all Gaussians are kept.
-        """
-        if self.filtered is None or self.grouping is None or self.merged is None:
-            return CellStatistics()
-        return CellStatistics(
-            filtered_count=self.filtered.left_out,
-            filtered_mass_share=self.filtered.left_out_mass_share,
-            single_member_cells=int((self.merged.partition.counts == 1).sum()),
-            largest_cell=int(self.grouping.partition.counts.amax()),
-            refilled_cells=self.grouping.refilled,
-            energies=self.grouping.energies,
-            energy=self.grouping.energy,
-            backend=self.grouping.backend,
-        )
 
 
 def reduce_scene(
@@ -137,11 +118,14 @@ def reduce_scene(
     if finest is None or finest.merged is None or finest.grouping is None:
         with clock.stage("filter"):
             filtered = filter_rows(used, analysis, target, config.filter)
+        left_out, left_out_mass_share = filtered.left_out, filtered.left_out_mass_share
         with clock.stage("tessellate", iterations) as advance:
             rows = filtered.rows
             grouping = group_rows(used, rows, analysis, target, config, on_iteration=advance)
+        del filtered, rows
     else:
-        filtered = finest.filtered or FilteredRows(finest.grouping.partition.order, 0, 0.0)
+        left_out = finest.statistics.filtered_count
+        left_out_mass_share = finest.statistics.filtered_mass_share
         with clock.stage("tessellate", iterations) as advance:
             fine, cells_of = finest.merged.scene, finest.grouping
             grouping = group_cells(fine, cells_of, analysis, target, config, on_iteration=advance)
@@ -168,7 +152,17 @@ def reduce_scene(
                 on_cells=advance,
             )
     small = restore_columns(standardized(small), scene, analysis.plan)
-    return Reduced(small, filtered, grouping, merged)
+    statistics = CellStatistics(
+        filtered_count=left_out,
+        filtered_mass_share=left_out_mass_share,
+        single_member_cells=int((merged.partition.counts == 1).sum()),
+        largest_cell=int(grouping.partition.counts.amax()),
+        refilled_cells=grouping.refilled,
+        energies=grouping.energies,
+        energy=grouping.energy,
+        backend=grouping.backend,
+    )
+    return Reduced(small, statistics, grouping, merged)
 
 
 def group_rows(

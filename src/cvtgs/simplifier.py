@@ -348,7 +348,7 @@ class Prepared:
             plan=analysis.plan,
             stages=tuple(clock.costs),
             config=self._config,
-            **reduced.statistics().model_dump(),
+            **reduced.statistics.model_dump(),
         )
         small = restore_columns(reduced.scene, scene, analysis.plan).to(scene.device)
         result = Simplified(small, report)

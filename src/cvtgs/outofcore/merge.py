@@ -175,7 +175,7 @@ def simplify_block(job: Job, block: int) -> None:
     report = BlockReport(
         input_count=len(scene),
         mass_out=float(reduced.scene.masses.sum()),
-        **reduced.statistics().model_dump(),
+        **reduced.statistics.model_dump(),
     )
     _write_block(job, block, reduced.scene, report)
 
