@@ -22,14 +22,14 @@ def add_info(add_parser: AddParser) -> None:
         "would compute for it.",
     )
     parser.set_defaults(run=show_info)
-    add_options(parser, "input", "--json", "--effects")
+    add_options(parser, "input", "--json", "--effects", "--trust-sizes")
 
 
 def show_info(options: argparse.Namespace) -> None:
     """Run ``cvtgs info``."""
     settings = read_settings(effects=options.effects)
     config = cvtgs.SimplifyConfig.compose(settings=settings)
-    facts = cvtgs.describe(read_scene(options.input, config), config)
+    facts = cvtgs.describe(read_scene(options, config), config)
     if options.json:
         print(facts.model_dump_json(indent=2))
     else:
@@ -89,13 +89,13 @@ def add_convert(add_parser: AddParser) -> None:
         "Prints what the format of OUT cannot hold before writing it.",
     )
     parser.set_defaults(run=convert)
-    add_options(parser, "input", "output", "--overwrite", "--quiet")
+    add_options(parser, "input", "output", "--trust-sizes", "--overwrite", "--quiet")
 
 
 def convert(options: argparse.Namespace) -> None:
     """Run ``cvtgs convert``."""
     cvtgs.io.check_save(options.output, overwrite=options.overwrite)
-    scene = cvtgs.io.load(options.input)
+    scene = cvtgs.io.load(options.input, trust_sizes=options.trust_sizes)
     lost = cvtgs.io.losses(scene, options.output)
     if not options.quiet:
         print(f"{options.input}: {len(scene):,} Gaussians of SH degree {scene.sh_degree}")

@@ -44,7 +44,7 @@ def add_levels(add_parser: AddParser) -> None:
     parser.add_argument(
         "--no-scores", action="store_true", help="skip rendering and scoring the levels"
     )
-    add_options(parser, "--overwrite")
+    add_options(parser, "--trust-sizes", "--overwrite")
     add_view_options(parser, size=400)
 
 
@@ -66,7 +66,7 @@ def levels(options: argparse.Namespace) -> None:
         simplifier = cvtgs.Simplifier(
             checkpoint, config=config, device=options.device, listener=listener
         )
-        scene = cvtgs.load(options.input)
+        scene = cvtgs.load(options.input, trust_sizes=options.trust_sizes)
         cameras = None if options.cameras is None else cvtgs.load_cameras(options.cameras)
         made = simplifier.levels(scene, rhos, cameras=cameras)
         scores = None if options.no_scores else _score(options, scene, made, names, listener)

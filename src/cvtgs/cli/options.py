@@ -108,6 +108,10 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     },
     "--overwrite": {"action": "store_true", "help": "replace existing files"},
     "--quiet": {"action": "store_true", "help": "print only errors and warnings"},
+    "--trust-sizes": {
+        "action": "store_true",
+        "help": "read compressed files that claim far more Gaussians than their bytes can hold",
+    },
     "--json": {"action": "store_true", "help": "print JSON"},
 }
 
@@ -266,7 +270,12 @@ def _setting_names(section: "type[pydantic.BaseModel]", prefix: str = "") -> Ite
             yield prefix + name
 
 
-def read_scene(path: Path, config: "SimplifyConfig") -> "GaussianScene":
-    """Read a scene without what ``--effects`` switches off."""
+def read_scene(options: argparse.Namespace, config: "SimplifyConfig") -> "GaussianScene":
+    """Read the scene of ``IN`` without what ``--effects`` switches off."""
     degree = None if config.effects.sh == "auto" else config.effects.sh
-    return cvtgs.io.load(path, sh_degree=degree, extras=config.effects.extras != "off")
+    return cvtgs.io.load(
+        options.input,
+        sh_degree=degree,
+        extras=config.effects.extras != "off",
+        trust_sizes=options.trust_sizes,
+    )

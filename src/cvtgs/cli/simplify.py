@@ -118,7 +118,7 @@ def add_simplify(add_parser: AddParser) -> None:
     parser.add_argument(
         "--report", type=Path, metavar="R.json", help="file for a report of the run in JSON"
     )
-    add_options(parser, "--device", "--overwrite", "--quiet")
+    add_options(parser, "--device", "--trust-sizes", "--overwrite", "--quiet")
 
 
 def simplify(options: argparse.Namespace) -> None:
@@ -161,7 +161,7 @@ def _simplify_in_memory(
 ) -> "tuple[SimplifyReport, list[str]]":
     """Read, simplify and save a scene; return the report, and notes to print below it."""
     notes = []
-    scene = read_scene(options.input, config)
+    scene = read_scene(options, config)
     cameras = None if options.cameras is None else cvtgs.load_cameras(options.cameras)
     if options.time_budget is not None:
         chosen = choose_preset(options, scene, settings, listener)

@@ -1,6 +1,7 @@
 """Checkpoints of gsplat's trainer and of nerfstudio's Splatfacto: scenes before the export."""
 
-import pickle
+import pickletools
+import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -10,27 +11,42 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cvtgs.errors import FileFormatError, InvalidSceneError
-from cvtgs.io.dicts import from_dict
+from cvtgs.errors import CvtgsError, FileFormatError, InvalidSceneError
+from cvtgs.io.dicts import check_tensors, from_dict
+from cvtgs.io.documents import shown
 from cvtgs.io.files import open_input
+from cvtgs.io.sizes import check_stored
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
 _NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN", "features_dc", "features_rest")
+_ALLOWED = re.compile(
+    r"collections\.(OrderedDict|defaultdict)|torch\._utils\._rebuild_(tensor(_v2)?|parameter)|"
+    r"torch\.(\w+Storage|Size|device|u?int\d+|b?float\d+(_\w+)?|bool|nn\.parameter\.Parameter)|"
+    r"torch\.storage\.\w+Storage|numpy(\._?core\.multiarray\.scalar|\.dtype)|_codecs\.encode|"
+    r"(builtins|__builtin__)\.(dict|list|set|tuple|int|float|complex)"
+)
+"""What a checkpoint may name: all that tensors and numbers need."""
+
+_BYTE_CODECS = re.compile(r"(?i)(hex|base.?64|quopri|quoted.?printable|uu|bz2|zlib|zip)(.?codec)?")
 _PREFIXES = ("", "_model.gauss_params.", "_model.", "module._model.gauss_params.")
 
 
-def read_checkpoint(path: Path) -> GaussianScene:
+def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
     """Read the scene of a checkpoint.
 
     Two kinds are known: ``step-000029999.ckpt`` of nerfstudio, which holds the scene under
     ``pipeline`` as ``_model.gauss_params.means`` (``_model.means`` before 2024) and so on; and
     ``ckpt_29999_rank0.pt`` of gsplat's examples, which holds it under ``splats``. Nothing in the
     file is executed, and only the scene is loaded, not the state of the optimiser. Splatfacto
-    trains colours without SH through a sigmoid; these become ordinary colours.
+    trains colours without SH through a sigmoid; these become ordinary colours. A tensor that
+    repeats numbers instead of storing them is refused, unless sizes are trusted.
     """
     tensors, splatfacto = _scene_tensors(_unpickled(path), path)
     try:
+        check_tensors(tensors)
+        if not trust_sizes:
+            check_stored(path, tensors)
         scene = from_dict({name: tensor.clone() for name, tensor in tensors.items()})
     except InvalidSceneError as error:
         raise FileFormatError(f"{path}: {error}") from error
@@ -65,13 +81,40 @@ def _unpickled(path: Path) -> Any:
                 f"{path}: must be a checkpoint that torch.save wrote as a zip, found another file."
             )
     try:
+        for name in _names_in(path):
+            if not _ALLOWED.fullmatch(name):
+                raise FileFormatError(
+                    f"{path}: must be a whole checkpoint of tensors and plain numbers, "
+                    f"found {shown(name)}."
+                )
         with _numpy_numbers_ignored():
             return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
-        reason = str(error).strip().splitlines()[0].rstrip(".")
+    except (CvtgsError, MemoryError):
+        raise
+    except Exception as error:  # pickle, zip and torch raise nearly all there are
         raise FileFormatError(
-            f"{path}: must be a whole checkpoint of tensors and plain numbers, found: {reason}."
+            f"{path}: must be a whole checkpoint of tensors and plain numbers, found damage "
+            f"({type(error).__name__})."
         ) from error
+
+
+def _names_in(path: Path) -> Iterator[str]:
+    """Return what the pickles of a checkpoint name, and codecs that make bytes of bytes.
+
+    ``weights_only`` keeps code out, but allows ``bytearray`` and others that take any memory.
+    """
+    with zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+        for entry in entries:
+            if entry.compress_type != zipfile.ZIP_STORED:  # torch.save packs nothing
+                yield f"a packed {entry.filename}"
+        for entry in entries:
+            if entry.filename.endswith(".pkl"):
+                for operation, value, _ in pickletools.genops(archive.read(entry)):
+                    if operation.name in ("GLOBAL", "INST"):
+                        yield str(value).replace(" ", ".")
+                    elif isinstance(value, str) and _BYTE_CODECS.fullmatch(value):
+                        yield value
 
 
 class _IgnoredType:

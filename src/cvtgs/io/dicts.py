@@ -143,6 +143,24 @@ def _prefix(mapping: Mapping[str, Any]) -> str:
     return found[0].removesuffix("means") if found else ""
 
 
+def check_tensors(mapping: Mapping[Any, Any]) -> None:
+    """Check that values are dense tensors of rows in memory, before any is copied."""
+    for name, value in mapping.items():
+        if not isinstance(value, Tensor):
+            kind = type(value).__name__
+        elif value.is_nested:
+            kind = "a nested one"
+        elif value.layout != torch.strided:
+            kind = f"layout {str(value.layout).removeprefix('torch.')}"
+        elif value.is_meta:
+            kind = "one without values (device meta)"
+        elif value.ndim == 0:
+            kind = "a single number"
+        else:
+            continue
+        raise InvalidSceneError(f"{name} must be a dense tensor of rows, found {kind}.")
+
+
 def _as_tensor(key: str, value: Tensor | NDArray[Any]) -> Tensor:
     if isinstance(value, np.ndarray):
         native = value.dtype.newbyteorder("=")
@@ -152,6 +170,7 @@ def _as_tensor(key: str, value: Tensor | NDArray[Any]) -> Tensor:
             f"{key} must be a torch.Tensor or numpy array of floats, "
             f"found {getattr(value, 'dtype', type(value).__name__)}."
         )
+    check_tensors({key: value})
     return value.detach()
 
 

@@ -32,6 +32,9 @@ _READERS: Mapping[str, str] = MappingProxyType(
 )
 """Readers by suffix, of which the first that fits counts; imported when they are needed."""
 
+_SIZED = (".compressed.ply", ".splat")
+"""Formats besides plain PLY whose files have as many bytes as their rows take."""
+
 _WRITERS: Mapping[str, str] = MappingProxyType(
     {
         ".compressed.ply": "cvtgs.io.compressed_ply:write_compressed_ply",
@@ -49,6 +52,7 @@ def load(
     device: str | torch.device = "cpu",
     sh_degree: int | None = None,
     extras: bool = True,
+    trust_sizes: bool = False,
 ) -> GaussianScene:
     """Read a scene from a file or the folder of a trained model.
 
@@ -64,6 +68,8 @@ def load(
         sh_degree: SH bands above this degree are zeros, whatever the file holds; None for all. Of
             plain PLY files their columns are not even copied.
         extras: Whether columns beyond the standard ones are carried; only plain PLY files have any.
+        trust_sizes: Whether a compressed file may unpack to any size. By default, one that claims
+            far more Gaussians than its bytes can hold is refused before it takes memory.
 
     Returns:
         The scene: float32, or float64 if the file has double coordinates.
@@ -100,7 +106,8 @@ def load(
     read: Callable[..., GaussianScene] = resolve_name(_READERS[suffix])
     if suffix == ".ply":
         return read(source, sh_degree=sh_degree, extras=extras).to(device)
-    scene = read(source)
+    options = {} if suffix in _SIZED else {"trust_sizes": trust_sizes}
+    scene = read(source, **options)
     if sh_degree is not None and sh_degree < scene.sh_degree:
         rest = scene.shN.clone()
         rest[:, REST_COUNTS[sh_degree] :] = 0.0

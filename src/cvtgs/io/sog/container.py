@@ -4,7 +4,7 @@ import io
 import os
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path, PurePosixPath
 
@@ -12,10 +12,14 @@ import numpy as np
 from jaxtyping import UInt8
 
 from cvtgs.errors import FileFormatError
-from cvtgs.io.files import open_input
+from cvtgs.io.files import is_file, open_input
 
 META = "meta.json"
-MOST_META_BYTES = 1 << 24
+MOST_META_BYTES = 1 << 20
+"""Real ones have some ten thousand."""
+
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Those whose output zipfile bounds; a block of bzip2 or LZMA is unpacked whole."""
 
 PALETTE_COLUMNS = 64
 """Entries of the SH palette in a row of its image."""
@@ -23,14 +27,17 @@ PALETTE_COLUMNS = 64
 Reader = Callable[[str, int], bytes]
 """Reads a file by its name; one of more than this many bytes is an error."""
 
+StoredBytes = Callable[[Sequence[str]], int]
+"""Returns how many bytes files have on the disk, packed as they are."""
 
-def open_container(path: Path) -> AbstractContextManager[Reader]:
+
+def open_container(path: Path) -> AbstractContextManager[tuple[Reader, StoredBytes]]:
     """Open a bundled or an unbundled SOG."""
     return _beside(path) if path.name == META else _inside(path)
 
 
 @contextmanager
-def _beside(path: Path) -> Iterator[Reader]:
+def _beside(path: Path) -> Iterator[tuple[Reader, StoredBytes]]:
     def read(name: str, most: int) -> bytes:
         _check_name(name, path)
         with open_input(path.with_name(name)) as file:
@@ -39,11 +46,17 @@ def _beside(path: Path) -> Iterator[Reader]:
                 raise _too_long(f"{path.with_name(name)}", most, size)
             return file.read()
 
-    yield read
+    def stored(names: Sequence[str]) -> int:
+        for name in names:
+            _check_name(name, path)
+        parts = [path.with_name(name) for name in names]
+        return sum(part.stat().st_size for part in parts if is_file(part))
+
+    yield read, stored
 
 
 @contextmanager
-def _inside(path: Path) -> Iterator[Reader]:
+def _inside(path: Path) -> Iterator[tuple[Reader, StoredBytes]]:
     with open_input(path) as file:
         try:
             archive = zipfile.ZipFile(file)
@@ -56,9 +69,14 @@ def _inside(path: Path) -> Iterator[Reader]:
         def read(name: str, most: int) -> bytes:
             _check_name(name, path)
             try:
-                size = archive.getinfo(name).file_size
-                if size > most:
-                    raise _too_long(f"{path}: {name}", most, size)
+                entry = archive.getinfo(name)
+                if entry.compress_type not in _METHODS:
+                    raise FileFormatError(
+                        f"{path}: {name} must be stored or deflated in the zip, found method "
+                        f"{entry.compress_type}; zip the images again."
+                    )
+                if entry.file_size > most:
+                    raise _too_long(f"{path}: {name}", most, entry.file_size)
                 with archive.open(name) as member:
                     return member.read(most)
             except KeyError as error:
@@ -69,7 +87,7 @@ def _inside(path: Path) -> Iterator[Reader]:
                 ) from error
 
         with archive:
-            yield read
+            yield read, lambda names: os.fstat(file.fileno()).st_size
 
 
 def _check_name(name: str, path: Path) -> None:

@@ -12,11 +12,13 @@ from pydantic import AfterValidator, Field
 from cvtgs.errors import FileFormatError
 from cvtgs.io.arrays import Arrays, logits_of_bytes, restore_largest, scene_of
 from cvtgs.io.documents import Document, Number, Text, Vector, Whole, parse_json, validated
+from cvtgs.io.sizes import check_expansion
 from cvtgs.io.sog.container import (
     META,
     MOST_META_BYTES,
     PALETTE_COLUMNS,
     Reader,
+    StoredBytes,
     decode_webp,
     open_container,
 )
@@ -127,11 +129,12 @@ class _Meta:
     palette: Float[np.ndarray, "256"] | None = None
 
 
-def read_sog(path: Path) -> GaussianScene:
+def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
     """Read a SOG, version 1 or 2, bundled or not.
 
     Args:
         path: The ``.sog`` file, or the ``meta.json`` that lies beside its images.
+        trust_sizes: Whether the images may unpack to any size.
 
     Returns:
         The scene.
@@ -141,10 +144,12 @@ def read_sog(path: Path) -> GaussianScene:
         InputError: A file cannot be opened or read.
         FileFormatError: It is not a SOG, or damaged.
     """
-    with open_container(path) as read:
+    with open_container(path) as (read, stored):
         where = str(path) if path.name == META else f"{path}: {META}"
         meta = _read_meta(parse_json(read(META, MOST_META_BYTES), where), where)
         document = meta.document
+        if not trust_sizes:
+            _check_expansion(meta, stored, path)
         images = _Images(read=read, count=meta.count, path=path)
         means = _means(images, document.means)
         quats = _quats(images.rows(document.quats.files[0]))
@@ -160,6 +165,15 @@ def read_sog(path: Path) -> GaussianScene:
         )
     antialiased = document.model == "antialiased" or document.antialias is True
     return scene_of(arrays, antialiased=antialiased)
+
+
+def _check_expansion(meta: _Meta, stored: StoredBytes, path: Path) -> None:
+    document = meta.document
+    parts = (document.means, document.scales, document.quats, document.sh0, document.shN)
+    names = {name for part in parts if part is not None for name in part.files}
+    bands = document.shN.bands if isinstance(document.shN, _Palette) else 3
+    rest = 0 if document.shN is None else REST_COUNTS[bands]
+    check_expansion(path, count=meta.count, rest=rest, stored=stored(sorted(names)))
 
 
 def _read_meta(content: Any, where: str) -> _Meta:

@@ -14,6 +14,7 @@ from jaxtyping import Float, UInt8
 from cvtgs.errors import DroppedDataWarning, FileFormatError, MissingDependencyError
 from cvtgs.io.arrays import HALF_RANGE, Arrays, logits_of_bytes, restore_largest, scene_of
 from cvtgs.io.files import open_input
+from cvtgs.io.sizes import check_expansion
 from cvtgs.io.spz.layout import (
     COLOR_SCALE,
     EXTENSIONS_FLAG,
@@ -38,7 +39,7 @@ _TABLE_START = slice(16, 20)
 _FOURTH_HEADER_BYTES = 32
 
 
-def read_spz(path: Path, *, axes: Axes = "RUB") -> GaussianScene:
+def read_spz(path: Path, *, axes: Axes = "RUB", trust_sizes: bool = False) -> GaussianScene:
     """Read an ``.spz`` file of version 1 to 4.
 
     The axes of the file are not in it. Niantic defines them as right, up, back, and its apps
@@ -48,6 +49,7 @@ def read_spz(path: Path, *, axes: Axes = "RUB") -> GaussianScene:
     Args:
         path: The file.
         axes: What the axes of the file are; ``"RDF"`` for those of PLY files.
+        trust_sizes: Whether the file may unpack to any size.
 
     Returns:
         The scene. SH bands above degree 3 are left out with a warning.
@@ -58,7 +60,7 @@ def read_spz(path: Path, *, axes: Axes = "RUB") -> GaussianScene:
         FileFormatError: It is not an ``.spz`` file, or damaged.
         MissingDependencyError: It is of version 4, and zstandard is not installed.
     """
-    header, blocks = _read_blocks(path)
+    header, blocks = _read_blocks(path, trust_sizes=trust_sizes)
     if header.sh_degree > 3:
         warnings.warn(
             f"{path}: left out the SH bands above degree 3 (the file has degree "
@@ -107,27 +109,29 @@ def _quats(stored: UInt8[np.ndarray, "n b"]) -> Float[np.ndarray, "n 4"]:
     return np.roll(restore_largest((words >> 30).astype(np.int64), others), 1, axis=1)
 
 
-def _read_blocks(path: Path) -> tuple[SpzHeader, Blocks]:
+def _read_blocks(path: Path, *, trust_sizes: bool) -> tuple[SpzHeader, Blocks]:
     """Read and decompress a file."""
     with open_input(path) as file:
         content = file.read()
     if content[:2] == _GZIP:
-        return _read_gzip(content, path)
+        return _read_gzip(content, path, trust_sizes=trust_sizes)
     if content[:4] == MAGIC.to_bytes(4, "little"):
-        return _read_version_4(content, path)
+        return _read_version_4(content, path, trust_sizes=trust_sizes)
     raise FileFormatError(
         f"{path}: an .spz file must start with gzip's or its own magic number, "
         f"found {content[:4]!r}."
     )
 
 
-def _read_gzip(content: bytes, path: Path) -> tuple[SpzHeader, Blocks]:
+def _read_gzip(content: bytes, path: Path, *, trust_sizes: bool) -> tuple[SpzHeader, Blocks]:
     stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     try:
         header = _header(stream.decompress(content, HEADER.size), path, versions=(1, 2, 3))
         wanted = sum(header.sizes.values())
         if wanted > _MOST_EXPANSION * len(content):
             raise _too_short(path, header, wanted, f"{len(content):,} compressed ones")
+        if not trust_sizes:
+            _check_expansion(path, header, len(content))
         payload = stream.decompress(stream.unconsumed_tail, wanted)
         surplus = len(stream.decompress(stream.unconsumed_tail, 1))
     except zlib.error as error:
@@ -153,7 +157,7 @@ def _read_gzip(content: bytes, path: Path) -> tuple[SpzHeader, Blocks]:
     return header, dict(zip(header.sizes, blocks, strict=True))
 
 
-def _read_version_4(content: bytes, path: Path) -> tuple[SpzHeader, Blocks]:
+def _read_version_4(content: bytes, path: Path, *, trust_sizes: bool) -> tuple[SpzHeader, Blocks]:
     header = _header(content[: HEADER.size], path, versions=(4,))
     sizes = {name: size for name, size in header.sizes.items() if size}
     start = int.from_bytes(content[_TABLE_START], "little")
@@ -164,6 +168,8 @@ def _read_version_4(content: bytes, path: Path) -> tuple[SpzHeader, Blocks]:
             f"{path}: must hold {len(sizes)} blocks, found a table of {header.streams} at byte "
             f"{start:,} of {len(content):,}."
         )
+    if not trust_sizes:
+        _check_expansion(path, header, len(content))
     blocks = {"sh": np.empty(0, np.uint8)}
     at = start + 16 * len(sizes)
     for (name, size), (packed, unpacked) in zip(
@@ -177,6 +183,11 @@ def _read_version_4(content: bytes, path: Path) -> tuple[SpzHeader, Blocks]:
         blocks[name] = _unzstd(content[at : at + packed], size, f"{path}: block {name!r}")
         at += packed
     return header, blocks
+
+
+def _check_expansion(path: Path, header: SpzHeader, stored: int) -> None:
+    rest = STORED_REST_COUNTS[header.sh_degree]
+    check_expansion(path, count=header.count, rest=rest, stored=stored)
 
 
 def _header(start: bytes, path: Path, *, versions: tuple[int, ...]) -> SpzHeader:

@@ -1,0 +1,204 @@
+"""Small files that claim or unpack to very much: below 1 GB each, and one sentence."""
+
+import gzip
+import io
+import json
+import os
+import struct
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import zstandard
+from PIL import Image
+
+import cvtgs
+from cvtgs.cli.main import main
+from cvtgs.errors import FileFormatError
+from cvtgs.io.sizes import FREE_BYTES, MOST_EXPANSION
+from format_cases import DATA, refusal
+from scenes import random_scene
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="measures memory as Linux does")
+FULLEST = FREE_BYTES // 56
+"""Gaussians without view-dependent colour that a file of any size may claim."""
+
+MEASURE = """
+import os, sys, torch, cvtgs, cvtgs.io.sog, cvtgs.io.spz, cvtgs.io.checkpoints
+for path in sys.argv[1:]:
+    child = os.fork()
+    if child == 0:
+        try:
+            cvtgs.load(path)
+        except cvtgs.CvtgsError as error:
+            os._exit(1)
+        except BaseException as error:
+            print(path, repr(error), file=sys.stderr)
+            os._exit(2)
+        os._exit(0)
+    _, status, used = os.wait4(child, 0)
+    print(os.waitstatus_to_exitcode(status), used.ru_maxrss * 1024)
+"""
+
+
+def spz_header(count: int, *, version: int = 3, degree: int = 0, streams: int = 0) -> bytes:
+    return struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, 12, 0, streams)
+
+
+def fourth_spz(count: int) -> bytes:
+    sizes = [count * size for size in (9, 1, 3, 3, 4)]
+    packed = [zstandard.compress(bytes(min(size, 1 << 26))) for size in sizes]
+    table = b"".join(struct.pack("<QQ", len(p), s) for p, s in zip(packed, sizes, strict=True))
+    head = spz_header(count, version=4, streams=5) + struct.pack("<IIII", 32, 0, 0, 0)[:16]
+    return head + table + b"".join(packed)
+
+
+def sog(path: Path, count: int, *, method: int = zipfile.ZIP_DEFLATED, junk: int = 0) -> None:
+    """Write a SOG of equal Gaussians, in images of just enough pixels."""
+    height = -(-min(count, 1 << 24) // 4096)
+    image = io.BytesIO()
+    Image.new("RGBA", (4096, height), (128, 128, 128, 252)).save(image, "webp", lossless=True)
+    names = ["means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp"]
+    codes = {"codebook": [0.0]}
+    meta = {
+        "version": 2,
+        "count": count,
+        "means": {"mins": [0, 0, 0], "maxs": [1, 1, 1], "files": names[:2]},
+        "scales": codes | {"files": [names[2]]},
+        "quats": {"files": [names[3]]},
+        "sh0": codes | {"files": [names[4]]},
+    }
+    with zipfile.ZipFile(path, "w", method) as archive:
+        archive.writestr("meta.json", json.dumps(meta) + " " * junk)
+        for name in names:
+            archive.writestr(name, image.getvalue())
+
+
+def expanded(rows: int) -> dict[str, torch.Tensor]:
+    """Return a scene whose rows are all the same memory."""
+    tensors = cvtgs.to_dict(random_scene(1, degree=0))
+    return {name: values.expand(rows, *values.shape[1:]) for name, values in tensors.items()}
+
+
+class Filler:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return bytearray, (8 << 30,)
+
+
+def make(folder: Path) -> dict[str, Path]:
+    """Write the files, by what is wrong with them."""
+    paths = {}
+
+    def at(name: str, suffix: str) -> Path:
+        paths[name] = folder / f"{name}{suffix}"
+        return paths[name]
+
+    at("zeros of spz", ".spz").write_bytes(gzip.compress(bytes(100_000_000)))
+    lie = gzip.compress(spz_header(4_000_000) + bytes(4_000_000 * 20), 9)
+    at("zeros behind a header of spz", ".spz").write_bytes(lie)
+    at("count of spz 4", ".spz").write_bytes(fourth_spz(4_000_000_000))
+    sog(at("count of sog", ".sog"), 169_000_000)
+    sog(at("bzip2 of sog", ".sog"), 100, method=zipfile.ZIP_BZIP2, junk=1 << 26)
+    sog(at("lzma of sog", ".sog"), 100, method=zipfile.ZIP_LZMA, junk=1 << 26)
+    sog(at("long meta of sog", ".sog"), 100, junk=1 << 26)
+    torch.save({"splats": expanded(10**12)}, at("strides of a checkpoint", ".pt"))
+    torch.save({"more": Filler(), "splats": expanded(1)}, at("filler of a checkpoint", ".pt"))
+    with zipfile.ZipFile(at("packed checkpoint", ".pt"), "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a/data.pkl", bytes(1 << 27))
+    return paths
+
+
+def make_full(folder: Path) -> dict[str, Path]:
+    """Write the largest scenes that fit into small files."""
+    paths = {"spz": folder / "full.spz", "spz 4": folder / "4.spz", "sog": folder / "full.sog"}
+    rows = bytes(FULLEST * 20)
+    paths["spz"].write_bytes(gzip.compress(spz_header(FULLEST) + rows, 9))
+    paths["spz 4"].write_bytes(fourth_spz(FULLEST))
+    sog(paths["sog"], FULLEST)
+    return paths
+
+
+@linux
+def test_small_files_take_less_than_a_gigabyte(tmp_path: Path) -> None:
+    refused, read = make(tmp_path), make_full(tmp_path)
+    paths = [*refused.values(), *read.values()]
+    assert max(path.stat().st_size for path in paths) < 1 << 20
+    done = subprocess.run(
+        [sys.executable, "-c", MEASURE, *map(str, paths)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+    )
+    assert done.stderr == ""
+    ends = [[int(word) for word in line.split()] for line in done.stdout.splitlines()]
+    wanted = dict.fromkeys(refused, 1) | dict.fromkeys(read, 0)
+    assert {name: code for name, (code, _) in zip(wanted, ends, strict=True)} == wanted
+    peaks = {name: peak for name, (_, peak) in zip(wanted, ends, strict=True)}
+    assert {name: peak for name, peak in peaks.items() if peak >= 10**9} == {}
+
+
+def test_what_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "a.sog"
+    sog(path, 3_000_000)
+    size = path.stat().st_size
+    assert refusal(path) == (
+        f"{path}: a scene must have at most 64 MiB and {MOST_EXPANSION} times the bytes of its "
+        f"file, found 3,000,000 Gaussians that take 168,000,000 bytes in a file of {size:,}; if "
+        f"you trust the file, pass trust_sizes=True (--trust-sizes)."
+    )
+    sog(path, 100, method=zipfile.ZIP_BZIP2)
+    assert refusal(path) == (
+        f"{path}: meta.json must be stored or deflated in the zip, found method 12; zip the "
+        f"images again."
+    )
+    path = tmp_path / "a.pt"
+    torch.save({"splats": expanded(100)}, path)
+    assert refusal(path) == (
+        f"{path}: 'means' must store each of its 1,200 bytes, found 12; if you trust the file, "
+        f"pass trust_sizes=True (--trust-sizes)."
+    )
+    torch.save({"more": Filler(), "splats": expanded(1)}, path)
+    assert refusal(path) == (
+        f"{path}: must be a whole checkpoint of tensors and plain numbers, "
+        f"found '__builtin__.bytearray'."
+    )
+
+
+def test_who_trusts_a_file_gets_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    torch.save({"splats": expanded(100)}, path)
+    assert len(cvtgs.load(path, trust_sizes=True)) == 100
+    path, count = tmp_path / "a.spz", 2 * FULLEST
+    path.write_bytes(gzip.compress(spz_header(count) + bytes(count * 20), 9))
+    with pytest.raises(FileFormatError, match="if you trust the file"):
+        cvtgs.load(path)
+    assert len(cvtgs.load(path, trust_sizes=True)) == count
+    path = tmp_path / "a.splat"  # whose size cannot lie
+    path.write_bytes(bytes(32))
+    assert len(cvtgs.load(path, trust_sizes=True)) == 1
+
+
+def test_option_of_commands(tmp_path: Path) -> None:
+    path, small = tmp_path / "a.pt", tmp_path / "small.ply"
+    torch.save({"splats": expanded(100)}, path)
+    convert = ["convert", str(path), str(tmp_path / "a.ply"), "--quiet"]
+    assert [main(convert), main([*convert, "--trust-sizes"])] == [1, 0]
+    assert main(["info", str(path), "--trust-sizes"]) == 0
+    words = ["simplify", str(path), str(small), "--count", "3", "--quiet", "--preset", "fast"]
+    assert main([*words, "--trust-sizes"]) == 0
+    words = ["levels", str(path), "-o", str(tmp_path / "levels"), "--rho", "0.1", "--no-scores"]
+    assert main([*words, "--quiet", "--trust-sizes"]) == 0
+
+
+def test_an_unbundled_sog_counts_its_images(tmp_path: Path) -> None:
+    sog(tmp_path / "a.sog", 3_000_000)
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        archive.extractall(tmp_path)
+    with pytest.raises(FileFormatError, match="that take 168,000,000 bytes in a file of"):
+        cvtgs.load(tmp_path / "meta.json")
+    assert len(cvtgs.load(DATA / "splat-transform.sog")) > 0
