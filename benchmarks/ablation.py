@@ -35,7 +35,7 @@ from benchmarks.quality import (
     measure,
     scoring_parser,
 )
-from cvtgs import cells, cvt
+from cvtgs import cells
 from cvtgs.mergenet import MergeNet, correct_cells, load_checkpoint
 from cvtgs.pipeline import merge_cells
 from cvtgs.plots import Panel, Series, line_chart
@@ -229,7 +229,6 @@ def regroup(
         partition,
         config.merge,
         areas=scene.areas,
-        backend=cvt.nearest_backend(config.cvt.backend, scene.device)[0],
         with_network=net is not None,
     )
     if net is None:

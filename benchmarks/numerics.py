@@ -120,7 +120,7 @@ def figures(make: Callable[[int, torch.dtype], GaussianScene], count: int) -> Fi
     wanted = exact_covariances(double, part, config.area_power)
     size = wanted.abs().amax(dim=(1, 2))
     place = (second.means.double() - first.means).norm(dim=1) / size.sqrt()
-    neighbors = nearest_neighbors(first.means, 8, backend="scipy")
+    neighbors = nearest_neighbors(first.means, 8)
     corrected = corrected_scales(double, first, part, neighbors)
     approximate = corrected_scales(single, second, part, neighbors)
     return Figures(

@@ -100,7 +100,7 @@ def case_of(
     merged = merge_cells(scene, part, config=config or MergeConfig())
     if visibility is None:
         visibility = torch.rand(len(scene), generator=torch.Generator().manual_seed(5))
-    neighbors = nearest_neighbors(merged.means, near, backend="torch")
+    neighbors = nearest_neighbors(merged.means, near)
     merged = align_axes(merged, part, neighbors)
     return Case(scene, merged, part, neighbors, visibility.double())
 

@@ -135,7 +135,6 @@ def reduce_scene(
             grouping.partition,
             config.merge,
             areas=analysis.areas,
-            backend=grouping.backend,
             with_network=net is not None,
             on_cells=advance,
         )
@@ -265,7 +264,6 @@ def merge_cells(
     config: MergeConfig,
     *,
     areas: Float[Tensor, "n"],
-    backend: str,
     with_network: bool,
     on_cells: Callable[[int], None] = lambda done: None,
 ) -> Merged:
@@ -276,7 +274,6 @@ def merge_cells(
         partition: Rows of every cell.
         config: How a cell becomes one Gaussian.
         areas: Mean projected areas of the Gaussians.
-        backend: What searches the neighbours.
         with_network: Whether a network will ask for the neighbours.
         on_cells: Called with the number of finished cells.
 
@@ -285,7 +282,7 @@ def merge_cells(
     """
     merged, shown = merge_members(scene, partition, config, areas=areas, on_cells=on_cells)
     near = neighbor_count(config, with_network=with_network)
-    neighbors = cvt.nearest_neighbors(merged.means, near, backend=backend)
+    neighbors = cvt.nearest_neighbors(merged.means, near)
     return Merged(shape_merged(merged, shown, neighbors, config), shown, neighbors)
 
 

@@ -32,7 +32,7 @@ def cells_of(shape: tuple[float, float, float], *, dtype=torch.float64) -> Gauss
 
 def settled(scene: GaussianScene, members: int = 2) -> GaussianScene:
     labels = torch.arange(len(scene)).repeat_interleave(members)
-    neighbors = nearest_neighbors(scene.means, 8, backend="torch")
+    neighbors = nearest_neighbors(scene.means, 8)
     return align_axes(scene, Partition.from_labels(labels, len(scene)), neighbors)
 
 

@@ -32,7 +32,7 @@ def opaque_scene(count: int) -> GaussianScene:
 
 
 def widened(scene: GaussianScene, counts: list[int], **growth: float) -> GaussianScene:
-    neighbors = nearest_neighbors(scene.means, 8, backend="torch")
+    neighbors = nearest_neighbors(scene.means, 8)
     return inflate_cells(scene, crowded(counts), neighbors, **{**GROWTH, **growth})
 
 
@@ -80,7 +80,7 @@ def test_cover_equals_the_oracle():
 def test_inflation_equals_the_oracle():
     scene, counts = opaque_scene(9), [1, 2, 3, 10, 50, 100, 1000, 2, 7]
     rows = torch.arange(9)
-    cover = side_cover(scene, rows, nearest_neighbors(scene.means, 8, backend="torch"))
+    cover = side_cover(scene, rows, nearest_neighbors(scene.means, 8))
     ratio = widened(scene, counts).scales / scene.scales
     for row in rows.tolist():
         wanted = [

@@ -1,24 +1,20 @@
-"""The nearest other sites of every site: both backends against plain comparison."""
+"""The nearest other sites of every site against plain comparison."""
 
 import pytest
 import torch
 
 from cvtgs.cvt import nearest_neighbors
 
-each_backend = pytest.mark.parametrize("backend", ["scipy", "torch"])
 
-
-@each_backend
-def test_three_sites_on_a_line(backend):
+def test_three_sites_on_a_line():
     sites = torch.tensor([[0.0], [1.0], [9.0]])
-    assert nearest_neighbors(sites, 2, backend=backend).tolist() == [[1, 2], [0, 2], [1, 0]]
+    assert nearest_neighbors(sites, 2).tolist() == [[1, 2], [0, 2], [1, 0]]
 
 
-@each_backend
 @pytest.mark.parametrize(("m", "count"), [(1, 8), (2, 8), (9, 8), (300, 5)])
-def test_neighbours_are_the_nearest_others(m, count, backend):
+def test_neighbours_are_the_nearest_others(m, count):
     sites = torch.randn(m, 3, generator=torch.Generator().manual_seed(m), dtype=torch.float64)
-    found = nearest_neighbors(sites, count, backend=backend)
+    found = nearest_neighbors(sites, count)
     assert found.shape == (m, min(count, m - 1))
     distances = (sites[:, None] - sites[None]).norm(dim=2)
     distances.fill_diagonal_(torch.inf)
@@ -26,16 +22,8 @@ def test_neighbours_are_the_nearest_others(m, count, backend):
     torch.testing.assert_close(distances.gather(1, found), wanted)
 
 
-@each_backend
-def test_coincident_sites_never_name_themselves(backend):
+def test_coincident_sites_never_name_themselves():
     sites = torch.zeros(50, 3)
-    found = nearest_neighbors(sites, 4, backend=backend)
+    found = nearest_neighbors(sites, 4)
     assert found.shape == (50, 4)
     assert not bool((found == torch.arange(50)[:, None]).any())
-
-
-def test_pieces_do_not_change_the_answer(monkeypatch):
-    sites = torch.randn(64, 3, generator=torch.Generator().manual_seed(0))
-    whole = nearest_neighbors(sites, 6, backend="torch")
-    monkeypatch.setitem(nearest_neighbors.__globals__, "MAX_ENTRIES", 100)
-    assert torch.equal(nearest_neighbors(sites, 6, backend="torch"), whole)

@@ -126,15 +126,14 @@ def test_equally_near_sites_stay_in_the_own_block():
     assert found.blocks.tolist() == [-1]
 
 
-@pytest.mark.parametrize("backend", ["scipy", "torch"])
-def test_several_nearest(backend):
+def test_several_nearest():
     g = torch.Generator().manual_seed(1)
     points, sites = torch.rand(50, 3, generator=g), torch.rand(20, 3, generator=g)
-    rows, distances = nearest_several(points, sites, 4, backend=backend)
+    rows, distances = nearest_several(points, sites, 4)
     wanted = torch.cdist(points.double(), sites.double()).sort(dim=1)
     assert torch.equal(rows, wanted.indices[:, :4])
     torch.testing.assert_close(distances, wanted.values[:, :4])
-    assert nearest_several(points, sites, 99, backend=backend)[0].shape == (50, 20)
+    assert nearest_several(points, sites, 99)[0].shape == (50, 20)
 
 
 def test_coincident_sites_are_not_compared_all_with_all():
@@ -143,7 +142,7 @@ def test_coincident_sites_are_not_compared_all_with_all():
     seconds = []
     for sites in (apart, torch.zeros_like(apart)):
         start = time.process_time()
-        _, distances = nearest_several(sites, sites, 9, backend="scipy")
+        _, distances = nearest_several(sites, sites, 9)
         seconds.append(time.process_time() - start)
     assert float(distances.amax()) < 1e-6
     assert seconds[1] < 2 * seconds[0] + 0.1
@@ -154,9 +153,9 @@ def test_a_halo_holds_all_that_may_be_a_neighbour(count):
     blocks = [(None, sites) for _, sites in random_blocks(count, 3, seed=2) if len(sites)]
     starts = torch.tensor([0, *[len(sites) for _, sites in blocks]]).cumsum(0)
     centers = torch.cat([sites for _, sites in blocks])
-    wanted = cvt.nearest_neighbors(centers, 8, backend="scipy")
+    wanted = cvt.nearest_neighbors(centers, 8)
     for own, (_, sites) in enumerate(blocks):
-        found = halo_cells(sites, others_of(blocks, own), count=8, backend="scipy")
+        found = halo_cells(sites, others_of(blocks, own), count=8)
         held = set((starts[found[:, 0]] + found[:, 1]).tolist())
         held |= set(range(int(starts[own]), int(starts[own + 1])))
         assert set(wanted[starts[own] : starts[own + 1]].flatten().tolist()) <= held
@@ -191,7 +190,7 @@ def test_gaussians_go_to_cells_of_other_blocks(job):
 
 def test_cells_have_the_neighbours_of_one_piece(job):
     merged = scene_of_all(job, job.merged_path)
-    wanted = cvt.nearest_neighbors(merged.means, 8, backend="scipy")
+    wanted = cvt.nearest_neighbors(merged.means, 8)
     starts, crossed = block_starts(job), 0
     for block in job.blocks_with_cells():
         own, _ = map_tensors(job.inflated_path(block))
@@ -214,7 +213,7 @@ def test_axes_and_inflation_are_those_of_one_piece(job):
     partition = cells.Partition.from_labels(
         torch.repeat_interleave(torch.arange(TARGET), sizes), TARGET
     )
-    neighbors = cvt.nearest_neighbors(merged.means, 8, backend="scipy")
+    neighbors = cvt.nearest_neighbors(merged.means, 8)
     wanted = shape_merged(merged, partition, neighbors, job.config.merge)
     assert bool((inflated.log_scales != merged.log_scales).any())
     assert same_bits(inflated, wanted)
@@ -244,7 +243,7 @@ def test_the_network_corrects_as_in_one_piece(job):
     shown = partition.keep_only(representatives)
     assert int((representatives >= 0).sum()) > 0
     inflated = scene_of_all(job, job.inflated_path)
-    neighbors = cvt.nearest_neighbors(inflated.means, 8, backend="scipy")
+    neighbors = cvt.nearest_neighbors(inflated.means, 8)
     wanted = validity.standardized(
         correct_cells(
             job.read_network().net,

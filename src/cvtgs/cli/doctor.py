@@ -88,7 +88,7 @@ def doctor(options: argparse.Namespace) -> None:
         print(f"\n{one}: {device_name(one)}")
         for name in RENDERERS:
             print(f"  images by {name:<7} {_renderer_state(name, one)}")
-        print(f"  nearest site by  {cvtgs.cvt.nearest_backend('auto', one)[0]}")
+        print(f"  nearest site by  {cvtgs.cvt.nearest_backend('auto')[0]}")
     default = chosen_device(options.device)
     print(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one image")
     try:

@@ -83,7 +83,7 @@ class TessellationConfig(Section):
         iterations: Lloyd iterations, at most.
         tolerance: Lloyd stops when an iteration lowers the energy by less than this share.
         samples_per_site: Lloyd looks at this many Gaussians per cell at most; 0 looks at all.
-        backend: What searches the nearest site; ``auto`` takes scipy on a CPU, else torch.
+        backend: What searches the nearest site; ``auto`` takes scipy, whose tree is on the host.
     """
 
     area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)

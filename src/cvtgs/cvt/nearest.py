@@ -1,4 +1,4 @@
-"""Nearest sites and neighbours: by scipy's k-d tree on the CPU, by torch blocks on any device."""
+"""Nearest sites and neighbours: by scipy's k-d tree on the host, or by blocks in torch."""
 
 import math
 import os
@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.errors import DeviceError
 from cvtgs.math.frames import morton_order
 
 NearestSite = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -34,33 +33,20 @@ MAX_ENTRIES = 1 << 23
 UNKNOWN = torch.iinfo(torch.int64).max
 
 
-def nearest_backend(
-    name: Literal["auto", "scipy", "torch"], device: torch.device
-) -> tuple[str, NearestSite]:
-    """Resolve the name of a backend for a device.
+def nearest_backend(name: Literal["auto", "scipy", "torch"]) -> tuple[str, NearestSite]:
+    """Resolve the name of a backend.
 
     Args:
-        name: ``scipy``, ``torch``, or ``auto``: scipy on a CPU, torch elsewhere.
-        device: Where the points are.
+        name: ``scipy``, ``torch``, or ``auto``, which is scipy on every device.
 
     Returns:
         The resolved name and the function.
 
-    Raises:
-        DeviceError: scipy was asked for and the points are not on the CPU.
-
     Example:
-        >>> nearest_backend("auto", torch.device("cpu"))[0]
+        >>> nearest_backend("auto")[0]
         'scipy'
     """
-    if name == "auto":
-        name = "scipy" if device.type == "cpu" else "torch"
-    if name == "scipy" and device.type != "cpu":
-        raise DeviceError(
-            f"cvt.backend 'scipy' works on the CPU only, found device {device}; "
-            f"use 'torch' or 'auto'."
-        )
-    return name, nearest_scipy if name == "scipy" else nearest_torch
+    return ("torch", nearest_torch) if name == "torch" else ("scipy", nearest_scipy)
 
 
 def nearest_scipy(
@@ -69,10 +55,11 @@ def nearest_scipy(
     """Find the nearest site of every point with a k-d tree (Maneewongvatana and Mount 1999).
 
     Distances are computed in float64. Points along a space-filling curve take half the time of
-    shuffled ones. Memory is ``16 n`` bytes for the result, and a chunk of points in float64.
+    shuffled ones. The tree is on the host: positions from another device are copied there, and
+    the result back. Memory is ``16 n`` bytes for the result, and a chunk of points in float64.
 
     Args:
-        points: Positions on the CPU.
+        points: Positions on any device.
         sites: Positions, at least one.
 
     Returns:
@@ -83,6 +70,7 @@ def nearest_scipy(
         >>> labels.tolist()
         [1]
     """
+    device, points, sites = points.device, points.cpu(), sites.cpu()
     distinct = distinct_rows(sites)  # a tree cannot part coincident sites: it would compare all
     tree = build_tree(sites if distinct is None else sites[distinct])
     labels = np.empty(len(points), dtype=np.int64)
@@ -98,7 +86,9 @@ def nearest_scipy(
         for _ in pool.map(search, range(0, len(points), CHUNK)):
             pass
     found = torch.from_numpy(labels)
-    return found if distinct is None else distinct[found], torch.from_numpy(squared)
+    if distinct is not None:
+        found = distinct[found]
+    return found.to(device), torch.from_numpy(squared).to(device)
 
 
 def build_tree(sites: Float[Tensor, "m d"]) -> Any:
@@ -108,47 +98,39 @@ def build_tree(sites: Float[Tensor, "m d"]) -> Any:
     return cKDTree(np.asarray(sites, dtype=np.float64))
 
 
-def nearest_neighbors(
-    sites: Float[Tensor, "m d"], count: int, *, backend: str
-) -> Int[Tensor, "m k"]:
-    """Find the nearest other sites of every site.
+def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m k"]:
+    """Find the nearest other sites of every site with a k-d tree on the host.
 
     Args:
-        sites: Positions.
+        sites: Positions on any device.
         count: How many neighbours each site gets; fewer if there are not so many others.
-        backend: ``scipy`` (CPU only, a k-d tree) or ``torch`` (any device; compares all sites with
-            all others in pieces, so time grows with m squared).
 
     Returns:
         Row numbers, k = min(count, m - 1); the site itself is not among them. Of equally near
         sites any may be named.
 
     Example:
-        >>> nearest_neighbors(torch.tensor([[0.0], [1.0], [9.0]]), 1, backend="scipy").tolist()
+        >>> nearest_neighbors(torch.tensor([[0.0], [1.0], [9.0]]), 1).tolist()
         [[1], [0], [1]]
     """
     with_self = min(count + 1, len(sites))
-    if backend == "scipy":
-        apart = _apart(sites)
-        rows, _ = _by_tree(apart, apart, with_self)
-    else:
-        rows, _ = _by_comparison(sites.double(), sites.double(), with_self)
+    apart = _apart(sites.cpu())
+    rows, _ = _by_tree(apart, apart, with_self)
     # Among coincident sites the site itself may be anywhere, even missing: then the last one goes.
-    is_self = rows == torch.arange(len(sites), device=sites.device)[:, None]
+    is_self = rows == torch.arange(len(sites))[:, None]
     others = torch.sort(is_self.to(torch.uint8), dim=1, stable=True).indices[:, : with_self - 1]
-    return rows.gather(1, others)
+    return rows.gather(1, others).to(sites.device)
 
 
 def nearest_several(
-    points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int, *, backend: str
+    points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
-    """Find the nearest sites of every point."""
-    among = min(count, len(sites))
-    if backend == "scipy":
-        apart = _apart(sites)
-        more = apart.shape[1] - points.shape[1]
-        return _by_tree(torch.nn.functional.pad(points.double(), (0, more)), apart, among)
-    return _by_comparison(points.double(), sites.double(), among)
+    """Find the nearest sites of every point, and their distances, with a k-d tree on the host."""
+    apart = _apart(sites.cpu())
+    more = apart.shape[1] - points.shape[1]
+    padded = torch.nn.functional.pad(points.cpu().double(), (0, more))
+    rows, distances = _by_tree(padded, apart, min(count, len(sites)))
+    return rows.to(points.device), distances.to(points.device)
 
 
 def _apart(sites: Float[Tensor, "m d"]) -> Float[Tensor, "m e"]:
@@ -171,19 +153,6 @@ def _by_tree(
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
     distances, rows = build_tree(sites).query(np.asarray(points), k=[*range(1, count + 1)])
     return torch.from_numpy(rows.astype(np.int64)), torch.from_numpy(distances)
-
-
-def _by_comparison(
-    points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int
-) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
-    step = max(1, MAX_ENTRIES // len(sites))
-    found = [
-        torch.cdist(part, sites, compute_mode="donot_use_mm_for_euclid_dist").topk(
-            count, dim=1, largest=False
-        )
-        for part in points.split(step)
-    ]
-    return torch.cat([one.indices for one in found]), torch.cat([one.values for one in found])
 
 
 def nearest_torch(

@@ -65,7 +65,6 @@ def tessellate(
 
     Raises:
         InvalidArgumentError: ``count`` is outside 1 to n.
-        DeviceError: The backend does not work on the device of the points.
 
     Example:
         >>> points = torch.tensor([[0.0, 0, 0], [5, 0, 0], [5.1, 0, 0]])
@@ -76,7 +75,7 @@ def tessellate(
         raise InvalidArgumentError(
             f"count must be between 1 and the number of points, {len(points)}; found {count}."
         )
-    backend, nearest = choose_search(config, points.device, has_duplicates=has_duplicates)
+    backend, nearest = choose_search(config, has_duplicates=has_duplicates)
     seeds = choose_seeds(weights, count, config=config, seed=seed)
     sample, sample_weights = sample_points(points, weights, config.samples_per_site * count)
     settled = lloyd(
@@ -101,11 +100,9 @@ def tessellate(
     )
 
 
-def choose_search(
-    config: TessellationConfig, device: torch.device, *, has_duplicates: bool
-) -> tuple[str, NearestSite]:
+def choose_search(config: TessellationConfig, *, has_duplicates: bool) -> tuple[str, NearestSite]:
     """Choose what searches the nearest site."""
-    backend, nearest = nearest_backend(config.backend, device)
+    backend, nearest = nearest_backend(config.backend)
     return backend, search_once_per_position(nearest) if has_duplicates else nearest
 
 

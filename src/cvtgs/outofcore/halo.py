@@ -140,12 +140,12 @@ def assign_points(
 
 
 def halo_cells(
-    centers: Float[Tensor, "m 3"], others: Iterable[OtherBlock], *, count: int, backend: str
+    centers: Float[Tensor, "m 3"], others: Iterable[OtherBlock], *, count: int
 ) -> Int[Tensor, "h 2"]:
     """Return block and number of remote cells that may be among the nearest of an own cell."""
     centers = centers.double()
     if len(centers) > count:
-        _, distances = nearest_several(centers, centers, count + 1, backend=backend)
+        _, distances = nearest_several(centers, centers, count + 1)
         squared = distances[:, -1].square()
     else:
         squared = torch.full_like(centers[:, 0], torch.inf)
@@ -154,7 +154,7 @@ def halo_cells(
         rows = balls.touching(other.bounds)
         if len(rows) == 0:
             continue
-        cells, distances = nearest_several(centers[rows], other.load(), count, backend=backend)
+        cells, distances = nearest_several(centers[rows], other.load(), count)
         near = torch.unique(cells[distances.square() <= squared[rows][:, None]])
         found.append(torch.stack([torch.full_like(near, other.number), near], dim=1))
     return torch.cat(found)

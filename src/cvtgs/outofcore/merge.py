@@ -96,11 +96,10 @@ def inflate(job: Job, block: int) -> None:
         return
     own, _ = map_tensors(job.merged_path(block))
     near = neighbor_count(job.config.merge, with_network=job.has_network)
-    backend, _ = cvt.nearest_backend(job.config.cvt.backend, own["means"].device)
     others = other_blocks(job, block, job.merged_path, name="means")
-    remote = halo_cells(own["means"], others, count=near, backend=backend)
+    remote = halo_cells(own["means"], others, count=near)
     merged, _, own_count = _with_halo(job, block, remote, job.merged_path)
-    neighbors = cvt.nearest_neighbors(merged.means, near, backend=backend)[:own_count]
+    neighbors = cvt.nearest_neighbors(merged.means, near)[:own_count]
     # Only the number of members of a cell counts here, so their rows are left out.
     offsets = torch.nn.functional.pad(own["sizes"].cumsum(0), (1, 0))
     shown = cells.Partition(order=own["sizes"][:0], offsets=offsets)
@@ -143,7 +142,7 @@ def correct(job: Job, block: int) -> None:
         largest_cell=int(partition.counts.amax()),
         refilled_cells=int(labels["refilled"]),
         energy=float(labels["energy"]),
-        backend=cvt.nearest_backend(job.config.cvt.backend, visibility.device)[0],
+        backend=cvt.nearest_backend(job.config.cvt.backend)[0],
     )
     _write_block(job, block, small, report)
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from cvtgs.analysis import ambient_visibility
 from cvtgs.config import Rates, RefineConfig
-from cvtgs.cvt import nearest_backend
+from cvtgs.cvt import nearest_scipy
 from cvtgs.evaluation.scorer import MOST_PSNR, Scorer
 from cvtgs.losses import relative_loss
 from cvtgs.math import parameters
@@ -224,8 +224,7 @@ def learning_rate_scales(small: GaussianScene, full: GaussianScene) -> Float[Ten
 
 def _own_mass_shares(small: GaussianScene, full: GaussianScene) -> Float[Tensor, "n"]:
     """Return the share of the nearest mass that is the Gaussian's own; 0 if it has changed."""
-    _, nearest = nearest_backend("auto", small.device)
-    labels, _ = nearest(full.means, small.means)
+    labels, _ = nearest_scipy(full.means, small.means)
     same = torch.ones_like(labels, dtype=torch.bool)
     for name in ("means", "log_scales", "logit_opacities", "sh0"):
         before, now = getattr(full, name), getattr(small, name)

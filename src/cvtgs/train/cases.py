@@ -50,7 +50,6 @@ def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> Me
         grouping.partition,
         config.merge,
         areas=analysis.areas,
-        backend=grouping.backend,
         with_network=True,
     )
     return MergedScene(
