@@ -1,6 +1,7 @@
 """What the tests of formats share: scenes, comparisons with oracles and within error bounds."""
 
 import math
+import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,15 @@ def storable_scene(count: int, *, seed: int = 0, degree: int = 3) -> GaussianSce
     scene = random_scene(count, seed=seed, degree=degree)
     tensors = {"sh0": scene.sh0.clamp(-1.7, 1.7), "shN": scene.shN.clamp(-0.9, 0.9)}
     return replace(scene.with_tensors(tensors, {}), comments=(ANTIALIASED_TAG,))
+
+
+def with_extension(content: bytes, kind: int, payload: bytes) -> bytes:
+    """Insert an extension into an SPZ file of version 4, before the table of its blocks."""
+    start = struct.unpack_from("<I", content, 16)[0]
+    record = struct.pack("<II", kind, len(payload)) + payload
+    flags, place = bytes([content[14] | 2]), struct.pack("<I", start + len(record))
+    head = content[:14] + flags + content[15:16] + place + content[20:start]
+    return head + record + content[start:]
 
 
 def refusal(path: Path) -> str | None:

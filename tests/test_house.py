@@ -53,7 +53,8 @@ OWNERS = {
     "matplotlib": "plots.py",
     "distributed": "outofcore/distributed.py",
 }
-HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "jinja2", "matplotlib", "distributed")
+HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "jinja2", "matplotlib", "zstandard")
+HEAVY += ("distributed",)
 
 
 def relative(path: Path) -> str:

@@ -156,6 +156,7 @@ def write_levels(
     source: str,
     suffix: str = ".ply",
     evaluation: Evaluation | None = None,
+    axes: str = "rdf",
     overwrite: bool = False,
 ) -> LevelsIndex:
     """Write levels and, at last, the index that names them.
@@ -167,6 +168,7 @@ def write_levels(
         source: Name of the full scene.
         suffix: End of the names, which says the format.
         evaluation: Scores of the levels, by the names of :func:`level_names`; None for none.
+        axes: The axes of the files, as :func:`cvtgs.io.change_axes` names them.
         overwrite: Whether existing files may be replaced.
 
     Returns:
@@ -191,7 +193,7 @@ def write_levels(
     scores = {one.name: one for one in evaluation.scenes} if evaluation else {}
     entries = []
     for level, rho, name in zip(levels, rhos, names, strict=True):
-        save(level.scene, place / name, overwrite=overwrite)
+        save(level.scene, place / name, overwrite=overwrite, axes=axes)
         size = (place / name).stat().st_size
         entries.append(LevelEntry.of(level, rho, file=name, size=size, scores=scores.get(name)))
     index = LevelsIndex(

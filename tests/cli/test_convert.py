@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from cvtgs import load, save
+from cvtgs import Simplifier, load, save
 from cvtgs.cli.main import main
 from cvtgs.io import Losses, losses
-from format_cases import DATA, storable_scene
+from format_cases import DATA, assert_within, storable_scene
+from scenes import same_bits
 
 FORMATS = ("ply", "compressed.ply", "spz", "splat", "sog")
 
@@ -107,3 +108,50 @@ def test_losses_of_a_ply_are_none() -> None:
     other = replace(scene, comments=("made by hand", "SplatRenderMode: mip"))
     assert losses(other, "a.spz").changed[-1] == "without 1 comment"
     assert losses(other, "a.spz").dropped == ()
+
+
+def test_axes_of_both_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Niantic's file comes out as the PLY that it was made of, and goes back to its axes."""
+    source, small = load(DATA / "source.ply"), tmp_path / "a.spz"
+    words = ["convert", str(DATA / "niantic-v3.spz"), "--quiet"]
+    assert main([*words, str(tmp_path / "a.ply"), "--axes", "rub"]) == 0
+    assert_within(source, load(tmp_path / "a.ply"), {"means": 1e-3, "first_band": 0.04})
+    assert main([*words, str(small), "--axes", "rub:rub"]) == 0
+    assert main([*words, str(tmp_path / "b.spz")]) == 0
+    assert small.read_bytes() == (tmp_path / "b.spz").read_bytes()
+    save(source, tmp_path / "source.ply")
+    assert (
+        main(["convert", str(tmp_path / "source.ply"), str(tmp_path / "c.spz"), "--axes", ":rub"])
+        == 0
+    )
+    assert_within(source, load(tmp_path / "c.spz", axes="rub"), {"means": 1e-3})
+    capsys.readouterr()
+    assert main([*words, str(tmp_path / "d.ply"), "--axes", "up"]) == 1
+    assert "axes must be three letters" in capsys.readouterr().err
+
+
+def test_simplify_and_levels_take_axes(tmp_path: Path) -> None:
+    scene = replace(storable_scene(300, degree=1), comments=())
+    save(scene, tmp_path / "a.spz", axes="rub")
+    words = ["--axes", "rub:luf", "--quiet"]
+    size = ["--count", "20", "--ckpt", "none"]
+    assert main(["simplify", str(tmp_path / "a.spz"), str(tmp_path / "b.ply"), *size, *words]) == 0
+    save(load(tmp_path / "a.spz", axes="rub"), tmp_path / "plain.ply")
+    one = ["simplify", str(tmp_path / "plain.ply"), str(tmp_path / "c.ply"), *size, "--quiet"]
+    assert main(one) == 0
+    assert same_bits(load(tmp_path / "b.ply", axes="luf"), load(tmp_path / "c.ply"))
+    two = ["levels", str(tmp_path / "a.spz"), "-o", str(tmp_path / "levels"), "--rho", "0.0667"]
+    assert main([*two, *words, "--no-scores", "--ckpt", "none"]) == 0
+    (level,) = (tmp_path / "levels").glob("*.ply")
+    one = Simplifier(None, device="cpu").levels(load(tmp_path / "plain.ply"), [0.0667])[0]
+    assert same_bits(load(level, axes="luf"), one.scene)
+
+
+def test_axes_are_not_for_blocks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cvtgs.outofcore.memory.BASE_BYTES", 10)
+    save(storable_scene(3000), tmp_path / "a.ply")
+    words = ["simplify", str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), "--rho", "0.1"]
+    assert main([*words, "--memory", "300kB", "--axes", "rub"]) == 1
+    assert "blocks cannot go with --axes, which need the whole scene" in capsys.readouterr().err

@@ -12,10 +12,19 @@ from hypothesis import strategies as st
 
 from cvtgs import GaussianScene, load, save
 from cvtgs.errors import DroppedDataWarning
+from cvtgs.io import change_axes
 from cvtgs.io.atomic import atomic_output
-from cvtgs.io.spz import read_spz, write_spz
-from format_cases import DATA, assert_as_oracle, assert_within, half_turn, storable_scene
+from cvtgs.io.spz import write_spz
+from format_cases import (
+    DATA,
+    assert_as_oracle,
+    assert_within,
+    half_turn,
+    storable_scene,
+    with_extension,
+)
 from format_oracles import read_gzip_spz
+from scenes import same_bits
 
 BOUNDS = {
     "means": 0.5 / 4096,
@@ -45,45 +54,48 @@ def one_gaussian(version: int, quat: bytes, *, bits: int = 12, flags: int = 0) -
     ],
 )
 def test_a_file_by_hand(tmp_path: Path, version: int, quat: bytes) -> None:
-    """Half a turn about x, as the axes too: y and z change signs, and bands odd in y or z."""
+    """In the axes of PLY files, as most tools write them, unless the axes are given."""
     path = tmp_path / "a.spz"
     path.write_bytes(one_gaussian(version, quat, flags=1))
     scene = load(path)
-    assert scene.means.tolist() == [[1, -2, 3]]
+    assert scene.means.tolist() == [[1, 2, -3]]
     assert scene.log_scales.tolist() == [[0, 1, 2]]
     torch.testing.assert_close(scene.opacities, torch.tensor([0.2]))
     torch.testing.assert_close(scene.sh0, torch.tensor([[[0.5, -0.5, -0.5]]]) / 0.15)
-    rest = [[-8 / 128, 0, 0], [8 / 128, 0, 0], [0, 16 / 128, 0]]
-    assert scene.shN.tolist() == [rest]
+    assert scene.shN.tolist() == [[[8 / 128, 0, 0], [-8 / 128, 0, 0], [0, 16 / 128, 0]]]
     torch.testing.assert_close(
         scene.quats.abs(), torch.tensor([[0.0, 1.0, 0.0, 0.0]]), rtol=0, atol=0.01
     )
     assert scene.antialiased
-    assert_as_oracle(read_spz(path, axes="RDF"), read_gzip_spz(path.read_bytes()))
+    assert_as_oracle(scene, read_gzip_spz(path.read_bytes()))
+    turned = load(path, axes="rub")  # y and z change signs, and bands odd in y or z
+    assert turned.means.tolist() == [[1, -2, 3]]
+    assert turned.shN.tolist() == [[[-8 / 128, 0, 0], [8 / 128, 0, 0], [0, 16 / 128, 0]]]
 
 
 def test_half_precision_of_version_1(tmp_path: Path) -> None:
     body = struct.pack("<3e", 1, 2, -3) + bytes([51, 255, 0, 0, 160, 176, 192, 128, 128, 128])
     path = tmp_path / "a.spz"
     path.write_bytes(gzip.compress(HEADER.pack(b"NGSP", 1, 1, 0, 12, 0, 0) + body))
-    assert load(path).means.tolist() == [[1, -2, 3]]
-    assert_as_oracle(read_spz(path, axes="RDF"), read_gzip_spz(path.read_bytes()))
+    assert load(path).means.tolist() == [[1, 2, -3]]
+    assert_as_oracle(load(path), read_gzip_spz(path.read_bytes()))
 
 
 def test_fractional_bits_are_those_of_the_header(tmp_path: Path) -> None:
     path = tmp_path / "a.spz"
     for bits in (0, 7, 20):
         path.write_bytes(one_gaussian(3, bytes(4), bits=bits))
-        assert load(path).means.tolist() == [[1, -2, 3]]
+        assert load(path).means.tolist() == [[1, 2, -3]]
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
 def test_files_of_niantics_library(version: int) -> None:
-    if version == 4:
-        pytest.importorskip("zstandard")
-    scene, source = load(DATA / f"niantic-v{version}.spz"), load(DATA / "source.ply")
+    """They were written as Niantic's apps do, by a caller that stated the axes of the PLY."""
+    path, source = DATA / f"niantic-v{version}.spz", load(DATA / "source.ply")
+    scene = load(path, axes="rub")
     bounds = BOUNDS | ({"angle": 0.2} if version == 2 else {})  # w is derived, badly if small
     assert_within(source, scene, bounds)
+    assert_within(half_turn(source), load(path), bounds)
     assert scene.comments == ("SplatRenderMode: mip",)
 
 
@@ -91,7 +103,7 @@ def test_files_of_niantics_library(version: int) -> None:
 def test_our_files_are_niantics_files(tmp_path: Path, version: int) -> None:
     """Byte for byte when decompressed, but for halves, which may be rounded the other way."""
     path = tmp_path / "a.spz"
-    source = load(DATA / "source.ply")
+    source = change_axes(load(DATA / "source.ply"), "rdf", "rub")
     with atomic_output(path) as file:
         write_spz(source, file, version=2 if version == 2 else 3)
     ours, theirs = (
@@ -101,27 +113,36 @@ def test_our_files_are_niantics_files(tmp_path: Path, version: int) -> None:
     assert ours[:16] == theirs[:16]
     assert sum(a != b for a, b in zip(ours[16:], theirs[16:], strict=True)) <= 1
     splats = read_gzip_spz((DATA / f"niantic-v{version}.spz").read_bytes())
-    assert_as_oracle(read_spz(DATA / f"niantic-v{version}.spz", axes="RDF"), splats)
+    assert_as_oracle(load(DATA / f"niantic-v{version}.spz"), splats)
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_files_in_ply_axes(version: int) -> None:
-    """What splat-transform writes is turned by half a turn about x unless told otherwise."""
-    if version == 4:
-        pytest.importorskip("zstandard")
-    path, source = DATA / f"splat-transform-v{version}.spz", load(DATA / "source.ply")
-    assert_within(source, read_spz(path, axes="RDF"), BOUNDS)
-    assert_within(half_turn(source), load(path), BOUNDS)
+def test_files_of_splat_transform_have_the_axes_of_the_ply(version: int) -> None:
+    source = load(DATA / "source.ply")
+    assert_within(source, load(DATA / f"splat-transform-v{version}.spz"), BOUNDS)
 
 
-def test_axes_of_the_file_are_half_a_turn_away(tmp_path: Path) -> None:
+def test_files_stand_as_their_ply_unless_axes_are_given(tmp_path: Path) -> None:
     """Against rotated spherical harmonics of an oracle."""
     path, scene = tmp_path / "a.spz", storable_scene(30)
     save(scene, path)
-    assert_within(half_turn(scene), read_spz(path, axes="RDF"), BOUNDS)
-    with atomic_output(path, overwrite=True) as file:
-        write_spz(scene, file, axes="RDF")
-    assert_within(scene, read_spz(path, axes="RDF"), BOUNDS)
+    assert_within(scene, load(path), BOUNDS)
+    save(scene, path, axes="rub", overwrite=True)
+    assert_within(half_turn(scene), load(path), BOUNDS)
+    assert_within(scene, load(path, axes="RUB"), BOUNDS)
+
+
+@pytest.mark.parametrize(
+    ("number", "axes"), [(0, "rub"), (1, "ldb"), (4, "rub"), (6, "rdf"), (16, "rfu")]
+)
+def test_axes_that_a_file_states_are_followed(tmp_path: Path, number: int, axes: str) -> None:
+    """Adobe's extension, behind one of an unknown vendor; given axes count more."""
+    path, fourth = tmp_path / "a.spz", (DATA / "splat-transform-v4.spz").read_bytes()
+    other = with_extension(fourth, 0x12340001, b"unknown")
+    path.write_bytes(with_extension(other, 0xADBE0003, number.to_bytes(4, "little")))
+    plain = load(DATA / "splat-transform-v4.spz")
+    assert same_bits(load(path), change_axes(plain, axes, "rdf"))
+    assert same_bits(load(path, axes="rdf"), plain)
 
 
 @settings(max_examples=20, deadline=None)
@@ -137,7 +158,7 @@ def test_round_trip(
     assert_within(scene, again, BOUNDS)
     assert again.sh_degree == degree
     assert again.antialiased
-    assert_as_oracle(read_spz(path, axes="RDF"), read_gzip_spz(path.read_bytes()))
+    assert_as_oracle(load(path), read_gzip_spz(path.read_bytes()))
     save(again, path, overwrite=True)
     for name, tensor in load(path).tensors().items():
         wanted, bound = again.tensors()[name], 1e-5

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.display import file_size
-from cvtgs.cli.options import AddParser, add_options, read_scene, read_settings
+from cvtgs.cli.options import AddParser, add_options, read_axes, read_scene, read_settings
 
 if TYPE_CHECKING:
     from cvtgs.analysis import Effect
@@ -89,13 +89,14 @@ def add_convert(add_parser: AddParser) -> None:
         "Prints what the format of OUT cannot hold before writing it.",
     )
     parser.set_defaults(run=convert)
-    add_options(parser, "input", "output", "--trust-sizes", "--overwrite", "--quiet")
+    add_options(parser, "input", "output", "--axes", "--trust-sizes", "--overwrite", "--quiet")
 
 
 def convert(options: argparse.Namespace) -> None:
     """Run ``cvtgs convert``."""
+    axes = read_axes(options.axes)
     cvtgs.io.check_save(options.output, overwrite=options.overwrite)
-    scene = cvtgs.io.load(options.input, trust_sizes=options.trust_sizes)
+    scene = cvtgs.io.load(options.input, axes=axes.source, trust_sizes=options.trust_sizes)
     lost = cvtgs.io.losses(scene, options.output)
     if not options.quiet:
         print(f"{options.input}: {len(scene):,} Gaussians of SH degree {scene.sh_degree}")
@@ -103,7 +104,9 @@ def convert(options: argparse.Namespace) -> None:
             print(f"Files like {options.output.name} hold:")
         for phrase in lost.changed:
             print(f"  {phrase}", flush=True)
-    cvtgs.io.save(scene, options.output, overwrite=options.overwrite)  # warns of losses first
+    cvtgs.io.save(  # warns of losses first
+        scene, options.output, overwrite=options.overwrite, axes=axes.target
+    )
     if not options.quiet:
         print(
             f"{options.output}: {lost.count:,} Gaussians of SH degree {lost.sh_degree}, "

@@ -13,6 +13,7 @@ from cvtgs.cli.options import (
     check_view_options,
     choose_cameras,
     evaluation_settings,
+    read_axes,
     read_ratios,
     read_settings,
 )
@@ -40,7 +41,7 @@ def add_levels(add_parser: AddParser) -> None:
     parser.add_argument(
         "--suffix", default=".ply", metavar="END", help="format of the files (default .ply)"
     )
-    add_options(parser, "--preset", "--ckpt", "--config", "--set")
+    add_options(parser, "--preset", "--ckpt", "--config", "--set", "--axes")
     parser.add_argument(
         "--no-scores", action="store_true", help="skip rendering and scoring the levels"
     )
@@ -53,6 +54,7 @@ def levels(options: argparse.Namespace) -> None:
     from cvtgs.levels import check_levels
 
     check_view_options(options)
+    axes = read_axes(options.axes)
     rhos = sorted(read_ratios(options.rho), reverse=True)
     for rho in rhos:
         cvtgs.target_count(1, rho)
@@ -66,7 +68,7 @@ def levels(options: argparse.Namespace) -> None:
         simplifier = cvtgs.Simplifier(
             checkpoint, config=config, device=options.device, listener=listener
         )
-        scene = cvtgs.load(options.input, trust_sizes=options.trust_sizes)
+        scene = cvtgs.load(options.input, axes=axes.source, trust_sizes=options.trust_sizes)
         cameras = None if options.cameras is None else cvtgs.load_cameras(options.cameras)
         made = simplifier.levels(scene, rhos, cameras=cameras)
         scores = None if options.no_scores else _score(options, scene, made, names, listener)
@@ -77,6 +79,7 @@ def levels(options: argparse.Namespace) -> None:
             source=options.input.name,
             suffix=options.suffix,
             evaluation=scores,
+            axes=axes.target,
             overwrite=options.overwrite,
         )
     if not options.quiet:

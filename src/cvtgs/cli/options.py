@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import cvtgs
 from cvtgs.errors import ConfigError, InvalidArgumentError
@@ -105,6 +105,11 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
         "metavar": "DEVICE",
         "default": "auto",
         "help": "device to compute on: auto (default), cpu or cuda",
+    },
+    "--axes": {
+        "metavar": "IN[:OUT]",
+        "help": "axes of the files: where x, y and z point, for example rub (right, up, back) or "
+        "rub:rub (default rdf:rdf, right, down, forward, unless IN states its own)",
     },
     "--overwrite": {"action": "store_true", "help": "replace existing files"},
     "--quiet": {"action": "store_true", "help": "print only errors and warnings"},
@@ -237,6 +242,23 @@ def read_ratios(text: str) -> list[float]:
     return ratios
 
 
+class FileAxes(NamedTuple):
+    """The axes of a file to read, None if they were not given, and of files to write."""
+
+    source: str | None
+    target: str
+
+
+def read_axes(text: str | None) -> FileAxes:
+    """Read ``--axes``."""
+    from cvtgs.io.axes import SCENE_AXES, checked_axes
+
+    source, _, target = (text or "").partition(":")
+    return FileAxes(
+        checked_axes(source) if source else None, checked_axes(target) if target else SCENE_AXES
+    )
+
+
 def read_settings(words: Sequence[str] = (), effects: str | None = None) -> dict[str, str]:
     """Read ``--set`` and ``--effects`` as settings by dotted key; those of ``--set`` win."""
     example = "--effects needs NAME=VALUE, for example sh=1,mip=off"
@@ -270,12 +292,15 @@ def _setting_names(section: "type[pydantic.BaseModel]", prefix: str = "") -> Ite
             yield prefix + name
 
 
-def read_scene(options: argparse.Namespace, config: "SimplifyConfig") -> "GaussianScene":
+def read_scene(
+    options: argparse.Namespace, config: "SimplifyConfig", *, axes: str | None = None
+) -> "GaussianScene":
     """Read the scene of ``IN`` without what ``--effects`` switches off."""
     degree = None if config.effects.sh == "auto" else config.effects.sh
     return cvtgs.io.load(
         options.input,
         sh_degree=degree,
         extras=config.effects.extras != "off",
+        axes=axes,
         trust_sizes=options.trust_sizes,
     )

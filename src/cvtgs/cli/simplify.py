@@ -14,6 +14,7 @@ from cvtgs.cli.options import (
     CAMERA_FILES,
     AddParser,
     add_options,
+    read_axes,
     read_scene,
     read_settings,
 )
@@ -118,11 +119,12 @@ def add_simplify(add_parser: AddParser) -> None:
     parser.add_argument(
         "--report", type=Path, metavar="R.json", help="file for a report of the run in JSON"
     )
-    add_options(parser, "--device", "--trust-sizes", "--overwrite", "--quiet")
+    add_options(parser, "--axes", "--device", "--trust-sizes", "--overwrite", "--quiet")
 
 
 def simplify(options: argparse.Namespace) -> None:
     """Run ``cvtgs simplify``."""
+    read_axes(options.axes)
     check_goals(options)
     checkpoint = None if options.ckpt == "none" else options.ckpt
     preset = options.preset
@@ -161,7 +163,8 @@ def _simplify_in_memory(
 ) -> "tuple[SimplifyReport, list[str]]":
     """Read, simplify and save a scene; return the report, and notes to print below it."""
     notes = []
-    scene = read_scene(options, config)
+    axes = read_axes(options.axes)
+    scene = read_scene(options, config, axes=axes.source)
     cameras = None if options.cameras is None else cvtgs.load_cameras(options.cameras)
     if options.time_budget is not None:
         chosen = choose_preset(options, scene, settings, listener)
@@ -192,7 +195,7 @@ def _simplify_in_memory(
         small, report = simplifier.run(
             scene, options.rho, count=options.count, cameras=cameras, keep=keep
         )
-    cvtgs.io.save(small, options.output, overwrite=options.overwrite)
+    cvtgs.io.save(small, options.output, overwrite=options.overwrite, axes=axes.target)
     return report, notes
 
 
@@ -307,7 +310,7 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
     from cvtgs.io.ply import open_rows
     from cvtgs.outofcore import available_memory, block_count, check_config, read_bytes
 
-    names = ("target_psnr", "target_ssim", "time_budget", "cameras")
+    names = ("target_psnr", "target_ssim", "time_budget", "cameras", "axes")
     excluded = [name for name in names if getattr(options, name) is not None]
     memory = available_memory() if options.memory is None else read_bytes(options.memory)
     if options.memory is None and options.scheduler is None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cvtgs.io.atomic import atomic_output, check_output
+    from cvtgs.io.axes import change_axes
     from cvtgs.io.cameras import load_cameras
     from cvtgs.io.dicts import from_dict, to_dict
     from cvtgs.io.files import scene_file, scene_size
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 _HOME = {
     "Losses": "limits",
     "atomic_output": "atomic",
+    "change_axes": "axes",
     "check_output": "atomic",
     "check_save": "formats",
     "from_dict": "dicts",
@@ -31,6 +33,7 @@ _HOME = {
 __all__ = [
     "Losses",
     "atomic_output",
+    "change_axes",
     "check_output",
     "check_save",
     "from_dict",

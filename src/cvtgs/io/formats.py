@@ -13,6 +13,7 @@ import torch
 from cvtgs.devices import usable_device
 from cvtgs.errors import DroppedDataWarning, FileFormatError, InvalidArgumentError
 from cvtgs.io.atomic import atomic_output, check_output
+from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
 from cvtgs.io.files import is_file, scene_file
 from cvtgs.io.limits import FORMAT_LIMITS, Losses, losses_within
 from cvtgs.math.spherical_harmonics import REST_COUNTS
@@ -52,6 +53,7 @@ def load(
     device: str | torch.device = "cpu",
     sh_degree: int | None = None,
     extras: bool = True,
+    axes: str | None = None,
     trust_sizes: bool = False,
 ) -> GaussianScene:
     """Read a scene from a file or the folder of a trained model.
@@ -68,6 +70,10 @@ def load(
         sh_degree: SH bands above this degree are zeros, whatever the file holds; None for all. Of
             plain PLY files their columns are not even copied.
         extras: Whether columns beyond the standard ones are carried; only plain PLY files have any.
+        axes: Where x, y and z of the file point, for example ``"rub"``, as
+            :func:`cvtgs.io.change_axes` names them; the scene is turned to ``"rdf"``, the axes of
+            PLY files. None for the axes that the file states, which only ``.spz`` files of version
+            4 can; others are taken to be ``"rdf"``.
         trust_sizes: Whether a compressed file may unpack to any size. By default, one that claims
             far more Gaussians than its bytes can hold is refused before it takes memory.
 
@@ -80,7 +86,7 @@ def load(
         FileFormatError: The format is unknown, or the file is not what its format promises.
         MissingDependencyError: Reading this file needs an optional package.
         DeviceError: The device is not there.
-        InvalidArgumentError: There is no such SH degree.
+        InvalidArgumentError: There is no such SH degree, or there are no such axes.
 
     Example:
         >>> import tempfile
@@ -97,6 +103,7 @@ def load(
     usable_device(device)
     if sh_degree is not None and not 0 <= sh_degree < len(REST_COUNTS):
         raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {sh_degree!r}.")
+    axes = None if axes is None else checked_axes(axes)
     source = scene_file(path)
     suffix = _suffix_of(source, _READERS) if is_file(source) else ".ply"  # whose reader raises
     if suffix.endswith(".ply"):
@@ -105,17 +112,27 @@ def load(
         suffix = ".compressed.ply" if is_compressed_ply(source) else ".ply"
     read: Callable[..., GaussianScene] = resolve_name(_READERS[suffix])
     if suffix == ".ply":
-        return read(source, sh_degree=sh_degree, extras=extras).to(device)
-    options = {} if suffix in _SIZED else {"trust_sizes": trust_sizes}
-    scene = read(source, **options)
-    if sh_degree is not None and sh_degree < scene.sh_degree:
+        scene = read(source, sh_degree=sh_degree, extras=extras)
+    elif suffix == ".spz":
+        scene = read(source, axes=axes, trust_sizes=trust_sizes)
+    else:
+        scene = read(source, **({} if suffix in _SIZED else {"trust_sizes": trust_sizes}))
+    if axes is not None and suffix != ".spz":
+        scene = change_axes(scene, axes, SCENE_AXES)
+    if suffix != ".ply" and sh_degree is not None and sh_degree < scene.sh_degree:
         rest = scene.shN.clone()
         rest[:, REST_COUNTS[sh_degree] :] = 0.0
         scene = scene.with_tensors({"shN": rest}, scene.extras)
     return scene.to(device)
 
 
-def save(scene: GaussianScene, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+def save(
+    scene: GaussianScene,
+    path: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    axes: str = SCENE_AXES,
+) -> None:
     """Write a scene to a file, completely or not at all.
 
     A scene that was loaded from a PLY is written to one with the properties, their order, types
@@ -128,12 +145,15 @@ def save(scene: GaussianScene, path: str | os.PathLike[str], *, overwrite: bool 
         path: The file to write; its suffix chooses the format: ``.ply``,
             ``.compressed.ply``, ``.spz``, ``.splat`` or ``.sog``.
         overwrite: Whether an existing file may be replaced.
+        axes: Where x, y and z of the file are to point, as :func:`cvtgs.io.change_axes` names
+            them; the scene, whose own are ``"rdf"``, is turned to them.
 
     Raises:
         FileFormatError: The format is unknown or cannot be written.
         OutputExistsError: The file exists and may not be replaced.
         OutputError: The file cannot be written (directory missing, no permission, disk full).
         InvalidSceneError: Something in the scene has no place in the format.
+        InvalidArgumentError: There are no such axes.
 
     Example:
         >>> import tempfile
@@ -148,6 +168,7 @@ def save(scene: GaussianScene, path: str | os.PathLike[str], *, overwrite: bool 
     """
     writer = _WRITERS[_suffix_of(path, _WRITERS)]
     check_output(path, overwrite)
+    scene = change_axes(scene, SCENE_AXES, axes)
     dropped = losses(scene, path).dropped
     if dropped:
         warnings.warn(

@@ -1,15 +1,9 @@
-"""What reading and writing ``.spz`` files share: header, sizes of blocks, axes."""
+"""What reading and writing ``.spz`` files share: header and sizes of blocks."""
 
 import struct
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass
 
 import numpy as np
-
-from cvtgs.io.arrays import Arrays
-
-Axes = Literal["RUB", "RDF"]
-"""Where x, y and z point: right, up, back, as Niantic's files do; right, down, forward, as PLYs."""
 
 MAGIC = 0x5053474E
 HEADER = struct.Struct("<IIIBBBB")
@@ -20,11 +14,6 @@ COLOR_SCALE = np.float32(0.15)
 
 STORED_REST_COUNTS = (0, 3, 8, 15, 24)
 """View-dependent coefficients per channel that files may hold, by degree."""
-
-# Half a turn about x takes right-down-forward to right-up-back and back. It changes the sign of
-# y and z, and of every SH function that is odd in y and z together.
-_SIGNS = np.array([1, -1, -1], np.float32)
-_SH_SIGNS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,11 +59,3 @@ class SpzHeader:
             self.flags,
             self.streams,
         )
-
-
-def turn_axes(arrays: Arrays) -> Arrays:
-    """Turn a scene by half a turn about x: between right-up-back and right-down-forward axes."""
-    quats = arrays.quats.copy()
-    quats[:, 1:] *= _SIGNS  # of y z, x z and x y, which are the same
-    signs = _SH_SIGNS[: arrays.shN.shape[1], None]
-    return replace(arrays, means=arrays.means * _SIGNS, quats=quats, shN=arrays.shN * signs)

@@ -7,12 +7,14 @@ import struct
 import warnings
 import zlib
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from cvtgs.errors import DroppedDataWarning, FileFormatError, MissingDependencyError
+from cvtgs.errors import DroppedDataWarning, FileFormatError
 from cvtgs.io.arrays import HALF_RANGE, Arrays, logits_of_bytes, restore_largest, scene_of
+from cvtgs.io.axes import AXES, SCENE_AXES, change_axes, checked_axes
 from cvtgs.io.files import open_input
 from cvtgs.io.sizes import check_expansion
 from cvtgs.io.spz.layout import (
@@ -21,14 +23,21 @@ from cvtgs.io.spz.layout import (
     HEADER,
     MAGIC,
     STORED_REST_COUNTS,
-    Axes,
     SpzHeader,
-    turn_axes,
 )
 from cvtgs.scene import GaussianScene
 
 Blocks = dict[str, UInt8[np.ndarray, "b"]]
 """Bytes by name: means, opacities, colors, log_scales, quats, sh."""
+
+
+class _Content(NamedTuple):
+    """What a file holds; the axes only if it states them."""
+
+    header: SpzHeader
+    blocks: Blocks
+    axes: str | None = None
+
 
 _GZIP = b"\x1f\x8b"
 _MOST_BITS = 24
@@ -37,18 +46,20 @@ _MOST_EXPANSION = 1032
 
 _TABLE_START = slice(16, 20)
 _FOURTH_HEADER_BYTES = 32
+_AXES_EXTENSION = 0xADBE0003
+"""The type of Adobe's extension for the axes."""
 
 
-def read_spz(path: Path, *, axes: Axes = "RUB", trust_sizes: bool = False) -> GaussianScene:
+def read_spz(path: Path, *, axes: str | None = None, trust_sizes: bool = False) -> GaussianScene:
     """Read an ``.spz`` file of version 1 to 4.
 
-    The axes of the file are not in it. Niantic defines them as right, up, back, and its apps
-    write them so; the scene is turned by half a turn about x to the axes of PLY files. Some
-    tools (splat-transform, gsply) write PLY axes instead.
+    Few files state their axes, by an extension of version 4. Files that do not are taken to have
+    those of PLY files, as most tools write them; Niantic's apps write ``"rub"``.
 
     Args:
         path: The file.
-        axes: What the axes of the file are; ``"RDF"`` for those of PLY files.
+        axes: The axes of the file, as :func:`cvtgs.io.change_axes` names them, whatever it
+            states; None for those that it states, else those of PLY files.
         trust_sizes: Whether the file may unpack to any size.
 
     Returns:
@@ -58,9 +69,11 @@ def read_spz(path: Path, *, axes: Axes = "RUB", trust_sizes: bool = False) -> Ga
         InputNotFoundError: There is no such file.
         InputError: It cannot be opened or read.
         FileFormatError: It is not an ``.spz`` file, or damaged.
-        MissingDependencyError: It is of version 4, and zstandard is not installed.
+        InvalidArgumentError: There are no axes of this name.
     """
-    header, blocks = _read_blocks(path, trust_sizes=trust_sizes)
+    axes = None if axes is None else checked_axes(axes)
+    content = _read_content(path, trust_sizes=trust_sizes)
+    header, blocks = content.header, content.blocks
     if header.sh_degree > 3:
         warnings.warn(
             f"{path}: left out the SH bands above degree 3 (the file has degree "
@@ -68,9 +81,8 @@ def read_spz(path: Path, *, axes: Axes = "RUB", trust_sizes: bool = False) -> Ga
             DroppedDataWarning,
             stacklevel=3,
         )
-    arrays = _unpack(header, blocks)
-    arrays = turn_axes(arrays) if axes == "RUB" else arrays
-    return scene_of(arrays, antialiased=header.antialiased)
+    scene = scene_of(_unpack(header, blocks), antialiased=header.antialiased)
+    return change_axes(scene, axes or content.axes or SCENE_AXES, SCENE_AXES)
 
 
 def _unpack(header: SpzHeader, blocks: Blocks) -> Arrays:
@@ -109,7 +121,7 @@ def _quats(stored: UInt8[np.ndarray, "n b"]) -> Float[np.ndarray, "n 4"]:
     return np.roll(restore_largest((words >> 30).astype(np.int64), others), 1, axis=1)
 
 
-def _read_blocks(path: Path, *, trust_sizes: bool) -> tuple[SpzHeader, Blocks]:
+def _read_content(path: Path, *, trust_sizes: bool) -> _Content:
     """Read and decompress a file."""
     with open_input(path) as file:
         content = file.read()
@@ -123,7 +135,7 @@ def _read_blocks(path: Path, *, trust_sizes: bool) -> tuple[SpzHeader, Blocks]:
     )
 
 
-def _read_gzip(content: bytes, path: Path, *, trust_sizes: bool) -> tuple[SpzHeader, Blocks]:
+def _read_gzip(content: bytes, path: Path, *, trust_sizes: bool) -> _Content:
     stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     try:
         header = _header(stream.decompress(content, HEADER.size), path, versions=(1, 2, 3))
@@ -154,10 +166,10 @@ def _read_gzip(content: bytes, path: Path, *, trust_sizes: bool) -> tuple[SpzHea
         raise FileFormatError(f"{path}: must be whole gzip, found it cut short.")
     ends = np.cumsum(list(header.sizes.values()))[:-1]
     blocks = np.split(np.frombuffer(payload, np.uint8), ends)
-    return header, dict(zip(header.sizes, blocks, strict=True))
+    return _Content(header, dict(zip(header.sizes, blocks, strict=True)))
 
 
-def _read_version_4(content: bytes, path: Path, *, trust_sizes: bool) -> tuple[SpzHeader, Blocks]:
+def _read_version_4(content: bytes, path: Path, *, trust_sizes: bool) -> _Content:
     header = _header(content[: HEADER.size], path, versions=(4,))
     sizes = {name: size for name, size in header.sizes.items() if size}
     start = int.from_bytes(content[_TABLE_START], "little")
@@ -182,7 +194,25 @@ def _read_version_4(content: bytes, path: Path, *, trust_sizes: bool) -> tuple[S
             )
         blocks[name] = _unzstd(content[at : at + packed], size, f"{path}: block {name!r}")
         at += packed
-    return header, blocks
+    extensions = content[_FOURTH_HEADER_BYTES:start] if header.flags & EXTENSIONS_FLAG else b""
+    return _Content(header, blocks, _stated_axes(extensions, path))
+
+
+def _stated_axes(extensions: bytes, path: Path) -> str | None:
+    """Return the axes that the extensions state: records of type, number of bytes, and bytes."""
+    axes, at = None, 0
+    while at + 8 <= len(extensions):
+        kind, size = struct.unpack_from("<II", extensions, at)
+        if kind == _AXES_EXTENSION:
+            number = int.from_bytes(extensions[at + 8 : at + 12], "little")
+            if size != 4 or len(extensions) < at + 12 or number > len(AXES):
+                raise FileFormatError(
+                    f"{path}: the extension for the axes must hold a number of 4 bytes from 0 to "
+                    f"{len(AXES)}, found {number} in {size:,} bytes."
+                )
+            axes = AXES[number - 1] if number else "rub"  # as Niantic's library takes it
+        at += 8 + size
+    return axes
 
 
 def _check_expansion(path: Path, header: SpzHeader, stored: int) -> None:
@@ -230,13 +260,8 @@ def _too_short(path: Path, header: SpzHeader, wanted: int, found: str) -> FileFo
 
 def _unzstd(content: bytes, size: int, where: str) -> UInt8[np.ndarray, "b"]:
     """Decompress a block of known size."""
-    try:
-        import zstandard  # noqa: PLC0415 (optional)
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"{where}: .spz files of version 4 need the package zstandard: "
-            f'pip install "cvtgs[spz]"; or write the file as version 3.'
-        ) from error
+    import zstandard  # noqa: PLC0415 (only for version 4)
+
     try:
         with zstandard.ZstdDecompressor().stream_reader(content) as stream:
             data = stream.read(size + 1)

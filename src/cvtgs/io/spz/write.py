@@ -18,7 +18,7 @@ from cvtgs.io.arrays import (
     to_bytes,
 )
 from cvtgs.io.limits import writable_rows
-from cvtgs.io.spz.layout import ANTIALIASED_FLAG, COLOR_SCALE, Axes, SpzHeader, turn_axes
+from cvtgs.io.spz.layout import ANTIALIASED_FLAG, COLOR_SCALE, SpzHeader
 from cvtgs.math.spherical_harmonics import REST_COUNTS, degree_of
 from cvtgs.scene import GaussianScene
 
@@ -29,10 +29,8 @@ _OUTLIERS = 0.001
 _CHUNK_ROWS = 1 << 18
 
 
-def write_spz(
-    scene: GaussianScene, file: BinaryIO, *, version: Literal[2, 3] = 3, axes: Axes = "RUB"
-) -> None:
-    r"""Write an ``.spz`` file, in the order of the scene.
+def write_spz(scene: GaussianScene, file: BinaryIO, *, version: Literal[2, 3] = 3) -> None:
+    r"""Write an ``.spz`` file, in the order and the axes of the scene.
 
     Numbers are rounded as Niantic's library rounds them, so that its files and these are alike.
 
@@ -40,7 +38,6 @@ def write_spz(
         scene: The scene, on any device.
         file: Where to, open for writing.
         version: 3, or 2 for older readers, which stores rotations in 24 instead of 32 bits.
-        axes: The axes of the file: Niantic's, or ``"RDF"`` for readers that expect PLY axes.
 
     Raises:
         InvalidSceneError: No Gaussian of the scene is finite.
@@ -55,7 +52,6 @@ def write_spz(
         b'\x1f\x8b'
     """
     arrays = arrays_of(scene)
-    arrays = turn_axes(arrays) if axes == "RUB" else arrays
     header = SpzHeader(
         version=version,
         count=len(arrays.means),

@@ -1,0 +1,119 @@
+"""Axes of scenes and files: their names, and turning a scene from one to another."""
+
+from functools import cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.math.parameters import multiply_quats
+from cvtgs.math.spherical_harmonics import rest_basis
+from cvtgs.scene import GaussianScene
+
+AXES = (
+    *("ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf"),
+    *("lbd", "rbd", "lbu", "rbu", "lfd", "rfd", "lfu", "rfu"),
+)
+"""Where x, y and z point (left, right, up, down, back, forward), as SPZ numbers them from 1."""
+
+SCENE_AXES = "rdf"
+"""The axes of scenes in memory: right, down, forward, as PLY files of 3DGS have them."""
+
+_DIRECTIONS = {"r": (1, 0, 0), "u": (0, 1, 0), "b": (0, 0, 1)}
+_DIRECTIONS |= {"l": (-1, 0, 0), "d": (0, -1, 0), "f": (0, 0, -1)}
+
+_QUARTER_TURN = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]).double()
+"""(x, y, z) becomes (x, -z, y)."""
+
+
+def checked_axes(name: str) -> str:
+    """Return the name of axes in lower case."""
+    if name.lower() not in AXES:
+        raise InvalidArgumentError(
+            f"axes must be three letters for x, y and z, such as rdf (right, down, forward: PLY) "
+            f"or rub (right, up, back: Niantic), of {', '.join(AXES)}; found {name!r}."
+        )
+    return name.lower()
+
+
+def change_axes(scene: GaussianScene, source: str, target: str) -> GaussianScene:
+    """Turn a scene from one choice of axes to another.
+
+    Names have a letter each for x, y and z: where it points, of left or right, up or down, back or
+    forward, for example ``"rdf"`` (PLY files of 3DGS) or ``"rub"`` (OpenGL, Niantic's apps). Where
+    only signs differ, only signs of centres, quaternions and SH coefficients change. Axes of the
+    other handedness mirror the scene.
+
+    Args:
+        scene: The scene.
+        source: Its axes.
+        target: The axes to turn it to.
+
+    Returns:
+        The turned scene; this one if the axes are the same.
+
+    Raises:
+        InvalidArgumentError: There are no axes of this name.
+
+    Example:
+        >>> from cvtgs.synthetic import scene
+        >>> one = scene("object", 1, sh_degree=0, seed=0)
+        >>> change_axes(one, "rdf", "rub").means / one.means
+        tensor([[ 1., -1., -1.]])
+    """
+    matrix = _matrix(checked_axes(target)) @ _matrix(checked_axes(source)).T
+    if matrix[1, 1] == 0:  # y and z change places
+        scene = _with_quarter_turn(scene)
+        matrix = matrix @ _QUARTER_TURN.T
+    x, y, z = (int(sign) for sign in matrix.diagonal())
+    return scene if x == y == z == 1 else _with_signs(scene, x, y, z)
+
+
+def _matrix(name: str) -> Float[Tensor, "3 3"]:
+    """Return the axes as rows of right, up and back."""
+    return torch.tensor([_DIRECTIONS[letter] for letter in name], dtype=torch.float64)
+
+
+def _with_signs(scene: GaussianScene, x: int, y: int, z: int) -> GaussianScene:
+    """Change signs of coordinates; the axes of each Gaussian change theirs, too."""
+    return scene.with_tensors(
+        {
+            "means": scene.means * scene.means.new_tensor([x, y, z]),
+            "quats": scene.quats * scene.quats.new_tensor([1, y * z, x * z, x * y]),
+            "shN": scene.shN * _sh_signs(x, y, z).to(scene.shN)[: scene.shN.shape[1], None],
+        },
+        scene.extras,
+    )
+
+
+def _with_quarter_turn(scene: GaussianScene) -> GaussianScene:
+    turn = scene.quats.new_tensor([[0.5**0.5, 0.5**0.5, 0.0, 0.0]]).expand(len(scene), 4)
+    bands = _sh_quarter_turn().to(scene.shN)[: scene.shN.shape[1], : scene.shN.shape[1]]
+    return scene.with_tensors(
+        {
+            "means": scene.means @ _QUARTER_TURN.T.to(scene.means),
+            "quats": multiply_quats(turn, scene.quats),
+            "shN": torch.einsum("jk,nkc->njc", bands, scene.shN),
+        },
+        scene.extras,
+    )
+
+
+@cache
+def _sh_signs(x: int, y: int, z: int) -> Float[Tensor, "k"]:
+    """Return the sign of each SH function after that of coordinates, in a general direction."""
+    direction = torch.tensor([[0.2, 0.5, 0.9]], dtype=torch.float64)
+    turned = direction * direction.new_tensor([x, y, z])
+    return (rest_basis(turned, 3) / rest_basis(direction, 3))[0].sign()
+
+
+@cache
+def _sh_quarter_turn() -> Float[Tensor, "k k"]:
+    """Return the matrix of the quarter turn; each entry is the root of a whole number / 16."""
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(64, 3, generator=generator, dtype=torch.float64)
+    directions /= directions.norm(dim=1, keepdim=True)
+    basis, turned = rest_basis(directions, 3), rest_basis(directions @ _QUARTER_TURN, 3)
+    matrix: Tensor = torch.linalg.lstsq(basis, turned).solution
+    return matrix.sign() * ((16 * matrix**2).round() / 16).sqrt()
