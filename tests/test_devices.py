@@ -6,7 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from cvtgs.devices import chosen_device, device_name, one_thread, resolve_device, usable_device
+from cvtgs.devices import (
+    chosen_device,
+    chunk_length,
+    device_name,
+    one_thread,
+    resolve_device,
+    usable_device,
+)
 from cvtgs.errors import DeviceError
 
 
@@ -22,6 +29,11 @@ def test_auto_is_cuda_for_what_is_on_the_cpu(monkeypatch, has_cuda, home, found)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: has_cuda)
     assert resolve_device("auto") is None
     assert chosen_device("auto", home) == torch.device(found)
+
+
+def test_chunks_are_longer_where_launches_cost():
+    assert chunk_length(7, torch.device("cpu")) == 7
+    assert chunk_length(7, torch.device("cuda")) == 224
 
 
 @pytest.mark.parametrize("name", ["tpu9", "cpu:seven"])

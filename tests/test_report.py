@@ -42,6 +42,31 @@ def test_the_clock_tells_start_steps_and_end():
     assert clock.costs[0].peak_device_memory_bytes == 0
 
 
+def test_every_stage_has_its_own_peak_on_a_device(monkeypatch):
+    """The clock of a device that a test moves by hand; its memory peak is 50, then 20."""
+    memory = {"now": 0, "peak": 0}
+
+    def reset(device: torch.device) -> None:
+        if not torch.cuda.is_initialized():
+            raise RuntimeError("did you call init?")
+        memory["peak"] = memory["now"]
+
+    def take(count: int) -> None:
+        memory["now"] += count
+        memory["peak"] = max(memory["peak"], memory["now"])
+
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda device: None)
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: memory["peak"])
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: memory["now"] > 0)
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", reset)
+    clock = StageClock(silent, torch.device("cuda"))
+    for name, count in (("merge", 50), ("network", 10)):
+        with clock.stage(name):
+            take(count)
+            take(10 - count)
+    assert [cost.peak_device_memory_bytes for cost in clock.costs] == [50, 20]
+
+
 def test_a_stage_that_fails_has_no_cost_and_no_end():
     events: list[ProgressEvent] = []
     clock = StageClock(events.append, CPU)

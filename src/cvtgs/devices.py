@@ -9,6 +9,9 @@ import torch
 
 from cvtgs.errors import DeviceError
 
+LONGER_CHUNKS = 32
+"""How many times as much as on a CPU is computed together on another device."""
+
 
 def resolve_device(device: str | torch.device) -> torch.device | None:
     """Turn a name that may be ``auto`` into a device that is there.
@@ -100,6 +103,26 @@ def device_name(device: torch.device) -> str:
         lines = []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return models[0] if models else platform.processor() or platform.machine()
+
+
+def chunk_length(length: int, device: torch.device) -> int:
+    """Return how much to compute together on a device.
+
+    A chunk that fits the caches of a CPU is too short for a GPU, where every chunk costs the
+    launches of its operations and memory is ample.
+
+    Args:
+        length: What a CPU computes together.
+        device: Where it is computed.
+
+    Returns:
+        The length on a CPU, 32 times as much elsewhere.
+
+    Example:
+        >>> chunk_length(100, torch.device("cpu"))
+        100
+    """
+    return length if device.type == "cpu" else LONGER_CHUNKS * length
 
 
 @contextmanager

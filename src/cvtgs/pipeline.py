@@ -18,6 +18,7 @@ from cvtgs.analysis import (
     restore_columns,
 )
 from cvtgs.config import MergeConfig, SimplifyConfig
+from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
 from cvtgs.math.frames import RobustFrame, morton_order
 from cvtgs.math.segments import segment_ids
@@ -367,7 +368,8 @@ def geometric_error(
     """
     squares, total = 0.0, 0.0
     ids = segment_ids(partition.offsets)
-    for rows, cell in zip(partition.order.split(CHUNK), ids.split(CHUNK), strict=True):
+    chunk = chunk_length(CHUNK, scene.device)
+    for rows, cell in zip(partition.order.split(chunk), ids.split(chunk), strict=True):
         shifts = scene.means[rows].double() - small.means[cell].double()
         squares += float((masses[rows] * shifts.square().sum(dim=1)).sum())
         total += float(masses[rows].sum())

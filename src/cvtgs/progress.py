@@ -51,7 +51,8 @@ class StageCost(pydantic.BaseModel):
         cpu_seconds: Processor seconds of the whole process.
         peak_memory_bytes: Largest resident size of the process up to the end of the stage, or 0
             where the system does not tell; it never falls from stage to stage.
-        peak_device_memory_bytes: The same for tensors on a CUDA device, 0 elsewhere.
+        peak_device_memory_bytes: Largest size of tensors on a CUDA device during the stage, those
+            of the process before it included; 0 elsewhere.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -91,10 +92,12 @@ class StageClock:
         def advance(done: int) -> None:
             self._listener(ProgressEvent(stage=name, done=done, total=total))
 
+        on_cuda = self._device.type == "cuda"
         advance(0)
+        if on_cuda and torch.cuda.is_initialized():  # else there is no peak yet, and it would fail
+            torch.cuda.reset_peak_memory_stats(self._device)
         wall, cpu = time.perf_counter(), time.process_time()
         yield advance
-        on_cuda = self._device.type == "cuda"
         if on_cuda:
             torch.cuda.synchronize(self._device)
         self.costs.append(

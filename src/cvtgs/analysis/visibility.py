@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.devices import chunk_length
 from cvtgs.math.frames import RobustFrame
 
 VOXEL = 0.04
@@ -51,7 +52,8 @@ def ambient_visibility(
     voxels = add_depths(depths, means, masses, frame)
     visibility = visibility_grid(depths)
     del depths
-    return torch.cat([visibility[part.long()] for part in voxels.split(CHUNK)]).double()
+    parts = voxels.split(chunk_length(CHUNK, means.device))
+    return torch.cat([visibility[part.long()] for part in parts]).double()
 
 
 def empty_depth_grid(device: torch.device) -> Int[Tensor, "voxels"]:
@@ -95,8 +97,9 @@ def add_depths(
         [1.0]
     """
     voxels = torch.empty(len(means), dtype=torch.int32, device=means.device)
-    for start in range(0, len(means), CHUNK):
-        part = slice(start, start + CHUNK)
+    chunk = chunk_length(CHUNK, means.device)
+    for start in range(0, len(means), chunk):
+        part = slice(start, start + chunk)
         voxel, shrinkage = _voxels_of(means[part], frame)
         voxels[part] = voxel.to(torch.int32)
         depths = masses[part] * (shrinkage / (frame.radius * VOXEL)).square()
@@ -143,7 +146,8 @@ def visibility_at(
         >>> visibility_at(grid, torch.zeros(1, 3), frame).tolist()
         [1.0]
     """
-    parts = [grid[_voxels_of(part, frame)[0]] for part in means.split(CHUNK)]
+    chunks = means.split(chunk_length(CHUNK, means.device))
+    parts = [grid[_voxels_of(part, frame)[0]] for part in chunks]
     return torch.cat([grid[:0], *parts]).double()
 
 

@@ -5,6 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cells.partition import Partition
+from cvtgs.devices import chunk_length
 from cvtgs.math import parameters
 from cvtgs.math.segments import gather_columns
 from cvtgs.scene import GaussianScene
@@ -138,7 +139,8 @@ def inflate_cells(
     log_scales = merged.log_scales.clone()
     crowding = (counts.double().log10() / 2).clamp_max(1.0)
     strength = merged.opacities[: len(counts)].double().square() * crowding
-    for part in (counts > 1).nonzero()[:, 0].split(CHUNK):
+    chunk = chunk_length(CHUNK, counts.device)
+    for part in (counts > 1).nonzero()[:, 0].split(chunk):
         cover = side_cover(merged, part, neighbors[part]).amin(dim=2)
         growth = everywhere + covered * (cover / FULL_COVER).clamp_max(1.0)
         factors = 1 + strength[part, None] * growth

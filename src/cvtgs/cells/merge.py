@@ -10,6 +10,7 @@ from torch import Tensor
 
 from cvtgs.cells.partition import Partition
 from cvtgs.config import MergeConfig
+from cvtgs.devices import chunk_length
 from cvtgs.math import parameters
 from cvtgs.math.segments import (
     gather_columns,
@@ -59,7 +60,8 @@ def merge_cells(
     cells = is_merged.nonzero()[:, 0]
     done = len(is_merged) - len(cells)
     tensors, extras = merged.tensors(), dict(merged.extras)
-    for run, part in partition.select(is_merged).chunks(CHUNK_MEMBERS):
+    chunk = chunk_length(CHUNK_MEMBERS, scene.device)
+    for run, part in partition.select(is_merged).chunks(chunk):
         new_tensors, new_extras = _merge_chunk(scene, part, config)
         for name, values in new_tensors.items():
             tensors[name][cells[run]] = values.to(tensors[name].dtype)

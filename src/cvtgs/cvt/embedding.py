@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.devices import chunk_length
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import SH_C0
 
@@ -45,8 +46,9 @@ def embed(
     """
     colored = sh0 is not None and color > 0.0
     points = means.new_empty(len(means), 6 if colored else 3)
-    for start in range(0, len(means), CHUNK):
-        part = slice(start, start + CHUNK)
+    chunk = chunk_length(CHUNK, means.device)
+    for start in range(0, len(means), chunk):
+        part = slice(start, start + chunk)
         local = means[part]
         position = frame.contract(local, contraction) if contraction else frame.normalize(local)
         points[part, :3] = position.clamp_(-FARTHEST, FARTHEST)

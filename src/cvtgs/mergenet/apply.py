@@ -8,6 +8,7 @@ from torch import Tensor
 
 from cvtgs.cells import Partition
 from cvtgs.cells.features import describe_members, neighbor_context
+from cvtgs.devices import chunk_length
 from cvtgs.math import parameters
 from cvtgs.math.segments import segment_sum, segment_sum_of
 from cvtgs.mergenet.model import MergeNet, Residuals
@@ -68,13 +69,14 @@ def correct_cells(
     done = len(counts) - len(cells)
     originals = merged.tensors()
     tensors = {name: values.clone() for name, values in originals.items() if values.numel()}
-    step = max(1, CHUNK_MEMBERS // max(1, near))
+    chunk = chunk_length(CHUNK_MEMBERS, scene.device)
+    step = max(1, chunk // max(1, near))
     with torch.no_grad():
         for block in (slice(start, start + step) for start in range(0, len(cells), step)):
             context = neighbor_context(
                 merged, cells=cells[block], neighbors=neighbors[cells[block]], sizes=sizes
             )
-            for run, part in several.cut(block).chunks(CHUNK_MEMBERS, cell_cost=near):
+            for run, part in several.cut(block).chunks(chunk, cell_cost=near):
                 rows = cells[block][run]
                 descriptors = describe_members(
                     scene, part, context=context.cut(run), visibility=visibility
