@@ -19,7 +19,7 @@ import cvtgs
 from benchmarks.measuring import generated_scenes, machine
 from cvtgs.budget import CostModel, Work, cost_model
 from cvtgs.budget.calibrate import CANDIDATES, undisturbed_seconds
-from cvtgs.progress import StageCost
+from cvtgs.clock import StageCost
 from cvtgs.tradeoff.runs import Task, run_task
 
 SCENES = (

@@ -20,7 +20,7 @@ TEXTS = {path: path.read_text(encoding="utf-8") for path in FILES}
 # and `cameras` (data) stand as low as their imports allow.
 LEVELS = [
     {"errors", "progress"},
-    {"math", "devices", "plots", "counts", "boxes"},
+    {"math", "clock", "devices", "plots", "counts", "boxes"},
     {"config", "scene", "cameras"},
     {"validity", "io", "synthetic", "rendering", "losses"},
     {"views", "evaluation"},

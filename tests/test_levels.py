@@ -9,10 +9,10 @@ import cvtgs
 from cvtgs import Simplifier
 from cvtgs.analysis import analyze
 from cvtgs.cli.main import main
+from cvtgs.clock import StageClock
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
 from cvtgs.levels import LevelsIndex, level_names, write_levels
 from cvtgs.pipeline import reduce_scene
-from cvtgs.progress import StageClock
 from scenes import random_scene, same_bits
 
 RHOS = [0.2, 0.04, 0.004]

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from cvtgs import ProgressEvent, Simplifier, SimplifyConfig, SimplifyReport
-from cvtgs.progress import StageClock, StageCost, peak_memory_bytes, silent
+from cvtgs.clock import StageClock, StageCost, peak_memory_bytes
+from cvtgs.progress import silent
 from scenes import random_scene
 
 CPU = torch.device("cpu")

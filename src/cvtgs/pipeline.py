@@ -17,13 +17,13 @@ from cvtgs.analysis import (
     drop_unused_bands,
     restore_columns,
 )
+from cvtgs.clock import StageClock
 from cvtgs.config import MergeConfig, SimplifyConfig
 from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
 from cvtgs.math.frames import RobustFrame, morton_order
 from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import MergeNet, correct_cells
-from cvtgs.progress import StageClock
 from cvtgs.report import CellStatistics
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities

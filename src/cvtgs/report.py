@@ -5,9 +5,9 @@ from typing import NamedTuple
 import pydantic
 
 from cvtgs.analysis import EffectPlan
+from cvtgs.clock import StageCost
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
-from cvtgs.progress import StageCost
 from cvtgs.scene import GaussianScene
 
 

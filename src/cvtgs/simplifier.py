@@ -19,13 +19,14 @@ from cvtgs.analysis import (
 )
 from cvtgs.boxes import check_mask, check_room
 from cvtgs.cameras import Cameras
+from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shortfall, target_count
 from cvtgs.devices import chosen_device, resolve_device
 from cvtgs.errors import ConfigError, InvalidArgumentError
 from cvtgs.mergenet import SHIPPED, Checkpoint, load_checkpoint
 from cvtgs.pipeline import Reduced, geometric_error, reduce_scene
-from cvtgs.progress import ProgressListener, StageClock, silent
+from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified, SimplifyReport
 from cvtgs.scene import GaussianScene, concatenate
 from cvtgs.validity import (

@@ -9,6 +9,7 @@ import cvtgs
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.analysis import analyze
 from cvtgs.cli.main import main
+from cvtgs.clock import StageClock
 from cvtgs.errors import CheckpointError, ConfigError, InvalidArgumentError
 from cvtgs.mergenet import (
     Architecture,
@@ -19,7 +20,6 @@ from cvtgs.mergenet import (
     save_checkpoint,
 )
 from cvtgs.pipeline import reduce_scene
-from cvtgs.progress import StageClock
 from cvtgs.train.cases import merge_scene
 from cvtgs.validity import standardized
 from mergenet_cases import lively_net

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 import cvtgs
+from cvtgs.clock import StageCost
 from cvtgs.errors import ConfigError, InvalidArgumentError, RunError
 from cvtgs.evaluation import Evaluation, EvaluationSettings, SceneScores, Score, compare
-from cvtgs.progress import StageCost
 from cvtgs.report import SimplifyReport
 from cvtgs.tradeoff import Failure, Measured, Tradeoff, TradeoffResult, on_front, write_tradeoff
 from cvtgs.tradeoff.files import (

@@ -51,11 +51,10 @@ def drop_unused_bands(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
 
     Example:
         >>> from cvtgs.analysis import plan_effects
-        >>> from cvtgs.math.frames import robust_frame
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 10, sh_degree=2, seed=0)
         >>> dull = scene.with_tensors({"shN": torch.zeros_like(scene.shN)}, {})
-        >>> plan = plan_effects(dull, dull.masses, frame=robust_frame(dull.means))
+        >>> plan = plan_effects(dull, dull.masses, distances=torch.ones(10))
         >>> drop_unused_bands(dull, plan).sh_degree
         0
     """
@@ -75,12 +74,10 @@ def drop_mip_tag(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
     Example:
         >>> from cvtgs.config import SimplifyConfig
         >>> from cvtgs.analysis import plan_effects
-        >>> from cvtgs.math.frames import robust_frame
         >>> from cvtgs.synthetic import scene as make
         >>> scene = replace(make("object", 10, sh_degree=0, seed=0), comments=(ANTIALIASED_TAG,))
         >>> config = SimplifyConfig(effects=EffectsConfig(mip="off"))
-        >>> frame = robust_frame(scene.means)
-        >>> plan = plan_effects(scene, scene.masses, frame=frame, config=config)
+        >>> plan = plan_effects(scene, scene.masses, distances=torch.ones(10), config=config)
         >>> scene.antialiased, drop_mip_tag(scene, plan).antialiased
         (True, False)
     """
@@ -104,10 +101,9 @@ def restore_columns(small: GaussianScene, scene: GaussianScene, plan: EffectPlan
 
     Example:
         >>> from cvtgs.analysis import plan_effects
-        >>> from cvtgs.math.frames import robust_frame
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 10, sh_degree=3, seed=0)
-        >>> plan = plan_effects(scene, scene.masses, frame=robust_frame(scene.means))
+        >>> plan = plan_effects(scene, scene.masses, distances=torch.ones(10))
         >>> restore_columns(select_columns(scene, EffectsConfig(sh=0)), scene, plan).sh_degree
         3
     """

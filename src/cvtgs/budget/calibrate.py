@@ -16,13 +16,14 @@ import torch
 
 import cvtgs
 from cvtgs.budget.costs import CostModel, Measurement, Work
+from cvtgs.clock import StageCost
 from cvtgs.config import PRESETS, RefineConfig, Section, SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.counts import target_count
 from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import OutputError
 from cvtgs.io import atomic_output
-from cvtgs.progress import ProgressEvent, ProgressListener, StageCost, silent
+from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.scene import GaussianScene
 from cvtgs.simplifier import Simplifier
 from cvtgs.synthetic import scene as make

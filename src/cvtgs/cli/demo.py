@@ -10,8 +10,8 @@ from cvtgs.cli.display import file_size, progress_bars
 from cvtgs.cli.options import AddParser, add_options
 
 if TYPE_CHECKING:
+    from cvtgs.clock import StageCost
     from cvtgs.evaluation import SceneScores
-    from cvtgs.progress import StageCost
 
 RATIOS = (0.1, 0.01, 0.001)
 VIEWS, WIDTH, HEIGHT = 8, 640, 480

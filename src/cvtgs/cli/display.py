@@ -10,7 +10,7 @@ import cvtgs
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 
 if TYPE_CHECKING:
-    from cvtgs.progress import StageCost
+    from cvtgs.clock import StageCost
 
 
 def size_text(count: int) -> str:

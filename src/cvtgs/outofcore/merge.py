@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cvtgs import cells, cvt, validity
 from cvtgs.analysis import SceneAnalysis, drop_unused_bands, restore_columns, select_columns
+from cvtgs.clock import StageClock
 from cvtgs.devices import one_thread
 from cvtgs.io import atomic_output, save
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
@@ -19,7 +20,7 @@ from cvtgs.outofcore.halo import bounding_box, halo_cells, other_blocks
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.rows import read_members, read_rows
 from cvtgs.pipeline import merge_members, neighbor_count, reduce_scene, shape_merged
-from cvtgs.progress import StageClock, silent
+from cvtgs.progress import silent
 from cvtgs.report import CellStatistics
 from cvtgs.scene import GaussianScene
 

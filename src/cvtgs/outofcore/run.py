@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from cvtgs.boxes import Box, check_room
+from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, shortfall, target_count
 from cvtgs.devices import one_thread
@@ -34,7 +35,7 @@ from cvtgs.outofcore.memory import available_memory, block_count
 from cvtgs.outofcore.merge import BlockReport, correct, inflate, merge, simplify_block
 from cvtgs.outofcore.rows import SortedCounts, sort_range
 from cvtgs.outofcore.scan import RowRange, add_totals, read_sample, scan_range, scan_scene
-from cvtgs.progress import ProgressListener, StageClock, silent
+from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport
 from cvtgs.scene import concatenate
 from cvtgs.simplifier import Simplifier

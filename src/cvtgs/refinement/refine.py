@@ -5,11 +5,12 @@ from typing import NamedTuple
 import torch
 
 from cvtgs.cameras import Cameras
+from cvtgs.clock import StageClock
 from cvtgs.config import RefineConfig
 from cvtgs.devices import chosen_device
 from cvtgs.errors import InvalidSceneError
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer
-from cvtgs.progress import ProgressListener, StageClock, silent
+from cvtgs.progress import ProgressListener, silent
 from cvtgs.refinement.images import ImageBuffer, generated_views, split_views
 from cvtgs.refinement.limits import Limits, check_limits
 from cvtgs.refinement.optimize import STAGE, learning_rate_scales, optimize
