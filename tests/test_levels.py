@@ -110,6 +110,50 @@ def test_the_index_says_what_lies_there(scene, simplifier, tmp_path):
         write_levels(simplifier.levels(scene, RHOS), folder, rhos=RHOS, source="scene.ply")
 
 
+@pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
+@pytest.mark.parametrize("axes", ["rdf", "luf"])
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".splat", ".sog"])
+def test_boxes_counts_and_errors_are_those_of_the_files(scene, simplifier, tmp_path, suffix, axes):
+    levels = simplifier.levels(scene, RHOS)
+    write_levels(levels, tmp_path / "out", rhos=RHOS, source="a.ply", suffix=suffix, axes=axes)
+    index = json.loads((tmp_path / "out" / "levels.json").read_text())
+    assert len(index["levels"]) == len(RHOS)
+    for entry in index["levels"]:
+        path = tmp_path / "out" / entry["file"]
+        stored, small = cvtgs.load(path, axes="rdf"), cvtgs.load(path, axes=axes)
+        assert entry["count"] == len(stored)
+        assert entry["bytes"] == path.stat().st_size
+        assert entry["box_min"] == stored.means.amin(dim=0).tolist()
+        assert entry["box_max"] == stored.means.amax(dim=0).tolist()
+        level = levels[RHOS.index(entry["rho"])]
+        assert entry["geometric_error"] == level.geometric_error
+        wanted, found = (mean_distance(scene, other) for other in (level.scene, small))
+        assert found == pytest.approx(wanted, rel=0.02)  # so the error is that of the file, too
+        assert 0.5 < found / entry["geometric_error"] < 1.1
+
+
+def test_scores_are_those_of_the_files(scene, tmp_path):
+    """A .splat drops the view-dependent colours, and its score says so."""
+    cvtgs.save(scene, tmp_path / "in.ply")
+    words = ["levels", str(tmp_path / "in.ply"), "--rho", "0.1", "--views", "2", "--size", "32"]
+    psnr = {}
+    for suffix in (".ply", ".splat"):
+        out = tmp_path / suffix[1:]
+        assert main([*words, "-o", str(out), "--suffix", suffix, "--quiet"]) == 0
+        psnr[suffix] = json.loads((out / "levels.json").read_text())["levels"][0]["psnr"]
+    assert psnr[".splat"] != psnr[".ply"]
+    cameras = cvtgs.views.automatic_views(scene, 2, width=32, height=24)
+    files = {suffix: cvtgs.load(tmp_path / suffix[1:] / f"rho_0.1{suffix}") for suffix in psnr}
+    for one in cvtgs.evaluate(scene, files, cameras).scenes:
+        assert psnr[one.name] == pytest.approx(one.psnr.mean)
+
+
+def mean_distance(scene, small):
+    """Return the root mean square distance to the nearest small one, weighted by mass."""
+    squares = torch.cdist(scene.means, small.means).amin(dim=1).double() ** 2
+    return float(((scene.masses * squares).sum() / scene.masses.sum()).sqrt())
+
+
 def test_command(scene, tmp_path, capsys):
     cvtgs.save(scene, tmp_path / "in.ply")
     words = ["levels", str(tmp_path / "in.ply"), "-o", str(tmp_path / "out"), "--rho", "0.1,0.01"]

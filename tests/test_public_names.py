@@ -180,7 +180,14 @@ STAGES = {
         "on_front",
         "write_tradeoff",
     },
-    "levels": {"INDEX_NAME", "LevelEntry", "LevelsIndex", "level_names", "write_levels"},
+    "levels": {
+        "INDEX_NAME",
+        "LevelEntry",
+        "LevelsIndex",
+        "add_scores",
+        "level_names",
+        "write_levels",
+    },
     "outofcore": {
         "ClusterWorkers",
         "Workers",

@@ -9,10 +9,11 @@ import torch
 
 from cvtgs.config.base import Record
 from cvtgs.evaluation import Evaluation, SceneScores
-from cvtgs.io import atomic_output, check_output, check_save, save
+from cvtgs.io import atomic_output, check_output, check_save, load, save
+from cvtgs.io.axes import SCENE_AXES
 from cvtgs.report import Level
 
-__all__ = ["INDEX_NAME", "LevelEntry", "LevelsIndex", "level_names", "write_levels"]
+__all__ = ["INDEX_NAME", "LevelEntry", "LevelsIndex", "add_scores", "level_names", "write_levels"]
 
 INDEX_NAME = "levels.json"
 """Name of the index beside the levels."""
@@ -26,15 +27,15 @@ class LevelEntry(Record):
     Attributes:
         file: Name of the file, in the folder of the index.
         rho: Ratio of Gaussians that was given.
-        count: Its Gaussians.
+        count: Gaussians in the file.
         bytes: Size of the file.
         geometric_error: Root mean square distance from the Gaussians of the full scene to those
             that represent them, weighted by mass; scene units. 0 if all are there.
-        box_min: Least coordinates of the centres, scene units.
-        box_max: Largest coordinates of the centres.
+        box_min: Least coordinates of the centres in the file, in its axes, scene units.
+        box_max: Largest coordinates of the centres in the file.
         nested: Whether each of its cells consists of whole cells of the finest level.
         seconds: Wall-clock seconds beyond what finer levels had done already.
-        psnr: Mean PSNR against the full scene, dB; None if it was not measured.
+        psnr: Mean PSNR of the file against the full scene, dB; None if it was not measured.
         ssim: The same for SSIM.
         lpips: The same for LPIPS.
     """
@@ -53,35 +54,43 @@ class LevelEntry(Record):
     lpips: float | None = None
 
     @classmethod
-    def of(
-        cls, level: Level, rho: float, *, file: str, size: int, scores: SceneScores | None
-    ) -> Self:
-        """Describe a level.
+    def of(cls, level: Level, rho: float, path: Path) -> Self:
+        """Describe a level by its file, which may hold rounded values.
 
         Args:
             level: The level.
             rho: Ratio that was given.
-            file: Name of its file.
-            size: Bytes of its file.
-            scores: Its scores; None if it was not evaluated.
+            path: Its file.
 
         Returns:
-            The entry.
+            The entry, without scores.
         """
-        lowest, highest = torch.aminmax(level.scene.means, dim=0)
+        stored = load(path, axes=SCENE_AXES, trust_sizes=True)
+        lowest, highest = torch.aminmax(stored.means, dim=0)
         return cls(
-            file=file,
+            file=path.name,
             rho=rho,
-            count=len(level.scene),
-            bytes=size,
+            count=len(stored),
+            bytes=path.stat().st_size,
             geometric_error=level.geometric_error,
             box_min=_corner(lowest),
             box_max=_corner(highest),
             nested=level.nested,
             seconds=level.report.seconds,
-            psnr=scores.psnr.mean if scores else None,
-            ssim=scores.ssim.mean if scores else None,
-            lpips=scores.lpips.mean if scores and scores.lpips else None,
+        )
+
+    def with_scores(self, scores: SceneScores) -> Self:
+        """Add scores.
+
+        Args:
+            scores: The scores of the file.
+
+        Returns:
+            A new entry.
+        """
+        lpips = None if scores.lpips is None else scores.lpips.mean
+        return self.model_copy(
+            update={"psnr": scores.psnr.mean, "ssim": scores.ssim.mean, "lpips": lpips}
         )
 
 
@@ -155,8 +164,7 @@ def write_levels(
     rhos: Sequence[float],
     source: str,
     suffix: str = ".ply",
-    evaluation: Evaluation | None = None,
-    axes: str = "rdf",
+    axes: str = SCENE_AXES,
     overwrite: bool = False,
 ) -> LevelsIndex:
     """Write levels and, at last, the index that names them.
@@ -167,7 +175,6 @@ def write_levels(
         rhos: The ratio of each.
         source: Name of the full scene.
         suffix: End of the names, which says the format.
-        evaluation: Scores of the levels, by the names of :func:`level_names`; None for none.
         axes: The axes of the files, as :func:`cvtgs.io.change_axes` names them.
         overwrite: Whether existing files may be replaced.
 
@@ -190,18 +197,57 @@ def write_levels(
     place, names = Path(folder), level_names(rhos, suffix)
     check_levels(place, names, overwrite=overwrite)
     place.mkdir(exist_ok=True)
-    scores = {one.name: one for one in evaluation.scenes} if evaluation else {}
     entries = []
     for level, rho, name in zip(levels, rhos, names, strict=True):
         save(level.scene, place / name, overwrite=overwrite, axes=axes)
-        size = (place / name).stat().st_size
-        entries.append(LevelEntry.of(level, rho, file=name, size=size, scores=scores.get(name)))
+        entries.append(LevelEntry.of(level, rho, place / name))
     index = LevelsIndex(
         source=source,
         source_count=levels[0].report.input_count,
-        views=len(evaluation.views) if evaluation else 0,
         levels=tuple(sorted(entries, key=lambda entry: -entry.count)),
     )
-    with atomic_output(place / INDEX_NAME, overwrite=overwrite) as file:
-        file.write(index.to_json().encode())
+    _write_index(index, place, overwrite=overwrite)
     return index
+
+
+def add_scores(folder: str | os.PathLike[str], evaluation: Evaluation) -> LevelsIndex:
+    """Add scores to the index of levels that were written.
+
+    Args:
+        folder: Where :func:`write_levels` wrote.
+        evaluation: Scores of the files, by their names.
+
+    Returns:
+        The index with scores, as it is now in the folder.
+
+    Raises:
+        OutputError: The index cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> import cvtgs
+        >>> scene = cvtgs.synthetic.scene("object", 500)
+        >>> levels = cvtgs.Simplifier(device="cpu").levels(scene, [0.1])
+        >>> views = cvtgs.views.automatic_views(scene, 2, width=32, height=24)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     index = write_levels(levels, folder, rhos=[0.1], source="object", suffix=".spz")
+        ...     files = {"rho_0.1.spz": cvtgs.load(f"{folder}/rho_0.1.spz")}
+        ...     index = add_scores(folder, cvtgs.evaluate(scene, files, views))
+        >>> index.views, index.levels[0].psnr is None
+        (2, False)
+    """
+    place = Path(folder)
+    index = LevelsIndex.model_validate_json((place / INDEX_NAME).read_bytes())
+    scores = {one.name: one for one in evaluation.scenes}
+    levels = tuple(
+        level.with_scores(scores[level.file]) if level.file in scores else level
+        for level in index.levels
+    )
+    index = index.model_copy(update={"levels": levels, "views": len(evaluation.views)})
+    _write_index(index, place, overwrite=True)
+    return index
+
+
+def _write_index(index: LevelsIndex, folder: Path, *, overwrite: bool) -> None:
+    with atomic_output(folder / INDEX_NAME, overwrite=overwrite) as file:
+        file.write(index.to_json().encode())

@@ -1,7 +1,7 @@
 """``cvtgs levels``: several sizes of one scene, and an index for viewers."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import cvtgs
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation
     from cvtgs.levels import LevelsIndex
     from cvtgs.progress import ProgressListener
-    from cvtgs.report import Level
     from cvtgs.scene import GaussianScene
 
 
@@ -71,17 +70,22 @@ def levels(options: argparse.Namespace) -> None:
         scene = cvtgs.load(options.input, axes=axes.source, trust_sizes=options.trust_sizes)
         cameras = None if options.cameras is None else cvtgs.load_cameras(options.cameras)
         made = simplifier.levels(scene, rhos, cameras=cameras)
-        scores = None if options.no_scores else _score(options, scene, made, names, listener)
         index = cvtgs.levels.write_levels(
             made,
             options.output,
             rhos=rhos,
             source=options.input.name,
             suffix=options.suffix,
-            evaluation=scores,
             axes=axes.target,
             overwrite=options.overwrite,
         )
+        if not options.no_scores:
+            files = {
+                name: cvtgs.load(options.output / name, axes=axes.target, trust_sizes=True)
+                for name in names
+            }
+            evaluation = _score(options, scene, files, listener)
+            index = cvtgs.levels.add_scores(options.output, evaluation)
     if not options.quiet:
         _print_index(index)
 
@@ -89,8 +93,7 @@ def levels(options: argparse.Namespace) -> None:
 def _score(
     options: argparse.Namespace,
     scene: "GaussianScene",
-    levels: "Sequence[Level]",
-    names: Sequence[str],
+    levels: "Mapping[str, GaussianScene]",
     listener: "ProgressListener",
 ) -> "Evaluation":
     from cvtgs.devices import chosen_device
@@ -99,7 +102,7 @@ def _score(
     full = scene.select(cvtgs.validity.valid_rows(scene)).to(device)
     return cvtgs.evaluate(
         full,
-        {name: level.scene.to(device) for name, level in zip(names, levels, strict=True)},
+        {name: level.to(device) for name, level in levels.items()},
         choose_cameras(options, full),
         settings=evaluation_settings(options),
         listener=listener,
