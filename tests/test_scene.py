@@ -8,6 +8,7 @@ import pickle
 import pytest
 import torch
 
+import cvtgs
 from cvtgs import GaussianScene
 from cvtgs.errors import InvalidSceneError
 from scenes import random_scene, same_bits
@@ -199,3 +200,21 @@ def test_scenes_can_be_copied_and_sent_to_other_processes(copied):
     assert all(torch.equal(other.tensors()[name], value) for name, value in scene.tensors().items())
     assert torch.equal(other.extras["label"], scene.extras["label"])
     assert (other.comments, other.layout) == (scene.comments, scene.layout)
+
+
+def test_scenes_are_joined_in_their_order():
+    scene = random_scene(7).with_tensors({}, {"label": torch.arange(7)})
+    parts = [scene.select(torch.arange(first, last)) for first, last in ((0, 2), (2, 3), (3, 7))]
+    assert same_bits(cvtgs.concatenate(parts), scene)
+    assert cvtgs.concatenate(parts[:1]) is parts[0]
+
+
+def test_scenes_that_do_not_fit_are_not_joined():
+    scene = random_scene(3)
+    labelled = scene.with_tensors({}, {"label": torch.arange(3)})
+    with pytest.raises(InvalidSceneError, match="same extra columns"):
+        cvtgs.concatenate([scene, labelled])
+    with pytest.raises(InvalidSceneError, match="same SH degree"):
+        cvtgs.concatenate([random_scene(3, degree=0), random_scene(3, degree=1)])
+    with pytest.raises(InvalidSceneError, match="at least one scene"):
+        cvtgs.concatenate([])

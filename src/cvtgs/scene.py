@@ -220,11 +220,23 @@ def concatenate(scenes: Sequence[GaussianScene]) -> GaussianScene:
     Raises:
         InvalidSceneError: The scenes do not fit together.
     """
+    if not scenes:
+        raise InvalidSceneError("joining needs at least one scene, found none.")
     first, *others = scenes
     if not others:
         return first
-    if any(set(other.extras) != set(first.extras) for other in others):
-        raise InvalidSceneError("scenes to join must have the same extra columns.")
+    for number, other in enumerate(others, start=1):
+        if set(other.extras) != set(first.extras):
+            raise InvalidSceneError(
+                f"scenes to join must have the same extra columns; the first has "
+                f"{sorted(first.extras)}, scene {number} has {sorted(other.extras)}."
+            )
+        if (other.sh_degree, other.dtype) != (first.sh_degree, first.dtype):
+            raise InvalidSceneError(
+                f"scenes to join must have the same SH degree and dtype; the first has "
+                f"{first.sh_degree} and {first.dtype}, scene {number} {other.sh_degree} and "
+                f"{other.dtype}."
+            )
     tensors = [scene.tensors() for scene in scenes]
     return first.with_tensors(
         {name: torch.cat([each[name] for each in tensors]) for name in tensors[0]},
