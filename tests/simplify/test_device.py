@@ -1,0 +1,137 @@
+"""Simplification on a pretended CUDA device: no mixing of devices, the CPU's bits, few waits."""
+
+import pytest
+import torch
+
+from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.cvt import nearest_backend, nearest_neighbors, nearest_several
+from pretended_device import CUDA, DeviceTensor, pretended_cuda
+from scenes import random_scene, same_bits
+
+PRESETS = ["draft", "fast", "standard", "paper"]
+WAITS, COPIES = 100, 66
+"""Most waits of the host, and copies, in one simplification.
+
+Of the copies 24 are the network and 6 the scene. Both grow only with the moves until tessellation
+settles, each of which copies points and sites to the host, labels and distances back.
+"""
+
+
+def on_device(scene):
+    """Check that a scene is on the device, and bring it back."""
+    assert all(isinstance(tensor, DeviceTensor) for tensor in scene.tensors().values())
+    return scene.to("cpu")
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_scene_on_a_device(preset, dtype):
+    scene = random_scene(600, degree=1, dtype=dtype)
+    wanted = Simplifier(config=preset, device="cpu").simplify(scene, 0.1)
+    with pretended_cuda() as traffic:
+        small, report = Simplifier(config=preset, device="cuda").run(scene.to("cuda"), 0.1)
+        assert same_bits(on_device(small), wanted)
+    assert report.backend == "scipy"
+    assert traffic.waits.total() <= WAITS, traffic.waits
+    assert traffic.copies.total() <= COPIES, traffic.copies
+
+
+def test_a_larger_scene_waits_no_more():
+    scene = random_scene(6000, degree=0, size=0.02)
+    with pretended_cuda() as traffic:
+        Simplifier(device="cuda").simplify(scene.to("cuda"), 0.02)
+    assert traffic.waits.total() <= WAITS, traffic.waits
+    assert traffic.copies.total() <= COPIES, traffic.copies
+
+
+def test_auto_takes_the_device_for_a_scene_of_the_cpu():
+    scene = random_scene(300)
+    wanted = Simplifier(device="cpu").simplify(scene, 0.1)
+    with pretended_cuda() as traffic:
+        assert same_bits(Simplifier().simplify(scene, 0.1).to("cpu"), wanted)
+    assert traffic.copies
+
+
+def test_the_search_by_blocks():
+    scene = random_scene(400)
+    config = SimplifyConfig.from_mapping({"cvt": {"backend": "torch"}})
+    wanted = Simplifier(config=config, device="cpu").simplify(scene, 0.1)
+    with pretended_cuda():
+        small, report = Simplifier(config=config, device="cuda").run(scene.to("cuda"), 0.1)
+        assert same_bits(on_device(small), wanted)
+    assert report.backend == "torch"
+
+
+@pytest.mark.parametrize("preset", ["standard", "paper"])
+def test_levels(preset):
+    scene, rhos = random_scene(2000, degree=1), [0.2, 0.04, 0.01]
+    wanted = Simplifier(config=preset, device="cpu").levels(scene, rhos)
+    with pretended_cuda():
+        found = Simplifier(config=preset, device="cuda").levels(scene.to("cuda"), rhos)
+        for level, same in zip(found, wanted, strict=True):
+            assert same_bits(on_device(level.scene), same.scene)
+            assert level.geometric_error == same.geometric_error
+
+
+@pytest.mark.parametrize("preset", ["draft", "standard"])
+def test_protected_regions(preset):
+    scene = random_scene(500, degree=1)
+    keep = torch.arange(500) % 25 == 0
+    wanted = Simplifier(config=preset, device="cpu").simplify(scene, 0.1, keep=keep)
+    with pretended_cuda():
+        simplifier = Simplifier(config=preset, device="cuda")
+        for mask in (keep, keep.to("cuda")):
+            assert same_bits(
+                on_device(simplifier.simplify(scene.to("cuda"), 0.1, keep=mask)), wanted
+            )
+
+
+@pytest.mark.parametrize("name", ["auto", "scipy", "torch"])
+def test_nearest_sites_of_points_on_a_device(name):
+    points = torch.randn(300, 3, generator=torch.Generator().manual_seed(0))
+    sites = torch.cat([points[::7], points[:3]])  # some twice
+    _, search = nearest_backend(name)
+    wanted = search(points, sites)
+    with pretended_cuda():
+        found = search(points.to("cuda"), sites.to("cuda"))
+        for one, same in zip(found, wanted, strict=True):
+            assert one.device == CUDA
+            assert torch.equal(one.cpu(), same)
+
+
+def test_neighbours_on_a_device():
+    sites = torch.randn(100, 3, generator=torch.Generator().manual_seed(0)).repeat(2, 1)
+    wanted = nearest_neighbors(sites, 5), *nearest_several(sites, sites[:50], 4)
+    with pretended_cuda():
+        there = sites.to("cuda")
+        found = nearest_neighbors(there, 5), *nearest_several(there, there[:50], 4)
+        for one, same in zip(found, wanted, strict=True):
+            assert one.device == CUDA
+            assert torch.equal(one.cpu(), same)
+
+
+def test_the_pretended_device_refuses_and_counts():
+    host = torch.arange(6.0).reshape(2, 3)
+    with pretended_cuda() as traffic:
+        there = host.to("cuda")
+        assert there.device == (there + 1).device == torch.zeros(2, device="cuda").device == CUDA
+        for mix in (
+            lambda: there + host,
+            lambda: host[there.long()],
+            lambda: torch.cat([there, host]),
+        ):
+            with pytest.raises(RuntimeError, match="on the same device"):
+                mix()
+        with pytest.raises(TypeError, match="numpy"):
+            there.numpy()
+        with pytest.raises(RuntimeError, match="generator"):
+            torch.rand(2, device="cuda", generator=torch.Generator())
+        assert (traffic.waits.total(), traffic.copies.total()) == (0, 1)
+        assert float(there.sum()) == 15
+        assert there[there > 2].tolist() == [3, 4, 5]
+        assert there[:, [2, 0]].cpu().tolist() == [[2, 0], [5, 3]]
+        assert (traffic.waits.total(), traffic.copies.total()) == (2, 4)
+        there[0] += 1
+        assert torch.equal(there[:1].cpu(), host[:1] + 1)
+    with pytest.raises(RuntimeError, match="no device outside"):
+        there + 1
