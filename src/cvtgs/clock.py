@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pydantic
 import torch
 
-from cvtgs.progress import ProgressEvent, ProgressListener
+from cvtgs.progress import ProgressEvent, ProgressListener, silent
 
 
 class StageCost(pydantic.BaseModel):
@@ -59,7 +59,8 @@ class StageClock:
         """
 
         def advance(done: int) -> None:
-            self._listener(ProgressEvent(stage=name, done=done, total=total))
+            if self._listener is not silent:
+                self._listener(ProgressEvent(stage=name, done=done, total=total))
 
         on_cuda = self._device.type == "cuda"
         advance(0)
