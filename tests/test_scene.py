@@ -10,7 +10,7 @@ import torch
 
 import cvtgs
 from cvtgs import GaussianScene
-from cvtgs.errors import InvalidSceneError
+from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from scenes import random_scene, same_bits
 
 INF = float("inf")
@@ -51,6 +51,19 @@ def test_sh_puts_the_constant_band_first():
 @pytest.mark.parametrize(("rest", "degree"), [(0, 0), (3, 1), (8, 2), (15, 3)])
 def test_degree(rest, degree):
     assert GaussianScene(**tensors_of(rest=rest)).sh_degree == degree
+
+
+def test_bands_above_a_degree_are_dropped():
+    scene = random_scene(5, degree=3)
+    for degree, count in ((0, 0), (1, 3), (2, 8)):
+        small = scene.with_sh_degree(degree)
+        assert small.sh_degree == degree
+        assert torch.equal(small.shN, scene.shN[:, :count])
+        assert torch.equal(small.means, scene.means)
+    assert scene.with_sh_degree(3) is scene
+    assert random_scene(5, degree=1).with_sh_degree(2).sh_degree == 1
+    with pytest.raises(InvalidArgumentError, match="the SH degree must be from 0 to 3, found 4"):
+        scene.with_sh_degree(4)
 
 
 def test_an_empty_scene_is_a_scene():

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.errors import InvalidSceneError
+from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.math import parameters, spherical_harmonics
 
 ANTIALIASED_TAG = "SplatRenderMode: mip"
@@ -159,6 +159,26 @@ class GaussianScene:
             {name: tensor.index_select(0, rows) for name, tensor in self.tensors().items()},
             {name: column.index_select(0, rows) for name, column in self.extras.items()},
         )
+
+    def with_sh_degree(self, degree: int) -> Self:
+        """Drop the SH bands above a degree; files of the scene get smaller.
+
+        Args:
+            degree: 0 to 3.
+
+        Returns:
+            The same Gaussians with fewer bands; this scene if it has none above the degree.
+
+        Raises:
+            InvalidArgumentError: There is no such degree.
+        """
+        if degree not in range(len(spherical_harmonics.REST_COUNTS)):
+            raise InvalidArgumentError(f"the SH degree must be from 0 to 3, found {degree!r}.")
+        if degree >= self.sh_degree:
+            return self
+        count = spherical_harmonics.REST_COUNTS[degree]
+        # A copy: sums over cells read rows in one piece.
+        return self.with_tensors({"shN": self.shN[:, :count].contiguous()}, self.extras)
 
     def with_tensors(self, tensors: Mapping[str, Tensor], extras: Mapping[str, Tensor]) -> Self:
         """Return a scene of other Gaussians with the comments and the layout of this one.

@@ -155,3 +155,33 @@ def test_axes_are_not_for_blocks(
     words = ["simplify", str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), "--rho", "0.1"]
     assert main([*words, "--memory", "300kB", "--axes", "rub"]) == 1
     assert "blocks cannot go with --axes, which need the whole scene" in capsys.readouterr().err
+
+
+@pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
+@pytest.mark.parametrize("end", FORMATS)
+def test_dropped_bands_make_files_smaller(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], end: str
+) -> None:
+    source = tmp_path / "a.ply"
+    save(replace(storable_scene(300), comments=()), source)
+    save(load(source).with_sh_degree(1), tmp_path / f"wanted.{end}")
+    words = ["convert", str(source), str(tmp_path / f"b.{end}"), "--sh-degree", "1"]
+    assert main(words) == 0
+    assert "SH bands above degree 1 (--sh-degree)" in capsys.readouterr().out
+    assert (tmp_path / f"b.{end}").read_bytes() == (tmp_path / f"wanted.{end}").read_bytes()
+    assert load(tmp_path / f"b.{end}").sh_degree == (0 if end == "splat" else 1)
+
+
+@pytest.mark.parametrize(("degree", "columns"), [(0, 0), (1, 9), (3, 45)])
+def test_simplify_and_levels_write_no_columns_of_dropped_bands(
+    tmp_path: Path, degree: int, columns: int
+) -> None:
+    source, small = tmp_path / "a.ply", tmp_path / "b.ply"
+    save(storable_scene(300), source)
+    words = ["--ckpt", "none", "--quiet", "--sh-degree", str(degree)]
+    assert main(["simplify", str(source), str(small), "--count", "20", *words]) == 0
+    levels = ["levels", str(source), "-o", str(tmp_path / "levels"), "--rho", "0.1"]
+    assert main([*levels, *words, "--no-scores"]) == 0
+    for path in (small, tmp_path / "levels" / "rho_0.1.ply"):
+        assert path.read_bytes().count(b"property float f_rest_") == columns
+        assert load(path).sh_degree == degree

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from cvtgs.analysis.effects import EffectPlan
 from cvtgs.config import EffectsConfig
-from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import ANTIALIASED_TAG, FLAT_LOG_SCALE, GaussianScene
 
 
@@ -32,7 +31,7 @@ def select_columns(scene: GaussianScene, choices: EffectsConfig) -> GaussianScen
         True
     """
     if choices.sh != "auto":
-        scene = _of_degree(scene, choices.sh)
+        scene = scene.with_sh_degree(choices.sh)
     if choices.extras == "off" and scene.extras:
         scene = scene.with_tensors({}, {})
     return scene
@@ -58,7 +57,7 @@ def drop_unused_bands(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
         >>> drop_unused_bands(dull, plan).sh_degree
         0
     """
-    return drop_mip_tag(_of_degree(scene, plan.sh.degree), plan)
+    return drop_mip_tag(scene.with_sh_degree(plan.sh.degree), plan)
 
 
 def drop_mip_tag(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
@@ -116,14 +115,6 @@ def restore_columns(small: GaussianScene, scene: GaussianScene, plan: EffectPlan
     if changes:
         small = small.with_tensors(changes, small.extras)
     return small if small.comments == scene.comments else replace(small, comments=scene.comments)
-
-
-def _of_degree(scene: GaussianScene, degree: int) -> GaussianScene:
-    if degree >= scene.sh_degree:
-        return scene
-    # A copy: sums over cells read rows in one piece.
-    rest = scene.shN[:, : REST_COUNTS[degree]].contiguous()
-    return scene.with_tensors({"shN": rest}, scene.extras)
 
 
 def _flattened(log_scales: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:

@@ -89,7 +89,16 @@ def add_convert(add_parser: AddParser) -> None:
         "Prints what the format of OUT cannot hold before writing it.",
     )
     parser.set_defaults(run=convert)
-    add_options(parser, "input", "output", "--axes", "--trust-sizes", "--overwrite", "--quiet")
+    add_options(
+        parser,
+        "input",
+        "output",
+        "--sh-degree",
+        "--axes",
+        "--trust-sizes",
+        "--overwrite",
+        "--quiet",
+    )
 
 
 def convert(options: argparse.Namespace) -> None:
@@ -97,9 +106,13 @@ def convert(options: argparse.Namespace) -> None:
     axes = read_axes(options.axes)
     cvtgs.io.check_save(options.output, overwrite=options.overwrite)
     scene = cvtgs.io.load(options.input, axes=axes.source, trust_sizes=options.trust_sizes)
+    degree, phrases = scene.sh_degree, []
+    if options.sh_degree is not None and options.sh_degree < degree:
+        scene = scene.with_sh_degree(options.sh_degree)
+        phrases = [f"SH bands above degree {options.sh_degree} (--sh-degree)"]
     lost = cvtgs.io.losses(scene, options.output)
     if not options.quiet:
-        print(f"{options.input}: {len(scene):,} Gaussians of SH degree {scene.sh_degree}")
+        print(f"{options.input}: {len(scene):,} Gaussians of SH degree {degree}")
         if lost.changed:
             print(f"Files like {options.output.name} hold:")
         for phrase in lost.changed:
@@ -113,4 +126,4 @@ def convert(options: argparse.Namespace) -> None:
             f"{file_size(options.input)} -> {file_size(options.output)}"
         )
         rest = "nothing but precision" if lost.changed else "nothing"
-        print(f"Lost: {'; '.join(lost.dropped) or rest}.")
+        print(f"Lost: {'; '.join([*phrases, *lost.dropped]) or rest}.")

@@ -40,7 +40,7 @@ def add_levels(add_parser: AddParser) -> None:
     parser.add_argument(
         "--suffix", default=".ply", metavar="END", help="format of the files (default .ply)"
     )
-    add_options(parser, "--preset", "--ckpt", "--config", "--set", "--axes")
+    add_options(parser, "--preset", "--ckpt", "--config", "--set", "--sh-degree", "--axes")
     parser.add_argument(
         "--no-scores", action="store_true", help="skip rendering and scoring the levels"
     )
@@ -68,6 +68,8 @@ def levels(options: argparse.Namespace) -> None:
             checkpoint, config=config, device=options.device, listener=listener
         )
         scene = cvtgs.load(options.input, axes=axes.source, trust_sizes=options.trust_sizes)
+        if options.sh_degree is not None:
+            scene = scene.with_sh_degree(options.sh_degree)
         cameras = None if options.cameras is None else cvtgs.load_cameras(options.cameras)
         made = simplifier.levels(scene, rhos, cameras=cameras)
         index = cvtgs.levels.write_levels(

@@ -106,6 +106,12 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
         "default": "auto",
         "help": "device to compute on: auto (default), cpu or cuda",
     },
+    "--sh-degree": {
+        "metavar": "D",
+        "type": int,
+        "choices": range(4),
+        "help": "drop the SH bands of IN above this degree, 0 to 3; OUT gets smaller",
+    },
     "--axes": {
         "metavar": "IN[:OUT]",
         "help": "axes of the files: where x, y and z point, for example rub (right, up, back) or "
@@ -295,12 +301,14 @@ def _setting_names(section: "type[pydantic.BaseModel]", prefix: str = "") -> Ite
 def read_scene(
     options: argparse.Namespace, config: "SimplifyConfig", *, axes: str | None = None
 ) -> "GaussianScene":
-    """Read the scene of ``IN`` without what ``--effects`` switches off."""
-    degree = None if config.effects.sh == "auto" else config.effects.sh
-    return cvtgs.io.load(
+    """Read the scene of ``IN`` without what ``--effects`` and ``--sh-degree`` leave out."""
+    kept = getattr(options, "sh_degree", None)
+    limits = [limit for limit in (config.effects.sh, kept) if isinstance(limit, int)]
+    scene = cvtgs.io.load(
         options.input,
-        sh_degree=degree,
+        sh_degree=min(limits, default=None),
         extras=config.effects.extras != "off",
         axes=axes,
         trust_sizes=options.trust_sizes,
     )
+    return scene if kept is None else scene.with_sh_degree(kept)

@@ -119,7 +119,9 @@ def add_simplify(add_parser: AddParser) -> None:
     parser.add_argument(
         "--report", type=Path, metavar="R.json", help="file for a report of the run in JSON"
     )
-    add_options(parser, "--axes", "--device", "--trust-sizes", "--overwrite", "--quiet")
+    add_options(
+        parser, "--sh-degree", "--axes", "--device", "--trust-sizes", "--overwrite", "--quiet"
+    )
 
 
 def simplify(options: argparse.Namespace) -> None:
@@ -310,7 +312,7 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
     from cvtgs.io.ply import open_rows
     from cvtgs.outofcore import available_memory, block_count, check_config, read_bytes
 
-    names = ("target_psnr", "target_ssim", "time_budget", "cameras", "axes")
+    names = ("target_psnr", "target_ssim", "time_budget", "cameras", "axes", "sh_degree")
     excluded = [name for name in names if getattr(options, name) is not None]
     memory = available_memory() if options.memory is None else read_bytes(options.memory)
     if options.memory is None and options.scheduler is None:
