@@ -19,7 +19,7 @@ TEXTS = {path: path.read_text(encoding="utf-8") for path in FILES}
 # the effect plan of `analysis`, so each stands above what it needs; `devices` (names of devices)
 # and `cameras` (data) stand as low as their imports allow.
 LEVELS = [
-    {"errors", "progress"},
+    {"errors", "progress", "text"},
     {"math", "clock", "devices", "plots", "counts", "boxes"},
     {"config", "scene", "cameras"},
     {"validity", "io", "synthetic", "rendering", "losses"},

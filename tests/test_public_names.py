@@ -226,6 +226,7 @@ ERRORS = {
     "OutputExistsError": FileExistsError,
     "OutputError": OSError,
     "DeviceError": RuntimeError,
+    "OutOfMemoryError": MemoryError,
     "CheckpointError": ValueError,
     "MissingDependencyError": ImportError,
     "TrainingError": RuntimeError,

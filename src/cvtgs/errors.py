@@ -1,5 +1,16 @@
 """The errors and warnings of cvtgs; each is also the builtin that it specialises."""
 
+import errno
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_NO_MEMORY = re.compile(
+    r"(?i)(can.?not|can't|not enough|out of|failed to) (allocate )?memory|bad.?alloc|"
+    r"ALLOC_FAILED|failed to map segment|can't start new thread|could not allocate"
+)
+"""How torch, CUDA and the loader of libraries tell that there is no memory."""
+
 
 class CvtgsError(Exception):
     """Base of every error that cvtgs raises on purpose; its text is one clear sentence."""
@@ -45,6 +56,10 @@ class CheckpointError(CvtgsError, ValueError):
     """A MergeNet checkpoint cannot be used."""
 
 
+class OutOfMemoryError(CvtgsError, MemoryError):
+    """There is not enough memory; the text says what to do."""
+
+
 class TrainingError(CvtgsError, RuntimeError):
     """A training cannot go on; the text says where it stopped, and which file is good."""
 
@@ -63,3 +78,25 @@ class MissingDependencyError(CvtgsError, ImportError):
 
 class DroppedDataWarning(UserWarning):
     """Something in the input was left out; the text says what, how much and why."""
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether an error of any library means that there is not enough memory."""
+    if isinstance(error, MemoryError):
+        return True
+    if isinstance(error, OSError) and error.errno == errno.ENOMEM:
+        return True
+    told = isinstance(error, RuntimeError | ImportError | OSError)
+    return told and _NO_MEMORY.search(str(error)) is not None
+
+
+@contextmanager
+def memory_errors(work: str, advice: str) -> Iterator[None]:
+    """Turn what every library raises without memory into one sentence."""
+    try:
+        yield
+    except Exception as error:
+        cause = error.__cause__ if isinstance(error, CvtgsError) else error
+        if isinstance(error, OutOfMemoryError) or cause is None or not is_out_of_memory(cause):
+            raise
+        raise OutOfMemoryError(f"{work} needs more memory than there is; {advice}.") from error

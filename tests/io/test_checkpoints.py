@@ -1,7 +1,10 @@
 """Checkpoints of nerfstudio and gsplat."""
 
 import pickle
+import random
+import warnings
 from collections import OrderedDict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +13,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from cvtgs import GaussianScene, load, to_dict
-from cvtgs.errors import FileFormatError
+from cvtgs import GaussianScene, from_dict, load, to_dict
+from cvtgs.errors import FileFormatError, InvalidSceneError
 from scenes import random_scene, same_bits
 
 NEWER, OLDER = "_model.gauss_params.", "_model."
@@ -131,3 +134,73 @@ def test_a_pickle_is_not_opened(tmp_path: Path) -> None:
     path.write_bytes(pickle.dumps(Evil()))
     with pytest.raises(FileFormatError, match="found another file"):
         load(path)
+
+
+MEANS = random_scene(3).means
+ODD: dict[str, Callable[[], Any]] = {
+    "found int": lambda: 5,
+    "found list": lambda: [MEANS],
+    "found layout sparse_coo": MEANS.to_sparse,
+    "found layout sparse_csr": MEANS.to_sparse_csr,
+    "found a nested one": lambda: torch.nested.nested_tensor([MEANS, MEANS]),
+    "found one without values (device meta)": lambda: MEANS.to("meta"),
+    "found a single number": lambda: torch.tensor(1.0),
+    "floats, found torch.int64": MEANS.long,
+    "means must have shape": lambda: torch.zeros(3, 3, 3),
+}
+"""Means that are something else, by how a sentence about them ends."""
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("found", ODD)
+def test_what_is_no_tensor_of_rows(tmp_path: Path, found: str) -> None:
+    path, means = tmp_path / "a.pt", ODD[found]()
+    state = to_dict(random_scene(3)) | {"means": means}
+    torch.save({"splats": state}, path)
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    text = str(caught.value)
+    assert found in text or "must be a whole checkpoint of tensors and plain numbers" in text
+    if not isinstance(means, Tensor) or means.layout == torch.strided:
+        with pytest.raises(InvalidSceneError) as alone:
+            from_dict(state)
+        assert found in str(alone.value)
+
+
+def test_no_advice_of_torch_is_passed_on(tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    torch.save({"splats": to_dict(random_scene(2)), "more": Evil()}, path)
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    assert "must be a whole checkpoint of tensors and plain numbers, found" in str(caught.value)
+    assert "weights_only" not in str(caught.value)
+
+
+def test_many_names_are_not_all_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.pt"
+    torch.save({f"{i}" * 100: 1 for i in range(50)}, path)
+    with pytest.raises(FileFormatError) as caught:
+        load(path)
+    assert len(str(caught.value)) < 500 + len(str(path))
+
+
+def test_every_damage_is_one_sentence(tmp_path: Path) -> None:
+    """Bits of the pickle, of the zip's directory and of everything, flipped."""
+    path, dice = tmp_path / "a.pt", random.Random(3)
+    torch.save({"splats": to_dict(random_scene(2, degree=0)), "rate": 0.1}, path)
+    content = path.read_bytes()
+    for number in range(400):
+        data, start = bytearray(content), number % 3 * len(content) // 3
+        for _ in range(dice.choice((1, 2, 8))):
+            data[dice.randrange(start, len(data))] = dice.choice((0, 1, 255, dice.randrange(256)))
+        path.write_bytes(data)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                load(path)
+        except FileFormatError as error:
+            text = str(error)
+            assert text.startswith(f"{path}: ")
+            assert text.endswith(".")
+            assert "\n" not in text
+            assert len(text) < 500 + len(str(path))

@@ -1,5 +1,6 @@
 """PlayCanvas' compressed PLY files."""
 
+import math
 import struct
 from pathlib import Path
 
@@ -204,3 +205,24 @@ def test_any_damage_is_an_error_of_ours(
     path.write_bytes(bytes(content[: data.draw(st.integers(0, len(content)))]))
     text = refusal(path)
     assert text is None or text.startswith(str(path))
+
+
+@pytest.mark.parametrize("missing", COLORS)
+def test_ranges_of_colours_are_all_there_or_none(tmp_path: Path, missing: str) -> None:
+    path = tmp_path / "a.ply"
+    path.write_bytes(by_hand([name for name in RANGES + COLORS if name != missing]))
+    assert refusal(path).endswith(f"must have the float property '{missing}', found none.")
+
+
+def test_ranges_that_are_not_finite_give_no_warning(tmp_path: Path) -> None:
+    path, content = tmp_path / "a.ply", by_hand()
+    at = content.index(struct.pack("<6f", 0, 0, 0, 4, 4, 4))
+    path.write_bytes(content[:at] + struct.pack("<2f", math.nan, -math.inf) + content[at + 8 :])
+    assert not load(path).means.isfinite().all()
+
+
+def test_long_names_are_cut(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    names = "".join(f"element {i}{chr(0x1F600) * 150} 1\nproperty int a\n" for i in range(9))
+    path.write_text(f"ply\nformat ascii 1.0\n{names}end_header\n1\n", encoding="utf-8")
+    assert len(refusal(path)) < 500 + len(str(path))

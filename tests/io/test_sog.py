@@ -280,3 +280,44 @@ def test_any_damage_is_an_error_of_ours(
     path.write_bytes(bytes(content[: data.draw(st.integers(0, len(content)))]))
     text = refusal(path)
     assert text is None or text.startswith(str(path))
+
+
+@pytest.mark.parametrize(
+    "name", ["", "..", "a\x00b", "\ud800", "a\x1b[2J", "c:x", "a" * 5000 + "/b"]
+)
+def test_odd_names_are_refused(tmp_path: Path, name: str) -> None:
+    path = changed(tmp_path, lambda meta: meta["quats"].update(files=[name]))
+    text = refusal(path)
+    assert "the files of a SOG must be named without folders, found" in text
+    assert text.isprintable()
+    assert len(text) < 200 + len(str(path))
+
+
+def zip_version_99(data: bytearray) -> None:
+    for start in (b"PK\x01\x02", b"PK\x03\x04"):
+        at = data.index(start)
+        data[at + 4 + 2 * (start[2] == 1)] = 99
+
+
+def undecodable_name(data: bytearray) -> None:
+    at = data.index(b"PK\x01\x02")
+    data[at + 9] |= 8  # names are UTF-8
+    data[at + 46] = 0xFF
+
+
+def other_name_before_the_file(data: bytearray) -> None:
+    data[30] = 0xFF
+    data[7] |= 8
+
+
+@pytest.mark.parametrize("damage", [zip_version_99, undecodable_name, other_name_before_the_file])
+def test_damage_of_the_zip(tmp_path: Path, damage: Callable[[bytearray], None]) -> None:
+    data, path = bytearray(THEIRS.read_bytes()), tmp_path / "a.sog"
+    damage(data)
+    path.write_bytes(data)
+    assert "found" in refusal(path)
+
+
+def test_numbers_beyond_float32_give_no_warning(tmp_path: Path) -> None:
+    path = changed(tmp_path, lambda meta: meta["means"].update(maxs=[1e308, 1e308, 1e308]))
+    assert not load(path).means.isfinite().all()

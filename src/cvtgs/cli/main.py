@@ -16,10 +16,14 @@ from cvtgs.cli.levels import add_levels
 from cvtgs.cli.options import CommandParser
 from cvtgs.cli.simplify import add_simplify
 from cvtgs.cli.train import add_train
-from cvtgs.errors import CvtgsError
+from cvtgs.errors import CvtgsError, memory_errors
 
 INTERRUPTED = 130
 TERMINATED = 143
+MEMORY_ADVICE = (
+    "free some, or give simplify less to hold at once: a binary .ply with --memory AMOUNT, for "
+    "example 2GB, and --device cpu if a GPU ran out"
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -37,7 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         warnings.showwarning = _show_warning
         warnings.simplefilter("always", UserWarning)
         try:
-            options.run(options)
+            with memory_errors(f"cvtgs {options.command}", MEMORY_ADVICE):
+                options.run(options)
         except CvtgsError as error:
             print(f"cvtgs: error: {error}", file=sys.stderr)
             return 1

@@ -5,19 +5,20 @@ import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from cvtgs.errors import CvtgsError, FileFormatError, InvalidSceneError
+from cvtgs.errors import CvtgsError, FileFormatError, InvalidSceneError, is_out_of_memory
 from cvtgs.io.dicts import check_tensors, from_dict
-from cvtgs.io.documents import shown
 from cvtgs.io.files import open_input
 from cvtgs.io.sizes import check_stored
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
+from cvtgs.text import shown
 
 _NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN", "features_dc", "features_rest")
 _ALLOWED = re.compile(
@@ -42,14 +43,12 @@ def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
     trains colours without SH through a sigmoid; these become ordinary colours. A tensor that
     repeats numbers instead of storing them is refused, unless sizes are trusted.
     """
-    tensors, splatfacto = _scene_tensors(_unpickled(path), path)
-    try:
+    with _damage_named(path):
+        tensors, splatfacto = _scene_tensors(_unpickled(path), path)
         check_tensors(tensors)
         if not trust_sizes:
             check_stored(path, tensors)
         scene = from_dict({name: tensor.clone() for name, tensor in tensors.items()})
-    except InvalidSceneError as error:
-        raise FileFormatError(f"{path}: {error}") from error
     if splatfacto and scene.sh_degree == 0:
         colors = torch.sigmoid(scene.sh0)
         return scene.with_tensors({"sh0": (colors - 0.5) / SH_C0}, {})
@@ -69,8 +68,34 @@ def _scene_tensors(content: Any, path: Path) -> tuple[dict[str, Tensor], bool]:
                 return tensors, "features_dc" in tensors
     raise FileFormatError(
         f"{path}: a checkpoint must hold a scene under 'splats' (gsplat) or "
-        f"'pipeline' (nerfstudio's Splatfacto), found {', '.join(map(repr, groups)) or 'neither'}."
+        f"'pipeline' (nerfstudio's Splatfacto), found {_keys_of(groups)}."
     )
+
+
+def _keys_of(groups: Mapping[Any, Any]) -> str:
+    names = [shown(name) for name in islice(groups, 6)]
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "") or "neither"
+
+
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    """Turn whatever pickle, zip, struct and torch raise for a damaged file into one sentence.
+
+    Texts of torch are not passed on: some advise to let the file execute what it likes.
+    """
+    try:
+        yield
+    except InvalidSceneError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    except CvtgsError:
+        raise
+    except Exception as error:
+        if is_out_of_memory(error):
+            raise
+        raise FileFormatError(
+            f"{path}: must be a whole checkpoint of tensors and plain numbers, found damage "
+            f"({type(error).__name__})."
+        ) from error
 
 
 def _unpickled(path: Path) -> Any:
@@ -80,22 +105,14 @@ def _unpickled(path: Path) -> Any:
             raise FileFormatError(
                 f"{path}: must be a checkpoint that torch.save wrote as a zip, found another file."
             )
-    try:
-        for name in _names_in(path):
-            if not _ALLOWED.fullmatch(name):
-                raise FileFormatError(
-                    f"{path}: must be a whole checkpoint of tensors and plain numbers, "
-                    f"found {shown(name)}."
-                )
-        with _numpy_numbers_ignored():
-            return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except (CvtgsError, MemoryError):
-        raise
-    except Exception as error:  # pickle, zip and torch raise nearly all there are
-        raise FileFormatError(
-            f"{path}: must be a whole checkpoint of tensors and plain numbers, found damage "
-            f"({type(error).__name__})."
-        ) from error
+    for name in _names_in(path):
+        if not _ALLOWED.fullmatch(name):
+            raise FileFormatError(
+                f"{path}: must be a whole checkpoint of tensors and plain numbers, "
+                f"found {shown(name)}."
+            )
+    with _numpy_numbers_ignored():
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
 
 
 def _names_in(path: Path) -> Iterator[str]:

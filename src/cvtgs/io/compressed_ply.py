@@ -82,6 +82,11 @@ def read_compressed_ply(path: Path) -> GaussianScene:
         header = read_header(file, str(path))
         _check(header, path)
         tables = _read_tables(file, header, path)
+    with np.errstate(all="ignore"):  # damaged ranges give numbers that are not finite
+        return replace(_scene_of(tables), comments=header.comments)
+
+
+def _scene_of(tables: dict[str, Rows]) -> GaussianScene:
     ranges = _ranges(tables["chunk"])
     vertices = tables["vertex"]
     packed = {name: vertices[name] for name in _PACKED}
@@ -99,7 +104,7 @@ def read_compressed_ply(path: Path) -> GaussianScene:
         sh0=sh0_of_colors(_between(ranges[:, 12:18], colors[:, :3])),
         shN=_rest(tables.get("sh"), len(vertices)),
     )
-    return replace(scene_of(arrays), comments=header.comments)
+    return scene_of(arrays)
 
 
 def _between(
@@ -139,8 +144,10 @@ def _check(header: Header, path: Path) -> None:
         raise FileFormatError(
             f"{path}: a compressed PLY must be binary_little_endian, found {header.encoding}."
         )
+    chunk = found["chunk"].properties if "chunk" in found else ()
+    is_colored = any(prop.name in _RANGES[_UNCOLORED:] for prop in chunk)
     for name, wanted, kind in (
-        ("chunk", _RANGES[:_UNCOLORED], "float"),
+        ("chunk", _RANGES if is_colored else _RANGES[:_UNCOLORED], "float"),
         ("vertex", _PACKED, "uint"),
     ):
         types = {prop.name: prop.type for prop in found[name].properties} if name in found else {}

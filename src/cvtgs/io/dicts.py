@@ -11,6 +11,7 @@ from torch import Tensor
 from cvtgs.errors import InvalidSceneError
 from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
+from cvtgs.text import shown
 
 _TENSORS = {
     "means": "means",
@@ -111,11 +112,13 @@ def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
     prefix = _prefix(mapping)
     keys: dict[str, str] = {}
     for key in mapping:
+        if not isinstance(key, str):
+            raise InvalidSceneError(f"the names must be {_KNOWN}, found {shown(key)}.")
         if not key.startswith(prefix):
             continue
         name = _TENSORS.get(key.removeprefix(prefix))
         if name is None:
-            raise InvalidSceneError(f"the names must be {_KNOWN}, found {key!r}.")
+            raise InvalidSceneError(f"the names must be {_KNOWN}, found {shown(key)}.")
         if name in keys:
             raise InvalidSceneError(
                 f"a dictionary must give {name} once, found {keys[name]!r} and {key!r}."
@@ -135,7 +138,7 @@ def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
 
 def _prefix(mapping: Mapping[str, Any]) -> str:
     """Return the common prefix of the names: what stands before ``means``."""
-    found = [key for key in mapping if key == "means" or key.endswith(".means")]
+    found = [key for key in mapping if str(key) == "means" or str(key).endswith(".means")]
     if len(found) > 1:
         raise InvalidSceneError(
             f"a dictionary must give means once, found {' and '.join(map(repr, found))}."

@@ -10,6 +10,7 @@ from pydantic import AllowInfNan, BeforeValidator, Field, Strict
 
 from cvtgs.errors import FileFormatError
 from cvtgs.io.files import open_input
+from cvtgs.text import shown
 
 _MOST_WHOLE = 1 << 53
 """Whole numbers up to here are the same in every JSON parser."""
@@ -59,12 +60,6 @@ def _sentence(model: type[Document], value: Any, keys: Sequence[int | str], wher
     required = schema.get("description") or schema["anyOf"][0]["description"]  # X, X | None
     found = shown(value[key]) if key in value else "none"
     return f"{where}: {key!r} must be {required}, found {found}."
-
-
-def shown(value: Any) -> str:
-    """Return a value as Python writes it, cut after 60 characters."""
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def read_json(path: Path) -> Any:

@@ -6,12 +6,17 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from pkgutil import resolve_name
 from types import MappingProxyType
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import torch
 
 from cvtgs.devices import usable_device
-from cvtgs.errors import DroppedDataWarning, FileFormatError, InvalidArgumentError
+from cvtgs.errors import (
+    DroppedDataWarning,
+    FileFormatError,
+    InvalidArgumentError,
+    memory_errors,
+)
 from cvtgs.io.atomic import atomic_output, check_output
 from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
 from cvtgs.io.files import is_file, scene_file
@@ -32,6 +37,10 @@ _READERS: Mapping[str, str] = MappingProxyType(
     }
 )
 """Readers by suffix, of which the first that fits counts; imported when they are needed."""
+
+_ADVICE = (
+    "free some, or simplify a binary .ply block by block: cvtgs simplify IN OUT --memory AMOUNT"
+)
 
 _SIZED = (".compressed.ply", ".splat")
 """Formats besides plain PLY whose files have as many bytes as their rows take."""
@@ -87,6 +96,7 @@ def load(
         MissingDependencyError: Reading this file needs an optional package.
         DeviceError: The device is not there.
         InvalidArgumentError: There is no such SH degree, or there are no such axes.
+        OutOfMemoryError: The scene does not fit into memory.
 
     Example:
         >>> import tempfile
@@ -110,20 +120,21 @@ def load(
         from cvtgs.io.ply.header import is_compressed_ply  # noqa: PLC0415 (loaded as readers are)
 
         suffix = ".compressed.ply" if is_compressed_ply(source) else ".ply"
-    read: Callable[..., GaussianScene] = resolve_name(_READERS[suffix])
+    options: dict[str, Any] = {} if suffix in _SIZED else {"trust_sizes": trust_sizes}
     if suffix == ".ply":
-        scene = read(source, sh_degree=sh_degree, extras=extras)
+        options = {"sh_degree": sh_degree, "extras": extras}
     elif suffix == ".spz":
-        scene = read(source, axes=axes, trust_sizes=trust_sizes)
-    else:
-        scene = read(source, **({} if suffix in _SIZED else {"trust_sizes": trust_sizes}))
-    if axes is not None and suffix != ".spz":
-        scene = change_axes(scene, axes, SCENE_AXES)
-    if suffix != ".ply" and sh_degree is not None and sh_degree < scene.sh_degree:
-        rest = scene.shN.clone()
-        rest[:, REST_COUNTS[sh_degree] :] = 0.0
-        scene = scene.with_tensors({"shN": rest}, scene.extras)
-    return scene.to(device)
+        options["axes"] = axes
+    with memory_errors(f"{source}: reading the scene", _ADVICE):
+        read: Callable[..., GaussianScene] = resolve_name(_READERS[suffix])
+        scene = read(source, **options)
+        if axes is not None and suffix != ".spz":
+            scene = change_axes(scene, axes, SCENE_AXES)
+        if suffix != ".ply" and sh_degree is not None and sh_degree < scene.sh_degree:
+            rest = scene.shN.clone()
+            rest[:, REST_COUNTS[sh_degree] :] = 0.0
+            scene = scene.with_tensors({"shN": rest}, scene.extras)
+        return scene.to(device)
 
 
 def save(

@@ -19,8 +19,9 @@ from cvtgs.io.cameras.views import (
     hold_out,
     viewmat_of_pose,
 )
-from cvtgs.io.documents import Document, Items, Number, Text, Vector, Whole, shown, validated
+from cvtgs.io.documents import Document, Items, Number, Text, Vector, Whole, validated
 from cvtgs.io.files import is_file, open_input
+from cvtgs.text import shown
 
 _PinholeModel = Literal[
     "PINHOLE",

@@ -12,6 +12,7 @@ import torch
 
 from cvtgs.errors import CvtgsError, FileFormatError, InvalidSceneError
 from cvtgs.io.files import open_input
+from cvtgs.text import shown
 
 Encoding = Literal["ascii", "binary_little_endian", "binary_big_endian"]
 
@@ -230,15 +231,15 @@ def _check_unique(elements: tuple[Element, ...], path: str) -> None:
     for element in elements:
         if element.name in tables:
             raise FileFormatError(
-                f"{path}: elements must have different names, found {element.name!r} twice."
+                f"{path}: elements must have different names, found {shown(element.name)} twice."
             )
         tables.add(element.name)
         columns: set[str] = set()
         for prop in element.properties:
             if prop.name in columns:
                 raise FileFormatError(
-                    f"{path}: properties of element {element.name!r} must have different names, "
-                    f"found {prop.name!r} twice."
+                    f"{path}: properties of element {shown(element.name)} must have different "
+                    f"names, found {shown(prop.name)} twice."
                 )
             columns.add(prop.name)
 

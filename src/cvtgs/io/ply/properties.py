@@ -9,6 +9,7 @@ import torch
 from cvtgs.errors import FileFormatError
 from cvtgs.io.ply.header import FLOAT_TYPES, Element, Header, Layout
 from cvtgs.math.spherical_harmonics import REST_COUNTS
+from cvtgs.text import shown
 
 NORMALS = ("nx", "ny", "nz")
 """Columns that 3DGS files carry for viewers of point clouds, almost always zero."""
@@ -77,7 +78,7 @@ def find_vertices(header: Header, path: str) -> Element:
     """Find the vertex element and check that it holds Gaussians."""
     vertex = next((element for element in header.elements if element.name == "vertex"), None)
     if vertex is None:
-        found = ", ".join(repr(element.name) for element in header.elements[:5]) or "no element"
+        found = ", ".join(shown(element.name) for element in header.elements[:5]) or "no element"
         found += ", ..." if len(header.elements) > 5 else ""
         raise FileFormatError(f"{path}: must have an element 'vertex', found {found}.")
     _check_properties(vertex, path)

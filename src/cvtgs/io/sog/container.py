@@ -11,8 +11,9 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import UInt8
 
-from cvtgs.errors import FileFormatError
+from cvtgs.errors import FileFormatError, is_out_of_memory
 from cvtgs.io.files import is_file, open_input
+from cvtgs.text import shown
 
 META = "meta.json"
 MOST_META_BYTES = 1 << 20
@@ -60,10 +61,12 @@ def _inside(path: Path) -> Iterator[tuple[Reader, StoredBytes]]:
     with open_input(path) as file:
         try:
             archive = zipfile.ZipFile(file)
-        except (zipfile.BadZipFile, ValueError) as error:
+        except Exception as error:  # zipfile passes on what its parts raise
+            if is_out_of_memory(error):
+                raise
             raise FileFormatError(
                 f"{path}: a .sog file must be a zip of meta.json and images, found none: "
-                f"{str(error).lower()}."
+                f"{_reason(error)}."
             ) from error
 
         def read(name: str, most: int) -> bytes:
@@ -81,19 +84,28 @@ def _inside(path: Path) -> Iterator[tuple[Reader, StoredBytes]]:
                     return member.read(most)
             except KeyError as error:
                 raise FileFormatError(f"{path}: must contain {name}, found none.") from error
-            except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+            except FileFormatError:
+                raise
+            except Exception as error:
+                if is_out_of_memory(error):
+                    raise
                 raise FileFormatError(
-                    f"{path}: {name} must be whole, found damage: {error}."
+                    f"{path}: {name} must be whole, found damage: {_reason(error)}."
                 ) from error
 
         with archive:
             yield read, lambda names: os.fstat(file.fileno()).st_size
 
 
+def _reason(error: Exception) -> str:
+    return shown(str(error).lower().rstrip(".") or type(error).__name__)[1:-1]
+
+
 def _check_name(name: str, path: Path) -> None:
-    if PurePosixPath(name).name != name or "\\" in name:
+    plain = name.isprintable() and name not in ("", "..") and not set(name) & set("\\:")
+    if PurePosixPath(name).name != name or not plain:
         raise FileFormatError(
-            f"{path}: the files of a SOG must be named without folders, found {name!r}."
+            f"{path}: the files of a SOG must be named without folders, found {shown(name)}."
         )
 
 
@@ -119,8 +131,10 @@ def decode_webp(content: bytes, where: str, *, most_pixels: int) -> UInt8[np.nda
         raise FileFormatError(f"{where} must be a WebP image, found something else.") from error
     except FileFormatError:
         raise
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise FileFormatError(f"{where} must be a whole image, found: {error}.") from error
+    except Exception as error:  # Pillow passes on what its codecs raise
+        if is_out_of_memory(error):
+            raise
+        raise FileFormatError(f"{where} must be a whole image, found: {_reason(error)}.") from error
 
 
 def encode_webp(numbers: UInt8[np.ndarray, "h w 4"]) -> bytes:

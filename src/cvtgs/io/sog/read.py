@@ -144,7 +144,8 @@ def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
         InputError: A file cannot be opened or read.
         FileFormatError: It is not a SOG, or damaged.
     """
-    with open_container(path) as (read, stored):
+    # Numbers of a damaged file may be beyond float32.
+    with open_container(path) as (read, stored), np.errstate(all="ignore"):
         where = str(path) if path.name == META else f"{path}: {META}"
         meta = _read_meta(parse_json(read(META, MOST_META_BYTES), where), where)
         document = meta.document

@@ -1,0 +1,44 @@
+"""Other people's texts in messages: names in files, comments, paths, whatever they contain."""
+
+import json
+import re
+from typing import Any
+
+_UNSAFE = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+"""Control characters but tab and line feed, those that change the direction, lone surrogates."""
+
+MOST_LETTERS = 60
+"""Of a value in an error text."""
+
+
+def printable(text: str, encoding: str = "utf-8") -> str:
+    r"""Return a text with what a terminal obeys, or cannot encode, as ``\u001b`` (also in JSON)."""
+    text = _UNSAFE.sub(lambda match: _escaped(match[0]), text)
+    try:
+        text.encode(encoding)
+    except UnicodeEncodeError:
+        return "".join(letter if _fits(letter, encoding) else _escaped(letter) for letter in text)
+    return text
+
+
+def _fits(letter: str, encoding: str) -> bool:
+    try:
+        letter.encode(encoding)
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _escaped(letter: str) -> str:
+    return f"\\u{ord(letter):04x}" if ord(letter) < 1 << 16 else json.dumps(letter)[1:-1]
+
+
+def shown(value: Any) -> str:
+    """Return a value as Python writes it, cut after 60 characters."""
+    try:
+        text = repr(value)
+    except RecursionError:  # lists in lists in lists
+        return f"a deeply nested {type(value).__name__}"
+    return text if len(text) <= MOST_LETTERS else f"{text[: MOST_LETTERS - 3]}..."

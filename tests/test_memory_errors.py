@@ -1,0 +1,98 @@
+"""What every library raises without memory is one sentence, with what to do."""
+
+import errno
+from pathlib import Path
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs import io
+from cvtgs.cli.main import main
+from cvtgs.errors import FileFormatError, OutOfMemoryError, is_out_of_memory, memory_errors
+from scenes import random_scene
+
+
+def torch_error() -> RuntimeError:
+    """Return what torch really raises."""
+    try:
+        torch.empty(1 << 60, dtype=torch.uint8)
+    except RuntimeError as error:
+        return error
+    raise AssertionError
+
+
+NO_MEMORY = {
+    "python": MemoryError(),
+    "torch": torch_error(),
+    "torch on Windows": RuntimeError("DefaultCPUAllocator: not enough memory: you tried to"),
+    "cuda": torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+    "cuda kernel": RuntimeError("CUDA error: out of memory"),
+    "cublas": RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling"),
+    "c++": RuntimeError("std::bad_alloc"),
+    "system": OSError(errno.ENOMEM, "Cannot allocate memory"),
+    "loader": ImportError("libtorch.so: failed to map segment from shared object"),
+    "threads": RuntimeError("can't start new thread"),
+}
+
+
+@pytest.mark.parametrize("name", NO_MEMORY)
+def test_known_signs(name: str) -> None:
+    assert is_out_of_memory(NO_MEMORY[name])
+    with pytest.raises(OutOfMemoryError) as caught, memory_errors("the work", "rest"):
+        raise NO_MEMORY[name]
+    assert str(caught.value) == "the work needs more memory than there is; rest."
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError("shapes differ"), KeyError("out of memory"), ValueError(), OSError()]
+)
+def test_other_errors_stay(error: Exception) -> None:
+    assert not is_out_of_memory(error)
+    with pytest.raises(type(error)), memory_errors("the work", "rest"):
+        raise error
+
+
+def test_causes_count_and_sentences_are_not_wrapped_twice() -> None:
+    outer, inner = memory_errors("two", "rest"), memory_errors("one", "rest")
+    with pytest.raises(OutOfMemoryError, match="one needs"), outer, inner:
+        raise MemoryError
+    with pytest.raises(OutOfMemoryError, match="two needs"), memory_errors("two", "rest"):
+        raise FileFormatError("damaged.") from MemoryError()
+    with pytest.raises(FileFormatError), memory_errors("two", "rest"):
+        raise FileFormatError("damaged.") from ValueError()
+
+
+def without_memory(*_: object, **__: object) -> None:
+    torch.empty(1 << 60, dtype=torch.uint8)
+
+
+@pytest.mark.parametrize("reader", ["ply:read_ply", "splat:read_splat"])
+def test_at_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: str) -> None:
+    module, name = reader.split(":")
+    path = tmp_path / f"a.{module}"
+    io.save(random_scene(2, degree=0), path)
+    monkeypatch.setattr(f"cvtgs.io.{module}.{name}", without_memory)
+    with pytest.raises(OutOfMemoryError) as caught:
+        io.load(path)
+    assert str(caught.value) == (
+        f"{path}: reading the scene needs more memory than there is; free some, or simplify a "
+        f"binary .ply block by block: cvtgs simplify IN OUT --memory AMOUNT."
+    )
+    assert isinstance(caught.value, MemoryError)
+
+
+def test_at_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.ply"
+    io.save(random_scene(50), path)
+    monkeypatch.setattr(cvtgs.Simplifier, "run", without_memory)
+    words = ["simplify", str(path), str(tmp_path / "b.ply"), "--rho", "0.5", "--quiet"]
+    assert main([*words, "--preset", "fast"]) == 1
+    assert capsys.readouterr().err == (
+        "cvtgs: error: cvtgs simplify needs more memory than there is; free some, or give simplify "
+        "less to hold at once: a binary .ply with --memory AMOUNT, for example 2GB, and --device "
+        "cpu if a GPU ran out.\n"
+    )
+    assert not (tmp_path / "b.ply").exists()
