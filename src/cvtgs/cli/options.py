@@ -1,6 +1,7 @@
 """Options that several commands share, and reading their values."""
 
 import argparse
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
@@ -312,3 +313,33 @@ def read_scene(
         trust_sizes=options.trust_sizes,
     )
     return scene if kept is None else scene.with_sh_degree(kept)
+
+
+def check_written_files(options: argparse.Namespace) -> None:
+    """Refuse to write OUT or the report over each other or over a file that is read.
+
+    Only OUT may replace IN, which is read before.
+    """
+    read = {"IN": cvtgs.io.scene_file(options.input)} | {
+        f"--{name}": Path(value)
+        for name in ("config", "cameras", "keep", "ckpt")
+        if (value := getattr(options, name)) not in (None, "auto", "none")
+    }
+    written = {"OUT": options.output, "--report": options.report}
+    for name, path in written.items():
+        others = {key: other for key, other in read.items() if (name, key) != ("OUT", "IN")}
+        others |= {"OUT": options.output} if name == "--report" else {}
+        for other, taken in others.items():
+            if path is not None and _is_same_file(path, taken):
+                raise InvalidArgumentError(
+                    f"{name} must be another file than {other}, found {path} for both."
+                )
+
+
+def _is_same_file(path: Path, other: Path) -> bool:
+    if os.path.realpath(path) == os.path.realpath(other):
+        return True
+    try:
+        return path.samefile(other)  # a link, or another spelling where case does not count
+    except (OSError, ValueError):
+        return False

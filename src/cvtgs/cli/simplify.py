@@ -14,6 +14,7 @@ from cvtgs.cli.options import (
     CAMERA_FILES,
     AddParser,
     add_options,
+    check_written_files,
     read_axes,
     read_scene,
     read_settings,
@@ -24,6 +25,8 @@ from cvtgs.errors import (
     GoalError,
     InputError,
     InvalidArgumentError,
+    OutputError,
+    OutputExistsError,
 )
 from cvtgs.progress import ProgressListener, silent
 
@@ -139,6 +142,7 @@ def simplify(options: argparse.Namespace) -> None:
     cvtgs.io.check_save(options.output, overwrite=options.overwrite)
     if options.report is not None:
         cvtgs.io.check_output(options.report, overwrite=options.overwrite)
+    check_written_files(options)
     notes: list[str] = []
     with progress_bars(quiet=options.quiet) as listener:
         memory = block_memory(options, config)
@@ -148,8 +152,7 @@ def simplify(options: argparse.Namespace) -> None:
         else:
             report, notes = _simplify_in_memory(options, checkpoint, config, settings, listener)
     if options.report is not None:
-        with cvtgs.io.atomic_output(options.report, overwrite=options.overwrite) as file:
-            file.write(report.to_json().encode())
+        _write_report(options, report)
     if not options.quiet:
         _print_summary(options, report)
         for note in notes:
@@ -199,6 +202,19 @@ def _simplify_in_memory(
         )
     cvtgs.io.save(small, options.output, overwrite=options.overwrite, axes=axes.target)
     return report, notes
+
+
+def _write_report(options: argparse.Namespace, report: "SimplifyReport") -> None:
+    try:
+        with cvtgs.io.atomic_output(options.report, overwrite=options.overwrite) as file:
+            file.write(report.to_json().encode())
+    except OSError as error:
+        if not isinstance(error, OutputError | OutputExistsError):
+            raise
+        reason = str(error).removesuffix("; nothing was written.").rstrip(".")
+        raise OutputError(
+            f"{reason}; the scene {options.output} was written, the report was not."
+        ) from error
 
 
 def _refine_settings(options: argparse.Namespace) -> dict[str, str]:

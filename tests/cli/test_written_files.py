@@ -1,0 +1,93 @@
+"""Files of one command that would replace each other, and a report that cannot be written."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+import cvtgs
+from cvtgs.cli.main import main
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    path = tmp_path / "in.ply"
+    cvtgs.save(cvtgs.synthetic.scene("object", 300, sh_degree=0, seed=3), path)
+    return path
+
+
+@pytest.mark.parametrize("other", ["IN", "OUT", "--config", "--keep", "--cameras"])
+@pytest.mark.parametrize("spelling", ["same", "dots", "symlink", "hard link"])
+def test_the_report_replaces_nothing(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], other: str, spelling: str
+) -> None:
+    if other == "OUT" and spelling == "hard link":
+        return  # OUT is not there yet
+    taken = {"IN": source, "OUT": tmp_path / "out.ply"}.get(other, tmp_path / "given.file")
+    words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.1", "--overwrite"]
+    if other.startswith("--"):
+        taken.write_text("")
+        words += [other, str(taken)]
+    report = {
+        "same": taken,
+        "dots": tmp_path / "folder" / ".." / taken.name,
+        "symlink": tmp_path / "link",
+        "hard link": tmp_path / "twin",
+    }[spelling]
+    (tmp_path / "folder").mkdir()
+    if spelling == "symlink":
+        report.symlink_to(taken)
+    if spelling == "hard link":
+        report.hardlink_to(taken)
+    before = taken.read_bytes() if taken.exists() else None
+    if other == "--config":
+        taken.write_text("seed = 3\n")
+        before = taken.read_bytes()
+    assert main([*words, "--report", str(report)]) == 1
+    assert capsys.readouterr().err == (
+        f"cvtgs: error: --report must be another file than {other}, found {report} for both.\n"
+    )
+    assert (taken.read_bytes() if taken.exists() else None) == before
+
+
+def test_the_output_may_be_the_input_but_no_other_file(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["simplify", str(source), str(source), "--rho", "0.1", "--overwrite", "--quiet"]
+    assert main(words) == 0
+    assert len(cvtgs.load(source)) == 30
+    boxes = tmp_path / "boxes.ply"
+    boxes.write_text("[]")
+    assert main(["simplify", str(source), str(boxes), *words[3:], "--keep", str(boxes)]) == 1
+    assert "OUT must be another file than --keep" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("number", "text"),
+    [(errno.ENOSPC, "needs more space than the disk has left"), (errno.EIO, "must be writable")],
+)
+def test_a_report_that_fails_leaves_the_scene_and_says_so(
+    source: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    number: int,
+    text: str,
+) -> None:
+    output, report, sync = tmp_path / "out.ply", tmp_path / "report.json", os.fsync
+
+    def fail(descriptor: int) -> None:
+        if output.exists():
+            raise OSError(number, os.strerror(number))
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fail)
+    words = ["simplify", str(source), str(output), "--rho", "0.1", "--report", str(report)]
+    assert main(words) == 1
+    error = capsys.readouterr().err
+    assert text in error
+    assert "nothing was written" not in error
+    assert error.endswith(f"; the scene {output} was written, the report was not.\n")
+    assert len(cvtgs.load(output)) == 30
+    assert not report.exists()
