@@ -52,6 +52,7 @@ OWNERS = {
     "safetensors": "io/tensors.py",
     "matplotlib": "plots.py",
     "distributed": "outofcore/distributed.py",
+    "psutil": "outofcore/memory.py",
 }
 HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "jinja2", "matplotlib", "zstandard")
 HEAVY += ("distributed",)

@@ -1,15 +1,19 @@
 """Memory: how much is free, how much a simplification takes, and how many blocks that makes."""
 
 import math
-import os
 import re
+import sys
 from pathlib import Path
+from typing import NamedTuple
 
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.ply import PlyRows
 
 BASE_BYTES = 600_000_000
 """Interpreter, torch, network, the grid of depths, and one chunk of rows."""
+
+LEAST_BYTES = 2 * BASE_BYTES
+"""The least memory to plan with; what runs in it takes about half of it."""
 
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 
@@ -37,35 +41,87 @@ def read_bytes(text: str) -> int:
     if match[3]:
         unit = 1024 ** " KMGT".index(match[2] or " ")
     amount = int(float(match[1]) * unit)
-    least = 2 * BASE_BYTES
-    if amount < least:
+    if amount < LEAST_BYTES:
         raise InvalidArgumentError(
-            f"memory must be at least {least / 1e9:g} GB, which torch and one block need; "
+            f"memory must be at least {LEAST_BYTES / 1e9:g} GB, which torch and one block need; "
             f"found {text!r}."
         )
     return amount
 
 
 def available_memory() -> int:
-    """Return how much memory is free.
+    """Return how much more memory this process may use.
+
+    The least of what the machine has free, of the limits of the control groups (versions 1 and 2)
+    that a container or a job runs in, and of the limits of the process (``ulimit -v``).
 
     Returns:
-        Bytes; a very large number where the system does not tell.
+        Bytes.
 
     Example:
         >>> available_memory() > 0
         True
     """
+    import psutil  # noqa: PLC0415 (loaded when it is used)
+
+    rooms: list[int] = [psutil.virtual_memory().available, *control_group_rooms(Path("/"))]
+    if sys.platform != "win32":
+        import resource  # noqa: PLC0415 (not on Windows)
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY:
+            rooms.append(limit - psutil.Process().memory_info().vms)
+    return max(0, min(rooms))
+
+
+def control_group_rooms(root: Path) -> list[int]:
+    """Return the bytes left in each control group with a limit that this process is in."""
     try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        words = {line.split(":")[0]: line.split()[1] for line in lines}
-        return 1024 * int(words["MemAvailable"])
-    except (OSError, KeyError, IndexError, ValueError):
+        lines = (root / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError):
+        return []
+    rooms = []
+    for line in lines:
+        _, controllers, path = line.split(":", 2) if line.count(":") > 1 else ("", "-", "")
+        if controllers == "":
+            names, top = _VERSION_2, root / "sys/fs/cgroup"
+        elif "memory" in controllers.split(","):
+            names, top = _VERSION_1, root / "sys/fs/cgroup/memory"
+        else:
+            continue
+        # Limits of parents hold too; in a container, the path may be that outside of it.
+        parts = [part for part in path.split("/") if part not in ("", "..")]
+        folders = {top.joinpath(*parts[:depth]) for depth in range(len(parts) + 1)}
+        rooms += [room for folder in folders if (room := _room(folder, names)) is not None]
+    return rooms
+
+
+class _GroupFiles(NamedTuple):
+    """Names of the files of a control group."""
+
+    limit: str
+    usage: str
+    cache: str
+    """Key in ``memory.stat`` of file pages that the system takes back first."""
+
+
+_VERSION_1 = _GroupFiles("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+_VERSION_2 = _GroupFiles("memory.max", "memory.current", "inactive_file")
+
+
+def _room(folder: Path, names: _GroupFiles) -> int | None:
+    """Return the bytes left in a group; None if it has no limit (version 2 writes ``max``)."""
+    try:
+        limit = int((folder / names.limit).read_text(encoding="ascii"))
+        used = int((folder / names.usage).read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None
+    try:
+        text = (folder / "memory.stat").read_text(encoding="ascii")
+        used -= int(dict(line.split(maxsplit=1) for line in text.splitlines())[names.cache])
+    except (OSError, ValueError, KeyError):
         pass
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, OSError, ValueError):
-        return 1 << 62
+    return limit - max(0, used)
 
 
 def needed_memory(source: PlyRows, rows: int) -> int:
@@ -97,5 +153,5 @@ def block_count(source: PlyRows, memory: int) -> int:
     """
     if needed_memory(source, source.count) <= memory:
         return 1
-    room = memory - BASE_BYTES
-    return math.ceil(2 * (needed_memory(source, source.count) - BASE_BYTES) / room)
+    room = max(memory, LEAST_BYTES) - BASE_BYTES
+    return max(2, math.ceil(2 * (needed_memory(source, source.count) - BASE_BYTES) / room))

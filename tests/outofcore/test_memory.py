@@ -1,0 +1,136 @@
+"""How much memory a process may still use: machine, control groups, limits of the process."""
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import psutil
+import pytest
+
+import cvtgs
+from cvtgs.io.ply import open_rows
+from cvtgs.outofcore import available_memory, block_count, needed_memory
+from cvtgs.outofcore.memory import LEAST_BYTES, control_group_rooms
+
+
+def machine(root: Path, groups: str, files: dict[str, str]) -> Path:
+    """Write the files of the system under another root."""
+    for name, text in {"proc/self/cgroup": groups, **files}.items():
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return root
+
+
+V2, V1 = "sys/fs/cgroup", "sys/fs/cgroup/memory"
+MACHINES = {
+    "none": ("", {}, []),
+    "version 2 in a container": (
+        "0::/\n",
+        {
+            f"{V2}/memory.max": "950000000\n",
+            f"{V2}/memory.current": "400000000\n",
+            f"{V2}/memory.stat": "anon 300000000\nfile 100000000\ninactive_file 60000000\n",
+        },
+        [610_000_000],
+    ),
+    "version 2, limit of the parent": (
+        "0::/jobs/one\n",
+        {
+            f"{V2}/jobs/memory.max": "3000\n",
+            f"{V2}/jobs/memory.current": "1000\n",
+            f"{V2}/jobs/one/memory.max": "max\n",
+            f"{V2}/jobs/one/memory.current": "900\n",
+        },
+        [2000],
+    ),
+    "version 2, both have limits": (
+        "0::/jobs/one\n",
+        {
+            f"{V2}/jobs/memory.max": "3000\n",
+            f"{V2}/jobs/memory.current": "1000\n",
+            f"{V2}/jobs/one/memory.max": "1500\n",
+            f"{V2}/jobs/one/memory.current": "900\n",
+        },
+        [600, 2000],
+    ),
+    "version 1 of a cluster": (
+        "12:cpu,cpuacct:/x\n7:memory:/slurm/job_7\n1:name=systemd:/y\n0::/z\n",
+        {
+            f"{V1}/memory.limit_in_bytes": "9223372036854771712\n",
+            f"{V1}/memory.usage_in_bytes": "5000\n",
+            f"{V1}/slurm/job_7/memory.limit_in_bytes": "8000\n",
+            f"{V1}/slurm/job_7/memory.usage_in_bytes": "5000\n",
+            f"{V1}/slurm/job_7/memory.stat": "cache 3\ntotal_inactive_file 1000\n",
+        },
+        [4000, 9223372036854771712 - 5000],
+    ),
+    "version 1, a path of the host": (
+        "4:memory:/docker/0123\n",
+        {f"{V1}/memory.limit_in_bytes": "8000\n", f"{V1}/memory.usage_in_bytes": "9000\n"},
+        [-1000],
+    ),
+    "damaged": (
+        "nothing\n0::/\n5:memory\n",
+        {f"{V2}/memory.max": "much\n", f"{V2}/memory.current": "\n"},
+        [],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_control_groups(tmp_path: Path, name: str) -> None:
+    groups, files, rooms = MACHINES[name]
+    assert sorted(control_group_rooms(machine(tmp_path, groups, files))) == rooms
+
+
+def test_the_least_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = SimpleNamespace(available=5000)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
+    rooms = [9000]
+    monkeypatch.setattr("cvtgs.outofcore.memory.control_group_rooms", lambda root: rooms)
+    assert available_memory() == 5000
+    rooms.append(700)
+    assert available_memory() == 700
+    rooms.append(-3)
+    assert available_memory() == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no ulimit")
+def test_limit_of_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    used = psutil.Process().memory_info().vms
+    limits = (used + 500_000_000, resource.RLIM_INFINITY)
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: limits)
+    assert abs(available_memory() - 500_000_000) < 50_000_000
+
+
+def test_little_memory_gives_blocks_and_no_division_by_zero(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    cvtgs.save(cvtgs.synthetic.scene("object", 200, sh_degree=0), path)
+    rows = open_rows(path)
+    assert block_count(rows, needed_memory(rows, rows.count)) == 1
+    assert block_count(rows, needed_memory(rows, rows.count) - 1) > 1
+    assert block_count(rows, 0) == block_count(rows, LEAST_BYTES // 2) == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="uses ulimit")
+def test_a_job_under_a_limit_chooses_blocks_by_itself(tmp_path: Path) -> None:
+    """With less than the scene takes at once, and more than the program itself does."""
+    path, small = tmp_path / "a.ply", tmp_path / "small.ply"
+    cvtgs.save(cvtgs.synthetic.scene("object", 3000, sh_degree=0), path)
+    program = (
+        "import resource, psutil, sys, torch, cvtgs.simplifier, cvtgs.outofcore.run\n"
+        "used = psutil.Process().memory_info().vms\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (used + 590_000_000, -1))\n"
+        "from cvtgs.cli.main import main\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    words = ["simplify", str(path), str(small), "--rho", "0.1", "--preset", "fast"]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "In 2 blocks" in done.stdout
+    assert len(cvtgs.load(small)) == 300
