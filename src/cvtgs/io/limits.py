@@ -5,9 +5,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
+from cvtgs.io.arrays import writable_rows
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
 
@@ -132,15 +131,6 @@ def losses_within(scene: GaussianScene, limits: FormatLimits) -> Losses:
         count=int(writable_rows(scene).sum()),
         sh_degree=min(scene.sh_degree, limits.sh_degree),
     )
-
-
-def writable_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
-    """Find the rows that compact formats can hold."""
-    rows = ~scene.logit_opacities.isnan() & (scene.quats != 0).any(dim=1)
-    for name, tensor in scene.tensors().items():
-        if name != "logit_opacities" and tensor.numel():
-            rows &= tensor.float().isfinite().reshape(len(scene), -1).all(dim=1)
-    return rows
 
 
 def _dropped(scene: GaussianScene, limits: FormatLimits) -> Iterator[str]:
