@@ -60,16 +60,15 @@ class DeviceTensor(Tensor):
     is_cuda = property(lambda self: True)  # type: ignore[assignment]
     is_cpu = property(lambda self: False)  # type: ignore[assignment]
     is_meta = property(lambda self: False)  # type: ignore[assignment]
+    is_sparse = property(lambda self: self.host.is_sparse)  # type: ignore[assignment]
 
     @staticmethod
     def __new__(cls, host: Tensor) -> "DeviceTensor":
+        layout = {}
+        if not host.is_sparse:
+            layout = {"strides": host.stride(), "storage_offset": host.storage_offset()}
         made = torch.Tensor._make_wrapper_subclass(
-            cls,
-            host.shape,
-            strides=host.stride(),
-            storage_offset=host.storage_offset(),
-            dtype=host.dtype,
-            device="meta",
+            cls, host.shape, dtype=host.dtype, device="meta", **layout
         )
         made.host = host
         return made
@@ -170,6 +169,10 @@ class Constructors(TorchFunctionMode):
         if func is Tensor.new_tensor and isinstance(args[0], DeviceTensor):
             kwargs = {"dtype": args[0].dtype, "device": CUDA} | kwargs
             func, args = torch.tensor, args[1:]
+        if func is Tensor.coalesce and isinstance(args[0], DeviceTensor):
+            return DeviceTensor(args[0].host.coalesce())  # torch would ask the wrapper's layout
+        if func is Tensor.new and isinstance(args[0], DeviceTensor):  # so SparseAdam makes them
+            return torch.sparse_coo_tensor(*args[1:], check_invariants=True)
         if func is Tensor.tolist and isinstance(args[0], DeviceTensor):
             return args[0].to("cpu").tolist()
         if func in (Tensor.__getitem__, Tensor.__setitem__) and isinstance(args[0], DeviceTensor):
