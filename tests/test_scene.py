@@ -10,7 +10,7 @@ import torch
 
 import cvtgs
 from cvtgs import GaussianScene
-from cvtgs.errors import InvalidArgumentError, InvalidSceneError
+from cvtgs.errors import InvalidArgumentError, InvalidSceneError, OutputExistsError
 from scenes import random_scene, same_bits
 
 INF = float("inf")
@@ -64,6 +64,39 @@ def test_bands_above_a_degree_are_dropped():
     assert random_scene(5, degree=1).with_sh_degree(2).sh_degree == 1
     with pytest.raises(InvalidArgumentError, match="the SH degree must be from 0 to 3, found 4"):
         scene.with_sh_degree(4)
+
+
+def test_rows_are_taken_as_of_a_tensor():
+    scene = random_scene(9, degree=1)
+    scene = scene.with_tensors({}, {"label": torch.arange(9)})
+    mask = torch.arange(9) % 2 == 0
+    taken = [
+        (scene[mask], [0, 2, 4, 6, 8]),
+        (scene[mask.tolist()], [0, 2, 4, 6, 8]),
+        (scene[:3], [0, 1, 2]),
+        (scene[::-4], [8, 4, 0]),
+        (scene[5:2], []),
+        (scene[[7, -1]], [7, 8]),
+        (scene[[]], []),
+        (scene[mask.numpy()], [0, 2, 4, 6, 8]),
+    ]
+    for small, rows in taken:
+        assert small.extras["label"].tolist() == rows
+        assert torch.equal(small.means, scene.means[torch.tensor(rows, dtype=torch.int64)])
+    with pytest.raises(InvalidArgumentError, match=r"found 5; write scene\[5:6\] for a single"):
+        scene[5]
+    with pytest.raises(InvalidArgumentError, match="for each of 9 Gaussians, found 8"):
+        scene[mask[:8]]
+
+
+def test_a_scene_saves_itself(tmp_path):
+    scene = random_scene(9)
+    scene.save(tmp_path / "a.ply")
+    assert same_bits(cvtgs.load(tmp_path / "a.ply"), scene)
+    with pytest.raises(OutputExistsError):
+        scene.save(tmp_path / "a.ply")
+    scene.save(tmp_path / "a.ply", overwrite=True, axes="rub")
+    assert same_bits(cvtgs.load(tmp_path / "a.ply", axes="rub"), scene)
 
 
 def test_an_empty_scene_is_a_scene():

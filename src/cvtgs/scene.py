@@ -1,8 +1,10 @@
 """GaussianScene: the only thing that travels between the stages."""
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import Any, Self
 
@@ -160,6 +162,51 @@ class GaussianScene:
             {name: column.index_select(0, rows) for name, column in self.extras.items()},
         )
 
+    def __getitem__(self, rows: slice | Sequence[int] | Tensor) -> Self:
+        """Take some Gaussians, as :meth:`select` does.
+
+        Args:
+            rows: A slice, a mask, or row numbers.
+
+        Returns:
+            A scene with those rows, copied.
+
+        Raises:
+            InvalidArgumentError: A mask does not have an entry for every Gaussian, or rows is a
+                single number.
+        """
+        if isinstance(rows, slice):
+            these = range(len(self))[rows]
+            stop = these.start + len(these) * these.step
+            rows = torch.arange(these.start, stop, these.step)
+        if isinstance(rows, int) or getattr(rows, "ndim", 1) != 1:
+            raise InvalidArgumentError(
+                f"rows of a scene must be a slice, a mask or row numbers, found {rows!r}; "
+                f"write scene[5:6] for a single Gaussian."
+            )
+        picked = torch.as_tensor(rows, device=self.device)
+        if picked.dtype == torch.bool and len(picked) != len(self):
+            raise InvalidArgumentError(
+                f"a mask must have an entry for each of {len(self):,} Gaussians, "
+                f"found {len(picked):,}."
+            )
+        picked = picked if len(picked) else picked.to(torch.int64)
+        if picked.dtype != torch.bool:
+            picked = torch.where(picked < 0, picked + len(self), picked)
+        return self.select(picked)
+
+    def save(
+        self, path: str | os.PathLike[str], *, overwrite: bool = False, axes: str = "rdf"
+    ) -> None:
+        """Write the scene to a file, as :func:`cvtgs.save` does.
+
+        Args:
+            path: The file to write; its suffix chooses the format.
+            overwrite: Whether an existing file may be replaced.
+            axes: Where x, y and z of the file are to point.
+        """
+        resolve_name("cvtgs.io.formats:save")(self, path, overwrite=overwrite, axes=axes)
+
     def with_sh_degree(self, degree: int) -> Self:
         """Drop the SH bands above a degree; files of the scene get smaller.
 
@@ -225,6 +272,16 @@ class GaussianScene:
             f"GaussianScene({len(self):,} Gaussians, SH degree {self.sh_degree}, "
             f"{str(self.dtype).removeprefix('torch.')}, {self.device})"
         )
+
+
+def check_is_scene(value: object) -> None:
+    """Refuse what is no scene, such as the path of one."""
+    if isinstance(value, GaussianScene):
+        return
+    found = type(value).__name__
+    if isinstance(value, str | os.PathLike):
+        found = f"the path {os.fspath(value)!r}; read it with cvtgs.load"
+    raise InvalidArgumentError(f"scene must be a GaussianScene, found {found}.")
 
 
 def concatenate(scenes: Sequence[GaussianScene]) -> GaussianScene:

@@ -23,12 +23,13 @@ from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shortfall, target_count
 from cvtgs.devices import chosen_device, resolve_device
-from cvtgs.errors import ConfigError, InvalidArgumentError
-from cvtgs.mergenet import SHIPPED, Checkpoint, load_checkpoint
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.mergenet import Checkpoint
+from cvtgs.mergenet.checkpoint import checkpoint_for
 from cvtgs.pipeline import Reduced, geometric_error, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified, SimplifyReport
-from cvtgs.scene import GaussianScene, concatenate
+from cvtgs.scene import GaussianScene, check_is_scene, concatenate
 from cvtgs.validity import (
     CheckedScene,
     check_rows,
@@ -49,6 +50,7 @@ class Simplifier:
             file; ``auto`` is the shipped one that fits the configuration's preset, ``None``
             merges by moments alone.
         config: A configuration, or the name of a preset; None is the preset of the checkpoint.
+        preset: The name of a preset, instead of a configuration.
         device: Where to compute: ``auto`` stays where the scene is, but takes CUDA for scenes on
             the CPU if there is one; or any torch device. The result is where the scene was.
         listener: Called with progress events.
@@ -70,12 +72,16 @@ class Simplifier:
         ckpt: str | os.PathLike[str] | None = "auto",
         *,
         config: SimplifyConfig | str | None = None,
+        preset: str | None = None,
         device: str | torch.device = "auto",
         listener: ProgressListener = silent,
     ) -> None:
+        if preset is not None and config is not None:
+            raise InvalidArgumentError("give either preset or config, found both.")
+        config = config if preset is None else preset
         if isinstance(config, str):
             config = SimplifyConfig.from_preset(config)
-        self.checkpoint = _checkpoint(ckpt, config)
+        self.checkpoint = checkpoint_for(ckpt, config)
         self.config = config or SimplifyConfig.from_preset(
             "standard" if self.checkpoint is None else self.checkpoint.info.preset
         )
@@ -211,6 +217,7 @@ class Prepared:
         cameras: Cameras | None = None,
         listener: ProgressListener = silent,
     ) -> None:
+        check_is_scene(scene)
         self._scene, self._config, self._checkpoint = scene, config, checkpoint
         self._cameras, self._listener = cameras, listener
         self._device = chosen_device(device or "auto", scene.device)
@@ -378,20 +385,3 @@ class Prepared:
         )
         restored = restore_columns(refined.scene, self._scene, plan)
         return Simplified(restored, join_reports(result.report, refined))
-
-
-def _checkpoint(
-    ckpt: str | os.PathLike[str] | None, config: SimplifyConfig | None
-) -> Checkpoint | None:
-    if ckpt is None:
-        return None
-    if config is not None and not config.merge.network:
-        if ckpt == "auto":
-            return None
-        raise ConfigError(
-            f"merge.network is false, so ckpt must be None or auto; found {os.fspath(ckpt)!r}."
-        )
-    if ckpt == "auto":
-        preset = "standard" if config is None else config.preset
-        return load_checkpoint(preset if preset in SHIPPED else "standard")
-    return load_checkpoint(ckpt)

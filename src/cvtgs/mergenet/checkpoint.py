@@ -11,7 +11,8 @@ import pydantic
 import torch
 from torch import Tensor
 
-from cvtgs.errors import CheckpointError, FileFormatError
+from cvtgs.config import PRESETS, SimplifyConfig
+from cvtgs.errors import CheckpointError, ConfigError, FileFormatError
 from cvtgs.io.tensors import pack_tensors, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet
 
@@ -135,8 +136,9 @@ def _read(path: Path, name: str) -> bytes:
             return path.read_bytes()
         path.stat()
     except (FileNotFoundError, ValueError):
+        preset = f" For the preset, write preset={name!r}." if name in PRESETS else ""
         raise CheckpointError(
-            f"{name}: no such checkpoint; it must be {' or '.join(SHIPPED)}, or a file."
+            f"{name}: no such checkpoint; it must be {' or '.join(SHIPPED)}, or a file.{preset}"
         ) from None
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
@@ -210,3 +212,21 @@ def _digest(tensors: Mapping[str, Tensor], described: str) -> str:
         digest.update(f"{name} {values.dtype} {tuple(values.shape)}\n".encode())
         digest.update(values.contiguous().flatten().view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()
+
+
+def checkpoint_for(
+    ckpt: str | os.PathLike[str] | None, config: SimplifyConfig | None
+) -> Checkpoint | None:
+    """Return the checkpoint that a name or a file and a configuration choose."""
+    if ckpt is None:
+        return None
+    if config is not None and not config.merge.network:
+        if ckpt == "auto":
+            return None
+        raise ConfigError(
+            f"merge.network is false, so ckpt must be None or auto; found {os.fspath(ckpt)!r}."
+        )
+    if ckpt == "auto":
+        preset = "standard" if config is None else config.preset
+        return load_checkpoint(preset if preset in SHIPPED else "standard")
+    return load_checkpoint(ckpt)
