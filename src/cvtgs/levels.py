@@ -12,6 +12,7 @@ from cvtgs.evaluation import Evaluation, SceneScores
 from cvtgs.io import atomic_output, check_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.report import Level
+from cvtgs.text import printable
 
 __all__ = ["INDEX_NAME", "LevelEntry", "LevelsIndex", "add_scores", "level_names", "write_levels"]
 
@@ -202,7 +203,7 @@ def write_levels(
         save(level.scene, place / name, overwrite=overwrite, axes=axes)
         entries.append(LevelEntry.of(level, rho, place / name))
     index = LevelsIndex(
-        source=source,
+        source=printable(source),
         source_count=levels[0].report.input_count,
         levels=tuple(sorted(entries, key=lambda entry: -entry.count)),
     )

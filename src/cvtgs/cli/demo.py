@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cvtgs
-from cvtgs.cli.display import file_size, progress_bars
+from cvtgs.cli.display import file_size, progress_bars, say
 from cvtgs.cli.options import AddParser, add_options
 
 if TYPE_CHECKING:
@@ -112,9 +112,9 @@ def _print_table(columns: list[dict[str, str]]) -> None:
 
 
 def _print_next_steps(folder: Path) -> None:
-    print("Look at them side by side: open this page in a browser, it needs no network.")
-    print(f"  {(folder / 'index.html').resolve().as_uri()}")
-    print(f"The scenes are in {folder}; any 3DGS viewer opens them. With a scene of your own:")
-    print("  cvtgs info scene.ply")
-    print("  cvtgs simplify scene.ply small.ply --rho 0.01")
-    print("  cvtgs compare scene.ply small.ply -o comparison")
+    say("Look at them side by side: open this page in a browser, it needs no network.")
+    say(f"  {(folder / 'index.html').resolve().as_uri()}")
+    say(f"The scenes are in {folder}; any 3DGS viewer opens them. With a scene of your own:")
+    say("  cvtgs info scene.ply")
+    say("  cvtgs simplify scene.ply small.ply --rho 0.01")
+    say("  cvtgs compare scene.ply small.ply -o comparison")

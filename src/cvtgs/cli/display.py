@@ -4,13 +4,20 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 import cvtgs
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
+from cvtgs.text import printable
 
 if TYPE_CHECKING:
     from cvtgs.clock import StageCost
+
+
+def say(text: str, *, file: TextIO | None = None, end: str = "\n", flush: bool = False) -> None:
+    """Print a text, with what a terminal would obey or cannot show as escapes."""
+    file = sys.stdout if file is None else file
+    print(printable(text, file.encoding or "utf-8"), file=file, end=end, flush=flush)
 
 
 def size_text(count: int) -> str:
@@ -44,6 +51,7 @@ def progress_bars(*, quiet: bool) -> Iterator[ProgressListener]:
         yield silent
         return
     from rich.console import Console
+    from rich.markup import escape
     from rich.progress import Progress, TaskID
 
     with Progress(console=Console(stderr=True)) as progress:
@@ -54,7 +62,7 @@ def progress_bars(*, quiet: bool) -> Iterator[ProgressListener]:
                 bars[event.stage] = progress.add_task(event.stage, total=event.total)
             progress.update(bars[event.stage], completed=event.done, total=event.total)
             if event.note:
-                text = f"{event.stage} {event.note}"
+                text = escape(printable(f"{event.stage} {event.note}", sys.stderr.encoding))
                 progress.update(bars[event.stage], description=text)
 
         yield listen

@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import cvtgs
+from cvtgs.cli.display import say
 from cvtgs.cli.options import AddParser
 from cvtgs.errors import CvtgsError, DeviceError
 
@@ -39,7 +40,7 @@ class ShowVersions(argparse.Action):
         option_string: str | None = None,
     ) -> NoReturn:
         """Print the versions and exit."""
-        print("\n".join(version_lines()))
+        say("\n".join(version_lines()))
         parser.exit()
 
 
@@ -80,26 +81,26 @@ def doctor(options: argparse.Namespace) -> None:
 
     from cvtgs.devices import chosen_device, device_name, resolve_device
 
-    print("\n".join(version_lines()))
+    say("\n".join(version_lines()))
     device = resolve_device(options.device)
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     devices = [torch.device("cpu"), *(torch.device("cuda", number) for number in range(gpus))]
     for one in devices if device is None else [device]:
-        print(f"\n{one}: {device_name(one)}")
+        say(f"\n{one}: {device_name(one)}")
         for name in RENDERERS:
-            print(f"  images by {name:<7} {_renderer_state(name, one)}")
-        print(f"  nearest site by  {cvtgs.cvt.nearest_backend('auto')[0]}")
+            say(f"  images by {name:<7} {_renderer_state(name, one)}")
+        say(f"  nearest site by  {cvtgs.cvt.nearest_backend('auto')[0]}")
     default = chosen_device(options.device)
-    print(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one image")
+    say(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one image")
     try:
         for line in _small_run(default):
-            print(f"  {line}")
+            say(f"  {line}")
     except Exception as error:  # whatever a driver or a broken installation raises
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise DeviceError(
             f"the default path does not work on {default}: {reason}; try cvtgs doctor --device cpu."
         ) from error
-    print("The default path works.")
+    say("The default path works.")
 
 
 def _renderer_state(name: str, device: "torch.device") -> str:

@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple
 
 import cvtgs
-from cvtgs.cli.display import progress_bars, size_text
+from cvtgs.cli.display import progress_bars, say, size_text
 from cvtgs.cli.options import (
     AddParser,
     add_options,
@@ -21,6 +21,7 @@ from cvtgs.cli.options import (
 )
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.progress import ProgressEvent
+from cvtgs.text import printable
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation, SceneScores
@@ -72,9 +73,7 @@ def render(options: argparse.Namespace) -> None:
                 file.write(encode(as_bytes(image), "png"))
         listener(ProgressEvent(stage="render", done=len(paths), total=len(paths)))
     if not options.quiet:
-        print(
-            f"{len(paths)} images of {cameras.width} x {cameras.height} pixels in {options.output}"
-        )
+        say(f"{len(paths)} images of {cameras.width} x {cameras.height} pixels in {options.output}")
 
 
 def file_names(views: Sequence[str]) -> list[str]:
@@ -103,9 +102,9 @@ def _read_scenes(options: argparse.Namespace) -> _Scenes:
     from cvtgs.devices import chosen_device
 
     paths = [options.reference, *options.small]
-    names = [path.name for path in paths]
+    names = [printable(path.name) for path in paths]
     names = [
-        name if names.count(name) == 1 else str(path)
+        name if names.count(name) == 1 else printable(str(path))
         for name, path in zip(names, paths, strict=True)
     ]
     twice = [name for name in names if names.count(name) > 1]
@@ -167,31 +166,31 @@ def evaluate(options: argparse.Namespace) -> None:
             listener=listener,
         )
     if options.json:
-        print(evaluation.to_json(), end="")
+        say(evaluation.to_json(), end="")
     elif not options.quiet:
         _print_scores(evaluation, scenes.sizes)
 
 
 def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
-    print(
+    say(
         f"{len(evaluation.views)} views of {evaluation.width} x {evaluation.height} pixels, "
         f"rendered by {evaluation.backend}"
     )
-    print(f"against {evaluation.reference}, {evaluation.reference_count:,} Gaussians:")
+    say(f"against {evaluation.reference}, {evaluation.reference_count:,} Gaussians:")
     _print_score_table(evaluation.scenes, sizes)
     if evaluation.photographs:
-        print("against photographs:")
+        say("against photographs:")
         _print_score_table(evaluation.photographs, sizes)
     if evaluation.lpips_sentence:
-        print(evaluation.lpips_sentence)
+        say(evaluation.lpips_sentence)
 
 
 def _print_score_table(scenes: "tuple[SceneScores, ...]", sizes: dict[str, int]) -> None:
     width = max(len(scene.name) for scene in scenes)
-    print(f"  {'':{width}}  {'Gaussians':>12}  {'size':>9}  {'PSNR':>6}  {'SSIM':>6}  LPIPS")
+    say(f"  {'':{width}}  {'Gaussians':>12}  {'size':>9}  {'PSNR':>6}  {'SSIM':>6}  LPIPS")
     for scene in scenes:
         distance = f"{scene.lpips.mean:.4f}" if scene.lpips else "-"
-        print(
+        say(
             f"  {scene.name:{width}}  {scene.count:>12,}  {size_text(sizes[scene.name]):>9}  "
             f"{scene.psnr.mean:>6.2f}  {scene.ssim.mean:>6.4f}  {distance}"
         )
@@ -233,11 +232,11 @@ def compare(options: argparse.Namespace) -> None:
         )
     if not options.quiet:
         for scores in comparison.evaluation.scenes:
-            print(
+            say(
                 f"{scores.name}: {scores.count:,} Gaussians, "
                 f"PSNR {scores.psnr.mean:.2f} dB, SSIM {scores.ssim.mean:.4f}"
             )
-        print(f"Wrote {', '.join(path.name for path in paths)}. Open {paths[-1]} in a browser.")
+        say(f"Wrote {', '.join(path.name for path in paths)}. Open {paths[-1]} in a browser.")
 
 
 def add_tradeoff(add_parser: AddParser) -> None:
@@ -288,16 +287,16 @@ def tradeoff(options: argparse.Namespace) -> None:
     if not options.quiet:
         _print_tradeoff(measured.tradeoff)
         names = ", ".join(path.name for path in paths)
-        print(f"Wrote {names}. Open {paths[-1]} in a browser.")
+        say(f"Wrote {names}. Open {paths[-1]} in a browser.")
         if note:
-            print(f"Without a plot: {note}")
+            say(f"Without a plot: {note}")
 
 
 def _print_tradeoff(tradeoff: "Tradeoff") -> None:
     from cvtgs.tradeoff.files import MARK_MEANS, cells, heading, how_measured
 
     for rho in tradeoff.ratios:
-        print(heading(tradeoff, rho))
+        say(heading(tradeoff, rho))
         columns = [cells(tradeoff, result) for result in tradeoff.results if result.rho == rho]
         left = max(len(name) for name in columns[0])
         widths = [max(map(len, column.values())) for column in columns]
@@ -305,6 +304,6 @@ def _print_tradeoff(tradeoff: "Tradeoff") -> None:
             words = (
                 f"{column[name]:>{width}}" for column, width in zip(columns, widths, strict=True)
             )
-            print(f"  {name:{left}}  {'  '.join(words)}".rstrip())
-    print(MARK_MEANS)
-    print(how_measured(tradeoff))
+            say(f"  {name:{left}}  {'  '.join(words)}".rstrip())
+    say(MARK_MEANS)
+    say(how_measured(tradeoff))

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cvtgs
-from cvtgs.cli.display import file_size
+from cvtgs.cli.display import file_size, say
 from cvtgs.cli.options import AddParser, add_options, read_axes, read_scene, read_settings
 
 if TYPE_CHECKING:
@@ -31,10 +31,10 @@ def show_info(options: argparse.Namespace) -> None:
     config = cvtgs.SimplifyConfig.compose(settings=settings)
     facts = cvtgs.describe(read_scene(options, config), config)
     if options.json:
-        print(facts.model_dump_json(indent=2))
+        say(facts.model_dump_json(indent=2))
     else:
         for label, text in _rows(facts, options.input):
-            print(f"{label:<16} {text}")
+            say(f"{label:<16} {text}")
 
 
 def _rows(facts: "SceneInfo", path: Path) -> list[tuple[str, str]]:
@@ -112,18 +112,18 @@ def convert(options: argparse.Namespace) -> None:
         phrases = [f"SH bands above degree {options.sh_degree} (--sh-degree)"]
     lost = cvtgs.io.losses(scene, options.output)
     if not options.quiet:
-        print(f"{options.input}: {len(scene):,} Gaussians of SH degree {degree}")
+        say(f"{options.input}: {len(scene):,} Gaussians of SH degree {degree}")
         if lost.changed:
-            print(f"Files like {options.output.name} hold:")
+            say(f"Files like {options.output.name} hold:")
         for phrase in lost.changed:
-            print(f"  {phrase}", flush=True)
+            say(f"  {phrase}", flush=True)
     cvtgs.io.save(  # warns of losses first
         scene, options.output, overwrite=options.overwrite, axes=axes.target
     )
     if not options.quiet:
-        print(
+        say(
             f"{options.output}: {lost.count:,} Gaussians of SH degree {lost.sh_degree}, "
             f"{file_size(options.input)} -> {file_size(options.output)}"
         )
         rest = "nothing but precision" if lost.changed else "nothing"
-        print(f"Lost: {'; '.join([*phrases, *lost.dropped]) or rest}.")
+        say(f"Lost: {'; '.join([*phrases, *lost.dropped]) or rest}.")

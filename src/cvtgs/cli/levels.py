@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import cvtgs
-from cvtgs.cli.display import progress_bars, size_text
+from cvtgs.cli.display import progress_bars, say, size_text
 from cvtgs.cli.options import (
     AddParser,
     add_options,
@@ -113,11 +113,11 @@ def _score(
 
 def _print_index(index: "LevelsIndex") -> None:
     width = max(len(level.file) for level in index.levels)
-    print(f"{index.source}, {index.source_count:,} Gaussians:")
-    print(f"  {'':{width}}  {'Gaussians':>12}  {'size':>9}  {'error':>9}  {'PSNR':>6}  seconds")
+    say(f"{index.source}, {index.source_count:,} Gaussians:")
+    say(f"  {'':{width}}  {'Gaussians':>12}  {'size':>9}  {'error':>9}  {'PSNR':>6}  seconds")
     for level in index.levels:
         psnr = "-" if level.psnr is None else f"{level.psnr:.2f}"
-        print(
+        say(
             f"  {level.file:{width}}  {level.count:>12,}  {size_text(level.bytes):>9}  "
             f"{level.geometric_error:>9.3g}  {psnr:>6}  {level.seconds:.2f}"
         )

@@ -1,5 +1,6 @@
 """``cvtgs``: parse the command line, run a command, turn errors into exit codes."""
 
+import io
 import os
 import signal
 import sys
@@ -9,6 +10,7 @@ from types import FrameType
 from typing import NoReturn, TextIO
 
 from cvtgs.cli.demo import add_demo
+from cvtgs.cli.display import say
 from cvtgs.cli.doctor import ShowVersions, add_doctor
 from cvtgs.cli.evaluate import add_compare, add_evaluate, add_render, add_tradeoff
 from cvtgs.cli.files import add_convert, add_info
@@ -44,13 +46,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             with memory_errors(f"cvtgs {options.command}", MEMORY_ADVICE):
                 options.run(options)
         except CvtgsError as error:
-            print(f"cvtgs: error: {error}", file=sys.stderr)
+            say(f"cvtgs: error: {error}", file=sys.stderr)
             return 1
         except (KeyboardInterrupt, Exception):
             # An interrupted import may raise another error instead of KeyboardInterrupt.
             if not interrupt.happened:
                 raise
-            print("cvtgs: interrupted; nothing was half-written.", file=sys.stderr)
+            say("cvtgs: interrupted; nothing was half-written.", file=sys.stderr)
             return INTERRUPTED
         finally:
             for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
@@ -60,6 +62,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run_process() -> NoReturn:
     """Run the command line and end the process with its exit status."""
+    for stream in (sys.stdout, sys.stderr):  # also for what libraries print
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     code = main()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt from here on must not change it
     sys.exit(code)
@@ -114,7 +119,7 @@ def _show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    print(f"cvtgs: warning: {message}", file=sys.stderr)
+    say(f"cvtgs: warning: {message}", file=sys.stderr)
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:

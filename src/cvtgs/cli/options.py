@@ -3,6 +3,7 @@
 import argparse
 import os
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from itertools import takewhile
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 import cvtgs
+from cvtgs.cli.display import say
 from cvtgs.errors import ConfigError, InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -140,6 +142,10 @@ class CommandParser(argparse.ArgumentParser):
                 if name.startswith("--") and not any(one.startswith(name) for one in options):
                     self.error(f"unrecognized argument: {name}{suggestion(name, options)}")
         return super().parse_known_args(args, namespace)
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Print as :func:`say` does; argparse has no public way to."""
+        say(message, file=file or sys.stderr, end="")
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and a message with a suggestion, and exit with status 2."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import cvtgs
-from cvtgs.cli.display import file_size, progress_bars, stage_seconds
+from cvtgs.cli.display import file_size, progress_bars, say, stage_seconds
 from cvtgs.cli.options import (
     CAMERA_FILES,
     AddParser,
@@ -156,7 +156,7 @@ def simplify(options: argparse.Namespace) -> None:
     if not options.quiet:
         _print_summary(options, report)
         for note in notes:
-            print(note)
+            say(note)
 
 
 def _simplify_in_memory(
@@ -226,19 +226,19 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
 
 
 def _print_summary(options: argparse.Namespace, report: "SimplifyReport") -> None:
-    print(
+    say(
         f"{report.input_count:,} -> {report.output_count:,} Gaussians, "
         f"{file_size(options.input)} -> {file_size(options.output)}, "
         f"{stage_seconds(report.stages)}"
     )
     if report.blocks > 1:
         resumed = f", {report.resumed_blocks} of them done before" if report.resumed_blocks else ""
-        print(f"In {report.blocks} blocks{resumed}.")
+        say(f"In {report.blocks} blocks{resumed}.")
     if report.shortfall:
-        print(f"Fewer than the {report.target_count:,} asked for: {report.shortfall}.")
+        say(f"Fewer than the {report.target_count:,} asked for: {report.shortfall}.")
     if report.refinement is not None:
         refined = report.refinement
-        print(
+        say(
             f"Refined in {refined.steps:,} {'step' if refined.steps == 1 else 'steps'}: "
             f"{refined.gain:+.2f} dB on views that were held out, "
             f"{refined.psnr_before:.2f} -> {refined.psnr_after:.2f}."
@@ -309,7 +309,7 @@ def choose_preset(
     target = cvtgs.target_count(len(scene), options.rho, count=options.count)
     again = options.recalibrate or not is_calibrated(options.device)
     if again and not options.quiet:
-        print("cvtgs: measuring this machine once, about a minute", file=sys.stderr)
+        say("cvtgs: measuring this machine once, about a minute", file=sys.stderr)
     model = cvtgs.budget.cost_model(options.device, recalibrate=again, listener=listener)
     if options.ckpt == "none":
         settings = {**settings, "merge.network": "false"}

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cvtgs
-from cvtgs.cli.display import progress_bars
+from cvtgs.cli.display import progress_bars, say
 from cvtgs.cli.options import AddParser, add_options
 from cvtgs.errors import OutputError
 
@@ -76,9 +76,9 @@ def train(options: argparse.Namespace) -> None:
         )
     best = history.best()
     if best is not None and not options.quiet:
-        print(f"best at step {best.step}: {best.mean_gain:+.2f} dB on scenes it never learned from")
+        say(f"best at step {best.step}: {best.mean_gain:+.2f} dB on scenes it never learned from")
         curves = f"curves in {files.curves}" if files.curves.is_file() else WITHOUT_CURVES
-        print(f"{files.checkpoint}, {curves}")
+        say(f"{files.checkpoint}, {curves}")
 
 
 def _with_scenes(config: "TrainConfig", folders: list[Path]) -> "TrainConfig":
@@ -94,4 +94,4 @@ def print_validation(history: "History") -> None:
         for ratio, row in last.by_ratio().items()
     )
     loss = "-" if math.isnan(last.loss) else f"{last.loss:.3f}"
-    print(f"step {last.step}: loss {loss}, dB gained: {gains}")
+    say(f"step {last.step}: loss {loss}, dB gained: {gains}")

@@ -15,6 +15,7 @@ from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.errors import CheckpointError, ConfigError, FileFormatError
 from cvtgs.io.tensors import pack_tensors, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet
+from cvtgs.text import printable
 
 SHIPPED = ("standard", "paper")
 """Names of the checkpoints that come with the package."""
@@ -92,7 +93,9 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
             f"{name}: the checkpoint is damaged: its content has the hash {digest[:12]}..., "
             f"it says {str(metadata.get('sha256'))[:12]}..."
         )
-    return Checkpoint(net=_build_net(info, tensors, name), info=info, name=name, digest=digest)
+    return Checkpoint(
+        net=_build_net(info, tensors, name), info=info, name=printable(name), digest=digest
+    )
 
 
 def save_checkpoint(net: MergeNet, info: CheckpointInfo) -> bytes:
