@@ -116,6 +116,22 @@ def valid_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
     return valid
 
 
+def writable_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
+    """Return which rows compact formats can hold: finite in float32, with a rotation.
+
+    Args:
+        scene: Any scene.
+
+    Returns:
+        Mask of these rows.
+    """
+    rows = ~scene.logit_opacities.isnan() & (scene.quats != 0).any(dim=1)
+    for name, tensor in scene.tensors().items():
+        if name != "logit_opacities" and tensor.numel():
+            rows &= tensor.float().isfinite().reshape(len(scene), -1).all(dim=1)
+    return rows
+
+
 def with_finite_opacities(scene: GaussianScene) -> GaussianScene:
     """Replace infinite opacity logits, which are valid input, by the largest finite ones.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -16,6 +16,7 @@ from cvtgs.math import parameters
 from cvtgs.math.frames import morton_order
 from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
 from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
+from cvtgs.validity import writable_rows
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -147,12 +148,3 @@ def morton_rows(means: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
     inside = np.sign(away) * np.log1p(np.abs(away) / np.float32(radius))
     order: Int[np.ndarray, n] = morton_order(torch.from_numpy(inside)).numpy()
     return order
-
-
-def writable_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
-    """Find the rows that compact formats can hold."""
-    rows = ~scene.logit_opacities.isnan() & (scene.quats != 0).any(dim=1)
-    for name, tensor in scene.tensors().items():
-        if name != "logit_opacities" and tensor.numel():
-            rows &= tensor.float().isfinite().reshape(len(scene), -1).all(dim=1)
-    return rows

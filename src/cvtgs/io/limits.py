@@ -6,9 +6,9 @@ from types import MappingProxyType
 
 import torch
 
-from cvtgs.io.arrays import writable_rows
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
+from cvtgs.validity import writable_rows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,11 +16,11 @@ from cvtgs.io.arrays import (
     drop_largest,
     opacity_bytes,
     to_bytes,
-    writable_rows,
 )
 from cvtgs.io.spz.layout import ANTIALIASED_FLAG, COLOR_SCALE, SpzHeader
 from cvtgs.math.spherical_harmonics import REST_COUNTS, degree_of
 from cvtgs.scene import GaussianScene
+from cvtgs.validity import writable_rows
 
 _USUAL_BITS = 12
 _MOST_BITS = 22
