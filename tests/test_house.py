@@ -30,7 +30,7 @@ LEVELS = [
     {"mergenet"},
     {"pipeline", "refinement"},
     {"simplifier", "info"},
-    {"budget", "tradeoff", "levels", "outofcore"},
+    {"budget", "tradeoff", "levels", "outofcore", "oneshot"},
     {"train"},
     {"cli"},
     {"__main__"},

@@ -51,6 +51,7 @@ NAMES = {
     "refine",
     "render",
     "save",
+    "simplify",
     "synthetic",
     "target_count",
     "to_dict",

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from cvtgs.evaluation import evaluate
     from cvtgs.info import SceneInfo, describe
     from cvtgs.io import from_dict, load, load_cameras, save, to_dict
+    from cvtgs.oneshot import simplify
     from cvtgs.progress import ProgressEvent, ProgressListener
     from cvtgs.refinement import refine
     from cvtgs.rendering import Rendering, render
@@ -80,6 +81,7 @@ _HOME = {
     "Prepared": "cvtgs.simplifier",
     "Simplified": "cvtgs.report",
     "Simplifier": "cvtgs.simplifier",
+    "simplify": "cvtgs.oneshot",
     "target_count": "cvtgs.counts",
 }
 _MODULES = (
@@ -148,6 +150,7 @@ __all__ = [
     "render",
     "rendering",
     "save",
+    "simplify",
     "synthetic",
     "target_count",
     "to_dict",

@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import pytest
+import torch
 
+import cvtgs
 from cvtgs import Simplifier
-from cvtgs.errors import CheckpointError, InvalidArgumentError
+from cvtgs.errors import CheckpointError, ConfigError, InputNotFoundError, InvalidArgumentError
 from scenes import random_scene, same_bits
 
 
@@ -17,6 +19,20 @@ def test_a_preset_by_its_name():
     assert same_bits(fast.simplify(scene, 0.1), other.simplify(scene, 0.1))
     with pytest.raises(InvalidArgumentError, match="either preset or config, found both"):
         Simplifier(preset="fast", config="fast")
+
+
+def test_one_call_takes_a_scene_or_a_path(tmp_path):
+    scene, path = random_scene(300), tmp_path / "scene.ply"
+    scene.save(path)
+    wanted = Simplifier(preset="fast", device="cpu").simplify(scene, 0.1)
+    for one in (scene, path, str(path)):
+        small = cvtgs.simplify(one, 0.1, preset="fast", device="cpu")
+        assert all(torch.equal(small.tensors()[k], wanted.tensors()[k]) for k in wanted.tensors())
+    assert len(cvtgs.simplify(path, count=7, device="cpu")) == 7
+    with pytest.raises(ConfigError, match="fastest"):
+        cvtgs.simplify(tmp_path / "missing.ply", 0.1, preset="fastest")
+    with pytest.raises(InputNotFoundError):
+        cvtgs.simplify(tmp_path / "missing.ply", 0.1)
 
 
 def test_a_preset_in_the_place_of_the_checkpoint():

@@ -1,0 +1,52 @@
+"""Simplify a scene or a file of one in a single call."""
+
+import os
+
+import torch
+
+from cvtgs.io import load
+from cvtgs.scene import GaussianScene
+from cvtgs.simplifier import Simplifier
+
+__all__ = ["simplify"]
+
+
+def simplify(
+    scene: GaussianScene | str | os.PathLike[str],
+    rho: float | None = None,
+    *,
+    count: int | None = None,
+    preset: str = "standard",
+    device: str | torch.device = "auto",
+) -> GaussianScene:
+    """Make a scene smaller.
+
+    :class:`cvtgs.Simplifier` does the same, with more choices and a report.
+
+    Args:
+        scene: The scene, or a file or folder that :func:`cvtgs.load` reads.
+        rho: Ratio of Gaussians to keep, in (0, 1].
+        count: Number of Gaussians to keep, instead of ``rho``.
+        preset: Name of the preset, from ``draft``, the fastest, to ``max``, the best.
+        device: Where to compute, as for :class:`cvtgs.Simplifier`.
+
+    Returns:
+        A scene of exactly ``ceil(rho * N)`` (or ``count``) Gaussians; fewer only if so many rows
+        are invalid.
+
+    Raises:
+        InputError: The file cannot be read.
+        FileFormatError: The file is not what its format promises.
+        ConfigError: There is no such preset.
+        InvalidArgumentError: Ratio or count is out of range, or both or neither are given.
+        InvalidSceneError: The scene has no valid row.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> len(simplify(make("object", 1000), 0.01, device="cpu"))
+        10
+    """
+    simplifier = Simplifier(preset=preset, device=device)
+    if isinstance(scene, str | os.PathLike):
+        scene = load(scene)
+    return simplifier.simplify(scene, rho, count=count)
