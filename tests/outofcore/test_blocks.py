@@ -14,7 +14,7 @@ from cvtgs.devices import one_thread
 from cvtgs.errors import ConfigError, FileFormatError, InvalidArgumentError, InvalidSceneError
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.io.ply import open_rows
-from cvtgs.outofcore import block_count, memory, read_bytes, simplify_file
+from cvtgs.outofcore import block_count, read_bytes, simplify_file
 from cvtgs.outofcore.partition import partition_space
 from cvtgs.views import automatic_views
 from scenes import random_scene, same_bits
@@ -239,17 +239,6 @@ def test_amounts_of_memory(text, wanted):
 def test_bad_amounts_of_memory(text):
     with pytest.raises(InvalidArgumentError, match="memory must be"):
         read_bytes(text)
-
-
-def test_free_memory_is_known_where_linux_does_not_tell(monkeypatch):
-    def refuse(*_, **__):
-        raise OSError
-
-    told = memory.available_memory()
-    monkeypatch.setattr(memory.Path, "read_text", refuse)
-    assert memory.available_memory() >= told  # all of it, where nobody says what is free
-    monkeypatch.setattr(memory.os, "sysconf", refuse)
-    assert memory.available_memory() == 1 << 62
 
 
 def test_less_memory_makes_more_blocks(source):

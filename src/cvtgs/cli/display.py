@@ -56,13 +56,14 @@ def progress_bars(*, quiet: bool) -> Iterator[ProgressListener]:
 
     with Progress(console=Console(stderr=True)) as progress:
         bars: dict[str, TaskID] = {}
+        encoding = sys.stderr.encoding or "utf-8"  # None of a StringIO
 
         def listen(event: ProgressEvent) -> None:
             if event.done == 0 or event.stage not in bars:
                 bars[event.stage] = progress.add_task(event.stage, total=event.total)
             progress.update(bars[event.stage], completed=event.done, total=event.total)
             if event.note:
-                text = escape(printable(f"{event.stage} {event.note}", sys.stderr.encoding))
+                text = escape(printable(f"{event.stage} {event.note}", encoding))
                 progress.update(bars[event.stage], description=text)
 
         yield listen

@@ -327,10 +327,14 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
     """Return the memory for simplifying block by block; None if it is not needed or possible."""
     from cvtgs.io.ply import open_rows
     from cvtgs.outofcore import available_memory, block_count, check_config, read_bytes
+    from cvtgs.outofcore.memory import memory_to_plan
 
     names = ("target_psnr", "target_ssim", "time_budget", "cameras", "axes", "sh_degree")
     excluded = [name for name in names if getattr(options, name) is not None]
-    memory = available_memory() if options.memory is None else read_bytes(options.memory)
+    if options.memory is None:
+        memory = memory_to_plan(available_memory())
+    else:
+        memory = read_bytes(options.memory)
     if options.memory is None and options.scheduler is None:
         try:
             if excluded or block_count(open_rows(options.input), memory) == 1:

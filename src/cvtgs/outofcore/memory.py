@@ -12,9 +12,6 @@ from cvtgs.io.ply import PlyRows
 BASE_BYTES = 600_000_000
 """Interpreter, torch, network, the grid of depths, and one chunk of rows."""
 
-LEAST_BYTES = 2 * BASE_BYTES
-"""The least memory to plan with; what runs in it takes about half of it."""
-
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 
 
@@ -41,9 +38,10 @@ def read_bytes(text: str) -> int:
     if match[3]:
         unit = 1024 ** " KMGT".index(match[2] or " ")
     amount = int(float(match[1]) * unit)
-    if amount < LEAST_BYTES:
+    least = 2 * BASE_BYTES
+    if amount < least:
         raise InvalidArgumentError(
-            f"memory must be at least {LEAST_BYTES / 1e9:g} GB, which torch and one block need; "
+            f"memory must be at least {least / 1e9:g} GB, which torch and one block need; "
             f"found {text!r}."
         )
     return amount
@@ -72,6 +70,14 @@ def available_memory() -> int:
         if limit != resource.RLIM_INFINITY:
             rooms.append(limit - psutil.Process().memory_info().vms)
     return max(0, min(rooms))
+
+
+def memory_to_plan(free: int) -> int:
+    """Return the memory to plan with by default: what is free, but enough for a small block.
+
+    The estimates are twice what is used, so less than that would only make more blocks.
+    """
+    return max(free, BASE_BYTES + BASE_BYTES // 4)
 
 
 def control_group_rooms(root: Path) -> list[int]:
@@ -153,5 +159,5 @@ def block_count(source: PlyRows, memory: int) -> int:
     """
     if needed_memory(source, source.count) <= memory:
         return 1
-    room = max(memory, LEAST_BYTES) - BASE_BYTES
+    room = memory - BASE_BYTES if memory > BASE_BYTES else BASE_BYTES // 4
     return max(2, math.ceil(2 * (needed_memory(source, source.count) - BASE_BYTES) / room))

@@ -31,7 +31,7 @@ from cvtgs.io.tensors import map_tensors
 from cvtgs.math.frames import robust_frame
 from cvtgs.outofcore.job import Job, job_folder
 from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
-from cvtgs.outofcore.memory import available_memory, block_count
+from cvtgs.outofcore.memory import available_memory, block_count, memory_to_plan
 from cvtgs.outofcore.merge import BlockReport, correct, inflate, merge, simplify_block
 from cvtgs.outofcore.rows import SortedCounts, sort_range
 from cvtgs.outofcore.scan import RowRange, add_totals, read_sample, scan_range, scan_scene
@@ -133,7 +133,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     check_save(output, overwrite=overwrite)
     rows = open_rows(source)
     target = target_count(rows.count, rho, count=count)
-    wanted = blocks or block_count(rows, memory or available_memory())
+    wanted = blocks or block_count(rows, memory or memory_to_plan(available_memory()))
     job = Job(
         folder=job_folder(output),
         source=rows,
