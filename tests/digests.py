@@ -108,7 +108,7 @@ CASES = {
     **{f"{kind} protected": partial(protected, kind) for kind in KINDS},
     **{f"{kind} torch search": partial(torch_search, kind) for kind in ("room", "landscape")},
     **{f"{kind} levels": partial(levels, kind) for kind in KINDS},
-    **{f"large {rho}": partial(large, rho) for rho in (0.1, 0.003)},
+    **{f"large {rho}": partial(large, rho) for rho in (0.4, 0.1, 0.003)},
     **{f"{kind} in 1 block": partial(in_blocks, kind, 1) for kind in ("object", "landscape")},
     **{f"{kind} in 4 blocks": partial(in_blocks, kind, 4) for kind in KINDS},
     "room in 5 blocks, boxes": partial(

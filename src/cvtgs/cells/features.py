@@ -358,7 +358,7 @@ def _cell_features(context: NeighborContext, totals: CellTotals) -> Float[Tensor
         context.cover.amax(dim=2),
         totals.extents,
         0.2 * torch.log(totals.counts),
-        merged.opacities,
+        torch.sigmoid(merged.logits),  # of these cells alone: rounding goes with the length
         0.2 * merged.logits,
         0.3 * parameters.positive_log(totals.depths).clamp(-14, 14),
         0.5 * (log_scales[:, 0] - log_scales[:, 1]).clamp(-8, 8),
