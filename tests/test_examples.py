@@ -13,6 +13,8 @@ import cvtgs
 from tests.io.test_checkpoints import splatfacto
 from tests.io.test_files import inria_model
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 

@@ -103,6 +103,7 @@ def run(encoding: str, *words: str | bytes) -> subprocess.CompletedProcess[bytes
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
 def test_consoles_of_other_encodings(tmp_path: Path, encoding: str) -> None:
     path = tmp_path / "caf\u00e9 \u4e2d.ply"
@@ -118,6 +119,7 @@ def test_consoles_of_other_encodings(tmp_path: Path, encoding: str) -> None:
     assert b"Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 @linux
 def test_names_that_are_not_utf_8(tmp_path: Path) -> None:
     path = os.fsencode(tmp_path) + b"/sc\xe9ne.ply"

@@ -32,6 +32,7 @@ def test_an_embedding_program_is_typed(folder: Path) -> None:
     assert done.returncode == 0, done.stdout
 
 
+@pytest.mark.slow
 def test_wrong_calls_are_found(folder: Path) -> None:
     """The check could fail: three mistakes give three errors."""
     program = folder / "wrong.py"

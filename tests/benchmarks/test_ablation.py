@@ -13,6 +13,8 @@ from benchmarks.ablation import grouped_simplifier, nearest_groups, regroup
 from cvtgs.mergenet import load_checkpoint
 from cvtgs.train.cases import merge_scene
 
+pytestmark = pytest.mark.slow
+
 JUDGE = """
 import json, sys
 print(json.dumps([{"psnr": 20.0 + k, "ssim": 0.5} for k in range(len(sys.argv) - 2)]))

@@ -17,6 +17,8 @@ from cvtgs.validity import invalid_rows
 from render_cases import one_camera
 from scenes import random_scene
 
+pytestmark = pytest.mark.slow
+
 COVERED = "opacity pruning", "mass pruning", "GHAP", "NanoGS"  # the others need images
 
 

@@ -14,6 +14,8 @@ from benchmarks.baselines import baseline, ghap, nano_gs
 from cvtgs.validity import standardized
 from scenes import random_scene
 
+pytestmark = pytest.mark.slow
+
 
 def divergence(mean, cov, center, spread) -> float:
     """``KL(N(mean, cov) || N(center, spread))``, from its definition."""

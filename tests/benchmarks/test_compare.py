@@ -10,6 +10,8 @@ import lpips_cases
 from benchmarks import compare, quality
 from benchmarks.baselines import BASELINES, baseline
 
+pytestmark = pytest.mark.slow
+
 COPY = """
 import sys
 

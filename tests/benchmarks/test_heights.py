@@ -2,8 +2,12 @@
 
 import sys
 
+import pytest
+
 import cvtgs
 from benchmarks import heights
+
+pytestmark = pytest.mark.slow
 
 
 def test_every_variant_is_compared_with_standard_at_every_height(tmp_path, monkeypatch, capsys):

@@ -6,6 +6,8 @@ import torch
 from benchmarks import numerics
 from hard_cases import CASES
 
+pytestmark = pytest.mark.slow
+
 MARKS = "<!-- tables: python -m benchmarks.numerics -->", "<!-- end of tables -->"
 
 

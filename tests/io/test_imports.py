@@ -41,6 +41,7 @@ LOADED = (
 )
 
 
+@pytest.mark.slow
 def test_plyfile_is_loaded_only_for_odd_files(tmp_path: Path) -> None:
     properties = gaussian_properties()
     rows = gaussian_rows(properties, 1)
@@ -69,6 +70,7 @@ def test_a_scene_in_memory_needs_no_format() -> None:
     assert printed(program) == ["", "atomic tensors"]  # of the merge network
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
 @pytest.mark.parametrize("end", FORMATS)
 def test_a_format_is_loaded_when_a_file_of_it_is_read(tmp_path: Path, end: str) -> None:

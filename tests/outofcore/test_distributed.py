@@ -55,6 +55,7 @@ def test_a_killed_worker_changes_nothing(cluster, source, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["alone.ply", "together.ply"]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_command(cluster, source, tmp_path):
     words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.01", "--quiet"]

@@ -37,6 +37,7 @@ def test_images_and_gradients(dtype):
         torch.testing.assert_close(one, same, **CLOSE[dtype])
 
 
+@pytest.mark.slow
 def test_refinement():
     full = full_scene(300)
     small, config = discolored(small_scene(full)), quick(check_every=4)
@@ -50,6 +51,7 @@ def test_refinement():
     torch.testing.assert_close(after.sh0, wanted.scene.sh0, rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_preset_that_refines():
     changes = {"steps": 4, "check_every": 2, "size": 32, "heldout": 4, "batch": 4}
     config = SimplifyConfig.from_mapping({"preset": "high", "refine": changes})

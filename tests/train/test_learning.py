@@ -64,6 +64,7 @@ def test_a_scene_never_learned_from_gains(trained):
     assert trained.history.best().mean_gain > 1.0
 
 
+@pytest.mark.slow
 def test_a_training_scene_gains_in_views_never_seen(trained):
     """Other views, at another ratio, through the simplifier and the file that was written."""
     scene = small_scene(COUNT, seed=0)
