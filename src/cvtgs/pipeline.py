@@ -22,7 +22,7 @@ from cvtgs.config import MergeConfig, SimplifyConfig
 from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
 from cvtgs.math.frames import RobustFrame, morton_order
-from cvtgs.math.segments import segment_ids
+from cvtgs.math.segments import label_sums, segment_ids
 from cvtgs.mergenet import MergeNet, correct_cells
 from cvtgs.report import CellStatistics
 from cvtgs.scene import GaussianScene
@@ -247,11 +247,11 @@ def group_cells(
 def _grouping(
     tessellation: cvt.Tessellation, rows: Tensor, labels: Tensor, weights: Tensor, target: int
 ) -> Grouping:
-    """Collect the rows of every label; labels and memory of the tessellation are not kept."""
+    """Return the rows and the weight of every cell; the labels of the points are let go."""
     local = cells.Partition.from_labels(labels, target)
     return Grouping(
         partition=cells.Partition(order=rows[local.order], offsets=local.offsets),
-        weights=torch.bincount(tessellation.labels, weights),
+        weights=label_sums([weights], tessellation.labels, target)[:, 0],
         refilled=tessellation.refilled,
         energies=tessellation.energies,
         energy=tessellation.energy,
