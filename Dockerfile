@@ -1,0 +1,16 @@
+# docker build -t cvtgs .
+# docker run --rm -u "$(id -u):$(id -g)" -v "$PWD:/data" cvtgs simplify scene.ply small.ply --rho 0.01
+FROM python:3.12-slim
+
+WORKDIR /src
+COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY src src
+RUN python -m pip install --no-cache-dir --extra-index-url https://download.pytorch.org/whl/cpu \
+        -c constraints.txt ".[numba,plots]" \
+    && rm -rf /src
+
+# Any user may run it: caches of numba and matplotlib and the measured speed of the machine.
+ENV HOME=/tmp
+WORKDIR /data
+ENTRYPOINT ["cvtgs"]
+CMD ["--help"]

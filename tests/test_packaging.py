@@ -1,0 +1,56 @@
+"""The files that other programs build and test the package by agree with pyproject.toml."""
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import cvtgs
+
+ROOT = Path(__file__).parent.parent
+PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+CONDA_NAMES = {"torch": "pytorch", "matplotlib": "matplotlib-base"}
+"""Packages that have another name at conda-forge."""
+
+
+def read(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def spaced(requirement: str) -> str:
+    """Return a requirement as conda writes it."""
+    name, version = re.fullmatch(r"([\w-]+)(>=.*)", requirement).groups()
+    return f"{CONDA_NAMES.get(name, name)} {version}"
+
+
+def test_one_version_everywhere():
+    assert PROJECT["version"] == cvtgs.__version__
+    assert f"\nversion: {cvtgs.__version__}\n" in read("CITATION.cff")
+
+
+def test_the_workflow_checks_every_supported_python_as_ci_does():
+    workflow = read(".github/workflows/checks.yml")
+    matrix = re.search(r"python: \[(.*)\]", workflow)[1]
+    classifiers = re.findall(r"Python :: (3\.\d+)", "\n".join(PROJECT["classifiers"]))
+    assert re.findall(r"3\.\d+", matrix) == classifiers
+    assert f">={classifiers[0]}" == PROJECT["requires-python"]
+    assert "      - run: .ci/run\n" in workflow
+    sessions = re.findall(r"nox -s (\w+)", workflow)
+    assert sessions == ["docs", "wheel"]
+    assert [name for name in sessions if f"\ndef {name}(" not in read("noxfile.py")] == []
+
+
+def test_the_conda_recipe_needs_what_the_package_needs():
+    needs = re.search(r"  run:\n(.*?)  run_constrained:\n", read("conda/meta.yaml"), re.DOTALL)[1]
+    listed = re.findall(r"    - (.*)\n", needs)
+    assert listed[0] == f"python {PROJECT['requires-python']}"
+    assert sorted(listed[1:]) == sorted(map(spaced, PROJECT["dependencies"]))
+
+
+def test_the_docker_context_holds_what_is_copied():
+    files = re.findall(r"^COPY (.*) \S+$", read("Dockerfile"), re.MULTILINE)
+    copied = [name for line in files for name in line.split()]
+    assert sorted(copied) == sorted(re.findall(r"^!(\S+)$", read(".dockerignore"), re.MULTILINE))
+    assert [name for name in copied if not (ROOT / name).exists()] == []
+    extras = re.search(r'"\.\[(.*)\]"', read("Dockerfile"))[1].split(",")
+    assert set(extras) <= set(PROJECT["optional-dependencies"])
