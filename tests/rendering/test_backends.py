@@ -4,10 +4,13 @@ import math
 import os
 import subprocess
 import sys
+import tomllib
 from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 import torch
+from packaging.requirements import Requirement
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError, InvalidArgumentError
@@ -15,6 +18,7 @@ from cvtgs.progress import ProgressEvent
 from cvtgs.rendering import choose_backend, render
 from scenes import random_scene
 
+ROOT = Path(__file__).parents[2]
 CAMERAS = Cameras(
     viewmats=torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]])[None],
     Ks=torch.tensor([[[8.0, 0, 4], [0, 8, 3], [0, 0, 1]]]),
@@ -83,8 +87,32 @@ def test_without_numba():
         "torch",
         "backend 'numba' needs the package numba, which cannot be imported "
         "(import of numba halted; None in sys.modules); "
-        "install it with: pip install 'cvtgs[numba]', or use backend='torch'.",
+        "install it with: pip install numba, or use backend='torch'.",
     ]
+
+
+def test_without_a_folder_for_compiled_code():
+    pytest.importorskip("numba")
+    lines = python(
+        "from numba.core import caching\n"
+        "caching.CacheImpl._locator_classes = []\n"
+        "from cvtgs.rendering.compiled import serial\n"
+        "print(serial(lambda number: number + 1)(2))\n"
+    )
+    assert lines == ["3"]
+
+
+def test_numba_is_installed_with_the_package_where_it_has_wheels():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    (found,) = [Requirement(n) for n in project["dependencies"] if n.startswith("numba")]
+    assert "numba" not in project["optional-dependencies"]
+    here = {"platform_python_implementation": "CPython", "python_version": "3.13"}
+    for machine in ("x86_64", "AMD64", "aarch64", "arm64", "ARM64"):
+        assert found.marker.evaluate({**here, "platform_machine": machine})
+        assert not found.marker.evaluate(
+            {**here, "platform_machine": machine, "python_version": "3.16"}
+        )
+    assert not found.marker.evaluate({**here, "platform_machine": "ppc64le"})
 
 
 def test_importing_loads_no_optional_package():

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from cvtgs.rendering import BackendName
 
 BACKENDS = ("torch", "numpy", "scipy", "numba", "gsplat")
-"""The packages that compute; the last two are optional."""
+"""The packages that compute; cvtgs works without the last two."""
 
 RENDERERS = ("torch", "numba", "gsplat")
 COUNT, RHO, SIDE = 20_000, 0.1, 256
@@ -87,9 +87,12 @@ def doctor(options: argparse.Namespace) -> None:
     devices = [torch.device("cpu"), *(torch.device("cuda", number) for number in range(gpus))]
     for one in devices if device is None else [device]:
         say(f"\n{one}: {device_name(one)}")
+        taken = cvtgs.rendering.choose_backend("auto", one)[0]
         for name in RENDERERS:
-            say(f"  images by {name:<7} {_renderer_state(name, one)}")
-        say(f"  nearest site by  {cvtgs.cvt.nearest_backend('auto')[0]}")
+            use = " (used: the fastest of those that work here)" if name == taken else ""
+            say(f"  images by {name:<7} {_renderer_state(name, one)}{use}")
+        search = cvtgs.cvt.nearest_backend("auto")[0]
+        say(f"  nearest site by {search} (used: a k-d tree on the host, whatever the device)")
     default = chosen_device(options.device)
     say(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one image")
     try:

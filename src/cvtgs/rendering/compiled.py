@@ -1,7 +1,8 @@
 """What the compiled kernels share: numba, which only this file imports, and their arrays.
 
-Compiled code is kept on disk beside the source (or in ``NUMBA_CACHE_DIR``), so only the first
-call ever waits for the compiler. A kernel's cache notices changes of its own file only: after
+Compiled code is kept on disk beside the source, in the user's folder for caches or in
+``NUMBA_CACHE_DIR``, so only the first call ever waits for the compiler; where none of these can be
+written, every process compiles anew. A kernel's cache notices changes of its own file only: after
 changing a function that a kernel of another file calls, clear the cache.
 """
 
@@ -15,10 +16,10 @@ from cvtgs.errors import MissingDependencyError
 
 try:
     import numba
-except ImportError as error:
+except (ImportError, OSError) as error:
     raise MissingDependencyError(
         f"backend 'numba' needs the package numba, which cannot be imported ({error}); "
-        f"install it with: pip install 'cvtgs[numba]', or use backend='torch'."
+        f"install it with: pip install numba, or use backend='torch'."
     ) from error
 
 Array = NDArray[Any]
@@ -45,12 +46,19 @@ _SETTINGS: dict[str, Any] = {
 
 def serial(function: F) -> F:
     """Compile a function when it is first called."""
-    return cast("F", numba.njit(**_SETTINGS)(function))
+    return _compiled(function, **_SETTINGS)
 
 
 def parallel(function: F) -> F:
     """Compile a function whose outer loop runs over :data:`prange`."""
-    return cast("F", numba.njit(parallel=True, **_SETTINGS)(function))
+    return _compiled(function, **_SETTINGS, parallel=True)
+
+
+def _compiled(function: F, **settings: Any) -> F:
+    try:
+        return cast("F", numba.njit(**settings)(function))
+    except RuntimeError:  # no folder for compiled code can be written
+        return cast("F", numba.njit(**settings | {"cache": False})(function))
 
 
 def use_threads(count: int) -> None:
