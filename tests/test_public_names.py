@@ -140,6 +140,8 @@ STAGES = {
         "LpipsWeights",
         "SceneScores",
         "Score",
+        "alpha_bias",
+        "alpha_error",
         "compare",
         "evaluate",
         "load_lpips",

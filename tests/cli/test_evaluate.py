@@ -43,7 +43,9 @@ def test_evaluate_prints_a_row_per_scene(scenes, capsys):
     printed = capsys.readouterr().out
     assert "2 views of 48 x 36 pixels, rendered by" in printed
     assert "against full.ply, 2,000 Gaussians:" in printed
-    assert re.search(r"0\.1\.ply +200 +[\d.]+ kB +\d+\.\d\d +0\.\d{4}  -", printed)
+    assert re.search(
+        r"0\.1\.ply +200 +[\d.]+ kB +\d+\.\d\d +0\.\d{4}  +-  0\.\d{4}  [+-]0\.\d{4}\n", printed
+    )
     assert "LPIPS" in printed
 
 
@@ -62,7 +64,9 @@ def test_evaluate_against_photographs(folder, scenes, capsys):
     assert (evaluation.width, evaluation.height) == (64, 48)
     assert [scores.name for scores in evaluation.photographs] == ["full.ply", "0.1.ply"]
     assert main(["evaluate", *scenes[:2], *words, "--lpips", "off", *SMALL]) == 0
-    assert "against photographs:" in capsys.readouterr().out
+    against_full, against_photographs = capsys.readouterr().out.split("against photographs:")
+    assert "alpha" in against_full
+    assert "alpha" not in against_photographs
 
 
 @pytest.mark.parametrize(

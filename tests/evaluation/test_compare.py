@@ -14,6 +14,8 @@ from cvtgs.errors import InputError, InvalidArgumentError
 from cvtgs.evaluation import (
     Evaluation,
     EvaluationSettings,
+    alpha_bias,
+    alpha_error,
     compare,
     evaluate,
     load_photographs,
@@ -64,6 +66,10 @@ def test_scores_are_those_of_the_metrics(scene, small, cameras):
     assert scores.ssim.views == pytest.approx(ssim(image, truth).tolist(), rel=1e-5)
     assert scores.psnr.mean == pytest.approx(sum(scores.psnr.views) / 3)
     assert scores.lpips is None
+    alpha, true_alpha = (render(s, cameras).alpha for s in (small["0.1"], scene))
+    wanted = alpha_error(alpha, true_alpha), alpha_bias(alpha, true_alpha)
+    assert scores.alpha_error.views == pytest.approx(wanted[0].tolist(), rel=1e-5)
+    assert scores.alpha_bias.views == pytest.approx(wanted[1].tolist(), rel=1e-4)
     assert evaluation.lpips_note == "not asked for"
     assert evaluation.scenes[1].psnr.mean < scores.psnr.mean
     assert evaluation.views == ("view 1", "view 2", "view 3")
@@ -112,6 +118,8 @@ def test_photographs_are_scored_for_every_scene(scene, small, cameras):
     evaluation = evaluate(scene, small, cameras, settings=OFF, photographs=photographs)
     assert [scores.name for scores in evaluation.photographs] == ["full", "0.1", "0.01"]
     full, tenth, _ = evaluation.photographs
+    assert tenth.alpha_error is None
+    assert tenth.alpha_bias is None
     assert tenth.psnr.mean < full.psnr.mean < 40
     with pytest.raises(ValueError, match=r"photographs must have shape \(3, 36, 48, 3\)"):
         evaluate(scene, small, cameras, settings=OFF, photographs=photographs[:2])

@@ -1,4 +1,4 @@
-"""PSNR and SSIM against hand-computed values and scipy."""
+"""PSNR, SSIM and the error of alpha against hand-computed values and scipy."""
 
 import math
 
@@ -8,7 +8,7 @@ import torch
 from scipy.ndimage import correlate1d
 
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.evaluation import psnr, ssim
+from cvtgs.evaluation import alpha_bias, alpha_error, psnr, ssim
 from cvtgs.losses import ssim_loss
 
 
@@ -119,3 +119,22 @@ def test_error_texts() -> None:
     assert str(error.value) == "images must have at least 11 x 11 pixels here, found 12 x 10."
     with pytest.raises(InvalidArgumentError, match="both stacks of images must have one shape"):
         psnr(image, image[:, :5])
+
+
+def test_error_and_bias_of_alpha_by_hand() -> None:
+    small = torch.tensor([[[0.5, 1.0], [0.0, 0.25]], [[1.0, 1.0], [1.0, 1.0]]])
+    full = torch.tensor([[[1.0, 0.75], [0.0, 0.75]], [[1.0, 1.0], [1.0, 0.0]]])
+    assert alpha_error(small, full).tolist() == [1.25 / 4, 1 / 4]
+    assert alpha_bias(small, full).tolist() == [-0.75 / 4, 1 / 4]
+    holes = (alpha_error(small, full) - alpha_bias(small, full)) / 2
+    assert holes.tolist() == [1 / 4, 0]
+    assert alpha_error(full + 1e-6, full)[1].item() < 1e-6  # clipped at 1
+
+
+def test_alpha_that_does_not_fit_is_refused() -> None:
+    alpha = torch.zeros(1, 2, 3)
+    for other in (alpha.double(), torch.zeros(1, 3, 2)):
+        with pytest.raises(InvalidArgumentError, match="must share shape, dtype and device"):
+            alpha_error(alpha, other)
+    with pytest.raises(InvalidArgumentError, match=r"floats of shape \(c, h, w\)"):
+        alpha_bias(alpha[0], alpha[0])

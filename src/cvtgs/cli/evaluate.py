@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 MOST_CAMERAS = 8
 """Cameras that a page shows unless ``--views`` sets another number."""
 
+ALPHA_MEANS = "alpha: mean |difference| of coverage; bias < 0: more of the background shows"
+
 
 def add_render(add_parser: AddParser) -> None:
     """Add the command and its options."""
@@ -178,6 +180,7 @@ def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
     )
     say(f"against {evaluation.reference}, {evaluation.reference_count:,} Gaussians:")
     _print_score_table(evaluation.scenes, sizes)
+    say(ALPHA_MEANS)
     if evaluation.photographs:
         say("against photographs:")
         _print_score_table(evaluation.photographs, sizes)
@@ -187,13 +190,20 @@ def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
 
 def _print_score_table(scenes: "tuple[SceneScores, ...]", sizes: dict[str, int]) -> None:
     width = max(len(scene.name) for scene in scenes)
-    say(f"  {'':{width}}  {'Gaussians':>12}  {'size':>9}  {'PSNR':>6}  {'SSIM':>6}  LPIPS")
+    heads = (
+        f"  {'':{width}}  {'Gaussians':>12}  {'size':>9}  {'PSNR':>6}  {'SSIM':>6}  {'LPIPS':>6}"
+    )
+    with_alpha = all(scene.alpha_error for scene in scenes)
+    say(f"{heads}  {'alpha':>6}  {'bias':>7}" if with_alpha else heads)
     for scene in scenes:
         distance = f"{scene.lpips.mean:.4f}" if scene.lpips else "-"
-        say(
+        line = (
             f"  {scene.name:{width}}  {scene.count:>12,}  {size_text(sizes[scene.name]):>9}  "
-            f"{scene.psnr.mean:>6.2f}  {scene.ssim.mean:>6.4f}  {distance}"
+            f"{scene.psnr.mean:>6.2f}  {scene.ssim.mean:>6.4f}  {distance:>6}"
         )
+        if scene.alpha_error and scene.alpha_bias:
+            line += f"  {scene.alpha_error.mean:>6.4f}  {scene.alpha_bias.mean:>+7.4f}"
+        say(line)
 
 
 def add_compare(add_parser: AddParser) -> None:

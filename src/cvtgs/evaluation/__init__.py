@@ -3,7 +3,7 @@
 from cvtgs.evaluation.compare import Comparison, compare, evaluate
 from cvtgs.evaluation.comparison_files import write_comparison
 from cvtgs.evaluation.lpips import LPIPS_VARIABLE, LpipsWeights, load_lpips, lpips
-from cvtgs.evaluation.metrics import psnr, ssim
+from cvtgs.evaluation.metrics import alpha_bias, alpha_error, psnr, ssim
 from cvtgs.evaluation.photographs import load_photographs
 from cvtgs.evaluation.report import Evaluation, SceneScores, Score
 from cvtgs.evaluation.scorer import EvaluationSettings
@@ -16,6 +16,8 @@ __all__ = [
     "LpipsWeights",
     "SceneScores",
     "Score",
+    "alpha_bias",
+    "alpha_error",
     "compare",
     "evaluate",
     "load_lpips",

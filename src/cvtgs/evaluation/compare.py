@@ -187,7 +187,7 @@ def _score_images(
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
     for view in range(len(cameras)):
         camera = cameras.select(torch.tensor([view]))
-        truth = reference.means.new_zeros(0)
+        truth = truth_alpha = reference.means.new_zeros(0)
         for name, scene in scenes.items():
             rendered = render_view(scene, camera, backend=settings.backend)
             backend = rendered.backend
@@ -196,9 +196,10 @@ def _score_images(
             if images is not None:
                 images[name][view] = as_bytes(image[0])
             if name == reference_name:
-                truth = image
+                truth, truth_alpha = image, rendered.alpha
             else:
-                against_full[name].append(metrics.compare(image, truth))
+                alphas = (rendered.alpha, truth_alpha.to(rendered.alpha))
+                against_full[name].append(metrics.compare(image, truth, alphas=alphas))
             if photographs is not None:
                 found = metrics.compare(image, photographs[view : view + 1])
                 against_photographs[name].append(found)

@@ -1,9 +1,10 @@
-"""Image metrics by formula: PSNR and SSIM."""
+"""Image metrics by formula: PSNR, SSIM and the error of alpha."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.losses import SSIM_WINDOW, check_pair, mean_ssim
 
 
@@ -60,6 +61,73 @@ def ssim(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tens
     check_pair(a, b, least=SSIM_WINDOW)
     pairs = zip(a.clamp(0, 1).split(1), b.clamp(0, 1).split(1), strict=True)
     return torch.cat([mean_ssim(one, other) for one, other in pairs])
+
+
+@torch.no_grad()
+def alpha_error(a: Float[Tensor, "c h w"], b: Float[Tensor, "c h w"]) -> Float[Tensor, "c"]:
+    """Return the mean absolute difference of accumulated alpha of each pair of images.
+
+    Accumulated alpha is the share of a pixel that the scene covers; the rest is background. The
+    error is the same over every background, so holes show that a similar background hides.
+
+    Args:
+        a: ``(c, h, w)`` alpha, clipped to [0, 1].
+        b: ``(c, h, w)`` alpha, clipped to [0, 1].
+
+    Returns:
+        ``(c,)`` values from 0 to 1, without gradient; 0 for equal alpha.
+
+    Raises:
+        InvalidArgumentError: Shape, dtype or device do not fit.
+
+    Example:
+        >>> alpha_error(torch.tensor([[[0.5, 1.0]]]), torch.tensor([[[1.0, 0.75]]])).tolist()
+        [0.375]
+    """
+    return _alpha_differences(a, b).abs().mean(dim=(1, 2)).to(a.dtype)
+
+
+@torch.no_grad()
+def alpha_bias(a: Float[Tensor, "c h w"], b: Float[Tensor, "c h w"]) -> Float[Tensor, "c"]:
+    """Return the mean of ``a - b`` of each pair of images of accumulated alpha.
+
+    It is negative where ``a`` lets more light of the background through than ``b``: -0.01 means
+    that 1 % more of it arrives. Holes alone have the mean ``(error - bias) / 2``, with
+    :func:`alpha_error`.
+
+    Args:
+        a: ``(c, h, w)`` alpha of the simplified scene, clipped to [0, 1].
+        b: ``(c, h, w)`` alpha of the full scene, clipped to [0, 1].
+
+    Returns:
+        ``(c,)`` values from -1 to 1, without gradient.
+
+    Raises:
+        InvalidArgumentError: Shape, dtype or device do not fit.
+
+    Example:
+        >>> alpha_bias(torch.tensor([[[0.5, 1.0]]]), torch.tensor([[[1.0, 0.75]]])).tolist()
+        [-0.125]
+    """
+    return _alpha_differences(a, b).mean(dim=(1, 2)).to(a.dtype)
+
+
+def _alpha_differences(
+    a: Float[Tensor, "c h w"], b: Float[Tensor, "c h w"]
+) -> Float[Tensor, "c h w"]:
+    """Return ``a - b`` in float64, of images of alpha that fit together."""
+    for images in (a, b):
+        if images.ndim != 3 or 0 in images.shape or not images.is_floating_point():
+            raise InvalidArgumentError(
+                f"images of alpha must be floats of shape (c, h, w) with nothing empty, "
+                f"found {images.dtype} of shape {tuple(images.shape)}."
+            )
+    if a.shape != b.shape or a.dtype != b.dtype or a.device != b.device:
+        raise InvalidArgumentError(
+            f"both stacks of alpha must share shape, dtype and device, found {a.dtype} of shape "
+            f"{tuple(a.shape)} on {a.device} and {b.dtype} of shape {tuple(b.shape)} on {b.device}."
+        )
+    return a.clamp(0, 1).double() - b.clamp(0, 1).double()
 
 
 def pair_psnr(one: Float[Tensor, "1 h w 3"], other: Float[Tensor, "1 h w 3"]) -> Float[Tensor, ""]:

@@ -48,6 +48,10 @@ class SceneScores(Record):
         psnr: Peak signal-to-noise ratio, dB; infinite where images are equal.
         ssim: Structural similarity, at most 1.
         lpips: LPIPS distance, at least 0; None where it was not measured.
+        alpha_error: Mean absolute difference of accumulated alpha, 0 to 1; None against
+            photographs, which have none.
+        alpha_bias: Mean of the accumulated alpha minus that of the full scene, -1 to 1; negative
+            where more of the background shows through. None against photographs.
     """
 
     name: str
@@ -55,6 +59,8 @@ class SceneScores(Record):
     psnr: Score
     ssim: Score
     lpips: Score | None = None
+    alpha_error: Score | None = None
+    alpha_bias: Score | None = None
 
 
 class Evaluation(Record):

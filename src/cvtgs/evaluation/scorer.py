@@ -12,7 +12,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.errors import CvtgsError, InvalidArgumentError
 from cvtgs.evaluation.lpips import LEAST_PIXELS, LpipsNetwork, LpipsWeights, load_lpips, lpips
-from cvtgs.evaluation.metrics import pair_psnr, ssim
+from cvtgs.evaluation.metrics import alpha_bias, alpha_error, pair_psnr, ssim
 from cvtgs.evaluation.report import NOT_ASKED_FOR, SceneScores, Score
 from cvtgs.rendering import BackendName, render
 from cvtgs.scene import GaussianScene
@@ -88,6 +88,8 @@ class ImageScores(NamedTuple):
     psnr: float
     ssim: float | None
     lpips: float | None
+    alpha_error: float | None = None
+    alpha_bias: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,9 +109,13 @@ class Metrics:
     most_psnr: float = math.inf
 
     def compare(
-        self, image: Float[Tensor, "1 h w 3"], truth: Float[Tensor, "1 h w 3"]
+        self,
+        image: Float[Tensor, "1 h w 3"],
+        truth: Float[Tensor, "1 h w 3"],
+        *,
+        alphas: tuple[Float[Tensor, "1 h w"], Float[Tensor, "1 h w"]] | None = None,
     ) -> ImageScores:
-        """Score one image against what it should be."""
+        """Score one image against what it should be; with alphas, those of both images."""
         truth, weights = truth.to(image), self.lpips
         return ImageScores(
             psnr=min(float(pair_psnr(image, truth)), self.most_psnr),
@@ -117,6 +123,8 @@ class Metrics:
             lpips=float(lpips(image, truth, network=weights.network, weights=weights))
             if weights
             else None,
+            alpha_error=None if alphas is None else float(alpha_error(*alphas)),
+            alpha_bias=None if alphas is None else float(alpha_bias(*alphas)),
         )
 
 
@@ -143,20 +151,23 @@ def chosen_metrics(choice: LpipsChoice, size: tuple[int, int]) -> Metrics:
 
 def scene_scores(name: str, count: int, rows: Sequence[ImageScores]) -> SceneScores:
     """Average the scores of a scene, one row per view, of which SSIM was computed."""
-    psnrs, ssims, distances = zip(*rows, strict=True)
+    psnrs, ssims, *others = zip(*rows, strict=True)
+    distances, errors, biases = (None if None in values else Score.of(values) for values in others)
     return SceneScores(
         name=name,
         count=count,
         psnr=Score.of(psnrs),
         ssim=Score.of(ssims),
-        lpips=None if None in distances else Score.of(distances),
+        lpips=distances,
+        alpha_error=errors,
+        alpha_bias=biases,
     )
 
 
 class Scorer:
     """Scores scenes against images of a full one, each of which is rendered once.
 
-    Memory: ``12 b c h w`` bytes for ``c`` views over ``b`` backgrounds in float32.
+    Memory: ``(12 b + 4) c h w`` bytes for ``c`` views over ``b`` backgrounds in float32.
 
     Args:
         full: The full scene.
@@ -177,10 +188,10 @@ class Scorer:
     ) -> None:
         self._metrics = metrics
         self._backgrounds = [full.means.new_tensor(color) for color in backgrounds]
-        self._truths: list[tuple[Cameras, list[Tensor]]] = []
+        self._truths: list[tuple[Cameras, _OverBackgrounds]] = []
         for camera in cameras:
             progress(len(self._truths))
-            self._truths.append((camera, self._images(full, camera)))
+            self._truths.append((camera, self._render(full, camera)))
         progress(len(self._truths))
 
     def __len__(self) -> int:
@@ -188,12 +199,24 @@ class Scorer:
 
     def score(self, scene: GaussianScene) -> list[ImageScores]:
         """Score a scene, view by view and over every background."""
-        return [
-            self._metrics.compare(image, truth)
-            for camera, truths in self._truths
-            for image, truth in zip(self._images(scene, camera), truths, strict=True)
-        ]
+        scores = []
+        for camera, truths in self._truths:
+            images = self._render(scene, camera)
+            alphas = (images.alpha, truths.alpha.to(images.alpha))
+            scores += [
+                self._metrics.compare(image, truth, alphas=alphas)
+                for image, truth in zip(images.colors, truths.colors, strict=True)
+            ]
+        return scores
 
-    def _images(self, scene: GaussianScene, camera: Cameras) -> list[Float[Tensor, "1 h w 3"]]:
+    def _render(self, scene: GaussianScene, camera: Cameras) -> "_OverBackgrounds":
         image = render_view(scene, camera)
-        return [image.over(background).clamp(0, 1) for background in self._backgrounds]
+        colors = [image.over(background).clamp(0, 1) for background in self._backgrounds]
+        return _OverBackgrounds(colors, image.alpha)
+
+
+class _OverBackgrounds(NamedTuple):
+    """An image over every background, and its alpha."""
+
+    colors: list[Float[Tensor, "1 h w 3"]]
+    alpha: Float[Tensor, "1 h w"]

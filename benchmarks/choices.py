@@ -1,0 +1,258 @@
+r"""What choices of ``simplify`` are worth, seen by cameras that were picked by eye.
+
+Every ``--set`` is one configuration, a list of settings that differ from the base; ``preset`` is
+one of them:
+
+    python -m benchmarks.choices a.ply b.ply --rho 0.1 0.01 \
+        --set cvt.color=0.1 --set cvt.color=0.1 merge.network=false --set preset=high
+
+Cameras lie beside each scene (``benchmarks.cameras`` says how), or are automatic ones with
+``--automatic``. Every line has PSNR, SSIM, the mean absolute error of alpha, its bias (negative:
+more of the background shows through than in the full scene), each with its difference to the base,
+and processor seconds of the simplification alone, in one process. Means over the scenes come last.
+``--base merge.network=false`` changes what everything is compared with. Images of full scenes are
+kept in ``--cache``, so that a second run starts at once. With ``--pages DIR`` there is a page per
+scene and ratio to look at, with maps of the errors of colour and of alpha.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import fmean
+
+import cvtgs
+from benchmarks.cameras import CACHE, FullImages, cameras_beside
+from benchmarks.measuring import write_file
+from cvtgs.cameras import Cameras
+from cvtgs.evaluation import EvaluationSettings, compare, write_comparison
+from cvtgs.evaluation.scorer import (
+    BLACK,
+    ImageScores,
+    Metrics,
+    chosen_metrics,
+    render_view,
+    scene_scores,
+)
+from cvtgs.views import automatic_views
+
+RATIOS = (0.1, 0.01)
+BASE, MEAN = "base", "mean"
+AUTOMATIC_VIEWS, AUTOMATIC_SIZE = 8, 400
+
+Settings = Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """What one configuration makes of one scene at one ratio.
+
+    Attributes:
+        scene: Name of the scene, or ``mean``.
+        rho: Share of Gaussians kept.
+        name: Settings of the configuration, or ``base``.
+        psnr: dB.
+        ssim: At most 1.
+        lpips: None if it was not measured.
+        alpha_error: Mean absolute difference of alpha.
+        alpha_bias: Mean of alpha minus that of the full scene.
+        seconds: Processor time of the simplification.
+    """
+
+    scene: str
+    rho: float
+    name: str
+    psnr: float
+    ssim: float
+    lpips: float | None
+    alpha_error: float
+    alpha_bias: float
+    seconds: float
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    options = parser().parse_args(arguments)
+    base = settings_of(options.base)
+    configurations = {BASE: {"preset": "standard", **base}}
+    for words in options.set:
+        name = " ".join(words)
+        if name in configurations:
+            raise SystemExit(f"--set: {name!r} is given twice.")
+        configurations[name] = {**configurations[BASE], **settings_of(words)}
+    rows: list[Row] = []
+    warm_up()
+    print(heads(options), flush=True)
+    for file in options.files:
+        for row in measure(file, configurations, options):
+            rows.append(row)
+            print(line(row, rows), flush=True)
+        save(rows, options.json)
+    if len(options.files) > 1:
+        averages: list[Row] = []
+        for row in means(rows):
+            averages.append(row)
+            print(line(row, averages))
+        save([*rows, *averages], options.json)
+
+
+def parser() -> argparse.ArgumentParser:
+    found = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    found.add_argument("files", nargs="+", type=Path, help="full scenes")
+    found.add_argument("--rho", type=float, nargs="+", default=list(RATIOS))
+    found.add_argument(
+        "--set", action="append", nargs="+", default=[], metavar="KEY=VALUE",
+        help="one configuration; may be repeated",
+    )  # fmt: skip
+    found.add_argument(
+        "--base", nargs="+", default=[], metavar="KEY=VALUE", help="settings of all of them"
+    )
+    found.add_argument("--automatic", action="store_true", help="automatic views instead")
+    found.add_argument("--size", type=int, help="longer side of the images, pixels")
+    found.add_argument(
+        "--lpips", default="off", choices=("off", "auto", "vgg", "alex"), help="measure LPIPS too"
+    )
+    found.add_argument("--cache", type=Path, default=CACHE, help=f"images are kept here ({CACHE})")
+    found.add_argument("--json", type=Path, help="write the rows to this file, too")
+    found.add_argument("--pages", type=Path, metavar="DIR", help="write pages of images, too")
+    return found
+
+
+def settings_of(words: Sequence[str]) -> dict[str, str]:
+    """Return settings by key."""
+    wrong = [word for word in words if "=" not in word]
+    if wrong:
+        raise SystemExit(f"a setting must be KEY=VALUE, found {wrong[0]!r}.")
+    return dict(word.split("=", 1) for word in words)
+
+
+def warm_up() -> None:
+    """Let code compile or load before anything is measured."""
+    cvtgs.Simplifier().simplify(cvtgs.synthetic.scene("object", 1000, sh_degree=0, seed=0), 0.1)
+
+
+def measure(
+    file: Path, configurations: Mapping[str, Settings], options: argparse.Namespace
+) -> Iterator[Row]:
+    """Score all configurations on one scene, ratio by ratio."""
+    scene = cvtgs.load(file)
+    cameras = views_of(file, scene, options)
+    metrics = chosen_metrics(options.lpips, (cameras.width, cameras.height))
+    full = FullImages(scene=scene, cameras=cameras, folder=options.cache)
+    for rho in options.rho:
+        kept: dict[str, cvtgs.GaussianScene] = {}
+        for name, settings in configurations.items():
+            values = dict(settings)
+            config = cvtgs.SimplifyConfig.compose(preset=values.pop("preset"), settings=values)
+            simplifier = cvtgs.Simplifier(config=config)
+            start = time.process_time()
+            small = simplifier.simplify(scene, rho)
+            seconds = time.process_time() - start
+            scores = scene_scores(name, len(small), list(score(small, full, metrics)))
+            assert scores.alpha_error is not None
+            assert scores.alpha_bias is not None
+            yield Row(
+                scene=file.stem,
+                rho=rho,
+                name=name,
+                psnr=scores.psnr.mean,
+                ssim=scores.ssim.mean,
+                lpips=scores.lpips.mean if scores.lpips else None,
+                alpha_error=scores.alpha_error.mean,
+                alpha_bias=scores.alpha_bias.mean,
+                seconds=seconds,
+            )
+            if options.pages:
+                kept[name] = small
+        if options.pages:
+            settings_off = EvaluationSettings(lpips="off")
+            comparison = compare(
+                scene, kept, cameras, reference_name=file.stem, settings=settings_off
+            )
+            folder = options.pages / f"{file.stem}-{rho:g}"
+            write_comparison(comparison, folder, overwrite=True)
+
+
+def views_of(file: Path, scene: cvtgs.GaussianScene, options: argparse.Namespace) -> Cameras:
+    """Return the cameras beside a scene, or automatic ones."""
+    if not options.automatic:
+        return cameras_beside(file, size=options.size).to(scene.device)
+    size = options.size or AUTOMATIC_SIZE
+    return automatic_views(scene, AUTOMATIC_VIEWS, width=size, height=size)
+
+
+def score(small: cvtgs.GaussianScene, full: FullImages, metrics: Metrics) -> Iterator[ImageScores]:
+    """Score a simplified scene view by view, over black."""
+    background = small.means.new_tensor(BLACK)
+    for truth in full.images():
+        image = render_view(small, truth.camera)
+        pair = [one.over(background).clamp(0, 1) for one in (image, truth)]
+        yield metrics.compare(*pair, alphas=(image.alpha, truth.alpha))
+
+
+def means(rows: Sequence[Row]) -> Iterator[Row]:
+    """Average over scenes, for every ratio and configuration in their order."""
+    for rho, name in dict.fromkeys((row.rho, row.name) for row in rows):
+        some = [row for row in rows if (row.rho, row.name) == (rho, name)]
+        distances = [row.lpips for row in some if row.lpips is not None]
+        yield Row(
+            scene=MEAN,
+            rho=rho,
+            name=name,
+            psnr=fmean(row.psnr for row in some),
+            ssim=fmean(row.ssim for row in some),
+            lpips=fmean(distances) if len(distances) == len(some) else None,
+            alpha_error=fmean(row.alpha_error for row in some),
+            alpha_bias=fmean(row.alpha_bias for row in some),
+            seconds=fmean(row.seconds for row in some),
+        )
+
+
+COLUMNS = {
+    "psnr": ("PSNR", 6, 2),
+    "ssim": ("SSIM", 6, 4),
+    "lpips": ("LPIPS", 6, 4),
+    "alpha_error": ("alpha error", 6, 4),
+    "alpha_bias": ("alpha bias", 7, 4),
+}
+"""Heading, width and digits of each score."""
+
+
+def heads(options: argparse.Namespace) -> str:
+    """Return the headings of the lines."""
+    cells = [f"{'scene':16}", f"{'rho':>6}"]
+    cells += [
+        f"{title:>{width + digits + 4}}"
+        for key, (title, width, digits) in COLUMNS.items()
+        if key != "lpips" or options.lpips != "off"
+    ]
+    return "  ".join([*cells, f"{'CPU s':>6}", "configuration"])
+
+
+def line(row: Row, rows: Sequence[Row]) -> str:
+    """Return the text of a row, each score with its difference to the base."""
+    base = next(
+        each for each in rows if (each.scene, each.rho, each.name) == (row.scene, row.rho, BASE)
+    )
+    cells = [f"{row.scene[:16]:16}", f"{row.rho:>6g}"]
+    for key, (_, width, digits) in COLUMNS.items():
+        value, before = getattr(row, key), getattr(base, key)
+        if value is not None:
+            change = "" if row is base else f"{value - before:+.{digits}f}"
+            cells.append(f"{value:{width}.{digits}f} {change:>{digits + 3}}")
+    return "  ".join([*cells, f"{row.seconds:6.2f}", row.name])
+
+
+def save(rows: Sequence[Row], path: Path | None) -> None:
+    """Write all rows as JSON, if there is a file for them."""
+    if path is not None:
+        write_file(path, (json.dumps([asdict(row) for row in rows], indent=1) + "\n").encode())
+
+
+if __name__ == "__main__":
+    sys.stdout.reconfigure(line_buffering=True)
+    main()

@@ -1,0 +1,75 @@
+"""The table of choices: its scores, its differences to the base, and images kept on disk."""
+
+import json
+
+import pytest
+import torch
+
+import cvtgs
+from benchmarks import cameras as camera_files
+from benchmarks import choices
+from cvtgs.evaluation import EvaluationSettings
+from cvtgs.views import automatic_views
+
+SCENE = cvtgs.synthetic.scene("object", 600, sh_degree=0, seed=0)
+VIEWS = automatic_views(SCENE, 2, width=40, height=30)
+
+
+@pytest.fixture
+def file(tmp_path):
+    cvtgs.save(SCENE, tmp_path / "thing.ply")
+    document = {
+        "width": 40,
+        "height": 30,
+        "K": VIEWS.Ks[0].tolist(),
+        "world_to_camera": VIEWS.viewmats.tolist(),
+    }
+    (tmp_path / "thing.cameras.json").write_text(json.dumps(document))
+    return tmp_path / "thing.ply"
+
+
+def test_rows_have_the_scores_of_evaluate_and_differences_to_the_base(file, tmp_path, capsys):
+    place = tmp_path / "rows.json"
+    common = ["--base", "merge.network=false", "--rho", "0.1", "--cache", str(tmp_path / "kept")]
+    choices.main([str(file), *common, "--set", "cvt.color=0.5", "--json", str(place)])
+    base, other = json.loads(place.read_text())
+    config = cvtgs.SimplifyConfig.compose(
+        preset="standard", settings={"merge.network": "false", "cvt.color": "0.5"}
+    )
+    small = cvtgs.Simplifier(config=config).simplify(SCENE, 0.1)
+    wanted = cvtgs.evaluate(
+        SCENE, {"small": small}, VIEWS, settings=EvaluationSettings(lpips="off")
+    ).scenes[0]
+    assert other["name"] == "cvt.color=0.5"
+    assert other["psnr"] == pytest.approx(wanted.psnr.mean, abs=1e-3)
+    assert other["alpha_error"] == pytest.approx(wanted.alpha_error.mean, abs=1e-5)
+    assert other["alpha_bias"] == pytest.approx(wanted.alpha_bias.mean, abs=1e-5)
+    assert other["seconds"] > 0
+    last = capsys.readouterr().out.splitlines()[-1].split()
+    assert last[:2] == ["thing", "0.1"]
+    assert float(last[3]) == pytest.approx(other["psnr"] - base["psnr"], abs=0.006)
+
+
+def test_full_scenes_are_rendered_once_and_then_read(file, tmp_path, monkeypatch):
+    def images():
+        cameras = camera_files.cameras_beside(file)
+        full = camera_files.FullImages(scene=SCENE, cameras=cameras, folder=tmp_path / "kept")
+        return [torch.cat([one.rgb, one.alpha[..., None]], dim=3) for one in full.images()]
+
+    first = images()
+    assert first[0].shape == (1, 30, 40, 4)
+    monkeypatch.delattr(camera_files, "render_view")
+    assert all(torch.equal(one, other) for one, other in zip(first, images(), strict=True))
+
+
+def test_a_scene_without_cameras_is_named(tmp_path):
+    with pytest.raises(SystemExit, match=r"other\.ply: needs cameras beside it"):
+        camera_files.cameras_beside(tmp_path / "other.ply")
+
+
+def test_means_are_over_scenes():
+    common = {"rho": 0.1, "name": "base", "ssim": 0.5, "lpips": None, "alpha_error": 0.1}
+    common |= {"alpha_bias": -0.1, "seconds": 1.0}
+    rows = [choices.Row(scene=str(psnr), psnr=psnr, **common) for psnr in (20.0, 30.0)]
+    (found,) = choices.means(rows)
+    assert (found.scene, found.psnr, found.lpips) == ("mean", 25.0, None)
