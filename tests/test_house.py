@@ -53,6 +53,7 @@ OWNERS = {
     "safetensors": "io/tensors.py",
     "matplotlib": "plots.py",
     "distributed": "outofcore/distributed.py",
+    "filelock": "io/locks.py",
     "psutil": "outofcore/memory.py",
 }
 HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "jinja2", "matplotlib", "zstandard")

@@ -228,6 +228,7 @@ ERRORS = {
     "InputError": OSError,
     "OutputExistsError": FileExistsError,
     "OutputError": OSError,
+    "OutputBusyError": OSError,
     "DeviceError": RuntimeError,
     "OutOfMemoryError": MemoryError,
     "CheckpointError": ValueError,

@@ -48,6 +48,10 @@ class OutputError(CvtgsError, OSError):
     """The output could not be written (missing directory, no permission, disk full)."""
 
 
+class OutputBusyError(OutputError):
+    """Another run works on the same output; the text says which process."""
+
+
 class DeviceError(CvtgsError, RuntimeError):
     """The device that was asked for is not there, or cannot do what was asked."""
 

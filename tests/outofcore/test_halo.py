@@ -14,7 +14,7 @@ from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import correct_cells
 from cvtgs.outofcore import simplify_file
 from cvtgs.outofcore.halo import Balls, OtherBlock, assign_points, bounding_box, halo_cells
-from cvtgs.outofcore.job import Job, job_folder
+from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.merge import read_cells
 from cvtgs.pipeline import shape_merged
 from cvtgs.scene import concatenate
@@ -48,7 +48,7 @@ def job(tmp_path_factory):
             listener=stop_before_assemble,
         )
     return Job(
-        folder=job_folder(folder / "out.ply"),
+        folder=str(next((folder / ".out.ply.blocks").iterdir())),
         source=open_rows(folder / "in.ply"),
         target=TARGET,
         blocks=BLOCKS,

@@ -47,13 +47,13 @@ def test_a_killed_run_continues_with_the_missing_blocks(source, tmp_path):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
     whole = tmp_path / "whole.ply"
     simplify_file(source, whole, 0.05, blocks=8)
-    assert kill_when(start(source, output), lambda: len(list(folder.glob("small_*.ply"))) >= 2)
+    assert kill_when(start(source, output), lambda: len(list(folder.glob("*/small_*.ply"))) >= 2)
     assert not output.exists()
-    done = {path.name: path.stat().st_mtime_ns for path in folder.glob("small_*.ply")}
+    done = {path.name: path.stat().st_mtime_ns for path in folder.glob("*/small_*.ply")}
     seen = {}
 
     def note(event):
-        seen.update({path.name: path.stat().st_mtime_ns for path in folder.glob("small_*.ply")})
+        seen.update({path.name: path.stat().st_mtime_ns for path in folder.glob("*/small_*.ply")})
 
     report = simplify_file(source, output, 0.05, blocks=8, listener=note)
     assert report.resumed_blocks == len(done) >= 2
@@ -69,10 +69,10 @@ def test_a_run_killed_between_steps_of_all_blocks_continues(source, tmp_path, st
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
     whole = tmp_path / "whole.ply"
     simplify_file(source, whole, 0.05, blocks=8)
-    assert kill_when(start(source, output), lambda: len(list(folder.glob(f"{step}_*"))) >= 3)
+    assert kill_when(start(source, output), lambda: len(list(folder.glob(f"*/{step}_*"))) >= 3)
     assert not output.exists()
     names = ("sample", "sites", "sums", "labels", "merged", "inflated")
-    files = [path for name in names for path in folder.glob(f"{name}_*")]
+    files = [path for name in names for path in folder.glob(f"*/{name}_*")]
     done = {path: path.stat().st_mtime_ns for path in files}
     seen = {}
 
@@ -91,7 +91,7 @@ def test_a_run_killed_before_all_rows_were_sorted_starts_over(source, tmp_path):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
     killed = kill_when(start(source, output), folder.exists)
     assert killed
-    assert not (folder / "manifest.json").exists()
+    assert not list(folder.glob("*/manifest.json"))
     report = simplify_file(source, output, 0.05, blocks=8)
     assert report.resumed_blocks == 0
     assert len(cvtgs.load(output)) == 1000
@@ -108,21 +108,43 @@ def stop_in_blocks(event):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("change", ["rho", "blocks", "file", "config", "manifest", "scan"])
+@pytest.mark.parametrize(
+    "change", ["rho", "blocks", "file", "config", "manifest", "scan", "rows", "size"]
+)
 def test_blocks_of_another_job_are_not_used(source, tmp_path, change):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
     with pytest.raises(StoppedError):
         simplify_file(source, output, 0.05, blocks=8, listener=stop_in_blocks)
-    assert len(list(folder.glob("small_*.ply"))) == 3
+    assert len(list(folder.glob("*/small_*.ply"))) == 3
     simplifier = cvtgs.Simplifier(config="draft" if change == "config" else None, device="cpu")
     if change == "file":
         os.utime(source, ns=(0, 0))
     if change == "manifest":
-        (folder / "manifest.json").write_text("[]")
+        next(folder.glob("*/manifest.json")).write_text("[]")
     if change == "scan":
-        save_tensors(folder / "scan.safetensors", {}, {})
+        save_tensors(next(folder.glob("*/scan.safetensors")), {}, {})
+    if change == "rows":
+        with next(folder.glob("*/rows_*")).open("r+b") as file:
+            file.write(b"wrong")
+    if change == "size":
+        with next(folder.glob("*/rows_*")).open("ab") as file:
+            file.write(b"more")
     rho, blocks = (0.04 if change == "rho" else 0.05), (7 if change == "blocks" else 8)
     report = simplify_file(source, output, rho, blocks=blocks, simplifier=simplifier)
     assert report.resumed_blocks == 0
     assert len(cvtgs.load(output)) == cvtgs.target_count(20_000, rho)
     assert not folder.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["labels", "sent", "merged", "inflated", "small"])
+def test_damaged_files_of_steps_are_made_again(source, tmp_path, kind):
+    output, folder, whole = tmp_path / "out.ply", tmp_path / ".out.ply.blocks", tmp_path / "w.ply"
+    simplify_file(source, whole, 0.05, blocks=8)
+    with pytest.raises(StoppedError):
+        simplify_file(source, output, 0.05, blocks=8, listener=stop_in_blocks)
+    path = next(path for path in sorted(folder.glob(f"*/{kind}_*")) if path.stat().st_size > 99)
+    os.truncate(path, path.stat().st_size // 2)
+    report = simplify_file(source, output, 0.05, blocks=8)
+    assert report.resumed_blocks == (2 if kind == "small" else 3)
+    assert output.read_bytes() == whole.read_bytes()

@@ -3,9 +3,13 @@
 import hashlib
 import json
 import os
+import secrets
 import shutil
+import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import pydantic
 import torch
@@ -13,10 +17,15 @@ import torch
 import cvtgs
 from cvtgs.boxes import Box
 from cvtgs.config import SimplifyConfig
+from cvtgs.errors import CvtgsError, OutputError, RunError
 from cvtgs.io import atomic_output
-from cvtgs.io.ply import PlyRows
+from cvtgs.io.ply import PlyRows, open_rows
+from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import Checkpoint, load_checkpoint, save_checkpoint
 from cvtgs.outofcore.scan import RowRange, SceneScan, read_scan, write_scan
+
+SENT_BYTES = "sent_bytes"
+"""What the file of labels of a block says of the size of the file of its sent rows."""
 
 
 class Manifest(pydantic.BaseModel):
@@ -33,6 +42,51 @@ class Manifest(pydantic.BaseModel):
     key: str
     source: str
     targets: tuple[int, ...]
+
+
+class SortedFile(NamedTuple):
+    """A file that one attempt to sort a range has written, before it is adopted.
+
+    Attributes:
+        name: Name that it gets in the folder of the job.
+        attempt: Name that it has.
+        size: Bytes.
+        checksum: CRC-32 of its content.
+    """
+
+    name: str
+    attempt: str
+    size: int
+    checksum: int
+
+
+class Attempt:
+    """The files that one call writes for a range; a second call for it writes others.
+
+    So a worker that was taken for dead and still writes cannot damage those that are used.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self._folder = Path(folder)
+        self._token = secrets.token_hex(8)
+        self._found: dict[str, tuple[int, int]] = {}
+
+    def append(self, name: str, content: bytes) -> None:
+        """Append to the file that is to get a name."""
+        with (self._folder / self._name(name)).open("ab") as file:
+            file.write(content)
+        size, checksum = self._found.get(name, (0, 0))
+        self._found[name] = (size + len(content), zlib.crc32(content, checksum))
+
+    def files(self) -> tuple[SortedFile, ...]:
+        """Return what was written."""
+        return tuple(
+            SortedFile(name, self._name(name), size, checksum)
+            for name, (size, checksum) in self._found.items()
+        )
+
+    def _name(self, name: str) -> str:
+        return f"attempt_{name}_{self._token}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,17 +222,55 @@ class Job:
         return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
     def can_resume(self, key: str) -> bool:
-        """Return whether the folder holds all rows of just this job, sorted into blocks."""
+        """Return whether the folder holds all rows of just this job, sorted into blocks.
+
+        Later files that a lost disk or machine has damaged are removed, to be made again.
+        """
         try:
             self.read_scan()
-            return self._manifest().key == key
-        except (OSError, ValueError, KeyError):
+            if self._manifest().key != key:
+                return False
+            text = self.path("sorted.json").read_text(encoding="utf-8")
+            if not all(self._is_whole(name, *facts) for name, facts in json.loads(text).items()):
+                return False
+        except (OSError, ValueError, KeyError, TypeError):
             return False
+        self._remove_damaged()
+        return True
 
     def start_over(self) -> None:
-        """Make an empty folder."""
-        shutil.rmtree(self.folder, ignore_errors=True)
-        Path(self.folder).mkdir()
+        """Make an empty folder; what earlier jobs of this output have left is removed."""
+        parent = Path(self.folder).parent
+        shutil.rmtree(parent, ignore_errors=True)
+        try:
+            Path(self.folder).mkdir(parents=True)
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            raise OutputError(
+                f"{parent}: must become an empty folder for the files of blocks, found: {reason}."
+            ) from error
+
+    def adopt(self, files: Iterable[SortedFile]) -> None:
+        """Give the files of finished attempts their names, and remove those of all others."""
+        adopted = list(files)
+        for path in self.path("").glob("rows_*"):
+            path.unlink()  # of a sort with another filter
+        for file in adopted:
+            try:
+                found = self.path(file.attempt).stat().st_size
+            except OSError as error:
+                raise _not_seen(self.path(file.attempt)) from error
+            if found != file.size:
+                raise RunError(
+                    f"{self.path(file.attempt)}: must have the {file.size} bytes that were "
+                    f"written, found {found}; check the disk, and run the same command again."
+                )
+            self.path(file.attempt).replace(self.path(file.name))
+        for path in self.path("").glob("attempt_*"):
+            path.unlink(missing_ok=True)
+        facts = {file.name: (file.size, file.checksum) for file in adopted}
+        with atomic_output(self.path("sorted.json"), overwrite=True) as output:
+            output.write(json.dumps(facts).encode())
 
     def write_manifest(self, key: str, targets: list[int]) -> None:
         """Write that all rows are sorted, and how many Gaussians each block keeps."""
@@ -186,11 +278,54 @@ class Job:
         with atomic_output(self.path("manifest.json"), overwrite=True) as file:
             file.write(manifest.model_dump_json(indent=2).encode())
 
+    def _is_whole(self, name: str, size: int, checksum: int) -> bool:
+        """Return whether a file of rows has the size and the content that were written."""
+        with self.path(name).open("rb") as file:
+            if os.fstat(file.fileno()).st_size != size:
+                return False
+            found = 0
+            while part := file.read(1 << 20):
+                found = zlib.crc32(part, found)
+        return found == checksum
+
+    def _remove_damaged(self) -> None:
+        """Remove the files of steps that are not whole: the steps are done again."""
+        for kind in ("sample", "sites", "sums", "labels", "merged", "inflated"):
+            for path in self.path("").glob(f"{kind}_*"):
+                try:
+                    _, facts = map_tensors(path)
+                    whole = True
+                    if SENT_BYTES in facts:
+                        block = int(path.name.removeprefix("labels_"))
+                        whole = self.sent_path(block).stat().st_size == int(facts[SENT_BYTES])
+                except (CvtgsError, OSError):
+                    whole = False
+                if not whole:
+                    path.unlink(missing_ok=True)
+        for block in self.blocks_with_cells():
+            try:
+                json.loads(self.report_path(block).read_bytes())
+                whole = open_rows(self.small_path(block)).count == self.targets[block]
+            except (CvtgsError, OSError, ValueError):
+                whole = False
+            if not whole:
+                self.small_path(block).unlink(missing_ok=True)
+
     def _manifest(self) -> Manifest:
         return Manifest.model_validate_json(self.path("manifest.json").read_bytes())
 
 
-def job_folder(output: str | os.PathLike[str]) -> str:
-    """Return the folder of the job of an output: hidden, beside it."""
+def job_folder(output: str | os.PathLike[str], key: str) -> str:
+    """Return the folder of a job: its key, within a hidden folder beside the output.
+
+    A worker that still writes for another job of this output cannot reach it.
+    """
     target = Path(os.path.realpath(output))
-    return str(target.with_name(f".{target.name}.blocks"))
+    return str(target.with_name(f".{target.name}.blocks") / key[:16])
+
+
+def _not_seen(path: Path) -> RunError:
+    return RunError(
+        f"{path}: a worker says that it wrote this file, and it is not here; every worker must "
+        "see the folder of the output under the same path."
+    )

@@ -18,7 +18,7 @@ from cvtgs.cvt import (
 from cvtgs.devices import one_thread
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.outofcore.halo import Assignment, assign_points, bounding_box, other_blocks
-from cvtgs.outofcore.job import Job
+from cvtgs.outofcore.job import SENT_BYTES, Job
 from cvtgs.outofcore.rows import read_rows, send_rows
 from cvtgs.pipeline import curve_order, embed_rows
 
@@ -121,7 +121,8 @@ def assign(job: Job, iterations: int, block: int) -> None:
     sent = send_rows(job, block, owners, labels)
     labels = torch.where(owners < 0, labels, -1).int()
     result = {"labels": labels, "sent": sent, "energy": energy, "refilled": torch.tensor(refilled)}
-    save_tensors(job.labels_path(block), result, {})
+    facts = {SENT_BYTES: str(job.sent_path(block).stat().st_size)}
+    save_tensors(job.labels_path(block), result, facts)
 
 
 def _embedded_rows(job: Job, block: int, order: Tensor | None = None) -> EmbeddedRows:

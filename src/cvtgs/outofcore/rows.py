@@ -16,7 +16,7 @@ from cvtgs.devices import one_thread
 from cvtgs.io import atomic_output
 from cvtgs.io.ply import assemble
 from cvtgs.io.tensors import map_tensors
-from cvtgs.outofcore.job import Job
+from cvtgs.outofcore.job import Attempt, Job, SortedFile
 from cvtgs.outofcore.scan import CHUNK, RowRange, SceneScan
 from cvtgs.scene import GaussianScene
 
@@ -47,19 +47,18 @@ class SortedCounts(NamedTuple):
     Attributes:
         rows: Number of Gaussians.
         cells: Their weight in cells, none above 1.
+        files: Where the rows are.
     """
 
     rows: list[int]
     cells: list[float]
+    files: tuple[SortedFile, ...]
 
 
 @one_thread()
 def sort_range(job: Job, rows: RowRange) -> SortedCounts:
-    """Write the rows of a range into one file per block; doing it again writes the same files."""
-    scan = job.read_scan()
-    for block in range(job.blocks):
-        job.rows_path(block, rows.number).unlink(missing_ok=True)
-    job.kept_path(rows.number).unlink(missing_ok=True)
+    """Write the rows of a range into one file per block, which nobody else writes to."""
+    scan, attempt = job.read_scan(), Attempt(job.folder)
     row_counts = torch.zeros(job.blocks, dtype=torch.int64)
     cell_counts = torch.zeros(job.blocks).double()
     for start in range(rows.start, rows.stop, CHUNK):
@@ -68,7 +67,8 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
         valid = validity.valid_rows(scene)
         protected = valid & inside(job.boxes, scene.means) if job.boxes else ~valid & valid
         if bool(protected.any()):
-            _append_kept(job, rows.number, records, scene, protected)
+            kept = _kept_rows(records, scene, protected)
+            attempt.append(job.kept_path(rows.number).name, kept)
         chosen, areas, visibility = _filtered(
             scan, job.config.cvt, scene, (valid & ~protected).nonzero()[:, 0]
         )
@@ -89,9 +89,9 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
         ends = added.cumsum(0).tolist()
         for block, (end, count) in enumerate(zip(ends, added.tolist(), strict=True)):
             if count:
-                with job.rows_path(block, rows.number).open("ab") as file:
-                    file.write(table[end - count : end].tobytes())
-    return SortedCounts(row_counts.tolist(), cell_counts.tolist())
+                name = job.rows_path(block, rows.number).name
+                attempt.append(name, table[end - count : end].tobytes())
+    return SortedCounts(row_counts.tolist(), cell_counts.tolist(), attempt.files())
 
 
 def _filtered(
@@ -111,14 +111,12 @@ def _filtered(
     return rows[stays], apparent[stays], visibility[stays]
 
 
-def _append_kept(
-    job: Job, number: int, records: NDArray[Any], scene: GaussianScene, protected: Tensor
-) -> None:
+def _kept_rows(records: NDArray[Any], scene: GaussianScene, protected: Tensor) -> bytes:
+    """Return the protected rows, with finite opacities."""
     kept = records[protected.numpy()]
     logits = validity.with_finite_opacities(scene.select(protected)).logit_opacities
     kept["opacity"] = logits.numpy()
-    with job.kept_path(number).open("ab") as file:
-        file.write(kept.tobytes())
+    return bytes(kept.tobytes())
 
 
 def record_type(job: Job, *, with_cell: bool = False) -> np.dtype[Any]:

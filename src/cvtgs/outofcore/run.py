@@ -26,10 +26,11 @@ from cvtgs.errors import (
     InvalidSceneError,
 )
 from cvtgs.io import atomic_output, check_save, load, save
+from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import join_plys, open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.math.frames import robust_frame
-from cvtgs.outofcore.job import Job, job_folder
+from cvtgs.outofcore.job import Job, SortedFile, job_folder
 from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
 from cvtgs.outofcore.memory import available_memory, block_count, memory_to_plan
 from cvtgs.outofcore.merge import BlockReport, correct, inflate, merge, simplify_block
@@ -115,6 +116,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         InvalidArgumentError: Ratio, count or boxes cannot be met.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
+        OutputBusyError: Another run is at work on this output.
 
     Example:
         >>> import tempfile
@@ -135,7 +137,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     target = target_count(rows.count, rho, count=count)
     wanted = blocks or block_count(rows, memory or memory_to_plan(available_memory()))
     job = Job(
-        folder=job_folder(output),
+        folder="",
         source=rows,
         target=target,
         blocks=max(1, min(wanted, target)),
@@ -144,26 +146,22 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         has_network=simplifier.checkpoint is not None,
         range_rows=range_rows,
     )
-    clock = StageClock(listener, torch.device("cpu"))
     key = job.key(simplifier.checkpoint)
-    if not job.can_resume(key):
-        job.start_over()
-        if simplifier.checkpoint is not None:
-            job.write_network(simplifier.checkpoint)
-        with one_thread():
-            targets = _scan_and_sort(job, workers, clock)
-        job.write_manifest(key, targets)
-    with_cells = job.blocks_with_cells()
-    resumed = sum(job.small_path(block).exists() for block in with_cells)
-    if job.blocks > 1:
-        _tessellate_and_merge(job, workers, clock)
-    last = correct if job.blocks > 1 else simplify_block
-    with clock.stage("blocks", len(with_cells)) as advance:
-        _run_all(workers, partial(last, job), with_cells, advance)
-    with clock.stage("assemble"):
-        _assemble(job, output, overwrite=overwrite)
-    report = _report(job, simplifier, clock, resumed=resumed)
-    shutil.rmtree(job.folder, ignore_errors=True)
+    job = replace(job, folder=job_folder(output, key))
+    clock = StageClock(listener, torch.device("cpu"))
+    with output_lock(output):
+        if not job.can_resume(key):
+            job.start_over()
+            if simplifier.checkpoint is not None:
+                job.write_network(simplifier.checkpoint)
+            with one_thread():
+                targets = _scan_and_sort(job, workers, clock)
+            job.write_manifest(key, targets)
+        resumed = _run_blocks(job, workers, clock)
+        with clock.stage("assemble"):
+            _assemble(job, output, overwrite=overwrite)
+        report = _report(job, simplifier, clock, resumed=resumed)
+        shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
     return report
 
 
@@ -223,14 +221,28 @@ def _scan_and_sort(job: Job, workers: Workers, clock: StageClock) -> list[int]:
     return shared_out(rest, counts.cells, rooms=counts.rows)
 
 
+def _run_blocks(job: Job, workers: Workers, clock: StageClock) -> int:
+    """Simplify the blocks that are not finished; return how many were."""
+    with_cells = job.blocks_with_cells()
+    resumed = sum(job.small_path(block).exists() for block in with_cells)
+    if job.blocks > 1:
+        _tessellate_and_merge(job, workers, clock)
+    last = correct if job.blocks > 1 else simplify_block
+    with clock.stage("blocks", len(with_cells)) as advance:
+        _run_all(workers, partial(last, job), with_cells, advance)
+    return resumed
+
+
 def _sort(
     job: Job, workers: Workers, ranges: Sequence[RowRange], advance: Callable[[int], None]
 ) -> SortedCounts:
-    rows, cells = [0] * job.blocks, [0.0] * job.blocks
+    rows, cells, files = [0] * job.blocks, [0.0] * job.blocks, list[SortedFile]()
     for part in _with_progress(workers(partial(sort_range, job), ranges), advance):
         rows = [a + b for a, b in zip(rows, part.rows, strict=True)]
         cells = [a + b for a, b in zip(cells, part.cells, strict=True)]
-    return SortedCounts(rows, cells)
+        files += part.files
+    job.adopt(files)
+    return SortedCounts(rows, cells, tuple(files))
 
 
 def _tessellate_and_merge(job: Job, workers: Workers, clock: StageClock) -> None:

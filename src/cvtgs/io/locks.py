@@ -1,0 +1,85 @@
+"""One run at a time works on an output: a lock beside it that says who holds it."""
+
+import json
+import os
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from cvtgs.errors import OutputBusyError, OutputError
+
+
+@contextmanager
+def output_lock(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Hold the lock of an output, a hidden file ``.NAME.lock`` beside it.
+
+    The system releases it when the process ends, however it ends; the file is removed with it, or
+    by the next run after a kill.
+
+    Args:
+        path: The file or folder to work on; symbolic links are followed.
+
+    Raises:
+        OutputBusyError: Another run holds it.
+        OutputError: The lock file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with output_lock(Path(folder) / "out.ply"):
+        ...         len(list(Path(folder).iterdir()))
+        1
+    """
+    from filelock import FileLock, SoftFileLock, Timeout  # noqa: PLC0415 (loaded when used)
+
+    file = lock_path(path)
+    lock = FileLock(file, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise OutputBusyError(
+            f"{os.fspath(path)}: one run at a time may work on it, found {_holder(file)} at work; "
+            "wait until it ends, or choose another output."
+        ) from error
+    except (OSError, NotImplementedError) as error:
+        reason = (getattr(error, "strerror", None) or str(error)).lower()
+        raise OutputError(
+            f"{os.fspath(path)}: its folder must allow a lock file, found: {reason}."
+        ) from error
+    is_soft = isinstance(lock, SoftFileLock)  # its file has a content of its own
+    try:
+        if not is_soft:
+            with suppress(OSError):  # a locked file cannot be written to on Windows
+                file.write_text(_signature(), encoding="utf-8")
+        yield
+    finally:
+        if os.name == "posix" and not is_soft:  # while it is held, so no other lock is removed
+            with suppress(OSError):
+                file.unlink()
+        lock.release()
+
+
+def lock_path(path: str | os.PathLike[str]) -> Path:
+    """Return the lock file of an output."""
+    target = Path(os.path.realpath(path))
+    return target.with_name(f".{target.name}.lock")
+
+
+def _signature() -> str:
+    """Describe this process for others."""
+    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:2]]) if sys.argv else "python"
+    started = time.strftime("%Y-%m-%d %H:%M:%S")
+    holder = {"process": os.getpid(), "host": socket.gethostname()}
+    return json.dumps({**holder, "command": command, "since": started})
+
+
+def _holder(file: Path) -> str:
+    """Describe the process that holds a lock, as far as can be told."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+        return "process {process} on {host} ({command}, since {since})".format_map(found)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return "another process"
