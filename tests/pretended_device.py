@@ -174,7 +174,8 @@ class Constructors(TorchFunctionMode):
         if func is Tensor.new and isinstance(args[0], DeviceTensor):  # so SparseAdam makes them
             return torch.sparse_coo_tensor(*args[1:], check_invariants=True)
         if func is Tensor.tolist and isinstance(args[0], DeviceTensor):
-            return args[0].to("cpu").tolist()
+            self.traffic.waits[f"{caller()} tolist"] += 1
+            return args[0].host.tolist()
         if func in (Tensor.__getitem__, Tensor.__setitem__) and isinstance(args[0], DeviceTensor):
             # Torch would make a list an index without values, on the meta device.
             indices = args[1] if isinstance(args[1], tuple) else (args[1],)

@@ -1,6 +1,5 @@
 """The filter: faint Gaussians and flyaways that are left out before the tessellation."""
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -64,9 +63,9 @@ def filter_rows(
         seen = masses * perspective_falloff(distances)
         fewer = keep & ~flyaway_rows(distances, seen, max_share=config.max_flyaway_share)
         keep = fewer if int(fewer.sum()) >= target else keep
-    left_out = ~keep
-    mass_share = divide(masses[left_out].sum(), masses.sum())
-    return FilteredRows(keep.nonzero()[:, 0], int(left_out.sum()), float(mass_share))
+    mass_share = divide(masses[~keep].sum(), masses.sum())
+    rows = keep.nonzero()[:, 0]
+    return FilteredRows(rows, len(keep) - len(rows), float(mass_share))
 
 
 def visible_rows(
@@ -104,9 +103,10 @@ def visible_rows(
     faint = (opacities < min_opacity).nonzero()[:, 0]
     faint = faint[torch.sort(masses[faint], stable=True).indices]  # of equally faint ones
     faint = faint[torch.sort(opacities[faint], stable=True).indices]
-    lost = masses[faint].double().cumsum(0)
-    limit = max_mass_share * float(masses.double().sum()) if max_mass_share < 1 else math.inf
-    dropped = faint[lost <= limit]
+    dropped = faint
+    if max_mass_share < 1:
+        lost = masses[faint].double().cumsum(0)
+        dropped = faint[lost <= max_mass_share * masses.double().sum()]
     missing = at_least - (len(opacities) - len(dropped))
     if missing > 0:
         heaviest_first = torch.sort(masses[dropped], stable=True, descending=True).indices

@@ -152,11 +152,13 @@ def reduce_scene(
                 on_cells=advance,
             )
     small = restore_columns(standardized(small), scene, analysis.plan)
+    singles, largest = (merged.partition.counts == 1).sum(), grouping.partition.counts.amax()
+    single_count, largest_count = torch.stack([singles, largest]).tolist()
     statistics = CellStatistics(
         filtered_count=left_out,
         filtered_mass_share=left_out_mass_share,
-        single_member_cells=int((merged.partition.counts == 1).sum()),
-        largest_cell=int(grouping.partition.counts.amax()),
+        single_member_cells=single_count,
+        largest_cell=largest_count,
         refilled_cells=grouping.refilled,
         energies=grouping.energies,
         energy=grouping.energy,
@@ -367,7 +369,7 @@ def geometric_error(
     Masses weigh the mean; the distance is in scene units.
     """
     squares, total = 0.0, 0.0
-    ids = segment_ids(partition.offsets)
+    ids = segment_ids(partition.offsets, len(partition.order))
     chunk = chunk_length(CHUNK, scene.device)
     for rows, cell in zip(partition.order.split(chunk), ids.split(chunk), strict=True):
         shifts = scene.means[rows].double() - small.means[cell].double()

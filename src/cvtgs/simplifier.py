@@ -1,6 +1,5 @@
 """Simplifier: the one call that users make; what it runs stands in :mod:`cvtgs.pipeline`."""
 
-import copy
 import os
 from collections.abc import Sequence
 
@@ -224,8 +223,7 @@ class Prepared:
         self._used = select_columns(scene, config.effects).to(self._device)
         self._net = None
         if checkpoint is not None:
-            net = copy.deepcopy(checkpoint.net)
-            self._net = net.to(device=self._device, dtype=scene.dtype)
+            self._net = checkpoint.net.copy_to(self._device, scene.dtype)
         self._checked: CheckedScene | None = None
         self._analysis: SceneAnalysis | None = None
 
@@ -340,6 +338,8 @@ class Prepared:
     ) -> Simplified:
         """Report, restore what was not computed with, and refine if the configuration says so."""
         checked, scene = self._check(clock), self._scene
+        masses = [(analysis.areas * analysis.opacities).sum(), reduced.scene.masses.sum()]
+        mass_in, mass_out = torch.stack(masses).tolist()
         report = SimplifyReport(
             input_count=len(scene),
             output_count=len(reduced.scene),
@@ -349,8 +349,8 @@ class Prepared:
             invalid_count=checked.invalid_count,
             shortfall=shortfall(len(checked.scene), len(scene), target),
             kept_count=kept_count,
-            mass_in=float((analysis.areas * analysis.opacities).sum()),
-            mass_out=float(reduced.scene.masses.sum()),
+            mass_in=mass_in,
+            mass_out=mass_out,
             checkpoint="none" if self._checkpoint is None else self._checkpoint.name,
             device=str(self._device),
             plan=analysis.plan,

@@ -93,7 +93,9 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
         "sh0": ~_finite(scene.sh0),
         "shN": ~_finite(scene.shN),
     }
-    return {name: mask for name, mask in masks.items() if bool(mask.any())}
+    # One answer for all masks: a device is asked only once.
+    any_bad = torch.stack([mask.any() for mask in masks.values()]).tolist()
+    return {name: mask for (name, mask), bad in zip(masks.items(), any_bad, strict=True) if bad}
 
 
 def valid_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:

@@ -9,11 +9,12 @@ from pretended_device import CUDA, DeviceTensor, pretended_cuda
 from scenes import random_scene, same_bits
 
 PRESETS = ["draft", "fast", "standard", "paper"]
-WAITS, COPIES = 100, 66
+WAITS, COPIES = 23, 7
 """Most waits of the host, and copies, in one simplification.
 
-Of the copies 24 are the network and 6 the scene. Both grow only with the moves until tessellation
-settles, each of which copies points and sites to the host, labels and distances back.
+Of the copies 1 is the network, 4 are the tessellation (points and weights to the host, labels and
+sites back) and 2 the neighbours of merged Gaussians; a scene that is not on the device is 6 more.
+Neither grows with the scene, but for what is computed in chunks, which are large on a device.
 """
 
 
@@ -29,17 +30,21 @@ def test_a_scene_on_a_device(preset, dtype):
     scene = random_scene(600, degree=1, dtype=dtype)
     wanted = Simplifier(config=preset, device="cpu").simplify(scene, 0.1)
     with pretended_cuda() as traffic:
-        small, report = Simplifier(config=preset, device="cuda").run(scene.to("cuda"), 0.1)
+        there = scene.to("cuda")
+        traffic.copies.clear()
+        small, report = Simplifier(config=preset, device="cuda").run(there, 0.1)
+        assert traffic.waits.total() <= WAITS, traffic.waits
+        assert traffic.copies.total() <= COPIES, traffic.copies
         assert same_bits(on_device(small), wanted)
     assert report.backend == "scipy"
-    assert traffic.waits.total() <= WAITS, traffic.waits
-    assert traffic.copies.total() <= COPIES, traffic.copies
 
 
 def test_a_larger_scene_waits_no_more():
     scene = random_scene(6000, degree=0, size=0.02)
     with pretended_cuda() as traffic:
-        Simplifier(device="cuda").simplify(scene.to("cuda"), 0.02)
+        there = scene.to("cuda")
+        traffic.copies.clear()
+        Simplifier(device="cuda").simplify(there, 0.02)
     assert traffic.waits.total() <= WAITS, traffic.waits
     assert traffic.copies.total() <= COPIES, traffic.copies
 
@@ -130,7 +135,7 @@ def test_the_pretended_device_refuses_and_counts():
         assert float(there.sum()) == 15
         assert there[there > 2].tolist() == [3, 4, 5]
         assert there[:, [2, 0]].cpu().tolist() == [[2, 0], [5, 3]]
-        assert (traffic.waits.total(), traffic.copies.total()) == (2, 4)
+        assert (traffic.waits.total(), traffic.copies.total()) == (3, 3)
         there[0] += 1
         assert torch.equal(there[:1].cpu(), host[:1] + 1)
     with pytest.raises(RuntimeError, match="no device outside"):

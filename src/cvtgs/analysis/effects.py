@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.config import SimplifyConfig
+from cvtgs.devices import chunk_length
 from cvtgs.math.parameters import divide, opacity_from_logit
 from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
 from cvtgs.scene import GaussianScene
@@ -137,7 +138,12 @@ def plan_effects(
     config = config or SimplifyConfig()
     choices = config.effects
     apparent = masses if apparent_masses is None else apparent_masses
-    far = far_share(distances, masses)
+    shares = [
+        _far_share(distances, masses),
+        _haze_share(scene.opacities, apparent, config),
+        _duplicate_share(scene.means, scene.sh0),
+    ]
+    far, hazy, duplicates = torch.stack(shares).tolist()  # a device is asked only once
     above = (far - UNBOUNDED_SHARE) / (FULLY_UNBOUNDED_SHARE - UNBOUNDED_SHARE)
     beyond = f"share of mass beyond {UNBOUNDED_DISTANCE:g} robust radii"
     unbounded = _by_share(far, choices.unbounded, UNBOUNDED_SHARE, beyond)
@@ -153,7 +159,7 @@ def plan_effects(
             **unbounded.model_dump(),
             strength=min(1.0, max(0.0, above)) if unbounded.active else 0.0,
         ),
-        haze=plan_haze(scene.opacities, apparent, config=config),
+        haze=_plan_haze(hazy, config),
         flat=Effect(
             active=scene.has_two_scales and choices.flat != "off",
             figure=float(scene.has_two_scales),
@@ -161,7 +167,7 @@ def plan_effects(
             forced=choices.flat != "auto",
         ),
         duplicates=_by_share(
-            duplicate_share(scene.means, scene.sh0),
+            duplicates,
             choices.duplicates,
             DUPLICATE_SHARE,
             "share of Gaussians exactly where others of their colour are",
@@ -197,9 +203,19 @@ def plan_haze(
     Returns:
         The effect.
     """
+    return _plan_haze(float(_haze_share(opacities, apparent_masses, config)), config)
+
+
+def _haze_share(
+    opacities: Float[Tensor, "n"], apparent_masses: Float[Tensor, "n"], config: SimplifyConfig
+) -> Float[Tensor, ""]:
+    masses = apparent_masses.double()
+    return divide((masses * (opacities < config.filter.min_opacity)).sum(), masses.sum())
+
+
+def _plan_haze(share: float, config: SimplifyConfig) -> Effect:
     choice, most = config.effects.haze, config.filter.max_mass_share
-    masses, below = apparent_masses.double(), config.filter.min_opacity
-    share = float(divide((masses * (opacities < below)).sum(), masses.sum()))
+    below = config.filter.min_opacity
     return Effect(
         active=share > most if choice == "auto" else choice == "on",
         figure=share,
@@ -264,11 +280,14 @@ def band_losses(scene: GaussianScene, *, enough: float) -> tuple[float, ...]:
         return ()
     step = len(scene) // SAMPLE
     spread = [scene.shN[::step]] if step > 1 else []
-    unit = min(1.0, max(_contrast(scene), LEAST_CONTRAST))
-    losses = [0.0] * scene.sh_degree
-    for part in (*spread, *scene.shN.split(CHUNK)):
-        found = (_largest_change(part, degree) / unit for degree in range(1, len(losses) + 1))
-        losses = [max(pair) for pair in zip(losses, found, strict=True)]
+    contrast, losses = _contrast(scene), [0.0] * scene.sh_degree
+    for part in (*spread, *scene.shN.split(chunk_length(CHUNK, scene.device))):
+        largest = [_largest_square(part, degree) for degree in range(1, len(losses) + 1)]
+        deviation, *squares = torch.stack([contrast, *largest]).tolist()
+        unit = min(1.0, max(deviation, LEAST_CONTRAST))
+        for band, square in enumerate(squares):
+            change = math.sqrt((2 * band + 3) / (4 * math.pi) * square)
+            losses[band] = max(losses[band], change / unit)
         if losses[-1] >= enough:
             break
     return tuple(losses)
@@ -288,7 +307,11 @@ def far_share(distances: Float[Tensor, "n"], masses: Float[Tensor, "n"]) -> floa
         >>> far_share(torch.tensor([0.0, 9.0]), torch.tensor([1.0, 3.0]))
         0.75
     """
-    return float(divide((masses * (distances > UNBOUNDED_DISTANCE)).sum(), masses.sum()))
+    return float(_far_share(distances, masses))
+
+
+def _far_share(distances: Float[Tensor, "n"], masses: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    return divide((masses * (distances > UNBOUNDED_DISTANCE)).sum(), masses.sum()).double()
 
 
 def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) -> float:
@@ -307,39 +330,40 @@ def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) ->
         >>> duplicate_share(torch.zeros(4, 3), torch.zeros(4, 1, 3))
         0.75
     """
+    return float(_duplicate_share(means, sh0))
+
+
+def _duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) -> Float[Tensor, ""]:
     bits = max(0, math.floor(math.log2(max(1, len(means)) / HASHED)))
     rows, hashes = [], []
-    for start in range(0, len(means), CHUNK << 2):
-        keys = _hash(means[start : start + (CHUNK << 2)])
+    chunk = chunk_length(CHUNK << 2, means.device)
+    for start in range(0, len(means), chunk):
+        keys = _hash(means[start : start + chunk])
         chosen = (keys & ((1 << bits) - 1) == 0).nonzero()[:, 0]
         rows.append(chosen + start)
         hashes.append(keys[chosen])
     sample = torch.cat(rows)
     sample = sample[torch.sort(torch.cat(hashes), stable=True).indices]
-    if len(sample) == 0:
-        return 0.0
     place, color = means[sample], sh0[sample, 0]
     same = (place[1:] == place[:-1]).all(dim=1) & (color[1:] == color[:-1]).all(dim=1)
-    return float(same.sum()) / len(sample)
+    return same.sum().double() / max(1, len(sample))
 
 
-def _largest_change(rest: Float[Tensor, "n k 3"], degree: int) -> float:
-    """Bound what a band changes a channel by; sums over whole rows are fast."""
+def _largest_square(rest: Float[Tensor, "n k 3"], degree: int) -> Float[Tensor, ""]:
+    """Return the largest sum of squares of a band; sums over whole rows are fast."""
     band = rest[:, REST_COUNTS[degree - 1] : REST_COUNTS[degree]]
-    if band.numel() == 0:
-        return 0.0
-    squares = float(band.square().sum(dim=(1, 2)).amax())
-    return math.sqrt((2 * degree + 1) / (4 * math.pi) * squares)
+    squares = torch.nn.functional.pad(band.square().sum(dim=(1, 2)), (0, 1))
+    return squares.amax().double()
 
 
-def _contrast(scene: GaussianScene) -> float:
+def _contrast(scene: GaussianScene) -> Float[Tensor, ""]:
     """Return the standard deviation of the constant colours of some Gaussians."""
     rows = slice(None, None, max(1, len(scene) // SAMPLE))
     colors = SH_C0 * scene.sh0[rows, 0].double()
     shares = opacity_from_logit(scene.logit_opacities[rows]).double()
     shares = (shares / shares.sum())[:, None]
     mean = (shares * colors).sum(dim=0)
-    return float((shares * (colors - mean).square()).sum(dim=0).mean().sqrt())
+    return (shares * (colors - mean).square()).sum(dim=0).mean().sqrt()
 
 
 def _hash(means: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:

@@ -234,7 +234,7 @@ def describe_members(
 ) -> Descriptors:
     """Describe some cells whose neighbours are known, as :func:`describe_cells` does."""
     offsets, rows = part.offsets, part.order
-    ids = segment_ids(offsets)
+    ids = segment_ids(offsets, len(rows))
     members = _activate(scene, rows)
     relative = _relate(context.merged, ids, members)
     visible = visibility.index_select(0, rows).to(members.means.dtype)

@@ -56,12 +56,11 @@ def merge_cells(
         2
     """
     merged = scene.select(partition.order[partition.offsets[:-1]])
-    is_merged = partition.counts > 1
-    cells = is_merged.nonzero()[:, 0]
-    done = len(is_merged) - len(cells)
+    cells = (partition.counts > 1).nonzero()[:, 0]
+    done = len(partition) - len(cells)
     tensors, extras = merged.tensors(), dict(merged.extras)
     chunk = chunk_length(CHUNK_MEMBERS, scene.device)
-    for run, part in partition.select(is_merged).chunks(chunk):
+    for run, part in partition.select(cells).chunks(chunk):
         new_tensors, new_extras = _merge_chunk(scene, part, config)
         for name, values in new_tensors.items():
             tensors[name][cells[run]] = values.to(tensors[name].dtype)
@@ -137,7 +136,7 @@ class Members:
         """
         if area_power == 0.0:
             return normalized_weights(self.opacities, self.offsets)
-        ids = segment_ids(self.offsets)
+        ids = segment_ids(self.offsets, len(self.areas))
         largest = segment_max(self.areas, self.offsets).index_select(0, ids)
         shares = parameters.divide(self.areas, largest) ** area_power
         return normalized_weights(self.opacities * shares, self.offsets)
@@ -184,7 +183,7 @@ def normalized_weights(
         >>> normalized_weights(torch.tensor([1.0, 3.0]), torch.tensor([0, 2])).tolist()
         [0.25, 0.75]
     """
-    weights, ids = weights.double(), segment_ids(offsets)
+    weights, ids = weights.double(), segment_ids(offsets, len(weights))
     totals = segment_sum(weights, offsets).index_select(0, ids)
     shares = weights / totals.clamp_min(torch.finfo(weights.dtype).tiny)
     equal = offsets.diff().double().reciprocal().index_select(0, ids)
@@ -232,7 +231,7 @@ def mean_and_covariance(
         Means and covariances of the cells, float64.
     """
     offsets = members.offsets
-    ids = segment_ids(offsets)
+    ids = segment_ids(offsets, len(weights))
     first = members.means.index_select(0, offsets[:-1]).T.contiguous()
     local = members.means.T - first.index_select(1, ids)
     shift = weighted_mean(local.T, weights, offsets).T.contiguous()
@@ -244,7 +243,8 @@ def mean_and_covariance(
     for axis in axes.permute(2, 1, 0):
         for row, part in enumerate(products.split([3, 2, 1])):
             part.addcmul_(axis[row], axis[row:])
-    matrices = weighted_mean(products.T, weights, offsets)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
+    xx, xy, xz, yy, yz, zz = weighted_mean(products.T, weights, offsets).unbind(1)
+    matrices = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=1)
     return (first + shift).T, matrices.unflatten(1, (3, 3))
 
 
@@ -317,9 +317,9 @@ def keep_representatives(
     merged_areas = torch.exp(parameters.log_mean_projected_area(merged.log_scales.double()))
     is_kept = masses[best] ** 2 * merged_areas > cell_masses**2 * member_areas[best]
     is_kept &= offsets.diff() > 1
-    if not bool(is_kept.any()):
-        return merged, partition
     representatives, cells = order[best], is_kept.nonzero()[:, 0]
+    if len(cells) == 0:
+        return merged, partition
     kept = scene.select(representatives[cells])
     tensors = {
         name: values.index_copy(0, cells, getattr(kept, name))

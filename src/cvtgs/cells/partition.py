@@ -42,16 +42,17 @@ class Partition:
             >>> Partition.from_labels(torch.tensor([1, 0, 1]), 2).order.tolist()
             [1, 0, 2]
         """
-        if len(labels) and (int(labels.amin()) < 0 or int(labels.amax()) >= count):
-            raise InvalidArgumentError(
-                f"labels must be between 0 and {count - 1}, "
-                f"found {int(labels.amin())} to {int(labels.amax())}."
-            )
         order, offsets = sort_by_label(labels, count)
-        empty = (offsets.diff() == 0).nonzero()[:, 0]
-        if len(empty):
+        ends, empty = labels.aminmax() if len(labels) else (), offsets.diff() == 0
+        *found, missing = torch.stack([*ends, empty.sum()]).tolist()  # a device is asked only once
+        if found and (found[0] < 0 or found[1] >= count):
             raise InvalidArgumentError(
-                f"every cell needs a member; {len(empty)} have none, the first is {int(empty[0])}."
+                f"labels must be between 0 and {count - 1}, found {found[0]} to {found[1]}."
+            )
+        if missing:
+            first = int(empty.nonzero()[0])
+            raise InvalidArgumentError(
+                f"every cell needs a member; {missing} have none, the first is {first}."
             )
         return cls(order=order, offsets=offsets)
 
@@ -64,17 +65,20 @@ class Partition:
         """Members of every cell."""
         return self.offsets.diff()
 
-    def select(self, cells: Bool[Tensor, "m"]) -> Self:
+    def select(self, cells: Int[Tensor, "k"] | Bool[Tensor, "m"]) -> Self:
         """Keep some cells.
 
         Args:
-            cells: Mask of the cells to keep.
+            cells: The cells to keep, ascending, or a mask of them.
 
         Returns:
             Their partition, in the same order.
         """
         counts = self.counts
-        members = torch.repeat_interleave(cells, counts)
+        if cells.dtype == torch.bool:
+            cells = cells.nonzero()[:, 0]
+        is_kept = torch.zeros_like(counts, dtype=torch.bool).index_fill(0, cells, value=True)
+        members = torch.repeat_interleave(is_kept, counts, output_size=len(self.order))
         offsets = torch.nn.functional.pad(counts[cells].cumsum(0), (1, 0))
         return type(self)(order=self.order[members], offsets=offsets)
 
@@ -93,7 +97,7 @@ class Partition:
             [1, 2]
         """
         counts = self.counts
-        kept = torch.repeat_interleave(rows, counts)
+        kept = torch.repeat_interleave(rows, counts, output_size=len(self.order))
         offsets = torch.nn.functional.pad(torch.where(rows < 0, counts, 1).cumsum(0), (1, 0))
         return type(self)(order=self.order[(kept < 0) | (kept == self.order)], offsets=offsets)
 
@@ -106,6 +110,8 @@ class Partition:
         Returns:
             Their partition; its order is a view.
         """
+        if run.start == 0 and run.stop >= len(self):
+            return self
         ends = self.offsets[run.start : run.stop + 1]
         return type(self)(order=self.order[int(ends[0]) : int(ends[-1])], offsets=ends - ends[0])
 
@@ -130,10 +136,12 @@ class Partition:
         Yields:
             The cells of the run, and their partition.
         """
-        first = 0
-        costs = self.offsets
+        if len(self) and len(self.order) + cell_cost * len(self) <= max_members:
+            yield slice(0, len(self)), self
+            return
+        first, costs = 0, self.offsets.cpu()
         if cell_cost:
-            costs = costs + cell_cost * torch.arange(len(costs), device=costs.device)
+            costs = costs + cell_cost * torch.arange(len(costs))
         while first < len(self):
             fitting = torch.searchsorted(costs, costs[first] + max_members, right=True)
             last = max(first + 1, int(fitting) - 1)

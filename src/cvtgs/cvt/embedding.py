@@ -112,7 +112,5 @@ def tessellation_weights(
     largest_area = areas.amax().clamp_min(torch.finfo(torch.float64).tiny)
     raw = gaussian_weights(opacities, areas / largest_area, area_power)
     largest = raw.amax()
-    if not bool(largest > 0):
-        return torch.ones_like(raw)
     scaled = raw / largest
-    return (scaled / scaled.mean()).clamp_min(floor)
+    return torch.where(largest > 0, (scaled / scaled.mean()).clamp_min(floor), 1.0)

@@ -75,7 +75,10 @@ def tessellate(
         raise InvalidArgumentError(
             f"count must be between 1 and the number of points, {len(points)}; found {count}."
         )
+    home = points.device
     backend, nearest = choose_search(config, has_duplicates=has_duplicates)
+    if backend == "scipy":  # the tree is on the host: all that goes with it is done there
+        points, weights = points.cpu(), weights.cpu()
     seeds = choose_seeds(weights, count, config=config, seed=seed)
     sample, sample_weights = sample_points(points, weights, config.samples_per_site * count)
     settled = lloyd(
@@ -91,8 +94,8 @@ def tessellate(
     labels, squared = nearest(points, sites)
     labels, squared, refilled = fill_empty_cells(labels, weights, squared, count)
     return Tessellation(
-        labels=labels,
-        sites=sites,
+        labels=labels.to(home),
+        sites=sites.to(home),
         energies=settled.energies,
         energy=float((weights * squared).sum()),
         refilled=refilled,

@@ -26,9 +26,9 @@ def sort_by_label(
         >>> order.tolist(), offsets.tolist()
         ([1, 0, 2], [0, 1, 3])
     """
-    order = torch.sort(labels.to(torch.int32), stable=True).indices
-    ends = torch.bincount(labels, minlength=count).cumsum(0)
-    return order, torch.nn.functional.pad(ends, (1, 0))
+    ascending, order = torch.sort(labels.to(torch.int32), stable=True)
+    starts = torch.arange(count + 1, dtype=torch.int32, device=labels.device)
+    return order, torch.searchsorted(ascending, starts)
 
 
 def gather_columns(
@@ -149,16 +149,17 @@ def segment_max(
         >>> segment_max(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0, 2, 3])).tolist()
         [2.0, 3.0]
     """
-    ids = segment_ids(offsets).reshape(-1, *[1] * (values.ndim - 1)).expand_as(values)
+    ids = segment_ids(offsets, len(values)).reshape(-1, *[1] * (values.ndim - 1)).expand_as(values)
     lowest = values.new_full((len(offsets) - 1, *values.shape[1:]), -torch.inf)
     return lowest.scatter_reduce(0, ids, values, "amax")
 
 
-def segment_ids(offsets: Int[Tensor, "m_plus_1"]) -> Int[Tensor, "n"]:
+def segment_ids(offsets: Int[Tensor, "m_plus_1"], total: int | None = None) -> Int[Tensor, "n"]:
     """Return the segment of every row.
 
     Args:
         offsets: Where each segment starts, and the end of the last one.
+        total: Number of rows; None is read from the offsets, for which the host waits.
 
     Returns:
         Segment numbers, ascending.
@@ -167,7 +168,7 @@ def segment_ids(offsets: Int[Tensor, "m_plus_1"]) -> Int[Tensor, "n"]:
         >>> segment_ids(torch.tensor([0, 2, 3])).tolist()
         [0, 0, 1]
     """
-    return torch.repeat_interleave(offsets.diff())
+    return torch.repeat_interleave(offsets.diff(), output_size=total)
 
 
 def segment_argmax(
@@ -186,7 +187,7 @@ def segment_argmax(
         >>> segment_argmax(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0, 2, 3])).tolist()
         [1, 2]
     """
-    ids = segment_ids(offsets)
+    ids = segment_ids(offsets, len(values))
     is_top = values == segment_max(values, offsets)[ids]
     rows = torch.arange(len(values), device=values.device)
     candidates = torch.where(is_top, rows, len(values))
@@ -200,12 +201,13 @@ class _SumOfRuns(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, offsets: Tensor, weights: Tensor | None) -> Tensor:
         ctx.save_for_backward(offsets, weights)
+        ctx.total = len(values)
         return _sum_runs(values, offsets, weights)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
         offsets, weights = ctx.saved_tensors
-        spread = grad.index_select(0, segment_ids(offsets))
+        spread = grad.index_select(0, segment_ids(offsets, ctx.total))
         return spread if weights is None else spread * weights[:, None], None, None
 
 

@@ -63,9 +63,8 @@ def correct_cells(
     """
     counts, near = partition.counts, neighbors.shape[1]
     sizes = counts if sizes is None else sizes
-    is_merged = counts > 1
-    cells = is_merged.nonzero()[:, 0]
-    several = partition.select(is_merged)
+    cells = (counts > 1).nonzero()[:, 0]
+    several = partition.select(cells)
     done = len(counts) - len(cells)
     originals = merged.tensors()
     tensors = {name: values.clone() for name, values in originals.items() if values.numel()}

@@ -1,11 +1,14 @@
 """MergeNet: a small network, shared by all cells, that corrects their merged Gaussians."""
 
+import copy
 from dataclasses import dataclass
+from typing import Self
 
 import pydantic
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from cvtgs.cells.features import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES, Descriptors
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
@@ -112,6 +115,28 @@ class MergeNet(nn.Module):
         nn.init.zeros_(self.decoder.weight)
         nn.init.zeros_(self.decoder.bias)
 
+    def copy_to(self, device: torch.device, dtype: torch.dtype) -> Self:
+        """Return a copy on a device; all parameters go there in one piece.
+
+        Args:
+            device: Where to.
+            dtype: Precision of the copy.
+
+        Returns:
+            The copy.
+        """
+        copied = copy.deepcopy(self).to(dtype)
+        if device.type == "cpu":
+            return copied
+        state = copied.state_dict()
+        # Each starts at a multiple of 16 numbers: matrix products want them aligned.
+        padded = [pad(values.flatten(), (0, -values.numel() % 16)) for values in state.values()]
+        parts = torch.cat(padded).to(device).split([len(values) for values in padded])
+        for (name, values), part in zip(state.items(), parts, strict=True):
+            state[name] = part[: values.numel()].view(values.shape)
+        copied.load_state_dict(state, assign=True)
+        return copied
+
     def forward(self, descriptors: Descriptors) -> Residuals:
         """Predict the residuals of some cells.
 
@@ -122,7 +147,7 @@ class MergeNet(nn.Module):
             Residuals of each cell.
         """
         offsets, weights = descriptors.offsets, descriptors.weights
-        ids, shape = segment_ids(offsets), descriptors.pairs.shape[:2]
+        ids, shape = segment_ids(offsets, len(weights)), descriptors.pairs.shape[:2]
         members = self.member_layers(descriptors.members)
         pairs = self.pair_layers(descriptors.pairs.flatten(0, 1))
         pooled = [

@@ -130,7 +130,7 @@ def lay_out_cells(case: Case, corrected: dict[str, Tensor], *, rng: random.Rando
     side = math.ceil(math.sqrt(count))
     merged = reference.merged.select(case.cells)
     placement = _Placement.draw(merged, side, rng)
-    ids = segment_ids(case.part.offsets)
+    ids = segment_ids(case.part.offsets, len(case.part.order))
     members = reference.scene.select(case.part.order)
     own = torch.arange(count, device=ids.device)
     return CellGrid(
