@@ -22,7 +22,7 @@ LEVELS = [
     {"errors", "progress", "text"},
     {"math", "clock", "devices", "plots", "counts", "boxes"},
     {"config", "scene", "cameras"},
-    {"validity"},
+    {"validity", "edit"},
     {"io", "synthetic", "rendering", "losses"},
     {"views", "evaluation"},
     {"analysis"},

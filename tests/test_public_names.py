@@ -35,6 +35,7 @@ NAMES = {
     "cells",
     "cvt",
     "describe",
+    "edit",
     "analysis",
     "errors",
     "evaluate",

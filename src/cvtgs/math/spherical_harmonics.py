@@ -1,6 +1,7 @@
 """Real spherical harmonics in the order, scale and signs that 3DGS files use."""
 
 import math
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -29,6 +30,9 @@ SH_C3 = (
 
 REST_COUNTS = (0, 3, 8, 15)
 """Coefficients per colour channel above the constant band, by degree."""
+
+_ROUNDING = 1e-12
+"""Entries of a rotation of bands below this are zeros."""
 
 
 def degree_of(rest_count: int) -> int:
@@ -111,6 +115,51 @@ def evaluate(
     if degree > 0:
         colors = colors + (rest_basis(directions, degree)[:, :, None] * shN).sum(dim=1)
     return colors.clamp_min(0)
+
+
+def rotated_rest(
+    shN: Float[Tensor, "n k 3"],  # noqa: N803 (the name that gsplat gives it)
+    rotation: Float[Tensor, "3 3"],
+) -> Float[Tensor, "n k 3"]:
+    """Return the view-dependent bands of Gaussians that turned, colours included.
+
+    The colour along ``R d`` is what it was along ``d``. Every band is closed under rotation, so
+    the matrix of the bands follows from the basis in a few directions, in float64.
+
+    Args:
+        shN: View-dependent bands.
+        rotation: Rotation matrix.
+
+    Returns:
+        The bands of the turned Gaussians; without any, the same.
+
+    Raises:
+        InvalidArgumentError: ``shN`` has a number of coefficients that belongs to no degree.
+
+    Example:
+        >>> half = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+        >>> rotated_rest(torch.ones(1, 3, 1).expand(1, 3, 3), half)[0, :, 0].tolist()
+        [-1.0, -1.0, 1.0]
+    """
+    degree = degree_of(shN.shape[1])
+    if degree == 0:
+        return shN
+    matrix = _rest_rotation(rotation.detach().cpu().double(), degree).to(shN)
+    turned = torch.empty_like(shN)
+    for low, high in pairwise(REST_COUNTS[: degree + 1]):
+        band = shN[:, low:high]
+        turned[:, low:high] = torch.einsum("jk,nkc->njc", matrix[low:high, low:high], band)
+    return turned
+
+
+def _rest_rotation(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "k k"]:
+    """Return the matrix of the bands, zeros where it is zero but for rounding."""
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(64, 3, generator=generator, dtype=torch.float64)
+    directions /= directions.norm(dim=1, keepdim=True)
+    new, old = rest_basis(directions, degree), rest_basis(directions @ rotation, degree)
+    matrix: Tensor = torch.linalg.lstsq(new, old).solution
+    return torch.where(matrix.abs() < _ROUNDING, 0.0, matrix)
 
 
 def _quadratic(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:

@@ -1,0 +1,299 @@
+"""Edit scenes: crop, drop, move and merge. What an edit does not concern keeps its bits."""
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from cvtgs.boxes import Box, Corner, inside
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
+from cvtgs.math.parameters import multiply_quats, rotation_matrices
+from cvtgs.math.spherical_harmonics import REST_COUNTS, rotated_rest
+from cvtgs.scene import GaussianScene, concatenate
+
+__all__ = [
+    "Motion",
+    "Sphere",
+    "crop",
+    "drop_faint",
+    "drop_large",
+    "merge",
+    "move",
+]
+
+_NO_TURN = (1.0, 0.0, 0.0, 0.0)
+_NO_SHIFT = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sphere:
+    """A ball; its surface belongs to it.
+
+    Attributes:
+        center: Its middle, scene units.
+        radius: Its radius, scene units, at least 0.
+
+    Raises:
+        InvalidArgumentError: A number is not finite, or the radius is negative.
+
+    Example:
+        >>> Sphere(center=(0.0, 0.0, 0.0), radius=1.0).radius
+        1.0
+    """
+
+    center: Corner
+    radius: float
+
+    def __post_init__(self) -> None:
+        numbers = (*self.center, self.radius)
+        if len(numbers) != 4 or not all(map(math.isfinite, numbers)) or self.radius < 0:
+            raise InvalidArgumentError(
+                f"a sphere needs a center of 3 finite numbers and a radius of at least 0, "
+                f"found {self.center} and {self.radius}."
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion:
+    """A change of position that keeps shapes: ``x`` becomes ``scale * R x + shift``.
+
+    Attributes:
+        quat: The rotation ``R``, w first, of any length but 0.
+        scale: Factor of all lengths, above 0.
+        shift: Translation, scene units, after the others.
+
+    Raises:
+        InvalidArgumentError: A number is not finite, the factor is not above 0, or the quaternion
+            is 0.
+
+    Example:
+        >>> Motion(scale=2.0).shift
+        (0.0, 0.0, 0.0)
+    """
+
+    quat: tuple[float, float, float, float] = _NO_TURN
+    scale: float = 1.0
+    shift: Corner = _NO_SHIFT
+
+    def __post_init__(self) -> None:
+        numbers = (*self.quat, self.scale, *self.shift)
+        if len(numbers) != 8 or not all(map(math.isfinite, numbers)):
+            raise InvalidArgumentError(f"a motion must be of finite numbers, found {self}.")
+        if self.scale <= 0 or not any(self.quat):
+            raise InvalidArgumentError(
+                f"a motion needs a scale above 0 and a quaternion other than 0, "
+                f"found {self.scale} and {self.quat}."
+            )
+
+    @classmethod
+    def of_angles(
+        cls, angles: Corner, *, scale: float = 1.0, shift: Corner = _NO_SHIFT
+    ) -> "Motion":
+        """Build a motion from angles.
+
+        Args:
+            angles: Degrees about x, then y, then z, axes that stay where they are.
+            scale: Factor of all lengths.
+            shift: Translation.
+
+        Returns:
+            The motion.
+
+        Raises:
+            InvalidArgumentError: A number is not finite, or the factor is not above 0.
+        """
+        quat = torch.tensor([_NO_TURN], dtype=torch.float64)
+        for axis, angle in enumerate(angles):
+            turn = torch.zeros(1, 4, dtype=torch.float64)
+            # sinpi of quarter turns has no rounding, which sin of radians has
+            turn[0, 0], turn[0, 1 + axis] = _cos_sin(angle / 2)
+            quat = multiply_quats(turn, quat)
+        w, x, y, z = quat[0].tolist()
+        return cls(quat=(w, x, y, z), scale=scale, shift=shift)
+
+
+def _cos_sin(degrees: float) -> tuple[float, float]:
+    if math.isfinite(degrees) and degrees % 90 == 0:
+        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(degrees // 90) % 4]
+    radians = math.radians(degrees) if math.isfinite(degrees) else math.nan
+    return math.cos(radians), math.sin(radians)
+
+
+def crop(scene: GaussianScene, regions: Sequence[Box | Sphere]) -> GaussianScene:
+    """Keep the Gaussians whose centres lie in a region.
+
+    Args:
+        scene: The scene; it is not changed.
+        regions: Boxes and spheres, at least one; Gaussians in any of them stay.
+
+    Returns:
+        The Gaussians that stay, in their order, bit for bit; this scene if all do.
+
+    Raises:
+        InvalidArgumentError: There is no region.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 100, sh_degree=0, seed=0)
+        >>> len(crop(scene, [Sphere(center=(0.0, 0.0, 0.0), radius=1e6)]))
+        100
+    """
+    if not regions:
+        raise InvalidArgumentError("crop needs at least one box or sphere, found none.")
+    keep = inside([region for region in regions if isinstance(region, Box)], scene.means)
+    for region in regions:
+        if isinstance(region, Sphere):
+            away = scene.means.double() - scene.means.new_tensor(region.center).double()
+            keep |= away.square().sum(dim=1) <= region.radius**2
+    return _kept(scene, keep)
+
+
+def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
+    """Drop the Gaussians below an opacity.
+
+    Args:
+        scene: The scene; it is not changed.
+        least: Least opacity that stays, 0 to 1.
+
+    Returns:
+        The others, in their order, bit for bit; this scene if none is dropped.
+
+    Raises:
+        InvalidArgumentError: The opacity is not from 0 to 1.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 100, sh_degree=0, seed=0)
+        >>> bool((drop_faint(scene, 0.5).opacities >= 0.5).all())
+        True
+    """
+    if not 0 <= least <= 1:
+        raise InvalidArgumentError(f"the least opacity must be from 0 to 1, found {least!r}.")
+    # Not of clamped opacities: those of 1 - 1e-6 would not reach 1.
+    return _kept(scene, ~(torch.sigmoid(scene.logit_opacities.double()) < least))
+
+
+def drop_large(scene: GaussianScene, largest: float) -> GaussianScene:
+    """Drop the Gaussians above a size.
+
+    Args:
+        scene: The scene; it is not changed.
+        largest: Largest standard deviation that stays, scene units, above 0.
+
+    Returns:
+        The others, in their order, bit for bit; this scene if none is dropped.
+
+    Raises:
+        InvalidArgumentError: The size is not above 0.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 100, sh_degree=0, seed=0)
+        >>> len(drop_large(scene, 1e6))
+        100
+    """
+    if not largest > 0:
+        raise InvalidArgumentError(f"the largest size must be above 0, found {largest!r}.")
+    return _kept(scene, ~(scene.log_scales.double() > math.log(largest)).any(dim=1))
+
+
+def _kept(scene: GaussianScene, keep: Tensor) -> GaussianScene:
+    return scene if bool(keep.all()) else scene.select(keep)
+
+
+def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
+    """Turn, scale and shift a scene, colours included.
+
+    Args:
+        scene: The scene; it is not changed.
+        motion: Where to.
+
+    Returns:
+        The scene there. Only tensors that change are computed: a translation keeps all but the
+        centres, a factor all but centres and scales.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> one = make("object", 1, sh_degree=0, seed=0)
+        >>> (move(one, Motion(shift=(1.0, 0.0, 0.0))).means - one.means).tolist()
+        [[1.0, 0.0, 0.0]]
+    """
+    means, changes = scene.means.double(), {}
+    quat = torch.tensor([motion.quat], dtype=torch.float64, device=scene.device)
+    if bool((quat[0, 1:] != 0).any()):
+        turn = quat / torch.linalg.vector_norm(quat)
+        matrix = rotation_matrices(turn)[0]
+        means = means @ matrix.T
+        quats = multiply_quats(turn.expand(len(scene), 4), scene.quats.double())
+        changes["quats"] = quats.to(scene.dtype)
+        changes["shN"] = rotated_rest(scene.shN, matrix)
+    if motion.scale != 1.0:
+        means = motion.scale * means
+        log_scales = scene.log_scales.double() + math.log(motion.scale)
+        changes["log_scales"] = log_scales.to(scene.dtype)
+    if motion.shift != _NO_SHIFT:
+        means = means + means.new_tensor(motion.shift)
+    return scene.with_tensors({"means": means.to(scene.dtype), **changes}, scene.extras)
+
+
+def merge(scenes: Sequence[GaussianScene]) -> GaussianScene:
+    """Return the Gaussians of several scenes as one scene, whatever they hold.
+
+    Scenes of fewer SH bands get zeros, and all become float64 if one is. Extra columns that one
+    of them lacks are left out with a warning. Where some were trained with anti-aliasing and
+    others were not, viewers cannot show both as they should be, which is warned about.
+
+    Args:
+        scenes: At least one, all on one device.
+
+    Returns:
+        All Gaussians, in the order of the scenes, with the comments of all.
+
+    Raises:
+        InvalidSceneError: There is no scene, or they are on several devices.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> merge([make("object", 10, sh_degree=0), make("object", 5, sh_degree=2)])
+        GaussianScene(15 Gaussians, SH degree 2, float32, cpu)
+    """
+    if not scenes:
+        raise InvalidSceneError("merging needs at least one scene, found none.")
+    if len({scene.device for scene in scenes}) > 1:
+        raise InvalidSceneError("scenes to merge must be on one device, found several.")
+    common = set.intersection(*(set(scene.extras) for scene in scenes))
+    missing = sorted({name for scene in scenes for name in scene.extras} - common)
+    if missing:
+        warnings.warn(
+            f"left out {'columns' if len(missing) > 1 else 'column'} "
+            f"{', '.join(map(repr, missing))}, which not all of the scenes to merge have.",
+            DroppedDataWarning,
+            stacklevel=2,
+        )
+    if len({scene.antialiased for scene in scenes}) > 1:
+        warnings.warn(
+            "some of the scenes to merge were trained with anti-aliasing and others were not; "
+            "viewers will show those that were not too soft.",
+            DroppedDataWarning,
+            stacklevel=2,
+        )
+    dtype = torch.float64 if any(s.dtype == torch.float64 for s in scenes) else torch.float32
+    degree = max(scene.sh_degree for scene in scenes)
+    same_layout = len({scene.layout for scene in scenes}) == 1
+    alike = [_widened(scene, degree, dtype, common) for scene in scenes]
+    comments = tuple(dict.fromkeys(line for scene in scenes for line in scene.comments))
+    merged = concatenate(alike)
+    return replace(merged, comments=comments, layout=scenes[0].layout if same_layout else ())
+
+
+def _widened(
+    scene: GaussianScene, degree: int, dtype: torch.dtype, extras: set[str]
+) -> GaussianScene:
+    tensors = {name: tensor.to(dtype) for name, tensor in scene.tensors().items()}
+    missing = REST_COUNTS[degree] - scene.shN.shape[1]
+    tensors["shN"] = torch.nn.functional.pad(tensors["shN"], (0, 0, 0, missing))
+    kept = {name: column for name, column in scene.extras.items() if name in extras}
+    return scene.with_tensors(tensors, kept)

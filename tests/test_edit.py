@@ -1,0 +1,177 @@
+"""Edits of scenes in memory."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+import oracles
+from cvtgs import GaussianScene
+from cvtgs.boxes import Box
+from cvtgs.edit import Motion, Sphere, crop, drop_faint, drop_large, merge, move
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
+from cvtgs.math.spherical_harmonics import rotated_rest
+from format_cases import angles
+from scenes import moved, random_scene, same_bits
+
+
+def labelled(count: int, *, seed: int = 0, degree: int = 2) -> GaussianScene:
+    scene = random_scene(count, seed=seed, degree=degree)
+    labels = torch.arange(count, dtype=torch.int32)
+    return replace(scene.with_tensors({}, {"label": labels}), comments=("kept",))
+
+
+def test_crop_keeps_rows_as_they_are() -> None:
+    scene = labelled(200)
+    box, ball = Box(min=(-1, -1, -1), max=(0, 1, 1)), Sphere(center=(1.0, 0.0, 0.0), radius=0.7)
+    found = crop(scene, [box, ball])
+    wanted = [
+        row
+        for row, (x, y, z) in enumerate(scene.means.tolist())
+        if (-1 <= x <= 0 and abs(y) <= 1 and abs(z) <= 1) or math.dist((x, y, z), (1, 0, 0)) <= 0.7
+    ]
+    assert 20 < len(wanted) < 180
+    assert same_bits(found, scene.select(torch.tensor(wanted)))
+    assert found.comments == ("kept",)
+    assert crop(scene, [Sphere(center=(0.0, 0.0, 0.0), radius=100.0)]) is scene
+    with pytest.raises(InvalidArgumentError, match="needs at least one box or sphere, found none"):
+        crop(scene, [])
+
+
+def test_surface_belongs_to_a_sphere() -> None:
+    scene = random_scene(2).with_tensors({"means": torch.tensor([[3.0, 4, 0], [3.001, 4, 0]])}, {})
+    assert len(crop(scene, [Sphere(center=(0.0, 0.0, 0.0), radius=5.0)])) == 1
+
+
+def test_drop_by_opacity_and_by_size() -> None:
+    scene = labelled(200)
+    logits, sizes = scene.logit_opacities.tolist(), scene.log_scales.tolist()
+    faint = [row for row, logit in enumerate(logits) if 1 / (1 + math.exp(-logit)) >= 0.3]
+    small = [row for row, three in enumerate(sizes) if max(map(math.exp, three)) <= 0.15]
+    assert 20 < len(faint) < 180
+    assert 20 < len(small) < 180
+    assert same_bits(drop_faint(scene, 0.3), scene.select(torch.tensor(faint)))
+    assert same_bits(drop_large(scene, 0.15), scene.select(torch.tensor(small)))
+    assert drop_faint(scene, 0.0) is scene
+    assert drop_large(scene, math.inf) is scene
+
+
+def test_full_opacity_is_not_dropped() -> None:
+    scene = random_scene(2).with_tensors({"logit_opacities": torch.tensor([math.inf, 3.0])}, {})
+    assert len(drop_faint(scene, 1.0)) == 1
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_motion_is_that_of_the_oracle(degree: int) -> None:
+    scene = labelled(20, degree=degree)
+    quat, shift = (0.3, -0.8, 0.2, 0.5), (1.0, -2.0, 3.0)
+    found = move(scene, Motion(quat=quat, scale=0.4, shift=shift))
+    wanted = moved(scene, quat=quat, scale=0.4, shift=shift)
+    for name in ("means", "log_scales", "shN"):
+        torch.testing.assert_close(getattr(found, name), getattr(wanted, name))
+    assert angles(found.quats, wanted.quats).max() < 1e-3
+    assert torch.equal(found.extras["label"], scene.extras["label"])
+    assert torch.equal(found.sh0, scene.sh0)
+
+
+@pytest.mark.parametrize(
+    ("motion", "touched"),
+    [
+        (Motion(shift=(1.0, 2.0, 3.0)), {"means"}),
+        (Motion(scale=2.0), {"means", "log_scales"}),
+        (Motion(quat=(1.0, 1.0, 0.0, 0.0)), {"means", "quats", "shN"}),
+        (Motion(), set()),
+        (Motion(quat=(-2.0, 0.0, 0.0, 0.0)), set()),
+    ],
+)
+def test_what_a_motion_does_not_concern_keeps_its_bits(motion: Motion, touched: set[str]) -> None:
+    scene = labelled(20)
+    found = move(scene, motion)
+    changed = {
+        name
+        for name, tensor in scene.tensors().items()
+        if not torch.equal(tensor, found.tensors()[name])
+    }
+    assert changed == touched
+
+
+def test_there_and_back_again() -> None:
+    scene = random_scene(50, degree=3, dtype=torch.float64)
+    there = Motion(quat=(0.3, -0.8, 0.2, 0.5), scale=3.0)
+    back = Motion(quat=(0.3, 0.8, -0.2, -0.5), scale=1 / 3)
+    again = move(move(scene, there), back)
+    for name in ("means", "log_scales", "shN"):
+        torch.testing.assert_close(getattr(again, name), getattr(scene, name), rtol=0, atol=1e-12)
+
+
+def test_angles_are_about_x_then_y_then_z() -> None:
+    quat = Motion.of_angles((90, 0, 90)).quat
+    point = oracles.rotation(quat) @ [0, 1, 0]
+    assert point.round(12).tolist() == [0, 0, 1]  # y to z about x, which stays about z
+    assert Motion.of_angles((180, 0, 0)).quat == (0.0, 1.0, 0.0, 0.0)
+    assert Motion.of_angles((0, 0, -90)).quat == pytest.approx((0.5**0.5, 0, 0, -(0.5**0.5)))
+
+
+def test_quarter_turns_round_nothing_to_nonzero() -> None:
+    scene = random_scene(5).with_tensors({"means": torch.eye(3)[[0, 1, 2, 0, 1]]}, {})
+    means = move(scene, Motion.of_angles((0, 0, 180))).means
+    assert torch.equal(means.abs(), scene.means)
+
+
+def test_bands_do_not_mix() -> None:
+    turn = torch.tensor(oracles.rotation((0.3, -0.8, 0.2, 0.5)) / 1.0)
+    rest = torch.zeros(1, 15, 3, dtype=torch.float64)
+    rest[:, 3:8] = 1.0
+    found = rotated_rest(rest, turn)
+    assert torch.equal(found[:, :3], rest[:, :3])
+    assert torch.equal(found[:, 8:], rest[:, 8:])
+    torch.testing.assert_close(found.square().sum(), rest.square().sum())
+
+
+def test_merge_keeps_all_rows() -> None:
+    first, second = labelled(4, degree=2), labelled(3, seed=1, degree=2)
+    both = merge([first, second])
+    assert same_bits(both[:4], first)
+    assert same_bits(both[4:], second)
+    assert both.comments == ("kept",)
+    assert same_bits(merge([first]), first)
+
+
+def test_merge_of_unlike_scenes() -> None:
+    first = replace(labelled(4, degree=0), comments=("SplatRenderMode: mip",))
+    second = random_scene(3, degree=3, dtype=torch.float64)
+    with pytest.warns(DroppedDataWarning) as said:
+        both = merge([first, second])
+    assert [str(one.message) for one in said] == [
+        "left out column 'label', which not all of the scenes to merge have.",
+        "some of the scenes to merge were trained with anti-aliasing and others were not; viewers "
+        "will show those that were not too soft.",
+    ]
+    assert {one.filename for one in said} == {__file__}
+    assert (both.sh_degree, both.dtype, dict(both.extras)) == (3, torch.float64, {})
+    assert torch.equal(both.means[:4].float(), first.means)
+    assert not both.shN[:4].any()
+    assert torch.equal(both.shN[4:], second.shN)
+    with pytest.raises(InvalidSceneError, match="merging needs at least one scene, found none"):
+        merge([])
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (
+            lambda: Motion(scale=0.0),
+            "needs a scale above 0 and a quaternion other than 0, found 0.0",
+        ),
+        (lambda: Motion(quat=(0.0,) * 4), "a quaternion other than 0, found 1.0 and"),
+        (lambda: Motion(shift=(math.nan, 0, 0)), "must be of finite numbers"),
+        (lambda: Motion.of_angles((math.inf, 0, 0)), "must be of finite numbers"),
+        (lambda: Sphere(center=(0.0, 0.0, 0.0), radius=-1), "a radius of at least 0"),
+        (lambda: drop_faint(random_scene(2), 1.5), "from 0 to 1, found 1.5"),
+        (lambda: drop_large(random_scene(2), 0.0), "above 0, found 0.0"),
+    ],
+)
+def test_wrong_arguments(make, text: str) -> None:
+    with pytest.raises(InvalidArgumentError, match=text):
+        make()
