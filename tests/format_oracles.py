@@ -7,6 +7,7 @@ import gzip
 import io
 import json
 import math
+import re
 import struct
 import zipfile
 from dataclasses import dataclass, field
@@ -197,3 +198,34 @@ def sog_rest(rest, at, pixels) -> list[list[float]]:
         [rest["codebook"][byte] for byte in image.getpixel((label % 64 * k + j, label // 64))[:3]]
         for j in range(k)
     ]
+
+
+def read_glb(content: bytes) -> list[Splat]:
+    """Read a ``.glb`` of one mesh of floats, without turning any axis."""
+    size = struct.unpack_from("<I", content, 12)[0]
+    document, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
+    primitive = document["meshes"][0]["primitives"][0]
+    names = {name.rpartition(":")[2]: index for name, index in primitive["attributes"].items()}
+
+    def value(name, row):
+        accessor = document["accessors"][names[name]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        start = document["bufferViews"][accessor["bufferView"]].get("byteOffset", 0)
+        start += accessor.get("byteOffset", 0) + 4 * width * row
+        return list(struct.unpack_from(f"<{width}f", binary, start))
+
+    rest = sorted(name for name in names if re.match("SH_DEGREE_[123]", name))
+    found = []
+    for row in range(document["accessors"][names["POSITION"]]["count"]):
+        x, y, z, w = value("ROTATION", row)
+        found.append(
+            Splat(
+                mean=value("POSITION", row),
+                quat=unit([w, x, y, z]),
+                log_scale=[math.log(scale) for scale in value("SCALE", row)],
+                opacity=value("OPACITY", row)[0],
+                sh0=value("SH_DEGREE_0_COEF_0", row),
+                rest=[value(name, row) for name in rest],
+            )
+        )
+    return found

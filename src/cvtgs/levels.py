@@ -165,7 +165,7 @@ def write_levels(
     rhos: Sequence[float],
     source: str,
     suffix: str = ".ply",
-    axes: str = SCENE_AXES,
+    axes: str | None = None,
     overwrite: bool = False,
 ) -> LevelsIndex:
     """Write levels and, at last, the index that names them.
@@ -176,7 +176,8 @@ def write_levels(
         rhos: The ratio of each.
         source: Name of the full scene.
         suffix: End of the names, which says the format.
-        axes: The axes of the files, as :func:`cvtgs.io.change_axes` names them.
+        axes: The axes of the files, as :func:`cvtgs.io.change_axes` names them; None for those
+            of the format.
         overwrite: Whether existing files may be replaced.
 
     Returns:

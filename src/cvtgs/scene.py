@@ -196,14 +196,14 @@ class GaussianScene:
         return self.select(picked)
 
     def save(
-        self, path: str | os.PathLike[str], *, overwrite: bool = False, axes: str = "rdf"
+        self, path: str | os.PathLike[str], *, overwrite: bool = False, axes: str | None = None
     ) -> None:
         """Write the scene to a file, as :func:`cvtgs.save` does.
 
         Args:
             path: The file to write; its suffix chooses the format.
             overwrite: Whether an existing file may be replaced.
-            axes: Where x, y and z of the file are to point.
+            axes: Where x, y and z of the file are to point; None for the axes of the format.
         """
         resolve_name("cvtgs.io.formats:save")(self, path, overwrite=overwrite, axes=axes)
 

@@ -13,7 +13,7 @@ from cvtgs.outofcore import read_bytes
 from format_cases import DATA, assert_within, storable_scene
 from scenes import same_bits
 
-FORMATS = ("ply", "compressed.ply", "spz", "splat", "sog")
+FORMATS = ("ply", "compressed.ply", "spz", "splat", "sog", "glb", "spz.glb")
 
 
 def test_what_is_lost_is_said_before_it_is_written(
@@ -73,7 +73,8 @@ def test_what_cannot_be_written_is_refused_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     assert main(["convert", str(tmp_path / "missing.ply"), str(tmp_path / name)]) == 1
-    assert "must end in .compressed.ply, .ply, .spz, .splat or .sog" in capsys.readouterr().err
+    ends = ".compressed.ply, .ply, .spz, .splat, .sog, .spz.glb, .glb or .gltf"
+    assert f"must end in {ends}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("first", FORMATS)

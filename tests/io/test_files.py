@@ -82,7 +82,7 @@ def test_unknown_suffix(tmp_path: Path, name: str, found: str) -> None:
         load(path)
     assert str(caught.value) == (
         f"{path}: the file name must end in .compressed.ply, .ply, .spz, .splat, .sog, meta.json, "
-        f".ckpt or .pt, found {found}."
+        f".glb, .gltf, .ckpt or .pt, found {found}."
     )
 
 

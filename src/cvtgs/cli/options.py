@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 Color = tuple[float, float, float]
 
-READABLE = ".ply, .spz, .splat, .sog, .ckpt, .pt or the folder of a trained model"
+READABLE = ".ply, .spz, .splat, .sog, .glb, .gltf, .ckpt, .pt or the folder of a trained model"
 PRESET_NAMES = "draft, fast, standard, high, max (from the fastest to the best) or paper"
 CAMERA_FILES = "transforms.json, a COLMAP model, cameras.json, or a folder of these"
 COLORS: Mapping[str, Color] = {
@@ -41,7 +41,7 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     "output": {
         "metavar": "OUT",
         "type": Path,
-        "help": "scene to write (.ply, .compressed.ply, .spz, .splat or .sog)",
+        "help": "scene to write (.ply, .compressed.ply, .spz, .splat, .sog, .glb, .gltf, .spz.glb)",
     },
     "reference": {"metavar": "REF", "type": Path, "help": f"full scene ({READABLE})"},
     "small": {"metavar": "SMALL", "type": Path, "nargs": "+", "help": "simplified scenes"},
@@ -118,7 +118,7 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     "--axes": {
         "metavar": "IN[:OUT]",
         "help": "axes of the files: where x, y and z point, for example rub (right, up, back) or "
-        "rub:rub (default rdf:rdf, right, down, forward, unless IN states its own)",
+        "rub:rub (default rdf, right, down, forward; of glTF luf; unless IN states its own)",
     },
     "--overwrite": {"action": "store_true", "help": "replace existing files"},
     "--quiet": {"action": "store_true", "help": "print only errors and warnings"},
@@ -256,19 +256,19 @@ def read_ratios(text: str) -> list[float]:
 
 
 class FileAxes(NamedTuple):
-    """The axes of a file to read, None if they were not given, and of files to write."""
+    """The axes of a file to read and of files to write; None if they were not given."""
 
     source: str | None
-    target: str
+    target: str | None
 
 
 def read_axes(text: str | None) -> FileAxes:
     """Read ``--axes``."""
-    from cvtgs.io.axes import SCENE_AXES, checked_axes
+    from cvtgs.io.axes import checked_axes
 
     source, _, target = (text or "").partition(":")
     return FileAxes(
-        checked_axes(source) if source else None, checked_axes(target) if target else SCENE_AXES
+        checked_axes(source) if source else None, checked_axes(target) if target else None
     )
 
 

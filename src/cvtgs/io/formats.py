@@ -32,6 +32,8 @@ _READERS: Mapping[str, str] = MappingProxyType(
         ".splat": "cvtgs.io.splat:read_splat",
         ".sog": "cvtgs.io.sog:read_sog",
         "meta.json": "cvtgs.io.sog:read_sog",
+        ".glb": "cvtgs.io.gltf:read_gltf",
+        ".gltf": "cvtgs.io.gltf:read_gltf",
         ".ckpt": "cvtgs.io.checkpoints:read_checkpoint",
         ".pt": "cvtgs.io.checkpoints:read_checkpoint",
     }
@@ -45,6 +47,12 @@ _ADVICE = (
 _SIZED = (".compressed.ply", ".splat")
 """Formats besides plain PLY whose files have as many bytes as their rows take."""
 
+_STATES_AXES = (".spz", ".glb", ".gltf")
+"""Formats whose axes their readers know."""
+
+_FILE_AXES = {".spz.glb": "luf", ".glb": "luf", ".gltf": "luf"}
+"""Axes that a format prescribes, by suffix."""
+
 _WRITERS: Mapping[str, str] = MappingProxyType(
     {
         ".compressed.ply": "cvtgs.io.compressed_ply:write_compressed_ply",
@@ -52,6 +60,9 @@ _WRITERS: Mapping[str, str] = MappingProxyType(
         ".spz": "cvtgs.io.spz:write_spz",
         ".splat": "cvtgs.io.splat:write_splat",
         ".sog": "cvtgs.io.sog:write_sog",
+        ".spz.glb": "cvtgs.io.gltf:write_spz_glb",
+        ".glb": "cvtgs.io.gltf:write_glb",
+        ".gltf": "cvtgs.io.gltf:write_gltf",
     }
 )
 
@@ -73,16 +84,17 @@ def load(
     Args:
         path: The file; its suffix chooses the format: ``.ply`` (plain, or compressed by
             PlayCanvas' tools), ``.spz``, ``.splat``, ``.sog`` or the ``meta.json`` of a SOG,
-            ``.ckpt`` of nerfstudio's Splatfacto, ``.pt`` of gsplat's trainer. Of a folder, the
-            scene that :func:`cvtgs.io.scene_file` finds.
+            ``.glb`` or ``.gltf`` with ``KHR_gaussian_splatting``, ``.ckpt`` of nerfstudio's
+            Splatfacto, ``.pt`` of gsplat's trainer. Of a folder, the scene that
+            :func:`cvtgs.io.scene_file` finds.
         device: Where the tensors are to be.
         sh_degree: SH bands above this degree are zeros, whatever the file holds; None for all. Of
             plain PLY files their columns are not even copied.
         extras: Whether columns beyond the standard ones are carried; only plain PLY files have any.
         axes: Where x, y and z of the file point, for example ``"rub"``, as
             :func:`cvtgs.io.change_axes` names them; the scene is turned to ``"rdf"``, the axes of
-            PLY files. None for the axes that the file states, which only ``.spz`` files of version
-            4 can; others are taken to be ``"rdf"``.
+            PLY files. None for those that the file states, which ``.spz`` files of version 4 can,
+            or its format prescribes (``"luf"`` of glTF); others are taken to be ``"rdf"``.
         trust_sizes: Whether a compressed file may unpack to any size. By default, one that claims
             far more Gaussians than its bytes can hold is refused before it takes memory.
 
@@ -123,12 +135,12 @@ def load(
     options: dict[str, Any] = {} if suffix in _SIZED else {"trust_sizes": trust_sizes}
     if suffix == ".ply":
         options = {"sh_degree": sh_degree, "extras": extras}
-    elif suffix == ".spz":
+    elif suffix in _STATES_AXES:
         options["axes"] = axes
     with memory_errors(f"{source}: reading the scene", _ADVICE):
         read: Callable[..., GaussianScene] = resolve_name(_READERS[suffix])
         scene = read(source, **options)
-        if axes is not None and suffix != ".spz":
+        if axes is not None and suffix not in _STATES_AXES:
             scene = change_axes(scene, axes, SCENE_AXES)
         if suffix != ".ply" and sh_degree is not None and sh_degree < scene.sh_degree:
             rest = scene.shN.clone()
@@ -142,7 +154,7 @@ def save(
     path: str | os.PathLike[str],
     *,
     overwrite: bool = False,
-    axes: str = SCENE_AXES,
+    axes: str | None = None,
 ) -> None:
     """Write a scene to a file, completely or not at all.
 
@@ -154,10 +166,12 @@ def save(
     Args:
         scene: The scene, on any device.
         path: The file to write; its suffix chooses the format: ``.ply``,
-            ``.compressed.ply``, ``.spz``, ``.splat`` or ``.sog``.
+            ``.compressed.ply``, ``.spz``, ``.splat``, ``.sog``, ``.glb``, ``.gltf``, or
+            ``.spz.glb``, which is a glTF with an SPZ inside.
         overwrite: Whether an existing file may be replaced.
         axes: Where x, y and z of the file are to point, as :func:`cvtgs.io.change_axes` names
-            them; the scene, whose own are ``"rdf"``, is turned to them.
+            them; the scene, whose own are ``"rdf"``, is turned to them. None for those of the
+            format: ``"luf"`` of glTF, ``"rdf"`` of the others.
 
     Raises:
         FileFormatError: The format is unknown or cannot be written.
@@ -177,9 +191,9 @@ def save(
         ...     save(scene, Path(folder) / "two.ply")
         ...     save(scene, Path(folder) / "two.ply", overwrite=True)
     """
-    writer = _WRITERS[_suffix_of(path, _WRITERS)]
+    suffix = _suffix_of(path, _WRITERS)
     check_output(path, overwrite)
-    scene = change_axes(scene, SCENE_AXES, axes)
+    scene = change_axes(scene, SCENE_AXES, axes or _FILE_AXES.get(suffix, SCENE_AXES))
     dropped = losses(scene, path).dropped
     if dropped:
         warnings.warn(
@@ -187,7 +201,7 @@ def save(
             DroppedDataWarning,
             stacklevel=2,
         )
-    write: Callable[[GaussianScene, BinaryIO], None] = resolve_name(writer)
+    write: Callable[[GaussianScene, BinaryIO], None] = resolve_name(_WRITERS[suffix])
     with atomic_output(path, overwrite=overwrite) as file:
         write(scene, file)
 

@@ -1,7 +1,7 @@
 """What each format holds, and what of a scene it therefore loses."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import torch
@@ -50,6 +50,33 @@ def _largest_spz_coordinate(scene: GaussianScene) -> float:
     return largest_coordinate(scene)
 
 
+_SPZ = FormatLimits(  # of versions 3 and 4
+    sh_degree=3,
+    antialiased=True,
+    ranges={
+        "log_scales": (-10 - 1 / 32, 255 / 16 - 10 + 1 / 32),
+        "sh0": (-3.3464, 3.3464),
+        "shN": (-1.0625, 1.0625),
+    },
+    largest_coordinate=_largest_spz_coordinate,
+    changed=(
+        "positions in steps of 1/4096 (finer in scenes below 8 units, coarser above 2,048)",
+        "scales in steps of 6.4 %",
+        "rotations in steps of 1/723 per component",
+        "opacities in steps of 1/255",
+        "colours in steps of 0.0074",
+        "view-dependent SH coefficients in steps of 1/16 (degree 1) and 1/8",
+    ),
+)
+
+_GLTF = FormatLimits(
+    sh_degree=3,
+    antialiased=True,
+    comments=True,
+    ranges={"log_scales": (-87.3, 88.7)},  # scales that are float32
+    changed=("scales and opacities as float32, not their logarithms and logits",),
+)
+
 FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
     {
         ".compressed.ply": FormatLimits(
@@ -66,24 +93,10 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
                 "view-dependent SH coefficients in steps of 1/32",
             ),
         ),
-        ".spz": FormatLimits(  # of version 3
-            sh_degree=3,
-            antialiased=True,
-            ranges={
-                "log_scales": (-10 - 1 / 32, 255 / 16 - 10 + 1 / 32),
-                "sh0": (-3.3464, 3.3464),
-                "shN": (-1.0625, 1.0625),
-            },
-            largest_coordinate=_largest_spz_coordinate,
-            changed=(
-                "positions in steps of 1/4096 (finer in scenes below 8 units, coarser above 2,048)",
-                "scales in steps of 6.4 %",
-                "rotations in steps of 1/723 per component",
-                "opacities in steps of 1/255",
-                "colours in steps of 0.0074",
-                "view-dependent SH coefficients in steps of 1/16 (degree 1) and 1/8",
-            ),
-        ),
+        ".spz": _SPZ,
+        ".spz.glb": replace(_SPZ, comments=True),
+        ".glb": _GLTF,
+        ".gltf": _GLTF,
         ".splat": FormatLimits(
             sh_degree=0,
             antialiased=False,

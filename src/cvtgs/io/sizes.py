@@ -21,7 +21,7 @@ _FLOATS = 14
 """Numbers of a Gaussian without view-dependent colour."""
 
 
-def check_expansion(path: Path, *, count: int, rest: int, stored: int) -> None:
+def check_expansion(path: Path | str, *, count: int, rest: int, stored: int) -> None:
     """Refuse a file that claims far more Gaussians, of ``rest`` SH coefficients, than it can hold.
 
     Every reader of a compressed format calls this before it unpacks anything, unless sizes are

@@ -1,6 +1,6 @@
 """The ``.spz`` files of Niantic: 20 bytes per Gaussian and one per view-dependent number."""
 
-from cvtgs.io.spz.read import read_spz
+from cvtgs.io.spz.read import decode_spz, read_spz
 from cvtgs.io.spz.write import write_spz
 
-__all__ = ["read_spz", "write_spz"]
+__all__ = ["decode_spz", "read_spz", "write_spz"]

@@ -72,17 +72,26 @@ def read_spz(path: Path, *, axes: str | None = None, trust_sizes: bool = False) 
         InvalidArgumentError: There are no axes of this name.
     """
     axes = None if axes is None else checked_axes(axes)
-    content = _read_content(path, trust_sizes=trust_sizes)
-    header, blocks = content.header, content.blocks
+    with open_input(path) as file:
+        content = file.read()
+    return decode_spz(content, path, axes=axes, trust_sizes=trust_sizes)
+
+
+def decode_spz(
+    content: bytes, path: Path | str, *, axes: str | None = None, trust_sizes: bool = False
+) -> GaussianScene:
+    """Decode the content of an ``.spz`` file, read already, as :func:`read_spz` does."""
+    found = _parsed(content, path, trust_sizes=trust_sizes)
+    header, blocks = found.header, found.blocks
     if header.sh_degree > 3:
         warnings.warn(
             f"{path}: left out the SH bands above degree 3 (the file has degree "
             f"{header.sh_degree}), since a scene holds degree 0 to 3.",
             DroppedDataWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     scene = scene_of(_unpack(header, blocks), antialiased=header.antialiased)
-    return change_axes(scene, axes or content.axes or SCENE_AXES, SCENE_AXES)
+    return change_axes(scene, axes or found.axes or SCENE_AXES, SCENE_AXES)
 
 
 def _unpack(header: SpzHeader, blocks: Blocks) -> Arrays:
@@ -121,10 +130,8 @@ def _quats(stored: UInt8[np.ndarray, "n b"]) -> Float[np.ndarray, "n 4"]:
     return np.roll(restore_largest((words >> 30).astype(np.int64), others), 1, axis=1)
 
 
-def _read_content(path: Path, *, trust_sizes: bool) -> _Content:
-    """Read and decompress a file."""
-    with open_input(path) as file:
-        content = file.read()
+def _parsed(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Content:
+    """Check and decompress a file."""
     if content[:2] == _GZIP:
         return _read_gzip(content, path, trust_sizes=trust_sizes)
     if content[:4] == MAGIC.to_bytes(4, "little"):
@@ -135,7 +142,7 @@ def _read_content(path: Path, *, trust_sizes: bool) -> _Content:
     )
 
 
-def _read_gzip(content: bytes, path: Path, *, trust_sizes: bool) -> _Content:
+def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Content:
     stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     try:
         header = _header(stream.decompress(content, HEADER.size), path, versions=(1, 2, 3))
@@ -160,7 +167,7 @@ def _read_gzip(content: bytes, path: Path, *, trust_sizes: bool) -> _Content:
             f"{path}: left out what stands behind the {header.count:,} Gaussians that the header "
             f"promises.",
             DroppedDataWarning,
-            stacklevel=5,
+            stacklevel=6,
         )
     elif not stream.eof:
         raise FileFormatError(f"{path}: must be whole gzip, found it cut short.")
@@ -169,7 +176,7 @@ def _read_gzip(content: bytes, path: Path, *, trust_sizes: bool) -> _Content:
     return _Content(header, dict(zip(header.sizes, blocks, strict=True)))
 
 
-def _read_version_4(content: bytes, path: Path, *, trust_sizes: bool) -> _Content:
+def _read_version_4(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Content:
     header = _header(content[: HEADER.size], path, versions=(4,))
     sizes = {name: size for name, size in header.sizes.items() if size}
     start = int.from_bytes(content[_TABLE_START], "little")
@@ -198,7 +205,7 @@ def _read_version_4(content: bytes, path: Path, *, trust_sizes: bool) -> _Conten
     return _Content(header, blocks, _stated_axes(extensions, path))
 
 
-def _stated_axes(extensions: bytes, path: Path) -> str | None:
+def _stated_axes(extensions: bytes, path: Path | str) -> str | None:
     """Return the axes that the extensions state: records of type, number of bytes, and bytes."""
     axes, at = None, 0
     while at + 8 <= len(extensions):
@@ -215,12 +222,12 @@ def _stated_axes(extensions: bytes, path: Path) -> str | None:
     return axes
 
 
-def _check_expansion(path: Path, header: SpzHeader, stored: int) -> None:
+def _check_expansion(path: Path | str, header: SpzHeader, stored: int) -> None:
     rest = STORED_REST_COUNTS[header.sh_degree]
     check_expansion(path, count=header.count, rest=rest, stored=stored)
 
 
-def _header(start: bytes, path: Path, *, versions: tuple[int, ...]) -> SpzHeader:
+def _header(start: bytes, path: Path | str, *, versions: tuple[int, ...]) -> SpzHeader:
     if len(start) < HEADER.size:
         raise FileFormatError(
             f"{path}: an .spz file must start with a header of {HEADER.size} bytes, "
@@ -251,7 +258,7 @@ def _header(start: bytes, path: Path, *, versions: tuple[int, ...]) -> SpzHeader
     )
 
 
-def _too_short(path: Path, header: SpzHeader, wanted: int, found: str) -> FileFormatError:
+def _too_short(path: Path | str, header: SpzHeader, wanted: int, found: str) -> FileFormatError:
     return FileFormatError(
         f"{path}: must hold {wanted:,} bytes for the {header.count:,} Gaussians of SH degree "
         f"{header.sh_degree} that the header promises, found {found}."

@@ -1,0 +1,264 @@
+"""The parts of a glTF document that splats need: chunks, buffers, accessors and their checks."""
+
+import base64
+import binascii
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any
+from urllib.parse import unquote, urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from cvtgs.errors import FileFormatError
+from cvtgs.io.documents import (
+    AnyDocument,
+    Document,
+    Text,
+    Whole,
+    parse_json,
+    validated,
+)
+from cvtgs.io.files import open_input
+from cvtgs.text import shown
+
+SPLATS = "KHR_gaussian_splatting"
+SPZ = "KHR_gaussian_splatting_compression_spz_2"
+KERNEL = "ellipse"
+COLOR_SPACE = "srgb_rec709_display"
+AXES = "luf"
+"""Of every glTF: y up, z forward, so x left (section 3.4 of glTF 2.0)."""
+
+POSITION, COLOR = "POSITION", "COLOR_0"
+ROTATION, SCALE, OPACITY = f"{SPLATS}:ROTATION", f"{SPLATS}:SCALE", f"{SPLATS}:OPACITY"
+
+MAGIC, VERSION = b"glTF", 2
+HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<II")
+JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+
+BYTE, UNSIGNED_BYTE, SHORT, UNSIGNED_SHORT, FLOAT = 5120, 5121, 5122, 5123, 5126
+_COMPONENTS: dict[int, np.dtype[Any]] = {
+    BYTE: np.dtype("i1"),
+    UNSIGNED_BYTE: np.dtype("u1"),
+    SHORT: np.dtype("<i2"),
+    UNSIGNED_SHORT: np.dtype("<u2"),
+    FLOAT: np.dtype("<f4"),
+}
+_LARGEST = {BYTE: 127, UNSIGNED_BYTE: 255, SHORT: 32767, UNSIGNED_SHORT: 65535}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_MOST_STRIDE = 252
+
+
+def coefficient(degree: int, number: int) -> str:
+    """Return the name of the attribute of an SH coefficient."""
+    return f"{SPLATS}:SH_DEGREE_{degree}_COEF_{number}"
+
+
+Size = Annotated[Whole, Field(ge=0, description="a whole number of at least 0")]
+Entry = Annotated[dict[str, Any], Field(default_factory=dict, description="a JSON object")]
+Entries = Annotated[list[Any], Field(default_factory=list, description="a list")]
+
+
+class GltfRoot(Document):
+    """The root of a glTF document."""
+
+    asset: Entry
+    extensionsRequired: Entries  # noqa: N815 (the names of glTF, here and below)
+    scene: Size | None = None
+    scenes: Entries
+    nodes: Entries
+    meshes: Entries
+    accessors: Entries
+    bufferViews: Entries  # noqa: N815
+    buffers: Entries
+
+
+class _Buffer(Document):
+    byteLength: Size  # noqa: N815
+    uri: Text | None = None
+
+
+class _View(Document):
+    buffer: Size
+    byteOffset: Size = 0  # noqa: N815
+    byteLength: Size  # noqa: N815
+    byteStride: Size | None = None  # noqa: N815
+
+
+class _Accessor(Document):
+    bufferView: Size | None = None  # noqa: N815
+    byteOffset: Size = 0  # noqa: N815
+    componentType: Whole  # noqa: N815
+    normalized: bool = False
+    count: Size
+    type: Text
+    sparse: Any = None
+
+
+@dataclass(slots=True, kw_only=True)
+class GltfFile:
+    """A glTF document and its bytes, each looked up, checked and read when it is needed."""
+
+    path: Path
+    root: GltfRoot
+    binary: bytes | None = None
+    """The binary chunk of a ``.glb``."""
+    stored: int
+    """Bytes on the disk, with those of buffers beside the file that were read."""
+    _buffers: dict[int, bytes] = field(default_factory=dict)
+
+    def entry(self, model: type[AnyDocument], name: str, index: int) -> AnyDocument:
+        """Return a checked entry of one of the lists of the document."""
+        entries = getattr(self.root, name)
+        if not 0 <= index < len(entries):
+            raise self.error(f"{name} has {len(entries):,} entries, found a reference to {index}")
+        return validated(model, entries[index], f"{self.path}: {name}[{index}]")
+
+    def error(self, text: str) -> FileFormatError:
+        """Return an error about this file."""
+        return FileFormatError(f"{self.path}: {text}.")
+
+    def view(self, index: int) -> tuple[memoryview, int | None]:
+        """Return the bytes of a buffer view, and the stride that it states."""
+        view = self.entry(_View, "bufferViews", index)
+        content = self._buffer(view.buffer)
+        end = view.byteOffset + view.byteLength
+        if end > len(content):
+            raise self.error(
+                f"bufferViews[{index}] must end in buffer {view.buffer} of {len(content):,} "
+                f"bytes, found byte {end:,}"
+            )
+        return memoryview(content)[view.byteOffset : end], view.byteStride
+
+    def count(self, accessor: int) -> int:
+        """Return the number of elements that an accessor states."""
+        return self.entry(_Accessor, "accessors", accessor).count
+
+    def values(self, index: int, kind: str, name: str) -> NDArray[np.float32]:
+        """Return the numbers of an accessor as float32, one row per element."""
+        accessor = self.entry(_Accessor, "accessors", index)
+        where = f"accessors[{index}] ({name})"
+        dtype = _COMPONENTS.get(accessor.componentType)
+        if accessor.type != kind or dtype is None:
+            raise self.error(
+                f"{where} must be {kind} of bytes, shorts or floats, found "
+                f"{shown(accessor.type)} of component type {accessor.componentType}"
+            )
+        if accessor.sparse is not None or accessor.bufferView is None:
+            found = "a sparse one" if accessor.sparse is not None else "none"
+            raise self.error(f"{where} must lie in a buffer view, found {found}")
+        content, stated = self.view(accessor.bufferView)
+        width = WIDTHS[kind] * dtype.itemsize
+        stride = stated or width
+        if not width <= stride <= _MOST_STRIDE:
+            raise self.error(
+                f"bufferViews[{accessor.bufferView}] must have a stride of {width} to "
+                f"{_MOST_STRIDE} bytes, found {stride:,}"
+            )
+        end = accessor.byteOffset + stride * (accessor.count - 1) + width
+        if accessor.count == 0 or end > len(content):
+            raise self.error(
+                f"{where} must have one element at least and end in its buffer view of "
+                f"{len(content):,} bytes, found {accessor.count:,} elements that end at "
+                f"byte {end:,}"
+            )
+        rows: NDArray[Any] = np.ndarray(
+            (accessor.count, WIDTHS[kind]),
+            dtype,
+            content,
+            accessor.byteOffset,
+            (stride, dtype.itemsize),
+        )
+        numbers = rows.astype(np.float32)
+        if accessor.normalized and accessor.componentType in _LARGEST:
+            numbers /= np.float32(_LARGEST[accessor.componentType])
+            np.maximum(numbers, -1, out=numbers)
+        return numbers
+
+    def _buffer(self, index: int) -> bytes:
+        if index not in self._buffers:
+            self._buffers[index] = self._read_buffer(index)
+        return self._buffers[index]
+
+    def _read_buffer(self, index: int) -> bytes:
+        buffer = self.entry(_Buffer, "buffers", index)
+        content: bytes | None
+        if buffer.uri is None:
+            content = self.binary if index == 0 else None
+            if content is None:
+                raise self.error(f"buffers[{index}] must have a uri, found none")
+        elif buffer.uri.startswith("data:"):
+            content = self._decoded(buffer.uri, index)
+        else:
+            content = self._beside(buffer.uri, index, buffer.byteLength)
+        if len(content) < buffer.byteLength:
+            raise self.error(
+                f"buffers[{index}] must have {buffer.byteLength:,} bytes, found {len(content):,}"
+            )
+        return content[: buffer.byteLength]
+
+    def _decoded(self, uri: str, index: int) -> bytes:
+        head, _, text = uri.partition(",")
+        if not head.endswith(";base64"):
+            raise self.error(f"buffers[{index}] must have data in base64, found {shown(head)}")
+        try:
+            return base64.b64decode(text, validate=True)
+        except binascii.Error as error:
+            raise self.error(f"buffers[{index}] must be whole base64, found: {error}") from error
+
+    def _beside(self, uri: str, index: int, length: int) -> bytes:
+        parts = urlsplit(uri)
+        name = PurePosixPath(unquote(parts.path))
+        outside = name.is_absolute() or ".." in name.parts or not name.parts or "\\" in str(name)
+        if parts.scheme or parts.netloc or parts.query or outside or not str(name).isprintable():
+            raise self.error(
+                f"buffers[{index}] must be in the folder of the file, found {shown(uri)}"
+            )
+        with open_input(self.path.parent / name) as file:
+            content = file.read(length)
+        self.stored += len(content)
+        return content
+
+
+def open_gltf(path: Path) -> GltfFile:
+    """Read a ``.glb`` or ``.gltf``: its JSON, and the binary chunk."""
+    with open_input(path) as file:
+        content = file.read()
+    binary, text = None, content
+    if content[: len(MAGIC)] == MAGIC:
+        text, binary = _chunks(content, path)
+    elif path.suffix.lower() == ".glb":
+        raise FileFormatError(f"{path}: a .glb must start with b'glTF', found {content[:4]!r}.")
+    root = validated(GltfRoot, parse_json(text, path), str(path))
+    return GltfFile(path=path, root=root, binary=binary, stored=len(content))
+
+
+def _chunks(content: bytes, path: Path) -> tuple[bytes, bytes | None]:
+    """Split a ``.glb`` into its JSON and its binary chunk."""
+    if len(content) < HEADER.size:
+        raise FileFormatError(
+            f"{path}: a .glb must start with {HEADER.size} bytes of header, found {len(content)}."
+        )
+    _, version, length = HEADER.unpack_from(content)
+    if version != VERSION or length > len(content):
+        raise FileFormatError(
+            f"{path}: must be version {VERSION} of glTF and have the {length:,} bytes that its "
+            f"header promises, found version {version} and {len(content):,} bytes."
+        )
+    found: dict[int, bytes] = {}
+    at = HEADER.size
+    while at + CHUNK.size <= length:
+        size, kind = CHUNK.unpack_from(content, at)
+        at += CHUNK.size
+        if at + size > length:
+            raise FileFormatError(
+                f"{path}: a chunk must end in the {length:,} bytes of the file, found one that "
+                f"ends at byte {at + size:,}."
+            )
+        found.setdefault(kind, content[at : at + size])
+        at += size
+    if JSON_CHUNK not in found:
+        raise FileFormatError(f"{path}: a .glb must have a chunk of JSON, found none.")
+    return found[JSON_CHUNK], found.get(BINARY_CHUNK)

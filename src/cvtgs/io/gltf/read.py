@@ -1,0 +1,320 @@
+"""Read the splats of a glTF: those of all nodes of its scene, where the nodes put them."""
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from pydantic import Field
+
+from cvtgs.edit import Motion, merge, move
+from cvtgs.errors import DroppedDataWarning
+from cvtgs.io.arrays import Arrays, scene_of, unit_quats
+from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
+from cvtgs.io.documents import Document, Items, Number, Whole, validated
+from cvtgs.io.gltf.document import (
+    AXES,
+    COLOR_SPACE,
+    KERNEL,
+    OPACITY,
+    POSITION,
+    ROTATION,
+    SCALE,
+    SPLATS,
+    SPZ,
+    Entries,
+    Entry,
+    GltfFile,
+    Size,
+    coefficient,
+    open_gltf,
+)
+from cvtgs.io.sizes import check_expansion
+from cvtgs.io.spz import decode_spz
+from cvtgs.math.parameters import logit_from_opacity, matrices_to_quats
+from cvtgs.math.spherical_harmonics import REST_COUNTS
+from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
+from cvtgs.text import printable, shown
+
+_KNOWN = (SPLATS, SPZ, "KHR_mesh_quantization")
+_POINTS = 0
+_EVENNESS = 1e-4
+"""How far a node may be from an even scale, relative to it."""
+
+_TINY = np.finfo(np.float32).tiny
+
+Matrix = Float[np.ndarray, "4 4"]
+
+
+class _Scene(Document):
+    nodes: Entries
+
+
+class _Node(Document):
+    mesh: Size | None = None
+    children: Entries
+    matrix: Annotated[list[Number], Field(min_length=16, max_length=16)] | None = Field(
+        None, description="16 finite numbers"
+    )
+    translation: tuple[Number, Number, Number] = Field((0, 0, 0), description="3 finite numbers")
+    rotation: tuple[Number, Number, Number, Number] = Field(
+        (0, 0, 0, 1), description="4 finite numbers"
+    )
+    scale: tuple[Number, Number, Number] = Field((1, 1, 1), description="3 finite numbers")
+
+
+class _Mesh(Document):
+    primitives: Items
+
+
+class _Primitive(Document):
+    attributes: Entry
+    extensions: Entry
+    mode: Whole = 4
+    extras: Any = None
+
+
+class _Splatting(Document):
+    kernel: str = KERNEL
+    colorSpace: str = COLOR_SPACE  # noqa: N815 (the name of glTF)
+    extensions: Entry
+
+
+class _Compression(Document):
+    bufferView: Size  # noqa: N815
+
+
+class _Placed(NamedTuple):
+    """A primitive of splats, what the extension says of it, and where its node puts it."""
+
+    primitive: _Primitive
+    splatting: _Splatting
+    where: str
+    matrix: Matrix
+
+
+def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False) -> GaussianScene:
+    """Read the Gaussians of a ``.glb`` or ``.gltf``.
+
+    Args:
+        path: The file.
+        axes: Its axes, as :func:`cvtgs.io.change_axes` names them; None for those of glTF.
+        trust_sizes: Whether the file may unpack to any size.
+
+    Returns:
+        The Gaussians of all nodes of the scene, with the SH bands of the fullest.
+
+    Raises:
+        InputNotFoundError: There is no such file, or a buffer beside it is missing.
+        InputError: A file cannot be opened or read.
+        FileFormatError: It is not a glTF of Gaussians, or damaged.
+        InvalidArgumentError: There are no axes of this name.
+    """
+    axes = AXES if axes is None else checked_axes(axes)
+    file = open_gltf(path)
+    strange = [name for name in file.root.extensionsRequired if name not in _KNOWN]
+    if strange:
+        raise file.error(
+            f"must require no other extensions than {', '.join(_KNOWN)}, found {shown(strange[0])}"
+        )
+    placed = list(_splats(file))
+    if not placed:
+        raise file.error(f"must have a mesh primitive with {SPLATS}, found none")
+    if not trust_sizes:
+        _check_sizes(file, placed)
+    scenes = []
+    for one in placed:  # a comprehension is a level of the stack in Python 3.11 only
+        scenes.append(_read_primitive(file, one, trust_sizes=trust_sizes))
+    scene = scenes[0] if len(scenes) == 1 else merge(scenes)
+    return change_axes(scene, axes, SCENE_AXES)
+
+
+def _splats(file: GltfFile) -> Iterator[_Placed]:
+    """Return the primitives of splats of all nodes of the scene; others are warned about."""
+    others = 0
+    for index, matrix in _placed_meshes(file):
+        mesh = file.entry(_Mesh, "meshes", index)
+        for number, value in enumerate(mesh.primitives):
+            where = f"{file.path}: meshes[{index}].primitives[{number}]"
+            primitive = validated(_Primitive, value, where)
+            if SPLATS not in primitive.extensions:
+                others += 1
+                continue
+            splatting = validated(_Splatting, primitive.extensions[SPLATS], f"{where}: {SPLATS!r}")
+            yield _Placed(primitive, splatting, where, matrix)
+    if others:
+        warnings.warn(
+            f"{file.path}: left out {others:,} mesh "
+            f"{'primitive that is' if others == 1 else 'primitives that are'} not of Gaussians.",
+            DroppedDataWarning,
+            stacklevel=4,
+        )
+
+
+def _placed_meshes(file: GltfFile) -> Iterator[tuple[int, Matrix]]:
+    """Return the meshes of the nodes of the scene; all meshes where there is no scene."""
+    if not file.root.scenes:
+        yield from ((index, np.eye(4)) for index in range(len(file.root.meshes)))
+        return
+    scene = file.entry(_Scene, "scenes", file.root.scene or 0)
+    waiting = [(index, np.eye(4)) for index in reversed(scene.nodes)]
+    seen: set[int] = set()
+    while waiting:
+        index, above = waiting.pop()
+        if not isinstance(index, int) or isinstance(index, bool) or index in seen:
+            raise file.error(f"each node must hang in one place, found {shown(index)} again")
+        seen.add(index)
+        node = file.entry(_Node, "nodes", index)
+        matrix = above @ _local_matrix(node)
+        if node.mesh is not None:
+            yield node.mesh, matrix
+        waiting += [(child, matrix) for child in reversed(node.children)]
+
+
+def _local_matrix(node: _Node) -> Matrix:
+    if node.matrix is not None:
+        return np.array(node.matrix, np.float64).reshape(4, 4).T
+    x, y, z, w = node.rotation
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, :3] *= node.scale
+    matrix[:3, 3] = node.translation
+    return matrix
+
+
+def _check_sizes(file: GltfFile, placed: list[_Placed]) -> None:
+    """Refuse nodes that show the same bytes again and again; SPZ inside is checked on its own."""
+    total = rest = 0
+    for one in placed:
+        if POSITION in one.primitive.attributes:
+            total += file.count(_index(file, one, POSITION))
+        rest = max(rest, REST_COUNTS[_degree(file, one)])
+    check_expansion(file.path, count=total, rest=rest, stored=file.stored)
+
+
+def _read_primitive(file: GltfFile, one: _Placed, *, trust_sizes: bool) -> GaussianScene:
+    primitive, splatting, where, _ = one
+    if primitive.mode != _POINTS or splatting.kernel != KERNEL:
+        raise file.error(
+            f"Gaussians must be points (mode 0) of the kernel {KERNEL!r}, found mode "
+            f"{primitive.mode} and {shown(splatting.kernel)}"
+        )
+    if splatting.colorSpace != COLOR_SPACE:
+        warnings.warn(
+            f"{file.path}: took colours of the space {shown(splatting.colorSpace)} for those of "
+            f"{COLOR_SPACE!r}.",
+            DroppedDataWarning,
+            stacklevel=4,
+        )
+    if SPZ in splatting.extensions:
+        inside = validated(_Compression, splatting.extensions[SPZ], f"{where}: {SPZ!r}")
+        content, _ = file.view(inside.bufferView)
+        name = f"{file.path}: bufferViews[{inside.bufferView}]"
+        scene = decode_spz(bytes(content), name, axes=SCENE_AXES, trust_sizes=trust_sizes)
+    else:
+        scene = _read_attributes(file, one)
+    return _moved(file, _with_comments(scene, primitive.extras), one)
+
+
+def _read_attributes(file: GltfFile, one: _Placed) -> GaussianScene:
+    means = file.values(_index(file, one, POSITION), "VEC3", POSITION)
+
+    def rows(name: str, kind: str) -> Float[np.ndarray, "n k"]:
+        values = file.values(_index(file, one, name), kind, name)
+        if len(values) != len(means):
+            raise file.error(
+                f"all attributes must have the {len(means):,} elements of {POSITION}, found "
+                f"{len(values):,} in {name}"
+            )
+        return values
+
+    quats = rows(ROTATION, "VEC4")
+    scales = rows(SCALE, "VEC3")
+    if bool((scales < 0).any()):
+        row = int((scales < 0).any(axis=1).argmax())
+        raise file.error(
+            f"{SCALE} must not be negative, found {scales[row].min():.4g} in element {row:,}"
+        )
+    opacities = torch.from_numpy(rows(OPACITY, "SCALAR")[:, 0])
+    degree = _degree(file, one)
+    rest = [
+        rows(coefficient(band, number), "VEC3")
+        for band in range(1, degree + 1)
+        for number in range(2 * band + 1)
+    ]
+    return scene_of(
+        Arrays(
+            means=means,
+            quats=unit_quats(np.roll(quats, 1, axis=1)),
+            log_scales=np.log(np.maximum(scales, _TINY)),
+            logit_opacities=logit_from_opacity(opacities).numpy(),
+            sh0=rows(coefficient(0, 0), "VEC3"),
+            shN=np.stack(rest, axis=1) if rest else np.empty((len(means), 0, 3), np.float32),
+        )
+    )
+
+
+def _index(file: GltfFile, one: _Placed, name: str) -> int:
+    index = one.primitive.attributes.get(name)
+    if not isinstance(index, int) or isinstance(index, bool):
+        found = "none" if index is None else shown(index)
+        raise file.error(f"Gaussians must have an accessor for {name}, found {found}")
+    return index
+
+
+def _degree(file: GltfFile, one: _Placed) -> int:
+    """Return the SH degree; every coefficient of it and of those below must be there."""
+    names = one.primitive.attributes
+    degree = 0
+    for band in range(1, len(REST_COUNTS)):
+        wanted = [coefficient(band, number) for number in range(2 * band + 1)]
+        missing = [name for name in wanted if name not in names]
+        if len(missing) == len(wanted):
+            continue
+        if missing or degree != band - 1:
+            lacking = missing[0] if missing else coefficient(band - 1, 0)
+            raise file.error(
+                f"Gaussians must have all SH coefficients up to degree {band}, found no {lacking}"
+            )
+        degree = band
+    return degree
+
+
+def _with_comments(scene: GaussianScene, extras: Any) -> GaussianScene:
+    lines = extras.get("comments") if isinstance(extras, dict) else None
+    comments = [
+        printable(line)
+        for line in (lines if isinstance(lines, list) else ())
+        if isinstance(line, str) and "\n" not in line
+    ]
+    tagged = any(ANTIALIASED_TAG.lower() in line.lower() for line in comments)
+    own = () if tagged else scene.comments
+    return replace(scene, comments=(*own, *comments))
+
+
+def _moved(file: GltfFile, scene: GaussianScene, one: _Placed) -> GaussianScene:
+    """Move Gaussians to where their node puts them."""
+    matrix = one.matrix
+    if np.array_equal(matrix, np.eye(4)):
+        return scene
+    with np.errstate(all="ignore"):
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        rotation = matrix[:3, :3] / scale if scale > 0 else np.zeros((3, 3))
+        even = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_EVENNESS)
+    affine = np.array_equal(matrix[3], [0, 0, 0, 1]) and bool(np.isfinite(matrix).all())
+    if not even or not affine:
+        raise file.error(
+            "nodes must turn, shift and evenly scale Gaussians, found one that stretches, skews "
+            "or mirrors them"
+        )
+    w, a, b, c = matrices_to_quats(torch.from_numpy(rotation)[None])[0].tolist()
+    x, y, z = matrix[:3, 3].tolist()
+    return move(scene, Motion(quat=(w, a, b, c), scale=scale, shift=(x, y, z)))

@@ -1,0 +1,258 @@
+"""Write Gaussians as glTF."""
+
+import base64
+import io
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, BinaryIO, Final
+
+import numpy as np
+import torch
+from jaxtyping import Float, Shaped
+
+from cvtgs.errors import InvalidSceneError
+from cvtgs.io.arrays import Arrays, Bytes, arrays_of, colors_of_sh0, opacity_bytes, to_bytes
+from cvtgs.io.gltf.document import (
+    BINARY_CHUNK,
+    CHUNK,
+    COLOR,
+    COLOR_SPACE,
+    FLOAT,
+    HEADER,
+    JSON_CHUNK,
+    KERNEL,
+    MAGIC,
+    OPACITY,
+    POSITION,
+    ROTATION,
+    SCALE,
+    SPLATS,
+    SPZ,
+    UNSIGNED_BYTE,
+    VERSION,
+    WIDTHS,
+    coefficient,
+)
+from cvtgs.io.spz import write_spz
+from cvtgs.math.parameters import opacity_from_logit
+from cvtgs.math.spherical_harmonics import degree_of
+from cvtgs.scene import GaussianScene
+
+_CHUNK_ROWS = 1 << 18
+_ARRAY_BUFFER = 34962
+_MOST_BYTES = 1 << 32
+_SPZ_VERSION: Final = 3
+"""The newest that readers of the draft of the extension take."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Attribute:
+    """An attribute of all Gaussians; its values are made a part at a time."""
+
+    name: str
+    kind: str
+    component: int = FLOAT
+    values: Callable[[slice], Shaped[np.ndarray, "n k"]]
+
+    @property
+    def row_bytes(self) -> int:
+        return WIDTHS[self.kind] * (4 if self.component == FLOAT else 1)
+
+    def parts(self, count: int) -> Iterator[bytes]:
+        for start in range(0, count, _CHUNK_ROWS):
+            values = self.values(slice(start, min(start + _CHUNK_ROWS, count)))
+            yield np.ascontiguousarray(values).tobytes()
+
+
+def write_glb(scene: GaussianScene, file: BinaryIO) -> None:
+    """Write a ``.glb`` with ``KHR_gaussian_splatting``, in the order and the axes of the scene.
+
+    Args:
+        scene: The scene, on any device.
+        file: Where to, open for writing.
+
+    Raises:
+        InvalidSceneError: No Gaussian of the scene is finite, or there are too many for a file.
+        OSError: The file cannot be written.
+
+    Example:
+        >>> import io
+        >>> from cvtgs.synthetic import scene
+        >>> file = io.BytesIO()
+        >>> write_glb(scene("object", 5, sh_degree=0, seed=0), file)
+        >>> file.getvalue()[:4]
+        b'glTF'
+    """
+    arrays = arrays_of(scene)
+    attributes, count = _attributes(arrays), len(arrays.means)
+    document = _document(scene, arrays, attributes)
+    size = count * sum(one.row_bytes for one in attributes)
+    document["buffers"] = [{"byteLength": size}]
+    _start_glb(file, document, size)
+    for attribute in attributes:
+        for part in attribute.parts(count):
+            file.write(part)
+    file.write(bytes(-size % 4))
+
+
+def write_gltf(scene: GaussianScene, file: BinaryIO) -> None:
+    r"""Write a ``.gltf``: as :func:`write_glb`, but as one JSON text with the numbers in base64.
+
+    Args:
+        scene: The scene, on any device.
+        file: Where to, open for writing.
+
+    Raises:
+        InvalidSceneError: No Gaussian of the scene is finite.
+        OSError: The file cannot be written.
+
+    Example:
+        >>> import io
+        >>> from cvtgs.synthetic import scene
+        >>> file = io.BytesIO()
+        >>> write_gltf(scene("object", 5, sh_degree=0, seed=0), file)
+        >>> file.getvalue()[:2]
+        b'{"'
+    """
+    arrays = arrays_of(scene)
+    attributes, count = _attributes(arrays), len(arrays.means)
+    document = _document(scene, arrays, attributes)
+    content = b"".join(part for one in attributes for part in one.parts(count))
+    text = base64.b64encode(content).decode()
+    uri = f"data:application/octet-stream;base64,{text}"
+    document["buffers"] = [{"byteLength": len(content), "uri": uri}]
+    file.write(_json(document))
+
+
+def write_spz_glb(scene: GaussianScene, file: BinaryIO) -> None:
+    """Write a ``.glb`` with ``KHR_gaussian_splatting_compression_spz_2``: an SPZ inside a glTF.
+
+    The SPZ has the axes of the glTF, as CesiumJS reads it. Readers without the extension show
+    nothing.
+
+    Args:
+        scene: The scene, on any device.
+        file: Where to, open for writing.
+
+    Raises:
+        InvalidSceneError: No Gaussian of the scene is finite, or there are too many for a file.
+        OSError: The file cannot be written.
+    """
+    arrays = arrays_of(scene)
+    packed = io.BytesIO()
+    write_spz(scene, packed, version=_SPZ_VERSION)
+    content = packed.getvalue()
+    # Those that the draft of the extension lists; colours and opacities are in COLOR_0.
+    left_out = (OPACITY, coefficient(0, 0))
+    attributes = [one for one in _attributes(arrays) if one.name not in left_out]
+    document = _document(scene, arrays, attributes, compressed=len(content))
+    document["buffers"] = [{"byteLength": len(content)}]
+    _start_glb(file, document, len(content))
+    file.write(content)
+    file.write(bytes(-len(content) % 4))
+
+
+def _attributes(arrays: Arrays) -> list[_Attribute]:
+    def floats(name: str, kind: str, values: Callable[[slice], Any]) -> _Attribute:
+        return _Attribute(
+            name=name, kind=kind, values=lambda part: values(part).astype("<f4", copy=False)
+        )
+
+    def colors(part: slice) -> Bytes:
+        rgb = to_bytes(255 * colors_of_sh0(arrays.sh0[part]))
+        return np.column_stack([rgb, opacity_bytes(arrays.logit_opacities[part])])
+
+    def opacities(part: slice) -> Float[np.ndarray, "n 1"]:
+        logits = torch.from_numpy(arrays.logit_opacities[part])
+        return opacity_from_logit(logits).numpy()[:, None]
+
+    def coefficients(number: int) -> Callable[[slice], Float[np.ndarray, "n 3"]]:
+        return lambda part: arrays.shN[part, number]
+
+    attributes = [
+        floats(POSITION, "VEC3", lambda part: arrays.means[part]),
+        _Attribute(name=COLOR, kind="VEC4", component=UNSIGNED_BYTE, values=colors),
+        floats(ROTATION, "VEC4", lambda part: np.roll(arrays.quats[part], -1, axis=1)),
+        floats(SCALE, "VEC3", lambda part: np.exp(arrays.log_scales[part])),
+        floats(OPACITY, "SCALAR", opacities),
+        floats(coefficient(0, 0), "VEC3", lambda part: arrays.sh0[part]),
+    ]
+    number = 0
+    for degree in range(1, degree_of(arrays.shN.shape[1]) + 1):
+        for index in range(2 * degree + 1):
+            name = coefficient(degree, index)
+            attributes.append(floats(name, "VEC3", coefficients(number)))
+            number += 1
+    return attributes
+
+
+def _document(
+    scene: GaussianScene,
+    arrays: Arrays,
+    attributes: list[_Attribute],
+    *,
+    compressed: int | None = None,
+) -> dict[str, Any]:
+    """Return the document without its buffers; accessors of compressed values have no view."""
+    accessors, views, offset, count = [], [], 0, len(arrays.means)
+    for number, one in enumerate(attributes):
+        accessor: dict[str, Any] = {"componentType": one.component, "count": count}
+        accessor["type"] = one.kind
+        if one.component == UNSIGNED_BYTE:
+            accessor["normalized"] = True
+        if one.name == POSITION:
+            accessor["min"] = arrays.means.min(axis=0).tolist()
+            accessor["max"] = arrays.means.max(axis=0).tolist()
+        if compressed is None:
+            accessor["bufferView"] = number
+            size = count * one.row_bytes
+            view = {"buffer": 0, "byteOffset": offset, "byteLength": size}
+            views.append(view | {"target": _ARRAY_BUFFER})
+            offset += size
+        accessors.append(accessor)
+    splatting: dict[str, Any] = {"kernel": KERNEL, "colorSpace": COLOR_SPACE}
+    used = [SPLATS]
+    if compressed is not None:
+        views = [{"buffer": 0, "byteOffset": 0, "byteLength": compressed}]
+        splatting["extensions"] = {SPZ: {"bufferView": 0}}
+        used.append(SPZ)
+    primitive: dict[str, Any] = {
+        "mode": 0,
+        "attributes": {one.name: number for number, one in enumerate(attributes)},
+        "extensions": {SPLATS: splatting},
+    }
+    if scene.comments:
+        primitive["extras"] = {"comments": list(scene.comments)}
+    required = {} if compressed is None else {"extensionsRequired": used}
+    return {
+        "asset": {"version": "2.0", "generator": "cvtgs"},
+        "extensionsUsed": used,
+        **required,
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+    }
+
+
+def _json(document: dict[str, Any]) -> bytes:
+    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _start_glb(file: BinaryIO, document: dict[str, Any], size: int) -> None:
+    """Write header and JSON of a ``.glb``, and the start of its binary chunk."""
+    text = _json(document)
+    text += b" " * (-len(text) % 4)
+    padded = size + -size % 4
+    length = HEADER.size + 2 * CHUNK.size + len(text) + padded
+    if length >= _MOST_BYTES:
+        raise InvalidSceneError(
+            f"a .glb must have less than 4 GiB, found a scene that takes {length:,} bytes; write "
+            f".spz.glb, or simplify it."
+        )
+    file.write(HEADER.pack(MAGIC, VERSION, length))
+    file.write(CHUNK.pack(len(text), JSON_CHUNK) + text)
+    file.write(CHUNK.pack(padded, BINARY_CHUNK))
