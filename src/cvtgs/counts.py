@@ -1,13 +1,68 @@
 """How many Gaussians are left."""
 
 import math
+import re
 from collections.abc import Sequence
+from decimal import Decimal
 from fractions import Fraction
 
 from cvtgs.errors import InvalidArgumentError
 
+_UNITS = {"": 1, "k": 1000, "m": 1_000_000}
 
-def target_count(total: int, rho: float | None, *, count: int | None = None) -> int:
+
+def read_ratio(text: str) -> float:
+    """Return a ratio that is written as a number or in per cent.
+
+    Args:
+        text: For example ``0.05`` or ``5%``.
+
+    Returns:
+        The ratio, which may be out of range.
+
+    Raises:
+        InvalidArgumentError: It is no number.
+
+    Example:
+        >>> read_ratio("0.7%")
+        0.007
+    """
+    match = re.fullmatch(
+        r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|nan|inf)\s*(%?)\s*", text, re.I
+    )
+    if not match:
+        raise InvalidArgumentError(f"a ratio must be a number such as 0.05 or 5%, found {text!r}.")
+    return float(Decimal(match[1]) / (100 if match[2] else 1))
+
+
+def read_count(text: str) -> int:
+    """Return a number of Gaussians that may be written with k for thousands or M for millions.
+
+    Args:
+        text: For example ``50000``, ``50_000``, ``50k`` or ``1.5M``.
+
+    Returns:
+        The count, at least 1.
+
+    Raises:
+        InvalidArgumentError: It is no whole number above 0.
+
+    Example:
+        >>> read_count("50k"), read_count("1.5M")
+        (50000, 1500000)
+    """
+    match = re.fullmatch(r"\s*(\d[\d_]*(?:\.\d+)?)\s*([km]?)\s*", text.lower())
+    count = Decimal(match[1]) * _UNITS[match[2]] if match else Decimal(0)
+    if count < 1 or count != int(count):
+        raise InvalidArgumentError(
+            f"a count must be a whole number above 0 such as 50000, 50k or 1.5M, found {text!r}."
+        )
+    return int(count)
+
+
+def target_count(
+    total: int, rho: float | None, *, count: int | None = None, max_count: int | None = None
+) -> int:
     """Return the number of Gaussians to keep.
 
     ``rho`` is taken as the decimal number that was written: 0.07 of 100 Gaussians are 7, though
@@ -17,19 +72,29 @@ def target_count(total: int, rho: float | None, *, count: int | None = None) -> 
         total: Number of Gaussians, N.
         rho: Ratio to keep, in (0, 1].
         count: Number to keep, 1 to N, instead of ``rho``.
+        max_count: Number to keep if there are more, instead of ``rho`` and ``count``.
 
     Returns:
-        ``ceil(rho * N)``, or ``count``.
+        ``ceil(rho * N)``, or ``count``, or ``min(max_count, N)``.
 
     Raises:
-        InvalidArgumentError: Ratio or count is out of range, or both or neither are given.
+        InvalidArgumentError: A value is out of range, or not exactly one is given.
 
     Example:
         >>> target_count(250, 0.01), target_count(10, 1e-9)
         (3, 1)
     """
-    if (rho is None) == (count is None):
-        raise InvalidArgumentError("give either rho or count, not both and not neither.")
+    values = {"rho": rho, "count": count, "max_count": max_count}
+    given = [name for name, value in values.items() if value is not None]
+    if len(given) != 1:
+        found = " and ".join(given) or "none"
+        raise InvalidArgumentError(f"give one of rho, count and max_count, found {found}.")
+    if max_count is not None:
+        if isinstance(max_count, bool) or not isinstance(max_count, int) or max_count < 1:
+            raise InvalidArgumentError(
+                f"max_count must be a whole number above 0; found {max_count!r}."
+            )
+        return min(max_count, total)
     if count is not None:
         if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= total:
             raise InvalidArgumentError(

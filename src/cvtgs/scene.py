@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pkgutil import resolve_name
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -196,16 +196,24 @@ class GaussianScene:
         return self.select(picked)
 
     def save(
-        self, path: str | os.PathLike[str], *, overwrite: bool = False, axes: str | None = None
+        self,
+        path: str | os.PathLike[str] | BinaryIO,
+        *,
+        format: str | None = None,
+        overwrite: bool = False,
+        axes: str | None = None,
     ) -> None:
         """Write the scene to a file, as :func:`cvtgs.save` does.
 
         Args:
-            path: The file to write; its suffix chooses the format.
+            path: The file to write; its suffix chooses the format. Or an open binary file.
+            format: The suffix of the format, if the name of the file does not say it.
             overwrite: Whether an existing file may be replaced.
             axes: Where x, y and z of the file are to point; None for the axes of the format.
         """
-        resolve_name("cvtgs.io.formats:save")(self, path, overwrite=overwrite, axes=axes)
+        resolve_name("cvtgs.io.formats:save")(
+            self, path, format=format, overwrite=overwrite, axes=axes
+        )
 
     def with_sh_degree(self, degree: int) -> Self:
         """Drop the SH bands above a degree; files of the scene get smaller.

@@ -93,6 +93,7 @@ class Simplifier:
         rho: float | None = None,
         *,
         count: int | None = None,
+        max_count: int | None = None,
         cameras: Cameras | None = None,
         keep: Bool[Tensor, "n"] | None = None,
     ) -> GaussianScene:
@@ -102,18 +103,21 @@ class Simplifier:
             scene: The scene; it is not changed.
             rho: Ratio of Gaussians to keep, in (0, 1].
             count: Number of Gaussians to keep, instead of ``rho``.
+            max_count: Number to keep if there are more; a smaller scene stays as it is.
             cameras: Cameras for presets that render the scene; None finds views.
             keep: Mask of Gaussians that are kept as they are; they count, and come first.
 
         Returns:
-            A scene of exactly ``ceil(rho * N)`` (or ``count``) Gaussians; fewer only if so many
+            A scene of exactly ``ceil(rho * N)`` (or the count) Gaussians; fewer only if so many
             rows are invalid. With ``rho = 1``, the scene's own valid rows.
 
         Raises:
-            InvalidArgumentError: Ratio or count is out of range, or both or neither are given.
+            InvalidArgumentError: Ratio or count is out of range, or not exactly one is given.
             InvalidSceneError: The scene has no valid row.
         """
-        return self.run(scene, rho, count=count, cameras=cameras, keep=keep).scene
+        return self.run(
+            scene, rho, count=count, max_count=max_count, cameras=cameras, keep=keep
+        ).scene
 
     def run(
         self,
@@ -121,6 +125,7 @@ class Simplifier:
         rho: float | None = None,
         *,
         count: int | None = None,
+        max_count: int | None = None,
         cameras: Cameras | None = None,
         keep: Bool[Tensor, "n"] | None = None,
     ) -> Simplified:
@@ -129,7 +134,9 @@ class Simplifier:
         Returns:
             The scene and the report.
         """
-        return self.prepare(scene, cameras=cameras).run(rho, count=count, keep=keep)
+        return self.prepare(scene, cameras=cameras).run(
+            rho, count=count, max_count=max_count, keep=keep
+        )
 
     def levels(
         self,
@@ -232,6 +239,7 @@ class Prepared:
         rho: float | None = None,
         *,
         count: int | None = None,
+        max_count: int | None = None,
         keep: Bool[Tensor, "n"] | None = None,
     ) -> Simplified:
         """Make the scene smaller, and report; arguments and errors as for :meth:`Simplifier.run`.
@@ -239,7 +247,7 @@ class Prepared:
         Returns:
             The scene and the report.
         """
-        target = target_count(len(self._scene), rho, count=count)
+        target = target_count(len(self._scene), rho, count=count, max_count=max_count)
         clock = StageClock(self._listener, self._device)
         if keep is not None:
             check_mask(keep, len(self._scene))

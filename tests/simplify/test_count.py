@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from cvtgs import GaussianScene, Simplifier, target_count
+from cvtgs.counts import read_count, read_ratio
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
 from scenes import random_scene, same_bits
 
@@ -180,8 +181,57 @@ def test_counts_out_of_range_are_errors(count):
     )
 
 
-@pytest.mark.parametrize("wish", [{}, {"rho": 0.5, "count": 2}])
-def test_both_or_neither_are_errors(wish):
+@pytest.mark.parametrize(
+    ("wish", "found"),
+    [
+        ({}, "none"),
+        ({"rho": 0.5, "count": 2}, "rho and count"),
+        ({"rho": 0.5, "max_count": 2}, "rho and max_count"),
+    ],
+)
+def test_several_or_none_are_errors(wish, found):
     with pytest.raises(InvalidArgumentError) as caught:
         simplifier("standard").simplify(random_scene(5), **wish)
-    assert str(caught.value) == "give either rho or count, not both and not neither."
+    assert str(caught.value) == f"give one of rho, count and max_count, found {found}."
+
+
+@pytest.mark.parametrize(("most", "kept"), [(1, 1), (4, 4), (5, 5), (500, 5)])
+def test_a_scene_below_the_most_stays_as_it_is(most, kept):
+    scene = random_scene(5)
+    small = simplifier("standard").simplify(scene, max_count=most)
+    assert len(small) == kept
+    assert most < 5 or torch.equal(small.means, scene.means)
+
+
+@pytest.mark.parametrize("most", [0, 2.0, True])
+def test_a_most_that_is_no_count_is_an_error(most):
+    with pytest.raises(InvalidArgumentError, match="max_count must be a whole number above 0"):
+        simplifier("standard").simplify(random_scene(5), max_count=most)
+
+
+@pytest.mark.parametrize(
+    ("text", "ratio"),
+    [("5%", 0.05), ("0.7 %", 0.007), ("7%", 0.07), ("0.1", 0.1), ("1e-3", 0.001), (".5", 0.5)],
+)
+def test_ratios_as_they_are_written(text, ratio):
+    assert read_ratio(text) == ratio
+
+
+@pytest.mark.parametrize("text", ["", "%", "5 percent", "5%%", "1,5"])
+def test_no_ratios(text):
+    with pytest.raises(InvalidArgumentError, match=r"a ratio must be a number such as 0\.05 or 5%"):
+        read_ratio(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [("50000", 50_000), ("50_000", 50_000), ("50k", 50_000), ("1.5M", 1_500_000), ("2 K", 2000)],
+)
+def test_counts_as_they_are_written(text, count):
+    assert read_count(text) == count
+
+
+@pytest.mark.parametrize("text", ["", "k", "0", "-5", "1.5", "0.1234k", "5g", "1e3"])
+def test_no_counts(text):
+    with pytest.raises(InvalidArgumentError, match="a count must be a whole number above 0"):
+        read_count(text)

@@ -101,7 +101,7 @@ def checked_target(psnr: float | None, *, ssim: float | None) -> Target:
                 f"the SSIM to reach must be above 0 and below 1, found {ssim!r}."
             )
         return Target("ssim", ssim)
-    raise InvalidArgumentError("give either psnr or ssim, not both and not neither.")
+    raise InvalidArgumentError("give either psnr or ssim, found both or neither.")
 
 
 def find_count(

@@ -1,23 +1,49 @@
 """Texts that several commands print: sizes, times, progress bars."""
 
 import sys
-from collections.abc import Iterator, Sequence
+import textwrap
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TextIO
 
 import cvtgs
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.text import printable
 
-if TYPE_CHECKING:
-    from cvtgs.clock import StageCost
+WIDTH = 80
+"""Columns that a line of output fills at most."""
+
+TIE = "\N{NO-BREAK SPACE}"
+"""A space where no line may end; it is printed as an ordinary one."""
 
 
 def say(text: str, *, file: TextIO | None = None, end: str = "\n", flush: bool = False) -> None:
     """Print a text, with what a terminal would obey or cannot show as escapes."""
     file = sys.stdout if file is None else file
     print(printable(text, file.encoding or "utf-8"), file=file, end=end, flush=flush)
+
+
+def say_wrapped(text: str, *, file: TextIO | None = None, indent: int = 0) -> None:
+    """Print a sentence in lines of 80 columns, which end neither in a path nor at a ``TIE``."""
+    for line in textwrap.wrap(
+        printable(text),
+        WIDTH,
+        initial_indent=" " * indent,
+        subsequent_indent=" " * (indent + 2),
+        break_long_words=False,
+        break_on_hyphens=False,
+    ):
+        say(line.replace(TIE, " "), file=file)
+
+
+def shortened(text: str, width: int) -> str:
+    """Return a text, without its middle if it is longer than the width."""
+    text = printable(text)
+    if len(text) <= width:
+        return text
+    head = (width - 3) // 2
+    return f"{text[:head]}...{text[len(text) - (width - 3 - head) :]}"
 
 
 def size_text(count: int) -> str:
@@ -37,16 +63,9 @@ def file_size(path: Path) -> str:
     return size_text(cvtgs.io.scene_size(path))
 
 
-def stage_seconds(stages: Sequence["StageCost"]) -> str:
-    """Return the time of all stages together, and of each."""
-    total = f"{sum(stage.seconds for stage in stages):.2f} s"
-    parts = ", ".join(f"{stage.stage} {stage.seconds:.2f}" for stage in stages)
-    return f"{total} ({parts})" if parts else total
-
-
 @contextmanager
-def progress_bars(*, quiet: bool) -> Iterator[ProgressListener]:
-    """Show a bar per stage on stderr if it is a terminal."""
+def progress_bars(*, quiet: bool, transient: bool = False) -> Iterator[ProgressListener]:
+    """Show a bar per stage on stderr if it is a terminal; transient ones are removed."""
     if quiet or not sys.stderr.isatty():
         yield silent
         return
@@ -54,7 +73,7 @@ def progress_bars(*, quiet: bool) -> Iterator[ProgressListener]:
     from rich.markup import escape
     from rich.progress import Progress, TaskID
 
-    with Progress(console=Console(stderr=True)) as progress:
+    with Progress(console=Console(stderr=True), transient=transient) as progress:
         bars: dict[str, TaskID] = {}
         encoding = sys.stderr.encoding or "utf-8"  # None of a StringIO
 

@@ -1,12 +1,16 @@
 """``cvtgs info`` and ``cvtgs convert``: facts about a scene, and other formats."""
 
 import argparse
+import sys
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cvtgs
-from cvtgs.cli.display import file_size, say
+from cvtgs.cli.display import file_size, say, say_wrapped
+from cvtgs.cli.jobs import Outcome, SceneJob, add_paths, check_paths, open_jobs, run_jobs
 from cvtgs.cli.options import AddParser, add_options, read_axes, read_scene, read_settings
+from cvtgs.errors import DroppedDataWarning
 
 if TYPE_CHECKING:
     from cvtgs.analysis import Effect
@@ -84,46 +88,46 @@ def add_convert(add_parser: AddParser) -> None:
     """Add the command and its options."""
     parser = add_parser(
         "convert",
-        help="write a scene in another format",
+        help="write scenes in another format",
         description="Read IN and write it as OUT; the suffixes of the names set the formats. "
         "Prints what the format of OUT cannot hold before writing it.",
     )
     parser.set_defaults(run=convert)
-    add_options(
-        parser,
-        "input",
-        "output",
-        "--sh-degree",
-        "--axes",
-        "--trust-sizes",
-        "--overwrite",
-        "--quiet",
-    )
+    parser.check = check_paths
+    add_paths(parser, options="")
+    add_options(parser, "--sh-degree", "--axes", "--trust-sizes", "--overwrite", "--quiet")
 
 
 def convert(options: argparse.Namespace) -> None:
     """Run ``cvtgs convert``."""
+    read_axes(options.axes)
+    with open_jobs(options) as jobs:
+        for job in jobs:
+            cvtgs.io.check_save(job.options.output, overwrite=options.overwrite)
+        run_jobs(jobs, _convert_one)
+
+
+def _convert_one(job: SceneJob) -> Outcome:
+    """Convert one scene, and say what is lost."""
+    options = job.options
     axes = read_axes(options.axes)
-    cvtgs.io.check_save(options.output, overwrite=options.overwrite)
     scene = cvtgs.io.load(options.input, axes=axes.source, trust_sizes=options.trust_sizes)
     degree, phrases = scene.sh_degree, []
     if options.sh_degree is not None and options.sh_degree < degree:
         scene = scene.with_sh_degree(options.sh_degree)
         phrases = [f"SH bands above degree {options.sh_degree} (--sh-degree)"]
     lost = cvtgs.io.losses(scene, options.output)
-    if not options.quiet:
-        say(f"{options.input}: {len(scene):,} Gaussians of SH degree {degree}")
+    if not (options.quiet or job.is_one_of_many):
+        stream = sys.stderr if job.to_stream else sys.stdout
         if lost.changed:
-            say(f"Files like {options.output.name} hold:")
+            say(f"In files like {options.output.name}:", file=stream)
         for phrase in lost.changed:
-            say(f"  {phrase}", flush=True)
-    cvtgs.io.save(  # warns of losses first
-        scene, options.output, overwrite=options.overwrite, axes=axes.target
-    )
-    if not options.quiet:
-        say(
-            f"{options.output}: {lost.count:,} Gaussians of SH degree {lost.sh_degree}, "
-            f"{file_size(options.input)} -> {file_size(options.output)}"
-        )
+            say_wrapped(phrase, indent=2, file=stream)
         rest = "nothing but precision" if lost.changed else "nothing"
-        say(f"Lost: {'; '.join([*phrases, *lost.dropped]) or rest}.")
+        say_wrapped(f"Lost: {'; '.join([*phrases, *lost.dropped]) or rest}.", file=stream)
+    with warnings.catch_warnings():
+        if not options.quiet:  # it is said here
+            warnings.simplefilter("ignore", DroppedDataWarning)
+        cvtgs.io.save(scene, options.output, overwrite=options.overwrite, axes=axes.target)
+    notes = [f"Lost: {'; '.join(lost.dropped)}."] if job.is_one_of_many and lost.dropped else []
+    return Outcome(f"{lost.count:,} Gaussians of SH degree {lost.sh_degree}", notes=notes)

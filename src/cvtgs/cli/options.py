@@ -5,6 +5,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from itertools import takewhile
 from pathlib import Path
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 Color = tuple[float, float, float]
 
 READABLE = ".ply, .spz, .splat, .sog, .glb, .gltf, .ckpt, .pt or the folder of a trained model"
+WRITABLE = ".ply, .compressed.ply, .spz, .splat, .sog, .glb, .gltf or .spz.glb"
 PRESET_NAMES = "draft, fast, standard, high, max (from the fastest to the best) or paper"
 CAMERA_FILES = "transforms.json, a COLMAP model, cameras.json, or a folder of these"
 COLORS: Mapping[str, Color] = {
@@ -38,11 +40,6 @@ AUTOMATIC_VIEWS = 8
 # a verb.
 _SHARED: Mapping[str, Mapping[str, Any]] = {
     "input": {"metavar": "IN", "type": Path, "help": f"scene to read ({READABLE})"},
-    "output": {
-        "metavar": "OUT",
-        "type": Path,
-        "help": "scene to write (.ply, .compressed.ply, .spz, .splat, .sog, .glb, .gltf, .spz.glb)",
-    },
     "reference": {"metavar": "REF", "type": Path, "help": f"full scene ({READABLE})"},
     "small": {"metavar": "SMALL", "type": Path, "nargs": "+", "help": "simplified scenes"},
     "-o/--output": {
@@ -133,6 +130,9 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
 class CommandParser(argparse.ArgumentParser):
     """An argument parser that suggests the nearest command, option or choice for an unknown one."""
 
+    check: "Callable[[CommandParser, argparse.Namespace], None] | None" = None
+    """Of a command that takes any number of paths: refuses what does not go together."""
+
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Report an unknown option, even if a required one is missing; then parse the words."""
         if self._subparsers is None:  # the parser of one command
@@ -141,7 +141,12 @@ class CommandParser(argparse.ArgumentParser):
                 name = word.partition("=")[0]
                 if name.startswith("--") and not any(one.startswith(name) for one in options):
                     self.error(f"unrecognized argument: {name}{suggestion(name, options)}")
-        return super().parse_known_args(args, namespace)
+        known, rest = super().parse_known_args(args, namespace)
+        if self.check is not None:  # paths may stand between options
+            known.paths += [word for word in rest if word == "-" or not word.startswith("-")]
+            rest = [word for word in rest if word != "-" and word.startswith("-")]
+            self.check(self, known)
+        return known, rest
 
     def _print_message(self, message: str, file: Any = None) -> None:
         """Print as :func:`say` does; argparse has no public way to."""
@@ -244,15 +249,43 @@ def read_words(text: str) -> list[str]:
 
 def read_ratios(text: str) -> list[float]:
     """Read the list of ratios of ``--rho``."""
+    from cvtgs.counts import read_ratio
+
     try:
-        ratios = [float(word) for word in read_words(text)]
-    except ValueError:
+        ratios = [read_ratio(word) for word in read_words(text)]
+    except InvalidArgumentError:
         ratios = []
     if not ratios or len(set(ratios)) < len(ratios):
         raise InvalidArgumentError(
-            f"--rho must be different numbers with commas, for example 0.1,0.01; found {text!r}."
+            f"--rho must be different numbers with commas, for example 0.1,0.01 or 10%,1%; "
+            f"found {text!r}."
         )
     return ratios
+
+
+def ratio(text: str) -> float:
+    """Read a ratio, for argparse."""
+    from cvtgs.counts import read_ratio
+
+    with _usage_errors():
+        return read_ratio(text)
+
+
+def count(text: str) -> int:
+    """Read a number of Gaussians, for argparse."""
+    from cvtgs.counts import read_count
+
+    with _usage_errors():
+        return read_count(text)
+
+
+@contextmanager
+def _usage_errors() -> Iterator[None]:
+    """Raise wrong values as argparse shows them."""
+    try:
+        yield
+    except InvalidArgumentError as error:
+        raise argparse.ArgumentTypeError(str(error).rstrip(".")) from error
 
 
 class FileAxes(NamedTuple):

@@ -1,28 +1,29 @@
 """``cvtgs simplify``: a smaller scene, by size, quality or time, in memory or block by block."""
 
 import argparse
-import math
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import cvtgs
-from cvtgs.cli.display import file_size, progress_bars, say, stage_seconds
+from cvtgs.cli.display import TIE, progress_bars
+from cvtgs.cli.jobs import Outcome, SceneJob, add_paths, check_paths, open_jobs, run_jobs
 from cvtgs.cli.options import (
     CAMERA_FILES,
     AddParser,
     add_options,
     check_written_files,
+    count,
+    ratio,
     read_axes,
     read_scene,
     read_settings,
 )
+from cvtgs.cli.time_budget import STARTED, check_time_budget, choose_preset
 from cvtgs.errors import (
     ConfigError,
     FileFormatError,
-    GoalError,
     InputError,
     InvalidArgumentError,
     OutputError,
@@ -33,34 +34,38 @@ from cvtgs.progress import ProgressListener, silent
 if TYPE_CHECKING:
     from cvtgs.config import SimplifyConfig
     from cvtgs.report import SimplifyReport
-    from cvtgs.scene import GaussianScene
     from cvtgs.simplifier import Simplifier
-
-STARTED = time.perf_counter()
-"""When this process started, about: a time budget counts from here."""
-
-UNITS = {"s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
-
-
-class ChosenPreset(NamedTuple):
-    """A preset, and the sentence that says why."""
-
-    name: str
-    reason: str
 
 
 def add_simplify(add_parser: AddParser) -> None:
     """Add the command and its options."""
     parser = add_parser(
         "simplify",
-        help="make a scene smaller",
+        help="make scenes smaller",
         description="Write a scene with exactly ceil(rho * N) of the N Gaussians of IN.",
     )
     parser.set_defaults(run=simplify)
-    add_options(parser, "input", "output")
+    parser.check = check_paths
+    add_paths(parser, options="--rho R|--count M|... ")
     size = parser.add_mutually_exclusive_group(required=True)
-    size.add_argument("--rho", type=float, metavar="R", help="ratio of Gaussians to keep, (0, 1]")
-    size.add_argument("--count", type=int, metavar="M", help="number of Gaussians to keep")
+    size.add_argument(
+        "--rho",
+        type=ratio,
+        metavar="R",
+        help="ratio of Gaussians to keep, above 0 and at most 1, for example 0.05 or 5%%",
+    )
+    size.add_argument(
+        "--count",
+        type=count,
+        metavar="M",
+        help="number of Gaussians to keep, for example 50000, 50k or 1.5M",
+    )
+    size.add_argument(
+        "--max-count",
+        type=count,
+        metavar="M",
+        help="number of Gaussians to keep if there are more; a smaller scene stays as it is",
+    )
     size.add_argument(
         "--target-psnr",
         type=float,
@@ -139,12 +144,24 @@ def simplify(options: argparse.Namespace) -> None:
     config = cvtgs.SimplifyConfig.compose(file=options.config, preset=preset, settings=settings)
     if options.rho is not None:
         cvtgs.target_count(1, options.rho)
-    cvtgs.io.check_save(options.output, overwrite=options.overwrite)
-    if options.report is not None:
-        cvtgs.io.check_output(options.report, overwrite=options.overwrite)
-    check_written_files(options)
-    notes: list[str] = []
-    with progress_bars(quiet=options.quiet) as listener:
+    with open_jobs(options) as jobs:
+        if options.report is not None and len(jobs) > 1:
+            raise InvalidArgumentError(f"--report is for one scene, found {len(jobs)}.")
+        for job in jobs:
+            check_written_files(job.options)
+            cvtgs.io.check_save(job.options.output, overwrite=options.overwrite)
+        if options.report is not None:
+            cvtgs.io.check_output(options.report, overwrite=options.overwrite)
+        run_jobs(jobs, lambda job: _simplify_one(job, checkpoint, config, settings))
+
+
+def _simplify_one(
+    job: SceneJob, checkpoint: str | None, config: "SimplifyConfig", settings: Mapping[str, str]
+) -> Outcome:
+    """Simplify one scene, in one piece or block by block, and say what was done."""
+    options, notes = job.options, list[str]()
+    options.begun = time.perf_counter() if job.is_one_of_many else STARTED
+    with progress_bars(quiet=options.quiet, transient=job.is_one_of_many) as listener:
         memory = block_memory(options, config)
         if memory is not None:
             simplifier = cvtgs.Simplifier(checkpoint, config=config, device="cpu")
@@ -153,10 +170,14 @@ def simplify(options: argparse.Namespace) -> None:
             report, notes = _simplify_in_memory(options, checkpoint, config, settings, listener)
     if options.report is not None:
         _write_report(options, report)
-    if not options.quiet:
-        _print_summary(options, report)
-        for note in notes:
-            say(note)
+    if not job.is_one_of_many and report.stages:
+        seconds = (f"{stage.stage}{TIE}{stage.seconds:.2f}" for stage in report.stages)
+        notes.insert(0, f"Seconds: {', '.join(seconds)}.")
+    return Outcome(
+        f"{report.input_count:,} -> {report.output_count:,} Gaussians",
+        f"{report.seconds:.2f} s",
+        notes + _report_notes(report),
+    )
 
 
 def _simplify_in_memory(
@@ -198,7 +219,12 @@ def _simplify_in_memory(
         if options.keep is not None:
             keep = cvtgs.boxes.inside(cvtgs.boxes.read_boxes(options.keep), scene.means)
         small, report = simplifier.run(
-            scene, options.rho, count=options.count, cameras=cameras, keep=keep
+            scene,
+            options.rho,
+            count=options.count,
+            max_count=options.max_count,
+            cameras=cameras,
+            keep=keep,
         )
     cvtgs.io.save(small, options.output, overwrite=options.overwrite, axes=axes.target)
     return report, notes
@@ -225,24 +251,22 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
     return {"refine.steps": str(steps), "refine.seconds": str(seconds)}
 
 
-def _print_summary(options: argparse.Namespace, report: "SimplifyReport") -> None:
-    say(
-        f"{report.input_count:,} -> {report.output_count:,} Gaussians, "
-        f"{file_size(options.input)} -> {file_size(options.output)}, "
-        f"{stage_seconds(report.stages)}"
-    )
+def _report_notes(report: "SimplifyReport") -> list[str]:
+    """Return what is worth a sentence beyond counts, sizes and seconds."""
+    notes = []
     if report.blocks > 1:
         resumed = f", {report.resumed_blocks} of them done before" if report.resumed_blocks else ""
-        say(f"In {report.blocks} blocks{resumed}.")
+        notes.append(f"In {report.blocks} blocks{resumed}.")
     if report.shortfall:
-        say(f"Fewer than the {report.target_count:,} asked for: {report.shortfall}.")
+        notes.append(f"Fewer than the {report.target_count:,} asked for: {report.shortfall}.")
     if report.refinement is not None:
         refined = report.refinement
-        say(
+        notes.append(
             f"Refined in {refined.steps:,} {'step' if refined.steps == 1 else 'steps'}: "
             f"{refined.gain:+.2f} dB on views that were held out, "
             f"{refined.psnr_before:.2f} -> {refined.psnr_after:.2f}."
         )
+    return notes
 
 
 def _has_target(options: argparse.Namespace) -> bool:
@@ -251,76 +275,13 @@ def _has_target(options: argparse.Namespace) -> bool:
 
 def check_goals(options: argparse.Namespace) -> None:
     """Check the targets and the time budget, and the options that exclude them."""
-    if options.time_budget is not None:
-        read_seconds(options.time_budget)
     if _has_target(options):
         from cvtgs.budget.count import checked_target
 
         if options.keep is not None:
-            raise InvalidArgumentError("--keep needs --rho or --count.")
+            raise InvalidArgumentError("--keep needs --rho, --count or --max-count.")
         checked_target(options.target_psnr, ssim=options.target_ssim)
-    if options.time_budget is None:
-        if options.recalibrate:
-            raise InvalidArgumentError("--recalibrate goes with --time-budget.")
-        return
-    excluded = {
-        "--preset": options.preset is not None,
-        "--config": options.config is not None,
-        "--ckpt": options.ckpt not in ("auto", "none"),
-        "--refine": options.refine is not None or options.refine_steps is not None,
-        "--target-psnr and --target-ssim": _has_target(options),
-    }
-    wrong = [name for name, is_given in excluded.items() if is_given]
-    if wrong:
-        raise InvalidArgumentError(
-            f"--time-budget chooses the preset and cannot go with {', '.join(wrong)}."
-        )
-
-
-def read_seconds(text: str) -> float:
-    """Read the time of ``--time-budget``."""
-    number = text.strip().rstrip("abcdefghijklmnopqrstuvwxyz")
-    unit = text.strip()[len(number) :] or "s"
-    try:
-        seconds = float(number) * UNITS[unit]
-    except (ValueError, KeyError):
-        seconds = math.nan
-    if not 0 < seconds < math.inf:
-        raise InvalidArgumentError(
-            f"--time-budget must be a time above 0, for example 20s or 2m; found {text!r}."
-        )
-    return seconds
-
-
-def choose_preset(
-    options: argparse.Namespace,
-    scene: "GaussianScene",
-    settings: Mapping[str, str],
-    listener: ProgressListener,
-) -> ChosenPreset:
-    """Choose the best preset that fits into the rest of the time budget."""
-    from cvtgs.budget.calibrate import is_calibrated
-
-    budget, spent = read_seconds(options.time_budget), time.perf_counter() - STARTED
-    if budget <= spent:
-        raise GoalError(
-            f"no preset fits into {budget:g} s: starting and reading took {spent:.1f} s."
-        )
-    target = cvtgs.target_count(len(scene), options.rho, count=options.count)
-    again = options.recalibrate or not is_calibrated(options.device)
-    if again and not options.quiet:
-        say("cvtgs: measuring this machine once, about a minute", file=sys.stderr)
-    model = cvtgs.budget.cost_model(options.device, recalibrate=again, listener=listener)
-    if options.ckpt == "none":
-        settings = {**settings, "merge.network": "false"}
-    choice = cvtgs.budget.choose_preset(
-        cvtgs.budget.Work.of(scene, target), budget - spent, settings=settings, model=model
-    )
-    reason = (
-        f"Preset {choice.preset}, the best that fits into {budget:g} s: expected to take "
-        f"{choice.seconds:.1f} s after {spent:.1f} s of starting and reading."
-    )
-    return ChosenPreset(choice.preset, reason)
+    check_time_budget(options, has_target=_has_target(options))
 
 
 def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int | None:
@@ -368,6 +329,7 @@ def _simplify_blocks(
             options.output,
             options.rho,
             count=options.count,
+            max_count=options.max_count,
             memory=memory,
             boxes=() if options.keep is None else cvtgs.boxes.read_boxes(options.keep),
             simplifier=simplifier,

@@ -3,6 +3,7 @@
 import os
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from pkgutil import resolve_name
 from types import MappingProxyType
@@ -21,6 +22,7 @@ from cvtgs.io.atomic import atomic_output, check_output
 from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
 from cvtgs.io.files import is_file, scene_file
 from cvtgs.io.limits import FORMAT_LIMITS, Losses, losses_within
+from cvtgs.io.streams import ByteSink, ByteSource, file_of, name_of, written_to
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
 
@@ -66,10 +68,14 @@ _WRITERS: Mapping[str, str] = MappingProxyType(
     }
 )
 
+READABLE_SUFFIXES = tuple(name for name in _READERS if name.startswith("."))
+WRITABLE_SUFFIXES = tuple(_WRITERS)
+
 
 def load(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | ByteSource,
     *,
+    format: str | None = None,
     device: str | torch.device = "cpu",
     sh_degree: int | None = None,
     extras: bool = True,
@@ -86,7 +92,10 @@ def load(
             PlayCanvas' tools), ``.spz``, ``.splat``, ``.sog`` or the ``meta.json`` of a SOG,
             ``.glb`` or ``.gltf`` with ``KHR_gaussian_splatting``, ``.ckpt`` of nerfstudio's
             Splatfacto, ``.pt`` of gsplat's trainer. Of a folder, the scene that
-            :func:`cvtgs.io.scene_file` finds.
+            :func:`cvtgs.io.scene_file` finds. Or a file that is open in binary mode, which is read
+            to its end; it need not be able to seek.
+        format: The suffix of the format, for example ``".splat"``, whatever the file is called.
+            None goes by the name, and for an open file by its first bytes.
         device: Where the tensors are to be.
         sh_degree: SH bands above this degree are zeros, whatever the file holds; None for all. Of
             plain PLY files their columns are not even copied.
@@ -126,8 +135,20 @@ def load(
     if sh_degree is not None and not 0 <= sh_degree < len(REST_COUNTS):
         raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {sh_degree!r}.")
     axes = None if axes is None else checked_axes(axes)
+    if not isinstance(path, str | os.PathLike):
+        with file_of(path, format) as copy:
+            return load(
+                copy,
+                format=format,
+                device=device,
+                sh_degree=sh_degree,
+                extras=extras,
+                axes=axes,
+                trust_sizes=trust_sizes,
+            )
     source = scene_file(path)
-    suffix = _suffix_of(source, _READERS) if is_file(source) else ".ply"  # whose reader raises
+    named = format or source
+    suffix = _suffix_of(named, _READERS) if is_file(source) else ".ply"  # whose reader raises
     if suffix.endswith(".ply"):
         from cvtgs.io.ply.header import is_compressed_ply  # noqa: PLC0415 (loaded as readers are)
 
@@ -151,8 +172,9 @@ def load(
 
 def save(
     scene: GaussianScene,
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | ByteSink,
     *,
+    format: str | None = None,
     overwrite: bool = False,
     axes: str | None = None,
 ) -> None:
@@ -167,7 +189,10 @@ def save(
         scene: The scene, on any device.
         path: The file to write; its suffix chooses the format: ``.ply``,
             ``.compressed.ply``, ``.spz``, ``.splat``, ``.sog``, ``.glb``, ``.gltf``, or
-            ``.spz.glb``, which is a glTF with an SPZ inside.
+            ``.spz.glb``, which is a glTF with an SPZ inside. Or a file that is open for writing in
+            binary mode, to which all bytes go once the scene is ready.
+        format: The suffix of the format, for example ``".spz"``, whatever the file is called.
+            None goes by the name; an open file is given a ``.ply``.
         overwrite: Whether an existing file may be replaced.
         axes: Where x, y and z of the file are to point, as :func:`cvtgs.io.change_axes` names
             them; the scene, whose own are ``"rdf"``, is turned to them. None for those of the
@@ -191,18 +216,26 @@ def save(
         ...     save(scene, Path(folder) / "two.ply")
         ...     save(scene, Path(folder) / "two.ply", overwrite=True)
     """
-    suffix = _suffix_of(path, _WRITERS)
-    check_output(path, overwrite)
+    output: AbstractContextManager[BinaryIO]
+    if isinstance(path, str | os.PathLike):
+        name, named = os.fspath(path), format or path
+        output = atomic_output(path, overwrite=overwrite)
+    else:
+        name, named = name_of(path), format or ".ply"
+        output = written_to(path)
+    suffix = _suffix_of(named, _WRITERS)
+    if isinstance(path, str | os.PathLike):
+        check_output(path, overwrite)
     scene = change_axes(scene, SCENE_AXES, axes or _FILE_AXES.get(suffix, SCENE_AXES))
-    dropped = losses(scene, path).dropped
+    dropped = losses(scene, named).dropped
     if dropped:
         warnings.warn(
-            f"{os.fspath(path)}: files of this format do not hold {'; '.join(dropped)}.",
+            f"{name}: files of this format do not hold {'; '.join(dropped)}.",
             DroppedDataWarning,
             stacklevel=2,
         )
     write: Callable[[GaussianScene, BinaryIO], None] = resolve_name(_WRITERS[suffix])
-    with atomic_output(path, overwrite=overwrite) as file:
+    with output as file:
         write(scene, file)
 
 

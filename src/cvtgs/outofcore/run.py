@@ -77,6 +77,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     rho: float | None = None,
     *,
     count: int | None = None,
+    max_count: int | None = None,
     memory: int | None = None,
     blocks: int | None = None,
     boxes: Sequence[Box] = (),
@@ -98,6 +99,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         output: The file to write; a ``.ply`` is written without being held in memory.
         rho: Ratio of Gaussians to keep, in (0, 1].
         count: Number of Gaussians to keep, instead of ``rho``.
+        max_count: Number of Gaussians to keep if there are more.
         memory: Bytes that one process may use; None for what is free.
         blocks: Number of blocks, instead of ``memory``.
         boxes: Gaussians with their centres in these are kept as they are, and come first.
@@ -134,7 +136,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     check_config(simplifier.config)
     check_save(output, overwrite=overwrite)
     rows = open_rows(source)
-    target = target_count(rows.count, rho, count=count)
+    target = target_count(rows.count, rho, count=count, max_count=max_count)
     wanted = blocks or block_count(rows, memory or memory_to_plan(available_memory()))
     job = Job(
         folder="",

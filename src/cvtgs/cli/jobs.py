@@ -1,0 +1,236 @@
+"""Which scenes a command reads and writes: one, many into a directory, or standard streams."""
+
+import argparse
+import glob
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import cvtgs
+from cvtgs.cli.display import WIDTH, file_size, say, say_wrapped, shortened, size_text
+from cvtgs.cli.options import READABLE, WRITABLE, CommandParser
+from cvtgs.errors import CvtgsError, InputNotFoundError, InvalidArgumentError, OutputError, RunError
+from cvtgs.text import printable
+
+STREAM = "-"
+"""What stands for standard input or output."""
+
+
+class Outcome(NamedTuple):
+    """What a command did to one scene.
+
+    Attributes:
+        counts: For example ``500 -> 50 Gaussians``.
+        seconds: How long it took, as a text; empty if that is not said.
+        notes: Sentences to print before the line that says where the output is.
+    """
+
+    counts: str
+    seconds: str = ""
+    notes: Sequence[str] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneJob:
+    """One scene to read, and the file to write.
+
+    Attributes:
+        options: The command line, with ``input`` and ``output`` of this scene.
+        is_one_of_many: Whether others go to the same directory.
+        to_stream: Whether the output is copied to standard output.
+    """
+
+    options: argparse.Namespace
+    is_one_of_many: bool = False
+    to_stream: bool = False
+
+
+def add_paths(parser: CommandParser, *, options: str) -> None:
+    """Add IN and OUT, or many IN and -o DIR, to a command."""
+    parser.usage = (
+        f"{parser.prog} IN OUT {options}[options]\n       {parser.prog} IN [IN ...] -o DIR "
+        f"{options}[options]"
+    )
+    parser.add_argument(
+        "paths",
+        nargs="+",
+        metavar="IN OUT",
+        help=f"scene to read ({READABLE}) and scene to write ({WRITABLE}); - is standard input or "
+        "output. With -o, any number of scenes to read; patterns such as 'scans/*.ply' are "
+        "expanded",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        dest="folder",
+        type=Path,
+        metavar="DIR",
+        help="directory to write to, under the names of the scenes",
+    )
+    parser.add_argument(
+        "--suffix",
+        metavar="END",
+        help="format of what is written to DIR or to standard output, for example .spz (default "
+        "that of IN if it can be written, else .ply)",
+    )
+
+
+def check_paths(parser: CommandParser, options: argparse.Namespace) -> None:
+    """Refuse a number of paths that does not go with -o, as wrong usage."""
+    if options.folder is None and len(options.paths) != 2:
+        found = f"{len(options.paths)} {'path' if len(options.paths) == 1 else 'paths'}"
+        parser.error(f"give IN and OUT, or any number of IN with -o DIR; found {found}")
+    if options.folder is not None and STREAM in options.paths:
+        parser.error("- goes with OUT, not with -o DIR")
+    if options.suffix and options.folder is None and options.paths[1] != STREAM:
+        parser.error("--suffix goes with -o DIR or the OUT -; else the name of OUT says the format")
+
+
+@contextmanager
+def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
+    """Find the scenes of a command line; standard streams are files while the context is."""
+    from cvtgs.io.streams import file_of
+
+    if options.folder is not None:
+        yield _folder_jobs(options)
+        return
+    source, target = options.paths
+    with TemporaryDirectory(prefix="cvtgs-") as folder:
+        if target == STREAM:
+            if sys.stdout.isatty():
+                raise OutputError("the OUT - must be a pipe or a file, found a terminal.")
+            target = Path(folder) / f"standard-output{options.suffix or '.ply'}"
+        if source != STREAM:
+            yield [_job(options, Path(source), Path(target), folder)]
+            return
+        with file_of(sys.stdin.buffer) as path:
+            yield [_job(options, path, Path(target), folder)]
+
+
+def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> None:
+    """Do the work for every scene, and say what came of it and where it is.
+
+    Raises:
+        RunError: Some of many scenes failed; the others are written.
+    """
+    first = jobs[0]
+    if not first.is_one_of_many:
+        _run_one(first, work)
+        return
+    folder, quiet, failed = first.options.folder, first.options.quiet, 0
+    before = after = 0
+    for number, job in enumerate(jobs, start=1):
+        source, target = job.options.input, job.options.output
+        place = f"[{number:>{len(str(len(jobs)))}}/{len(jobs)}] "
+        try:
+            bytes_in = _bytes_of(source)
+            outcome = work(job)
+        except CvtgsError as error:
+            failed += 1
+            say(f"cvtgs: error: {error}", file=sys.stderr)
+            continue
+        bytes_out = cvtgs.io.scene_size(target)
+        before, after = before + bytes_in, after + bytes_out
+        if not quiet:
+            sizes = f"{size_text(bytes_in)} -> {size_text(bytes_out)}"
+            facts = ", ".join(filter(None, (outcome.counts, sizes, outcome.seconds)))
+            room = max(8, WIDTH - len(place) - len(facts) - 2)
+            say(f"{place}{shortened(target.name, room)}: {facts}", flush=True)
+            for note in outcome.notes:
+                say_wrapped(note, indent=len(place))
+    done = len(jobs) - failed
+    if failed:
+        raise RunError(f"{failed} of {len(jobs)} scenes failed; {done} are in {folder}.")
+    if not quiet:
+        scenes = "1 scene" if done == 1 else f"{done} scenes"
+        say(f"{scenes} in {folder}, {size_text(before)} -> {size_text(after)}")
+
+
+def _run_one(job: SceneJob, work: Callable[[SceneJob], Outcome]) -> None:
+    options = job.options
+    before = _bytes_of(options.input)
+    outcome = work(job)
+    sizes = f"{size_text(before)} -> {file_size(options.output)}"
+    stream = sys.stderr if job.to_stream else sys.stdout
+    if job.to_stream:
+        with options.output.open("rb") as file:
+            shutil.copyfileobj(file, sys.stdout.buffer)
+        sys.stdout.buffer.flush()
+    if options.quiet:
+        return
+    for note in outcome.notes:
+        say_wrapped(note, file=stream)
+    name = "standard output" if job.to_stream else printable(str(options.output))
+    facts = ", ".join(filter(None, (outcome.counts, sizes, outcome.seconds)))
+    if len(name) + len(facts) + 2 > WIDTH:
+        say(facts, file=stream)
+        say(name, file=stream)
+    else:
+        say(f"{name}: {facts}", file=stream)
+
+
+def _bytes_of(path: Path) -> int:
+    """Return the size of a scene before it may be replaced; 0 of what reading it will refuse."""
+    try:
+        return cvtgs.io.scene_size(path)
+    except OSError:
+        return 0
+
+
+def _job(options: argparse.Namespace, source: Path, target: Path, folder: str) -> SceneJob:
+    own = argparse.Namespace(**{**vars(options), "input": source, "output": target})
+    return SceneJob(options=own, to_stream=target.parent == Path(folder))
+
+
+def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
+    """Return a job for every scene to read; no two write the same file."""
+    from cvtgs.evaluation.comparison_files import make_folder
+
+    sources = [Path(path) for pattern in options.paths for path in _expanded(pattern)]
+    targets: dict[Path, Path] = {}
+    for source in sources:
+        target = options.folder / _output_name(source, options.suffix)
+        if target in targets:
+            raise InvalidArgumentError(
+                f"two scenes must not have the same name in {options.folder}, found "
+                f"{targets[target]} and {source}."
+            )
+        targets[target] = source
+    make_folder(options.folder)
+    return [
+        SceneJob(
+            options=argparse.Namespace(**{**vars(options), "input": source, "output": target}),
+            is_one_of_many=True,
+        )
+        for target, source in targets.items()
+    ]
+
+
+def _expanded(pattern: str) -> list[str]:
+    """Return the files that a pattern stands for, where the shell has not expanded it."""
+    if os.path.lexists(pattern) or not glob.has_magic(pattern):
+        return [pattern]
+    found = sorted(glob.glob(pattern, recursive=True))  # noqa: PTH207 (any path, any pattern)
+    if not found:
+        raise InputNotFoundError(f"{pattern}: the pattern must match a file, found none.")
+    return found
+
+
+def _output_name(source: Path, suffix: str | None) -> str:
+    """Return the name of a scene in a directory, with the suffix that sets its format."""
+    from cvtgs.io.formats import READABLE_SUFFIXES, WRITABLE_SUFFIXES
+
+    if source.name == "meta.json":
+        source = source.parent
+    name = source.resolve().name if source.is_dir() else source.name
+    own = next(
+        (end for end in (*WRITABLE_SUFFIXES, *READABLE_SUFFIXES) if name.lower().endswith(end)), ""
+    )
+    end = suffix or (own if own in WRITABLE_SUFFIXES else ".ply")
+    return name[: len(name) - len(own)] + (end if end.startswith(".") else f".{end}")

@@ -1,0 +1,97 @@
+"""``--time-budget``: choose the best preset that ends in time."""
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import cvtgs
+from cvtgs.cli.display import say
+from cvtgs.errors import GoalError, InvalidArgumentError
+
+if TYPE_CHECKING:
+    from cvtgs.progress import ProgressListener
+    from cvtgs.scene import GaussianScene
+
+STARTED = time.perf_counter()
+"""When this process started, about: a time budget counts from here."""
+
+UNITS = {"s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+
+
+class ChosenPreset(NamedTuple):
+    """A preset, and the sentence that says why."""
+
+    name: str
+    reason: str
+
+
+def check_time_budget(options: argparse.Namespace, *, has_target: bool) -> None:
+    """Check ``--time-budget``, and the options that exclude it or need it."""
+    if options.time_budget is None:
+        if options.recalibrate:
+            raise InvalidArgumentError("--recalibrate goes with --time-budget.")
+        return
+    read_seconds(options.time_budget)
+    excluded = {
+        "--preset": options.preset is not None,
+        "--config": options.config is not None,
+        "--ckpt": options.ckpt not in ("auto", "none"),
+        "--refine": options.refine is not None or options.refine_steps is not None,
+        "--target-psnr and --target-ssim": has_target,
+    }
+    wrong = [name for name, is_given in excluded.items() if is_given]
+    if wrong:
+        raise InvalidArgumentError(
+            f"--time-budget chooses the preset and cannot go with {', '.join(wrong)}."
+        )
+
+
+def read_seconds(text: str) -> float:
+    """Read the time of ``--time-budget``."""
+    number = text.strip().rstrip("abcdefghijklmnopqrstuvwxyz")
+    unit = text.strip()[len(number) :] or "s"
+    try:
+        seconds = float(number) * UNITS[unit]
+    except (ValueError, KeyError):
+        seconds = math.nan
+    if not 0 < seconds < math.inf:
+        raise InvalidArgumentError(
+            f"--time-budget must be a time above 0, for example 20s or 2m; found {text!r}."
+        )
+    return seconds
+
+
+def choose_preset(
+    options: argparse.Namespace,
+    scene: "GaussianScene",
+    settings: Mapping[str, str],
+    listener: "ProgressListener",
+) -> ChosenPreset:
+    """Choose the best preset that fits into the rest of the time budget."""
+    from cvtgs.budget.calibrate import is_calibrated
+
+    budget, spent = read_seconds(options.time_budget), time.perf_counter() - options.begun
+    if budget <= spent:
+        raise GoalError(
+            f"no preset fits into {budget:g} s: starting and reading took {spent:.1f} s."
+        )
+    target = cvtgs.target_count(
+        len(scene), options.rho, count=options.count, max_count=options.max_count
+    )
+    again = options.recalibrate or not is_calibrated(options.device)
+    if again and not options.quiet:
+        say("cvtgs: measuring this machine once, about a minute", file=sys.stderr)
+    model = cvtgs.budget.cost_model(options.device, recalibrate=again, listener=listener)
+    if options.ckpt == "none":
+        settings = {**settings, "merge.network": "false"}
+    choice = cvtgs.budget.choose_preset(
+        cvtgs.budget.Work.of(scene, target), budget - spent, settings=settings, model=model
+    )
+    reason = (
+        f"Preset {choice.preset}, the best that fits into {budget:g} s: expected to take "
+        f"{choice.seconds:.1f} s after {spent:.1f} s of starting and reading."
+    )
+    return ChosenPreset(choice.preset, reason)

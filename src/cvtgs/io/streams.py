@@ -1,0 +1,150 @@
+"""Scenes in open binary files: a pipe, a socket, a zip member, bytes in memory."""
+
+import re
+import shutil
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import SpooledTemporaryFile, TemporaryDirectory
+from typing import BinaryIO, Protocol, cast
+
+from cvtgs.errors import FileFormatError, InputError, OutputError
+
+MEMORY_BYTES = 1 << 26
+"""A file is built in memory up to this size, and on the disk beyond it."""
+
+_FIRST_BYTES = {b"ply": ".ply", b"\x1f\x8b": ".spz", b"NGSP": ".spz", b"glTF": ".glb"}
+_TORCH_MEMBER = re.compile(r"[^/]+/data\.pkl")
+
+
+class ByteSource(Protocol):
+    """An open binary file to read."""
+
+    def read(self, size: int = -1, /) -> bytes:
+        """Return the next bytes; none at the end."""
+        ...
+
+
+class ByteSink(Protocol):
+    """An open binary file to write to."""
+
+    def write(self, data: bytes, /) -> object:
+        """Write bytes."""
+        ...
+
+
+@contextmanager
+def file_of(stream: ByteSource, format: str | None = None) -> Iterator[Path]:
+    """Copy what is left of a stream to a file, which is there while the context is.
+
+    Args:
+        stream: An open binary file; it need not be able to seek.
+        format: The suffix of the format, such as ``.spz``; None finds out by the first bytes.
+
+    Yields:
+        The file, with the suffix of its format.
+
+    Raises:
+        FileFormatError: The first bytes are of no known format.
+        InputError: The stream cannot be read.
+        OutputError: There is no space for the copy.
+
+    Example:
+        >>> import io
+        >>> with file_of(io.BytesIO(b"ply...")) as path:
+        ...     path.suffix, path.read_bytes()
+        ('.ply', b'ply...')
+    """
+    with TemporaryDirectory(prefix="cvtgs-") as folder:
+        path = Path(folder) / "stream"
+        with _opened(path) as file:
+            try:
+                first = stream.read(1 << 16)
+                if not isinstance(first, bytes):
+                    raise InputError(
+                        f"{name_of(stream)}: must be open in binary mode, found text; open it "
+                        f"with 'rb'."
+                    )
+                file.write(first)
+                shutil.copyfileobj(stream, file)
+            except OSError as error:
+                if isinstance(error, InputError):
+                    raise
+                raise InputError(
+                    f"{name_of(stream)}: must be readable to its end, found: {error}."
+                ) from error
+        suffix = format or format_of(path)
+        if suffix is None:
+            raise FileFormatError(
+                f"{name_of(stream)}: the first bytes must be those of a .ply, .spz, .sog, .glb or "
+                f".pt, found {first[:4]!r}; give format= for another one, such as '.splat'."
+            )
+        yield path.rename(path.with_suffix(suffix))
+
+
+@contextmanager
+def written_to(stream: ByteSink) -> Iterator[BinaryIO]:
+    """Open a file that can seek, and copy it to a stream when it is complete.
+
+    Args:
+        stream: An open binary file; it need not be able to seek.
+
+    Yields:
+        A file to write to.
+
+    Raises:
+        OutputError: The stream cannot be written to.
+
+    Example:
+        >>> import io
+        >>> stream = io.BytesIO()
+        >>> with written_to(stream) as file:
+        ...     _ = file.write(b"done")
+        >>> stream.getvalue()
+        b'done'
+    """
+    with SpooledTemporaryFile(max_size=MEMORY_BYTES) as file:
+        yield cast(BinaryIO, file)
+        file.seek(0)
+        try:
+            shutil.copyfileobj(file, stream)
+            getattr(stream, "flush", lambda: None)()
+        except (OSError, TypeError) as error:
+            raise OutputError(
+                f"{name_of(stream)}: must be open for writing in binary mode, found: {error}."
+            ) from error
+
+
+def format_of(path: Path) -> str | None:
+    """Return the suffix of the format that a file has by its content; None if it tells none."""
+    with path.open("rb") as file:
+        first = file.read(4)
+    for start, suffix in _FIRST_BYTES.items():
+        if first.startswith(start):
+            return suffix
+    if not first.startswith(b"PK"):
+        return None
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except (zipfile.BadZipFile, ValueError, OSError):
+        return ".sog"  # whose reader says what is wrong
+    return ".pt" if any(map(_TORCH_MEMBER.fullmatch, names)) else ".sog"
+
+
+def name_of(stream: ByteSource | ByteSink) -> str:
+    """Return what to call a stream in messages."""
+    name = getattr(stream, "name", None)
+    return name if isinstance(name, str) else f"the {type(stream).__name__}"
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    """Open a temporary file; a full disk is an OutputError that names its folder."""
+    try:
+        file = path.open("xb")
+    except OSError as error:
+        raise OutputError(f"{path.parent}: must be writable, found: {error}.") from error
+    with file:
+        yield file

@@ -1,0 +1,188 @@
+"""Many scenes in one command, standard streams, sizes and the last line of the output."""
+
+import io
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import cvtgs
+from cvtgs.cli.display import size_text
+from cvtgs.cli.main import main
+
+NAMES = ("a.ply", "b.compressed.ply", "c.spz")
+
+
+@pytest.fixture
+def scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Three scenes of 100, 200 and 300 Gaussians in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    for number, name in enumerate(NAMES, start=1):
+        cvtgs.save(cvtgs.synthetic.scene("object", 100 * number, sh_degree=0, seed=3), name)
+    return tmp_path
+
+
+SMALL = ("--preset", "draft")
+
+
+def wrong_usage(*words: str) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        main(list(words))
+    return int(str(stopped.value.code))
+
+
+@pytest.mark.parametrize("given", [NAMES, ("*",), ("a.ply", "[bc].*")])
+def test_many_scenes_get_a_line_each(
+    scenes: Path, capsys: pytest.CaptureFixture[str], given: tuple[str, ...]
+) -> None:
+    assert main(["simplify", *given, "--rho", "10%", "-o", "out", *SMALL]) == 0
+    printed = capsys.readouterr()
+    counts = {path.name: len(cvtgs.load(path)) for path in Path("out").iterdir()}
+    assert counts == dict(zip(NAMES, (10, 20, 30), strict=True))
+    *lines, last = printed.out.splitlines()
+    assert [line.split(":")[0] for line in lines] == [
+        f"[{number}/3] {name}" for number, name in enumerate(NAMES, start=1)
+    ]
+    assert "200 -> 20 Gaussians, " in lines[1]
+    assert last.startswith("3 scenes in out, ")
+    assert max(map(len, (*lines, last))) <= 80
+    assert printed.err == ""
+
+
+def test_one_suffix_for_all(scenes: Path) -> None:
+    assert main(["convert", *NAMES, "-o", "deep/out", "--suffix", "splat", "--quiet"]) == 0
+    names = {path.name for path in Path("deep/out").iterdir()}
+    assert names == {"a.splat", "b.splat", "c.splat"}
+
+
+def test_paths_may_stand_between_options(scenes: Path) -> None:
+    words = ["simplify", "a.ply", "--rho", "10%", "c.spz", "-o", "out", "--quiet", "b.*", *SMALL]
+    assert main(words) == 0
+    assert len(list(Path("out").iterdir())) == 3
+    assert main(["simplify", "--count", "0.01k", "a.ply", "--quiet", "z.ply", *SMALL]) == 0
+    assert len(cvtgs.load("z.ply")) == 10
+
+
+def test_smaller_scenes_stay_as_they_are(scenes: Path) -> None:
+    assert main(["simplify", *NAMES, "-o", "out", "--max-count", "0.15k", "--quiet", *SMALL]) == 0
+    assert [len(cvtgs.load(Path("out") / name)) for name in NAMES] == [100, 150, 150]
+    assert Path("out/a.ply").read_bytes() == Path("a.ply").read_bytes()
+
+
+def test_a_scene_that_fails_does_not_stop_the_others(
+    scenes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("b.compressed.ply").write_bytes(b"ply\nnonsense")
+    assert main(["convert", "missing.ply", *NAMES, "-o", "out"]) == 1
+    printed = capsys.readouterr()
+    first, second, last = printed.err.splitlines()
+    assert first.startswith("cvtgs: error: missing.ply: ")
+    assert second.startswith("cvtgs: error: b.compressed.ply: ")
+    assert last == "cvtgs: error: 2 of 4 scenes failed; 2 are in out."
+    assert {path.name for path in Path("out").iterdir()} == {"a.ply", "c.spz"}
+    assert [line[:5] for line in printed.out.splitlines()] == ["[2/4]", "[4/4]"]
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["a.ply", "other/a.ply", "-o", "out"], "two scenes must not have the same name in out"),
+        (
+            ["a.ply", "a.spz", "-o", ".", "--suffix", "spz"],
+            "the same name in ., found a.ply and a.spz.",
+        ),
+        (["nothing*", "-o", "out"], "nothing*: the pattern must match a file, found none."),
+        (["a.ply", "-o", "a.ply"], "a.ply: cannot be made: "),
+        (["a.ply", "c.spz", "-o", "out", "--suffix", "xyz"], "the file name must end in "),
+    ],
+)
+def test_wrong_jobs_are_refused_before_the_work(
+    scenes: Path, capsys: pytest.CaptureFixture[str], words: list[str], text: str
+) -> None:
+    Path("a.spz").write_bytes(Path("c.spz").read_bytes())
+    assert main(["convert", *words, "--overwrite"]) == 1
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert text in printed.err
+    assert not list(Path().glob("out/*"))
+
+
+def test_a_report_is_for_one_scene(scenes: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["simplify", *NAMES, "-o", "out", "--rho", "0.1", "--report", "r.json", *SMALL]
+    assert main(words) == 1
+    assert capsys.readouterr().err == "cvtgs: error: --report is for one scene, found 3.\n"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["a.ply"], ["a.ply", "b.ply", "c.ply"], ["-", "-o", "out"], ["a", "b.ply", "--suffix", "spz"]],
+)
+def test_paths_that_do_not_go_together_are_wrong_usage(
+    scenes: Path, capsys: pytest.CaptureFixture[str], words: list[str]
+) -> None:
+    assert wrong_usage("convert", *words) == 2
+    assert "usage: cvtgs convert IN OUT " in capsys.readouterr().err
+
+
+def test_the_last_line_says_where_the_output_is(
+    scenes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simplify", "a.ply", "z.ply", "--rho", "0.1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1].startswith("z.ply: 100 -> 10 Gaussians, 7.3 kB -> ")
+    assert max(map(len, lines)) <= 80
+    long = f"{'long' * 20}.ply"
+    assert main(["simplify", "a.ply", long, "--rho", "0.1"]) == 0
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert last == long
+    assert max(map(len, lines)) <= 80
+
+
+def test_sizes_are_of_before_and_after_in_place(
+    scenes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = Path("a.ply").stat().st_size
+    assert main(["simplify", "a.ply", "a.ply", "--rho", "0.1", "--overwrite", *SMALL]) == 0
+    after = Path("a.ply").stat().st_size
+    assert f", {size_text(before)} -> {size_text(after)}, " in capsys.readouterr().out
+    assert main(["convert", "a.ply", "-o", ".", "--overwrite"]) == 0
+    assert f", {size_text(after)} -> {size_text(after)}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_standard_streams(
+    scenes: Path,
+    capsysbinary: pytest.CaptureFixture[bytes],
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+) -> None:
+    class Stream(io.TextIOWrapper):
+        """Standard input of these bytes."""
+
+    monkeypatch.setattr(sys, "stdin", Stream(io.BytesIO(Path(name).read_bytes())))
+    assert main(["simplify", "-", "-", "--count", "7", "--suffix", ".spz", *SMALL]) == 0
+    printed = capsysbinary.readouterr()
+    assert len(cvtgs.load(io.BytesIO(printed.out))) == 7
+    assert printed.err.splitlines()[-1].startswith(b"standard output: ")
+    assert main(["convert", name, "-", "--quiet"]) == 0
+    assert capsysbinary.readouterr().out[:3] == b"ply"
+
+
+@pytest.mark.slow
+def test_a_pipe_of_two_commands(scenes: Path) -> None:
+    program = f"{sys.executable} -m cvtgs"
+    line = f"cat a.ply | {program} simplify - - --rho 10% | {program} convert - z.splat"
+    done = subprocess.run(line, shell=True, capture_output=True, text=True, check=True)
+    assert len(cvtgs.load("z.splat")) == 10
+    assert done.stdout.splitlines()[-1].startswith("z.splat: 10 Gaussians of SH degree 0, ")
+
+
+def test_nothing_binary_goes_to_a_terminal(
+    scenes: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    assert main(["convert", "a.ply", "-"]) == 1
+    assert capsys.readouterr().err == (
+        "cvtgs: error: the OUT - must be a pipe or a file, found a terminal.\n"
+    )
