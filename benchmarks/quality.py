@@ -223,7 +223,7 @@ def cells_of(quality: Quality) -> tuple[str, str, str]:
 
 
 def powers(power: str) -> dict[str, str]:
-    return {"cvt.area_power": power, "cvt.unbounded_area_power": power}
+    return {"cvt.area_power": power}
 
 
 CHOICES: Mapping[str, Mapping[str, str]] = {

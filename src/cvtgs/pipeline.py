@@ -18,7 +18,7 @@ from cvtgs.analysis import (
     restore_columns,
 )
 from cvtgs.clock import StageClock
-from cvtgs.config import MergeConfig, SimplifyConfig
+from cvtgs.config import AllocationConfig, MergeConfig, SimplifyConfig
 from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
 from cvtgs.math.frames import RobustFrame, morton_order
@@ -27,6 +27,9 @@ from cvtgs.mergenet import MergeNet, correct_cells
 from cvtgs.report import CellStatistics
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities
+
+REASSIGN = 7
+"""Cells around its own that a Gaussian may move to."""
 
 NEIGHBORS = 8
 """Cells around a cell that may cover its ends, and that the network sees."""
@@ -194,20 +197,66 @@ def group_rows(
     weights = cvt.tessellation_weights(
         analysis.opacities[rows],
         analysis.apparent_areas[rows],
-        area_power=analysis.area_power(config.cvt),
+        area_power=config.cvt.area_power,
         floor=config.cvt.weight_floor,
     )
     points = embed_rows(scene, rows, analysis, target, config)
+    count = finer_count(target, len(rows), config.allocation)
     tessellation = cvt.tessellate(
         points,
         weights,
-        target,
+        count,
         config=config.cvt,
         seed=config.seed,
         has_duplicates=analysis.plan.duplicates.active,
         on_iteration=on_iteration,
     )
-    return _grouping(tessellation, rows, tessellation.labels, weights, target)
+    members = cells.gaussian_moments(
+        scene,
+        rows,
+        analysis.frame,
+        weights=analysis.areas[rows] * analysis.opacities[rows],
+        masses=analysis.apparent_areas[rows] * analysis.opacities[rows],
+    )
+    labels = allocate(members, tessellation.labels, count, target, config.allocation)
+    sums = label_sums([weights], labels, target)[:, 0]
+    return _grouping(tessellation, rows, labels, sums)
+
+
+def finer_count(target: int, available: int, config: AllocationConfig) -> int:
+    """Return how many cells the tessellation makes, from which pairs merge."""
+    return min(available, math.ceil(config.oversampling * target))
+
+
+def allocate(
+    members: cells.Moments,
+    labels: Int[Tensor, "n"],
+    count: int,
+    target: int,
+    config: AllocationConfig,
+) -> Int[Tensor, "n"]:
+    """Merge cells in pairs until the target is met, and move members to the cell that fits.
+
+    Args:
+        members: Moments of what is grouped.
+        labels: Cell of each; none is empty.
+        count: Number of cells.
+        target: Number of cells to leave.
+        config: Costs.
+
+    Returns:
+        The new cell of each member; none is empty.
+    """
+    if count > target:
+        groups = cells.group_moments(members, labels, count)
+        groups = cells.Moments(*(column.cpu() for column in groups))  # many small steps
+        near = cvt.nearest_neighbors(groups.means.T, config.neighbors)
+        labels = cells.merge_pairs(groups, near, target, config).to(labels.device)[labels]
+    if config.reassign and target < len(labels):
+        groups = cells.group_moments(members, labels, target)
+        near = cvt.nearest_neighbors(groups.means.T, REASSIGN)
+        labels = cells.reassign(members, labels, groups, near, config)
+    return labels
 
 
 def group_cells(
@@ -236,24 +285,35 @@ def group_cells(
     masses = grouping.weights * merged.opacities
     rows = curve_order(merged, fine, analysis.frame, masses=masses)
     points, weights = embed_rows(merged, rows, analysis, target, config), grouping.weights[rows]
+    count = finer_count(target, len(rows), config.allocation)
     tessellation = cvt.tessellate(
-        points, weights, target, config=config.cvt, seed=config.seed, on_iteration=on_iteration
+        points,
+        weights,
+        count,
+        config=config.cvt,
+        seed=config.seed,
+        on_iteration=on_iteration,
     )
-    coarse = torch.empty_like(tessellation.labels)
-    coarse[rows] = tessellation.labels
-    members = grouping.partition
-    labels = torch.repeat_interleave(coarse, members.counts)
-    return _grouping(tessellation, members.order, labels, weights, target)
+    members = cells.gaussian_moments(
+        merged, rows, analysis.frame, weights=merged.masses[rows], masses=weights
+    )
+    labels = allocate(members, tessellation.labels, count, target, config.allocation)
+    coarse = torch.empty_like(labels)
+    coarse[rows] = labels
+    partition = grouping.partition
+    of_rows = torch.repeat_interleave(coarse, partition.counts)
+    sums = label_sums([grouping.weights], coarse, target)[:, 0]
+    return _grouping(tessellation, partition.order, of_rows, sums)
 
 
 def _grouping(
-    tessellation: cvt.Tessellation, rows: Tensor, labels: Tensor, weights: Tensor, target: int
+    tessellation: cvt.Tessellation, rows: Tensor, labels: Tensor, weights: Tensor
 ) -> Grouping:
-    """Return the rows and the weight of every cell; the labels of the points are let go."""
-    local = cells.Partition.from_labels(labels, target)
+    """Return the rows of every cell, with its weight; the labels of the points are let go."""
+    local = cells.Partition.from_labels(labels, len(weights))
     return Grouping(
         partition=cells.Partition(order=rows[local.order], offsets=local.offsets),
-        weights=label_sums([weights], tessellation.labels, target)[:, 0],
+        weights=weights,
         refilled=tessellation.refilled,
         energies=tessellation.energies,
         energy=tessellation.energy,

@@ -62,18 +62,6 @@ class SceneAnalysis:
             visibility=self.visibility[rows] if len(self.visibility) else self.visibility,
         )
 
-    def area_power(self, config: TessellationConfig) -> float:
-        """Return the power of the area in the weight: the more unbounded the scene, the flatter.
-
-        Args:
-            config: The powers for bounded and for unbounded scenes.
-
-        Returns:
-            A value between the two.
-        """
-        strength = self.plan.unbounded.strength
-        return (1 - strength) * config.area_power + strength * config.unbounded_area_power
-
 
 def analyze(
     scene: GaussianScene, config: SimplifyConfig, *, with_visibility: bool = False

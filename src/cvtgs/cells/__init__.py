@@ -1,5 +1,12 @@
 """From cells to Gaussians: members, moments, axes, inflation and descriptors."""
 
+from cvtgs.cells.allocate import (
+    Moments,
+    gaussian_moments,
+    group_moments,
+    merge_pairs,
+    reassign,
+)
 from cvtgs.cells.features import Descriptors, describe_cells
 from cvtgs.cells.inflate import align_axes, inflate_cells, side_cover
 from cvtgs.cells.merge import (
@@ -17,16 +24,21 @@ from cvtgs.cells.partition import Partition
 __all__ = [
     "Descriptors",
     "Members",
+    "Moments",
     "Partition",
     "align_axes",
     "describe_cells",
     "gather_members",
+    "gaussian_moments",
+    "group_moments",
     "inflate_cells",
     "keep_representatives",
     "mean_and_covariance",
     "merge_cells",
+    "merge_pairs",
     "merged_depth",
     "normalized_weights",
+    "reassign",
     "side_cover",
     "weighted_mean",
 ]

@@ -4,6 +4,7 @@ from cvtgs.config.base import Section, explain, read_toml
 from cvtgs.config.presets import PRESETS
 from cvtgs.config.refine import Rates, RefineConfig
 from cvtgs.config.sections import (
+    AllocationConfig,
     EffectsConfig,
     FilterConfig,
     MergeConfig,
@@ -14,6 +15,7 @@ from cvtgs.config.simplify import SimplifyConfig
 
 __all__ = [
     "PRESETS",
+    "AllocationConfig",
     "EffectsConfig",
     "FilterConfig",
     "MergeConfig",

@@ -14,7 +14,6 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "filter": {"max_mass_share": 1.0, "max_flyaway_share": 0.0},
         "cvt": {
             "area_power": 0.0,
-            "unbounded_area_power": 0.0,
             "perspective": False,
             "hidden_share": 1.0,
             "weight_floor": 0.0,
@@ -24,6 +23,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
             "tolerance": 0.0,
             "samples_per_site": 0,
         },
+        "allocation": {"oversampling": 1.0, "reassign": False},
         "merge": {
             "area_power": 0.0,
             "opacity": "union",

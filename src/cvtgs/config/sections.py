@@ -58,7 +58,7 @@ class FilterConfig(Section):
     """
 
     min_opacity: Share = 0.1
-    max_mass_share: Share = 0.01
+    max_mass_share: Share = 0.0
     max_flyaway_share: Share = 1e-3
 
 
@@ -68,8 +68,6 @@ class TessellationConfig(Section):
     Attributes:
         area_power: A Gaussian weighs its opacity times its mean projected area to this power: 0
             is the opacity alone, 1 the mass.
-        unbounded_area_power: The same in unbounded scenes, where the few huge and smooth Gaussians
-            of a sky would take too many cells.
         perspective: Whether areas count as they look from the middle of the scene, smaller when
             far.
         hidden_share: What an enclosed Gaussian counts, as a share of a free one; 1 does not look at
@@ -86,8 +84,7 @@ class TessellationConfig(Section):
         backend: What searches the nearest site; ``auto`` takes scipy, whose tree is on the host.
     """
 
-    area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)
-    unbounded_area_power: float = pydantic.Field(default=0.8, ge=0.0, le=2.0)
+    area_power: float = pydantic.Field(default=0.5, ge=0.0, le=2.0)
     perspective: bool = True
     hidden_share: Share = 0.1
     weight_floor: float = pydantic.Field(default=1e-3, ge=0.0)
@@ -98,6 +95,25 @@ class TessellationConfig(Section):
     tolerance: float = pydantic.Field(default=1e-3, ge=0.0)
     samples_per_site: int = pydantic.Field(default=12, ge=0)
     backend: Literal["auto", "scipy", "torch"] = "auto"
+
+
+class AllocationConfig(Section):
+    """How the cells of a finer tessellation become as many as are wanted.
+
+    Attributes:
+        oversampling: The tessellation makes this many times as many cells; pairs of them merge,
+            cheapest first. 1 keeps the cells of the tessellation.
+        neighbors: A cell may merge with this many of the nearest others, or give members to them.
+        color: Weight of squared distances of colours against distances of shape and position.
+        mass_power: The cost of a pair counts with the mass that images show to this power.
+        reassign: Whether every Gaussian then moves to the cell that explains it best.
+    """
+
+    oversampling: float = pydantic.Field(default=1.5, ge=1.0, le=8.0)
+    neighbors: int = pydantic.Field(default=12, ge=1, le=64)
+    color: float = pydantic.Field(default=15.0, ge=0.0)
+    mass_power: float = pydantic.Field(default=0.25, ge=0.0, le=2.0)
+    reassign: bool = True
 
 
 class VisibilityConfig(Section):

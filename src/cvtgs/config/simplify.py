@@ -10,6 +10,7 @@ from cvtgs.config.base import Section, explain, named, read_toml, shown
 from cvtgs.config.presets import PRESETS
 from cvtgs.config.refine import RefineConfig
 from cvtgs.config.sections import (
+    AllocationConfig,
     EffectsConfig,
     FilterConfig,
     MergeConfig,
@@ -29,6 +30,7 @@ class SimplifyConfig(Section):
         filter: Which Gaussians are left out.
         visibility: Whether images tell what is seen.
         cvt: How Gaussians are grouped.
+        allocation: How cells merge until as many are left as are wanted.
         merge: How a group becomes one Gaussian.
         refine: Whether, and how, the result is moved towards images of the scene.
 
@@ -43,6 +45,7 @@ class SimplifyConfig(Section):
     filter: FilterConfig = FilterConfig()
     visibility: VisibilityConfig = VisibilityConfig()
     cvt: TessellationConfig = TessellationConfig()
+    allocation: AllocationConfig = AllocationConfig()
     merge: MergeConfig = MergeConfig()
     refine: RefineConfig = RefineConfig()
 

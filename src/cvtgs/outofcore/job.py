@@ -35,6 +35,7 @@ class Manifest(pydantic.BaseModel):
         key: Digest of all that the result depends on.
         source: Path of the source.
         targets: Number of Gaussians that each block keeps.
+        cells: Number of cells that the tessellation makes in each block, at least as many.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -42,6 +43,7 @@ class Manifest(pydantic.BaseModel):
     key: str
     source: str
     targets: tuple[int, ...]
+    cells: tuple[int, ...]
 
 
 class SortedFile(NamedTuple):
@@ -172,6 +174,11 @@ class Job:
         """Number of Gaussians that each block keeps."""
         return self._manifest().targets
 
+    @property
+    def cells(self) -> tuple[int, ...]:
+        """Number of cells that the tessellation makes in each block."""
+        return self._manifest().cells
+
     def blocks_with_cells(self) -> list[int]:
         """Return the blocks that keep at least one Gaussian."""
         return [block for block, target in enumerate(self.targets) if target]
@@ -272,9 +279,11 @@ class Job:
         with atomic_output(self.path("sorted.json"), overwrite=True) as output:
             output.write(json.dumps(facts).encode())
 
-    def write_manifest(self, key: str, targets: list[int]) -> None:
-        """Write that all rows are sorted, and how many Gaussians each block keeps."""
-        manifest = Manifest(key=key, source=self.source.path, targets=tuple(targets))
+    def write_manifest(self, key: str, targets: list[int], cells: list[int]) -> None:
+        """Write that all rows are sorted, and how many cells and Gaussians each block makes."""
+        manifest = Manifest(
+            key=key, source=self.source.path, targets=tuple(targets), cells=tuple(cells)
+        )
         with atomic_output(self.path("manifest.json"), overwrite=True) as file:
             file.write(manifest.model_dump_json(indent=2).encode())
 

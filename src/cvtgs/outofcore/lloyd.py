@@ -46,12 +46,12 @@ def seed(job: Job, block: int) -> None:
     if job.sites_path(0, block).exists():
         return
     order, points, weights = _embedded_rows(job, block)
-    config, target = job.config.cvt, job.targets[block]
-    if target == 0:
+    config, count = job.config.cvt, job.cells[block]
+    if count == 0:
         save_tensors(job.sample_path(block), {"order": order}, {})
         return
-    seeds = choose_seeds(weights, target, config=config, seed=job.config.seed)
-    sample, shares = sample_points(points, weights, config.samples_per_site * target)
+    seeds = choose_seeds(weights, count, config=config, seed=job.config.seed)
+    sample, shares = sample_points(points, weights, config.samples_per_site * count)
     save_tensors(job.sample_path(block), {"order": order, "points": sample, "weights": shares}, {})
     _save_sites(job, 0, block, points[seeds].double())
 
@@ -59,7 +59,7 @@ def seed(job: Job, block: int) -> None:
 @one_thread()
 def accumulate(job: Job, iteration: int, block: int) -> float:
     """Sum the points of a block by their nearest site, own or remote; return their energy."""
-    if job.targets[block] == 0:
+    if job.cells[block] == 0:
         return 0.0
     path = job.sums_path(iteration, block)
     if path.exists():
@@ -154,7 +154,7 @@ def _assign(job: Job, iteration: int, block: int, points: Tensor) -> tuple[int, 
     has_duplicates = job.read_scan().plan.duplicates.active
     _, nearest = choose_search(job.config.cvt, has_duplicates=has_duplicates)
     sites = points[:0].double()
-    if job.targets[block]:
+    if job.cells[block]:
         sites = map_tensors(job.sites_path(iteration, block))[0]["sites"]
     others = other_blocks(job, block, lambda other: job.sites_path(iteration, other), name="sites")
     return len(sites), assign_points(points, sites, others, nearest=nearest)

@@ -18,8 +18,8 @@ from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.mergenet import correct_cells
 from cvtgs.outofcore.halo import bounding_box, halo_cells, other_blocks
 from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.rows import read_members, read_rows
-from cvtgs.pipeline import merge_members, neighbor_count, reduce_scene, shape_merged
+from cvtgs.outofcore.rows import BlockRows, read_members, read_rows
+from cvtgs.pipeline import allocate, merge_members, neighbor_count, reduce_scene, shape_merged
 from cvtgs.progress import silent
 from cvtgs.report import CellStatistics
 from cvtgs.scene import GaussianScene
@@ -74,16 +74,19 @@ class WithHalo(NamedTuple):
 
 @one_thread()
 def merge(job: Job, block: int) -> None:
-    """Merge the cells of a block."""
+    """Merge cells of the tessellation until the target of a block is met, and merge these."""
     if job.merged_path(block).exists():
         return
-    _, scene, _, partition = read_cells(job, block)
+    rows, labels = read_members(job, block)
+    labels = _allocate(job, block, rows, labels)
+    _, scene, _, partition = _block_cells(job, block, rows, labels)
     merged, shown = merge_members(scene, partition, job.config.merge, areas=scene.areas)
     first = shown.order[shown.offsets[:-1]]
     more = {
         "sizes": shown.counts,
         "representatives": torch.where(shown.counts < partition.counts, first, -1),
         "bounds": bounding_box(merged.means),
+        "labels": labels.int(),
     }
     tensors = merged.tensors() | add_prefix(EXTRA, merged.extras) | more
     save_tensors(job.merged_path(block), tensors, {})
@@ -180,9 +183,28 @@ def simplify_block(job: Job, block: int) -> None:
     _write_block(job, block, reduced.scene, report)
 
 
+def _allocate(job: Job, block: int, rows: BlockRows, labels: Tensor) -> Tensor:
+    """Return the final cell of every Gaussian in the cells of a block."""
+    scene = rows.scene
+    members = cells.gaussian_moments(
+        scene,
+        torch.arange(len(scene)),
+        job.read_scan().frame,
+        weights=scene.masses,
+        masses=rows.apparent_areas * scene.opacities,
+    )
+    count, target = job.cells[block], job.targets[block]
+    return allocate(members, labels, count, target, job.config.allocation)
+
+
 def read_cells(job: Job, block: int) -> BlockCells:
-    """Read the Gaussians in the cells of a block."""
-    rows, labels = read_members(job, block)
+    """Read the Gaussians in the final cells of a block, which is merged."""
+    rows, _ = read_members(job, block)
+    labels = map_tensors(job.merged_path(block))[0]["labels"].long()
+    return _block_cells(job, block, rows, labels)
+
+
+def _block_cells(job: Job, block: int, rows: BlockRows, labels: Tensor) -> BlockCells:
     original = select_columns(rows.scene, job.config.effects)
     scene = drop_unused_bands(original, job.read_scan().plan)
     partition = cells.Partition.from_labels(labels, job.targets[block])

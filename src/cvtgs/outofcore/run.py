@@ -36,6 +36,7 @@ from cvtgs.outofcore.memory import available_memory, block_count, memory_to_plan
 from cvtgs.outofcore.merge import BlockReport, correct, inflate, merge, simplify_block
 from cvtgs.outofcore.rows import SortedCounts, sort_range
 from cvtgs.outofcore.scan import RowRange, add_totals, read_sample, scan_range, scan_scene
+from cvtgs.pipeline import finer_count
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport
 from cvtgs.scene import concatenate
@@ -157,8 +158,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
             if simplifier.checkpoint is not None:
                 job.write_network(simplifier.checkpoint)
             with one_thread():
-                targets = _scan_and_sort(job, workers, clock)
-            job.write_manifest(key, targets)
+                targets, finer = _scan_and_sort(job, workers, clock)
+            job.write_manifest(key, targets, finer)
         resumed = _run_blocks(job, workers, clock)
         with clock.stage("assemble"):
             _assemble(job, output, overwrite=overwrite)
@@ -184,8 +185,11 @@ def check_config(config: SimplifyConfig) -> None:
         )
 
 
-def _scan_and_sort(job: Job, workers: Workers, clock: StageClock) -> list[int]:
-    """Scan the file and sort its rows into blocks; return how many each block keeps."""
+def _scan_and_sort(job: Job, workers: Workers, clock: StageClock) -> tuple[list[int], list[int]]:
+    """Scan the file and sort its rows into blocks.
+
+    Returns how many Gaussians each block keeps, and how many cells its tessellation makes.
+    """
     ranges = job.ranges()
     with clock.stage("scan", len(ranges)) as advance:
         sample = read_sample(job.source)
@@ -219,8 +223,14 @@ def _scan_and_sort(job: Job, workers: Workers, clock: StageClock) -> list[int]:
     occupied = sum(1 for count in counts.rows if count)
     if rest < occupied:  # tiny targets: the heaviest blocks get one each
         order = sorted(range(job.blocks), key=lambda block: -counts.cells[block])
-        return [int(block in order[:rest]) for block in range(job.blocks)]
-    return shared_out(rest, counts.cells, rooms=counts.rows)
+        targets = [int(block in order[:rest]) for block in range(job.blocks)]
+    else:
+        targets = shared_out(rest, counts.cells, rooms=counts.rows)
+    finer = [
+        finer_count(kept, available, job.config.allocation)
+        for kept, available in zip(targets, counts.rows, strict=True)
+    ]
+    return targets, finer
 
 
 def _run_blocks(job: Job, workers: Workers, clock: StageClock) -> int:

@@ -181,7 +181,7 @@ def scan_scene(
     least = min(len(sample), -int(-target // rows_per_sample))
     no_flyaways = config.filter.model_copy(update={"max_flyaway_share": 0.0})
     rows = filters.filter_rows(sample, known, least, no_flyaways).rows
-    power = known.area_power(config.cvt)
+    power = config.cvt.area_power
     weights = cvt.gaussian_weights(known.opacities, known.apparent_areas, power)[rows]
     mean_weight = float(weights.mean()) or 1.0
     min_weight = mean_weight * config.cvt.weight_floor

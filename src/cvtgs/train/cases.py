@@ -18,7 +18,7 @@ from cvtgs.mergenet import Residuals, compose
 from cvtgs.pipeline import group_rows, merge_cells
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
-from cvtgs.validity import check_rows, standardized
+from cvtgs.validity import check_rows
 from cvtgs.views import automatic_views, random_views
 
 
@@ -54,7 +54,7 @@ def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> Me
     )
     return MergedScene(
         valid,
-        standardized(merged.scene),
+        merged.scene,
         merged.partition,
         merged.neighbors,
         analysis.visibility,

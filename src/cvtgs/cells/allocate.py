@@ -1,0 +1,293 @@
+"""Allocation: cells that are alike merge in pairs, and Gaussians move to the cell that fits them.
+
+A Voronoi cell knows where its Gaussians lie, not what it costs to show them as one. So the
+tessellation makes more cells than are wanted, and the pairs that lose least merge.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cvtgs.config import AllocationConfig
+from cvtgs.devices import chunk_length
+from cvtgs.math.frames import RobustFrame
+from cvtgs.math.parameters import normalize_quats, quats_to_matrices
+from cvtgs.math.segments import label_sums
+from cvtgs.math.spherical_harmonics import SH_C0
+from cvtgs.scene import GaussianScene
+
+CHUNK = 1 << 15
+"""Gaussians whose costs are computed together, to bound memory."""
+
+SHARE_PER_ROUND = 0.2
+"""Pairs that merge before costs are computed again, as a share of the cells."""
+
+FLOOR = 1e-4
+"""Standard deviation, in robust radii, that is added to every shape: a plane has a volume too."""
+
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Row and column of the six numbers of a symmetric matrix."""
+
+
+class Moments(NamedTuple):
+    """Mean, covariance and colour of Gaussians, or of groups of them; one column each, float64.
+
+    Attributes:
+        weights: ``(n,)`` what each counts in the moments of a group: its mass.
+        masses: ``(n,)`` its mass as images show it, mean 1 over all Gaussians.
+        means: ``(3, n)`` positions, robust radii from the centre of the scene.
+        covariances: ``(6, n)`` upper triangles, squared robust radii.
+        colors: ``(3, n)`` RGB of the constant band.
+    """
+
+    weights: Float[Tensor, "n"]
+    masses: Float[Tensor, "n"]
+    means: Float[Tensor, "3 n"]
+    covariances: Float[Tensor, "6 n"]
+    colors: Float[Tensor, "3 n"]
+
+    def take(self, rows: Int[Tensor, "k"]) -> "Moments":
+        """Return some of them."""
+        return Moments(*(column.index_select(-1, rows) for column in self))
+
+
+def gaussian_moments(
+    scene: GaussianScene,
+    rows: Int[Tensor, "n"],
+    frame: RobustFrame,
+    *,
+    weights: Float[Tensor, "n"],
+    masses: Float[Tensor, "n"],
+) -> Moments:
+    """Return the moments of single Gaussians.
+
+    Args:
+        scene: The Gaussians.
+        rows: Which of them.
+        frame: Centre and radius of the scene, the unit of length.
+        weights: Mass of each.
+        masses: Mass of each as images show it.
+
+    Returns:
+        Their moments, in the order of the rows.
+    """
+    means = scene.means[rows].double() - frame.center.to(scene.device)
+    scales = torch.exp(scene.log_scales[rows].double()) / frame.radius
+    axes = quats_to_matrices(normalize_quats(scene.quats[rows].double())) * scales[:, None, :]
+    columns = axes.permute(1, 2, 0).contiguous()
+    covariances = torch.stack([(columns[i] * columns[j]).sum(0) for i, j in UPPER])
+    colors = (0.5 + SH_C0 * scene.sh0[rows, 0].double()).clamp(0.0, 1.5)
+    tiny = torch.finfo(torch.float64).tiny
+    weights, masses = weights.double(), masses.double()
+    return Moments(
+        weights=(weights / weights.mean().clamp_min(tiny)).clamp_min(1e-12),
+        masses=masses / masses.mean().clamp_min(tiny),
+        means=(means / frame.radius).T.contiguous(),
+        covariances=covariances,
+        colors=colors.T.contiguous(),
+    )
+
+
+def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Moments:
+    """Return the moments of groups; the spread of means is taken about the mean of the group.
+
+    Args:
+        members: Moments of the members.
+        labels: Group of each, 0 to ``count - 1``; none is empty.
+        count: Number of groups, m.
+
+    Returns:
+        Moments of the groups.
+    """
+    sums = label_sums([members.weights, members.masses], labels, count).T
+    shares = members.weights / sums[0].index_select(0, labels)
+    columns = [shares * column for column in (*members.means, *members.colors)]
+    means, colors = label_sums(columns, labels, count).T.contiguous().split(3)
+    shifts = members.means - means.index_select(1, labels)
+    columns = [
+        shares * (covariance + shifts[i] * shifts[j])
+        for covariance, (i, j) in zip(members.covariances, UPPER, strict=True)
+    ]
+    covariances = label_sums(columns, labels, count).T.contiguous()
+    return Moments(sums[0].contiguous(), sums[1].contiguous(), means, covariances, colors)
+
+
+def merge_pairs(
+    groups: Moments, neighbors: Int[Tensor, "m k"], count: int, config: AllocationConfig
+) -> Int[Tensor, "m"]:
+    """Merge neighbouring groups in pairs, cheapest first, until ``count`` are left.
+
+    The cost of a pair is Runnalls' bound (2007) on how far the mixture moves when both become one
+    Gaussian, plus the squared distance of colours, times a power of the mass that images show.
+
+    Args:
+        groups: Moments of the groups.
+        neighbors: Groups that each may merge with.
+        count: Number of groups to leave, 1 to m.
+        config: Weights of the cost.
+
+    Returns:
+        The new group of every group, 0 to ``count - 1``.
+    """
+    device, total = groups.weights.device, len(groups.weights)
+    labels = torch.arange(total, device=device)
+    pairs = _distinct_pairs(labels.repeat_interleave(neighbors.shape[1]), neighbors.flatten())
+    while total > count:
+        wanted = min(total - count, max(1, int(SHARE_PER_ROUND * total)))
+        if len(pairs[0]) == 0:  # groups without neighbours left: any pair will do
+            pairs = torch.arange(total - 1, device=device), torch.arange(1, total, device=device)
+        costs = _pair_costs(groups, *pairs, config)
+        first, second = _cheapest_disjoint(*pairs, costs, wanted, total)
+        target = torch.arange(total, device=device)
+        target[second] = first
+        keeps = torch.ones(total, dtype=torch.bool, device=device)
+        keeps[second] = False
+        target = (keeps.cumsum(0) - 1)[target]
+        total -= len(first)
+        groups = group_moments(groups, target, total)
+        labels = target[labels]
+        pairs = _distinct_pairs(target[pairs[0]], target[pairs[1]])
+    return labels
+
+
+def _distinct_pairs(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """Return each unordered pair of different groups once, in ascending order."""
+    low, high = torch.minimum(first, second), torch.maximum(first, second)
+    size = int(high.amax()) + 1 if len(high) else 1
+    keys = torch.unique((low * size + high)[low < high])
+    return keys // size, keys % size
+
+
+def _pair_costs(
+    groups: Moments, first: Tensor, second: Tensor, config: AllocationConfig
+) -> Float[Tensor, "p"]:
+    """Return what it costs to merge each pair."""
+    volumes = _log_volume(groups.covariances)
+    chunk = chunk_length(CHUNK, first.device)
+    costs = []
+    for i, j in zip(first.split(chunk), second.split(chunk), strict=True):
+        a, b = groups.take(i), groups.take(j)
+        total = a.weights + b.weights
+        share, other = a.weights / total, b.weights / total
+        product = share * other
+        shifts = a.means - b.means
+        merged = torch.stack([
+            share * a.covariances[k] + other * b.covariances[k] + product * shifts[r] * shifts[c]
+            for k, (r, c) in enumerate(UPPER)
+        ])  # fmt: skip
+        cost = 0.5 * (_log_volume(merged) - share * volumes[i] - other * volumes[j])
+        cost += config.color * product * (a.colors - b.colors).square().sum(0)
+        costs.append(cost * (a.masses + b.masses) ** config.mass_power)
+    return torch.cat(costs)
+
+
+def _log_volume(covariances: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:
+    """Return the logarithm of the determinants, with the floor added."""
+    xx, xy, xz, yy, yz, zz = covariances
+    xx, yy, zz = xx + FLOOR**2, yy + FLOOR**2, zz + FLOOR**2
+    minors = yy * zz - yz * yz, xy * zz - yz * xz, xy * yz - yy * xz
+    determinants = xx * minors[0] - xy * minors[1] + xz * minors[2]
+    volumes: Tensor = determinants.clamp_min(FLOOR**6).log()
+    return volumes
+
+
+def _cheapest_disjoint(
+    first: Tensor, second: Tensor, costs: Tensor, wanted: int, total: int
+) -> tuple[Tensor, Tensor]:
+    """Take disjoint pairs, cheapest first, at most as many as wanted.
+
+    A pair that is the cheapest one of both its groups is taken, again and again: the same as to
+    go through all pairs in order (Preis 1999), in few steps over all of them.
+    """
+    order = torch.sort(costs, stable=True).indices[: 6 * wanted]
+    first, second = first[order], second[order]
+    ranks = torch.arange(len(order), device=order.device)
+    taken = []
+    while len(ranks):
+        best = torch.full((total,), len(order), device=order.device)
+        for ends in (first, second):
+            best.scatter_reduce_(0, ends[ranks], ranks, "amin")
+        chosen = ranks[(best[first[ranks]] == ranks) & (best[second[ranks]] == ranks)]
+        taken.append(chosen)
+        used = torch.zeros(total, dtype=torch.bool, device=order.device)
+        used[first[chosen]] = True
+        used[second[chosen]] = True
+        ranks = ranks[~(used[first[ranks]] | used[second[ranks]])]
+    rows = torch.sort(torch.cat(taken)).values[:wanted]
+    return first[rows], second[rows]
+
+
+def reassign(
+    members: Moments,
+    labels: Int[Tensor, "n"],
+    groups: Moments,
+    neighbors: Int[Tensor, "m k"],
+    config: AllocationConfig,
+) -> Int[Tensor, "n"]:
+    """Move every member once to the group that explains it best, its own or a neighbouring one.
+
+    A group explains a member by the Kullback-Leibler divergence of the two Gaussians, plus the
+    squared distance of their colours. The member that fits its group best stays, so that no group
+    becomes empty.
+
+    Args:
+        members: Moments of the members.
+        labels: Group of each.
+        groups: Moments of the groups.
+        neighbors: Other groups that the members of each may move to.
+        config: Weight of colour.
+
+    Returns:
+        The new group of every member.
+    """
+    count = len(groups.weights)
+    own = torch.arange(count, device=labels.device)
+    candidates = torch.cat([own[:, None], neighbors], dim=1)
+    inverse, volumes = _inverse(groups.covariances)
+    found = torch.empty_like(labels)
+    own_costs = torch.empty(len(labels), dtype=torch.float64, device=labels.device)
+    chunk = chunk_length(CHUNK, labels.device)
+    for start in range(0, len(labels), chunk):
+        part = slice(start, min(start + chunk, len(labels)))
+        cells = labels[part]
+        mean, covariance = members.means[:, part], members.covariances[:, part]
+        color = members.colors[:, part]
+        least, best = None, cells
+        for nth in range(candidates.shape[1]):
+            group = candidates[cells, nth]
+            shifts = mean - groups.means.index_select(1, group)
+            matrix = inverse.index_select(1, group)
+            cost = volumes.index_select(0, group)
+            cost = cost + 2 * config.color * (
+                color - groups.colors.index_select(1, group)
+            ).square().sum(0)
+            for k, (r, c) in enumerate(UPPER):
+                twice = 1.0 if r == c else 2.0
+                cost.addcmul_(matrix[k], covariance[k] + shifts[r] * shifts[c], value=twice)
+            if least is None:
+                least, own_costs[part] = cost, cost
+                continue
+            closer = cost < least
+            least, best = torch.where(closer, cost, least), torch.where(closer, group, best)
+        found[part] = best
+    lowest = own_costs.new_full((count,), torch.inf).scatter_reduce(0, labels, own_costs, "amin")
+    rows = torch.arange(len(labels), device=labels.device)
+    is_anchor = own_costs == lowest[labels]
+    anchors = torch.full((count,), len(labels), device=labels.device)
+    anchors = anchors.scatter_reduce(0, labels[is_anchor], rows[is_anchor], "amin")
+    found[anchors] = own
+    return found
+
+
+def _inverse(covariances: Float[Tensor, "6 n"]) -> tuple[Float[Tensor, "6 n"], Float[Tensor, "n"]]:
+    """Return inverse matrices and the logarithm of determinants, with the floor added."""
+    xx, xy, xz, yy, yz, zz = covariances
+    xx, yy, zz = xx + FLOOR**2, yy + FLOOR**2, zz + FLOOR**2
+    cofactors = torch.stack([
+        yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy,
+        xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy,
+    ])  # fmt: skip
+    determinants = (xx * cofactors[0] + xy * cofactors[1] + xz * cofactors[2]).clamp_min(FLOOR**6)
+    return cofactors / determinants, determinants.log()

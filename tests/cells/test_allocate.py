@@ -1,0 +1,186 @@
+"""Allocation: cells merge in pairs, cheapest first, and members move to the cell that fits."""
+
+import math
+
+import pytest
+import torch
+
+from cvtgs import SimplifyConfig, cvt
+from cvtgs.analysis import analyze
+from cvtgs.cells import Moments, gaussian_moments, group_moments, merge_pairs, reassign
+from cvtgs.config import AllocationConfig
+from cvtgs.pipeline import allocate, finer_count, group_rows
+from cvtgs.synthetic import scene as make
+from scenes import random_scene
+
+DEFAULT = AllocationConfig()
+
+
+def points(places, *, colors=None, weights=None, size=0.01):
+    """Round Gaussians along the first axis."""
+    count = len(places)
+    means = torch.zeros(3, count).double()
+    means[0] = torch.tensor(places)
+    covariances = torch.zeros(6, count).double()
+    covariances[[0, 3, 5]] = size**2
+    weights = torch.tensor(weights or [1.0] * count).double()
+    shades = torch.tensor(colors or [0.5] * count).double().expand(3, -1).contiguous()
+    return Moments(weights, weights, means, covariances, shades)
+
+
+def all_others(count):
+    rows = torch.arange(count)
+    return torch.stack([rows[rows != row] for row in rows])
+
+
+def scene_moments(scene):
+    analysis = analyze(scene, SimplifyConfig())
+    rows = torch.arange(len(scene))
+    return gaussian_moments(
+        scene,
+        rows,
+        analysis.frame,
+        weights=scene.masses,
+        masses=analysis.apparent_areas * scene.opacities,
+    )
+
+
+def divergence(members, labels, count):
+    """Sum what is lost when members become Gaussians: log-volumes and squared colours."""
+    groups = group_moments(members, labels, count)
+
+    def matrices(moments):
+        xx, xy, xz, yy, yz, zz = moments.covariances
+        rows = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=1).unflatten(1, (3, 3))
+        return rows + 1e-8 * torch.eye(3)
+
+    own = matrices(groups)[labels]
+    shifts = (members.means - groups.means[:, labels]).T[:, :, None]
+    inside = torch.linalg.solve(own, matrices(members) + shifts @ shifts.transpose(1, 2))
+    cost = 0.5 * (inside.diagonal(dim1=1, dim2=2).sum(1) + torch.logdet(own))
+    return cost + DEFAULT.color * (members.colors - groups.colors[:, labels]).square().sum(0)
+
+
+def test_the_nearest_pair_merges_first():
+    labels = merge_pairs(points([0.0, 1.0, 5.0, 5.5]), all_others(4), 3, DEFAULT)
+    assert labels.tolist() == [0, 1, 2, 2]
+
+
+def test_unlike_colours_stay_apart():
+    moments = points([0.0, 0.02, 0.06], colors=[0.0, 1.0, 1.0])
+    assert merge_pairs(moments, all_others(3), 2, DEFAULT).tolist() == [0, 1, 1]
+    blind = AllocationConfig(color=0.0)
+    assert merge_pairs(moments, all_others(3), 2, blind).tolist() == [0, 0, 1]
+
+
+def test_what_images_hardly_show_merges_first():
+    """The pair on the right lies a little farther apart, and is hardly seen."""
+    moments = points([0.0, 1.0, 9.0, 10.1])
+    moments = moments._replace(masses=torch.tensor([1.0, 1.0, 1e-4, 1e-4]).double())
+    assert merge_pairs(moments, all_others(4), 3, DEFAULT).tolist() == [0, 1, 2, 2]
+    equal = AllocationConfig(mass_power=0.0)
+    assert merge_pairs(moments, all_others(4), 3, equal).tolist() == [0, 0, 1, 2]
+
+
+def test_the_cost_by_hand():
+    """Two round Gaussians of variance s^2, a apart: log-volume grows by log(1 + a^2 / 4 s^2)."""
+    groups, config = points([0.0, 0.3], size=0.1, colors=[0.2, 0.4]), AllocationConfig(mass_power=1)
+    costs = merge_pairs.__globals__["_pair_costs"](
+        groups, torch.tensor([0]), torch.tensor([1]), config
+    )
+    wanted = 0.5 * math.log((0.01 + 0.0225 + 1e-8) / (0.01 + 1e-8))
+    wanted += config.color * 0.25 * 3 * 0.2**2
+    assert float(costs[0]) == pytest.approx(2.0 * wanted)
+
+
+@pytest.mark.parametrize("count", [1, 2, 37, 99])
+def test_every_count_is_met_exactly(count):
+    moments = scene_moments(random_scene(100))
+    neighbors = cvt.nearest_neighbors(moments.means.T, 12)
+    labels = merge_pairs(moments, neighbors, count, DEFAULT)
+    assert torch.equal(torch.unique(labels), torch.arange(count))
+    assert torch.equal(labels, merge_pairs(moments, neighbors, count, DEFAULT))
+
+
+def test_groups_without_neighbours_merge_too():
+    """Neighbours that all became one group leave no pair; the count is met nevertheless."""
+    near = torch.tensor([[1], [0], [3], [2]])
+    labels = merge_pairs(points([0.0, 0.1, 7.0, 7.1]), near, 1, DEFAULT)
+    assert labels.tolist() == [0, 0, 0, 0]
+
+
+def test_disjoint_pairs_are_those_of_a_loop_over_all_pairs():
+    g = torch.Generator().manual_seed(0)
+    first, second = torch.combinations(torch.arange(40)).T
+    costs = torch.rand(len(first), generator=g).double()
+    take = merge_pairs.__globals__["_cheapest_disjoint"]
+    used, wanted = set(), []
+    for pair in costs.argsort().tolist()[: 6 * 12]:
+        ends = {int(first[pair]), int(second[pair])}
+        if not used & ends and len(wanted) < 12:
+            used |= ends
+            wanted.append(tuple(sorted(ends)))
+    found = list(zip(*(ends.tolist() for ends in take(first, second, costs, 12, 40)), strict=True))
+    assert found == wanted
+
+
+def test_moments_of_groups_are_those_of_the_merge():
+    """Two passes about the mean: also where the scene lies far from its centre."""
+    members = points([100.0, 100.5, 300.0], weights=[1.0, 3.0, 2.0], size=0.1)
+    groups = group_moments(members, torch.tensor([0, 0, 1]), 2)
+    assert groups.weights.tolist() == [4.0, 2.0]
+    assert groups.means[0].tolist() == pytest.approx([100.375, 300.0])
+    spread = 0.01 + 0.25 * 0.75 * 0.25
+    assert groups.covariances[0].tolist() == pytest.approx([spread, 0.01])
+
+
+def test_members_move_to_the_group_that_explains_them():
+    members = points([0.0, 0.1, 0.9, 1.0, 1.1], size=0.1)
+    labels = torch.tensor([0, 0, 0, 1, 1])
+    groups = group_moments(members, labels, 2)
+    found = reassign(members, labels, groups, torch.tensor([[1], [0]]), DEFAULT)
+    assert found.tolist() == [0, 0, 1, 1, 1]
+
+
+def test_no_group_becomes_empty():
+    members = points([0.0, 0.01, 0.02], size=0.1)
+    labels = torch.tensor([0, 1, 2])
+    groups = group_moments(members, labels, 3)
+    found = reassign(members, labels, groups, all_others(3), DEFAULT)
+    assert sorted(found.tolist()) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("kind", ["object", "courtyard"])
+def test_moving_members_explains_them_better(kind):
+    members = scene_moments(make(kind, 2000, sh_degree=0, seed=1))
+    near = cvt.nearest_neighbors(members.means.T, 12)
+    labels = merge_pairs(members, near, 200, DEFAULT)
+    groups = group_moments(members, labels, 200)
+    near = cvt.nearest_neighbors(groups.means.T, 7)
+    found = reassign(members, labels, groups, near, DEFAULT)
+    assert 0 < int((found != labels).sum()) < 1800
+    before, after = divergence(members, labels, 200), divergence(members, found, 200)
+    assert float((members.weights * after).sum()) < float((members.weights * before).sum())
+
+
+def test_merged_cells_lose_less_than_those_of_the_tessellation():
+    scene, target = make("object", 4000, sh_degree=0, seed=2), 200
+    members, losses = scene_moments(scene), []
+    for oversampling in (1.5, 1.0):
+        allocation = {"oversampling": oversampling, "reassign": False}
+        config = SimplifyConfig.from_mapping({"allocation": allocation})
+        analysis = analyze(scene, config)
+        cells = group_rows(scene, torch.arange(len(scene)), analysis, target, config).partition
+        labels = torch.empty(len(scene), dtype=torch.int64)
+        labels[cells.order] = torch.repeat_interleave(cells.counts)
+        losses.append(float(divergence(members, labels, target).sum()))
+    assert losses[0] < losses[1]
+
+
+def test_cells_of_the_tessellation_stay_where_allocation_is_off():
+    off = AllocationConfig(oversampling=1.0, reassign=False)
+    members, labels = points([0.0, 1.0, 2.0]), torch.tensor([0, 1, 0])
+    assert allocate(members, labels, 2, 2, off) is labels
+    assert finer_count(10, 12, off) == 10
+    assert finer_count(10, 12, DEFAULT) == 12
+    assert finer_count(10, 99, DEFAULT) == 15
