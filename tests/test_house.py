@@ -27,7 +27,7 @@ LEVELS = [
     {"views", "evaluation"},
     {"analysis"},
     {"filters", "cvt", "cells", "report"},
-    {"mergenet"},
+    {"mergenet", "grouping"},
     {"pipeline", "refinement"},
     {"simplifier", "info"},
     {"budget", "tradeoff", "levels", "outofcore", "oneshot"},

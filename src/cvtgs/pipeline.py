@@ -18,47 +18,21 @@ from cvtgs.analysis import (
     restore_columns,
 )
 from cvtgs.clock import StageClock
-from cvtgs.config import AllocationConfig, MergeConfig, SimplifyConfig
+from cvtgs.config import MergeConfig, SimplifyConfig
 from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
-from cvtgs.math.frames import RobustFrame, morton_order
-from cvtgs.math.segments import label_sums, segment_ids
+from cvtgs.grouping import Grouping, group_cells, group_rows
+from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import MergeNet, correct_cells
 from cvtgs.report import CellStatistics
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities
-
-REASSIGN = 7
-"""Cells around its own that a Gaussian may move to."""
 
 NEIGHBORS = 8
 """Cells around a cell that may cover its ends, and that the network sees."""
 
 CHUNK = 1 << 18
 """Gaussians whose distance is measured together, to bound memory."""
-
-COLOR_CELLS = 10_000
-"""The number of cells that ``cvt.color`` is meant for."""
-
-
-class Grouping(NamedTuple):
-    """Which Gaussians form which cell, and how good the tessellation is.
-
-    Attributes:
-        partition: Rows of the scene that make up every cell.
-        weights: ``(m,)`` summed weights of the members of every cell.
-        refilled: Cells that were empty after Lloyd and took a Gaussian from another.
-        energies: Energy before every Lloyd iteration, over the Gaussians that Lloyd samples.
-        energy: Energy of the final cells, over all Gaussians.
-        backend: Name of the nearest-site search.
-    """
-
-    partition: cells.Partition
-    weights: Float[Tensor, "m"]
-    refilled: int
-    energies: tuple[float, ...]
-    energy: float
-    backend: str
 
 
 class Merged(NamedTuple):
@@ -170,157 +144,6 @@ def reduce_scene(
     return Reduced(small, statistics, grouping, merged)
 
 
-def group_rows(
-    scene: GaussianScene,
-    rows: Int[Tensor, "k"],
-    analysis: SceneAnalysis,
-    target: int,
-    config: SimplifyConfig,
-    *,
-    on_iteration: Callable[[int], None] = lambda done: None,
-) -> Grouping:
-    """Group Gaussians into the cells of a weighted centroidal Voronoi tessellation.
-
-    Args:
-        scene: The Gaussians.
-        rows: Which of them, after the filter.
-        analysis: Frame, apparent areas and effect plan.
-        target: Number of cells, at most k.
-        config: Weights, space, seeding and iterations (``config.cvt``), and the seed.
-        on_iteration: Called with the number of finished Lloyd iterations.
-
-    Returns:
-        The cells.
-    """
-    masses = analysis.apparent_areas[rows] * analysis.opacities[rows]
-    rows = rows[curve_order(scene, rows, analysis.frame, masses=masses)]
-    weights = cvt.tessellation_weights(
-        analysis.opacities[rows],
-        analysis.apparent_areas[rows],
-        area_power=config.cvt.area_power,
-        floor=config.cvt.weight_floor,
-    )
-    points = embed_rows(scene, rows, analysis, target, config)
-    count = finer_count(target, len(rows), config.allocation)
-    tessellation = cvt.tessellate(
-        points,
-        weights,
-        count,
-        config=config.cvt,
-        seed=config.seed,
-        has_duplicates=analysis.plan.duplicates.active,
-        on_iteration=on_iteration,
-    )
-    members = cells.gaussian_moments(
-        scene,
-        rows,
-        analysis.frame,
-        weights=analysis.areas[rows] * analysis.opacities[rows],
-        masses=analysis.apparent_areas[rows] * analysis.opacities[rows],
-    )
-    labels = allocate(members, tessellation.labels, count, target, config.allocation)
-    sums = label_sums([weights], labels, target)[:, 0]
-    return _grouping(tessellation, rows, labels, sums)
-
-
-def finer_count(target: int, available: int, config: AllocationConfig) -> int:
-    """Return how many cells the tessellation makes, from which pairs merge."""
-    return min(available, math.ceil(config.oversampling * target))
-
-
-def allocate(
-    members: cells.Moments,
-    labels: Int[Tensor, "n"],
-    count: int,
-    target: int,
-    config: AllocationConfig,
-) -> Int[Tensor, "n"]:
-    """Merge cells in pairs until the target is met, and move members to the cell that fits.
-
-    Args:
-        members: Moments of what is grouped.
-        labels: Cell of each; none is empty.
-        count: Number of cells.
-        target: Number of cells to leave.
-        config: Costs.
-
-    Returns:
-        The new cell of each member; none is empty.
-    """
-    if count > target:
-        groups = cells.group_moments(members, labels, count)
-        groups = cells.Moments(*(column.cpu() for column in groups))  # many small steps
-        near = cvt.nearest_neighbors(groups.means.T, config.neighbors)
-        labels = cells.merge_pairs(groups, near, target, config).to(labels.device)[labels]
-    if config.reassign and target < len(labels):
-        groups = cells.group_moments(members, labels, target)
-        near = cvt.nearest_neighbors(groups.means.T, REASSIGN)
-        labels = cells.reassign(members, labels, groups, near, config)
-    return labels
-
-
-def group_cells(
-    merged: GaussianScene,
-    grouping: Grouping,
-    analysis: SceneAnalysis,
-    target: int,
-    config: SimplifyConfig,
-    *,
-    on_iteration: Callable[[int], None] = lambda done: None,
-) -> Grouping:
-    """Group the cells of a finer size into coarser ones, so that levels are nested.
-
-    Args:
-        merged: The merged Gaussians of the finer size.
-        grouping: The cells of the finer size.
-        analysis: Frame and effect plan of the scene.
-        target: Number of cells, at most that of the finer size.
-        config: As for :func:`group_rows`.
-        on_iteration: Called with the number of finished Lloyd iterations.
-
-    Returns:
-        Cells that consist of whole finer cells; members are Gaussians of the scene.
-    """
-    fine = torch.arange(len(merged), device=merged.device)
-    masses = grouping.weights * merged.opacities
-    rows = curve_order(merged, fine, analysis.frame, masses=masses)
-    points, weights = embed_rows(merged, rows, analysis, target, config), grouping.weights[rows]
-    count = finer_count(target, len(rows), config.allocation)
-    tessellation = cvt.tessellate(
-        points,
-        weights,
-        count,
-        config=config.cvt,
-        seed=config.seed,
-        on_iteration=on_iteration,
-    )
-    members = cells.gaussian_moments(
-        merged, rows, analysis.frame, weights=merged.masses[rows], masses=weights
-    )
-    labels = allocate(members, tessellation.labels, count, target, config.allocation)
-    coarse = torch.empty_like(labels)
-    coarse[rows] = labels
-    partition = grouping.partition
-    of_rows = torch.repeat_interleave(coarse, partition.counts)
-    sums = label_sums([grouping.weights], coarse, target)[:, 0]
-    return _grouping(tessellation, partition.order, of_rows, sums)
-
-
-def _grouping(
-    tessellation: cvt.Tessellation, rows: Tensor, labels: Tensor, weights: Tensor
-) -> Grouping:
-    """Return the rows of every cell, with its weight; the labels of the points are let go."""
-    local = cells.Partition.from_labels(labels, len(weights))
-    return Grouping(
-        partition=cells.Partition(order=rows[local.order], offsets=local.offsets),
-        weights=weights,
-        refilled=tessellation.refilled,
-        energies=tessellation.energies,
-        energy=tessellation.energy,
-        backend=tessellation.backend,
-    )
-
-
 def merge_cells(
     scene: GaussianScene,
     partition: cells.Partition,
@@ -382,38 +205,6 @@ def shape_merged(
         return merged
     return cells.inflate_cells(
         merged, shown, neighbors, everywhere=config.inflation, covered=config.covered_inflation
-    )
-
-
-def curve_order(
-    scene: GaussianScene,
-    rows: Int[Tensor, "k"],
-    frame: RobustFrame,
-    *,
-    masses: Float[Tensor, "k"],
-) -> Int[Tensor, "k"]:
-    """Return the order of Gaussians along a Morton curve, ties by mass.
-
-    The curve runs through contracted space: it stays fine where the bulk is, whatever flies away.
-    """
-    points = cvt.embed(scene.means[rows], frame=frame, contraction=1.0)
-    return morton_order(points, ties=masses)
-
-
-def embed_rows(
-    scene: GaussianScene,
-    rows: Int[Tensor, "k"],
-    analysis: SceneAnalysis,
-    target: int,
-    config: SimplifyConfig,
-) -> Float[Tensor, "k d"]:
-    """Embed Gaussians in the space of the tessellation; colour counts more with fewer cells."""
-    return cvt.embed(
-        scene.means[rows],
-        scene.sh0[rows],
-        frame=analysis.frame,
-        contraction=analysis.plan.unbounded.strength,
-        color=config.cvt.color * (target / COLOR_CELLS) ** config.cvt.color_power,
     )
 
 

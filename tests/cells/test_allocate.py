@@ -9,7 +9,7 @@ from cvtgs import SimplifyConfig, cvt
 from cvtgs.analysis import analyze
 from cvtgs.cells import Moments, gaussian_moments, group_moments, merge_pairs, reassign
 from cvtgs.config import AllocationConfig
-from cvtgs.pipeline import allocate, finer_count, group_rows
+from cvtgs.grouping import allocate, finer_count, group_rows
 from cvtgs.synthetic import scene as make
 from scenes import random_scene
 

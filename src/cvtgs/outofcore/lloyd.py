@@ -16,11 +16,11 @@ from cvtgs.cvt import (
     weighted_sums,
 )
 from cvtgs.devices import one_thread
+from cvtgs.grouping import curve_order, embed_rows
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.outofcore.halo import Assignment, assign_points, bounding_box, other_blocks
 from cvtgs.outofcore.job import SENT_BYTES, Job
 from cvtgs.outofcore.rows import read_rows, send_rows
-from cvtgs.pipeline import curve_order, embed_rows
 
 
 class EmbeddedRows(NamedTuple):

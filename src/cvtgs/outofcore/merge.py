@@ -13,13 +13,14 @@ from cvtgs import cells, cvt, validity
 from cvtgs.analysis import SceneAnalysis, drop_unused_bands, restore_columns, select_columns
 from cvtgs.clock import StageClock
 from cvtgs.devices import one_thread
+from cvtgs.grouping import allocate
 from cvtgs.io import atomic_output, save
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.mergenet import correct_cells
 from cvtgs.outofcore.halo import bounding_box, halo_cells, other_blocks
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.rows import BlockRows, read_members, read_rows
-from cvtgs.pipeline import allocate, merge_members, neighbor_count, reduce_scene, shape_merged
+from cvtgs.pipeline import merge_members, neighbor_count, reduce_scene, shape_merged
 from cvtgs.progress import silent
 from cvtgs.report import CellStatistics
 from cvtgs.scene import GaussianScene

@@ -25,6 +25,7 @@ from cvtgs.errors import (
     InvalidArgumentError,
     InvalidSceneError,
 )
+from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import join_plys, open_rows
@@ -36,7 +37,6 @@ from cvtgs.outofcore.memory import available_memory, block_count, memory_to_plan
 from cvtgs.outofcore.merge import BlockReport, correct, inflate, merge, simplify_block
 from cvtgs.outofcore.rows import SortedCounts, sort_range
 from cvtgs.outofcore.scan import RowRange, add_totals, read_sample, scan_range, scan_scene
-from cvtgs.pipeline import finer_count
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport
 from cvtgs.scene import concatenate

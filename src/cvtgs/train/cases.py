@@ -14,8 +14,9 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.counts import target_count
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.filters import filter_rows
+from cvtgs.grouping import group_rows
 from cvtgs.mergenet import Residuals, compose
-from cvtgs.pipeline import group_rows, merge_cells
+from cvtgs.pipeline import merge_cells
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import check_rows
