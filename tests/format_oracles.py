@@ -13,6 +13,7 @@ import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import zstandard
 from PIL import Image
 
 C0 = 0.28209479177387814
@@ -56,13 +57,29 @@ def read_splat(content: bytes) -> list[Splat]:
     return found
 
 
-def read_gzip_spz(content: bytes) -> list[Splat]:
-    """Read versions 1 to 3, without turning any axis."""
-    data = gzip.decompress(content)
+def unpacked_spz(content: bytes) -> bytes:
+    """Return header and blocks of any version, as those before 4 have them."""
+    if content[:2] == b"\x1f\x8b":
+        return gzip.decompress(content)
+    (streams,), (start,) = content[15:16], struct.unpack_from("<I", content, 16)
+    at = start + 16 * streams
+    blocks = []
+    for number in range(streams):
+        packed, size = struct.unpack_from("<QQ", content, start + 16 * number)
+        blocks.append(zstandard.decompress(content[at : at + packed]))
+        assert len(blocks[-1]) == size
+        at += packed
+    assert at == len(content)
+    return content[:16] + b"".join(blocks)
+
+
+def read_spz(content: bytes) -> list[Splat]:
+    """Read any version, without turning any axis."""
+    data = unpacked_spz(content)
     magic, version, count, degree, bits, _, _ = struct.unpack_from("<IIIBBBB", data)
     assert magic == int.from_bytes(b"NGSP", "little")
     k = {0: 0, 1: 3, 2: 8, 3: 15, 4: 24}[degree]
-    position_size, quat_size = 6 if version == 1 else 9, 4 if version == 3 else 3
+    position_size, quat_size = 6 if version == 1 else 9, 4 if version > 2 else 3
     at = 16
     starts = []
     for size in (position_size, 1, 3, 3, quat_size, 3 * k):

@@ -49,7 +49,7 @@ OWNERS = {
     "gsplat": "rendering/gsplat_backend.py",
     "PIL": ("evaluation/comparison_files.py", "evaluation/images.py", "io/sog/container.py"),
     "jinja2": "evaluation/page.py",
-    "zstandard": "io/spz/read.py",
+    "zstandard": ("io/spz/read.py", "io/spz/write.py"),
     "safetensors": "io/tensors.py",
     "matplotlib": "plots.py",
     "distributed": "outofcore/distributed.py",

@@ -39,6 +39,17 @@ class Box(pydantic.BaseModel):
         return self
 
 
+def checked_box(low: Sequence[float], high: Sequence[float], name: str) -> Box:
+    """Build a box of numbers that a user gave under a name."""
+    try:
+        return Box.model_validate({"min": tuple(low), "max": tuple(high)})
+    except pydantic.ValidationError as error:
+        raise InvalidArgumentError(
+            f"{name} must have finite numbers, none of the first three above those that follow, "
+            f"found {', '.join(f'{number:g}' for number in (*low, *high))}."
+        ) from error
+
+
 def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
     """Read boxes from a JSON file.
 

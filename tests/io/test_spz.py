@@ -11,10 +11,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from cvtgs import GaussianScene, load, save
-from cvtgs.errors import DroppedDataWarning
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
 from cvtgs.io import change_axes
 from cvtgs.io.atomic import atomic_output
 from cvtgs.io.spz import write_spz
+from cvtgs.io.spz.write import Version
 from format_cases import (
     DATA,
     assert_as_oracle,
@@ -23,7 +24,7 @@ from format_cases import (
     storable_scene,
     with_extension,
 )
-from format_oracles import read_gzip_spz
+from format_oracles import read_spz, unpacked_spz
 from scenes import same_bits
 
 BOUNDS = {
@@ -67,7 +68,7 @@ def test_a_file_by_hand(tmp_path: Path, version: int, quat: bytes) -> None:
         scene.quats.abs(), torch.tensor([[0.0, 1.0, 0.0, 0.0]]), rtol=0, atol=0.01
     )
     assert scene.antialiased
-    assert_as_oracle(scene, read_gzip_spz(path.read_bytes()))
+    assert_as_oracle(scene, read_spz(path.read_bytes()))
     turned = load(path, axes="rub")  # y and z change signs, and bands odd in y or z
     assert turned.means.tolist() == [[1, -2, 3]]
     assert turned.shN.tolist() == [[[-8 / 128, 0, 0], [8 / 128, 0, 0], [0, 16 / 128, 0]]]
@@ -78,7 +79,7 @@ def test_half_precision_of_version_1(tmp_path: Path) -> None:
     path = tmp_path / "a.spz"
     path.write_bytes(gzip.compress(HEADER.pack(b"NGSP", 1, 1, 0, 12, 0, 0) + body))
     assert load(path).means.tolist() == [[1, 2, -3]]
-    assert_as_oracle(load(path), read_gzip_spz(path.read_bytes()))
+    assert_as_oracle(load(path), read_spz(path.read_bytes()))
 
 
 def test_fractional_bits_are_those_of_the_header(tmp_path: Path) -> None:
@@ -99,20 +100,21 @@ def test_files_of_niantics_library(version: int) -> None:
     assert scene.comments == ("SplatRenderMode: mip",)
 
 
-@pytest.mark.parametrize("version", [2, 3])
-def test_our_files_are_niantics_files(tmp_path: Path, version: int) -> None:
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_our_files_are_niantics_files(tmp_path: Path, version: Version) -> None:
     """Byte for byte when decompressed, but for halves, which may be rounded the other way."""
     path = tmp_path / "a.spz"
     source = change_axes(load(DATA / "source.ply"), "rdf", "rub")
     with atomic_output(path) as file:
-        write_spz(source, file, version=2 if version == 2 else 3)
+        write_spz(source, file, version=version, axes="rub")
     ours, theirs = (
-        gzip.decompress(one.read_bytes()) for one in (path, DATA / f"niantic-v{version}.spz")
+        unpacked_spz(one.read_bytes()) for one in (path, DATA / f"niantic-v{version}.spz")
     )
     assert len(ours) == len(theirs)
-    assert ours[:16] == theirs[:16]
+    stated = 2 if version == 4 else 0  # that there are extensions
+    assert ours[:16] == theirs[:14] + bytes([theirs[14] | stated]) + theirs[15:16]
     assert sum(a != b for a, b in zip(ours[16:], theirs[16:], strict=True)) <= 1
-    splats = read_gzip_spz((DATA / f"niantic-v{version}.spz").read_bytes())
+    splats = read_spz((DATA / f"niantic-v{version}.spz").read_bytes())
     assert_as_oracle(load(DATA / f"niantic-v{version}.spz"), splats)
 
 
@@ -128,8 +130,34 @@ def test_files_stand_as_their_ply_unless_axes_are_given(tmp_path: Path) -> None:
     save(scene, path)
     assert_within(scene, load(path), BOUNDS)
     save(scene, path, axes="rub", overwrite=True)
+    assert_within(scene, load(path), BOUNDS)  # the file says so
+    assert_within(half_turn(scene), load(path, axes="rdf"), BOUNDS)
+    save(scene, path, axes="rub", overwrite=True, spz_version=3)
     assert_within(half_turn(scene), load(path), BOUNDS)
     assert_within(scene, load(path, axes="RUB"), BOUNDS)
+
+
+def test_a_fourth_version_by_hand(tmp_path: Path) -> None:
+    """The bytes of version 3 in six blocks behind a header that states the axes."""
+    scene = storable_scene(3, degree=1)
+    for version in (3, 4):
+        save(scene, tmp_path / f"{version}.spz", axes="luf", spz_version=version)
+    content = (tmp_path / "4.spz").read_bytes()
+    third = unpacked_spz((tmp_path / "3.spz").read_bytes())
+    assert content[:16] == HEADER.pack(b"NGSP", 4, 3, 1, third[13], 3, 6)
+    assert struct.unpack_from("<7I", content, 16) == (44, 0, 0, 0, 0xADBE0003, 4, 7)
+    sizes = [struct.unpack_from("<QQ", content, 44 + 16 * block)[1] for block in range(6)]
+    assert sizes == [27, 3, 9, 9, 12, 27]
+    assert unpacked_spz(content)[16:] == third[16:]
+    save(scene.with_sh_degree(0), tmp_path / "0.spz")
+    assert (tmp_path / "0.spz").read_bytes()[15] == 5
+
+
+@pytest.mark.parametrize("version", [1, 5, "4"])
+def test_versions_that_are_not_written(tmp_path: Path, version: Version) -> None:
+    with pytest.raises(InvalidArgumentError, match="must be 2, 3 or 4, found"):
+        save(storable_scene(3), tmp_path / "a.spz", spz_version=version)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -158,7 +186,7 @@ def test_round_trip(
     assert_within(scene, again, BOUNDS)
     assert again.sh_degree == degree
     assert again.antialiased
-    assert_as_oracle(load(path), read_gzip_spz(path.read_bytes()))
+    assert_as_oracle(load(path), read_spz(path.read_bytes()))
     save(again, path, overwrite=True)
     for name, tensor in load(path).tensors().items():
         wanted, bound = again.tensors()[name], 1e-5
@@ -176,7 +204,7 @@ def test_bits_follow_the_size_of_the_scene(tmp_path: Path, spread: float, bits: 
     path = tmp_path / "a.spz"
     unit = scene.means / scene.means.abs().max() * 3.9 * spread
     save(scene.with_tensors({"means": unit}, {}), path)
-    assert gzip.decompress(path.read_bytes())[13] == bits
+    assert unpacked_spz(path.read_bytes())[13] == bits
     assert float((load(path).means - unit).abs().max()) <= 0.5 / 2**bits * 1.01
 
 

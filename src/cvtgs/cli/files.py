@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.display import file_size, say, say_wrapped
+from cvtgs.cli.edits import SceneEdits, add_edit_options
 from cvtgs.cli.jobs import Outcome, SceneJob, add_paths, check_paths, open_jobs, run_jobs
 from cvtgs.cli.options import AddParser, add_options, read_axes, read_scene, read_settings
 from cvtgs.errors import DroppedDataWarning
@@ -90,32 +91,47 @@ def add_convert(add_parser: AddParser) -> None:
         "convert",
         help="write scenes in another format",
         description="Read IN and write it as OUT; the suffixes of the names set the formats. "
-        "Prints what the format of OUT cannot hold before writing it.",
+        "Prints what the format of OUT cannot hold before writing it. Scenes can be merged, "
+        "cropped, filtered and moved on the way.",
     )
     parser.set_defaults(run=convert)
     parser.check = check_paths
     add_paths(parser, options="")
     add_options(parser, "--sh-degree", "--axes", "--trust-sizes", "--overwrite", "--quiet")
+    parser.add_argument(
+        "--spz-version",
+        metavar="V",
+        type=int,
+        choices=(2, 3, 4),
+        default=4,
+        help="version of a .spz to write: 4 (default), or 3 or 2 for older readers",
+    )
+    add_edit_options(parser)
 
 
 def convert(options: argparse.Namespace) -> None:
     """Run ``cvtgs convert``."""
     read_axes(options.axes)
+    edits = SceneEdits(options)
     with open_jobs(options) as jobs:
         for job in jobs:
             cvtgs.io.check_save(job.options.output, overwrite=options.overwrite)
-        run_jobs(jobs, _convert_one)
+        run_jobs(jobs, lambda job: _convert_one(job, edits))
 
 
-def _convert_one(job: SceneJob) -> Outcome:
+def _convert_one(job: SceneJob, edits: SceneEdits) -> Outcome:
     """Convert one scene, and say what is lost."""
     options = job.options
     axes = read_axes(options.axes)
-    scene = cvtgs.io.load(options.input, axes=axes.source, trust_sizes=options.trust_sizes)
-    degree, phrases = scene.sh_degree, []
-    if options.sh_degree is not None and options.sh_degree < degree:
+    scenes = [
+        cvtgs.io.load(path, axes=axes.source, trust_sizes=options.trust_sizes)
+        for path in (options.input, *options.merge)
+    ]
+    scene = scenes[0] if len(scenes) == 1 else cvtgs.edit.merge(scenes)
+    scene, phrases = edits.apply(scene)
+    if options.sh_degree is not None and options.sh_degree < scene.sh_degree:
         scene = scene.with_sh_degree(options.sh_degree)
-        phrases = [f"SH bands above degree {options.sh_degree} (--sh-degree)"]
+        phrases += [f"SH bands above degree {options.sh_degree} (--sh-degree)"]
     lost = cvtgs.io.losses(scene, options.output)
     if not (options.quiet or job.is_one_of_many):
         stream = sys.stderr if job.to_stream else sys.stdout
@@ -128,6 +144,13 @@ def _convert_one(job: SceneJob) -> Outcome:
     with warnings.catch_warnings():
         if not options.quiet:  # it is said here
             warnings.simplefilter("ignore", DroppedDataWarning)
-        cvtgs.io.save(scene, options.output, overwrite=options.overwrite, axes=axes.target)
-    notes = [f"Lost: {'; '.join(lost.dropped)}."] if job.is_one_of_many and lost.dropped else []
+        cvtgs.io.save(
+            scene,
+            options.output,
+            overwrite=options.overwrite,
+            axes=axes.target,
+            spz_version=options.spz_version,
+        )
+    lines = [*phrases, *lost.dropped]
+    notes = [f"Lost: {'; '.join(lines)}."] if job.is_one_of_many and lines else []
     return Outcome(f"{lost.count:,} Gaussians of SH degree {lost.sh_degree}", notes=notes)

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from pkgutil import resolve_name
 from types import MappingProxyType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import torch
 
@@ -177,6 +177,7 @@ def save(
     format: str | None = None,
     overwrite: bool = False,
     axes: str | None = None,
+    spz_version: Literal[2, 3, 4] = 4,
 ) -> None:
     """Write a scene to a file, completely or not at all.
 
@@ -196,14 +197,16 @@ def save(
         overwrite: Whether an existing file may be replaced.
         axes: Where x, y and z of the file are to point, as :func:`cvtgs.io.change_axes` names
             them; the scene, whose own are ``"rdf"``, is turned to them. None for those of the
-            format: ``"luf"`` of glTF, ``"rdf"`` of the others.
+            format: ``"luf"`` of glTF, ``"rdf"`` of the others. ``.spz`` files of version 4 state
+            them.
+        spz_version: Version of ``.spz`` files: 4, or 3 or 2 for older readers.
 
     Raises:
         FileFormatError: The format is unknown or cannot be written.
         OutputExistsError: The file exists and may not be replaced.
         OutputError: The file cannot be written (directory missing, no permission, disk full).
         InvalidSceneError: Something in the scene has no place in the format.
-        InvalidArgumentError: There are no such axes.
+        InvalidArgumentError: There are no such axes, or there is no such version.
 
     Example:
         >>> import tempfile
@@ -226,7 +229,8 @@ def save(
     suffix = _suffix_of(named, _WRITERS)
     if isinstance(path, str | os.PathLike):
         check_output(path, overwrite)
-    scene = change_axes(scene, SCENE_AXES, axes or _FILE_AXES.get(suffix, SCENE_AXES))
+    axes = axes or _FILE_AXES.get(suffix, SCENE_AXES)
+    scene = change_axes(scene, SCENE_AXES, axes)
     dropped = losses(scene, named).dropped
     if dropped:
         warnings.warn(
@@ -234,9 +238,10 @@ def save(
             DroppedDataWarning,
             stacklevel=2,
         )
-    write: Callable[[GaussianScene, BinaryIO], None] = resolve_name(_WRITERS[suffix])
+    options = {"version": spz_version, "axes": axes} if suffix == ".spz" else {}
+    write: Callable[..., None] = resolve_name(_WRITERS[suffix])
     with output as file:
-        write(scene, file)
+        write(scene, file, **options)
 
 
 def losses(scene: GaussianScene, path: str | os.PathLike[str]) -> Losses:

@@ -9,6 +9,15 @@ MAGIC = 0x5053474E
 HEADER = struct.Struct("<IIIBBBB")
 ANTIALIASED_FLAG = 1
 EXTENSIONS_FLAG = 2
+AXES_EXTENSION = 0xADBE0003
+"""The type of Adobe's extension for the axes; its number counts the axes from 1."""
+
+FOURTH_HEADER_BYTES = 32
+"""Of version 4; extensions follow, then the sizes of the blocks, then the blocks."""
+
+TABLE_ENTRY = struct.Struct("<QQ")
+"""Bytes of a block, packed and unpacked."""
+
 COLOR_SCALE = np.float32(0.15)
 """Bytes of colour are ``0.5 + 0.15 sh0``, so that they hold more than what can be shown."""
 

@@ -1,7 +1,4 @@
-"""Read an ``.spz`` file: header, decompressed blocks (never more than it promises), and values.
-
-No other file imports zstandard.
-"""
+"""Read an ``.spz`` file: header, decompressed blocks (never more than it promises), and values."""
 
 import struct
 import warnings
@@ -18,11 +15,14 @@ from cvtgs.io.axes import AXES, SCENE_AXES, change_axes, checked_axes
 from cvtgs.io.files import open_input
 from cvtgs.io.sizes import check_expansion
 from cvtgs.io.spz.layout import (
+    AXES_EXTENSION,
     COLOR_SCALE,
     EXTENSIONS_FLAG,
+    FOURTH_HEADER_BYTES,
     HEADER,
     MAGIC,
     STORED_REST_COUNTS,
+    TABLE_ENTRY,
     SpzHeader,
 )
 from cvtgs.scene import GaussianScene
@@ -45,9 +45,6 @@ _MOST_EXPANSION = 1032
 """Deflate cannot make more than this many bytes of one."""
 
 _TABLE_START = slice(16, 20)
-_FOURTH_HEADER_BYTES = 32
-_AXES_EXTENSION = 0xADBE0003
-"""The type of Adobe's extension for the axes."""
 
 
 def read_spz(path: Path, *, axes: str | None = None, trust_sizes: bool = False) -> GaussianScene:
@@ -180,8 +177,8 @@ def _read_version_4(content: bytes, path: Path | str, *, trust_sizes: bool) -> _
     header = _header(content[: HEADER.size], path, versions=(4,))
     sizes = {name: size for name, size in header.sizes.items() if size}
     start = int.from_bytes(content[_TABLE_START], "little")
-    table = content[start : start + 16 * len(sizes)]
-    is_whole = start >= _FOURTH_HEADER_BYTES and len(table) == 16 * len(sizes)
+    table = content[start : start + TABLE_ENTRY.size * len(sizes)]
+    is_whole = start >= FOURTH_HEADER_BYTES and len(table) == TABLE_ENTRY.size * len(sizes)
     if header.streams != len(sizes) or not is_whole:
         raise FileFormatError(
             f"{path}: must hold {len(sizes)} blocks, found a table of {header.streams} at byte "
@@ -190,9 +187,9 @@ def _read_version_4(content: bytes, path: Path | str, *, trust_sizes: bool) -> _
     if not trust_sizes:
         _check_expansion(path, header, len(content))
     blocks = {"sh": np.empty(0, np.uint8)}
-    at = start + 16 * len(sizes)
+    at = start + TABLE_ENTRY.size * len(sizes)
     for (name, size), (packed, unpacked) in zip(
-        sizes.items(), struct.iter_unpack("<QQ", table), strict=True
+        sizes.items(), TABLE_ENTRY.iter_unpack(table), strict=True
     ):
         if unpacked != size or at + packed > len(content):
             raise FileFormatError(
@@ -201,7 +198,7 @@ def _read_version_4(content: bytes, path: Path | str, *, trust_sizes: bool) -> _
             )
         blocks[name] = _unzstd(content[at : at + packed], size, f"{path}: block {name!r}")
         at += packed
-    extensions = content[_FOURTH_HEADER_BYTES:start] if header.flags & EXTENSIONS_FLAG else b""
+    extensions = content[FOURTH_HEADER_BYTES:start] if header.flags & EXTENSIONS_FLAG else b""
     return _Content(header, blocks, _stated_axes(extensions, path))
 
 
@@ -210,7 +207,7 @@ def _stated_axes(extensions: bytes, path: Path | str) -> str | None:
     axes, at = None, 0
     while at + 8 <= len(extensions):
         kind, size = struct.unpack_from("<II", extensions, at)
-        if kind == _AXES_EXTENSION:
+        if kind == AXES_EXTENSION:
             number = int.from_bytes(extensions[at + 8 : at + 12], "little")
             if size != 4 or len(extensions) < at + 12 or number > len(AXES):
                 raise FileFormatError(

@@ -1,0 +1,109 @@
+"""Edits of ``cvtgs convert``."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from cvtgs import GaussianScene, load, save
+from cvtgs.boxes import Box
+from cvtgs.cli.main import main
+from cvtgs.edit import Motion, Sphere, crop, drop_faint, drop_large, merge, move
+from scenes import random_scene, same_bits
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> GaussianScene:
+    save(random_scene(200, degree=1), tmp_path / "a.ply")
+    return load(tmp_path / "a.ply")
+
+
+def converted(folder: Path, *words: str) -> GaussianScene:
+    target = folder / "out.ply"
+    command = ["convert", str(folder / "a.ply"), str(target), "--overwrite", *words]
+    assert main(command) == 0
+    return load(target)
+
+
+def test_each_edit_is_that_of_the_api(tmp_path: Path, scene: GaussianScene) -> None:
+    box, ball = Box(min=(-1, -1, -1), max=(0, 1, 1)), Sphere(center=(1.0, 0.0, 0.0), radius=0.7)
+    regions = ["--crop-box=-1,-1,-1,0,1,1", "--crop-sphere", "1,0,0,0.7"]
+    assert same_bits(converted(tmp_path, *regions), crop(scene, [box, ball]))
+    assert same_bits(converted(tmp_path, "--min-opacity", "0.3"), drop_faint(scene, 0.3))
+    assert same_bits(converted(tmp_path, "--max-size", "0.15"), drop_large(scene, 0.15))
+    motion = Motion.of_angles((90, 0, 45), scale=2.0, shift=(1.0, -2.0, 0.5))
+    words = ["--rotate", "90,0,45", "--scale", "2", "--translate", "1,-2,0.5"]
+    assert same_bits(converted(tmp_path, *words), move(scene, motion))
+    assert same_bits(converted(tmp_path), scene)
+
+
+def test_scenes_of_several_files_and_formats(tmp_path: Path, scene: GaussianScene) -> None:
+    save(random_scene(7, seed=1, degree=2), tmp_path / "b.ply")
+    save(random_scene(5, seed=2, degree=0), tmp_path / "c.glb")
+    others = [load(tmp_path / "b.ply"), load(tmp_path / "c.glb")]
+    names = [str(tmp_path / name) for name in ("b.ply", "c.glb")]
+    found = converted(tmp_path, "--merge", names[0], "--merge", names[1])
+    assert same_bits(found, merge([scene, *others]))
+    assert (len(found), found.sh_degree) == (212, 2)
+
+
+def test_what_is_printed(
+    tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--crop-sphere", "0,0,0,2", "--min-opacity", "0.5", "--sh-degree", "0"]
+    found = converted(tmp_path, "--merge", str(tmp_path / "a.ply"), *words)
+    inside = crop(merge([scene, scene]), [Sphere(center=(0.0, 0.0, 0.0), radius=2.0)])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert (
+        f"Lost: {400 - len(inside)} Gaussians (outside of --crop-box and --crop-sphere); "
+        f"{len(inside) - len(found)} Gaussians (below --min-opacity); SH bands above degree 0 "
+        f"(--sh-degree)."
+    ) in printed
+    assert 0 < len(found) < len(inside) < 400
+
+
+def test_edits_are_in_the_axes_of_a_ply(tmp_path: Path, scene: GaussianScene) -> None:
+    save(scene, tmp_path / "turned.ply", axes="rub")
+    words = [str(tmp_path / "turned.ply"), str(tmp_path / "out.ply"), "--axes", "rub", "--quiet"]
+    assert main(["convert", *words, "--crop-box=-9,0,-9,9,9,9"]) == 0
+    assert same_bits(load(tmp_path / "out.ply"), crop(scene, [Box(min=(-9, 0, -9), max=(9, 9, 9))]))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--crop-box", "1,2,3"], "--crop-box must be six numbers x,y,z,X,Y,Z, the least and the"),
+        (["--crop-box", "1,0,0,0,1,1"], "--crop-box must have finite numbers, none of the first"),
+        (["--crop-sphere", "0,0,0,-1"], "a radius of at least 0"),
+        (["--crop-sphere", "0,0,0,0"], "at least one Gaussian must be left to be written, found n"),
+        (["--min-opacity", "2"], "--min-opacity must be from 0 to 1, found 2.0."),
+        (["--max-size", "0"], "--max-size must be above 0, found 0.0."),
+        (["--scale", "-1"], "--scale must be above 0, found -1.0."),
+        (["--rotate", "90"], "--rotate must be three numbers x,y,z, degrees about each axis, fou"),
+        (["--translate", "nan,0,0"], "a motion must be of finite numbers"),
+        (["--merge", "missing.ply"], "missing.ply: the file to read must exist, found none."),
+    ],
+)
+def test_wrong_edits_write_nothing(
+    tmp_path: Path,
+    scene: GaussianScene,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    said: str,
+) -> None:
+    assert len(scene) == 200
+    target = tmp_path / "out.ply"
+    assert main(["convert", str(tmp_path / "a.ply"), str(target), *words]) == 1
+    assert said in capsys.readouterr().err
+    assert not target.exists()
+
+
+def test_older_spz_on_request(tmp_path: Path, scene: GaussianScene) -> None:
+    source, target = tmp_path / "a.ply", tmp_path / "a.spz"
+    words = ["convert", str(source), str(target), "--overwrite", "--quiet"]
+    starts = {}
+    for version in ("2", "3", "4"):
+        assert main([*words, "--spz-version", version]) == 0
+        starts[version] = target.read_bytes()[:2]
+        assert torch.allclose(load(target).means, scene.means, atol=1e-3)
+    assert starts == {"2": b"\x1f\x8b", "3": b"\x1f\x8b", "4": b"NG"}
