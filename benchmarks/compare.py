@@ -3,8 +3,8 @@ r"""Compare the presets, other methods and external tools: quality against secon
 ``python -m benchmarks.compare SCENE.ply ... -o DIR`` compares as CVT-GS does, but with images of
 the full scene instead of photographs: every method gets the same scenes and the same number of
 Gaussians M, and one scorer renders what it writes, without fine-tuning. Seconds are those of a
-separate process, with start, reading and writing. Output is one Markdown table, the mean over the
-scenes first; the folder gets that and a plot, updated after every scene.
+separate process, with start, reading and writing. Output are Markdown tables, means over the
+scenes first; the folder gets them and a plot, updated after every scene.
 
 Methods are the presets of cvtgs, ``standard, no network``, the baselines of
 ``benchmarks.baselines``, and any tool that reads and writes PLY files:
@@ -14,35 +14,38 @@ Methods are the presets of cvtgs, ``standard, no network``, the baselines of
         --tool "other=other-tool {IN} -o {OUT} --keep {RHO} --max {COUNT}"
 
 Scenes and judges are chosen as in ``benchmarks.quality``. Let it run once on a small scene first:
-what compiles itself does so then.
+what compiles itself does so then. ``--results FILE`` adds the results to those that the file has,
+and shows all of them, so that methods can be run one by one; ``--outputs DIR`` keeps every file
+that a method wrote with its seconds, and does not run again what lies there.
 """
 
 import argparse
+import json
 import re
 import shlex
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from statistics import mean
-from typing import Literal
 
 import cvtgs
 from benchmarks.baselines import BASELINES
-from benchmarks.measuring import Cost, machine, run, write_file
-from benchmarks.quality import (
-    MEAN,
-    SIZE,
-    VIEWS,
-    Quality,
-    Scorer,
-    make_scorer,
-    scenes,
-    scoring_parser,
+from benchmarks.cameras import cameras_file
+from benchmarks.compare_tables import (
+    Result,
+    Table,
+    chart,
+    failures,
+    joined,
+    markdown,
+    read_results,
+    results_json,
+    wrong_counts,
 )
+from benchmarks.measuring import Cost, machine, run, write_file
+from benchmarks.quality import SIZE, VIEWS, Scorer, make_scorer, scenes, scoring_parser
 from cvtgs.errors import MissingDependencyError
-from cvtgs.plots import Panel, Series, line_chart
 
 NO_NETWORK = "standard, no network"
 
@@ -55,48 +58,24 @@ class Task:
         source: The scene's file.
         rho: Share of Gaussians to keep.
         count: Number of Gaussians to keep.
+        output: The file to write.
     """
 
     source: Path
     rho: float
     count: int
-
-
-Clock = Literal["wall", "cpu"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Result:
-    """What one run of one method gave.
-
-    Attributes:
-        quality: Against the full scene.
-        wall_seconds: From the start of the process to its end.
-        cpu_seconds: Processor time outside the kernel.
-        count: Gaussians that it wrote.
-        wanted: Gaussians that it should have written.
-    """
-
-    quality: Quality
-    wall_seconds: float
-    cpu_seconds: float
-    count: int
-    wanted: int
-
-    def seconds(self, clock: Clock) -> float:
-        """Return the time on a clock."""
-        return self.wall_seconds if clock == "wall" else self.cpu_seconds
-
-
-Table = Mapping[str, Mapping[str, Sequence[Result | None]]]
-"""One result per ratio, None for a failure, by method, by scene."""
+    output: Path
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     options = parser().parse_args(arguments)
     commands = commands_of(options)
     text = ""
-    for table in measure(commands, options):
+    known = {} if options.results is None else read_results(options.results)
+    for measured in measure(commands, options):
+        table = joined(known, measured)
+        if options.results is not None:
+            write_file(options.results, results_json(table).encode())
         text = report(table, options)
         if options.output is not None:
             write_file(options.output / "compare.md", text.encode())
@@ -122,6 +101,8 @@ def parser() -> argparse.ArgumentParser:
         help="an external tool; {IN}, {OUT}, {RHO} and {COUNT} are filled in; may be repeated",
     )  # fmt: skip
     found.add_argument("--clock", choices=("wall", "cpu"), default="wall", help="whose seconds")
+    found.add_argument("--results", type=Path, metavar="FILE", help="add results to this file")
+    found.add_argument("--outputs", type=Path, metavar="DIR", help="keep the methods' files there")
     found.add_argument("-o", "--output", type=Path, help="folder for compare.md and compare.png")
     return found
 
@@ -161,20 +142,21 @@ def commands_of(options: argparse.Namespace) -> dict[str, list[str]]:
 
 def measure(commands: Mapping[str, list[str]], options: argparse.Namespace) -> Iterator[Table]:
     """Run every method on every scene; give the table so far after each scene."""
-    score = make_scorer(options)
-    table: dict[str, dict[str, list[Result | None]]] = {}
+    table: dict[str, dict[str, dict[float, Result | None]]] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for scene_name, scene, source in sources(options, folder):
-            tasks = [
-                Task(source=source, rho=rho, count=cvtgs.target_count(len(scene), rho))
-                for rho in options.rho
-            ]
-            runs = {
-                method: [attempt(command, task, folder / "small.ply") for task in tasks]
-                for method, command in commands.items()
-            }
-            table[scene_name] = judged(scene, runs, tasks, score=score)
+            runs = {}
+            for method, command in commands.items():
+                for rho in options.rho:
+                    place = folder / "small.ply"
+                    if options.outputs is not None:
+                        place = options.outputs / f"{scene_name} {rho:g} {method}.ply"
+                    count = cvtgs.target_count(len(scene), rho)
+                    task = Task(source=source, rho=rho, count=count, output=place)
+                    runs[method, task] = attempt(command, task, keep=options.outputs is not None)
+            score = make_scorer(options, options.files[len(table)] if options.files else None)
+            table[scene_name] = judged(scene, runs, score=score)
             print(f"compared on {scene_name}: {len(scene)} Gaussians", file=sys.stderr)
             yield dict(table)
 
@@ -193,9 +175,13 @@ def sources(
 Run = tuple[cvtgs.GaussianScene, Cost]
 
 
-def attempt(command: Sequence[str], task: Task, output: Path) -> Run | None:
-    """Run a method's command on a task; None if it fails."""
+def attempt(command: Sequence[str], task: Task, *, keep: bool) -> Run | None:
+    """Run a method's command on a task, unless its file was kept; None if it fails."""
+    output, costs = task.output, task.output.with_suffix(".json")
+    if keep and output.is_file() and costs.is_file():
+        return cvtgs.load(output), Cost(**json.loads(costs.read_text(encoding="utf-8")))
     output.unlink(missing_ok=True)
+    output.parent.mkdir(parents=True, exist_ok=True)
     places = {
         "{IN}": str(task.source),
         "{OUT}": str(output),
@@ -204,10 +190,13 @@ def attempt(command: Sequence[str], task: Task, output: Path) -> Run | None:
     }
     try:
         cost = run([filled(part, places) for part in command])
-        return cvtgs.load(output), cost
+        found = cvtgs.load(output)
     except (SystemExit, OSError, cvtgs.CvtgsError) as error:
         print(f"failed: {error}", file=sys.stderr)
         return None
+    if keep:
+        write_file(costs, json.dumps(asdict(cost)).encode())
+    return found, cost
 
 
 def filled(part: str, places: Mapping[str, str]) -> str:
@@ -217,141 +206,42 @@ def filled(part: str, places: Mapping[str, str]) -> str:
 
 
 def judged(
-    scene: cvtgs.GaussianScene,
-    runs: Mapping[str, Sequence[Run | None]],
-    tasks: Sequence[Task],
-    *,
-    score: Scorer,
-) -> dict[str, list[Result | None]]:
+    scene: cvtgs.GaussianScene, runs: Mapping[tuple[str, Task], Run | None], *, score: Scorer
+) -> dict[str, dict[float, Result | None]]:
     """Score everything that was made of one scene, all at once."""
-    small = [made[0] for row in runs.values() for made in row if made is not None]
+    small = [made[0] for made in runs.values() if made is not None]
     found = iter(score(scene, small) if small else [])
-    return {
-        method: [
-            None
-            if made is None
-            else Result(
-                quality=next(found),
-                wall_seconds=made[1].wall_seconds,
-                cpu_seconds=made[1].user_seconds,
-                count=len(made[0]),
-                wanted=task.count,
-            )
-            for made, task in zip(row, tasks, strict=True)
-        ]
-        for method, row in runs.items()
-    }
+    rows: dict[str, dict[float, Result | None]] = {}
+    for (method, task), made in runs.items():
+        rows.setdefault(method, {})[task.rho] = made and Result(
+            quality=next(found),
+            wall_seconds=made[1].wall_seconds,
+            cpu_seconds=made[1].user_seconds,
+            count=len(made[0]),
+            wanted=task.count,
+        )
+    return rows
 
 
 def report(table: Table, options: argparse.Namespace) -> str:
-    """Report what was measured, the table, and what is not as it should be."""
-    own = f"cvtgs' own renderer, {VIEWS} automatic views of {SIZE} x {SIZE} pixels"
-    judge = "the command of --scorer" if options.scorer else own
+    """Report what was measured, the tables, and what is not as it should be."""
+    judge = "cvtgs' own renderer, " + (
+        "cameras beside the scenes"
+        if options.files and all(cameras_file(file).is_file() for file in options.files)
+        else f"{VIEWS} automatic views of {SIZE} x {SIZE} pixels where none are beside a scene"
+    )
+    if options.scorer:
+        judge = "the command of --scorer"
     clock = "wall-clock" if options.clock == "wall" else "user CPU"
     parts = [
         f"Scenes: {', '.join(table)}. Judge: {judge}. "
         f"Seconds: {clock}, one process per run, reading and writing included; {machine()}. "
         f"cvtgs {cvtgs.__version__}.",
         markdown(table, options.rho, means_only=options.means, clock=options.clock),
-        wrong_counts(table, options.rho),
-        failures(table, options.rho),
+        wrong_counts(table),
+        failures(table),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
-
-
-METRICS: Mapping[str, tuple[Callable[[Result], float | None], str]] = {
-    "PSNR": (lambda result: result.quality.psnr, ".2f"),
-    "SSIM": (lambda result: result.quality.ssim, ".4f"),
-    "LPIPS": (lambda result: result.quality.lpips, ".4f"),
-}
-
-
-def markdown(
-    table: Table, ratios: Sequence[float], *, means_only: bool = False, clock: Clock = "wall"
-) -> str:
-    """Return a Markdown table: the mean first, then scene by scene.
-
-    A mean is over all scenes; a dash stands where a run failed or nothing was measured. There are
-    no columns for LPIPS if nobody measured it.
-    """
-    metrics = {**METRICS, "s": (lambda result: result.seconds(clock), ".1f")}
-    everything = [found for rows in table.values() for row in rows.values() for found in row]
-    if all(found is None or found.quality.lpips is None for found in everything):
-        del metrics["LPIPS"]
-    heads = [f"{name} at {rho:g}" for rho in ratios for name in metrics]
-    lines = [f"| scene | method | {' | '.join(heads)} |", "|---" * (len(heads) + 2) + "|"]
-    groups = {MEAN: list(table.values())}
-    if not means_only:
-        groups |= {scene: [rows] for scene, rows in table.items()}
-    for group, tables in groups.items():
-        for method in tables[0]:
-            cells = [
-                cell([found and value(found) for found in column], form)
-                for column in zip(*(rows[method] for rows in tables), strict=True)
-                for value, form in metrics.values()
-            ]
-            lines.append(f"| {group} | {method} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def cell(values: Sequence[float | None], form: str) -> str:
-    """Return the text of a mean, or a dash if a value is missing."""
-    known = [value for value in values if value is not None]
-    return f"{mean(known):{form}}" if len(known) == len(values) else "-"
-
-
-def wrong_counts(table: Table, ratios: Sequence[float]) -> str:
-    """Name the runs that did not give exactly M Gaussians; quality is not comparable there."""
-    lines = [
-        f"- {method}, {scene}, {rho:g}: {found.count:,} instead of {found.wanted:,}"
-        for scene, rows in table.items()
-        for method, row in rows.items()
-        for rho, found in zip(ratios, row, strict=True)
-        if found is not None and found.count != found.wanted
-    ]
-    return "\n".join(["Not the number of Gaussians that was asked for:\n", *lines] if lines else [])
-
-
-def failures(table: Table, ratios: Sequence[float]) -> str:
-    """Name the runs that failed."""
-    lines = [
-        f"- {method}, {scene}, {rho:g}"
-        for scene, rows in table.items()
-        for method, row in rows.items()
-        for rho, found in zip(ratios, row, strict=True)
-        if found is None
-    ]
-    return "\n".join(["Failed:\n", *lines] if lines else [])
-
-
-def chart(table: Table, ratios: Sequence[float], *, clock: Clock = "wall") -> bytes | None:
-    """Draw mean PSNR over mean seconds, a line per method and a point per ratio.
-
-    Points with a failure in any scene are left out; None if there are no others.
-    """
-    series = []
-    for method in next(iter(table.values())):
-        columns = zip(*(rows[method] for rows in table.values()), strict=True)
-        complete = [[found for found in column if found] for column in columns if all(column)]
-        if complete:
-            line = Series(
-                name=method,
-                x=[max(mean(each.seconds(clock) for each in column), 1e-3) for column in complete],
-                y=[mean(each.quality.psnr for each in column) for column in complete],
-                markers=True,
-            )
-            series.append(line)
-    if not series:
-        return None
-    shares = ", ".join(f"{rho:g}" for rho in sorted(ratios, reverse=True))
-    panel = Panel(
-        series=series,
-        title=f"Share of Gaussians kept: {shares} (from above)",
-        x_label="seconds, reading and writing included",
-        y_label="PSNR, dB",
-        log_x=True,
-    )
-    return line_chart([panel], width=1000, height=700)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """PSNR, SSIM and LPIPS against the full scene, of every preset or of single choices.
 
 ``python -m benchmarks.quality`` scores the presets on generated scenes with cvtgs' own renderer and
-views. Scenes of your own: name the files. LPIPS: ``--lpips WEIGHTS``. Another judge: ``--scorer
+views. Scenes of your own: name the files; cameras that lie beside a file (``benchmarks.cameras``)
+are used. LPIPS: ``--lpips WEIGHTS``. Another judge: ``--scorer
 "python score.py --json {full} {small}"``; it gets the full scene and the small ones, and prints a
 JSON list of objects with ``psnr``, ``ssim`` and perhaps ``lpips``, in that order.
 
@@ -20,12 +21,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
+from typing import Self
 
 import cvtgs
+from benchmarks.cameras import cameras_beside, cameras_file
 from cvtgs.cameras import Cameras
 from cvtgs.errors import FileFormatError
-from cvtgs.evaluation import EvaluationSettings, LpipsWeights, load_lpips
+from cvtgs.evaluation import EvaluationSettings, LpipsWeights, SceneScores, load_lpips
 from cvtgs.evaluation import scorer as scorers
+from cvtgs.evaluation.report import mean_of
 from cvtgs.views import automatic_views
 
 VIEWS = 8
@@ -34,6 +38,7 @@ SIZE = 400
 
 RATIOS = (0.1, 0.01, 0.001)
 MEAN = "mean"
+SCORES = ("psnr", "ssim", "lpips", "alpha_error", "alpha_bias")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,11 +49,26 @@ class Quality:
         psnr: dB.
         ssim: At most 1.
         lpips: At least 0, less is better; None if it was not measured.
+        alpha_error: Mean absolute difference of alpha, less is better; None if not measured.
+        alpha_bias: Mean of alpha minus that of the full scene; None if not measured.
     """
 
     psnr: float
     ssim: float
     lpips: float | None = None
+    alpha_error: float | None = None
+    alpha_bias: float | None = None
+
+    @classmethod
+    def of(cls, scores: SceneScores) -> Self:
+        """Take the means of an evaluation."""
+        return cls(
+            psnr=scores.psnr.mean,
+            ssim=scores.ssim.mean,
+            lpips=mean_of(scores.lpips),
+            alpha_error=mean_of(scores.alpha_error),
+            alpha_bias=mean_of(scores.alpha_bias),
+        )
 
 
 Simplify = Callable[[cvtgs.GaussianScene, float], cvtgs.GaussianScene]
@@ -95,9 +115,10 @@ def variants_of(
 
 def measure(variants: Mapping[str, Simplify], options: argparse.Namespace) -> Iterator[Table]:
     """Score every variant on every scene; give the table so far after each scene."""
-    score = make_scorer(options)
     table: dict[str, dict[str, list[Quality]]] = {}
     for name, scene in scenes(options.files, options.count):
+        file = options.files[len(table)] if options.files else None
+        score = make_scorer(options, file)
         small = [simplify(scene, rho) for simplify in variants.values() for rho in options.rho]
         found = iter(score(scene, small))
         table[name] = {variant: [next(found) for _ in options.rho] for variant in variants}
@@ -114,11 +135,13 @@ def scenes(files: Sequence[Path], count: int) -> Iterator[tuple[str, cvtgs.Gauss
         yield kind, cvtgs.synthetic.scene(kind, count, sh_degree=1, seed=seed)
 
 
-def make_scorer(options: argparse.Namespace) -> Scorer:
-    """Make what the options ask for; weights are read once."""
+def make_scorer(options: argparse.Namespace, file: Path | None) -> Scorer:
+    """Make what the options ask for, for the scene of a file or for a generated one."""
     if options.scorer:
         return command_scorer(options.scorer)
-    return own_scorer(None if options.lpips is None else any_lpips(options.lpips))
+    weights = None if options.lpips is None else any_lpips(options.lpips)
+    beside = file is not None and cameras_file(file).is_file()
+    return own_scorer(weights, cameras_beside(file) if file and beside else None)
 
 
 def any_lpips(path: Path) -> LpipsWeights:
@@ -129,21 +152,14 @@ def any_lpips(path: Path) -> LpipsWeights:
         return load_lpips("alex", path)
 
 
-def own_scorer(weights: LpipsWeights | None) -> Scorer:
-    """Score by cvtgs' own renderer and views."""
+def own_scorer(weights: LpipsWeights | None, cameras: Cameras | None = None) -> Scorer:
+    """Score by cvtgs' own renderer, from cameras or else from automatic views."""
 
     def score(full: cvtgs.GaussianScene, small: Sequence[cvtgs.GaussianScene]) -> list[Quality]:
-        cameras = automatic_views(full, VIEWS, width=SIZE, height=SIZE)
-        scorer = scorers.Scorer(full, cameras.singles(), metrics=scorers.Metrics(lpips=weights))
+        views = cameras or automatic_views(full, VIEWS, width=SIZE, height=SIZE)
+        scorer = scorers.Scorer(full, views.singles(), metrics=scorers.Metrics(lpips=weights))
         found = [scorers.scene_scores("", len(scene), scorer.score(scene)) for scene in small]
-        return [
-            Quality(
-                psnr=scores.psnr.mean,
-                ssim=scores.ssim.mean,
-                lpips=scores.lpips.mean if scores.lpips else None,
-            )
-            for scores in found
-        ]
+        return [Quality.of(scores) for scores in found]
 
     return score
 
@@ -151,14 +167,14 @@ def own_scorer(weights: LpipsWeights | None) -> Scorer:
 def score_views(
     full: cvtgs.GaussianScene, small: Mapping[str, cvtgs.GaussianScene], cameras: Cameras
 ) -> dict[str, Quality]:
-    """Return PSNR and SSIM of small scenes against the full one, means over the cameras."""
+    """Return scores of small scenes against the full one, means over the cameras."""
     settings = EvaluationSettings(lpips="off")
     found = cvtgs.evaluate(full, small, cameras, settings=settings)
-    return {one.name: Quality(psnr=one.psnr.mean, ssim=one.ssim.mean) for one in found.scenes}
+    return {one.name: Quality.of(one) for one in found.scenes}
 
 
 def command_scorer(template: str) -> Scorer:
-    """Score by a command, which gets files and prints JSON: ``psnr``, ``ssim``, maybe ``lpips``."""
+    """Score by a command, which gets files and prints JSON with scores by their names."""
 
     def score(full: cvtgs.GaussianScene, small: Sequence[cvtgs.GaussianScene]) -> list[Quality]:
         with tempfile.TemporaryDirectory() as folder:
@@ -169,7 +185,7 @@ def command_scorer(template: str) -> Scorer:
             command = shlex.split(template.format(full=first, small=" ".join(others)))
             output = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
         return [
-            Quality(psnr=entry["psnr"], ssim=entry["ssim"], lpips=entry.get("lpips"))
+            Quality(**{key: entry[key] for key in SCORES if key in entry})
             for entry in json.loads(output)
         ]
 
@@ -185,6 +201,8 @@ def means(table: Table) -> dict[str, list[Quality]]:
                 psnr=mean(quality.psnr for quality in column),
                 ssim=mean(quality.ssim for quality in column),
                 lpips=mean_or_none([quality.lpips for quality in column]),
+                alpha_error=mean_or_none([quality.alpha_error for quality in column]),
+                alpha_bias=mean_or_none([quality.alpha_bias for quality in column]),
             )
             for column in zip(*(rows[variant] for rows in table.values()), strict=True)
         ]
@@ -200,7 +218,9 @@ def mean_or_none(values: Sequence[float | None]) -> float | None:
 
 def markdown(table: Table, ratios: Sequence[float], *, means_only: bool = False) -> str:
     """Return a Markdown table: the mean first, then scene by scene."""
-    heads = [f"{name} at {rho:g}" for rho in ratios for name in ("PSNR", "SSIM", "LPIPS")]
+    heads = [
+        f"{name} at {rho:g}" for rho in ratios for name in ("PSNR", "SSIM", "LPIPS", "alpha error")
+    ]
     shown = {MEAN: means(table)} if means_only else {MEAN: means(table), **table}
     lines = [
         [scene, variant, *(cell for quality in row for cell in cells_of(quality))]
@@ -216,10 +236,12 @@ def markdown_rows(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
-def cells_of(quality: Quality) -> tuple[str, str, str]:
-    """Return the text of three columns; a dash for what was not measured."""
-    distance = "-" if quality.lpips is None else f"{quality.lpips:.4f}"
-    return f"{quality.psnr:.2f}", f"{quality.ssim:.4f}", distance
+def cells_of(quality: Quality) -> tuple[str, str, str, str]:
+    """Return the text of four columns; a dash for what was not measured."""
+    distance, error = (
+        "-" if value is None else f"{value:.4f}" for value in (quality.lpips, quality.alpha_error)
+    )
+    return f"{quality.psnr:.2f}", f"{quality.ssim:.4f}", distance, error
 
 
 def powers(power: str) -> dict[str, str]:

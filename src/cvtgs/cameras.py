@@ -146,8 +146,13 @@ class Cameras:
         Returns:
             Those cameras.
         """
-        count = min(count, len(self))
-        return self.select(torch.tensor([(k * len(self)) // count for k in range(count)]))
+        return self.select(torch.tensor(spread_rows(len(self), count)))
+
+
+def spread_rows(length: int, count: int) -> tuple[int, ...]:
+    """Return row numbers spread evenly over a length, all if ``count`` is no less."""
+    count = min(count, length)
+    return tuple((k * length) // count for k in range(count))
 
 
 def look_at(

@@ -9,6 +9,7 @@ import torch
 
 from cvtgs.config.base import Record
 from cvtgs.evaluation import Evaluation, SceneScores
+from cvtgs.evaluation.report import mean_of
 from cvtgs.io import atomic_output, check_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.report import Level
@@ -39,6 +40,9 @@ class LevelEntry(Record):
         psnr: Mean PSNR of the file against the full scene, dB; None if it was not measured.
         ssim: The same for SSIM.
         lpips: The same for LPIPS.
+        alpha_error: The same for the absolute difference of accumulated alpha.
+        alpha_bias: The same for the difference itself; negative where more of the background
+            shows through.
     """
 
     file: str
@@ -53,6 +57,8 @@ class LevelEntry(Record):
     psnr: float | None = None
     ssim: float | None = None
     lpips: float | None = None
+    alpha_error: float | None = None
+    alpha_bias: float | None = None
 
     @classmethod
     def of(cls, level: Level, rho: float, path: Path) -> Self:
@@ -89,9 +95,14 @@ class LevelEntry(Record):
         Returns:
             A new entry.
         """
-        lpips = None if scores.lpips is None else scores.lpips.mean
         return self.model_copy(
-            update={"psnr": scores.psnr.mean, "ssim": scores.ssim.mean, "lpips": lpips}
+            update={
+                "psnr": scores.psnr.mean,
+                "ssim": scores.ssim.mean,
+                "lpips": mean_of(scores.lpips),
+                "alpha_error": mean_of(scores.alpha_error),
+                "alpha_bias": mean_of(scores.alpha_bias),
+            }
         )
 
 

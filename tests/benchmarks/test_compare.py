@@ -7,7 +7,7 @@ import torch
 
 import cvtgs
 import lpips_cases
-from benchmarks import compare, quality
+from benchmarks import compare, compare_tables, quality
 from benchmarks.baselines import BASELINES, baseline
 
 pytestmark = pytest.mark.slow
@@ -44,7 +44,7 @@ def rows_of(text: str) -> list[list[str]]:
 
 def result(psnr: float, *, seconds: float = 2.0, lpips: float | None = None, count: int = 10):
     found = quality.Quality(psnr=psnr, ssim=0.5, lpips=lpips)
-    return compare.Result(
+    return compare_tables.Result(
         quality=found, wall_seconds=seconds, cpu_seconds=1.0, count=count, wanted=10
     )
 
@@ -60,12 +60,13 @@ def test_methods_and_a_tool_are_run_judged_and_reported(file, tmp_path, capsys):
     )
     text = capsys.readouterr().out
     head, _, *rows = rows_of(text)
-    assert head == ["scene", "method", "PSNR at 0.05", "SSIM at 0.05", "s at 0.05"]
-    assert [row[:2] for row in rows] == [
-        [scene, name] for scene in ("mean", "thing") for name in (*methods, "copy")
-    ]
-    assert all(5 < float(row[2]) < 60 and 0 < float(row[3]) <= 1 for row in rows)
-    assert all(0 < float(row[4]) < 100 for row in rows)
+    assert head == ["method", "PSNR", "SSIM", "alpha error", "alpha bias", "s"]
+    assert [row[0] for row in rows] == [*methods, "copy", "method", "---", *methods, "copy"]
+    assert all(5 < float(row[1]) < 60 and 0 < float(row[2]) <= 1 for row in rows[:3])
+    assert all(abs(float(row[4])) <= float(row[3]) < 1 for row in rows[:3])
+    assert all(0 < float(row[5]) < 100 for row in rows[:3])
+    assert rows[3] == ["method", "thing"]
+    assert rows[5][1].startswith(f"{float(rows[0][1]):.1f} / ")
     assert "- copy, thing, 0.05: 51 instead of 50" in text
     assert "Failed" not in text
     assert (out / "compare.md").read_text().strip() == text.strip()
@@ -77,9 +78,10 @@ def test_the_table_has_what_the_baseline_itself_gives(file, capsys):
     compare.main([str(file), "--rho", "0.1", "--methods", "mass pruning"])
     full = cvtgs.load(file)
     (found,) = quality.own_scorer(None)(full, [baseline("mass pruning")(full, 100)])
-    assert rows_of(capsys.readouterr().out)[-1][2:4] == [
+    assert rows_of(capsys.readouterr().out)[2][1:4] == [
         f"{found.psnr:.2f}",
         f"{found.ssim:.4f}",
+        f"{found.alpha_error:.4f}",
     ]
 
 
@@ -92,8 +94,9 @@ def test_a_failing_tool_does_not_stop_the_others(file, tmp_path, capsys):
     arguments = ["--rho", "0.1", "--methods", "opacity pruning", *tools, "-o", str(tmp_path)]
     compare.main([str(file), *arguments])
     text = capsys.readouterr().out
-    assert [row[2:] for row in rows_of(text)[-3:]] == [["-", "-", "-"]] * 3
-    assert float(rows_of(text)[-4][2]) > 5
+    assert [row[1:] for row in rows_of(text)[3:6]] == [["-"] * 5] * 3
+    assert [row[1:] for row in rows_of(text)[-3:]] == [["-"]] * 3
+    assert float(rows_of(text)[2][1]) > 5
     assert "Failed:\n\n- broken, thing, 0.1\n- silent, thing, 0.1\n- missing, thing, 0.1" in text
 
 
@@ -104,12 +107,13 @@ def test_another_judge_and_lpips(file, tmp_path, capsys):
     arguments = [str(file), "--rho", "0.1", "--methods", "opacity pruning", "--means"]
     compare.main([*arguments, "--lpips", weights])
     head, _, row = rows_of(capsys.readouterr().out)
-    assert head[4] == "LPIPS at 0.1"
-    assert float(row[4]) > 0
+    assert head[3] == "LPIPS"
+    assert float(row[3]) > 0
     (tmp_path / "judge.py").write_text('print(\'[{"psnr": 7, "ssim": 1}]\')')
     compare.main([*arguments, "--scorer", f"{sys.executable} {tmp_path / 'judge.py'}"])
     text = capsys.readouterr().out
-    assert rows_of(text)[-1][2:4] == ["7.00", "1.0000"]
+    assert rows_of(text)[0] == ["method", "PSNR", "SSIM", "s"]
+    assert rows_of(text)[2][1:3] == ["7.00", "1.0000"]
     assert "Judge: the command of --scorer" in text
 
 
@@ -146,26 +150,70 @@ def test_places_are_filled_and_other_braces_stay():
 
 def test_means_are_over_scenes_and_a_failure_leaves_a_dash():
     table = {
-        "a": {"x": [result(20.0, lpips=0.1), result(30.0)], "y": [result(10.0), None]},
-        "b": {"x": [result(30.0, seconds=4.0), result(30.0)], "y": [result(11.0), result(1.0)]},
+        "a": {
+            "x": {0.1: result(20.0, lpips=0.1), 0.01: result(30.0)},
+            "y": {0.1: result(10.0), 0.01: None},
+        },
+        "b": {"x": {0.1: result(30.0, seconds=4.0), 0.01: result(30.0)}, "y": {0.1: result(11.0)}},
     }
-    text = compare.markdown(table, [0.1, 0.01], means_only=True)
-    assert rows_of(text)[2:] == [
-        ["mean", "x", "25.00", "0.5000", "-", "3.0", "30.00", "0.5000", "-", "2.0"],
-        ["mean", "y", "10.50", "0.5000", "-", "2.0", "-", "-", "-", "-"],
+    text = compare_tables.markdown(table, [0.1, 0.01], means_only=True)
+    assert rows_of(text) == [
+        ["method", "PSNR", "SSIM", "LPIPS", "s"],
+        ["---"] * 5,
+        ["x", "25.00", "0.5000", "-", "3.0"],
+        ["y", "10.50", "0.5000", "-", "2.0"],
+        ["method", "PSNR", "SSIM", "LPIPS", "s"],
+        ["---"] * 5,
+        ["x", "30.00", "0.5000", "-", "2.0"],
+        ["y", "-", "-", "-", "-"],
     ]
-    cpu = compare.markdown(table, [0.1, 0.01], means_only=True, clock="cpu")
-    assert rows_of(cpu)[2][5] == "1.0"
-    assert compare.failures(table, [0.1, 0.01]).splitlines()[2:] == ["- y, a, 0.01"]
-    assert compare.wrong_counts(table, [0.1, 0.01]) == ""
+    single = compare_tables.scenes_table(table, 0.01)
+    assert rows_of(single)[2:] == [["x", "30.0 / 0.500", "30.0 / 0.500"], ["y", "-", "-"]]
+    cpu = compare_tables.markdown(table, [0.1, 0.01], means_only=True, clock="cpu")
+    assert rows_of(cpu)[2][-1] == "1.0"
+    assert compare_tables.failures(table).splitlines()[2:] == ["- y, a, 0.01"]
+    assert compare_tables.wrong_counts(table) == ""
+
+
+def test_results_are_joined_and_come_back_from_their_file(tmp_path):
+    first = {"a": {"x": {0.1: result(20.0)}, "y": {0.1: result(10.0, lpips=0.5)}}}
+    second = {"a": {"x": {0.1: None, 0.01: result(30.0)}}, "b": {"z": {0.1: result(1.0)}}}
+    both = compare_tables.joined(first, second)
+    assert both["a"]["x"] == {0.1: None, 0.01: result(30.0)}
+    assert both["a"]["y"] == first["a"]["y"]
+    assert compare_tables.methods_of(both) == ["x", "y", "z"]
+    (tmp_path / "results.json").write_text(compare_tables.results_json(both))
+    assert compare_tables.read_results(tmp_path / "results.json") == both
+    assert compare_tables.read_results(tmp_path / "none.json") == {}
+
+
+@pytest.mark.slow
+def test_kept_files_are_not_made_again_and_results_add_up(file, tmp_path, capsys):
+    (tmp_path / "first_rows.py").write_text(COPY)
+    common = [str(file), "--rho", "0.05", "--results", str(tmp_path / "results.json")]
+    common += ["--outputs", str(tmp_path / "kept"), "--methods"]
+    tool = f"copy={sys.executable} {tmp_path / 'first_rows.py'} {{IN}} {{OUT}} {{COUNT}} 0"
+    compare.main([*common, "--tool", tool])
+    first = rows_of(capsys.readouterr().out)[2]
+    (tmp_path / "first_rows.py").write_text("raise SystemExit(1)")
+    compare.main([*common, "opacity pruning", "--tool", tool])
+    rows = rows_of(capsys.readouterr().out)
+    assert rows[2] == first
+    assert rows[3][0] == "opacity pruning"
 
 
 def test_the_plot_shows_what_succeeded_everywhere(monkeypatch):
-    table = {"a": {"x": [result(20.0), result(10.0)], "y": [result(9.0), None], "z": [None, None]}}
+    table = {
+        "a": {
+            "x": {0.1: result(20.0), 0.01: result(10.0)},
+            "y": {0.1: result(9.0), 0.01: None},
+            "z": {0.1: None},
+        }
+    }
     drawn = []
-    monkeypatch.setattr(compare, "line_chart", lambda panels, **_: drawn.extend(panels))
-    compare.chart(table, [0.1, 0.01])
+    monkeypatch.setattr(compare_tables, "line_chart", lambda panels, **_: drawn.extend(panels))
+    compare_tables.chart(table, [0.1, 0.01])
     lines = {line.name: (line.x, line.y, line.markers) for line in drawn[0].series}
     assert lines == {"x": ([2.0, 2.0], [20.0, 10.0], True), "y": ([2.0], [9.0], True)}
     assert drawn[0].log_x
-    assert compare.chart({"a": {"z": [None]}}, [0.1]) is None
+    assert compare_tables.chart({"a": {"z": {0.1: None}}}, [0.1]) is None

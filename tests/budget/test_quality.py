@@ -104,6 +104,8 @@ def test_the_scores_are_those_of_an_evaluation(full, views, simplifier):
     wanted = cvtgs.evaluation.evaluate(full, {"small": small}, views, settings=settings).scenes[0]
     assert quality.psnr == pytest.approx(wanted.psnr.mean, abs=1e-4)
     assert quality.ssim == pytest.approx(wanted.ssim.mean, abs=1e-5)
+    assert quality.alpha_error == pytest.approx(wanted.alpha_error.mean, abs=1e-6)
+    assert quality.alpha_bias == pytest.approx(wanted.alpha_bias.mean, abs=1e-6)
 
 
 def test_the_full_scene_is_rendered_once(full, views, simplifier, monkeypatch):

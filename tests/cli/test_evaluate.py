@@ -136,6 +136,15 @@ def test_compare_writes_page_sheet_and_maps(scenes, tmp_path, capsys):
     assert main([*words, "--overwrite"]) == 0
 
 
+def test_evaluate_and_compare_print_the_same_scores(folder, scenes, tmp_path, capsys):
+    for number, words in enumerate(([], ["--cameras", str(folder / "transforms.json")])):
+        words = [*scenes, *words, "--lpips", "off"]  # noqa: PLW2901
+        assert main(["evaluate", *words]) == 0
+        evaluated = capsys.readouterr().out
+        assert main(["compare", *words, "-o", str(tmp_path / str(number))]) == 0
+        assert capsys.readouterr().out.startswith(evaluated)
+
+
 def test_compare_takes_eight_of_many_cameras(folder, scenes, tmp_path, capsys):
     words = ["--cameras", str(folder / "transforms.json"), "--lpips", "off"]
     assert main(["compare", *scenes[:2], "-o", str(tmp_path), *words]) == 0

@@ -25,7 +25,15 @@ from cvtgs.evaluation import (
     write_comparison,
 )
 from cvtgs.evaluation.comparison_files import bytes_text, contact_sheet, error_sheet
-from cvtgs.evaluation.images import ERROR_SCALE, encode, error_map, read_image
+from cvtgs.evaluation.images import (
+    ALPHA_SCALE,
+    ERROR_SCALE,
+    alpha_colors,
+    alpha_error_map,
+    encode,
+    error_map,
+    read_image,
+)
 from cvtgs.evaluation.page import comparison_page, render_template
 from cvtgs.evaluation.scorer import Metrics
 from cvtgs.rendering import render
@@ -33,6 +41,7 @@ from cvtgs.views import automatic_views
 from lpips_cases import random_images, random_weights
 
 OFF = EvaluationSettings(lpips="off")
+PARTS = ("images", "errors", "alpha_errors")
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +146,12 @@ def test_evaluate_refuses_what_makes_no_sense(scene, cameras):
 def test_the_background_shows_through(scene, small, cameras):
     settings = EvaluationSettings(lpips="off", background=(1.0, 1.0, 1.0))
     white = compare(scene, small, cameras, settings=settings)
-    assert (white.full[:, 0, 0] == 255).all()
+    assert (white.full.colors[:, 0, 0] == 255).all()
+    black = compare(scene, small, cameras, settings=OFF)
+    assert (white.full.alphas == black.full.alphas).all()
+    for one, other in zip(white.evaluation.scenes, black.evaluation.scenes, strict=True):
+        assert one.psnr != other.psnr
+        assert one.alpha_error == other.alpha_error
 
 
 def test_photographs_are_found_by_name_suffix_and_last_part(tmp_path, cameras):
@@ -191,11 +205,38 @@ def test_error_maps_grow_brighter_with_the_error():
     assert error_map(black[:, :1], limit).tolist()[0][0] == pytest.approx([252, 253, 191], abs=6)
 
 
+def test_maps_of_alpha_are_warm_where_the_background_shows_and_cold_where_less_does():
+    full = np.full((1, 3), 100, np.uint8)
+    holes, equal, cover = alpha_error_map(full, np.array([[75, 100, 125]], np.uint8))[0].astype(int)
+    assert holes[0] > holes[2] + 100
+    assert cover[2] > cover[0] + 100
+    assert equal.max() < 10
+    ends = np.array([[-ALPHA_SCALE, -1.0, ALPHA_SCALE]], np.float32)
+    assert alpha_colors(ends)[0].tolist() == [[255, 246, 205], [255, 246, 205], [214, 240, 255]]
+
+
+def test_scores_are_of_all_views_where_images_of_few_are_kept(scene, small, cameras):
+    names = ("a", "b", "c")
+    few = compare(scene, small, replace(cameras, names=names), most_images=2, settings=OFF)
+    assert few.evaluation == evaluate(scene, small, replace(cameras, names=names), settings=OFF)
+    assert (few.shown, few.views) == ((0, 1), ("a", "b"))
+    assert few.full.colors.shape == (2, 36, 48, 3)
+    assert few.small["0.1"].alphas.shape == (2, 36, 48)
+    data = data_of(comparison_page(few))
+    assert (data["views"], data["shown"], data["scored"]) == (["a", "b"], [0, 1], 3)
+    with pytest.raises(ValueError, match="most_images must be at least 1, found 0"):
+        compare(scene, small, cameras, most_images=0, settings=OFF)
+
+
 @pytest.mark.slow
 def test_sheets_hold_every_image(comparison):
     sheet, errors = contact_sheet(comparison), error_sheet(comparison)
+    full, tenth = comparison.full.alphas[2], comparison.small["0.1"].alphas[2]
+    wanted = alpha_error_map(full, tenth)
+    windows = np.lib.stride_tricks.sliding_window_view(errors, wanted.shape)[:, :, 0]
+    assert (windows == wanted).all(axis=(2, 3, 4)).any()
     assert sheet.dtype == errors.dtype == np.uint8
-    full = comparison.full[1]
+    full = comparison.full.colors[1]
     windows = np.lib.stride_tricks.sliding_window_view(sheet, full.shape)[:, :, 0]
     assert (windows == full).all(axis=(2, 3, 4)).any()
     assert errors.shape[1] == sheet.shape[1]
@@ -211,7 +252,7 @@ def test_the_page_holds_everything_and_needs_nothing(comparison):
     assert data["reference"] == {"name": "full", "count": 3000, "bytes": 123_456}
     assert [scene["count"] for scene in data["small"]] == [300, 30]
     assert [scene["bytes"] for scene in data["small"]] == [12_345, None]
-    assert all(len(scene[part]) == 3 for scene in data["small"] for part in ("images", "errors"))
+    assert all(len(scene[part]) == 3 for scene in data["small"] for part in PARTS)
     without_images = re.sub(r"data:image/webp;base64,[\w+/=]+", "", page)
     assert not re.search(r"(https?:)?//[a-z]|src=|@import|url\(|fetch\(|XMLHttp", without_images)
     assert "{{" not in without_images

@@ -52,7 +52,8 @@ def test_the_script_runs_and_shows_the_first_view(page):
     assert text_of(html, "view-name") == "view 1"
     first = evaluation.scenes[0]
     score = f"PSNR {first.psnr.views[0]:.2f} dB · SSIM {first.ssim.views[0]:.3f}"
-    assert text_of(html, "score") == score
+    alpha = f" · Alpha error {first.alpha_error.views[0]:.4f} · Alpha bias "
+    assert text_of(html, "score").startswith(score + alpha)
     assert "10\u00d7 fewer" in html
     assert "100 Gaussians · 6.8 kB · small_0.1.ply" in html
 
@@ -75,10 +76,24 @@ def test_differences_and_equal_scenes_are_shown(page):
     path, _ = page
     html = dom(path, "#view=3&small=3&error=1")
     assert attribute(html, "error") == "1"
-    assert "PSNR equal · SSIM 1.000" in text_of(html, "score")
+    assert "PSNR equal · SSIM 1.000 · Alpha error 0.0000 · Alpha bias 0.0000" in text_of(
+        html, "score"
+    )
     assert re.search(r'id="differences"[^>]*aria-pressed="true"', html)
     assert not re.search(r'id="scale"[^>]* hidden', html)
-    assert "Where a_scene_with" in html
+    assert "Where colours of a_scene_with" in html
+
+
+@pytest.mark.slow
+def test_errors_of_alpha_have_a_map_and_a_scale_of_their_own(page):
+    path, _ = page
+    html = dom(path, "#view=3&small=2&error=2")
+    assert attribute(html, "error") == "2"
+    assert re.search(r'id="alpha"[^>]*aria-pressed="true"', html)
+    assert re.search(r'id="differences"[^>]*aria-pressed="false"', html)
+    assert re.search(r'id="scale"[^>]* hidden', html)
+    assert not re.search(r'id="alpha-scale"[^>]* hidden', html)
+    assert "Where small_0.01.ply covers less or more than the full scene in view 3" in html
 
 
 @pytest.mark.slow

@@ -127,6 +127,9 @@ def test_csv_has_a_line_per_run_and_seconds_per_stage():
     assert rows[2]["visibility_seconds"] == "5.0"
     assert rows[0]["visibility_seconds"] == ""
     assert rows[0]["fronts"] == "psnr ssim"
+    with_alpha = tradeoff(result("draft", 2.0, 20.0, alpha_error=0.5, alpha_bias=-0.25)).to_csv()
+    (row,) = csv.DictReader(io.StringIO(with_alpha))
+    assert (row["alpha_error"], row["alpha_bias"]) == ("0.5", "-0.25")
     assert float(rows[3]["rho"]) == 0.01
 
 
@@ -149,9 +152,14 @@ def test_words_of_the_table():
         "all, s": "2.00",
         "PSNR, dB": "20.00*",
         "SSIM": "0.2000*",
+        "alpha error": "",
+        "alpha bias": "",
         "file": "4.2 kB",
         "memory": "300 MB",
     }
+    covered = result("draft", 2.0, 20.0, alpha_error=0.0123, alpha_bias=-0.01)
+    assert cells(made, covered)["alpha error"] == "0.0123"
+    assert cells(made, covered)["alpha bias"] == "-0.0100"
     assert heading(made, 0.01) == "rho 0.01: 50 of 500 Gaussians"
     assert "1 views of 64 x 48 pixels" in how_measured(made)
     assert how_measured(made).endswith(" on abacus.")

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
+from statistics import fmean
 from typing import Literal, NamedTuple
 
 from cvtgs.cameras import Cameras
@@ -42,11 +43,15 @@ class Tried:
         count: The number.
         psnr: Mean PSNR over the held-out views, dB, at most 60 each.
         ssim: Mean SSIM over them.
+        alpha_error: Mean absolute difference of accumulated alpha over them.
+        alpha_bias: Mean difference; negative where more of the background shows through.
     """
 
     count: int
     psnr: float
     ssim: float
+    alpha_error: float
+    alpha_bias: float
 
 
 class Found(NamedTuple):
@@ -57,6 +62,8 @@ class Found(NamedTuple):
         report: The report of its simplification.
         psnr: Its mean PSNR over the held-out views, dB, at most 60 each.
         ssim: Its mean SSIM over them.
+        alpha_error: Its mean absolute difference of accumulated alpha over them.
+        alpha_bias: Its mean difference; negative where more of the background shows through.
         tried: Everything that was tried, in that order.
     """
 
@@ -64,6 +71,8 @@ class Found(NamedTuple):
     report: SimplifyReport
     psnr: float
     ssim: float
+    alpha_error: float
+    alpha_bias: float
     tried: tuple[Tried, ...]
 
 
@@ -179,7 +188,15 @@ def find_count(
             f"{target.text(target.of(nearest))}."
         )
     (small, report), quality = best
-    return Found(small, report, quality.psnr, quality.ssim, tuple(tried))
+    return Found(
+        scene=small,
+        report=report,
+        psnr=quality.psnr,
+        ssim=quality.ssim,
+        alpha_error=quality.alpha_error,
+        alpha_bias=quality.alpha_bias,
+        tried=tuple(tried),
+    )
 
 
 def heldout_scorer(
@@ -199,8 +216,15 @@ def heldout_scorer(
 
 def heldout_quality(scorer: Scorer, small: GaussianScene, *, count: int) -> Tried:
     """Score a small scene over the held-out views."""
-    scores = scene_scores("", len(small), scorer.score(small))
-    return Tried(count=count, psnr=scores.psnr.mean, ssim=scores.ssim.mean)
+    rows = scorer.score(small)
+    scores = scene_scores("", len(small), rows)
+    return Tried(
+        count=count,
+        psnr=scores.psnr.mean,
+        ssim=scores.ssim.mean,
+        alpha_error=fmean(row.alpha_error for row in rows),
+        alpha_bias=fmean(row.alpha_bias for row in rows),
+    )
 
 
 def smallest_enough(

@@ -88,7 +88,8 @@ def demo(options: argparse.Namespace) -> None:
 
 
 def _scores(scores: "SceneScores") -> dict[str, str]:
-    return {"PSNR, dB": f"{scores.psnr.mean:.2f}", "SSIM": f"{scores.ssim.mean:.3f}"}
+    alpha = {"alpha error": f"{scores.alpha_error.mean:.4f}"} if scores.alpha_error else {}
+    return {"PSNR, dB": f"{scores.psnr.mean:.2f}", "SSIM": f"{scores.ssim.mean:.3f}"} | alpha
 
 
 def _column(path: Path, count: int, stages: "Sequence[StageCost]") -> dict[str, str]:

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 MOST_CAMERAS = 8
 """Cameras that a page shows unless ``--views`` sets another number."""
 
+SCORED_SIZE = 640
+"""Pixels of the longer side where scenes are scored, so that all commands print one score."""
+
 ALPHA_MEANS = "alpha: mean |difference| of coverage; bias < 0: more of the background shows"
 
 
@@ -141,7 +144,7 @@ def add_evaluate(add_parser: AddParser) -> None:
         help="directory of the photographs of --cameras, found by name",
     )
     add_options(parser, "--json")
-    add_view_options(parser, size=640)
+    add_view_options(parser, size=SCORED_SIZE)
 
 
 def evaluate(options: argparse.Namespace) -> None:
@@ -213,11 +216,12 @@ def add_compare(add_parser: AddParser) -> None:
         help="write a page that shows the full scene and simplified ones side by side",
         description="Write index.html, a single file that works offline, with a divider between "
         "REF and each SMALL; sheet.png, all images with their scores; and errors.png, maps of "
-        f"the differences. Of --cameras, {MOST_CAMERAS} are used unless --views sets a number.",
+        f"the errors of colour and of alpha. Scores are those of cvtgs evaluate; of many "
+        f"--cameras, {MOST_CAMERAS} are shown unless --views sets a number.",
     )
     parser.set_defaults(run=compare)
     add_options(parser, "reference", "small", "--lpips", "-o/--output", "--overwrite")
-    add_view_options(parser, size=800)
+    add_view_options(parser, size=SCORED_SIZE)
 
 
 def compare(options: argparse.Namespace) -> None:
@@ -231,9 +235,10 @@ def compare(options: argparse.Namespace) -> None:
         comparison = cvtgs.evaluation.compare(
             scenes.reference,
             scenes.others,
-            choose_cameras(options, scenes.reference, most=MOST_CAMERAS),
+            choose_cameras(options, scenes.reference),
             reference_name=scenes.name,
             sizes=scenes.sizes,
+            most_images=options.views or MOST_CAMERAS,
             settings=evaluation_settings(options),
             listener=listener,
         )
@@ -241,11 +246,7 @@ def compare(options: argparse.Namespace) -> None:
             comparison, options.output, overwrite=options.overwrite, listener=listener
         )
     if not options.quiet:
-        for scores in comparison.evaluation.scenes:
-            say(
-                f"{scores.name}: {scores.count:,} Gaussians, "
-                f"PSNR {scores.psnr.mean:.2f} dB, SSIM {scores.ssim.mean:.4f}"
-            )
+        _print_scores(comparison.evaluation, scenes.sizes)
         say(f"Wrote {', '.join(path.name for path in paths)}. Open {paths[-1]} in a browser.")
 
 
@@ -267,7 +268,7 @@ def add_tradeoff(add_parser: AddParser) -> None:
         "--save", action="store_true", help="write the simplified scenes to DIR, too"
     )
     add_options(parser, "--lpips", "--overwrite")
-    add_view_options(parser, size=640)
+    add_view_options(parser, size=SCORED_SIZE)
 
 
 def tradeoff(options: argparse.Namespace) -> None:

@@ -114,10 +114,14 @@ def _score(
 def _print_index(index: "LevelsIndex") -> None:
     width = max(len(level.file) for level in index.levels)
     say(f"{index.source}, {index.source_count:,} Gaussians:")
-    say(f"  {'':{width}}  {'Gaussians':>12}  {'size':>9}  {'error':>9}  {'PSNR':>6}  seconds")
+    say(
+        f"  {'':{width}}  {'Gaussians':>12}  {'size':>9}  {'error':>9}  {'PSNR':>6}  "
+        f"{'alpha':>6}  seconds"
+    )
     for level in index.levels:
         psnr = "-" if level.psnr is None else f"{level.psnr:.2f}"
+        alpha = "-" if level.alpha_error is None else f"{level.alpha_error:.4f}"
         say(
             f"  {level.file:{width}}  {level.count:>12,}  {size_text(level.bytes):>9}  "
-            f"{level.geometric_error:>9.3g}  {psnr:>6}  {level.seconds:.2f}"
+            f"{level.geometric_error:>9.3g}  {psnr:>6}  {alpha:>6}  {level.seconds:.2f}"
         )

@@ -211,8 +211,9 @@ def _simplify_in_memory(
         )
         small, report = found.scene, found.report
         notes.append(
-            f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f} over views that were held out; "
-            f"found in {len(found.tried)} tries."
+            f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f}, alpha error "
+            f"{found.alpha_error:.4f} (bias {found.alpha_bias:+.4f}) over views that were "
+            f"held out; found in {len(found.tried)} tries."
         )
     else:
         keep = None

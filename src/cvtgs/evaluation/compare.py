@@ -1,16 +1,17 @@
 """Scores and images of simplified scenes next to the full one, and to photographs."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from cvtgs.cameras import Cameras
+from cvtgs.cameras import Cameras, spread_rows
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.evaluation.images import as_bytes
+from cvtgs.evaluation.images import alpha_as_bytes, as_bytes
 from cvtgs.evaluation.report import Evaluation, SceneScores
 from cvtgs.evaluation.scorer import (
     EvaluationSettings,
@@ -26,6 +27,24 @@ STAGE = "evaluate"
 """The stage of the progress events; a step is an image."""
 
 Images = UInt8[np.ndarray, "c h w 3"]
+Alphas = UInt8[np.ndarray, "c h w"]
+
+
+class SceneImages(NamedTuple):
+    """Images of one scene, 8 bits.
+
+    Attributes:
+        colors: ``(c, h, w, 3)`` over the background.
+        alphas: ``(c, h, w)`` accumulated alpha: the share of each pixel that the scene covers.
+    """
+
+    colors: Images
+    alphas: Alphas
+
+
+class _RenderedImage(NamedTuple):
+    color: Float[Tensor, "1 h w 3"]
+    alpha: Float[Tensor, "1 h w"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -33,16 +52,23 @@ class Comparison:
     """Images, scores and sizes of a full scene and of simplified ones.
 
     Attributes:
-        evaluation: The scores.
-        full: ``(c, h, w, 3)`` images of the full scene, 8 bits.
+        evaluation: The scores, over all views.
+        shown: Numbers of the views whose images are kept, ``c`` of them.
+        full: Images of the full scene.
         small: The same of each simplified scene, by name.
         sizes: Bytes of the files by name of the scene, the full one included; may lack some.
     """
 
     evaluation: Evaluation
-    full: Images
-    small: Mapping[str, Images]
+    shown: tuple[int, ...]
+    full: SceneImages
+    small: Mapping[str, SceneImages]
     sizes: Mapping[str, int]
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of the views whose images are kept."""
+        return tuple(self.evaluation.views[view] for view in self.shown)
 
     def ratio(self, scores: SceneScores) -> float:
         """Return how many times fewer Gaussians a simplified scene has.
@@ -111,12 +137,13 @@ def compare(
     *,
     reference_name: str = "full",
     sizes: Mapping[str, int] | None = None,
+    most_images: int | None = None,
     settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
     listener: ProgressListener = silent,
 ) -> Comparison:
     """Score simplified scenes by images, and keep the images.
 
-    Memory: ``3 c h w`` bytes per scene, and what :func:`cvtgs.evaluation.evaluate` needs.
+    Memory: ``4 c h w`` bytes per scene, and what :func:`cvtgs.evaluation.evaluate` needs.
 
     Args:
         reference: The full scene.
@@ -124,6 +151,8 @@ def compare(
         cameras: From where to look.
         reference_name: Name of the full scene.
         sizes: Bytes of the files, by name.
+        most_images: Keep images of as many views at most, spread over their order; the scores
+            are those of all views. None keeps all.
         settings: Background, which LPIPS, and what renders.
         listener: Called after each image.
 
@@ -131,7 +160,8 @@ def compare(
         The images and the scores.
 
     Raises:
-        InvalidArgumentError: There is no camera, or two scenes share a name.
+        InvalidArgumentError: There is no camera, two scenes share a name, or ``most_images`` is
+            below 1.
         DeviceError: The backend does not work on a scene's device.
         MissingDependencyError: The backend's package or the chosen LPIPS is missing.
 
@@ -140,15 +170,30 @@ def compare(
         >>> from cvtgs.synthetic import scene as make
         >>> scene = make("object", 500, sh_degree=0)
         >>> cameras = automatic_views(scene, 2, width=32, height=24)
-        >>> compare(scene, {"same": scene}, cameras).full.shape
+        >>> compare(scene, {"same": scene}, cameras).full.colors.shape
         (2, 24, 32, 3)
     """
+    if most_images is not None and most_images < 1:
+        raise InvalidArgumentError(f"most_images must be at least 1, found {most_images}.")
     scenes = _named_scenes(reference, small, reference_name)
-    shape = (len(cameras), cameras.height, cameras.width, 3)
-    images = {name: np.zeros(shape, np.uint8) for name in scenes}
-    evaluation = _score_images(scenes, cameras, images=images, settings=settings, listener=listener)
+    shown = spread_rows(len(cameras), most_images or len(cameras))
+    shape = (len(shown), cameras.height, cameras.width)
+    images = {
+        name: SceneImages(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8))
+        for name in scenes
+    }
+    places = {view: place for place, view in enumerate(shown)}
+
+    def keep(name: str, view: int, image: _RenderedImage) -> None:
+        if view in places:
+            images[name].colors[places[view]] = as_bytes(image.color[0])
+            images[name].alphas[places[view]] = alpha_as_bytes(image.alpha[0])
+
+    evaluation = _score_images(scenes, cameras, keep=keep, settings=settings, listener=listener)
     full = images.pop(reference_name)
-    return Comparison(evaluation=evaluation, full=full, small=images, sizes=dict(sizes or {}))
+    return Comparison(
+        evaluation=evaluation, shown=shown, full=full, small=images, sizes=dict(sizes or {})
+    )
 
 
 def _named_scenes(
@@ -167,11 +212,11 @@ def _score_images(
     cameras: Cameras,
     *,
     photographs: Float[Tensor, "c h w 3"] | None = None,
-    images: Mapping[str, Images] | None = None,
+    keep: Callable[[str, int, _RenderedImage], None] = lambda name, view, image: None,
     settings: EvaluationSettings,
     listener: ProgressListener,
 ) -> Evaluation:
-    """Score all scenes against the first, view by view; fill ``images`` where they are given."""
+    """Score all scenes against the first, view by view; hand every image to ``keep``."""
     if len(cameras) == 0:
         raise InvalidArgumentError("an evaluation needs at least one camera, found none.")
     wanted = (len(cameras), cameras.height, cameras.width, 3)
@@ -187,21 +232,20 @@ def _score_images(
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
     for view in range(len(cameras)):
         camera = cameras.select(torch.tensor([view]))
-        truth = truth_alpha = reference.means.new_zeros(0)
+        truth: _RenderedImage | None = None
         for name, scene in scenes.items():
             rendered = render_view(scene, camera, backend=settings.backend)
             backend = rendered.backend
-            background = scene.means.new_tensor(settings.background)
-            image = rendered.over(background).clamp(0, 1)
-            if images is not None:
-                images[name][view] = as_bytes(image[0])
-            if name == reference_name:
-                truth, truth_alpha = image, rendered.alpha
+            color = rendered.over(scene.means.new_tensor(settings.background)).clamp(0, 1)
+            image = _RenderedImage(color, rendered.alpha)
+            keep(name, view, image)
+            if truth is None:
+                truth = image
             else:
-                alphas = (rendered.alpha, truth_alpha.to(rendered.alpha))
-                against_full[name].append(metrics.compare(image, truth, alphas=alphas))
+                alphas = (image.alpha, truth.alpha.to(image.alpha))
+                against_full[name].append(metrics.compare(color, truth.color, alphas=alphas))
             if photographs is not None:
-                found = metrics.compare(image, photographs[view : view + 1])
+                found = metrics.compare(color, photographs[view : view + 1])
                 against_photographs[name].append(found)
             done += 1
             listener(ProgressEvent(stage=STAGE, done=done, total=total))

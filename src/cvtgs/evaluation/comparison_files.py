@@ -11,13 +11,23 @@ from jaxtyping import UInt8
 
 from cvtgs.errors import OutputError
 from cvtgs.evaluation.compare import Comparison, Images
-from cvtgs.evaluation.images import ERROR_SCALE, encode, error_colors, error_map, resized
+from cvtgs.evaluation.images import (
+    ALPHA_SCALE,
+    ERROR_SCALE,
+    alpha_colors,
+    alpha_error_map,
+    encode,
+    error_colors,
+    error_map,
+    resized,
+)
 from cvtgs.evaluation.page import comparison_page
 from cvtgs.evaluation.report import SceneScores
 from cvtgs.io import atomic_output, check_output
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 
 if TYPE_CHECKING:
+    from PIL.Image import Image
     from PIL.ImageFont import FreeTypeFont, ImageFont
 
 PAGE, SHEET, ERRORS = "index.html", "sheet.png", "errors.png"
@@ -25,7 +35,8 @@ STAGE = "write pages"
 
 _PAPER, _INK, _FADED = (250, 250, 249), (28, 28, 30), (110, 110, 115)
 _LONGEST_TILE, _SHEET_WIDTH = 360, 2800
-_GAP, _MARGIN, _SIDE, _HEAD, _FOOT = 8, 28, 230, 44, 64
+_GAP, _MARGIN, _SIDE, _HEAD, _FOOT = 8, 28, 260, 44, 84
+_RAMP = 340, 14
 _NAME, _TEXT = 20, 15
 
 
@@ -109,22 +120,40 @@ def contact_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
     evaluation = comparison.evaluation
     size = bytes_text(comparison.sizes.get(evaluation.reference))
     full = [f"{evaluation.reference_count:,} Gaussians", size]
-    rows = [_Row(evaluation.reference, full, comparison.full)]
+    rows = [_Row(evaluation.reference, full, comparison.full.colors)]
     rows += [
-        _small_row(comparison, scores, comparison.small[scores.name])
+        _small_row(comparison, scores, comparison.small[scores.name].colors)
         for scores in evaluation.scenes
     ]
     return _draw_sheet(comparison, rows)
 
 
 def error_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
-    """Draw where every small image differs from the full one, with a legend of the colours."""
+    """Draw where every small image differs from the full one, with legends of the colours.
+
+    A simplified scene has a row for the errors of colour and one for those of alpha.
+    """
     rows = []
     for scores in comparison.evaluation.scenes:
-        pairs = zip(comparison.full, comparison.small[scores.name], strict=True)
-        maps = np.stack([error_map(one, other) for one, other in pairs])
-        rows.append(_small_row(comparison, scores, maps))
+        colors, alphas = error_maps(comparison, scores.name)
+        rows.append(_small_row(comparison, scores, colors))
+        if scores.alpha_error and scores.alpha_bias:
+            lines = [
+                "Alpha minus that of the full scene",
+                f"error {scores.alpha_error.mean:.4f}",
+                f"bias {scores.alpha_bias.mean:+.4f}",
+            ]
+            views = scores.alpha_error.views
+            captions = [f"error {views[view]:.4f}" for view in comparison.shown]
+            rows.append(_Row("", lines, alphas, captions))
     return _draw_sheet(comparison, rows, legend=True)
+
+
+def error_maps(comparison: Comparison, name: str) -> tuple[Images, Images]:
+    """Return maps of the errors of colour and of alpha of a simplified scene."""
+    full, small = comparison.full, comparison.small[name]
+    colors = map(error_map, full.colors, small.colors)
+    return np.stack(list(colors)), np.stack(list(map(alpha_error_map, full.alphas, small.alphas)))
 
 
 def _small_row(comparison: Comparison, scores: SceneScores, images: Images) -> _Row:
@@ -135,8 +164,11 @@ def _small_row(comparison: Comparison, scores: SceneScores, images: Images) -> _
         f"PSNR {_psnr_text(scores.psnr.mean)}",
         f"SSIM {scores.ssim.mean:.3f}",
         f"LPIPS {scores.lpips.mean:.3f}" if scores.lpips else "",
+        f"alpha error {scores.alpha_error.mean:.4f}" if scores.alpha_error else "",
+        f"alpha bias {scores.alpha_bias.mean:+.4f}" if scores.alpha_bias else "",
     ]
-    return _Row(scores.name, lines, images, [_psnr_text(value) for value in scores.psnr.views])
+    captions = [_psnr_text(scores.psnr.views[view]) for view in comparison.shown]
+    return _Row(scores.name, lines, images, captions)
 
 
 def _draw_sheet(
@@ -145,19 +177,19 @@ def _draw_sheet(
     """Draw rows of tiles with their texts, under the names of the views."""
     from PIL import Image, ImageDraw, ImageFont  # noqa: PLC0415 (takes time to load)
 
-    views, height, width, _ = comparison.full.shape
+    views, height, width, _ = comparison.full.colors.shape
     longest = min(_LONGEST_TILE, (_SHEET_WIDTH - _SIDE) / views - _GAP)
     factor = min(1.0, longest / max(width, height))
     tile = max(1, round(factor * width)), max(1, round(factor * height))
     line = 1.45 * _TEXT
-    row_height = max(tile[1] + round(1.6 * _TEXT), round(7.5 * line)) + _GAP
+    row_height = max(tile[1] + round(1.6 * _TEXT), round(9.5 * line)) + _GAP
     lefts = [_MARGIN + _SIDE + view * (max(tile[0], 90) + _GAP) for view in range(views + 1)]
     bottom = _MARGIN + _HEAD + len(rows) * row_height
     size = lefts[-1] + _MARGIN, bottom + _MARGIN + legend * _FOOT
     sheet = Image.new("RGB", size, _PAPER)
     draw = ImageDraw.Draw(sheet)
     large, small = ImageFont.load_default(_NAME), ImageFont.load_default(_TEXT)
-    for left, view in zip(lefts, comparison.evaluation.views, strict=False):
+    for left, view in zip(lefts, comparison.views, strict=False):
         draw.text((left, _MARGIN), _shortened(view, tile[0], small), _FADED, small)
     for number, row in enumerate(rows):
         top = _MARGIN + _HEAD + number * row_height
@@ -169,15 +201,33 @@ def _draw_sheet(
         for left, caption in zip(lefts, row.captions, strict=False):
             draw.text((left, top + tile[1] + 4), caption, _FADED, small)
     if legend:
-        width, height, left, top = 320, 14, lefts[0], bottom + 16
-        ramp = np.linspace(0, ERROR_SCALE, width, dtype=np.float32)[None].repeat(height, axis=0)
-        sheet.paste(Image.fromarray(error_colors(ramp)), (left, top))
-        draw.text((_MARGIN, top - 3), "RMS difference", _INK, small)
-        for step in range(4):
-            text = f"{step / 3 * ERROR_SCALE:.1f}{' +' if step == 3 else ''}"
-            place = left + step / 3 * width - (0 if step == 0 else 12)
-            draw.text((place, top + height + 5), text, _FADED, small)
+        _draw_legends(sheet, lefts[0], bottom + 16, small)
     return np.asarray(sheet)
+
+
+def _draw_legends(sheet: "Image", left: int, top: int, font: "FreeTypeFont | ImageFont") -> None:
+    """Draw the two ramps of colours with their numbers, side by side."""
+    from PIL import Image, ImageDraw  # noqa: PLC0415
+
+    draw, (width, height) = ImageDraw.Draw(sheet), _RAMP
+    steps = np.linspace(0, 1, width, dtype=np.float32)[None].repeat(height, axis=0)
+    for place, title, low, high, colors in (
+        (0, "RMS difference of colour", 0.0, ERROR_SCALE, error_colors),
+        (
+            1,
+            "Difference of alpha (below 0: more background)",
+            -ALPHA_SCALE,
+            ALPHA_SCALE,
+            alpha_colors,
+        ),
+    ):
+        start = left + place * (width + 100)
+        sheet.paste(Image.fromarray(colors(low + (high - low) * steps)), (start, top + 20))
+        draw.text((start, top - 4), title, _INK, font)
+        for share in (0.0, 0.5, 1.0):
+            text = f"{low + share * (high - low):.2g}"
+            shift = share * font.getlength(text)
+            draw.text((start + share * width - shift, top + 24 + height), text, _FADED, font)
 
 
 def _shortened(text: str, width: int, font: "FreeTypeFont | ImageFont") -> str:

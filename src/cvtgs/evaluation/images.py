@@ -30,7 +30,28 @@ _MAGMA = (
     (252, 253, 191),
 )
 
-CSS_GRADIENT = f"linear-gradient(90deg, {', '.join(f'rgb({r} {g} {b})' for r, g, b in _MAGMA)})"
+ALPHA_SCALE = 0.2
+"""The difference of alpha that gets the brightest colours."""
+
+# Warm where more of the background shows through, black where equal, cold where less does.
+_ALPHA = (
+    (255, 246, 205),
+    (250, 178, 66),
+    (190, 82, 22),
+    (92, 33, 12),
+    (0, 0, 4),
+    (14, 38, 92),
+    (28, 84, 172),
+    (78, 165, 240),
+    (214, 240, 255),
+)
+
+
+def _css_gradient(colors: tuple[tuple[int, int, int], ...]) -> str:
+    return f"linear-gradient(90deg, {', '.join(f'rgb({r} {g} {b})' for r, g, b in colors)})"
+
+
+CSS_GRADIENT, CSS_ALPHA_GRADIENT = _css_gradient(_MAGMA), _css_gradient(_ALPHA)
 """The colours of differences from left to right."""
 
 
@@ -38,6 +59,13 @@ def as_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Round colours to 8 bits."""
     rounded = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8)
     array: UInt8[np.ndarray, "h w 3"] = rounded.cpu().numpy()
+    return array
+
+
+def alpha_as_bytes(alpha: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w"]:
+    """Round accumulated alpha to 8 bits."""
+    rounded = (alpha.detach().clamp(0, 1) * 255).round().to(torch.uint8)
+    array: UInt8[np.ndarray, "h w"] = rounded.cpu().numpy()
     return array
 
 
@@ -92,7 +120,25 @@ def error_map(
 
 def error_colors(differences: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """Return the colours of differences."""
-    positions = np.linspace(0, 1, len(_MAGMA))
-    steps, values = np.asarray(_MAGMA, dtype=np.float32), differences / ERROR_SCALE
+    return _colors_of(differences / ERROR_SCALE, _MAGMA)
+
+
+def alpha_error_map(
+    full: UInt8[np.ndarray, "h w"], small: UInt8[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Show the alpha of a small scene minus that of the full one as colours."""
+    return alpha_colors((small.astype(np.float32) - full.astype(np.float32)) / 255)
+
+
+def alpha_colors(differences: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the colours of differences of alpha: warm below zero, cold above."""
+    return _colors_of((differences / ALPHA_SCALE + 1) / 2, _ALPHA)
+
+
+def _colors_of(
+    values: Float[np.ndarray, "h w"], colors: tuple[tuple[int, int, int], ...]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Interpolate in a row of colours, which stand for 0 to 1."""
+    positions, steps = np.linspace(0, 1, len(colors)), np.asarray(colors, dtype=np.float32)
     channels = [np.interp(values, positions, steps[:, channel]) for channel in range(3)]
     return np.stack(channels, axis=2).round().astype(np.uint8)

@@ -10,7 +10,16 @@ import numpy as np
 from jaxtyping import UInt8
 
 from cvtgs.evaluation.compare import Comparison
-from cvtgs.evaluation.images import CSS_GRADIENT, ERROR_SCALE, encode, error_map, resized
+from cvtgs.evaluation.images import (
+    ALPHA_SCALE,
+    CSS_ALPHA_GRADIENT,
+    CSS_GRADIENT,
+    ERROR_SCALE,
+    alpha_error_map,
+    encode,
+    error_map,
+    resized,
+)
 
 MOST_BYTES = 7_500_000
 """Pages are kept below this: images are compressed harder, and then made smaller."""
@@ -24,8 +33,9 @@ def comparison_page(
     """Return the page, with a summary of :func:`render_template` above the images.
 
     It has a divider between the full and a simplified scene, a chooser of scene and view, counts,
-    bytes and scores, and maps of the differences. ``#view=2&small=1&split=30&error=1`` at the end
-    of its address chooses what it shows first.
+    bytes and scores, and maps of the differences of colour and of alpha.
+    ``#view=2&small=1&split=30&error=1`` at the end of its address chooses what it shows first;
+    ``error=2`` is alpha.
     """
     parts = files("cvtgs.evaluation") / "page_parts"
     texts = {
@@ -41,6 +51,8 @@ def comparison_page(
             script=texts["js"],
             gradient=CSS_GRADIENT,
             error_scale=f"{ERROR_SCALE:g}",
+            alpha_gradient=CSS_ALPHA_GRADIENT,
+            alpha_scale=f"{ALPHA_SCALE:g}",
             summary=summary,
             data=_page_data(comparison, quality, factor),
         )
@@ -65,14 +77,17 @@ def _page_data(comparison: Comparison, quality: int, factor: float) -> dict[str,
     evaluation = comparison.evaluation
     small = []
     for scores in evaluation.scenes:
-        images = comparison.small[scores.name]
-        errors = map(error_map, comparison.full, images)
+        full, images = comparison.full, comparison.small[scores.name]
+        maps = {
+            "errors": map(error_map, full.colors, images.colors),
+            "alpha_errors": map(alpha_error_map, full.alphas, images.alphas),
+        }
         small.append(
             {
                 **json.loads(scores.model_dump_json()),  # which writes infinity as text
                 "bytes": comparison.sizes.get(scores.name),
-                "images": _data_urls(images, quality, factor),
-                "errors": _data_urls(errors, quality - 10, factor),
+                "images": _data_urls(images.colors, quality, factor),
+                **{name: _data_urls(part, quality - 10, factor) for name, part in maps.items()},
             }
         )
     return {
@@ -80,13 +95,15 @@ def _page_data(comparison: Comparison, quality: int, factor: float) -> dict[str,
         "width": evaluation.width,
         "height": evaluation.height,
         "lpips": evaluation.lpips_network,
-        "views": evaluation.views,
+        "views": comparison.views,
+        "shown": comparison.shown,
+        "scored": len(evaluation.views),
         "reference": {
             "name": evaluation.reference,
             "count": evaluation.reference_count,
             "bytes": comparison.sizes.get(evaluation.reference),
         },
-        "full": _data_urls(comparison.full, quality, factor),
+        "full": _data_urls(comparison.full.colors, quality, factor),
         "small": small,
     }
 

@@ -39,6 +39,11 @@ class Score(Record):
         return cls(mean=math.fsum(values) / len(values), views=tuple(values))
 
 
+def mean_of(score: Score | None) -> float | None:
+    """Return the mean of a score, None where there is none."""
+    return None if score is None else score.mean
+
+
 class SceneScores(Record):
     """How close the images of one scene come to others.
 

@@ -83,13 +83,13 @@ def render_view(
 
 
 class ImageScores(NamedTuple):
-    """The metrics of one pair of images; None for those that are not computed."""
+    """The metrics of one pair of images; None or, of alpha, NaN for those that are not computed."""
 
     psnr: float
     ssim: float | None
     lpips: float | None
-    alpha_error: float | None = None
-    alpha_bias: float | None = None
+    alpha_error: float = math.nan
+    alpha_bias: float = math.nan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,8 +123,8 @@ class Metrics:
             lpips=float(lpips(image, truth, network=weights.network, weights=weights))
             if weights
             else None,
-            alpha_error=None if alphas is None else float(alpha_error(*alphas)),
-            alpha_bias=None if alphas is None else float(alpha_bias(*alphas)),
+            alpha_error=float(alpha_error(*alphas)) if alphas else math.nan,
+            alpha_bias=float(alpha_bias(*alphas)) if alphas else math.nan,
         )
 
 
@@ -151,16 +151,16 @@ def chosen_metrics(choice: LpipsChoice, size: tuple[int, int]) -> Metrics:
 
 def scene_scores(name: str, count: int, rows: Sequence[ImageScores]) -> SceneScores:
     """Average the scores of a scene, one row per view, of which SSIM was computed."""
-    psnrs, ssims, *others = zip(*rows, strict=True)
-    distances, errors, biases = (None if None in values else Score.of(values) for values in others)
+    psnrs, ssims, distances, errors, biases = zip(*rows, strict=True)
+    has_alpha = not any(map(math.isnan, errors))
     return SceneScores(
         name=name,
         count=count,
         psnr=Score.of(psnrs),
         ssim=Score.of(ssims),
-        lpips=distances,
-        alpha_error=errors,
-        alpha_bias=biases,
+        lpips=None if None in distances else Score.of(distances),
+        alpha_error=Score.of(errors) if has_alpha else None,
+        alpha_bias=Score.of(biases) if has_alpha else None,
     )
 
 

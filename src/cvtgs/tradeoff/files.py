@@ -208,6 +208,8 @@ def cells(tradeoff: Tradeoff, result: TradeoffResult) -> Mapping[str, str]:
         "PSNR, dB": _score(result, "psnr", result.psnr, 2),
         "SSIM": _score(result, "ssim", result.ssim, 4),
         **distance,
+        "alpha error": "" if result.alpha_error is None else f"{result.alpha_error:.4f}",
+        "alpha bias": "" if result.alpha_bias is None else f"{result.alpha_bias:+.4f}",
         "file": bytes_text(result.bytes),
         "memory": bytes_text(result.peak_memory_bytes) if result.peak_memory_bytes else "",
     }

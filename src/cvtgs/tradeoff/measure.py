@@ -15,6 +15,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import RunError
 from cvtgs.evaluation import Comparison, EvaluationSettings, compare
+from cvtgs.evaluation.report import mean_of
 from cvtgs.io import load
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.scene import GaussianScene
@@ -127,7 +128,9 @@ def measure_tradeoff(
             peak_memory_bytes=run.cost.peak_memory_bytes,
             psnr=scores.psnr.mean,
             ssim=scores.ssim.mean,
-            lpips=scores.lpips.mean if scores.lpips else None,
+            lpips=mean_of(scores.lpips),
+            alpha_error=mean_of(scores.alpha_error),
+            alpha_bias=mean_of(scores.alpha_bias),
             report=run.report,
         )
         for run, scores in zip(runs, comparison.evaluation.scenes, strict=True)

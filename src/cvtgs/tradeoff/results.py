@@ -24,6 +24,9 @@ class TradeoffResult(Record):
         psnr: Mean over the views, dB; infinite if images are equal.
         ssim: Mean over the views.
         lpips: Mean over the views; None if it was not measured.
+        alpha_error: Mean absolute difference of accumulated alpha over the views.
+        alpha_bias: Mean of accumulated alpha minus that of the full scene; negative where more of
+            the background shows through.
         fronts: Metrics by which no other run of this ratio beats it: ``psnr``, ``ssim``, ``lpips``.
         report: The report of the simplification, with seconds and peak memory per stage.
     """
@@ -38,6 +41,8 @@ class TradeoffResult(Record):
     psnr: float
     ssim: float
     lpips: float | None = None
+    alpha_error: float | None = None
+    alpha_bias: float | None = None
     fronts: tuple[str, ...] = ()
     report: SimplifyReport
 
@@ -146,6 +151,8 @@ class Tradeoff(Record):
             "psnr": result.psnr,
             "ssim": result.ssim,
             "lpips": result.lpips,
+            "alpha_error": result.alpha_error,
+            "alpha_bias": result.alpha_bias,
             "fronts": " ".join(result.fronts),
         }
 

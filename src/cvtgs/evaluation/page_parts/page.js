@@ -38,7 +38,15 @@
     ["PSNR", (scene) => scene.psnr, decibels],
     ["SSIM", (scene) => scene.ssim, (value) => number(Number(value), 3)],
     ["LPIPS", (scene) => scene.lpips, (value) => number(Number(value), 3)],
+    ["Alpha error", (scene) => scene.alpha_error, (value) => number(Number(value), 4)],
+    ["Alpha bias", (scene) => scene.alpha_bias, (value) => (Number(value) > 0 ? "+" : "") + number(Number(value), 4)],
   ].filter(([, of]) => data.small.every((scene) => of(scene)));
+
+  const maps = [
+    { key: "images", tag: (scene) => `Simplified · ${count(scene.count)}`, alt: (scene, name) => `${name} of ${scene.name}, ${count(scene.count)} Gaussians` },
+    { key: "errors", tag: () => "Colour error", alt: (scene, name) => `Where colours of ${scene.name} differ from the full scene in ${name}` },
+    { key: "alpha_errors", tag: () => "Alpha error", alt: (scene, name) => `Where ${scene.name} covers less or more than the full scene in ${name}` },
+  ];
 
   const table = (id, headings, rows) => {
     const head = make("thead");
@@ -82,7 +90,9 @@
     const lpips = data.lpips ? `, LPIPS (${data.lpips === "vgg" ? "VGG" : "Alex"}) is lower for closer images` : "";
     at("about").textContent =
       `Scores compare images of each simplified scene with images of the full one, ${data.width} × ${data.height} pixels: ` +
-      `higher PSNR and SSIM mean closer${lpips}. Rendered by cvtgs with its ${data.backend} backend.`;
+      `higher PSNR and SSIM mean closer${lpips}. ` +
+      "Alpha is the share of a pixel that a scene covers; its error is a mean of absolute differences, and its bias is below zero where more of the background shows through. " +
+      `${data.scored > views.length ? `Means are over ${data.scored} views, of which ${views.length} are shown. ` : ""}Rendered by cvtgs with its ${data.backend} backend.`;
   };
 
   const show = () => {
@@ -91,16 +101,17 @@
     const index = state.view - 1;
     at("full").src = data.full[index];
     at("full").alt = `${name} of ${data.reference.name}, ${count(data.reference.count)} Gaussians`;
-    at("small").src = (state.error ? scene.errors : scene.images)[index];
-    at("small").alt = state.error
-      ? `Where ${scene.name} differs from the full scene in ${name}`
-      : `${name} of ${scene.name}, ${count(scene.count)} Gaussians`;
+    const map = maps[state.error];
+    at("small").src = scene[map.key][index];
+    at("small").alt = map.alt(scene, name);
     at("tag-full").textContent = `Full · ${count(data.reference.count)}`;
-    at("tag-small").textContent = state.error ? "Differences" : `Simplified · ${count(scene.count)}`;
+    at("tag-small").textContent = map.tag(scene);
     at("view-name").textContent = name;
-    at("score").textContent = join(...metrics.map(([label, of, text]) => `${label} ${text(of(scene).views[index])}`));
-    at("differences").setAttribute("aria-pressed", String(Boolean(state.error)));
-    at("scale").hidden = !state.error;
+    at("score").textContent = join(...metrics.map(([label, of, text]) => `${label} ${text(of(scene).views[data.shown[index]])}`));
+    at("differences").setAttribute("aria-pressed", String(state.error === 1));
+    at("alpha").setAttribute("aria-pressed", String(state.error === 2));
+    at("scale").hidden = state.error !== 1;
+    at("alpha-scale").hidden = state.error !== 2;
     for (const group of ["small", "view"]) {
       document.querySelectorAll(`input[name=${group}]`).forEach((input) => { input.checked = Number(input.value) === state[group]; });
     }
@@ -113,7 +124,7 @@
     at("views-title").textContent = `Per view of ${scene.name}`;
     table("per-view", ["View", ...labels], data.views.map((view, row) => ({
       chosen: row === index,
-      cells: [view, ...metrics.map(([, of, text]) => text(of(scene).views[row]))],
+      cells: [view, ...metrics.map(([, of, text]) => text(of(scene).views[data.shown[row]]))],
     })));
     slide();
   };
@@ -133,7 +144,7 @@
     clearTimeout(waiting);
     waiting = setTimeout(() => {
       const { view, small, split, error } = state;
-      const hash = `#view=${view}&small=${small}&split=${split}${error ? "&error=1" : ""}`;
+      const hash = `#view=${view}&small=${small}&split=${split}${error ? "&error=" + error : ""}`;
       try { history.replaceState(null, "", hash); } catch { /* not allowed everywhere, and not needed */ }
     }, 150);
   };
@@ -154,12 +165,12 @@
     read("view", 1, data.views.length);
     read("small", 1, data.small.length);
     read("split", 0, 100);
-    read("error", 0, 1);
+    read("error", 0, 2);
     show();
   };
 
   const step = (by) => change({ view: ((state.view - 1 + by + data.views.length) % data.views.length) + 1 });
-  const toggle = () => change({ error: 1 - state.error });
+  const toggle = (error) => change({ error: state.error === error ? 0 : error });
 
   const drag = (event) => {
     const box = stage.getBoundingClientRect();
@@ -176,14 +187,16 @@
   at("split").addEventListener("input", () => change({ split: Number(at("split").value) }));
   at("previous").addEventListener("click", () => step(-1));
   at("next").addEventListener("click", () => step(1));
-  at("differences").addEventListener("click", toggle);
+  at("differences").addEventListener("click", () => toggle(1));
+  at("alpha").addEventListener("click", () => toggle(2));
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const typing = event.target instanceof HTMLInputElement;
     const key = event.key.toLowerCase();
     if (key === "n") step(1);
     else if (key === "p") step(-1);
-    else if (key === "d") toggle();
+    else if (key === "d") toggle(1);
+    else if (key === "a") toggle(2);
     else if (/^[1-9]$/.test(key) && Number(key) <= data.small.length) change({ small: Number(key) });
     else if (!typing && key === "arrowleft") change({ split: clamp(state.split - 2, 0, 100) });
     else if (!typing && key === "arrowright") change({ split: clamp(state.split + 2, 0, 100) });

@@ -1,0 +1,206 @@
+"""Results of a comparison: kept in a file, and shown as Markdown tables and as a chart."""
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import mean
+from typing import Literal
+
+from benchmarks.quality import Quality, markdown_rows
+from cvtgs.plots import Panel, Series, line_chart
+
+Clock = Literal["wall", "cpu"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Result:
+    """What one run of one method gave.
+
+    Attributes:
+        quality: Against the full scene.
+        wall_seconds: From the start of the process to its end.
+        cpu_seconds: Processor time outside the kernel.
+        count: Gaussians that it wrote.
+        wanted: Gaussians that it should have written.
+    """
+
+    quality: Quality
+    wall_seconds: float
+    cpu_seconds: float
+    count: int
+    wanted: int
+
+    def seconds(self, clock: Clock) -> float:
+        """Return the time on a clock."""
+        return self.wall_seconds if clock == "wall" else self.cpu_seconds
+
+
+Table = Mapping[str, Mapping[str, Mapping[float, Result | None]]]
+"""One result per ratio, None for a failure, by method, by scene; what was not run is missing."""
+
+
+def joined(first: Table, second: Table) -> Table:
+    """Return the results of both; those of the second win."""
+    scenes = dict.fromkeys([*first, *second])
+    found: dict[str, dict[str, dict[float, Result | None]]] = {name: {} for name in scenes}
+    for table in (first, second):
+        for scene, rows in table.items():
+            for method, row in rows.items():
+                found[scene].setdefault(method, {}).update(row)
+    return found
+
+
+def results_json(table: Table) -> str:
+    """Write results as JSON text."""
+    records = [
+        {"scene": scene, "method": method, "rho": rho, "result": result and asdict(result)}
+        for scene, rows in table.items()
+        for method, row in rows.items()
+        for rho, result in row.items()
+    ]
+    return json.dumps(records, indent=1) + "\n"
+
+
+def read_results(path: Path) -> Table:
+    """Read what :func:`results_json` wrote; nothing if there is no file."""
+    table: dict[str, dict[str, dict[float, Result | None]]] = {}
+    for record in json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []:
+        found = record["result"]
+        result = found and Result(**{**found, "quality": Quality(**found["quality"])})
+        row = table.setdefault(record["scene"], {}).setdefault(record["method"], {})
+        row[record["rho"]] = result
+    return table
+
+
+def methods_of(table: Table) -> list[str]:
+    """Return the names of all methods, in their order."""
+    return list(dict.fromkeys(method for rows in table.values() for method in rows))
+
+
+METRICS: Mapping[str, tuple[Callable[[Result], float | None], str]] = {
+    "PSNR": (lambda result: result.quality.psnr, ".2f"),
+    "SSIM": (lambda result: result.quality.ssim, ".4f"),
+    "LPIPS": (lambda result: result.quality.lpips, ".4f"),
+    "alpha error": (lambda result: result.quality.alpha_error, ".4f"),
+    "alpha bias": (lambda result: result.quality.alpha_bias, "+.4f"),
+}
+
+
+def markdown(
+    table: Table, ratios: Sequence[float], *, means_only: bool = False, clock: Clock = "wall"
+) -> str:
+    """Return two Markdown tables per ratio: means over all scenes, then scene by scene.
+
+    A dash stands where a run failed, is missing or nothing was measured. A metric that nobody
+    measured has no column.
+    """
+    parts = []
+    for rho in ratios:
+        parts.append(f"Ratio {rho:g}, means over {len(table)} scenes:\n")
+        parts.append(means_table(table, rho, clock))
+        if not means_only:
+            parts.append(f"Ratio {rho:g}, PSNR / SSIM of each scene:\n")
+            parts.append(scenes_table(table, rho))
+    return "\n".join(parts)
+
+
+def means_table(table: Table, rho: float, clock: Clock) -> str:
+    """Return the means over all scenes, a row per method."""
+    everything = [result for rows in table.values() for row in rows.values() for result in _at(row)]
+    metrics = {
+        name: metric
+        for name, metric in METRICS.items()
+        if any(metric[0](result) is not None for result in everything)
+    }
+    metrics["s"] = (lambda result: result.seconds(clock), ".1f")
+    rows = []
+    for method in methods_of(table):
+        column = [rows_of.get(method, {}).get(rho) for rows_of in table.values()]
+        cells = [
+            _cell([result and value(result) for result in column], form)
+            for value, form in metrics.values()
+        ]
+        rows.append([method, *cells])
+    return markdown_rows(["method", *metrics], rows)
+
+
+def scenes_table(table: Table, rho: float) -> str:
+    """Return PSNR and SSIM, a row per method and a column per scene."""
+    rows = []
+    for method in methods_of(table):
+        found = [scene.get(method, {}).get(rho) for scene in table.values()]
+        rows.append(
+            [
+                method,
+                *(
+                    f"{one.quality.psnr:.1f} / {one.quality.ssim:.3f}" if one else "-"
+                    for one in found
+                ),
+            ]
+        )
+    return markdown_rows(["method", *table], rows)
+
+
+def _at(row: Mapping[float, Result | None]) -> Iterable[Result]:
+    return (result for result in row.values() if result is not None)
+
+
+def _cell(values: Sequence[float | None], form: str) -> str:
+    """Return the text of a mean, or a dash if a value is missing."""
+    known = [value for value in values if value is not None]
+    return f"{mean(known):{form}}" if len(known) == len(values) else "-"
+
+
+def wrong_counts(table: Table) -> str:
+    """Name the runs that did not give exactly M Gaussians; quality is not comparable there."""
+    lines = [
+        f"- {method}, {scene}, {rho:g}: {found.count:,} instead of {found.wanted:,}"
+        for scene, rows in table.items()
+        for method, row in rows.items()
+        for rho, found in row.items()
+        if found is not None and found.count != found.wanted
+    ]
+    return "\n".join(["Not the number of Gaussians that was asked for:\n", *lines] if lines else [])
+
+
+def failures(table: Table) -> str:
+    """Name the runs that failed."""
+    lines = [
+        f"- {method}, {scene}, {rho:g}"
+        for scene, rows in table.items()
+        for method, row in rows.items()
+        for rho, found in row.items()
+        if found is None
+    ]
+    return "\n".join(["Failed:\n", *lines] if lines else [])
+
+
+def chart(table: Table, ratios: Sequence[float], *, clock: Clock = "wall") -> bytes | None:
+    """Draw mean PSNR over mean seconds, a line per method and a point per ratio.
+
+    Points that some scene lacks are left out; None if there are no others.
+    """
+    series = []
+    for method in methods_of(table):
+        columns = [[rows.get(method, {}).get(rho) for rows in table.values()] for rho in ratios]
+        complete = [[found for found in column if found] for column in columns if all(column)]
+        if complete:
+            line = Series(
+                name=method,
+                x=[max(mean(each.seconds(clock) for each in column), 1e-3) for column in complete],
+                y=[mean(each.quality.psnr for each in column) for column in complete],
+                markers=True,
+            )
+            series.append(line)
+    if not series:
+        return None
+    shares = ", ".join(f"{rho:g}" for rho in sorted(ratios, reverse=True))
+    panel = Panel(
+        series=series,
+        title=f"Share of Gaussians kept: {shares} (from above)",
+        x_label="seconds, reading and writing included",
+        y_label="PSNR, dB",
+        log_x=True,
+    )
+    return line_chart([panel], width=1000, height=700)
