@@ -1,0 +1,45 @@
+"""Training on a pretended CUDA device: the CPU's gains, and resumed bit for bit."""
+
+import pytest
+
+from cvtgs.progress import ProgressEvent
+from cvtgs.train import History
+from pretended_device import pretended_cuda
+from train_cases import bits_of_state, run, tiny_config, tiny_data, write_scenes
+
+
+@pytest.fixture
+def _quick_curves(monkeypatch) -> None:
+    monkeypatch.setattr(History, "curves", lambda history: b"an image")
+
+
+class PowerCutError(Exception):
+    """Stands for anything that ends a process."""
+
+
+def stop_after_three(event: ProgressEvent) -> None:
+    if event.stage == "train" and event.done == 3:
+        raise PowerCutError
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_quick_curves")
+@pytest.mark.parametrize("kind", ["scene", "local"])
+def test_training_and_resuming(kind, tmp_path):
+    scenes = write_scenes(tmp_path / "scenes", ["exam", "lesson"], 300)
+    config, cache = tiny_config(tiny_data(scenes), kind=kind, steps=5), tmp_path / "cache"
+    names = [tmp_path / f"{name}.safetensors" for name in ("cpu", "whole", "cut")]
+    wanted = run(config, names[0], cache)
+    with pretended_cuda() as traffic:
+        whole = run(config, names[1], cache, device="cuda")
+        assert traffic.copies
+        with pytest.raises(PowerCutError):
+            run(config, names[2], cache, device="cuda", listener=stop_after_three)
+        cut = run(config, names[2], cache, device="cuda", resume=True)
+    assert repr(cut.validations) == repr(whole.validations)
+    assert bits_of_state(names[2].with_suffix(".state")) == bits_of_state(
+        names[1].with_suffix(".state")
+    )
+    for found, same in zip(whole.validations, wanted.validations, strict=True):
+        assert found.mean_gain == pytest.approx(same.mean_gain, abs=1e-3)
+        assert found.loss == pytest.approx(same.loss, rel=1e-3, nan_ok=True)
