@@ -3,7 +3,7 @@
 ``pretended_cuda()`` lets code that runs inside believe that there is a GPU ``cuda:0``. A tensor
 there wraps one on the CPU. Operations that mix devices, ``numpy()`` and generators of the CPU raise
 what CUDA raises; whatever makes the host wait for the device, and every copy between both, is
-counted, with the line of the library that caused it.
+counted, with the line of the library that caused it. Tensors above a limit do not fit.
 """
 
 import sys
@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -90,9 +91,9 @@ class DeviceTensor(Tensor):
 class Device(TorchDispatchMode):
     """Computes on what is wrapped, refuses what CUDA refuses, and counts."""
 
-    def __init__(self, traffic: Traffic) -> None:
+    def __init__(self, traffic: Traffic, largest: int | None) -> None:
         super().__init__()
-        self.traffic = traffic
+        self.traffic, self.largest = traffic, largest
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = dict(kwargs or {})
@@ -109,7 +110,7 @@ class Device(TorchDispatchMode):
             if bool(wrapped) != is_there:
                 self.traffic.copies[f"{caller()} to {'device' if is_there else 'host'}"] += 1
             copied = func(*tree_map(unwrapped, args), **kwargs)
-            return DeviceTensor(copied) if is_there else copied
+            return self.placed(copied) if is_there else copied
         if name == "aten::copy_":
             if isinstance(args[0], DeviceTensor) != isinstance(args[1], DeviceTensor):
                 self.traffic.copies[f"{caller()} copy_"] += 1
@@ -133,9 +134,15 @@ class Device(TorchDispatchMode):
         def wrap(leaf: Any) -> Any:
             if not isinstance(leaf, Tensor):
                 return leaf
-            return known[id(leaf)] if id(leaf) in known else DeviceTensor(leaf)
+            return known[id(leaf)] if id(leaf) in known else self.placed(leaf)
 
         return tree_map(wrap, found)
+
+    def placed(self, host: Tensor) -> DeviceTensor:
+        """Put what was computed on the device, if it fits."""
+        if self.largest is not None and not host.is_sparse and host.nbytes > self.largest:
+            raise torch.OutOfMemoryError(f"CUDA out of memory. Tried to allocate {host.nbytes} B.")
+        return DeviceTensor(host)
 
     def check(self, name: str, args: tuple[Any, ...], leaves: list[Any]) -> None:
         """Refuse tensors of the CPU, but for single numbers, and indices, which are copied."""
@@ -206,8 +213,11 @@ def caller() -> str:
 
 
 @contextmanager
-def pretended_cuda() -> Iterator[Traffic]:
-    """Pretend a CUDA device, and count what goes between it and the host."""
+def pretended_cuda(*, largest: int | None = None) -> Iterator[Traffic]:
+    """Pretend a CUDA device, and count what goes between it and the host.
+
+    ``largest`` is the number of bytes above which a tensor does not fit.
+    """
     traffic = Traffic()
     answers: dict[str, Callable[..., Any]] = {
         "_lazy_init": lambda: None,
@@ -215,6 +225,8 @@ def pretended_cuda() -> Iterator[Traffic]:
         "device_count": lambda: 1,
         "current_device": lambda: 0,
         "synchronize": lambda device=None: None,
+        "get_device_properties": lambda device: SimpleNamespace(total_memory=64 << 30),
     }
-    with patch.multiple(torch.cuda, **answers), Device(traffic), Constructors(traffic):
+    device = Device(traffic, largest)
+    with patch.multiple(torch.cuda, **answers), device, Constructors(traffic):
         yield traffic

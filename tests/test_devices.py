@@ -2,6 +2,7 @@
 
 import platform
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,8 +14,9 @@ from cvtgs.devices import (
     one_thread,
     resolve_device,
     usable_device,
+    within_memory,
 )
-from cvtgs.errors import DeviceError
+from cvtgs.errors import DeviceError, OutOfMemoryError
 
 
 def test_a_name_is_taken_at_its_word():
@@ -31,9 +33,51 @@ def test_auto_is_cuda_for_what_is_on_the_cpu(monkeypatch, has_cuda, home, found)
     assert chosen_device("auto", home) == torch.device(found)
 
 
-def test_chunks_are_longer_where_launches_cost():
+@pytest.mark.parametrize(("gigabytes", "factor"), [(0.1, 1), (2, 8), (8, 32), (80, 32)])
+def test_chunks_are_longer_where_launches_cost(monkeypatch, gigabytes, factor):
+    found = SimpleNamespace(total_memory=int(gigabytes * 2**30))
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: found)
     assert chunk_length(7, torch.device("cpu")) == 7
-    assert chunk_length(7, torch.device("cuda")) == 224
+    assert chunk_length(7, torch.device("meta")) == 224
+    assert chunk_length(7, torch.device("cuda")) == 7 * factor
+
+
+@pytest.mark.parametrize("may_leave", [True, False])
+def test_memory_that_ends(may_leave):
+    tried = []
+
+    def compute(device: torch.device, note: str) -> str:
+        tried.append((str(device), chunk_length(1, device), note))
+        if device.type != "cpu":
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB")
+        return note
+
+    there = torch.device("meta")
+    if may_leave:
+        note = within_memory(compute, there, work="a test", may_leave=True)
+        assert note == "meta ran out of memory; computed on the CPU"
+    else:
+        with pytest.raises(OutOfMemoryError, match="a test needs more memory than meta has"):
+            within_memory(compute, there, work="a test", may_leave=False)
+    assert tried[:2] == [
+        ("meta", 32, ""),
+        ("meta", 1, "meta ran out of memory; computed there in short chunks"),
+    ]
+    assert chunk_length(1, there) == 32
+    assert len(tried) == 2 + may_leave
+
+
+@pytest.mark.parametrize("where", ["cpu", "meta"])
+def test_other_errors_are_raised_at_once(where):
+    tried = []
+
+    def compute(device: torch.device, note: str) -> None:
+        tried.append(device)
+        raise RuntimeError("out of memory" if where == "cpu" else "shapes differ")
+
+    with pytest.raises(RuntimeError):
+        within_memory(compute, torch.device(where), work="a test", may_leave=True)
+    assert len(tried) == 1
 
 
 @pytest.mark.parametrize("name", ["tpu9", "cpu:seven"])

@@ -29,6 +29,7 @@ LEVELS = [
     {"filters", "cvt", "cells", "report"},
     {"mergenet", "grouping"},
     {"pipeline", "refinement"},
+    {"prepared"},
     {"simplifier", "info"},
     {"budget", "tradeoff", "levels", "outofcore", "oneshot"},
     {"train"},

@@ -47,12 +47,13 @@ if TYPE_CHECKING:
     from cvtgs.info import SceneInfo, describe
     from cvtgs.io import from_dict, load, load_cameras, save, to_dict
     from cvtgs.oneshot import simplify
+    from cvtgs.prepared import Prepared
     from cvtgs.progress import ProgressEvent, ProgressListener
     from cvtgs.refinement import refine
     from cvtgs.rendering import Rendering, render
     from cvtgs.report import Level, Simplified, SimplifyReport
     from cvtgs.scene import GaussianScene, concatenate
-    from cvtgs.simplifier import Prepared, Simplifier
+    from cvtgs.simplifier import Simplifier
 
 __version__ = "0.1.0"
 
@@ -79,7 +80,7 @@ _HOME = {
     "GaussianScene": "cvtgs.scene",
     "concatenate": "cvtgs.scene",
     "Level": "cvtgs.report",
-    "Prepared": "cvtgs.simplifier",
+    "Prepared": "cvtgs.prepared",
     "Simplified": "cvtgs.report",
     "Simplifier": "cvtgs.simplifier",
     "simplify": "cvtgs.oneshot",

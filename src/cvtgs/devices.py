@@ -1,16 +1,25 @@
-"""The device to compute on, by name, and the number of its threads."""
+"""The device to compute on: by name, its memory, and the number of its threads."""
 
+import gc
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
-from cvtgs.errors import DeviceError
+from cvtgs.errors import DeviceError, OutOfMemoryError, is_out_of_memory
 
 LONGER_CHUNKS = 32
-"""How many times as much as on a CPU is computed together on another device."""
+"""How many times as much as on a CPU is computed together on another device, at most."""
+
+CHUNK_BYTES = 1 << 28
+"""Device memory for each chunk as long as on a CPU, which takes a quarter of it at most."""
+
+Result = TypeVar("Result")
+_SHORT_CHUNKS = ContextVar("short_chunks", default=False)
 
 
 def resolve_device(device: str | torch.device) -> torch.device | None:
@@ -109,20 +118,77 @@ def chunk_length(length: int, device: torch.device) -> int:
     """Return how much to compute together on a device.
 
     A chunk that fits the caches of a CPU is too short for a GPU, where every chunk costs the
-    launches of its operations and memory is ample.
+    launches of its operations. It depends on the memory that a device has, not on what is free,
+    so that the same device gives the same bits.
 
     Args:
         length: What a CPU computes together.
         device: Where it is computed.
 
     Returns:
-        The length on a CPU, 32 times as much elsewhere.
+        The length on a CPU; elsewhere 32 times as much, or less on CUDA with less than 8 GiB, and
+        not more in the second attempt of :func:`within_memory`.
 
     Example:
         >>> chunk_length(100, torch.device("cpu"))
         100
     """
-    return length if device.type == "cpu" else LONGER_CHUNKS * length
+    if device.type == "cpu" or _SHORT_CHUNKS.get():
+        return length
+    if device.type != "cuda":
+        return LONGER_CHUNKS * length
+    memory = torch.cuda.get_device_properties(device).total_memory
+    return max(1, min(LONGER_CHUNKS, memory // CHUNK_BYTES)) * length
+
+
+def within_memory(
+    compute: Callable[[torch.device, str], Result],
+    device: torch.device,
+    *,
+    work: str,
+    may_leave: bool,
+) -> Result:
+    """Compute on a device; if its memory ends, in short chunks, and then on the CPU if that may be.
+
+    Args:
+        compute: Takes the device, and a note for the report: empty, or what happened.
+        device: Where to compute.
+        work: What is computed, for the error.
+        may_leave: Whether the CPU may be taken instead of the device.
+
+    Returns:
+        What ``compute`` returns.
+
+    Raises:
+        OutOfMemoryError: The device has too little memory, and it is the only one.
+
+    Example:
+        >>> within_memory(
+        ...     lambda device, note: f"{device}{note}", torch.device("cpu"), work="a test",
+        ...     may_leave=False,
+        ... )
+        'cpu'
+    """
+    note = ""
+    for is_short in (False, True):
+        token = _SHORT_CHUNKS.set(is_short)
+        try:
+            return compute(device, note)
+        except RuntimeError as error:
+            if device.type == "cpu" or not is_out_of_memory(error):
+                raise
+        finally:
+            _SHORT_CHUNKS.reset(token)
+        note = f"{device} ran out of memory; computed there in short chunks"
+        gc.collect()  # what the failed attempt held
+        if device.type == "cuda":
+            torch.cuda.empty_cache()
+    if not may_leave:
+        raise OutOfMemoryError(
+            f"{work} needs more memory than {device} has, in short chunks too; free some there, "
+            f"or compute with device='cpu' (--device cpu)."
+        )
+    return compute(torch.device("cpu"), f"{device} ran out of memory; computed on the CPU")
 
 
 @contextmanager

@@ -88,6 +88,8 @@ class SimplifyReport(CellStatistics):
         mass_out: The same of the output.
         checkpoint: What corrected the merged Gaussians: a shipped name, a file, or ``none``.
         device: Where it ran.
+        device_note: Why it ran elsewhere, or in short chunks: the memory of the chosen device ran
+            out; else empty.
         plan: The effects that the scene called for.
         stages: What each stage cost.
         refinement: What a refinement gained afterwards; None if there was none.
@@ -108,6 +110,7 @@ class SimplifyReport(CellStatistics):
     mass_out: float = 0.0
     checkpoint: str = "none"
     device: str = "cpu"
+    device_note: str = ""
     plan: EffectPlan | None = None
     stages: tuple[StageCost, ...] = ()
     refinement: RefineReport | None = None

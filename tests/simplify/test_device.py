@@ -5,6 +5,7 @@ import torch
 
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.cvt import nearest_backend, nearest_neighbors, nearest_several
+from cvtgs.errors import OutOfMemoryError
 from pretended_device import CUDA, DeviceTensor, pretended_cuda
 from scenes import random_scene, same_bits
 
@@ -65,6 +66,44 @@ def test_the_search_by_blocks():
         small, report = Simplifier(config=config, device="cuda").run(scene.to("cuda"), 0.1)
         assert same_bits(on_device(small), wanted)
     assert report.backend == "torch"
+
+
+def test_without_enough_memory_auto_takes_the_cpu():
+    scene = random_scene(300)
+    prepared = Simplifier(device="cpu").prepare(scene)
+    with pretended_cuda(largest=1000):
+        elsewhere = Simplifier().prepare(scene)
+        for count in (30, 20):
+            small, report = elsewhere.run(count=count)
+            assert same_bits(small, prepared.run(count=count).scene)
+            assert report.device == "cpu"
+            assert report.device_note == "cuda:0 ran out of memory; computed on the CPU"
+        (level,) = Simplifier().levels(scene, [0.1])
+        assert level.report.device == "cpu"
+
+
+def test_a_named_device_without_enough_memory():
+    with pretended_cuda(largest=1000), pytest.raises(OutOfMemoryError) as caught:
+        Simplifier(device="cuda").simplify(random_scene(300), 0.1)
+    assert str(caught.value) == (
+        "simplifying 300 Gaussians needs more memory than cuda:0 has, in short chunks too; free "
+        "some there, or compute with device='cpu' (--device cpu)."
+    )
+
+
+def test_short_chunks_where_long_ones_do_not_fit(monkeypatch):
+    for name in ("mergenet.apply", "cells.merge"):
+        monkeypatch.setattr(f"cvtgs.{name}.CHUNK_MEMBERS", 64)
+    monkeypatch.setattr("cvtgs.analysis.visibility.HALF_GRID", 8)
+    scene = random_scene(3000, degree=0, size=0.02)
+    wanted = Simplifier(device="cpu").simplify(scene, 0.1)
+    with pretended_cuda(largest=300_000):
+        prepared = Simplifier(device="cuda").prepare(scene.to("cuda"))
+        small, report = prepared.run(0.1)
+        assert same_bits(on_device(small), wanted)
+        assert report.device_note == "cuda:0 ran out of memory; computed there in short chunks"
+    with pretended_cuda():
+        assert Simplifier(device="cuda").run(scene.to("cuda"), 0.1).report.device_note == ""
 
 
 @pytest.mark.parametrize("preset", ["standard", "paper"])

@@ -255,6 +255,8 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
 def _report_notes(report: "SimplifyReport") -> list[str]:
     """Return what is worth a sentence beyond counts, sizes and seconds."""
     notes = []
+    if report.device_note:
+        notes.append(f"{report.device_note}.")
     if report.blocks > 1:
         resumed = f", {report.resumed_blocks} of them done before" if report.resumed_blocks else ""
         notes.append(f"In {report.blocks} blocks{resumed}.")
