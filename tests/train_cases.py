@@ -13,7 +13,7 @@ import cvtgs
 from cvtgs import GaussianScene
 from cvtgs.config import SimplifyConfig
 from cvtgs.io.tensors import map_tensors
-from cvtgs.mergenet import Architecture, MergeNet
+from cvtgs.mergenet import Architecture, LearnedScene, MergeNet
 from cvtgs.train import DataConfig, History, Source, TrainConfig, TrainFiles, ViewsConfig, train
 from cvtgs.train.cases import Case, TargetViews, make_case, render_views
 
@@ -73,7 +73,11 @@ def run(config: TrainConfig, name: Path, cache: Path | None = None, **options: A
 def source_of(scene: GaussianScene, *, name: str = "made", is_validation: bool = False) -> Source:
     """A source that is there already."""
     return Source(
-        name=name, identity=f"identity of {name}", is_validation=is_validation, make=lambda: scene
+        name=name,
+        identity=f"identity of {name}",
+        is_validation=is_validation,
+        origin=LearnedScene(name=name, count=len(scene), is_validation=is_validation),
+        make=lambda: scene,
     )
 
 

@@ -4,6 +4,14 @@ import cvtgs
 from cvtgs.cli import demo
 from cvtgs.cli.display import size_text
 from cvtgs.cli.main import main
+from cvtgs.mergenet import (
+    Architecture,
+    CheckpointInfo,
+    LearnedScene,
+    MergeNet,
+    load_checkpoint,
+    save_checkpoint,
+)
 
 
 def test_info_shows_what_the_file_holds(tmp_path, capsys):
@@ -23,6 +31,41 @@ def test_info_as_json_is_the_scene_info(tmp_path, capsys):
     assert main(["info", str(path), "--json"]) == 0
     facts = cvtgs.SceneInfo.model_validate_json(capsys.readouterr().out)
     assert facts == cvtgs.describe(cvtgs.load(path))
+
+
+def test_info_shows_how_a_checkpoint_was_trained(tmp_path, capsys):
+    path = tmp_path / "net.safetensors"
+    scenes = (
+        LearnedScene(name="yard", count=1500, sha256="ab" * 32),
+        LearnedScene(name="generated-room-3", count=20_000, is_validation=True),
+    )
+    info = CheckpointInfo(
+        architecture=Architecture(), preset="standard", training="a test", seed=7, steps=1200,
+        version="0.2", config='{"seed":7}', start="cd" * 32, scenes=scenes,
+    )  # fmt: skip
+    path.write_bytes(save_checkpoint(MergeNet(info.architecture), info))
+    assert main(["info", str(path)]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    for line in (
+        "preset           standard",
+        "seed, steps      7, 1,200",
+        f"started from     {'cd' * 32}",
+        'configuration    {"seed":7}',
+        f"learned from     yard, 1,500, {'ab' * 32}",
+        "validated with   generated-room-3, 20,000, generated",
+    ):
+        assert line in printed
+    assert main(["info", str(path), "--json"]) == 0
+    assert CheckpointInfo.model_validate_json(capsys.readouterr().out) == info
+
+
+def test_info_of_a_shipped_checkpoint_and_of_a_damaged_one(tmp_path, capsys):
+    assert main(["info", "standard"]) == 0
+    digest = load_checkpoint("standard").digest
+    assert f"digest           {digest}" in capsys.readouterr().out.splitlines()
+    (tmp_path / "bad.safetensors").write_bytes(b"nothing")
+    assert main(["info", str(tmp_path / "bad.safetensors")]) == 1
+    assert "no safetensors file, or damaged" in capsys.readouterr().err
 
 
 def test_demo_writes_four_scenes_and_a_page_and_says_what_is_next(tmp_path, capsys, monkeypatch):

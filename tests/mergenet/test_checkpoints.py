@@ -16,10 +16,12 @@ from cvtgs.mergenet import (
     Architecture,
     CheckpointInfo,
     MergeNet,
+    checkpoint,
     load_checkpoint,
     save_checkpoint,
 )
 from cvtgs.mergenet.checkpoint import LARGEST_FILE
+from cvtgs.mergenet.known import SUMMARY_FEATURES
 from mergenet_cases import fields_of, lively_net, some_case
 
 SMALL = Architecture(width=2, cell_width=3)
@@ -114,14 +116,19 @@ def test_a_digest_is_known_by_hand(path):
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_checkpoints_are_small_and_say_what_they_are(name):
+def test_shipped_checkpoints_are_small_and_say_what_they_are(name, path):
     found = load_checkpoint(name)
     folder = Path(load_checkpoint.__code__.co_filename).parent / "data"
     content = (folder / f"{name}.safetensors").read_bytes()
     assert len(content) <= 3 * 2**20
     assert found.name == found.info.preset == name
     assert found.info.training
-    assert save_checkpoint(found.net, found.info) == content
+    # Files of the first format are written in the present one: with a known range.
+    path.write_bytes(save_checkpoint(found.net, found.info))
+    again = load_checkpoint(path)
+    assert again.info == found.info
+    ours, theirs = found.net.state_dict(), again.net.state_dict()
+    assert all(torch.equal(ours[key], theirs[key]) for key in ours)
 
 
 def test_every_flipped_bit_is_found(path):
@@ -180,10 +187,10 @@ def test_texts_that_are_null(path):
     refusal(path, len(text).to_bytes(8, "little") + text)
 
 
-@pytest.mark.parametrize("version", ["2", "10", "0", "-1", "1.5", "new", "9" * 5000, None])
+@pytest.mark.parametrize("version", ["3", "10", "0", "-1", "1.5", "new", "9" * 5000, None])
 def test_a_format_that_is_too_new_or_none(path, version):
     assert refusal(path, content_of(format_version=version)) == (
-        f"the checkpoint has format version {version}, this cvtgs reads up to 1; update cvtgs."
+        f"the checkpoint has format version {version}, this cvtgs reads up to 2; update cvtgs."
     )
 
 
@@ -265,3 +272,36 @@ def test_a_huge_file_is_not_read(path):
 def test_an_untrained_network_is_a_valid_checkpoint(path):
     path.write_bytes(save_checkpoint(MergeNet(SMALL), INFO))
     assert load_checkpoint(path).info == INFO
+
+
+def test_a_file_of_the_first_version_corrects_every_cell(path):
+    """It has no known range; its other tensors are as they were."""
+    net = lively_net(torch.float32, architecture=SMALL)
+    weights = {name: v for name, v in net.state_dict().items() if not name.startswith("known.")}
+    told = INFO.model_dump_json(exclude={"config", "start", "scenes"})
+    path.write_bytes(packed(weights, told, version="1"))
+    loaded = load_checkpoint(path)
+    assert loaded.info == INFO
+    seen = some_case(dtype=torch.float32).describe()
+    first, second = fields_of(net(seen)), fields_of(loaded.net(seen))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert loaded.net.known(torch.full((1, SUMMARY_FEATURES), 1e9)).tolist() == [1.0]
+
+
+def test_a_half_known_range_is_another_architecture(path):
+    net = lively_net(torch.float32, architecture=SMALL)
+    weights = {name: v for name, v in net.state_dict().items() if name != "known.low"}
+    assert refusal(path, packed(weights, INFO.model_dump_json(), version="2")) == (
+        "the checkpoint is of another architecture: known.low does not fit."
+    )
+
+
+def packed(weights: dict[str, torch.Tensor], told: str, *, version: str) -> bytes:
+    """A checkpoint file of these tensors and this description."""
+    metadata = {
+        "format": "cvtgs-mergenet",
+        "format_version": version,
+        "info": told,
+        "sha256": checkpoint._digest(weights, told),
+    }
+    return save(weights, metadata)

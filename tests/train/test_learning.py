@@ -1,16 +1,19 @@
 """A training learns: on scenes and views that it never sees, too."""
 
+import hashlib
+import json
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
+import torch
 
 import cvtgs
 from cvtgs.evaluation import psnr
-from cvtgs.mergenet import load_checkpoint
+from cvtgs.mergenet import LearnedScene, load_checkpoint, summarize
 from cvtgs.rendering import render
-from cvtgs.train import Gain, History, TrainConfig, TrainFiles
+from cvtgs.train import DataConfig, Gain, History, TrainConfig, TrainFiles
 from cvtgs.train.losses import local_loss, scene_loss
 from cvtgs.views import automatic_views
 from train_cases import (
@@ -103,6 +106,57 @@ def test_the_checkpoint_says_what_it_is(trained):
     assert info.steps == trained.history.best().step > 0
     assert (info.seed, info.version) == (0, cvtgs.__version__)
     assert (info.architecture.width, info.architecture.cell_width) == (6, 10)
+
+
+def test_the_checkpoint_says_how_to_make_it_again(trained):
+    info = load_checkpoint(trained.files.checkpoint).info
+    told = json.loads(info.config)
+    assert "folders" not in told["data"]
+    assert "start" not in told
+    folders = trained.config.data.folders
+    data = DataConfig(**told.pop("data"), folders=folders)
+    assert TrainConfig(**told, data=data) == trained.config
+    assert info.start == ""
+    assert info.scenes == tuple(
+        LearnedScene(
+            name=name,
+            count=COUNT,
+            sha256=hashlib.sha256((folders[0] / f"{name}.ply").read_bytes()).hexdigest(),
+            is_validation=name == "exam",
+        )
+        for name in ("exam", "lesson", "lesson2")
+    )
+
+
+def test_a_second_training_names_the_first(trained, tmp_path):
+    """And it forgets the range of the first: only what it learns from counts."""
+    folders = (write_scenes(tmp_path / "other", ["exam", "lesson"]),)
+    config = trained.config.model_copy(
+        update={
+            "start": trained.files.checkpoint,
+            "steps": 1,
+            "validate_every": 1,
+            "data": trained.config.data.model_copy(update={"folders": folders}),
+        }
+    )
+    run(config, tmp_path / "second.safetensors")
+    first, second = (
+        load_checkpoint(path)
+        for path in (trained.files.checkpoint, tmp_path / "second.safetensors")
+    )
+    assert second.info.start == first.digest
+    assert [scene.count for scene in second.info.scenes] == [600, 600]
+    assert not torch.equal(first.net.known.low, second.net.known.low)
+
+
+def test_the_known_range_is_that_of_the_training_cases(trained):
+    """The lessons are within it for the most part; an exam of other cells is not."""
+    known = load_checkpoint(trained.files.checkpoint).net.known
+    lessons = some_case(COUNT, seed=1, ratio=0.05, preset="paper")
+    shares = known(summarize(lessons.descriptors))
+    assert float(shares.mean()) > 0.8
+    wild = replace(lessons.descriptors, cells=lessons.descriptors.cells + 100)
+    assert not bool(known(summarize(wild)).any())
 
 
 def test_curves_are_a_image(trained):

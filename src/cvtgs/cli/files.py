@@ -22,9 +22,10 @@ def add_info(add_parser: AddParser) -> None:
     """Add the command and its options."""
     parser = add_parser(
         "info",
-        help="show facts about a scene",
+        help="show facts about a scene or a checkpoint",
         description="Show counts, sizes and statistics of a scene, and which effects simplify "
-        "would compute for it.",
+        "would compute for it; or how a checkpoint (standard, paper or a .safetensors file) was "
+        "trained.",
     )
     parser.set_defaults(run=show_info)
     add_options(parser, "input", "--json", "--effects", "--trust-sizes")
@@ -32,6 +33,9 @@ def add_info(add_parser: AddParser) -> None:
 
 def show_info(options: argparse.Namespace) -> None:
     """Run ``cvtgs info``."""
+    if is_checkpoint(options.input):
+        show_checkpoint(options.input, as_json=options.json)
+        return
     settings = read_settings(effects=options.effects)
     config = cvtgs.SimplifyConfig.compose(settings=settings)
     facts = cvtgs.describe(read_scene(options, config), config)
@@ -40,6 +44,42 @@ def show_info(options: argparse.Namespace) -> None:
     else:
         for label, text in _rows(facts, options.input):
             say(f"{label:<16} {text}")
+
+
+def is_checkpoint(path: Path) -> bool:
+    """Whether a name means a checkpoint: that of a shipped one, or a file of that format."""
+    shipped = str(path) in cvtgs.mergenet.SHIPPED and not path.exists()
+    return shipped or path.suffix == ".safetensors"
+
+
+def show_checkpoint(path: Path, *, as_json: bool) -> None:
+    """Print how a checkpoint was trained."""
+    checkpoint = cvtgs.mergenet.load_checkpoint(path)
+    info = checkpoint.info
+    if as_json:
+        say(info.model_dump_json(indent=2))
+        return
+    unknown = "unknown"
+    rows = [
+        ("checkpoint", checkpoint.name),
+        ("digest", checkpoint.digest),
+        ("preset", info.preset),
+        ("training", info.training or unknown),
+        ("seed, steps", f"{info.seed}, {info.steps:,}"),
+        ("cvtgs", info.version or unknown),
+        ("architecture", info.architecture.model_dump_json()),
+        ("started from", info.start or ("nothing" if info.config else unknown)),
+        ("configuration", info.config or unknown),
+    ]
+    rows += [
+        (
+            "validated with" if scene.is_validation else "learned from",
+            f"{scene.name}, {scene.count:,}, {scene.sha256 or 'generated'}",
+        )
+        for scene in info.scenes
+    ]
+    for label, text in rows:
+        say(f"{label:<16} {text}")
 
 
 def _rows(facts: "SceneInfo", path: Path) -> list[tuple[str, str]]:

@@ -5,9 +5,11 @@ from cvtgs.mergenet.checkpoint import (
     SHIPPED,
     Checkpoint,
     CheckpointInfo,
+    LearnedScene,
     load_checkpoint,
     save_checkpoint,
 )
+from cvtgs.mergenet.known import KnownRange, summarize
 from cvtgs.mergenet.model import Architecture, MergeNet, Residuals
 
 __all__ = [
@@ -15,10 +17,13 @@ __all__ = [
     "Architecture",
     "Checkpoint",
     "CheckpointInfo",
+    "KnownRange",
+    "LearnedScene",
     "MergeNet",
     "Residuals",
     "compose",
     "correct_cells",
     "load_checkpoint",
     "save_checkpoint",
+    "summarize",
 ]

@@ -21,9 +21,33 @@ SHIPPED = ("standard", "paper")
 """Names of the checkpoints that come with the package."""
 
 FORMAT = "cvtgs-mergenet"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""Files of version 1 have no known range: their networks correct every cell."""
+
+KNOWN = "known."
+"""Tensors of the known range have names that start so."""
+
 LARGEST_FILE = 1 << 26
 """Files above 64 MiB are not read; a MergeNet has less than one."""
+
+
+class LearnedScene(pydantic.BaseModel):
+    """A scene that a training had.
+
+    Attributes:
+        name: Name of its file, without the suffix, or of the generated scene.
+        count: Gaussians.
+        sha256: Hash of the file, hexadecimal; empty for a generated scene, which name, count and
+            version of cvtgs determine.
+        is_validation: Whether it was for validation only.
+    """
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    count: int
+    sha256: str = ""
+    is_validation: bool = False
 
 
 class CheckpointInfo(pydantic.BaseModel):
@@ -36,6 +60,9 @@ class CheckpointInfo(pydantic.BaseModel):
         seed: Seed of the training.
         steps: Training steps.
         version: Version of cvtgs that trained it.
+        config: The configuration of the training as JSON, without paths; empty if unknown.
+        start: Digest of the checkpoint that it started from; empty for none.
+        scenes: What it learned from and was validated with.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -46,6 +73,9 @@ class CheckpointInfo(pydantic.BaseModel):
     seed: int = 0
     steps: int = 0
     version: str = ""
+    config: str = ""
+    start: str = ""
+    scenes: tuple[LearnedScene, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -194,6 +224,9 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
 
 def _build_net(info: CheckpointInfo, tensors: dict[str, Tensor], name: str) -> MergeNet:
     net = MergeNet(info.architecture)
+    if not any(key.startswith(KNOWN) for key in tensors):
+        own = net.state_dict()
+        tensors = tensors | {key: own[key] for key in own if key.startswith(KNOWN)}
     wanted = {key: (values.shape, values.dtype) for key, values in net.state_dict().items()}
     found = {key: (values.shape, values.dtype) for key, values in tensors.items()}
     if wanted != found:

@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 
 from cvtgs.cells.features import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES, Descriptors
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
+from cvtgs.mergenet.known import KnownRange, summarize
 
 LARGE_GROWTH = 0.6
 """A large change of a log scale, for the cost of residuals."""
@@ -82,6 +83,26 @@ class Residuals:
         ]
         return torch.stack([part.square().mean() for part in parts]).mean()
 
+    def scaled(self, shares: Float[Tensor, "m"], ids: Int[Tensor, "n"]) -> "Residuals":
+        """Multiply the changes of every cell by a share.
+
+        Args:
+            shares: One number per cell; 0 changes nothing.
+            ids: The cell of every member.
+
+        Returns:
+            The smaller residuals.
+        """
+        by_cell = shares[:, None]
+        return Residuals(
+            d_means=self.d_means * by_cell,
+            d_log_scales=self.d_log_scales * by_cell,
+            d_rotvecs=self.d_rotvecs * by_cell,
+            d_logit_opacities=self.d_logit_opacities * shares,
+            member_colors=self.member_colors * shares.index_select(0, ids),
+            pair_colors=self.pair_colors * by_cell,
+        )
+
 
 class MergeNet(nn.Module):
     """Predicts residuals from descriptors.
@@ -92,6 +113,7 @@ class MergeNet(nn.Module):
     but position, rotation and colour are sums over members and neighbours of their differences
     from the cell, each times a gate that the network predicts. So the residuals turn with the
     scene, mix the colours that are there, and any number of SH bands comes at no cost.
+    Cells unlike those of the training stay as they are (:class:`KnownRange`).
 
     Args:
         architecture: Its shape.
@@ -112,6 +134,7 @@ class MergeNet(nn.Module):
         self.decoder = nn.Linear(cell_width, 4)
         self.member_gates = _Gates(width, cell_width)
         self.pair_gates = _Gates(width, cell_width)
+        self.known = KnownRange()
         nn.init.zeros_(self.decoder.weight)
         nn.init.zeros_(self.decoder.bias)
 
@@ -169,7 +192,7 @@ class MergeNet(nn.Module):
         others = _pulls(of_pairs, pair_positions, near).unflatten(0, shape).sum(dim=1)
         # Twice, so that neighbours may turn a cell as a gate of 1 does.
         twists = pulls[:, 3:] + 2 * others[:, 3:]
-        return Residuals(
+        residuals = Residuals(
             d_means=pulls[:, :3] + others[:, :3],
             d_log_scales=self.architecture.largest_growth * torch.tanh(sizes[:, :3]),
             d_rotvecs=LARGEST_TURN * torch.tanh(twists),
@@ -177,6 +200,7 @@ class MergeNet(nn.Module):
             member_colors=of_members[:, 1] * weights,
             pair_colors=of_pairs[:, 1].unflatten(0, shape),
         )
+        return residuals.scaled(self.known(summarize(descriptors)), ids)
 
 
 class _SiLU(nn.Module):

@@ -13,7 +13,14 @@ from torch import Tensor
 import cvtgs
 from cvtgs.errors import ConfigError, MissingDependencyError, OutputError, TrainingError
 from cvtgs.io import atomic_output
-from cvtgs.mergenet import Architecture, CheckpointInfo, MergeNet, load_checkpoint, save_checkpoint
+from cvtgs.mergenet import (
+    Architecture,
+    CheckpointInfo,
+    MergeNet,
+    load_checkpoint,
+    save_checkpoint,
+    summarize,
+)
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.train.cache import TrainingScene, prepare_scene
 from cvtgs.train.cases import Case, TargetViews
@@ -128,6 +135,10 @@ def train(
         state.load(files.state, config)
     _make_folder(files.cache)
     cases, validation_scenes = _prepare_scenes(sources, config, files.cache, listener)
+    state.learn_from(
+        {source.origin: None for source in sources},
+        (summarize(case.descriptors) for case, _ in cases),
+    )
     if not state.history.validations:
         _validate(state, validation_scenes, math.nan, config, files, device)
         on_validation(state.history)
@@ -136,7 +147,8 @@ def train(
         losses.append(_step(state, cases, config, files, device))
         listener(ProgressEvent(stage="train", done=state.step, total=config.steps))
         if state.step % config.validate_every == 0 or state.step == config.steps:
-            _validate(state, validation_scenes, sum(losses) / len(losses), config, files, device)
+            loss = sum(losses) / len(losses)
+            _validate(state, validation_scenes, loss, config, files, device)
             on_validation(state.history)
             losses = []
     return state.history
@@ -262,6 +274,10 @@ def _validate(
 
 
 def _description(state: TrainState, config: TrainConfig) -> CheckpointInfo:
+    # Without paths, and without what does not set the weights.
+    told = config.model_dump_json(
+        exclude={"start": True, "note": True, "patience": True, "data": {"folders"}}
+    )
     return CheckpointInfo(
         architecture=state.net.architecture,
         preset=config.preset,
@@ -269,4 +285,7 @@ def _description(state: TrainState, config: TrainConfig) -> CheckpointInfo:
         seed=config.seed,
         steps=state.step,
         version=cvtgs.__version__,
+        config=told,
+        start="" if config.start is None else load_checkpoint(config.start).digest,
+        scenes=state.scenes,
     )

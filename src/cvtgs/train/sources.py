@@ -1,5 +1,6 @@
 """Scenes to train on and to validate with: files, pieces of them, copies, generated ones."""
 
+import hashlib
 import random
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from cvtgs.errors import ConfigError
 from cvtgs.io import load
 from cvtgs.math import parameters
 from cvtgs.math.parameters import positive_log
+from cvtgs.mergenet import LearnedScene
 from cvtgs.scene import GaussianScene
 from cvtgs.train.config import DataConfig
 from cvtgs.validity import valid_rows
@@ -29,12 +31,14 @@ class Source:
         name: Unique name.
         identity: Text that changes when the scene does, part of the name of its cache.
         is_validation: Whether it is for validation only.
+        origin: The file or generated scene that it is, or was cut from.
         make: Function that makes the scene.
     """
 
     name: str
     identity: str
     is_validation: bool
+    origin: LearnedScene
     make: Callable[[], GaussianScene]
 
 
@@ -88,11 +92,15 @@ def _from_files(
     files: list[Path], held_out: set[str], config: DataConfig, seed: int
 ) -> Iterator[Source]:
     for path in files:
-        count, file = len(load(path)), path.stat()
+        count, name = len(load(path)), path.stem
+        with path.open("rb") as file:
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        is_validation = name in held_out
         whole = Source(
-            name=path.stem,
-            identity=f"{path.resolve()} {file.st_size} {file.st_mtime_ns}",
-            is_validation=path.stem in held_out,
+            name=name,
+            identity=sha256,
+            is_validation=is_validation,
+            origin=LearnedScene(name=name, count=count, sha256=sha256, is_validation=is_validation),
             make=partial(_load_valid, path),
         )
         if whole.is_validation:
@@ -105,6 +113,7 @@ def _from_files(
                 name=f"{path.stem}-block{number}",
                 identity=f"{whole.identity} block {config.block_count} {seed + number}",
                 is_validation=False,
+                origin=whole.origin,
                 make=partial(_block_of, whole, config.block_count, seed + number),
             )
             originals.append(block)
@@ -134,6 +143,7 @@ def _copies(originals: list[Source], count: int, seed: int) -> Iterator[Source]:
                 name=name,
                 identity=f"{original.identity} copy {seed} {number}",
                 is_validation=False,
+                origin=original.origin,
                 make=partial(_perturbed, original, f"{seed}/{name}"),
             )
 
@@ -152,6 +162,7 @@ def _generated(config: DataConfig, seed: int) -> Iterator[Source]:
                     name=name,
                     identity=f"{name} {count} {degree}",
                     is_validation=is_validation,
+                    origin=LearnedScene(name=name, count=count, is_validation=is_validation),
                     make=partial(synthetic.scene, kind, count, sh_degree=degree, seed=first + turn),
                 )
 

@@ -2,7 +2,7 @@
 
 import copy
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from statistics import mean
 from typing import Any, NamedTuple, Self
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from cvtgs.errors import CheckpointError
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
-from cvtgs.mergenet import MergeNet
+from cvtgs.mergenet import LearnedScene, MergeNet
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.train.config import TrainConfig
 
@@ -177,7 +177,14 @@ class TrainState:
             net.parameters(), lr=config.learning_rate, betas=(0.9, 0.98), weight_decay=0.0
         )
         self.history = History()
+        self.scenes: tuple[LearnedScene, ...] = ()
         self.step = 0
+
+    def learn_from(self, scenes: Iterable[LearnedScene], cases: Iterable[Tensor]) -> None:
+        """Note the scenes, and tell both networks the range of the summaries of all cases."""
+        self.scenes = tuple(scenes)
+        self.net.known.fit(cases)
+        self.mean_net.known.load_state_dict(self.net.known.state_dict())
 
     def average(self) -> None:
         """Update the running mean of the weights."""
