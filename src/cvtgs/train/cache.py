@@ -22,7 +22,7 @@ from cvtgs.train.sources import Source
 
 Content = TypeVar("Content", TargetViews, Case)
 
-CACHE_VERSION = 3
+CACHE_VERSION = 4
 """Part of the name of every file; to be raised when the meaning of the content changes."""
 
 

@@ -20,7 +20,7 @@ from cvtgs.pipeline import merge_cells
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import check_rows
-from cvtgs.views import automatic_views, random_views
+from cvtgs.views import mixed_views
 
 
 class MergedScene(NamedTuple):
@@ -212,15 +212,8 @@ class TargetViews:
 
 
 def render_views(scene: GaussianScene, count: int, *, size: int, seed: int) -> TargetViews:
-    """Render a full scene: half from automatic cameras, half from random positions."""
-    around = random_views(scene, count // 2, size=size, seed=seed)
-    usual = automatic_views(scene, count - count // 2, width=size, height=size, seed=seed)
-    cameras = Cameras(
-        viewmats=torch.cat([usual.viewmats, around.viewmats]),
-        Ks=torch.cat([usual.Ks, around.Ks]),
-        width=size,
-        height=size,
-    )
+    """Render a full scene from automatic cameras and from random positions, near ones too."""
+    cameras = mixed_views(scene, count, size=size, seed=seed)
     with torch.no_grad():
         images = render(scene, cameras)
     return TargetViews(
