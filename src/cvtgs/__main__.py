@@ -1,5 +1,23 @@
-"""``python -m cvtgs``."""
+"""``python -m cvtgs`` and the command ``cvtgs``."""
 
-from cvtgs.cli.main import run_process
+import os
+import signal
+from types import FrameType
+from typing import NoReturn
 
-run_process()
+
+def run() -> NoReturn:
+    """Run the command line; an interrupt while its code is loaded is no traceback either."""
+    signal.signal(signal.SIGINT, _leave)
+    from cvtgs.cli.main import run_process  # noqa: PLC0415 (takes time to load)
+
+    run_process()
+
+
+def _leave(signum: int, frame: FrameType | None) -> None:
+    os.write(2, b"cvtgs: interrupted; nothing was written.\n")
+    os._exit(130)
+
+
+if __name__ == "__main__":
+    run()

@@ -161,3 +161,89 @@ def test_python_m_cvtgs_and_broken_pipe_do_not_trace_back():
     result = run_cvtgs("info", "missing.ply", env=environment)
     assert result.returncode == 1
     assert "Traceback" not in result.stderr
+
+
+full_disk = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+
+
+@full_disk
+@pytest.mark.parametrize("words", [["info", "a.ply"], ["--version"], ["info", "--help"]])
+def test_a_full_disk_behind_stdout_is_one_sentence(tmp_path, words):
+    cvtgs.save(cvtgs.synthetic.scene("object", 20, sh_degree=0, seed=0), tmp_path / "a.ply")
+    with Path("/dev/full").open("w") as full:
+        done = run_into(full, tmp_path, *words)
+    assert done.returncode == 1
+    assert done.stderr == (
+        "cvtgs: error: standard output must be writable, found: no space left on device.\n"
+    )
+
+
+def run_into(stdout, folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "cvtgs", *words]
+    return subprocess.run(
+        command, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False, cwd=folder
+    )
+
+
+@full_disk
+def test_what_cannot_be_said_on_stderr_changes_no_exit_code(tmp_path):
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "cvtgs", "info", "no.ply"], stderr=full, check=False
+        )
+    assert done.returncode == 1
+
+
+@pytest.mark.skipif(os.name != "posix", reason="closes pipes as POSIX does")
+def test_a_reader_that_leaves_is_no_error(tmp_path):
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as closed:
+        done = run_into(closed, tmp_path, "--version")
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_a_signal_lost_where_nothing_can_be_raised_is_sent_again(tmp_path, monkeypatch, capsys):
+    class Deaf:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    def run(options):
+        Deaf()  # its exception is lost
+        deadline = time.monotonic() + 30
+        while time.monotonic() < deadline:
+            time.sleep(0.01)
+        raise AssertionError("went on")
+
+    monkeypatch.setattr("cvtgs.cli.files.show_info", run)
+    assert main(["info", "a.ply"]) == 130
+    assert capsys.readouterr().err == "cvtgs: interrupted; nothing was half-written.\n"
+
+
+def test_an_interrupt_that_becomes_another_error_is_an_interrupt(monkeypatch, capsys):
+    def run(options):
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt as error:
+            raise cvtgs.errors.FileFormatError("of a library.") from error
+
+    monkeypatch.setattr("cvtgs.cli.files.show_info", run)
+    assert main(["info", "a.ply"]) == 143
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends signals as POSIX does")
+def test_an_interrupt_while_the_code_is_loaded_is_no_traceback(tmp_path):
+    """The first import of the command line sends it."""
+    (tmp_path / "cvtgs_stop.py").write_text(
+        "import signal, sys\n"
+        "class Stop:\n"
+        "    def find_spec(self, name, *rest):\n"
+        "        if name == 'cvtgs.cli':\n"
+        "            signal.raise_signal(signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Stop())\n"
+    )
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import cvtgs_stop; "
+    code += "import cvtgs.__main__ as start; start.run()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "cvtgs: interrupted; nothing was written.\n")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TextIO
 
 import cvtgs
+from cvtgs.errors import OutputError
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.text import printable
 
@@ -21,7 +22,30 @@ TIE = "\N{NO-BREAK SPACE}"
 def say(text: str, *, file: TextIO | None = None, end: str = "\n", flush: bool = False) -> None:
     """Print a text, with what a terminal would obey or cannot show as escapes."""
     file = sys.stdout if file is None else file
-    print(printable(text, file.encoding or "utf-8"), file=file, end=end, flush=flush)
+    if file is None:  # closed by who started the process
+        return
+    with _console_errors(file):
+        print(printable(text, file.encoding or "utf-8"), file=file, end=end, flush=flush)
+
+
+def flush_output() -> None:
+    """Print what is left in the buffer of stdout."""
+    file = sys.stdout
+    if file is None:
+        return
+    with _console_errors(file):
+        file.flush()
+
+
+@contextmanager
+def _console_errors(file: TextIO) -> Iterator[None]:
+    """Turn the error of a full disk or a closed pipe into a sentence; stderr is not missed."""
+    try:
+        yield
+    except OSError as error:
+        if file is not sys.stderr:
+            reason = (error.strerror or str(error)).lower()
+            raise OutputError(f"standard output must be writable, found: {reason}.") from error
 
 
 def say_wrapped(text: str, *, file: TextIO | None = None, indent: int = 0) -> None:

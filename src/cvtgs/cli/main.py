@@ -4,13 +4,14 @@ import io
 import os
 import signal
 import sys
+import threading
 import warnings
 from collections.abc import Sequence
 from types import FrameType
 from typing import NoReturn, TextIO
 
 from cvtgs.cli.demo import add_demo
-from cvtgs.cli.display import say
+from cvtgs.cli.display import flush_output, say
 from cvtgs.cli.doctor import ShowVersions, add_doctor
 from cvtgs.cli.evaluate import add_compare, add_evaluate, add_render, add_tradeoff
 from cvtgs.cli.files import add_convert, add_info
@@ -20,8 +21,7 @@ from cvtgs.cli.simplify import add_simplify
 from cvtgs.cli.train import add_train
 from cvtgs.errors import CvtgsError, memory_errors
 
-INTERRUPTED = 130
-TERMINATED = 143
+INTERRUPTED, TERMINATED, PIPE_CLOSED = 130, 143, 141
 MEMORY_ADVICE = (
     "free some, or give simplify less to hold at once: a binary .ply with --memory AMOUNT, for "
     "example 2GB, and --device cpu if a GPU ran out"
@@ -32,32 +32,42 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status."""
     # Torch reads this when it starts; by default idle OpenMP threads spin and use much CPU time.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    words = sys.argv[1:] if arguments is None else arguments
-    parser = build_parser()
-    if not words:
-        parser.exit(2, parser.format_help())
-    options = parser.parse_args(words)
-    interrupt = _Interrupt()
-    before = signal.signal(signal.SIGINT, interrupt), signal.signal(signal.SIGTERM, _terminate)
+    stop = _Stop()
+    before = signal.signal(signal.SIGINT, stop), signal.signal(signal.SIGTERM, stop)
+    hook, sys.unraisablehook = sys.unraisablehook, stop.notice
     with warnings.catch_warnings():
         warnings.showwarning = _show_warning
         warnings.simplefilter("always", UserWarning)
         try:
-            with memory_errors(f"cvtgs {options.command}", MEMORY_ADVICE):
-                options.run(options)
-        except CvtgsError as error:
+            _run(sys.argv[1:] if arguments is None else arguments)
+        except (KeyboardInterrupt, Exception) as error:
+            # An interrupted import may raise another error instead of KeyboardInterrupt.
+            if stop.code is not None:
+                signal.signal(signal.SIGINT, signal.SIG_IGN)  # of an impatient user
+                if stop.code == INTERRUPTED:
+                    say("cvtgs: interrupted; nothing was half-written.", file=sys.stderr)
+                return stop.code
+            if not isinstance(error, CvtgsError):
+                raise
+            if isinstance(error.__cause__, BrokenPipeError):  # of "cvtgs info | head"
+                return PIPE_CLOSED
             say(f"cvtgs: error: {error}", file=sys.stderr)
             return 1
-        except (KeyboardInterrupt, Exception):
-            # An interrupted import may raise another error instead of KeyboardInterrupt.
-            if not interrupt.happened:
-                raise
-            say("cvtgs: interrupted; nothing was half-written.", file=sys.stderr)
-            return INTERRUPTED
         finally:
+            sys.unraisablehook = hook
             for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
                 signal.signal(number, handler)
     return 0
+
+
+def _run(words: Sequence[str]) -> None:
+    parser = build_parser()
+    if not words:
+        parser.exit(2, parser.format_help())
+    options = parser.parse_args(words)
+    with memory_errors(f"cvtgs {options.command}", MEMORY_ADVICE):
+        options.run(options)
+    flush_output()
 
 
 def run_process() -> NoReturn:
@@ -67,18 +77,34 @@ def run_process() -> NoReturn:
             stream.reconfigure(errors="backslashreplace")
     code = main()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt from here on must not change it
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError:  # told already; Python would tell again when it ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     sys.exit(code)
 
 
-class _Interrupt:
-    """A handler of SIGINT that raises KeyboardInterrupt and records it."""
+class _Stop:
+    """A handler of SIGINT and SIGTERM that raises KeyboardInterrupt and records the exit status."""
 
     def __init__(self) -> None:
-        self.happened = False
+        self.code: int | None = None
 
     def __call__(self, signum: int, frame: FrameType | None) -> None:
-        self.happened = True
+        self.code = INTERRUPTED if signum == signal.SIGINT else TERMINATED
         raise KeyboardInterrupt
+
+    def notice(self, event: "sys.UnraisableHookArgs") -> None:
+        """Send the signal again if its exception was lost where none can be raised."""
+        if self.code is None:
+            sys.__unraisablehook__(event)
+            return
+        if event.exc_type is KeyboardInterrupt:
+            number = signal.SIGINT if self.code == INTERRUPTED else signal.SIGTERM
+            again = threading.Timer(0.01, signal.raise_signal, (number,))
+            again.daemon = True
+            again.start()
 
 
 def build_parser() -> CommandParser:
@@ -120,8 +146,3 @@ def _show_warning(
     line: str | None = None,
 ) -> None:
     say(f"cvtgs: warning: {message}", file=sys.stderr)
-
-
-def _terminate(signum: int, frame: FrameType | None) -> None:
-    """Exit through SystemExit, so that temporary files are removed."""
-    sys.exit(TERMINATED)
