@@ -90,15 +90,16 @@ def test_any_moment_leaves_the_old_file_or_none_or_the_new_one(tmp_path, name, n
         rest = [p for p in tmp_path.iterdir() if p not in (path, tmp_path / "whole.ply")]
         assert all(p.name.startswith(".a.ply.") and p.suffix == ".tmp" for p in rest)
         litter += len(rest)
-        for left in rest:
-            left.unlink()
+        if rest:
+            write(path, True)  # the next run removes what is left
+            assert {*tmp_path.iterdir()} == {path, tmp_path / "whole.ply"}
         if code == 0:
             break
     assert code == 0  # in the end there was no such line any more
     assert moment > 8 * STEPS[name]
     assert ends == {old, new}
-    # A kill leaves its temporary file; others only where they hit the line that removes it.
-    assert litter > 0 if number == signal.SIGKILL else litter <= 1
+    # A kill leaves its temporary file; others only where they hit the lines that open or remove it.
+    assert litter > 0 if number == signal.SIGKILL else litter <= 4
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the file size as Linux does")

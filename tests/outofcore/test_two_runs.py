@@ -2,9 +2,11 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -172,3 +174,19 @@ def test_a_folder_that_cannot_be_emptied_is_one_sentence(source, tmp_path):
     (tmp_path / ".out.ply.blocks").write_text("a file in its place")
     with pytest.raises(OutputError, match="must become an empty folder"):
         simplify_file(source, tmp_path / "out.ply", 0.1, blocks=3)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the maps of Linux")
+def test_no_file_is_mapped_when_the_folder_is_removed(source, tmp_path, monkeypatch):
+    """Windows does not remove such files."""
+    seen, remove = [], shutil.rmtree
+
+    def look(path, **options):
+        maps = Path("/proc/self/maps").read_text(encoding="utf-8")
+        seen.append([line for line in maps.splitlines() if ".blocks/" in line])
+        remove(path, **options)
+
+    monkeypatch.setattr(shutil, "rmtree", look)
+    box = cvtgs.boxes.Box(min=(0, 0, 0), max=(9, 9, 9))
+    simplify_file(source, tmp_path / "out.ply", 0.5, blocks=3, boxes=[box])
+    assert seen == [[], []]  # before and after

@@ -274,7 +274,8 @@ def test_tasks_are_checked():
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are those of POSIX")
-def test_an_interrupt_ends_the_process_too(tmp_path):
+@pytest.mark.parametrize("number", ["SIGINT", "SIGKILL"])
+def test_what_ends_this_process_ends_the_one_that_it_started(tmp_path, number):
     note = tmp_path / "pid"
     inner = f"import os, pathlib, time; pathlib.Path({str(note)!r}).write_text(str(os.getpid()))"
     outer = "import signal, sys; from cvtgs.tradeoff.runs import run_process;"
@@ -283,7 +284,7 @@ def test_an_interrupt_ends_the_process_too(tmp_path):
     outer += f"[sys.executable, '-c', {inner + '; time.sleep(120)'!r}])"
     with subprocess.Popen([sys.executable, "-c", outer], stderr=subprocess.PIPE) as process:
         pid = wait_for(lambda: note.exists() and note.read_text())
-        process.send_signal(signal.SIGINT)
+        process.send_signal(getattr(signal, number))
         process.communicate(timeout=60)
     assert process.returncode != 0
     assert wait_for(lambda: not is_alive(int(pid)))

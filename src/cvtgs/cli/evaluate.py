@@ -3,7 +3,7 @@
 import argparse
 import re
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING, NamedTuple
 
 import cvtgs
@@ -20,6 +20,7 @@ from cvtgs.cli.options import (
     read_words,
 )
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.io.atomic import windows_fault
 from cvtgs.progress import ProgressEvent
 from cvtgs.text import printable
 
@@ -87,7 +88,9 @@ def file_names(views: Sequence[str]) -> list[str]:
     for view in views:
         name = PurePosixPath(view.replace("\\", "/")).name
         bare = re.sub(r"\.(png|jpe?g|webp|tiff?|bmp)$", "", name, flags=re.IGNORECASE)
-        stems.append(re.sub(r"[^\w.-]+", "_", bare).strip("._") or "view")
+        stem = re.sub(r"[^\w.-]+", "_", bare).strip("._") or "view"
+        is_device = windows_fault(PureWindowsPath(stem)) is not None
+        stems.append(f"view_{stem}" if is_device else stem)
     if len({stem.lower() for stem in stems}) == len(stems):
         return [f"{stem}.png" for stem in stems]
     return [f"{number:03d}_{stem}.png" for number, stem in enumerate(stems, start=1)]

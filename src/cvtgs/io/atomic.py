@@ -5,15 +5,36 @@ import errno
 import os
 import secrets
 import stat
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from contextlib import contextmanager, suppress
+from pathlib import Path, PureWindowsPath
 from typing import BinaryIO
 
 from cvtgs.errors import CvtgsError, OutputError, OutputExistsError
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 _HERE, _NO_REPLACE = -100, 1
 """AT_FDCWD and RENAME_NOREPLACE of Linux."""
+
+_WINDOWS = os.name == "nt"
+_RESERVED = {
+    "CON",
+    "PRN",
+    "AUX",
+    "NUL",
+    *(f"{port}{n}" for port in ("COM", "LPT") for n in "123456789"),
+}
+
+_MOST_WRITERS = 16
+"""Writers of one output at once whose leftovers are found again after a kill."""
+
+_OLD_SECONDS = 3600
+"""Without locks, a temporary file that was not written to for so long is a leftover."""
 
 _DISK_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 
@@ -35,7 +56,14 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
         ...     check_output(Path(folder) / "new.ply")
     """
     target = _target(path)
+    fault = windows_fault(PureWindowsPath(path)) if _WINDOWS else None
+    if fault is not None:
+        raise OutputError(f"{os.fspath(path)}: the output must have a name, found {fault}.")
     try:
+        if target.is_symlink():  # links that are no loop are followed
+            raise OutputError(
+                f"{os.fspath(path)}: the output must be a file, found a loop of symbolic links."
+            )
         if target.is_dir():
             raise OutputError(f"{os.fspath(path)}: the output must be a file, found a directory.")
         if target.exists() and not target.is_file():
@@ -90,21 +118,99 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
     """
     check_output(path, overwrite)
     target = _target(path)
-    temporary = target.with_name(f".{target.name[:48]}.{secrets.token_hex(8)}.tmp")
+    temporary, file = None, None
     try:
-        with temporary.open("xb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        _publish(temporary, target, overwrite=overwrite)
+        temporary, file = _open_temporary(target)
+        with file:
+            try:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+                if fcntl is not None:  # still locked, so nobody takes it for a leftover
+                    _publish(temporary, target, overwrite=overwrite)
+            finally:
+                if fcntl is not None and _is_own(temporary, file):
+                    temporary.unlink()
+        if fcntl is None:
+            _publish(temporary, target, overwrite=overwrite)
     except OSError as error:
-        if isinstance(error, CvtgsError) or not _concerns(error, temporary):
+        if isinstance(error, CvtgsError) or not _concerns(error, target):
             raise
         if isinstance(error, FileExistsError):
             raise _exists(path) from error
         raise _failed(path, error) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        if fcntl is None and temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def windows_fault(path: PureWindowsPath) -> str | None:
+    """Return what Windows would not write to under this name, or under another one."""
+    name = path.name
+    wrong = sorted({letter for letter in name if letter in '<>:"|?*' or letter < " "})
+    if wrong:  # "a.ply:b" is a hidden part of the file a.ply
+        return f"the letters {' '.join(wrong)}, which Windows does not allow"
+    if name.split(".")[0].rstrip(" ").upper() in _RESERVED:
+        return f"{name}, which is a device on Windows"
+    if name != name.rstrip(" ."):
+        return "a dot or blank at its end, which Windows drops"
+    return None
+
+
+def _open_temporary(target: Path) -> tuple[Path, BinaryIO]:
+    """Open a new file beside a target; those that killed processes have left are removed."""
+    names = [f".{target.name[:48]}.{number}.tmp" for number in range(_MOST_WRITERS)]
+    for place, name in enumerate(names):
+        temporary = target.with_name(name)
+        _remove_leftover(temporary)
+        try:
+            file = temporary.open("xb")
+        except FileExistsError:  # another process writes to it
+            continue
+        if _lock(file.fileno()) and os.fstat(file.fileno()).st_nlink:
+            for later in names[place + 1 :]:
+                if not os.path.lexists(target.with_name(later)):
+                    break
+                _remove_leftover(target.with_name(later))
+            return temporary, file
+        file.close()
+    temporary = target.with_name(f".{target.name[:48]}.{secrets.token_hex(8)}.tmp")
+    return temporary, temporary.open("xb")
+
+
+def _lock(descriptor: int) -> bool:
+    """Lock a file until it is closed; False if another process holds it."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno not in (errno.EWOULDBLOCK, errno.EACCES)  # else there are no locks
+    return True
+
+
+def _remove_leftover(temporary: Path) -> None:
+    """Remove the file of a process that was killed; that of one which still writes stays."""
+    with suppress(OSError):
+        if fcntl is None:
+            if time.time() - temporary.stat().st_mtime > _OLD_SECONDS:
+                temporary.unlink()
+            return
+        descriptor = os.open(temporary, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(descriptor), temporary.lstat()):
+                temporary.unlink()
+        finally:
+            os.close(descriptor)
+
+
+def _is_own(temporary: Path, file: BinaryIO) -> bool:
+    """Return whether a name is still that of an open file, not of one made after it moved."""
+    try:
+        return os.path.samestat(temporary.lstat(), os.fstat(file.fileno()))
+    except (OSError, ValueError):
+        return False
 
 
 def _target(path: str | os.PathLike[str]) -> Path:
@@ -170,11 +276,11 @@ def _is(path: Path, empty: os.stat_result) -> bool:
     return os.path.samestat(found, empty) and found.st_size == 0
 
 
-def _concerns(error: OSError, temporary: Path) -> bool:
+def _concerns(error: OSError, target: Path) -> bool:
     """Return whether an error is about this output, not about other files of the caller."""
     if error.filename is None:
         return True
-    return Path(os.fsdecode(error.filename)).parent == temporary.parent
+    return Path(os.fsdecode(error.filename)).parent == target.parent
 
 
 def _exists(path: str | os.PathLike[str]) -> OutputExistsError:

@@ -1,7 +1,7 @@
 """The scan: what all blocks need of the whole scene, from a sample and one pass over the file."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
@@ -252,15 +252,15 @@ _ADAPTERS = {kind: pydantic.TypeAdapter(kind) for kind in (float, int, EffectPla
 
 def read_scan(path: Path) -> SceneScan:
     """Read what :func:`write_scan` wrote."""
-    tensors, texts = map_tensors(path)
-
-    def build(name: str, kind: Any) -> Any:
-        if kind in _ADAPTERS:
-            return _ADAPTERS[kind].validate_json(texts[name])
-        kinds = get_type_hints(kind) if is_dataclass(kind) else {}
-        if not kinds:
-            return tensors[name]
-        return kind(**{key: build(f"{name}.{key}", kinds[key]) for key in kinds})
-
-    scan: SceneScan = build("scan", SceneScan)
+    scan: SceneScan = _build("scan", SceneScan, *map_tensors(path))
     return scan
+
+
+def _build(name: str, kind: Any, tensors: Mapping[str, Tensor], texts: Mapping[str, str]) -> Any:
+    """Build a value of its parts; a closure that calls itself would keep the file mapped."""
+    if kind in _ADAPTERS:
+        return _ADAPTERS[kind].validate_json(texts[name])
+    kinds = get_type_hints(kind) if is_dataclass(kind) else {}
+    if not kinds:
+        return tensors[name]
+    return kind(**{key: _build(f"{name}.{key}", kinds[key], tensors, texts) for key in kinds})

@@ -22,12 +22,17 @@ START = "import cvtgs.cli.main, cvtgs.config, cvtgs.io, cvtgs.mergenet, cvtgs.si
 """What every process does before it reads a scene."""
 
 # A process inherits the peak of the one that starts it, so a small one must start it. It hears of
-# an interrupt and waits for its child, which hears of it too; an order to end is passed on.
+# an interrupt and waits for its child, which hears of it too. When the one that started it ends
+# or closes the pipe, however that happens, it ends its child.
 LAUNCHER = """
-import signal, subprocess, sys, time
+import os, signal, subprocess, sys, threading, time
 signal.signal(signal.SIGINT, lambda *_: None)
 start = time.perf_counter()
-process = subprocess.Popen(sys.argv[1:])
+process = subprocess.Popen(sys.argv[1:], stdin=subprocess.DEVNULL)
+def end():
+    os.read(0, 1)
+    process.terminate()
+threading.Thread(target=end, daemon=True).start()
 signal.signal(signal.SIGTERM, lambda *_: process.terminate())
 code = process.wait()
 wall = time.perf_counter() - start
@@ -177,13 +182,19 @@ def run_process(command: Sequence[str]) -> ProcessCost:
     If this call is interrupted, the process is ended first.
     """
     launcher = [sys.executable, "-S", "-c", LAUNCHER, *command]
-    with subprocess.Popen(launcher, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        try:
-            written = process.communicate()
-        except BaseException:
-            process.terminate()
-            process.communicate()
-            raise
+    reading, writing = os.pipe()
+    with os.fdopen(writing, "wb") as held:
+        with os.fdopen(reading, "rb") as watched:
+            process = subprocess.Popen(
+                launcher, stdin=watched, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+            )
+        with process:
+            try:
+                written = process.communicate()
+            except BaseException:
+                held.close()
+                process.communicate()
+                raise
     output, errors = (part.decode(errors="replace") for part in written)
     output, _, line = output.rstrip("\n").rpartition("\n")
     try:

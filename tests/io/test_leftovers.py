@@ -1,0 +1,146 @@
+"""Leftovers of killed runs, loops of links, names on Windows, and maps of replaced files."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path, PureWindowsPath
+
+import numpy as np
+import pytest
+
+import cvtgs
+from cvtgs.cli.main import main
+from cvtgs.errors import OutputError, OutputExistsError
+from cvtgs.io import atomic, atomic_output, check_output, check_save
+
+
+def write(path: Path, data: bytes = b"new", *, overwrite: bool = False) -> None:
+    with atomic_output(path, overwrite=overwrite) as file:
+        file.write(data)
+
+
+posix = pytest.mark.skipif(os.name == "nt", reason="locks and links are those of POSIX")
+HANGS = """
+import sys, time
+from cvtgs.io import atomic_output
+with atomic_output(sys.argv[1], overwrite=True) as file:
+    file.write(b"half")
+    file.flush()
+    print("writing", flush=True)
+    time.sleep(60)
+"""
+
+
+def leftovers(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.suffix == ".tmp")
+
+
+@posix
+def test_what_killed_runs_have_left_goes_with_the_next_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    command = [sys.executable, "-c", HANGS, str(path)]
+    started = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(3)]
+    for process in started:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"writing\n"
+    names = [f".a.bin.{number}.tmp" for number in range(3)]
+    assert leftovers(tmp_path) == names
+    write(path)  # takes nothing from those who still write
+    assert leftovers(tmp_path) == names
+    for process in started:
+        process.kill()
+        process.communicate()
+    assert leftovers(tmp_path) == names
+    write(path, b"newer", overwrite=True)
+    assert path.read_bytes() == b"newer"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_more_writers_than_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(atomic, "_MOST_WRITERS", 1)
+    path = tmp_path / "a.bin"
+    with atomic_output(path, overwrite=True) as one, atomic_output(path, overwrite=True) as other:
+        assert len(leftovers(tmp_path)) == 2
+        one.write(b"1")
+        other.write(b"2")
+    assert path.read_bytes() == b"1"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_without_locks_only_old_leftovers_go(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(atomic, "fcntl", None)
+    fresh, old = tmp_path / ".a.bin.0.tmp", tmp_path / ".b.bin.0.tmp"
+    for path in (fresh, old):
+        path.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    write(tmp_path / "a.bin")
+    write(tmp_path / "b.bin")
+    with pytest.raises(OutputExistsError):
+        write(tmp_path / "b.bin")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [fresh.name, "a.bin", "b.bin"]
+
+
+@posix
+def test_a_loop_of_links_is_found_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").symlink_to(tmp_path / "b.ply")
+    (tmp_path / "b.ply").symlink_to(tmp_path / "a.ply")
+    for overwrite in (False, True):
+        with pytest.raises(OutputError, match="found a loop of symbolic links"):
+            check_save(tmp_path / "a.ply", overwrite=overwrite)
+
+
+@pytest.mark.parametrize(
+    ("path", "wanted"),
+    [
+        (r"C:\scenes\a.ply", None),
+        (r"\\server\share\a b (1).ply", None),
+        ("C:a.ply", None),
+        ("console.ply", None),
+        (r"C:\scenes\a.ply:hidden", "the letters :"),
+        ("ab:c.ply", "the letters :"),
+        ('a<b>"|?*.ply', 'the letters " * < > ? |'),
+        ("nul", "a device"),
+        (r"D:\CON.ply", "a device"),
+        ("com1.tar.ply", "a device"),
+        ("a.ply.", "a dot or blank"),
+        ("a.ply ", "a dot or blank"),
+    ],
+)
+def test_names_that_windows_does_not_allow(path: str, wanted: str | None) -> None:
+    found = atomic.windows_fault(PureWindowsPath(path))
+    assert found is None if wanted is None else wanted in str(found)
+
+
+def test_on_windows_such_names_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    check_output(tmp_path / "a.ply_b")
+    monkeypatch.setattr(atomic, "_WINDOWS", True)
+    with pytest.raises(OutputError, match="the letters :, which Windows does not allow"):
+        check_output(tmp_path / "a.ply:b")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the maps of Linux")
+def test_a_file_is_not_mapped_when_it_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Windows refuses that."""
+    path, seen = tmp_path / "a.ply", list[str]()
+    cvtgs.save(cvtgs.synthetic.scene("object", 3000, sh_degree=1, seed=0), path)
+    replace = Path.replace
+
+    def look(self: Path, target: Path) -> Path:
+        maps = Path("/proc/self/maps").read_text(encoding="utf-8")
+        seen.extend(line for line in maps.splitlines() if str(target) in line)
+        seen.append("looked")
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", look)
+    words = ["simplify", str(path), str(path), "--rho", "0.1", "--overwrite", "--quiet"]
+    assert main([*words, "--preset", "draft"]) == 0
+    assert seen == ["looked"]
+    with path.open("rb") as file:  # the test can fail
+        held = np.memmap(file, np.uint8, "r")
+        look(path, path)
+    assert len(held) > 0
+    assert len(seen) > 2
