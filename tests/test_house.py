@@ -31,7 +31,7 @@ LEVELS = [
     {"pipeline", "refinement"},
     {"prepared"},
     {"simplifier", "info"},
-    {"budget", "tradeoff", "levels", "outofcore", "oneshot"},
+    {"budget", "tradeoff", "levels", "outofcore", "oneshot", "notebooks"},
     {"train"},
     {"cli"},
     {"__main__"},

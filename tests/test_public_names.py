@@ -272,7 +272,8 @@ def test_public_names():
 def test_every_name_resolves_and_is_listed():
     missing = [name for name in sorted(NAMES) if getattr(cvtgs, name, None) is None]
     assert missing == []
-    assert set(dir(cvtgs)) >= NAMES
+    assert set(dir(cvtgs)) == NAMES | {"__version__"}
+    assert set(dir(cvtgs.io)) == set(cvtgs.io.__all__)
 
 
 def test_tables_agree_with_what_type_checkers_see():

@@ -264,3 +264,15 @@ def test_scenes_that_do_not_fit_are_not_joined():
         cvtgs.concatenate([random_scene(3, degree=0), random_scene(3, degree=1)])
     with pytest.raises(InvalidSceneError, match="at least one scene"):
         cvtgs.concatenate([])
+
+
+def test_with_tensors_takes_keywords_and_keeps_extras():
+    scene = random_scene(4).with_tensors({}, {"label": torch.arange(4)})
+    changed = scene.with_tensors(sh0=torch.ones(4, 1, 3), shN=torch.zeros(4, 3, 3))
+    assert (changed.sh_degree, float(changed.sh0.sum())) == (1, 12.0)
+    assert changed.extras["label"].tolist() == [0, 1, 2, 3]
+    assert torch.equal(changed.means, scene.means)
+    with pytest.raises(InvalidSceneError, match=r"tensors of a scene are means, .*found scales;"):
+        scene.with_tensors(scales=torch.ones(4, 3))
+    with pytest.raises(InvalidSceneError, match=r"extra column 'label' must have shape \(2,\)"):
+        scene.with_tensors(scene[:2].tensors())

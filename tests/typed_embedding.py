@@ -3,6 +3,7 @@
 ``assert_type`` fixes what callers get. Nothing here is run but ``main``, on a small scene.
 """
 
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import assert_type
@@ -59,6 +60,19 @@ def use_stages(scene: cvtgs.GaussianScene) -> cvtgs.GaussianScene:
     return cvtgs.cells.merge_cells(scene, partition, config=config.merge)
 
 
+def exchange_gsplat(splats: torch.nn.ParameterDict, path: Path) -> bytes:
+    scene = cvtgs.from_dict(splats)
+    assert_type(scene.with_tensors(sh0=scene.sh0 * 0.5), cvtgs.GaussianScene)
+    stream = io.BytesIO()
+    cvtgs.save(scene, stream, format=".ply")
+    with path.open("wb") as file:
+        scene.save(file)
+    with path.open("rb") as file:
+        assert_type(cvtgs.load(file), cvtgs.GaussianScene)
+    assert_type(cvtgs.Simplifier(None).simplify(path, max_count=5), cvtgs.GaussianScene)
+    return stream.getvalue()
+
+
 def exchange(splats: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
     scene = cvtgs.from_dict(splats)
     path = folder / "scene.ply"
@@ -90,6 +104,8 @@ def main(folder: Path) -> int:
         assert_type(str(error), str)
     look(scene, small)
     exchange(cvtgs.to_dict(use_stages(scene)), folder)
+    parameters = {name: torch.nn.Parameter(one) for name, one in cvtgs.to_dict(scene).items()}
+    exchange_gsplat(torch.nn.ParameterDict(parameters), folder / "splats.ply")
     with torch.no_grad():
         assert_type(small.opacities, Tensor)
     return len(small) + len(bar.stages)

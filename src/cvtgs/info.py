@@ -9,7 +9,7 @@ from cvtgs.analysis import EffectPlan, analyze, select_columns
 from cvtgs.config import SimplifyConfig
 from cvtgs.errors import InvalidSceneError
 from cvtgs.math import parameters
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import SceneLike, as_scene
 from cvtgs.validity import invalid_rows
 
 FAINT = 0.1
@@ -65,11 +65,11 @@ class SceneInfo(pydantic.BaseModel):
 HEAVIEST = (0.001, 0.01, 0.1, 0.5)
 
 
-def describe(scene: GaussianScene, config: SimplifyConfig | None = None) -> SceneInfo:
+def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInfo:
     """Collect facts about a scene.
 
     Args:
-        scene: Any scene.
+        scene: Any scene, or a file or folder of one.
         config: For which simplification to plan; None for the default one.
 
     Returns:
@@ -83,6 +83,7 @@ def describe(scene: GaussianScene, config: SimplifyConfig | None = None) -> Scen
         >>> describe(scene("object", 100, sh_degree=2, seed=0)).sh_degree
         2
     """
+    scene = as_scene(scene)
     invalid = invalid_rows(scene)
     bad = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
     for mask in invalid.values():

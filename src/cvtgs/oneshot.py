@@ -1,18 +1,15 @@
 """Simplify a scene or a file of one in a single call."""
 
-import os
-
 import torch
 
-from cvtgs.io import load
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import GaussianScene, SceneLike
 from cvtgs.simplifier import Simplifier
 
 __all__ = ["simplify"]
 
 
 def simplify(
-    scene: GaussianScene | str | os.PathLike[str],
+    scene: SceneLike,
     rho: float | None = None,
     *,
     count: int | None = None,
@@ -49,6 +46,4 @@ def simplify(
         10
     """
     simplifier = Simplifier(preset=preset, device=device)
-    if isinstance(scene, str | os.PathLike):
-        scene = load(scene)
     return simplifier.simplify(scene, rho, count=count, max_count=max_count)

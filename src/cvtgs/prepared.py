@@ -27,7 +27,7 @@ from cvtgs.mergenet import Checkpoint, MergeNet
 from cvtgs.pipeline import Reduced, geometric_error, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified, SimplifyReport
-from cvtgs.scene import GaussianScene, check_is_scene, concatenate
+from cvtgs.scene import GaussianScene, concatenate
 from cvtgs.validity import (
     CheckedScene,
     check_rows,
@@ -67,7 +67,6 @@ class Prepared:
         cameras: Cameras | None = None,
         listener: ProgressListener = silent,
     ) -> None:
-        check_is_scene(scene)
         self._scene, self._config, self._checkpoint = scene, config, checkpoint
         self._cameras, self._listener = cameras, listener
         self._device = chosen_device(device or "auto", scene.device)

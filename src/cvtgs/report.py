@@ -1,5 +1,6 @@
 """SimplifyReport: what was done, what was left out, and what it cost."""
 
+from pkgutil import resolve_name
 from typing import NamedTuple
 
 import pydantic
@@ -121,6 +122,14 @@ class SimplifyReport(CellStatistics):
         """Wall-clock seconds of all stages."""
         return sum(stage.seconds for stage in self.stages)
 
+    def __repr__(self) -> str:
+        """Return counts, seconds and preset; :meth:`to_json` has the rest."""
+        return (
+            f"SimplifyReport({self.input_count:,} -> {self.output_count:,} Gaussians, "
+            f"{self.seconds:.2f} s, preset {self.config.preset}, checkpoint {self.checkpoint}, "
+            f"{self.device})"
+        )
+
     def to_json(self) -> str:
         """Return the report as indented JSON.
 
@@ -140,6 +149,11 @@ class Simplified(NamedTuple):
 
     scene: GaussianScene
     report: SimplifyReport
+
+    def _repr_html_(self) -> str:
+        """Return an image and what was done, for notebooks."""
+        text: str = resolve_name("cvtgs.notebooks:result_html")(self)
+        return text
 
 
 class Level(NamedTuple):

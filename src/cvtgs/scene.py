@@ -235,20 +235,33 @@ class GaussianScene:
         # A copy: sums over cells read rows in one piece.
         return self.with_tensors({"shN": self.shN[:, :count].contiguous()}, self.extras)
 
-    def with_tensors(self, tensors: Mapping[str, Tensor], extras: Mapping[str, Tensor]) -> Self:
+    def with_tensors(
+        self,
+        tensors: Mapping[str, Tensor] | None = None,
+        extras: Mapping[str, Tensor] | None = None,
+        **named: Tensor,
+    ) -> Self:
         """Return a scene of other Gaussians with the comments and the layout of this one.
 
         Args:
             tensors: Some or all of the six standard tensors by name.
-            extras: All further columns.
+            extras: All further columns; None for those of this scene.
+            named: Standard tensors by keyword: ``scene.with_tensors(sh0=colors)``.
 
         Returns:
             The new scene.
 
         Raises:
-            InvalidSceneError: The tensors do not fit together.
+            InvalidSceneError: There is no such tensor, or they do not fit together.
         """
-        changes: dict[str, Any] = {**tensors, "extras": extras}
+        given = {**(tensors or {}), **named}
+        unknown = sorted(given.keys() - _SHAPES.keys())
+        if unknown:
+            raise InvalidSceneError(
+                f"tensors of a scene are {', '.join(_SHAPES)}, found {unknown[0]}; give other "
+                f"columns as extras."
+            )
+        changes: dict[str, Any] = {**given, "extras": self.extras if extras is None else extras}
         return replace(self, **changes)
 
     def to(self, device: torch.device | str) -> Self:
@@ -281,15 +294,26 @@ class GaussianScene:
             f"{str(self.dtype).removeprefix('torch.')}, {self.device})"
         )
 
+    def _repr_html_(self) -> str:
+        """Return an image and the facts, for notebooks."""
+        text: str = resolve_name("cvtgs.notebooks:scene_html")(self)
+        return text
 
-def check_is_scene(value: object) -> None:
-    """Refuse what is no scene, such as the path of one."""
-    if isinstance(value, GaussianScene):
-        return
-    found = type(value).__name__
-    if isinstance(value, str | os.PathLike):
-        found = f"the path {os.fspath(value)!r}; read it with cvtgs.load"
-    raise InvalidArgumentError(f"scene must be a GaussianScene, found {found}.")
+
+SceneLike = GaussianScene | str | os.PathLike[str]
+"""A scene, or the file or folder of one."""
+
+
+def as_scene(scene: SceneLike, name: str = "scene") -> GaussianScene:
+    """Return a scene as it is, and read the path of one; refuse anything else."""
+    if isinstance(scene, GaussianScene):
+        return scene
+    if isinstance(scene, str | os.PathLike):
+        read: GaussianScene = resolve_name("cvtgs.io.formats:load")(scene)
+        return read
+    raise InvalidArgumentError(
+        f"{name} must be a GaussianScene or the path of one, found {type(scene).__name__}."
+    )
 
 
 def concatenate(scenes: Sequence[GaussianScene]) -> GaussianScene:

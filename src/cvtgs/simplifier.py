@@ -15,7 +15,7 @@ from cvtgs.mergenet.checkpoint import checkpoint_for
 from cvtgs.prepared import Prepared
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import GaussianScene, SceneLike, as_scene
 
 
 class Simplifier:
@@ -64,9 +64,14 @@ class Simplifier:
         self._device = resolve_device(device)
         self._listener = listener
 
+    def __repr__(self) -> str:
+        name = "none" if self.checkpoint is None else self.checkpoint.name
+        where = self._device or "auto"
+        return f"Simplifier(preset {self.config.preset}, checkpoint {name}, device {where})"
+
     def simplify(
         self,
-        scene: GaussianScene,
+        scene: SceneLike,
         rho: float | None = None,
         *,
         count: int | None = None,
@@ -77,7 +82,7 @@ class Simplifier:
         """Make a scene smaller.
 
         Args:
-            scene: The scene; it is not changed.
+            scene: The scene, which is not changed, or a file or folder of one.
             rho: Ratio of Gaussians to keep, in (0, 1].
             count: Number of Gaussians to keep, instead of ``rho``.
             max_count: Number to keep if there are more; a smaller scene stays as it is.
@@ -98,7 +103,7 @@ class Simplifier:
 
     def run(
         self,
-        scene: GaussianScene,
+        scene: SceneLike,
         rho: float | None = None,
         *,
         count: int | None = None,
@@ -117,7 +122,7 @@ class Simplifier:
 
     def levels(
         self,
-        scene: GaussianScene,
+        scene: SceneLike,
         rhos: Sequence[float],
         *,
         cameras: Cameras | None = None,
@@ -128,7 +133,7 @@ class Simplifier:
         whole cells of the finest, where it is at least four times as coarse.
 
         Args:
-            scene: The scene; it is not changed.
+            scene: The scene, which is not changed, or a file or folder of one.
             rhos: Ratios of Gaussians to keep, in (0, 1], in any order.
             cameras: Cameras for presets that render the scene; None finds views.
 
@@ -147,13 +152,14 @@ class Simplifier:
         """
         return self.prepare(scene, cameras=cameras).levels(rhos)
 
-    def prepare(self, scene: GaussianScene, *, cameras: Cameras | None = None) -> Prepared:
+    def prepare(self, scene: SceneLike, *, cameras: Cameras | None = None) -> Prepared:
         """Get ready to make a scene smaller again and again, for a slider or a search.
 
         What does not depend on the number of Gaussians is done in the first run only.
 
         Args:
-            scene: The scene; it is not changed, and must not be while this is used.
+            scene: The scene, which is not changed, and must not be while this is used; or a
+                file or folder of one.
             cameras: Cameras for presets that render the scene; None finds views.
 
         Returns:
@@ -166,7 +172,7 @@ class Simplifier:
             [10, 20]
         """
         return Prepared(
-            scene,
+            as_scene(scene),
             self.config,
             checkpoint=self.checkpoint,
             device=self._device,

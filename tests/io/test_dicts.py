@@ -1,12 +1,14 @@
 """Dictionaries of gsplat and nerfstudio in and out."""
 
 import math
+import re
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from cvtgs import synthetic
 from cvtgs.errors import InvalidSceneError
 from cvtgs.io import from_dict, to_dict
 
@@ -165,3 +167,52 @@ def test_what_is_no_scene(changes: dict[str, Any], activated: bool, text: str) -
     with pytest.raises(InvalidSceneError) as caught:
         from_dict(values, activated=activated)
     assert str(caught.value) == text
+
+
+def splats(count: int = 200, **changes: torch.Tensor) -> dict[str, torch.Tensor]:
+    return to_dict(scene_of_object(count)) | changes
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"opacities": torch.linspace(0.02, 0.99, 200)}, "opacities from 0.02 to 0.99: they are"),
+        (
+            {"scales": torch.linspace(0.001, 0.8, 600).reshape(200, 3)},
+            "scales from 0.001 to 0.8: they are",
+        ),
+        (
+            {
+                "opacities": torch.linspace(0, 1, 200),
+                "scales": torch.linspace(0.001, 0.8, 600).reshape(200, 3),
+            },
+            "opacities from 0 to 1 and scales from 0.001 to 0.8: they are taken for stored values",
+        ),
+    ],
+)
+def test_activated_values_are_noticed(changes, found):
+    with pytest.warns(UserWarning, match=re.escape(found)) as caught:
+        from_dict(splats(**changes))
+    assert len(caught) == 1
+    assert caught[0].filename == __file__
+
+
+def test_stored_values_are_not_called_activated():
+    from_dict(splats())
+    from_dict(splats(scales=torch.linspace(0.1, 5, 600).reshape(200, 3)))  # millimetres
+    from_dict(splats(opacities=torch.full((200,), 0.5)))
+    from_dict({name: rows[:50] for name, rows in splats(opacities=torch.rand(200)).items()})
+    activated = {"scales": torch.rand(200, 3), "opacities": torch.rand(200)}
+    from_dict(splats(**activated), activated=True)
+
+
+def test_the_parameters_of_gsplat_are_taken():
+    scene = scene_of_object(20)
+    parameters = {name: torch.nn.Parameter(one) for name, one in to_dict(scene).items()}
+    made = from_dict(torch.nn.ParameterDict(parameters))
+    assert torch.equal(made.means, scene.means)
+    assert not made.means.requires_grad
+
+
+def scene_of_object(count: int):
+    return synthetic.scene("object", count, sh_degree=0, seed=0)

@@ -1,13 +1,12 @@
 """Wrong arguments of Simplifier: the error names the right one."""
 
-from pathlib import Path
-
 import pytest
 import torch
 
 import cvtgs
 from cvtgs import Simplifier
 from cvtgs.errors import CheckpointError, ConfigError, InputNotFoundError, InvalidArgumentError
+from cvtgs.refinement import RefineConfig
 from scenes import random_scene, same_bits
 
 
@@ -40,10 +39,36 @@ def test_a_preset_in_the_place_of_the_checkpoint():
         Simplifier("fast")
 
 
-@pytest.mark.parametrize("path", ["scene.ply", Path("scene.ply")])
-def test_a_path_in_the_place_of_the_scene(path):
-    text = r"scene must be a GaussianScene, found the path 'scene.ply'; read it with cvtgs.load"
-    with pytest.raises(InvalidArgumentError, match=text):
-        Simplifier(device="cpu").simplify(path, 0.1)
-    with pytest.raises(InvalidArgumentError, match="found int"):
+def test_paths_are_taken_where_scenes_are(tmp_path):
+    scene, path = random_scene(300), tmp_path / "scene.ply"
+    scene.save(path)
+    simplifier = Simplifier(preset="fast", device="cpu")
+    (wanted,) = simplifier.levels(scene, [0.1])
+    assert repr(simplifier) == "Simplifier(preset fast, checkpoint none, device cpu)"
+    assert repr(Simplifier()) == "Simplifier(preset standard, checkpoint standard, device auto)"
+    for one in (path, str(path)):
+        assert same_bits(simplifier.simplify(one, 0.1), wanted.scene)
+        assert same_bits(simplifier.levels(one, [0.1])[0].scene, wanted.scene)
+        assert same_bits(simplifier.prepare(one).run(0.1).scene, wanted.scene)
+        assert cvtgs.describe(one) == cvtgs.describe(scene)
+    cameras = cvtgs.views.automatic_views(path, 2, width=32, height=24)
+    assert torch.equal(cvtgs.render(path, cameras).rgb, cvtgs.render(scene, cameras).rgb)
+    settings = cvtgs.evaluation.EvaluationSettings(lpips="off")
+    small = wanted.scene
+    by_paths = cvtgs.evaluate(path, {"same": str(path)}, cameras, settings=settings)
+    assert by_paths.scenes[0].psnr.mean == float("inf")
+    config = RefineConfig(size=32, heldout=2)
+    assert cvtgs.refine(small, path, steps=1, config=config).report.steps == 1
+    assert cvtgs.budget.find_count(path, psnr=1.0, simplifier=simplifier).psnr >= 1
+
+
+def test_what_is_no_scene_is_named():
+    with pytest.raises(InvalidArgumentError, match="scene must be a GaussianScene or the path of"):
         Simplifier(device="cpu").levels(3, [0.1])
+    cameras = cvtgs.views.automatic_views(random_scene(30), 1, width=32, height=24)
+    with pytest.raises(InvalidArgumentError, match=r"scene .small. must be .*, found int"):
+        cvtgs.evaluate(random_scene(30), {"small": 3}, cameras)
+    with pytest.raises(InvalidArgumentError, match=r"full must be .*, found NoneType"):
+        cvtgs.refine(random_scene(30), None)
+    with pytest.raises(InputNotFoundError, match=r"missing\.ply"):
+        Simplifier(device="cpu").simplify("missing.ply", 0.1)

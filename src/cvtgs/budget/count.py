@@ -12,7 +12,7 @@ from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.evaluation.scorer import MOST_PSNR, Metrics, Scorer, scene_scores
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import Simplified, SimplifyReport
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.simplifier import Simplifier
 from cvtgs.views import automatic_views
 
@@ -114,7 +114,7 @@ def checked_target(psnr: float | None, *, ssim: float | None) -> Target:
 
 
 def find_count(
-    scene: GaussianScene,
+    scene: SceneLike,
     *,
     psnr: float | None = None,
     ssim: float | None = None,
@@ -133,7 +133,7 @@ def find_count(
     Memory: that of a simplification, one small scene, and ``12 c h w`` bytes of images.
 
     Args:
-        scene: The full scene; it is not changed.
+        scene: The full scene, which is not changed, or a file or folder of one.
         psnr: Mean PSNR to reach, dB, above 0 and at most 60.
         ssim: Mean SSIM to reach instead, above 0 and below 1.
         simplifier: Makes the small scenes; None for the standard one.
@@ -158,6 +158,7 @@ def find_count(
         >>> found.psnr >= 18 and len(found.scene) < 400
         True
     """
+    scene = as_scene(scene)
     target = checked_target(psnr, ssim=ssim)
     scorer = heldout_scorer(scene, heldout, listener=listener)
     prepared = (simplifier or Simplifier()).prepare(scene, cameras=cameras)

@@ -21,7 +21,7 @@ from cvtgs.evaluation.scorer import (
     scene_scores,
 )
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import GaussianScene, SceneLike, as_scene
 
 STAGE = "evaluate"
 """The stage of the progress events; a step is an image."""
@@ -83,8 +83,8 @@ class Comparison:
 
 
 def evaluate(
-    reference: GaussianScene,
-    small: Mapping[str, GaussianScene],
+    reference: SceneLike,
+    small: Mapping[str, SceneLike],
     cameras: Cameras,
     *,
     reference_name: str = "full",
@@ -98,8 +98,8 @@ def evaluate(
     what :func:`cvtgs.rendering.render` needs, and two images.
 
     Args:
-        reference: The full scene.
-        small: Simplified scenes by name.
+        reference: The full scene, or a file or folder of one.
+        small: Simplified scenes, or files of them, by name.
         cameras: From where to look.
         reference_name: Name of the full scene.
         photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too.
@@ -131,8 +131,8 @@ def evaluate(
 
 
 def compare(
-    reference: GaussianScene,
-    small: Mapping[str, GaussianScene],
+    reference: SceneLike,
+    small: Mapping[str, SceneLike],
     cameras: Cameras,
     *,
     reference_name: str = "full",
@@ -146,8 +146,8 @@ def compare(
     Memory: ``4 c h w`` bytes per scene, and what :func:`cvtgs.evaluation.evaluate` needs.
 
     Args:
-        reference: The full scene.
-        small: Simplified scenes by name.
+        reference: The full scene, or a file or folder of one.
+        small: Simplified scenes, or files of them, by name.
         cameras: From where to look.
         reference_name: Name of the full scene.
         sizes: Bytes of the files, by name.
@@ -197,13 +197,14 @@ def compare(
 
 
 def _named_scenes(
-    reference: GaussianScene, small: Mapping[str, GaussianScene], reference_name: str
+    reference: SceneLike, small: Mapping[str, SceneLike], reference_name: str
 ) -> dict[str, GaussianScene]:
     if reference_name in small:
         raise InvalidArgumentError(
             f"the scenes must have different names; {reference_name!r} is that of the full scene."
         )
-    return {reference_name: reference, **small}
+    read = {name: as_scene(one, f"scene {name!r}") for name, one in small.items()}
+    return {reference_name: as_scene(reference, "reference"), **read}
 
 
 @torch.no_grad()

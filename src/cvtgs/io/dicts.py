@@ -1,5 +1,6 @@
 """Scenes in and out of the dictionaries that gsplat and nerfstudio users hold."""
 
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -29,8 +30,18 @@ _KNOWN = (
 )
 
 
+FEWEST_JUDGED = 100
+"""Of fewer Gaussians no value is called unlikely."""
+
+SMALL_SCALE = 0.5
+"""Logarithms of scales that are all above 0, half of them below this, would be of Gaussians of
+nearly one size above one unit; standard deviations are often like that."""
+
+
 def from_dict(
-    mapping: Mapping[str, Tensor | NDArray[Any]], *, activated: bool = False
+    mapping: Mapping[str, Tensor | NDArray[Any]] | torch.nn.ParameterDict,
+    *,
+    activated: bool = False,
 ) -> GaussianScene:
     """Make a scene of the dictionary of a gsplat or nerfstudio (Splatfacto) model.
 
@@ -40,10 +51,12 @@ def from_dict(
     Args:
         mapping: ``means (n, 3)``, ``quats (n, 4)`` w first, ``scales (n, 3)``, ``opacities (n,)``
             or ``(n, 1)``, ``sh0 (n, 1, 3)`` or ``features_dc (n, 3)``, and ``shN (n, k, 3)`` or
-            ``features_rest (n, k, 3)``, which may be missing. A common prefix such as
+            ``features_rest (n, k, 3)``, which may be missing. A dictionary, or the
+            ``torch.nn.ParameterDict`` that gsplat trains. A common prefix such as
             ``_model.gauss_params.`` is fine; names without it are then ignored.
         activated: Whether scales and opacities are what one sees (above 0; from 0 to 1) rather
-            than logarithms and logits, which both models hold.
+            than logarithms and logits, which both models hold. A warning says if values look like
+            the other.
 
     Returns:
         The scene, on the device of the tensors.
@@ -59,6 +72,7 @@ def from_dict(
         >>> scene.log_scales[0].tolist(), scene.logit_opacities.tolist()
         ([0.0, 0.0, 0.0], [0.0, 0.0])
     """
+    mapping = {key: mapping[key] for key in mapping}
     tensors = {name: _as_tensor(key, mapping[key]) for name, key in _keys(mapping).items()}
     double = any(tensor.dtype == torch.float64 for tensor in tensors.values())
     dtype = torch.float64 if double else torch.float32
@@ -75,7 +89,28 @@ def from_dict(
         _check_values("opacities", (opacities < 0) | (opacities > 1), required="from 0 to 1")
         tensors["log_scales"] = parameters.positive_log(scales)
         tensors["logit_opacities"] = parameters.logit_from_opacity(opacities)
-    return GaussianScene(**tensors, extras={}, comments=(), layout=())
+    scene = GaussianScene(**tensors, extras={}, comments=(), layout=())
+    if not activated and (unlikely := activated_values(scene)):
+        warnings.warn(
+            f"{' and '.join(unlikely)}: they are taken for stored values (logarithms of scales, "
+            f"logits of opacities) but look like activated ones; if they are, pass activated=True.",
+            stacklevel=2,
+        )
+    return scene
+
+
+def activated_values(scene: GaussianScene) -> list[str]:
+    """Return what of a scene looks activated where stored values belong, with what was found."""
+    if len(scene) < FEWEST_JUDGED:
+        return []
+    found = []
+    least, most = (float(value) for value in scene.logit_opacities.aminmax())
+    if 0 <= least < most <= 1:
+        found.append(f"opacities from {least:.3g} to {most:.3g}")
+    least, most = (float(value) for value in scene.log_scales.aminmax())
+    if least > 0 and float(scene.log_scales.median()) < SMALL_SCALE:
+        found.append(f"scales from {least:.3g} to {most:.3g}")
+    return found
 
 
 def to_dict(scene: GaussianScene) -> dict[str, Tensor]:

@@ -16,7 +16,7 @@ from cvtgs.refinement.limits import Limits, check_limits
 from cvtgs.refinement.optimize import STAGE, learning_rate_scales, optimize
 from cvtgs.rendering.backends import choose_backend
 from cvtgs.report import RefineReport, SimplifyReport
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.validity import valid_rows
 
 DEFAULT_STEPS = 500
@@ -36,8 +36,8 @@ class Refined(NamedTuple):
 
 
 def refine(  # noqa: PLR0913 (all but the scenes are options by name)
-    small: GaussianScene,
-    full: GaussianScene,
+    small: SceneLike,
+    full: SceneLike,
     *,
     seconds: float | None = None,
     steps: int | None = None,
@@ -92,6 +92,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         >>> result.report.stopped, result.report.gain
         ('perfect', 0.0)
     """
+    small, full = as_scene(small, "small"), as_scene(full, "full")
     config = config or RefineConfig()
     if seconds is None and steps is None:
         seconds, steps = config.seconds or None, config.steps or None

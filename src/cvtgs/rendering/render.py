@@ -11,7 +11,7 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import parameters
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.rendering.backends import BackendName, choose_backend
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import GaussianScene, SceneLike, as_scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,7 +34,7 @@ class Rendering:
 
 
 def render(
-    scene: GaussianScene,
+    scene: SceneLike,
     cameras: Cameras,
     *,
     backend: BackendName = "auto",
@@ -58,7 +58,8 @@ def render(
     Memory: cameras are rendered one by one; each backend's ``rasterize`` states its formula.
 
     Args:
-        scene: The Gaussians; their device and dtype are those of the images.
+        scene: The Gaussians, or a file or folder of them; their device and dtype are those of the
+            images.
         cameras: From where to look, any dtype and device.
         backend: ``torch``, ``numba`` (CPU), ``gsplat`` (CUDA) or ``auto``, the fastest of them
             that works on the scene's device.
@@ -87,6 +88,7 @@ def render(
         >>> render(demo_scene(1000), cameras, backend="torch").rgb.shape
         torch.Size([1, 48, 64, 3])
     """
+    scene = as_scene(scene)
     degree = _degree(scene, sh_degree)
     behind = _background(scene, cameras, background)
     name, chosen = choose_backend(backend, scene.device)

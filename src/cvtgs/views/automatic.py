@@ -10,7 +10,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.devices import one_thread
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import SceneLike, as_scene
 from cvtgs.views.candidates import CandidateCameras, inside_candidates, outside_candidates
 from cvtgs.views.layout import SceneLayout, find_layout
 from cvtgs.views.scoring import score_cameras
@@ -35,7 +35,7 @@ _GOLDEN = 0.6180339887498949
 
 
 def automatic_views(
-    scene: GaussianScene,
+    scene: SceneLike,
     count: int = 8,
     *,
     width: int = 640,
@@ -56,7 +56,7 @@ def automatic_views(
     30,000 Gaussians, and masks of the scene.
 
     Args:
-        scene: Any scene with at least one valid Gaussian.
+        scene: Any scene with at least one valid Gaussian, or a file or folder of one.
         count: Number of views, at least 1.
         width: Pixels per row.
         height: Rows.
@@ -77,7 +77,7 @@ def automatic_views(
     for name, value in (("count", count), ("width", width), ("height", height)):
         if value < 1:
             raise InvalidArgumentError(f"{name} must be at least 1, found {value}.")
-    size, turn = (width, height), 0.5 + seed * _GOLDEN
+    scene, size, turn = as_scene(scene), (width, height), 0.5 + seed * _GOLDEN
     with one_thread():
         layout = find_layout(scene)
         candidates = choose_candidates(layout, count, size=size, turn=turn)
