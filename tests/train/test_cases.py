@@ -9,7 +9,7 @@ from cvtgs.math.frames import robust_frame
 from cvtgs.mergenet import correct_cells
 from cvtgs.rendering import render
 from cvtgs.train.cases import TargetViews, make_case, merge_scene, render_views
-from cvtgs.views import automatic_views, random_views
+from cvtgs.views import automatic_views, mixed_views, random_views
 from mergenet_cases import fields_of, lively_net
 from scenes import random_scene, same_bits
 from train_cases import (
@@ -162,14 +162,13 @@ def test_one_image_keeps_its_camera():
     assert len(one.cameras) == 1
 
 
-def test_half_of_the_views_are_the_automatic_ones():
+def test_views_are_mixed_ones():
     scene = small_scene()
-    views = render_views(scene, 3, size=32, seed=2)
-    usual = automatic_views(scene, 2, width=32, height=32, seed=2)
-    around = random_views(scene, 1, size=32, seed=2)
-    assert torch.equal(views.cameras.viewmats, torch.cat([usual.viewmats, around.viewmats]))
-    assert torch.equal(views.cameras.Ks, torch.cat([usual.Ks, around.Ks]))
-    assert views.rgb.shape == (3, 32, 32, 3)
+    views = render_views(scene, 5, size=32, seed=2)
+    mixed = mixed_views(scene, 5, size=32, seed=2)
+    assert torch.equal(views.cameras.viewmats, mixed.viewmats)
+    assert torch.equal(views.cameras.Ks, mixed.Ks)
+    assert views.rgb.shape == (5, 32, 32, 3)
     assert views.rgb.dtype == views.alpha.dtype == torch.float16
     images = render(scene, views.cameras)
     torch.testing.assert_close(views.rgb.float(), images.rgb, rtol=1e-3, atol=1e-3)
