@@ -1,5 +1,6 @@
 """Devices: which one is chosen, and what it is called."""
 
+import os
 import platform
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,9 +11,11 @@ import torch
 from cvtgs.devices import (
     chosen_device,
     chunk_length,
+    core_count,
     device_name,
     one_thread,
     resolve_device,
+    thread_count,
     usable_device,
     within_memory,
 )
@@ -97,6 +100,21 @@ def test_names(monkeypatch):
 
     monkeypatch.setattr(Path, "read_text", refuse)
     assert device_name(torch.device("cpu")) == (platform.processor() or platform.machine())
+
+
+def test_searches_use_the_cores_that_the_process_may_use(monkeypatch):
+    monkeypatch.setattr("cvtgs.devices.core_count", lambda: 8)
+    for limit, found in {"": 8, "3": 3, "99": 8, "0": 1, "4,2": 8}.items():
+        monkeypatch.setenv("OMP_NUM_THREADS", limit)
+        assert thread_count() == found
+
+
+def test_cores(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {1, 4}, raising=False)
+    assert core_count() == 2
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert core_count() == 1
 
 
 def test_threads_come_back_after_an_error():

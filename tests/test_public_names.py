@@ -202,6 +202,7 @@ STAGES = {
     },
     "outofcore": {
         "ClusterWorkers",
+        "LocalWorkers",
         "Workers",
         "available_memory",
         "block_count",
@@ -211,6 +212,7 @@ STAGES = {
         "read_bytes",
         "simplify_distributed",
         "simplify_file",
+        "worker_count",
     },
     "synthetic": {"KINDS", "demo_scene", "scene"},
     "train": {

@@ -1,6 +1,7 @@
 """The device to compute on: by name, its memory, and the number of its threads."""
 
 import gc
+import os
 import platform
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -189,6 +190,35 @@ def within_memory(
             f"or compute with device='cpu' (--device cpu)."
         )
     return compute(torch.device("cpu"), f"{device} ran out of memory; computed on the CPU")
+
+
+def core_count() -> int:
+    """Return how many cores this process may use.
+
+    Returns:
+        A number, at least 1.
+
+    Example:
+        >>> core_count() >= 1
+        True
+    """
+    if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def thread_count() -> int:
+    """Return how many threads a search may use: one for each core, or ``OMP_NUM_THREADS``.
+
+    Returns:
+        A number, at least 1.
+
+    Example:
+        >>> thread_count() >= 1
+        True
+    """
+    limit = os.environ.get("OMP_NUM_THREADS", "")
+    return max(1, min(core_count(), int(limit))) if limit.isdecimal() else core_count()
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """Out-of-core runs: exact counts, the same bits in any order of work, seams, unusual files."""
 
 import json
+from itertools import pairwise
 
 import pytest
 import torch
@@ -14,8 +15,10 @@ from cvtgs.devices import one_thread
 from cvtgs.errors import ConfigError, FileFormatError, InvalidArgumentError, InvalidSceneError
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.io.ply import open_rows
+from cvtgs.math.frames import robust_frame
 from cvtgs.outofcore import block_count, read_bytes, simplify_file
 from cvtgs.outofcore.partition import partition_space
+from cvtgs.outofcore.scan import RowRange, add_totals, scan_range
 from cvtgs.views import automatic_views
 from scenes import random_scene, same_bits
 
@@ -116,6 +119,18 @@ def test_the_size_of_ranges_does_not_matter(source, tmp_path):
     for name, rows in (("a.ply", 1 << 20), ("b.ply", 1777)):
         simplify_file(source, tmp_path / name, 0.05, blocks=3, range_rows=rows)
     assert same_bits(cvtgs.load(tmp_path / "a.ply"), cvtgs.load(tmp_path / "b.ply"))
+
+
+def test_sums_do_not_depend_on_ranges(scene, source, monkeypatch):
+    monkeypatch.setattr("cvtgs.outofcore.scan.CHUNK", 10)
+    rows, frame = open_rows(source), robust_frame(scene.means)
+    whole = scan_range(rows, frame, (), RowRange(0, 0, 6000))
+    ends = range(0, 6001, 600)
+    parts = [scan_range(rows, frame, (), RowRange(0, *pair)) for pair in pairwise(ends)]
+    by_part = sum(part.mass for part in parts), sum(part.falloff_mass for part in parts)
+    assert by_part != (whole.mass, whole.falloff_mass)  # as rounding goes
+    total = add_totals(parts)
+    assert (total.mass, total.falloff_mass) == (whole.mass, whole.falloff_mass)
 
 
 def test_seams_cost_little(scene, source, tmp_path):

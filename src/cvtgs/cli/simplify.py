@@ -3,6 +3,7 @@
 import argparse
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,6 +34,7 @@ from cvtgs.progress import ProgressListener, silent
 
 if TYPE_CHECKING:
     from cvtgs.config import SimplifyConfig
+    from cvtgs.outofcore import Workers
     from cvtgs.report import SimplifyReport
     from cvtgs.simplifier import Simplifier
 
@@ -117,6 +119,13 @@ def add_simplify(add_parser: AddParser) -> None:
         metavar="AMOUNT",
         help="memory to use, for example 4GB (default: what is free); a binary .ply that needs "
         "more is simplified block by block, and the same command resumes an interrupted run",
+    )
+    parser.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="processes that work on blocks and share --memory (default: one for each core, as "
+        "far as memory allows)",
     )
     parser.add_argument(
         "--scheduler",
@@ -293,6 +302,11 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
     from cvtgs.outofcore import available_memory, block_count, check_config, read_bytes
     from cvtgs.outofcore.memory import memory_to_plan
 
+    if options.workers is not None and (options.workers < 1 or options.scheduler is not None):
+        raise InvalidArgumentError(
+            "--workers must be at least 1, and goes with blocks on this machine, not with "
+            f"--scheduler; found {options.workers}."
+        )
     names = ("target_psnr", "target_ssim", "time_budget", "cameras", "axes", "sh_degree")
     excluded = [name for name in names if getattr(options, name) is not None]
     if options.memory is None:
@@ -322,11 +336,15 @@ def _simplify_blocks(
     memory: int,
     listener: ProgressListener,
 ) -> "SimplifyReport":
-    """Simplify a file block by block, in this process or on a cluster."""
-    from cvtgs.outofcore import ClusterWorkers, connect
+    """Simplify a file block by block, in processes of this machine or on a cluster."""
+    from cvtgs.outofcore import ClusterWorkers, LocalWorkers, connect, worker_count
 
-    client = None if options.scheduler is None else connect(options.scheduler)
-    try:
+    with ExitStack() as stack:
+        workers: Workers | None = None
+        if options.scheduler is not None:
+            workers = ClusterWorkers(stack.enter_context(closing(connect(options.scheduler))))
+        elif (count := worker_count(memory, options.workers)) > 1:
+            workers, memory = stack.enter_context(LocalWorkers(count)), memory // count
         return cvtgs.outofcore.simplify_file(
             options.input,
             options.output,
@@ -336,10 +354,7 @@ def _simplify_blocks(
             memory=memory,
             boxes=() if options.keep is None else cvtgs.boxes.read_boxes(options.keep),
             simplifier=simplifier,
-            workers=None if client is None else ClusterWorkers(client),
+            workers=workers,
             overwrite=options.overwrite,
             listener=listener,
         )
-    finally:
-        if client is not None:
-            client.close()

@@ -1,7 +1,6 @@
 """Nearest sites and neighbours: by scipy's k-d tree on the host, or by blocks in torch."""
 
 import math
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal
@@ -11,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from cvtgs.devices import thread_count
 from cvtgs.math.frames import morton_order
 
 NearestSite = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -82,7 +82,7 @@ def nearest_scipy(
         np.square(distances, out=squared[part])
 
     # Threads of our own: an interrupt waits for them, where scipy's own would be left running.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(thread_count()) as pool:
         for _ in pool.map(search, range(0, len(points), CHUNK)):
             pass
     found = torch.from_numpy(labels)

@@ -2,10 +2,12 @@
 
 from cvtgs.outofcore.distributed import ClusterWorkers, connect, simplify_distributed
 from cvtgs.outofcore.memory import available_memory, block_count, needed_memory, read_bytes
+from cvtgs.outofcore.processes import LocalWorkers, worker_count
 from cvtgs.outofcore.run import Workers, check_config, simplify_file
 
 __all__ = [
     "ClusterWorkers",
+    "LocalWorkers",
     "Workers",
     "available_memory",
     "block_count",
@@ -15,4 +17,5 @@ __all__ = [
     "read_bytes",
     "simplify_distributed",
     "simplify_file",
+    "worker_count",
 ]

@@ -46,12 +46,12 @@ class SortedCounts(NamedTuple):
 
     Attributes:
         rows: Number of Gaussians.
-        cells: Their weight in cells, none above 1.
+        cells: Their weight in cells, none above 1, for each chunk of rows.
         files: Where the rows are.
     """
 
     rows: list[int]
-    cells: list[float]
+    cells: list[list[float]]
     files: tuple[SortedFile, ...]
 
 
@@ -60,7 +60,7 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
     """Write the rows of a range into one file per block, which nobody else writes to."""
     scan, attempt = job.read_scan(), Attempt(job.folder)
     row_counts = torch.zeros(job.blocks, dtype=torch.int64)
-    cell_counts = torch.zeros(job.blocks).double()
+    cell_counts = []
     for start in range(rows.start, rows.stop, CHUNK):
         records = job.source.read(start, min(start + CHUNK, rows.stop))
         scene = job.source.scene(records)
@@ -79,7 +79,7 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
         blocks = scan.partition.blocks_of(scan.frame.contract(scene.means[chosen]))
         added = torch.bincount(blocks, minlength=job.blocks)
         row_counts += added
-        cell_counts += torch.bincount(blocks, cells, minlength=job.blocks)
+        cell_counts.append(torch.bincount(blocks, cells, minlength=job.blocks).tolist())
         order = torch.sort(blocks, stable=True).indices
         table = np.empty(len(order), record_type(job))
         numbers = chosen[order].numpy()
@@ -91,7 +91,7 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
             if count:
                 name = job.rows_path(block, rows.number).name
                 attempt.append(name, table[end - count : end].tobytes())
-    return SortedCounts(row_counts.tolist(), cell_counts.tolist(), attempt.files())
+    return SortedCounts(row_counts.tolist(), cell_counts, attempt.files())
 
 
 def _filtered(

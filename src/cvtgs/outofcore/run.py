@@ -35,15 +35,15 @@ from cvtgs.outofcore.job import Job, SortedFile, job_folder
 from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
 from cvtgs.outofcore.memory import available_memory, block_count, memory_to_plan
 from cvtgs.outofcore.merge import BlockReport, correct, inflate, merge, simplify_block
-from cvtgs.outofcore.rows import SortedCounts, sort_range
-from cvtgs.outofcore.scan import RowRange, add_totals, read_sample, scan_range, scan_scene
+from cvtgs.outofcore.rows import sort_range
+from cvtgs.outofcore.scan import CHUNK, RowRange, add_totals, read_sample, scan_range, scan_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport
 from cvtgs.scene import concatenate
 from cvtgs.simplifier import Simplifier
 
-RANGE_ROWS = 1 << 26
-"""Rows of the file that one process reads in one call."""
+RANGE_ROWS, MOST_RANGES = 1 << 20, 64
+"""Rows of the file that one process reads in one call, at least, and number of such calls."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -84,7 +84,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     boxes: Sequence[Box] = (),
     simplifier: Simplifier | None = None,
     workers: Workers | None = None,
-    range_rows: int = RANGE_ROWS,
+    range_rows: int | None = None,
     overwrite: bool = False,
     listener: ProgressListener = silent,
 ) -> SimplifyReport:
@@ -107,7 +107,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         simplifier: Configuration and network; None for the defaults.
         workers: Calls functions for ranges of the file and for blocks; None calls them here, one
             after the other.
-        range_rows: Rows of the file that one process reads in one call.
+        range_rows: Rows of the file that one process reads in one call; None for a million, or a
+            64th of the file.
         overwrite: Whether an existing output may be replaced.
         listener: Called with progress events.
 
@@ -147,7 +148,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         boxes=tuple(boxes),
         config=simplifier.config,
         has_network=simplifier.checkpoint is not None,
-        range_rows=range_rows,
+        range_rows=range_rows or rows_per_range(rows.count),
     )
     key = job.key(simplifier.checkpoint)
     job = replace(job, folder=job_folder(output, key))
@@ -166,6 +167,11 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         report = _report(job, simplifier, clock, resumed=resumed)
         shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
     return report
+
+
+def rows_per_range(count: int) -> int:
+    """Choose how many rows one process reads in one call, in whole chunks."""
+    return max(RANGE_ROWS, CHUNK * math.ceil(count / MOST_RANGES / CHUNK))
 
 
 def check_config(config: SimplifyConfig) -> None:
@@ -216,19 +222,18 @@ def _scan_and_sort(job: Job, workers: Workers, clock: StageClock) -> tuple[list[
         )
     with clock.stage("sort", len(ranges)) as advance:
         job.write_scan(scan)
-        counts = _sort(job, workers, ranges, advance)
-        if sum(counts.rows) < rest:  # the filter was too strict for so large a target
+        rows, cells = _sort(job, workers, ranges, advance)
+        if sum(rows) < rest:  # the filter was too strict for so large a target
             job.write_scan(replace(scan, min_opacity=0.0, max_flyaway_mass=-1.0))
-            counts = _sort(job, workers, ranges, advance)
-    occupied = sum(1 for count in counts.rows if count)
-    if rest < occupied:  # tiny targets: the heaviest blocks get one each
-        order = sorted(range(job.blocks), key=lambda block: -counts.cells[block])
+            rows, cells = _sort(job, workers, ranges, advance)
+    if rest < sum(1 for count in rows if count):  # tiny targets: the heaviest blocks get one each
+        order = sorted(range(job.blocks), key=lambda block: -cells[block])
         targets = [int(block in order[:rest]) for block in range(job.blocks)]
     else:
-        targets = shared_out(rest, counts.cells, rooms=counts.rows)
+        targets = shared_out(rest, cells, rooms=rows)
     finer = [
         finer_count(kept, available, job.config.allocation)
-        for kept, available in zip(targets, counts.rows, strict=True)
+        for kept, available in zip(targets, rows, strict=True)
     ]
     return targets, finer
 
@@ -247,14 +252,16 @@ def _run_blocks(job: Job, workers: Workers, clock: StageClock) -> int:
 
 def _sort(
     job: Job, workers: Workers, ranges: Sequence[RowRange], advance: Callable[[int], None]
-) -> SortedCounts:
+) -> tuple[list[int], list[float]]:
+    """Sort all rows into blocks; return how many each has, and their weight in cells."""
     rows, cells, files = [0] * job.blocks, [0.0] * job.blocks, list[SortedFile]()
     for part in _with_progress(workers(partial(sort_range, job), ranges), advance):
         rows = [a + b for a, b in zip(rows, part.rows, strict=True)]
-        cells = [a + b for a, b in zip(cells, part.cells, strict=True)]
+        for chunk in part.cells:  # one after the other: the same bits whatever the ranges
+            cells = [a + b for a, b in zip(cells, chunk, strict=True)]
         files += part.files
     job.adopt(files)
-    return SortedCounts(rows, cells, tuple(files))
+    return rows, cells
 
 
 def _tessellate_and_merge(job: Job, workers: Workers, clock: StageClock) -> None:

@@ -3,6 +3,8 @@
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import reduce
+from operator import add
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
@@ -48,19 +50,30 @@ class RangeTotals(NamedTuple):
 
     Attributes:
         depths: Grid of optical depths (:func:`cvtgs.analysis.add_depths`).
-        mass: Sum of opacity times mean projected area, squared scene units.
-        falloff_mass: Sum of the same times the perspective falloff.
+        masses: ``(c,)`` sum of opacity times mean projected area over each chunk of rows, squared
+            scene units; one after the other they add up to the same bits whatever the ranges.
+        falloff_masses: ``(c,)`` sums of the same times the perspective falloff.
         far_masses: ``(f,)`` the latter of each Gaussian beyond the distance of flyaways.
         valid_count: Number of valid rows.
         kept_count: Number of those in boxes.
     """
 
     depths: Int[Tensor, "voxels"]
-    mass: float
-    falloff_mass: float
+    masses: tuple[float, ...]
+    falloff_masses: tuple[float, ...]
     far_masses: Float[Tensor, "f"]
     valid_count: int
     kept_count: int
+
+    @property
+    def mass(self) -> float:
+        """Mass of all rows."""
+        return reduce(add, self.masses, 0.0)
+
+    @property
+    def falloff_mass(self) -> float:
+        """Mass of all rows with the perspective falloff."""
+        return reduce(add, self.falloff_masses, 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -116,7 +129,7 @@ def scan_range(
 ) -> RangeTotals:
     """Sum optical depths, masses and counts over a range of the source."""
     depths = analysis.empty_depth_grid(torch.device("cpu"))
-    mass, falloff_mass, valid_count, kept_count = 0.0, 0.0, 0, 0
+    all_masses, falloff_masses, valid_count, kept_count = list[float](), list[float](), 0, 0
     far_masses = [torch.zeros(0, dtype=torch.float64)]
     for start in range(rows.start, rows.stop, CHUNK):
         scene = source.scene(source.read(start, min(start + CHUNK, rows.stop)))
@@ -128,10 +141,18 @@ def scan_range(
         distances = frame.distances(scene.means)
         seen = masses * analysis.perspective_falloff(distances)
         far_masses.append(seen[distances > filters.FLYAWAY_RADII])
-        mass, falloff_mass = mass + float(masses.sum()), falloff_mass + float(seen.sum())
+        all_masses.append(float(masses.sum()))
+        falloff_masses.append(float(seen.sum()))
         valid_count += len(scene)
         kept_count += int(inside(boxes, scene.means).sum()) if boxes else 0
-    return RangeTotals(depths, mass, falloff_mass, torch.cat(far_masses), valid_count, kept_count)
+    return RangeTotals(
+        depths,
+        tuple(all_masses),
+        tuple(falloff_masses),
+        torch.cat(far_masses),
+        valid_count,
+        kept_count,
+    )
 
 
 def add_totals(parts: Iterable[RangeTotals]) -> RangeTotals:
@@ -142,8 +163,8 @@ def add_totals(parts: Iterable[RangeTotals]) -> RangeTotals:
         far_masses.append(part.far_masses)
         total = total._replace(
             depths=total.depths.add_(part.depths),
-            mass=total.mass + part.mass,
-            falloff_mass=total.falloff_mass + part.falloff_mass,
+            masses=total.masses + part.masses,
+            falloff_masses=total.falloff_masses + part.falloff_masses,
             valid_count=total.valid_count + part.valid_count,
             kept_count=total.kept_count + part.kept_count,
         )

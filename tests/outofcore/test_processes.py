@@ -1,0 +1,153 @@
+"""Blocks in processes of this machine: the bits of one process, errors, and how they end."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from functools import partial
+
+import psutil
+import pytest
+
+import cvtgs
+from cvtgs.cli.main import main
+from cvtgs.devices import core_count
+from cvtgs.errors import InvalidSceneError, RunError
+from cvtgs.outofcore import LocalWorkers, simplify_file, worker_count
+from process_cases import die, numbered, refuse, wait
+
+pytestmark = pytest.mark.slow  # every process loads torch
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    path = tmp_path_factory.mktemp("processes") / "in.ply"
+    cvtgs.save(cvtgs.synthetic.scene("courtyard", 20_000, sh_degree=1, seed=4), path)
+    return path
+
+
+on_posix = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+
+
+@pytest.fixture(scope="module")
+def workers():
+    with LocalWorkers(2) as found:
+        yield found
+
+
+def test_the_same_bits_and_the_same_progress(source, tmp_path, workers):
+    events = {}
+    for name, more in {"alone": {}, "together": {"workers": workers}}.items():
+        seen = events[name] = []
+        output = tmp_path / f"{name}.ply"
+        simplify_file(source, output, 0.05, blocks=4, range_rows=6000, listener=seen.append, **more)
+    assert (tmp_path / "together.ply").read_bytes() == (tmp_path / "alone.ply").read_bytes()
+    assert events["together"] == events["alone"]
+
+
+def test_calls_are_shared_and_results_in_order(workers):
+    found = list(workers(numbered, range(40)))
+    assert [number for number, _, _ in found] == list(range(40))
+    assert {threads for _, _, threads in found} == {str(max(1, core_count() // 2))}
+    assert os.getpid() not in {pid for _, pid, _ in found}
+
+
+def test_errors_come_back(workers):
+    with pytest.raises(InvalidSceneError, match="0: found none"):
+        list(workers(refuse, range(3)))
+    assert [number for number, _, _ in workers(numbered, [7])] == [7]
+
+
+def test_a_process_that_is_ended():
+    with pytest.raises(RunError, match="most likely for lack of memory"), LocalWorkers(1) as found:
+        list(found(die, range(2)))
+
+
+@on_posix
+def test_an_interrupt_ends_what_is_at_work(tmp_path):
+    def interrupt() -> None:
+        while len(list(tmp_path.iterdir())) < 2:
+            time.sleep(0.01)
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+    def interrupted() -> None:
+        with LocalWorkers(2) as found:
+            threading.Thread(target=interrupt, daemon=True).start()
+            list(found(partial(wait, str(tmp_path)), range(4)))
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    pids = [int(path.name) for path in tmp_path.iterdir()]
+    assert len(pids) == 2
+    assert not any(psutil.pid_exists(pid) for pid in pids)
+
+
+CODE = """
+import sys, os
+from cvtgs.outofcore import LocalWorkers, simplify_file
+if __name__ == "__main__":
+    with LocalWorkers(2) as workers:
+        simplify_file(sys.argv[1], sys.argv[2], 0.05, blocks=8, workers=workers)
+"""
+
+
+@on_posix
+@pytest.mark.parametrize("sign", [signal.SIGKILL, signal.SIGINT])
+def test_no_process_is_left_behind_and_the_run_continues(source, tmp_path, sign):
+    script, output = tmp_path / "run.py", tmp_path / "out.ply"
+    script.write_text(CODE, encoding="utf-8")
+    running = subprocess.Popen(
+        [sys.executable, str(script), str(source), str(output)], stderr=subprocess.DEVNULL
+    )
+    folder = tmp_path / ".out.ply.blocks"
+    while not list(folder.glob("*/sites_01_*")):
+        assert running.poll() is None
+        time.sleep(0.01)
+    children = psutil.Process(running.pid).children(recursive=True)
+    running.send_signal(sign)
+    running.wait()
+    _, left = psutil.wait_procs(children, timeout=60)
+    assert len(children) >= 2
+    assert not left
+    assert not output.exists()
+    simplify_file(source, output, 0.05, blocks=8)
+    simplify_file(source, tmp_path / "whole.ply", 0.05, blocks=8)
+    assert output.read_bytes() == (tmp_path / "whole.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("memory", "wanted", "found"),
+    [(10**9, None, 1), (10**11, 3, 3), (4 * 10**9, 8, 3), (2**60, None, None)],
+)
+def test_how_many(memory, wanted, found):
+    assert worker_count(memory, wanted) == (found or core_count())
+
+
+def test_at_the_command_line(source, tmp_path, monkeypatch, capsys):
+    plans = []
+    true = cvtgs.outofcore.simplify_file
+
+    def noting(*words, memory, workers, **more):
+        plans.append((memory, workers is not None))
+        return true(*words, blocks=4, workers=workers, **more)
+
+    monkeypatch.setattr(cvtgs.outofcore, "simplify_file", noting)
+    monkeypatch.setattr("cvtgs.outofcore.block_count", lambda source, memory: 4)
+    outputs = [tmp_path / "two.ply", tmp_path / "one.ply"]
+    for output, count in zip(outputs, ("2", "1"), strict=True):
+        words = ["simplify", str(source), str(output), "--rho", "0.05", "--memory", "6GB"]
+        assert main([*words, "--workers", count]) == 0
+    assert plans == [(3 * 10**9, True), (6 * 10**9, False)]
+    assert outputs[0].read_bytes() == outputs[1].read_bytes()
+    assert "In 4 blocks." in capsys.readouterr().out
+
+
+def test_workers_must_be_some(source, tmp_path, capsys):
+    words = ["simplify", str(source), str(tmp_path / "a.ply"), "--rho", "0.1", "--workers", "0"]
+    assert main(words) == 1
+    assert capsys.readouterr().err == (
+        "cvtgs: error: --workers must be at least 1, and goes with blocks on this machine, not "
+        "with --scheduler; found 0.\n"
+    )

@@ -1,0 +1,23 @@
+"""What processes do in the tests of them, where they can import it."""
+
+import os
+import time
+
+from cvtgs.errors import InvalidSceneError
+
+
+def numbered(number: int) -> tuple[int, int, str]:
+    return number, os.getpid(), os.environ["OMP_NUM_THREADS"]
+
+
+def refuse(number: int) -> None:
+    raise InvalidSceneError(f"{number}: found none.")
+
+
+def die(number: int) -> None:
+    os._exit(9)
+
+
+def wait(folder: str, number: int) -> None:
+    os.close(os.open(f"{folder}/{os.getpid()}", os.O_CREAT))
+    time.sleep(600)
