@@ -120,8 +120,7 @@ def allocate(
         The new cell of each member; none is empty.
     """
     if count > target:
-        groups = cells.group_moments(members, labels, count)
-        groups = cells.Moments(*(column.cpu() for column in groups))  # many small steps
+        groups = cells.group_moments(members, labels, count).on_host()  # many small steps
         near = cvt.nearest_neighbors(groups.means.T, config.neighbors)
         labels = cells.merge_pairs(groups, near, target, config).to(labels.device)[labels]
     if config.reassign and target < len(labels):

@@ -10,12 +10,13 @@ from pretended_device import CUDA, DeviceTensor, pretended_cuda
 from scenes import random_scene, same_bits
 
 PRESETS = ["draft", "fast", "standard", "paper"]
-WAITS, COPIES = 23, 7
+WAITS, COPIES = 23, 11
 """Most waits of the host, and copies, in one simplification.
 
 Of the copies 1 is the network, 4 are the tessellation (points and weights to the host, labels and
-sites back) and 2 the neighbours of merged Gaussians; a scene that is not on the device is 6 more.
-Neither grows with the scene, but for what is computed in chunks, which are large on a device.
+sites back), 4 the allocation and 2 the neighbours of merged Gaussians; a scene that is not on the
+device is 6 more. Neither grows with the scene, but for what is computed in chunks, which are large
+on a device.
 """
 
 

@@ -52,6 +52,14 @@ class Moments(NamedTuple):
         """Return some of them."""
         return Moments(*(column.index_select(-1, rows) for column in self))
 
+    def on_host(self) -> "Moments":
+        """Return them on the CPU; they go there in one piece."""
+        if self.weights.device.type == "cpu":
+            return self
+        table = torch.cat([self.weights[None], self.masses[None], *self[2:]]).cpu()
+        weights, masses, *others = table.split([1, 1, 3, 6, 3])
+        return Moments(weights[0], masses[0], *others)
+
 
 def gaussian_moments(
     scene: GaussianScene,
@@ -274,9 +282,9 @@ def reassign(
         found[part] = best
     lowest = own_costs.new_full((count,), torch.inf).scatter_reduce(0, labels, own_costs, "amin")
     rows = torch.arange(len(labels), device=labels.device)
-    is_anchor = own_costs == lowest[labels]
+    rows = torch.where(own_costs == lowest[labels], rows, len(labels))
     anchors = torch.full((count,), len(labels), device=labels.device)
-    anchors = anchors.scatter_reduce(0, labels[is_anchor], rows[is_anchor], "amin")
+    anchors = anchors.scatter_reduce(0, labels, rows, "amin")
     found[anchors] = own
     return found
 
