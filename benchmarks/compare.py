@@ -15,8 +15,9 @@ Methods are the presets of cvtgs, ``standard, no network``, the baselines of
 
 Scenes and judges are chosen as in ``benchmarks.quality``. Let it run once on a small scene first:
 what compiles itself does so then. ``--results FILE`` adds the results to those that the file has,
-and shows all of them, so that methods can be run one by one; ``--outputs DIR`` keeps every file
-that a method wrote with its seconds, and does not run again what lies there.
+and shows all of them, so that methods can be run one by one; with ``--methods`` and no name, it
+only shows them. ``--outputs DIR`` keeps every file that a method wrote with its seconds, and does
+not run again what lies there.
 """
 
 import argparse
@@ -72,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     commands = commands_of(options)
     text = ""
     known = {} if options.results is None else read_results(options.results)
-    for measured in measure(commands, options):
+    for measured in measure(commands, options) if commands else [{}]:
         table = joined(known, measured)
         if options.results is not None:
             write_file(options.results, results_json(table).encode())
@@ -135,8 +136,8 @@ def commands_of(options: argparse.Namespace) -> dict[str, list[str]]:
         if name in commands:
             raise SystemExit(f"--tool: there is a method named {name!r} already.")
         commands[name] = shlex.split(command)
-    if not commands:
-        raise SystemExit("name at least one method or tool.")
+    if not commands and options.results is None:
+        raise SystemExit("name at least one method or tool, or --results to show.")
     return commands
 
 

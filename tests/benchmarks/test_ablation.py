@@ -111,7 +111,8 @@ def test_the_table_has_its_rows_and_the_folder_its_files(file, tmp_path, capsys)
     ablation.main([str(file), "--rho", "0.05", "-o", str(tmp_path / "new")])
     text = capsys.readouterr().out
     head, _, *rows = rows_of(text)
-    assert head == ["scene", "variant", "PSNR at 0.05", "SSIM at 0.05", "LPIPS at 0.05"]
+    names = ("PSNR", "SSIM", "LPIPS", "alpha error")
+    assert head == ["scene", "variant", *(f"{name} at 0.05" for name in names)]
     parts = ["w/o CVT", "w/o filter", "w/o MergeNet", "full"]
     variants = [f"{preset}, {part}" for preset in ("paper", "standard") for part in parts]
     assert [row[:2] for row in rows] == [
@@ -119,6 +120,7 @@ def test_the_table_has_its_rows_and_the_folder_its_files(file, tmp_path, capsys)
     ]
     assert all(5 < float(row[2]) < 60 and 0 < float(row[3]) <= 1 for row in rows)
     assert {row[4] for row in rows} == {"-"}
+    assert all(0 < float(row[5]) < 1 for row in rows)
     assert (tmp_path / "new" / "ablation.md").read_text().strip() == text.strip()
     assert (tmp_path / "new" / "ablation.png").read_bytes()[1:4] == b"PNG"
 
@@ -137,17 +139,17 @@ def test_another_judge_gets_every_small_scene(file, tmp_path, capsys):
     command = f"{sys.executable} {tmp_path / 'judge.py'} {{full}} {{small}}"
     ablation.main([str(file), "--rho", "0.1", "0.05", "--means", "--scorer", command])
     _, _, *rows = rows_of(capsys.readouterr().out)
-    found = [float(row[column]) for row in rows for column in (2, 5)]
+    found = [float(row[column]) for row in rows for column in (2, 6)]
     assert found == [20.0 + number for number in range(16)]
 
 
 def test_means_are_over_scenes_and_unknown_lpips_stays_unknown():
-    low = quality.Quality(psnr=20.0, ssim=0.5, lpips=0.2)
-    high = quality.Quality(psnr=30.0, ssim=0.7)
+    low = quality.Quality(psnr=20.0, ssim=0.5, lpips=0.2, alpha_error=0.25)
+    high = quality.Quality(psnr=30.0, ssim=0.7, alpha_error=0.75)
     table = {"a": {"full": [low, low]}, "b": {"full": [high, low]}}
     mixed, same = quality.means(table)["full"]
-    assert mixed == quality.Quality(psnr=25.0, ssim=0.6, lpips=None)
+    assert mixed == quality.Quality(psnr=25.0, ssim=0.6, lpips=None, alpha_error=0.5)
     assert same == low
     assert quality.markdown(table, [0.1, 0.01], means_only=True).splitlines()[-1] == (
-        "| mean | full | 25.00 | 0.6000 | - | 20.00 | 0.5000 | 0.2000 |"
+        "| mean | full | 25.00 | 0.6000 | - | 0.5000 | 20.00 | 0.5000 | 0.2000 | 0.2500 |"
     )

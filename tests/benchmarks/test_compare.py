@@ -142,6 +142,13 @@ def test_nothing_to_compare_is_refused():
         compare.main(["--methods"])
 
 
+def test_results_are_shown_without_running_anything(tmp_path, capsys):
+    kept = {"a": {"x": {0.1: result(20.0)}}}
+    (tmp_path / "results.json").write_text(compare_tables.results_json(kept))
+    compare.main(["--results", str(tmp_path / "results.json"), "--methods", "--rho", "0.1"])
+    assert rows_of(capsys.readouterr().out)[2] == ["x", "20.00", "0.5000", "2.0"]
+
+
 def test_places_are_filled_and_other_braces_stay():
     places = {"{IN}": "{OUT}.ply", "{OUT}": "b", "{COUNT}": "12"}
     assert compare.filled("--x={COUNT},{other}{{}}", places) == "--x=12,{other}{{}}"
