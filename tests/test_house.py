@@ -27,7 +27,7 @@ LEVELS = [
     {"views", "evaluation"},
     {"analysis"},
     {"filters", "cvt", "cells", "report"},
-    {"mergenet", "grouping"},
+    {"mergenet", "grouping", "matching"},
     {"pipeline", "refinement"},
     {"prepared"},
     {"simplifier", "info"},

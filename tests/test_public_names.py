@@ -47,6 +47,7 @@ NAMES = {
     "load",
     "load_cameras",
     "losses",
+    "matching",
     "math",
     "mergenet",
     "refine",
@@ -171,6 +172,13 @@ STAGES = {
         "load_checkpoint",
         "save_checkpoint",
         "summarize",
+    },
+    "matching": {
+        "Matched",
+        "cell_contributions",
+        "fit_colors",
+        "match_opacities",
+        "match_views",
     },
     "refinement": {"RefineConfig", "Refined", "join_reports", "refine"},
     "budget": {

@@ -24,7 +24,7 @@ from cvtgs.filters import filter_rows
 from cvtgs.grouping import Grouping, group_cells, group_rows
 from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import MergeNet, correct_cells
-from cvtgs.report import CellStatistics
+from cvtgs.report import CellStatistics, MatchReport
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities
 
@@ -57,12 +57,14 @@ class Reduced(NamedTuple):
         statistics: What the report says about the filter and the cells.
         grouping: The cells; None if all Gaussians are kept.
         merged: One Gaussian per cell before the network; None if all Gaussians are kept.
+        matching: What matching to images gained; None if there was none.
     """
 
     scene: GaussianScene
     statistics: CellStatistics = CellStatistics()
     grouping: Grouping | None = None
     merged: Merged | None = None
+    matching: MatchReport | None = None
 
 
 def reduce_scene(

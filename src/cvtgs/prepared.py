@@ -128,18 +128,20 @@ class Prepared:
         analysis = self._analyze(target, clock)
         if keep is None or not bool(keep.any()):
             reduced = self._reduce(valid, analysis, target, clock)
+            reduced = self._match(reduced, analysis, clock)
             return self._result(reduced, analysis, target, clock)
         keep = keep.to(valid.device)
         kept = keep if len(keep) == len(valid) else keep[valid_rows(self._used)]
         check_room(int(kept.sum()), target=target, total=len(valid))
         first, rest = kept.nonzero()[:, 0], (~kept).nonzero()[:, 0]
         protected = with_finite_opacities(valid.select(first))
+        part, room = analysis.select(rest), target - len(protected)
         if target >= len(valid):
             others = Reduced(with_finite_opacities(valid.select(rest)))
         else:
-            part, room = analysis.select(rest), target - len(protected)
             others = self._reduce(valid.select(rest), part, room, clock)
         reduced = others._replace(scene=concatenate([protected, others.scene]))
+        reduced = self._match(reduced, part, clock)
         return self._result(reduced, analysis, target, clock, kept_count=len(protected))
 
     def levels(self, rhos: Sequence[float]) -> tuple[Level, ...]:
@@ -170,7 +172,8 @@ class Prepared:
                 masses = analysis.apparent_areas * analysis.opacities
                 partition = reduced.grouping.partition
                 error = geometric_error(valid, reduced.scene, partition, masses=masses)
-            result = self._result(reduced, analysis, target, clock)
+            matched = self._match(reduced, analysis, clock)
+            result = self._result(matched, analysis, target, clock)
             found[target] = Level(*result, error, nested)
         return found
 
@@ -212,6 +215,31 @@ class Prepared:
         config, net = self._config, self._net
         return reduce_scene(scene, analysis, target, config, net=net, clock=clock, finest=finest)
 
+    def _match(self, reduced: Reduced, analysis: SceneAnalysis, clock: StageClock) -> Reduced:
+        """Match the small scene to the images of the analysis, if the configuration says so."""
+        if reduced.grouping is None or analysis.observed is None:
+            return reduced
+        from cvtgs.matching import cell_contributions, match_views  # noqa: PLC0415 (few need it)
+
+        with clock.stage("match"):
+            targets = cell_contributions(
+                analysis.observed.contributions, reduced.grouping.partition
+            )
+            small = drop_unused_bands(reduced.scene, analysis.plan)
+            kept = len(small) - len(targets)  # protected Gaussians come first, and have no cells
+            matched = match_views(
+                small,
+                analysis.observed,
+                torch.nn.functional.pad(targets, (kept, 0)),
+                config=self._config.match,
+                frozen=kept,
+            )
+            scene = restore_columns(matched.scene, reduced.scene, analysis.plan)
+            rows = torch.arange(len(scene), device=scene.device)
+            protected = reduced.scene.select(rows[:kept])
+            scene = concatenate([protected, scene.select(rows[kept:])]) if kept else scene
+        return reduced._replace(scene=scene, matching=matched.report)
+
     def _result(
         self,
         reduced: Reduced,
@@ -240,6 +268,7 @@ class Prepared:
             device=str(self._device),
             device_note=self._note,
             plan=analysis.plan,
+            matching=reduced.matching,
             stages=tuple(clock.costs),
             config=self._config,
             **reduced.statistics.model_dump(),

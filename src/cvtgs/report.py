@@ -44,6 +44,26 @@ class RefineReport(Record):
     cost: StageCost
 
 
+class MatchReport(Record):
+    """What matching merged Gaussians to images of the full scene did.
+
+    Attributes:
+        views: Images of the full scene.
+        opacities_kept: Whether the matched opacities stayed: they did no harm to every eighth
+            image.
+        psnr_before: PSNR of the mean squared error of every eighth image (all of fewer than
+            eight) before, dB.
+        psnr_after: The same afterwards.
+        backend: What rendered.
+    """
+
+    views: int
+    opacities_kept: bool
+    psnr_before: float
+    psnr_after: float
+    backend: str
+
+
 class CellStatistics(Record):
     """What the filter left out, and what the cells of a tessellation are like.
 
@@ -93,6 +113,7 @@ class SimplifyReport(CellStatistics):
             out; else empty.
         plan: The effects that the scene called for.
         stages: What each stage cost.
+        matching: What matching to images of the scene gained; None if there was none.
         refinement: What a refinement gained afterwards; None if there was none.
         config: The configuration.
     """
@@ -114,6 +135,7 @@ class SimplifyReport(CellStatistics):
     device_note: str = ""
     plan: EffectPlan | None = None
     stages: tuple[StageCost, ...] = ()
+    matching: MatchReport | None = None
     refinement: RefineReport | None = None
     config: SimplifyConfig
 

@@ -26,7 +26,7 @@ TRIALS = [
     Trial(kind="object", count=count, sh_degree=degree, ratios=ratios)
     for count, degree, ratios in ((50, 0, (0.1, 0.5)), (200, 3, (0.05, 0.4)), (400, 1, (0.2, 0.1)))
 ]
-SPEEDS = dict(zip(CANDIDATES, (1.0, 2.0, 4.0, 50.0, 50.0), strict=True))
+SPEEDS = dict(zip(CANDIDATES, (1.0, 2.0, 4.0, 10.0, 50.0, 50.0), strict=True))
 
 
 def made_up(config, scene, count) -> dict[str, float]:
@@ -39,6 +39,9 @@ def made_up(config, scene, count) -> dict[str, float]:
     }
     if config.visibility.views:
         seconds["visibility"] = 1e-6 * config.visibility.views * len(scene)
+    if config.match.enabled:
+        work = Work(count=len(scene), target=count)
+        seconds["match"] = 1e-3 + 1e-9 * work.features("match", config)["view_pixels"]
     if config.refine.enabled:
         work = Work(count=len(scene), target=count)
         seconds["refine"] = work.features("refine", config)["look_pixels"]
@@ -82,6 +85,18 @@ def test_few_images_stand_for_many(model):
     assert model.seconds("max", work) > model.seconds("high", work)
 
 
+def test_images_to_match_stand_for_many(model):
+    matched = cvtgs.SimplifyConfig.from_preset("matched")
+    work = Work(count=100_000, target=1000)
+    stages = model.stage_seconds("matched", work)
+    pixels = work.features("match", matched)["view_pixels"]
+    assert stages["match"] == pytest.approx(1e-3 + 1e-9 * pixels, rel=0.02)
+    unmatched = cvtgs.SimplifyConfig.compose(
+        preset="matched", settings={"match.opacity_rounds": "0", "match.color_iterations": "0"}
+    )
+    assert "match" not in model.stage_seconds("matched", work, config=unmatched)
+
+
 def test_settings_count(model):
     """Stages that are left out cost nothing, those asked for cost what they cost elsewhere."""
     work = Work(count=100_000, target=1000)
@@ -107,7 +122,7 @@ def test_settings_count(model):
 def test_a_setting_makes_room_for_a_better_preset(model):
     work = Work(count=1_000_000, target=10_000)
     budget = 1.3 * model.seconds("high", work) - 1
-    assert choose_preset(work, budget, model=model).preset == "standard"
+    assert choose_preset(work, budget, model=model).preset == "matched"
     fewer = {"refine.steps": str(high_steps() // 2)}
     choice = choose_preset(work, budget, settings=fewer, model=model)
     assert choice.preset == CANDIDATES[-1]

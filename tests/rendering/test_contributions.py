@@ -128,7 +128,7 @@ def test_images_that_show_nothing_change_nothing():
     assert torch.equal(one.means, Simplifier(device="cpu").simplify(scene, 0.2).means)
 
 
-@pytest.mark.parametrize("name", ["draft", "fast", "high", "max"])
+@pytest.mark.parametrize("name", ["draft", "fast", "matched", "high", "max"])
 def test_every_preset_gives_the_exact_count(name):
     settings = {"refine.size": "32", "visibility.size": "32", "refine.heldout": "2"}
     if name in ("high", "max"):
@@ -138,6 +138,7 @@ def test_every_preset_gives_the_exact_count(name):
     small, report = Simplifier(config=config, device="cpu").run(scene, 0.1)
     assert len(small) == 70
     names = [stage.stage for stage in report.stages]
-    assert ("visibility" in names) == ("refine" in names) == (name in ("high", "max"))
-    assert ("network" in names) == (name in ("high", "max"))
-    assert report.checkpoint == ("standard" if name in ("high", "max") else "none")
+    assert ("refine" in names) == (name in ("high", "max"))
+    assert ("visibility" in names) == ("network" in names) == (name not in ("draft", "fast"))
+    assert ("match" in names) == (name == "matched")
+    assert report.checkpoint == ("none" if name in ("draft", "fast") else "standard")

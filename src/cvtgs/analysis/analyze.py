@@ -6,14 +6,14 @@ from typing import Self
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.analysis.columns import drop_mip_tag
+from cvtgs.analysis.columns import drop_unused_bands
 from cvtgs.analysis.effects import EffectPlan, plan_effects, plan_haze
 from cvtgs.analysis.visibility import ambient_visibility, perspective_falloff
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig, TessellationConfig
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import divide
-from cvtgs.rendering import contributions
+from cvtgs.rendering import ObservedViews, contributions, observe
 from cvtgs.scene import GaussianScene
 from cvtgs.views import mixed_views
 
@@ -35,6 +35,8 @@ class SceneAnalysis:
         visibility: ``(n,)`` ambient visibility of every Gaussian, 0 (enclosed) to 1 (free);
             empty if neither weights nor the network use it.
         plan: The effects that the scene calls for.
+        observed: Images of the scene and what these Gaussians add to them; None if later stages
+            do not use them.
     """
 
     frame: RobustFrame
@@ -44,6 +46,7 @@ class SceneAnalysis:
     apparent_areas: Float[Tensor, "n"]
     visibility: Float[Tensor, "n_or_0"]
     plan: EffectPlan
+    observed: ObservedViews | None = None
 
     def select(self, rows: Tensor) -> Self:
         """Return the analysis of some Gaussians.
@@ -54,8 +57,12 @@ class SceneAnalysis:
         Returns:
             Their values; frame, farthest distance and plan are still those of the whole scene.
         """
+        observed = self.observed
+        if observed is not None:
+            observed = replace(observed, contributions=observed.contributions[rows])
         return replace(
             self,
+            observed=observed,
             opacities=self.opacities[rows],
             areas=self.areas[rows],
             apparent_areas=self.apparent_areas[rows],
@@ -150,7 +157,12 @@ def measure_visibility(
     else:
         longer = max(cameras.width, cameras.height)
         views = cameras.spread(choices.views).fitted(min(choices.size, longer))
-    rendered = contributions(drop_mip_tag(scene, analysis.plan), views)
+    used, observed = drop_unused_bands(scene, analysis.plan), None
+    if config.match.enabled:
+        observed = observe(used, views)
+        rendered = observed.contributions
+    else:
+        rendered = contributions(used, views)
     opacities, apparent = analysis.opacities, analysis.apparent_areas
     masses = (apparent * opacities).double()
     if float(rendered.sum()) > 0.0:
@@ -160,4 +172,4 @@ def measure_visibility(
         apparent = divide(blended, opacities.double().clamp_min(MIN_OPACITY)).to(apparent.dtype)
     haze = plan_haze(opacities, apparent * opacities, config=config)
     plan = analysis.plan.model_copy(update={"haze": haze})
-    return replace(analysis, apparent_areas=apparent, plan=plan)
+    return replace(analysis, apparent_areas=apparent, plan=plan, observed=observed)

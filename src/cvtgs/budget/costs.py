@@ -14,7 +14,7 @@ from cvtgs.cvt.tessellate import MIN_SAMPLES
 from cvtgs.errors import ConfigError
 from cvtgs.scene import GaussianScene
 
-VISIBILITY, NETWORK, REFINE = "visibility", "network", "refine"
+VISIBILITY, NETWORK, MATCH, REFINE = "visibility", "network", "match", "refine"
 
 FEATURES: Mapping[str, tuple[str, ...]] = {
     "check": ("in", "in_values"),
@@ -23,6 +23,7 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     "tessellate": ("once", "in", "search"),
     "merge": ("once", "in", "in_values", "out", "out_values"),
     VISIBILITY: ("once", "view_pixels", "views_in"),
+    MATCH: ("once", "view_pixels", "views_out", "view_values"),
     REFINE: ("images_in", "look_pixels", "looks_out"),
     NETWORK: ("once", "in", "in_values", "out", "out_values"),
 }
@@ -100,6 +101,8 @@ class Work:
             "out_values": float(self.target * self.colors),
             "view_pixels": float(visibility.views * visibility.size**2),
             "views_in": float(visibility.views * self.count),
+            "views_out": float(visibility.views * self.target),
+            "view_values": float(visibility.views * self.target * self.colors),
             "images_in": (refine.heldout + new_images) * self.count,
             "look_pixels": renders * refine.size**2,
             "looks_out": renders * self.target,
@@ -195,6 +198,7 @@ class CostModel(Record, allow_inf_nan=False):
         optional = {
             VISIBILITY: config.uses_renders,
             NETWORK: config.merge.network,
+            MATCH: config.uses_renders and config.match.enabled,
             REFINE: config.refine.enabled,
         }
         known = {stage: rates for name in self.rates for stage, rates in self.rates[name].items()}

@@ -271,6 +271,12 @@ def _report_notes(report: "SimplifyReport") -> list[str]:
         notes.append(f"In {report.blocks} blocks{resumed}.")
     if report.shortfall:
         notes.append(f"Fewer than the {report.target_count:,} asked for: {report.shortfall}.")
+    if report.matching is not None:
+        matched = report.matching
+        notes.append(
+            f"Matched to {matched.views} images of the scene: "
+            f"{matched.psnr_before:.2f} -> {matched.psnr_after:.2f} dB on every eighth of them."
+        )
     if report.refinement is not None:
         refined = report.refinement
         notes.append(

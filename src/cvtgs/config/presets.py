@@ -7,6 +7,10 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "draft": {"cvt": {"iterations": 0}, "merge": {"network": False}},
     "fast": {"merge": {"network": False}},
     "standard": {},
+    "matched": {
+        "visibility": {"views": 24, "size": 256},
+        "match": {"opacity_rounds": 1, "color_iterations": 6},
+    },
     "high": {"visibility": {"views": 64}, "refine": {"steps": 200, "half_after": 60, "size": 400}},
     "max": {"visibility": {"views": 64}, "refine": {"steps": 600, "size": 400}},
     "paper": {

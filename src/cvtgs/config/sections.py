@@ -132,6 +132,31 @@ class VisibilityConfig(Section):
     mass_share: Share = 0.7
 
 
+class MatchConfig(Section):
+    """How merged Gaussians are matched to images of the full scene, without descent.
+
+    The images are those of :class:`VisibilityConfig`; without them nothing is matched.
+
+    Attributes:
+        opacity_rounds: Rounds in which opacities change until every Gaussian paints what the
+            members of its cell paint in the full scene; 0 leaves opacities as they are.
+        color_iterations: Conjugate gradients for the least squares of colours; 0 leaves colours as
+            they are.
+        color_ridge: What keeps colours where they were, as a share of what weighs on them.
+        band_ridge: Bands above the constant one are kept this many times as strongly.
+    """
+
+    opacity_rounds: int = pydantic.Field(default=0, ge=0)
+    color_iterations: int = pydantic.Field(default=0, ge=0)
+    color_ridge: float = pydantic.Field(default=0.25, gt=0.0)
+    band_ridge: float = pydantic.Field(default=8.0, gt=0.0)
+
+    @property
+    def enabled(self) -> bool:
+        """Whether anything is matched."""
+        return bool(self.opacity_rounds or self.color_iterations)
+
+
 class MergeConfig(Section):
     """How a cell becomes one Gaussian.
 

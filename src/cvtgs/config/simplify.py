@@ -13,6 +13,7 @@ from cvtgs.config.sections import (
     AllocationConfig,
     EffectsConfig,
     FilterConfig,
+    MatchConfig,
     MergeConfig,
     TessellationConfig,
     VisibilityConfig,
@@ -32,6 +33,7 @@ class SimplifyConfig(Section):
         cvt: How Gaussians are grouped.
         allocation: How cells merge until as many are left as are wanted.
         merge: How a group becomes one Gaussian.
+        match: Whether, and how, opacities and colours are matched to images of the scene.
         refine: Whether, and how, the result is moved towards images of the scene.
 
     Example:
@@ -47,6 +49,7 @@ class SimplifyConfig(Section):
     cvt: TessellationConfig = TessellationConfig()
     allocation: AllocationConfig = AllocationConfig()
     merge: MergeConfig = MergeConfig()
+    match: MatchConfig = MatchConfig()
     refine: RefineConfig = RefineConfig()
 
     @property

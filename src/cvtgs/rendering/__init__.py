@@ -4,7 +4,24 @@
 imported only when they are chosen.
 """
 
-from cvtgs.rendering.backends import BackendName, choose_backend
-from cvtgs.rendering.render import Rendering, contributions, render
+from cvtgs.rendering.backends import BackendName, BlendingWeights, choose_backend
+from cvtgs.rendering.render import (
+    ObservedViews,
+    Rendering,
+    blending_weights,
+    contributions,
+    observe,
+    render,
+)
 
-__all__ = ["BackendName", "Rendering", "choose_backend", "contributions", "render"]
+__all__ = [
+    "BackendName",
+    "BlendingWeights",
+    "ObservedViews",
+    "Rendering",
+    "blending_weights",
+    "choose_backend",
+    "contributions",
+    "observe",
+    "render",
+]

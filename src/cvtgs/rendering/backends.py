@@ -37,6 +37,29 @@ class RasterOutput:
     depth: Float[Tensor, "c h w"]
 
 
+class BlendingWeights(Protocol):
+    """The weights ``alpha * T`` of every Gaussian in every pixel of one image.
+
+    The image is linear in the colours: these are the products with the matrix of the weights.
+    """
+
+    def paint(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+        """Return the image that Gaussians of these colours make, on black."""
+        ...
+
+    def collect(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
+        """Return for every Gaussian the sum of the pixels times its weights."""
+        ...
+
+    def normal(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Return what is collected from the image that is painted."""
+        ...
+
+    def powers(self) -> Float[Tensor, "n 2"]:
+        """Return the sums of every Gaussian's weights and of their squares."""
+        ...
+
+
 class Backend(Protocol):
     """The functions of every backend's module."""
 
@@ -57,6 +80,16 @@ class Backend(Protocol):
 
     def contributions(self, scene: GaussianScene, camera: Cameras) -> Tensor:
         """Return every Gaussian's sum of weights ``alpha * T`` over one image."""
+        ...
+
+    def observe(
+        self, scene: GaussianScene, camera: Cameras, *, sh_degree: int
+    ) -> tuple[RasterOutput, Tensor]:
+        """Render one image on black, and return the contributions to it."""
+        ...
+
+    def blending_weights(self, scene: GaussianScene, camera: Cameras) -> BlendingWeights:
+        """Return the weights of every Gaussian in the pixels of one image."""
         ...
 
 

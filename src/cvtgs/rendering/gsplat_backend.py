@@ -18,7 +18,12 @@ from cvtgs.errors import DeviceError, MissingDependencyError
 from cvtgs.math.spherical_harmonics import REST_COUNTS, evaluate
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.rendering import torch_backend
-from cvtgs.rendering.backends import STAGE, RasterOutput, contributions_by_gradient
+from cvtgs.rendering.backends import (
+    STAGE,
+    BlendingWeights,
+    RasterOutput,
+    contributions_by_gradient,
+)
 from cvtgs.rendering.projection import DILATION, NEAR_PLANE, to_pinholes
 from cvtgs.scene import GaussianScene
 
@@ -74,6 +79,18 @@ def rasterize(
 def contributions(scene: GaussianScene, camera: Cameras) -> Tensor:
     """Return every Gaussian's sum of weights ``alpha * T`` over one image."""
     return contributions_by_gradient(rasterize, scene, camera)
+
+
+def observe(
+    scene: GaussianScene, camera: Cameras, *, sh_degree: int
+) -> tuple[RasterOutput, Tensor]:
+    """Render one image, and return every Gaussian's sum of weights over it."""
+    return rasterize(scene, camera, sh_degree=sh_degree), contributions(scene, camera)
+
+
+def blending_weights(scene: GaussianScene, camera: Cameras) -> BlendingWeights:
+    """Return the weights of every Gaussian in every pixel, which gsplat does not give, by torch."""
+    return torch_backend.blending_weights(scene, camera)
 
 
 def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tuple[Tensor, Tensor]:

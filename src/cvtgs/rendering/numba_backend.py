@@ -29,6 +29,7 @@ from cvtgs.rendering.kernels_blending import (
     write_tiles,
 )
 from cvtgs.rendering.kernels_projection import project_all, project_all_gradient
+from cvtgs.rendering.kernels_weights import TileWeights
 from cvtgs.rendering.projection import Pinhole, to_pinholes
 from cvtgs.scene import GaussianScene
 
@@ -74,18 +75,40 @@ def rasterize(
 
 def contributions(scene: GaussianScene, camera: Cameras) -> Float[Tensor, "n"]:
     """Return every Gaussian's sum of weights ``alpha * T`` over one image, by one forward pass."""
-    use_threads(torch.get_num_threads())
+    return observe(scene, camera, sh_degree=0)[1]
+
+
+def observe(
+    scene: GaussianScene, camera: Cameras, *, sh_degree: int
+) -> tuple[RasterOutput, Float[Tensor, "n"]]:
+    """Render one image, and return every Gaussian's sum of weights over it, in the same pass."""
+    (pinhole,) = to_pinholes(camera)
+    settings = _settings(pinhole, sh_degree, scene.antialiased)
+    splats, tiles = _splats_by_tile(_arrays(scene), settings)
+    image = np.empty((settings.size[1], settings.size[0], 5), splats.packed.dtype)
+    weights = np.zeros(len(tiles.lists))
+    composite_all(splats.packed, tiles, _pixel_centers(image), image, weights)
+    sums = np.concatenate([[0.0], np.cumsum(weights)])[splats.starts]
     found = np.zeros(len(scene))
-    arrays = [tensor.detach().contiguous().numpy() for tensor in scene.tensors().values()]
-    for pinhole in to_pinholes(camera):
-        settings = _settings(pinhole, 0, scene.antialiased)
-        splats, tiles = _splats_by_tile(GaussianArrays(*arrays), settings)
-        image = np.empty((settings.size[1], settings.size[0], 5), splats.packed.dtype)
-        weights = np.zeros(len(tiles.lists))
-        composite_all(splats.packed, tiles, _pixel_centers(image), image, weights)
-        sums = np.concatenate([[0.0], np.cumsum(weights)])[splats.starts]
-        found[splats.rows] += np.diff(sums)
-    return torch.from_numpy(found)
+    found[splats.rows] = np.diff(sums)
+    layers = torch.from_numpy(image)[None]
+    output = RasterOutput(rgb=layers[..., :3], depth=layers[..., 3], alpha=1 - layers[..., 4])
+    return output, torch.from_numpy(found)
+
+
+def blending_weights(scene: GaussianScene, camera: Cameras) -> TileWeights:
+    """Return the weights of every Gaussian in every pixel of one image."""
+    (pinhole,) = to_pinholes(camera)
+    settings = _settings(pinhole, 0, scene.antialiased)
+    splats, tiles = _splats_by_tile(_arrays(scene), settings)
+    centers = (np.arange(max(settings.size)) + 0.5).astype(splats.packed.dtype)
+    return TileWeights(splats, tiles, settings.size, centers=centers, count=len(scene))
+
+
+def _arrays(scene: GaussianScene) -> GaussianArrays:
+    use_threads(torch.get_num_threads())
+    tensors = scene.tensors().values()
+    return GaussianArrays(*(tensor.detach().contiguous().numpy() for tensor in tensors))
 
 
 class _Render(torch.autograd.Function):

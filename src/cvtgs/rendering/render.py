@@ -10,7 +10,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import parameters
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.rendering.backends import BackendName, choose_backend
+from cvtgs.rendering.backends import BackendName, BlendingWeights, choose_backend
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
 
 
@@ -142,6 +142,101 @@ def contributions(
         camera = placed.select(torch.tensor([number], device=scene.device))
         total += chosen.contributions(scene, camera)
     return total
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ObservedViews:
+    """Images of a scene, and what every Gaussian adds to them.
+
+    Attributes:
+        cameras: From where the images are.
+        rgb: ``(c, h, w, 3)`` colours over black.
+        alpha: ``(c, h, w)`` what the Gaussians hide of a background, 0 to 1.
+        contributions: ``(n,)`` summed weights ``alpha * T`` over all images, pixels, float64.
+        backend: Name of what rendered.
+    """
+
+    cameras: Cameras
+    rgb: Float[Tensor, "c h w 3"]
+    alpha: Float[Tensor, "c h w"]
+    contributions: Float[Tensor, "n"]
+    backend: str
+
+
+@torch.no_grad()
+def observe(
+    scene: GaussianScene, cameras: Cameras, *, backend: BackendName = "auto"
+) -> ObservedViews:
+    """Render a scene and sum what every Gaussian adds, in one pass where the backend can.
+
+    Args:
+        scene: The Gaussians.
+        cameras: From where to look, at least one.
+        backend: What renders, as in :func:`cvtgs.rendering.render`.
+
+    Returns:
+        What :func:`cvtgs.rendering.render` and :func:`cvtgs.rendering.contributions` return,
+        without gradients.
+
+    Raises:
+        InvalidArgumentError: A camera is no pinhole camera, or there is no such backend.
+        DeviceError: The backend does not work on the scene's device.
+        MissingDependencyError: The backend's package is missing.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> from cvtgs.views import automatic_views
+        >>> scene = make("object", 500, sh_degree=0, seed=0)
+        >>> views = observe(scene, automatic_views(scene, 2, width=32, height=32))
+        >>> views.rgb.shape, bool((views.alpha.sum() - views.contributions.sum()).abs() < 1e-2)
+        (torch.Size([2, 32, 32, 3]), True)
+    """
+    name, chosen = choose_backend(backend, scene.device)
+    total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
+    outputs = []
+    for camera in cameras.to(scene.device).singles():
+        output, found = chosen.observe(scene, camera, sh_degree=scene.sh_degree)
+        total += found
+        outputs.append(output)
+    return ObservedViews(
+        cameras=cameras,
+        rgb=torch.cat([output.rgb for output in outputs]),
+        alpha=torch.cat([output.alpha for output in outputs]),
+        contributions=total,
+        backend=name,
+    )
+
+
+def blending_weights(
+    scene: GaussianScene, camera: Cameras, *, backend: BackendName = "auto"
+) -> BlendingWeights:
+    """Compute the weights ``alpha * T`` of every Gaussian in every pixel of one image.
+
+    Memory: 5 bytes per Gaussian and pixel that it reaches with backend ``numba``, else 40.
+
+    Args:
+        scene: The Gaussians.
+        camera: A single camera.
+        backend: What renders, as in :func:`cvtgs.rendering.render`; torch where gsplat would.
+
+    Returns:
+        The weights, as a matrix to multiply with.
+
+    Raises:
+        InvalidArgumentError: The camera is no pinhole camera, or there is no such backend.
+        DeviceError: The backend does not work on the scene's device.
+        MissingDependencyError: The backend's package is missing.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> from cvtgs.views import automatic_views
+        >>> scene = make("object", 500, sh_degree=0, seed=0)
+        >>> weights = blending_weights(scene, automatic_views(scene, 1, width=32, height=32))
+        >>> weights.paint(torch.ones(500, 3)).shape
+        torch.Size([32, 32, 3])
+    """
+    chosen = choose_backend(backend, scene.device)[1]
+    return chosen.blending_weights(scene, camera.to(scene.device))
 
 
 def _degree(scene: GaussianScene, sh_degree: int | None) -> int:

@@ -14,6 +14,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.math import segments
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.rendering.backends import RasterOutput, contributions_by_gradient, render_each
+from cvtgs.rendering.pixel_weights import PixelWeights
 from cvtgs.rendering.projection import (
     MAX_ALPHA,
     MIN_ALPHA,
@@ -92,6 +93,35 @@ def rasterize(
 def contributions(scene: GaussianScene, camera: Cameras) -> Tensor:
     """Return every Gaussian's sum of weights ``alpha * T`` over one image."""
     return contributions_by_gradient(rasterize, scene, camera)
+
+
+def observe(
+    scene: GaussianScene, camera: Cameras, *, sh_degree: int
+) -> tuple[RasterOutput, Tensor]:
+    """Render one image, and return every Gaussian's sum of weights over it."""
+    return rasterize(scene, camera, sh_degree=sh_degree), contributions(scene, camera)
+
+
+@torch.no_grad()
+def blending_weights(scene: GaussianScene, camera: Cameras) -> PixelWeights:
+    """Return the weights of every Gaussian in every pixel of one image."""
+    (pinhole,) = to_pinholes(camera)
+    splats = project(scene, pinhole, 0)
+    lists = intersect(splats, pinhole.size, TILE.get(scene.device.type, _TILE_ELSEWHERE))
+    entries, values = [], []
+    for batch in _batches(pack(splats), lists):
+        weights = batch.alpha * batch.transmittance
+        row, rank, pixel = weights.nonzero(as_tuple=True)
+        tile = batch.tiles[row]
+        x = tile % lists.across * lists.side + pixel % lists.side
+        y = tile // lists.across * lists.side + pixel // lists.side
+        inside = (x < pinhole.size[0]) & (y < pinhole.size[1])
+        splat = splats.rows[lists.splats[batch.entries[row, rank]]]
+        entries.append(torch.stack([y * pinhole.size[0] + x, splat])[:, inside])
+        values.append(weights[row, rank, pixel][inside])
+    pixels, rows = torch.cat([splats.rows.new_zeros(2, 0), *entries], dim=1)
+    weights = torch.cat([scene.means.new_zeros(0), *values])
+    return PixelWeights(pixels, rows, weights, size=pinhole.size, count=len(scene))
 
 
 def _render_one(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Float[Tensor, "h w 5"]:

@@ -1,0 +1,307 @@
+"""The blending weights of an image, kept by tile and splat in compiled loops: 5 bytes each."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cvtgs.rendering.compiled import (
+    Array,
+    Ints,
+    PixelBox,
+    SplatArrays,
+    TileArrays,
+    parallel,
+    prange,
+    serial,
+)
+from cvtgs.rendering.kernels_blending import LOG_MIN_ALPHA, box_of, span, tile_at
+from cvtgs.rendering.projection import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+
+
+class WeightArrays(NamedTuple):
+    """Weights ``alpha * T`` of the splats of each tile, in the order of the tiles' lists.
+
+    Attributes:
+        starts: ``(p + 1,)`` where each intersection's weights start.
+        counts: ``(p,)`` how many each has.
+        pixels: Pixel of each weight within its tile.
+        values: The weights.
+    """
+
+    starts: Ints
+    counts: Ints
+    pixels: NDArray[np.uint8]
+    values: NDArray[np.float32]
+
+
+@serial
+def rows_of(splat: Array, box: PixelBox) -> tuple[int, int]:
+    """Return the pixel rows of a tile that a splat reaches."""
+    half = math.sqrt(max(0.0, (LOG_MIN_ALPHA - splat[5]) / splat[4]))
+    return span(splat[1] - half, splat[1] + half, box[2], box[3])
+
+
+@serial
+def columns_of(splat: Array, box: PixelBox, down: float) -> tuple[int, int, float, float]:
+    """Return the pixel columns that a splat reaches in a row, where it is, and its exponent."""
+    middle = splat[0] - splat[3] * down
+    exponent = splat[5] + splat[4] * down * down
+    half = math.sqrt(max(0.0, (LOG_MIN_ALPHA - exponent) / splat[2]))
+    first, end = span(middle - half, middle + half, box[0], box[1])
+    return first, end, middle, exponent
+
+
+@parallel
+def count_pixels(
+    packed: Array, tiles: TileArrays, size: tuple[int, int], centers: Array, counts: Ints
+) -> None:
+    """Write how many pixels of its tile each intersection reaches at most."""
+    starts, lists, side = tiles
+    for step in prange(len(starts) - 1):
+        tile = tile_at(step, len(starts) - 1)
+        box = box_of(tile, side, size)
+        for entry in range(starts[tile], starts[tile + 1]):
+            splat = packed[lists[entry, 1]]
+            top, bottom = rows_of(splat, box)
+            count = 0
+            for y in range(top, bottom):
+                first, end, _, _ = columns_of(splat, box, centers[y] - splat[1])
+                count += max(0, end - first)
+            counts[entry] = count
+
+
+@parallel
+def write_weights(
+    packed: Array,
+    tiles: TileArrays,
+    size: tuple[int, int],
+    centers: Array,
+    weights: WeightArrays,
+) -> None:
+    """Blend without colours, and write the weight of every splat in every pixel."""
+    starts, lists, side = tiles
+    begins, counts, pixels, values = weights
+    for step in prange(len(starts) - 1):
+        tile = tile_at(step, len(starts) - 1)
+        box = box_of(tile, side, size)
+        through = np.ones(side * side, centers.dtype)
+        pending = (box[1] - box[0]) * (box[3] - box[2])
+        for entry in range(starts[tile], starts[tile + 1]):
+            counts[entry] = 0
+            if pending == 0:
+                continue
+            begin = begins[entry]
+            counts[entry], finished = blend_weights(
+                packed[lists[entry, 1]],
+                box,
+                centers,
+                through,
+                (pixels[begin:], values[begin:]),
+                side,
+            )
+            pending -= finished
+
+
+@serial
+def blend_weights(
+    splat: Array,
+    box: PixelBox,
+    centers: Array,
+    through: Array,
+    out: tuple[NDArray[np.uint8], NDArray[np.float32]],
+    side: int,
+) -> tuple[int, int]:
+    """Blend one splat into a tile; return how many weights there are, and pixels it finished.
+
+    ``through`` is the transmittance of each pixel, negative where it is finished.
+    """
+    found, finished = 0, 0
+    one, least = centers.dtype.type(1), centers.dtype.type(MIN_TRANSMITTANCE)
+    faintest, most = centers.dtype.type(MIN_ALPHA), centers.dtype.type(MAX_ALPHA)
+    pixels, values = out
+    top, bottom = rows_of(splat, box)
+    for y in range(top, bottom):
+        first, end, middle, exponent = columns_of(splat, box, centers[y] - splat[1])
+        for x in range(first, end):
+            pixel = (y - box[2]) * side + x - box[0]
+            before = through[pixel]
+            if before < 0:
+                continue
+            along = centers[x] - middle
+            alpha = min(most, math.exp(exponent + splat[2] * along * along))
+            if alpha < faintest:
+                continue
+            after = before * (one - alpha)
+            if after < least:
+                through[pixel] = -one
+                finished += 1
+                continue
+            through[pixel] = after
+            pixels[found] = pixel
+            values[found] = alpha * before
+            found += 1
+    return found, finished
+
+
+@parallel
+def sum_powers(tiles: TileArrays, weights: WeightArrays, sums: Array) -> None:
+    """Write the sum of the weights and of their squares of every intersection, by its place."""
+    starts, lists, _ = tiles
+    for tile in prange(len(starts) - 1):
+        for entry in range(starts[tile], starts[tile + 1]):
+            begin, first, second = weights.starts[entry], 0.0, 0.0
+            for k in range(begin, begin + weights.counts[entry]):
+                value = weights.values[k]
+                first += value
+                second += value * value
+            sums[lists[entry, 0], 0] = first
+            sums[lists[entry, 0], 1] = second
+
+
+@serial
+def paint_tile(
+    tiles: TileArrays, tile: int, weights: WeightArrays, colors: Array, canvas: Array
+) -> None:
+    """Add the colours of the splats of a tile, each times its weight."""
+    starts, lists, _ = tiles
+    for entry in range(starts[tile], starts[tile + 1]):
+        splat, begin = lists[entry, 1], weights.starts[entry]
+        red, green, blue = colors[splat, 0], colors[splat, 1], colors[splat, 2]
+        for k in range(begin, begin + weights.counts[entry]):
+            pixel, value = weights.pixels[k], weights.values[k]
+            canvas[pixel, 0] += value * red
+            canvas[pixel, 1] += value * green
+            canvas[pixel, 2] += value * blue
+
+
+@serial
+def collect_tile(
+    tiles: TileArrays, tile: int, weights: WeightArrays, canvas: Array, sums: Array
+) -> None:
+    """Write the sums over a tile of weights times pixels, by place of the intersection."""
+    starts, lists, _ = tiles
+    for entry in range(starts[tile], starts[tile + 1]):
+        place, begin = lists[entry, 0], weights.starts[entry]
+        red = green = blue = np.float32(0)
+        for k in range(begin, begin + weights.counts[entry]):
+            pixel, value = weights.pixels[k], weights.values[k]
+            red += value * canvas[pixel, 0]
+            green += value * canvas[pixel, 1]
+            blue += value * canvas[pixel, 2]
+        sums[place, 0], sums[place, 1], sums[place, 2] = red, green, blue
+
+
+@parallel
+def paint_all(tiles: TileArrays, weights: WeightArrays, colors: Array, image: Array) -> None:
+    """Write the image of some colours."""
+    side = tiles.side
+    height, width = image.shape[:2]
+    for tile in prange(len(tiles.starts) - 1):
+        x0, x1, y0, y1 = box_of(tile, side, (width, height))
+        canvas = np.zeros((side * side, 3), np.float32)
+        paint_tile(tiles, tile, weights, colors, canvas)
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                for channel in range(3):
+                    image[y, x, channel] = canvas[(y - y0) * side + x - x0, channel]
+
+
+@parallel
+def collect_all(tiles: TileArrays, weights: WeightArrays, image: Array, sums: Array) -> None:
+    """Write the sums of weights times pixels of every intersection."""
+    side = tiles.side
+    height, width = image.shape[:2]
+    for tile in prange(len(tiles.starts) - 1):
+        x0, x1, y0, y1 = box_of(tile, side, (width, height))
+        canvas = np.zeros((side * side, 3), np.float32)
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                for channel in range(3):
+                    canvas[(y - y0) * side + x - x0, channel] = image[y, x, channel]
+        collect_tile(tiles, tile, weights, canvas, sums)
+
+
+@parallel
+def normal_all(tiles: TileArrays, weights: WeightArrays, colors: Array, sums: Array) -> None:
+    """Paint colours and collect the image at once, tile by tile."""
+    for tile in prange(len(tiles.starts) - 1):
+        canvas = np.zeros((tiles.side * tiles.side, 3), np.float32)
+        paint_tile(tiles, tile, weights, colors, canvas)
+        collect_tile(tiles, tile, weights, canvas, sums)
+
+
+@parallel
+def sum_places(starts: Ints, rows: Ints, per_place: Array, out: Array) -> None:
+    """Write the sum over the intersections of every splat to the row of its Gaussian."""
+    for splat in prange(len(rows)):
+        for column in range(per_place.shape[1]):
+            total = 0.0
+            for place in range(starts[splat], starts[splat + 1]):
+                total += per_place[place, column]
+            out[rows[splat], column] = total
+
+
+class TileWeights:
+    """The blending weights of one image; see :class:`cvtgs.rendering.BlendingWeights`.
+
+    Memory: 5 bytes per splat and pixel that it reaches, and 20 per intersection of splat and tile.
+    """
+
+    def __init__(
+        self,
+        splats: SplatArrays,
+        tiles: TileArrays,
+        size: tuple[int, int],
+        *,
+        centers: Array,
+        count: int,
+    ) -> None:
+        packed = splats.packed
+        self._rows, self._splat_starts, self._tiles = splats.rows, splats.starts, tiles
+        self._size, self._count = size, count
+        entries = len(tiles.lists)
+        counts = np.zeros(entries, np.int64)
+        count_pixels(packed, tiles, size, centers, counts)
+        starts = np.zeros(entries + 1, np.int64)
+        np.cumsum(counts, out=starts[1:])
+        pixels, values = np.empty(starts[-1], np.uint8), np.empty(starts[-1], np.float32)
+        self._weights = WeightArrays(starts, counts, pixels, values)
+        write_weights(packed, tiles, size, centers, self._weights)
+
+    def paint(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
+        """Return the image that Gaussians of these colours make."""
+        image = np.empty((self._size[1], self._size[0], 3), np.float32)
+        paint_all(self._tiles, self._weights, self._of_splats(colors), image)
+        return torch.from_numpy(image).to(colors.dtype)
+
+    def collect(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
+        """Return for every Gaussian the sum of the pixels times its weights."""
+        sums = np.empty((len(self._tiles.lists), 3), np.float32)
+        pixels = image.detach().contiguous().numpy().astype(np.float32, copy=False)
+        collect_all(self._tiles, self._weights, pixels, sums)
+        return self._of_gaussians(sums).to(image.dtype)
+
+    def normal(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Return what is collected from the image that is painted."""
+        sums = np.empty((len(self._tiles.lists), 3), np.float32)
+        normal_all(self._tiles, self._weights, self._of_splats(colors), sums)
+        return self._of_gaussians(sums).to(colors.dtype)
+
+    def powers(self) -> Float[Tensor, "n 2"]:
+        """Return the sums of every Gaussian's weights and of their squares."""
+        sums = np.empty((len(self._tiles.lists), 2), np.float32)
+        sum_powers(self._tiles, self._weights, sums)
+        return self._of_gaussians(sums)
+
+    def _of_splats(self, colors: Tensor) -> NDArray[np.float32]:
+        return colors.detach().numpy()[self._rows].astype(np.float32, copy=False)
+
+    def _of_gaussians(self, sums: NDArray[np.float32]) -> Tensor:
+        out = np.zeros((self._count, sums.shape[1]), np.float32)
+        sum_places(self._splat_starts, self._rows, sums, out)
+        return torch.from_numpy(out)

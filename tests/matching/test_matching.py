@@ -1,0 +1,170 @@
+"""Matching to images without descent: opacities by what cells paint, colours by least squares."""
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.config import MatchConfig
+from cvtgs.matching import cell_contributions, colors, fit_colors, match_opacities, match_views
+from cvtgs.rendering import contributions, observe, render
+from cvtgs.views import automatic_views, mixed_views
+from render_cases import backends
+from scenes import random_scene, same_bits
+
+SMALL = {"visibility": {"views": 10, "size": 48}}
+
+
+def preset(**changes) -> SimplifyConfig:
+    return SimplifyConfig.from_mapping({"preset": "matched"} | SMALL | changes)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return cvtgs.synthetic.scene("object", 1500, sh_degree=1, seed=2)
+
+
+@pytest.fixture(scope="module")
+def views(scene):
+    return observe(scene, mixed_views(scene, 10, size=48))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_least_squares_recover_known_colours(degree):
+    """Images of a scene say which colours it had, where they show enough of it."""
+    scene = cvtgs.synthetic.scene("object", 150, sh_degree=degree, seed=2)
+    scene = scene.with_tensors({"sh0": scene.sh0 + 1.0}, {})  # none below 0, which would be cut
+    views = observe(scene, mixed_views(scene, 40, size=64))
+    shN = 0.5 * scene.shN  # noqa: N806 (the name that scenes give it)
+    dull = scene.with_tensors({"sh0": scene.sh0 + 0.3, "shN": shN}, {})
+    config = MatchConfig(color_iterations=200, color_ridge=1e-6, band_ridge=1.0)
+    found = fit_colors(dull, views, config=config)
+    seen = views.contributions > 200.0
+    assert int(seen.sum()) > 40
+    assert float((found.sh0 - scene.sh0)[seen].abs().median()) < 0.03
+    if degree:
+        before, after = ((one.shN - scene.shN)[seen].abs().mean() for one in (dull, found))
+        assert after < 0.5 * before
+
+
+def test_the_ridge_keeps_colours_of_what_no_image_shows(scene, views):
+    hidden = views.contributions == 0.0
+    assert bool(hidden.any())
+    dull = scene.with_tensors({"sh0": 0.5 * scene.sh0}, {})
+    found = fit_colors(dull, views, config=MatchConfig(color_iterations=5))
+    assert torch.equal(found.sh0[hidden], dull.sh0[hidden])
+    assert not torch.equal(found.sh0, dull.sh0)
+
+
+@backends
+def test_backends_find_the_same_colours(scene, views, backend, monkeypatch):
+    plain = colors.blending_weights
+    dull = scene.with_tensors({"sh0": 0.5 * scene.sh0}, {})
+    config = MatchConfig(color_iterations=4)
+    wanted = fit_colors(dull, views, config=config)
+    monkeypatch.setattr(
+        colors, "blending_weights", lambda one, camera: plain(one, camera, backend=backend)
+    )
+    found = fit_colors(dull, views, config=config)
+    assert torch.allclose(found.sh0, wanted.sh0, atol=2e-3)
+
+
+def test_matched_opacities_conserve_what_is_painted(scene, views):
+    """Where opacities were halved, what every Gaussian adds to the images comes back."""
+    fainter = scene.with_tensors({"logit_opacities": scene.logit_opacities - 1.5}, {})
+    wanted = views.contributions
+    config = MatchConfig(opacity_rounds=8)
+    found = match_opacities(fainter, views.cameras, wanted, config=config)
+    big = wanted > 20.0
+    errors = [
+        float((contributions(one, views.cameras) / wanted)[big].log().abs().mean())
+        for one in (fainter, found)
+    ]
+    assert errors[0] > 0.3
+    assert errors[1] < 0.15 * errors[0]
+
+
+def test_cells_paint_what_their_members_painted(scene, views):
+    partition = cvtgs.cells.Partition.from_labels(torch.arange(1500) % 7, 7)
+    sums = cell_contributions(views.contributions, partition)
+    assert float(sums.sum()) == pytest.approx(float(views.contributions.sum()))
+    assert float(sums[3]) == pytest.approx(float(views.contributions[3::7].sum()))
+
+
+def test_a_perfect_scene_stays_as_it_is(scene, views):
+    config = MatchConfig(opacity_rounds=2, color_iterations=5)
+    found = match_views(scene, views, views.contributions, config=config)
+    assert not found.report.opacities_kept
+    assert found.report.psnr_after == found.report.psnr_before == 100.0
+    assert float((found.scene.sh0 - scene.sh0).abs().amax()) < 1e-3
+
+
+def test_opacities_that_harm_held_out_images_are_not_taken(scene, views):
+    wrong = views.contributions * torch.linspace(0.1, 10, len(scene)).double()
+    config = MatchConfig(opacity_rounds=2)
+    found = match_views(scene, views, wrong, config=config)
+    assert not found.report.opacities_kept
+    assert found.scene is scene
+
+
+@pytest.mark.parametrize("rho", [0.2, 0.05])
+def test_matching_is_better_than_standard_in_other_views(scene, rho):
+    """The same cells, by weights of which none comes from images."""
+    images = {"views": 16, "size": 96, "mass_share": 1.0}
+    cameras = automatic_views(scene, 6, width=96, height=96, seed=9)
+    truth = render(scene, cameras).rgb
+    errors = []
+    for config in (SimplifyConfig(), preset(visibility=images)):
+        small = Simplifier(config=config, device="cpu").simplify(scene, rho)
+        errors.append(float((render(small, cameras).rgb - truth).square().mean()))
+    assert errors[1] < 0.95 * errors[0]
+
+
+def test_count_report_and_determinism(scene):
+    simplifier = Simplifier(config=preset(), device="cpu")
+    small, report = simplifier.run(scene, 0.1)
+    assert len(small) == 150
+    assert [cost.stage for cost in report.stages][-1] == "match"
+    assert report.matching.views == 10
+    assert report.matching.psnr_after > report.matching.psnr_before
+    assert same_bits(small, simplifier.simplify(scene, 0.1))
+    assert float(small.opacities.amax()) <= 1 - 1e-6
+
+
+def test_protected_gaussians_stay_bit_for_bit(scene):
+    keep = torch.arange(1500) % 100 == 7
+    small, report = Simplifier(config=preset(), device="cpu").run(scene, 0.1, keep=keep)
+    assert len(small) == 150
+    assert same_bits(small.select(torch.arange(15)), scene.select(keep))
+    assert report.matching.psnr_after > report.matching.psnr_before
+
+
+def test_every_level_is_matched(scene):
+    levels = Simplifier(config=preset(), device="cpu").levels(scene, [0.2, 0.02])
+    assert [len(level.scene) for level in levels] == [300, 30]
+    assert levels[1].nested
+    alone = Simplifier(config=preset(), device="cpu").simplify(scene, 0.2)
+    assert same_bits(levels[0].scene, alone)
+    for level in levels:
+        assert level.report.matching.psnr_after > level.report.matching.psnr_before
+
+
+def test_given_cameras_are_used(scene):
+    cameras = automatic_views(scene, 3, width=40, height=30, seed=1)
+    report = Simplifier(config=preset(), device="cpu").run(scene, 0.1, cameras=cameras).report
+    assert report.matching.views == 3
+
+
+def test_without_images_nothing_is_matched(scene):
+    config = preset(effects={"visibility": "off"})
+    small, report = Simplifier(config=config, device="cpu").run(scene, 0.1)
+    assert report.matching is None
+    assert same_bits(small, Simplifier(device="cpu").simplify(scene, 0.1))
+
+
+def test_bands_that_were_left_out_stay_zero():
+    scene = random_scene(300, degree=2)
+    plain = scene.with_tensors({"shN": torch.zeros_like(scene.shN)}, {})
+    small = Simplifier(config=preset(), device="cpu").simplify(plain, 0.1)
+    assert small.sh_degree == 2
+    assert not bool(small.shN.any())
