@@ -1,14 +1,21 @@
 """Blocks on a cluster of processes: the same bits, also when a worker is killed."""
 
+import json
 import os
 import signal
+import subprocess
+import sys
+import time
+from importlib import import_module
+from operator import attrgetter
+from pathlib import Path
 
 import pytest
 
 import cvtgs
 from cvtgs.cli.main import main
-from cvtgs.errors import MissingDependencyError
-from cvtgs.outofcore import simplify_distributed, simplify_file
+from cvtgs.errors import InvalidSceneError, MissingDependencyError, RunError
+from cvtgs.outofcore import ClusterWorkers, distributed, simplify_distributed, simplify_file
 from cvtgs.outofcore.distributed import connect
 
 BLOCKS = 10
@@ -68,3 +75,182 @@ def test_without_the_package_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'cvtgs\[dask\]'"):
         connect("tcp://127.0.0.1:1")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_relative_path_is_that_of_the_caller(cluster, source, tmp_path, monkeypatch):
+    monkeypatch.chdir(source.parent)
+    report = simplify_distributed(
+        source.name, 0.01, cluster.scheduler_address, output=tmp_path / "out.ply", blocks=3
+    )
+    assert report.output_count == 200
+    assert report.stages[0].stage == "workers"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_without_workers_is_one_sentence(source, tmp_path, monkeypatch):
+    package = pytest.importorskip("distributed")
+    monkeypatch.setattr(distributed, "ANSWER_SECONDS", 1.0)
+    with (
+        package.LocalCluster(n_workers=0, dashboard_address=None) as empty,
+        pytest.raises(RunError, match="must have workers, found none within 1 s; start some with"),
+    ):
+        simplify_distributed(source, 0.01, empty.scheduler_address, output=tmp_path / "out.ply")
+
+
+class Answers:
+    """A client whose only worker answers a question as it is told to."""
+
+    def __init__(self, answer, error=None):
+        self.answer, self.error, self.status = answer, error, "running"
+        self.scheduler = None
+
+    def scheduler_info(self, n_workers):
+        return {"workers": {"tcp://10.0.0.2:1": {}}}
+
+    def submit(self, function, *arguments, **options):
+        if function is import_module or isinstance(function, attrgetter):
+            return self.Future("finished", None, cvtgs.__version__)
+        return self.Future("error" if self.error else "finished", self.error, self.answer)
+
+    def cancel(self, futures):
+        pass
+
+    class Future:
+        def __init__(self, status, error, answer):
+            self.status, self.error, self.answer = status, error, answer
+
+        def exception(self):
+            return self.error
+
+        def result(self):
+            return self.answer
+
+
+def answer(**changes):
+    found = distributed._Worker(distributed._versions(), 10_000, sees_folder=True)
+    return found._replace(**changes)
+
+
+@pytest.mark.parametrize(
+    ("found", "error", "text"),
+    [
+        (answer(versions={"cvtgs": "0.0.1"}), None, "found cvtgs 0.0.1 for "),
+        (answer(source_bytes=None), None, "must see the input .* found none"),
+        (answer(source_bytes=7), None, "found 7 bytes"),
+        (answer(sees_folder=False), None, "must see and may write the folder of the output"),
+        (None, ModuleNotFoundError("No module named 'cvtgs'"), "must have cvtgs .*No module named"),
+    ],
+)
+def test_a_worker_that_cannot_do_the_work_is_named(tmp_path, monkeypatch, found, error, text):
+    package = pytest.importorskip("distributed")
+    monkeypatch.setattr(package, "wait", lambda futures, timeout: None)
+    source = tmp_path / "in.ply"
+    cvtgs.save(cvtgs.synthetic.scene("object", 300, sh_degree=0, seed=1), source)
+    if found is not None and found.source_bytes == 10_000:
+        found = found._replace(source_bytes=source.stat().st_size)
+    with pytest.raises(RunError, match=text) as caught:
+        simplify_file(
+            source, tmp_path / "out.ply", 0.1, blocks=2,
+            workers=ClusterWorkers(Answers(found, error)),
+        )  # fmt: skip
+    assert "10.0.0.2" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_worker_sees_what_it_sees(tmp_path):
+    folder = tmp_path / ".out.ply.blocks" / "key"
+    folder.mkdir(parents=True)
+    (tmp_path / "in.ply").write_bytes(b"12345")
+    (folder / "probe").write_text("token")
+    look = distributed._look
+    assert look(str(tmp_path / "in.ply"), str(folder / "probe"), "token") == (
+        distributed._versions(), 5, True,
+    )  # fmt: skip
+    assert not look("none.ply", str(folder / "probe"), "another").sees_folder
+    assert look("none.ply", "/nowhere/at/all/probe", "token")[1:] == (None, False)
+
+
+def test_a_worker_that_joins_later_with_another_version_is_refused():
+    assert distributed._call(abs, distributed._versions(), -3) == 3
+    with pytest.raises(RunError, match="must have the versions of this process"):
+        distributed._call(abs, {"cvtgs": "0.0.1"}, -3)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_errors_of_workers_are_sentences(cluster, source):
+    from distributed import Client  # noqa: PLC0415 (optional)
+
+    def fails(kind, text, item):
+        raise kind(text)
+
+    with Client(cluster) as client:
+        workers = ClusterWorkers(client)
+        for kind, text, wanted in (
+            (FileNotFoundError, "/data/x", "a worker could not do its work: FileNotFoundError: /d"),
+            (ValueError, "", "a worker could not do its work: ValueError; all need"),
+        ):
+            with pytest.raises(RunError) as caught:
+                list(workers(lambda item, k=kind, t=text: fails(k, t, item), [1]))
+            assert str(caught.value).startswith(wanted)
+            assert str(caught.value).endswith("the same command continues.")
+        with pytest.raises(InvalidSceneError, match="ours"):
+            list(workers(lambda item: fails(InvalidSceneError, "ours", item), [1]))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
+@pytest.mark.parametrize("fault", ["no scheduler", "no cvtgs", "another cvtgs"])
+def test_the_command_ends_in_one_sentence(source, tmp_path, fault):
+    """With a real scheduler, which is killed, or a real worker, without this cvtgs."""
+    address, other = tmp_path / "scheduler.json", tmp_path / "other"
+    other.mkdir()
+    (other / "cvtgs.py").write_text(
+        "__version__ = '0.0.1'\n" if fault == "another cvtgs" else "raise ImportError('no cvtgs')\n"
+    )
+    bare = {**os.environ, "PYTHONPATH": str(other)}
+    whole = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    options = ["--scheduler-file", str(address), "--no-dashboard"]
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-m", f"distributed.cli.dask_{kind}", *options, *more],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=env, cwd=tmp_path,
+        )
+        for kind, more, env in (
+            ("scheduler", ["--port", "0"], whole),
+            ("worker", ["--nthreads", "1", "--no-nanny"], whole if fault[:4] == "no s" else bare),
+        )
+    ]  # fmt: skip
+    try:
+        deadline = time.monotonic() + 60
+        while not address.exists() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        command = [sys.executable, "-m", "cvtgs", "simplify", str(source), str(tmp_path / "o.ply")]
+        command += ["--rho", "0.05", "--scheduler", scheduler_address(address)]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=whole) as run:
+            if fault == "no scheduler":
+                while not list(tmp_path.glob(".o.ply.blocks/*/*")) and run.poll() is None:
+                    time.sleep(0.01)
+                started[0].kill()
+            _, errors = run.communicate(timeout=200)
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+    assert "Traceback" not in errors
+    assert run.returncode == 1
+    assert errors.startswith("cvtgs: error: ")
+    assert errors.count("\n") == 1
+    wanted = {
+        "no scheduler": "the same command continues.",
+        "no cvtgs": f"must have cvtgs {cvtgs.__version__}, found ImportError: no cvtgs; install",
+        "another cvtgs": f"must have cvtgs {cvtgs.__version__}, found 0.0.1; install it",
+    }
+    assert wanted[fault] in errors
+
+
+def scheduler_address(path: Path) -> str:
+    return json.loads(path.read_text())["address"]

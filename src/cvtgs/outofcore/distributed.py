@@ -1,19 +1,37 @@
 """Blocks on many machines, by the distributed scheduler of Dask; only this file imports it."""
 
+import logging
 import os
-from collections.abc import Callable, Iterable, Sequence
+import platform
+import secrets
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import contextmanager, suppress
+from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from cvtgs.errors import MissingDependencyError, RunError
+import torch
+
+import cvtgs
+from cvtgs.errors import CvtgsError, MissingDependencyError, RunError, is_out_of_memory
+from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.run import Item, Result, simplify_file
 from cvtgs.report import SimplifyReport
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Future
 
 MAX_DEATHS = 5
 """Rounds of workers that may die with a task before it is given up."""
+
+ANSWER_SECONDS = 30.0
+"""How long a scheduler, a first worker, or a worker that is asked something may take."""
+
+_SHARE_SECONDS = 10.0
+"""How long a shared disk may take until a worker sees a new file."""
 
 
 def simplify_distributed(
@@ -44,7 +62,8 @@ def simplify_distributed(
 
     Raises:
         MissingDependencyError: ``distributed`` is not installed.
-        RunError: A task fails again and again, or there is no such scheduler.
+        RunError: There is no such scheduler, its workers cannot do the work (no access, another
+            version), or a task fails again and again.
         CvtgsError: What :func:`cvtgs.outofcore.simplify_file` raises.
     """
     if output is None:
@@ -75,10 +94,61 @@ def connect(address: str) -> "Client":
             "work on many machines needs the package distributed; "
             "install it with: pip install 'cvtgs[dask]'."
         ) from error
+    for name in ("distributed", "distributed.client"):  # what they tell is raised, too
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
-        return Client(address)
-    except (OSError, ValueError) as error:
-        raise RunError(f"{address}: no scheduler answers there: {error}.") from error
+        return Client(address, timeout=ANSWER_SECONDS)
+    except (OSError, ValueError, TypeError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+        raise RunError(f"{address}: no scheduler answers there: {reason}.") from error
+
+
+class _Worker(NamedTuple):
+    """What a worker says of itself.
+
+    Attributes:
+        versions: Of what the result depends on.
+        source_bytes: Size of the source as it sees it, None if it does not.
+        sees_folder: Whether it reads and may write the folder of the job.
+    """
+
+    versions: dict[str, str]
+    source_bytes: int | None
+    sees_folder: bool
+
+
+def _versions() -> dict[str, str]:
+    python = ".".join(platform.python_version_tuple()[:2])
+    return {"cvtgs": cvtgs.__version__, "torch": torch.__version__, "Python": python}
+
+
+def _look(source: str, probe: str, token: str) -> _Worker:
+    """Look on a worker at what it has; shared disks get a while to show the probe."""
+    path, deadline = Path(probe), time.monotonic() + _SHARE_SECONDS
+    while not path.exists() and path.parent.parent.parent.is_dir() and time.monotonic() < deadline:
+        time.sleep(0.2)
+    try:
+        sees_folder = path.read_text(encoding="ascii") == token and os.access(path.parent, os.W_OK)
+    except (OSError, ValueError):
+        sees_folder = False
+    try:
+        size = Path(source).stat().st_size
+    except OSError:
+        size = None
+    return _Worker(_versions(), size, sees_folder)
+
+
+def _call(function: Callable[[Any], Any], versions: dict[str, str], item: Any) -> Any:
+    """Call a function on a worker, unless one of another version has joined meanwhile."""
+    if versions != _versions():
+        raise RunError(_differs("a worker", _versions()))
+    return function(item)
+
+
+def _differs(worker: str, found: dict[str, str]) -> str:
+    pairs = [(name, own, found.get(name, "none")) for name, own in _versions().items()]
+    wrong = ", ".join(f"{name} {other} for {own}" for name, own, other in pairs if own != other)
+    return f"{worker}: must have the versions of this process, found {wrong}; install the same."
 
 
 class ClusterWorkers:
@@ -90,6 +160,82 @@ class ClusterWorkers:
 
     def __init__(self, client: "Client") -> None:
         self._client = client
+
+    def check(self, job: Job) -> int:
+        """Check within half a minute that all workers can do a job.
+
+        Args:
+            job: The job; its folder is there.
+
+        Returns:
+            How many workers there are.
+
+        Raises:
+            RunError: There is none, or one has no cvtgs, another version, or no access to the
+                source or to the folder of the output.
+        """
+        with _scheduler_errors():
+            addresses = self._wait_for_workers()
+            self._check_packages(addresses)
+            self._check_access(addresses, job)
+        return len(addresses)
+
+    def _check_access(self, addresses: Sequence[str], job: Job) -> None:
+        """Refuse workers that do not see what a job reads and writes."""
+        from distributed import wait  # noqa: PLC0415 (optional)
+
+        token, probe = secrets.token_hex(8), job.path("probe")
+        probe.write_text(token, encoding="ascii")
+        arguments = (job.source.path, str(probe), token)
+        futures = {
+            address: self._client.submit(_look, *arguments, workers=[address], pure=False)
+            for address in addresses
+        }
+        with suppress(TimeoutError):  # who has not answered is named below
+            wait(list(futures.values()), timeout=ANSWER_SECONDS)
+        try:
+            for address, future in futures.items():
+                _check_answer(address, future, job)
+        finally:
+            probe.unlink(missing_ok=True)
+            self._cancel(list(futures.values()))
+
+    def _check_packages(self, addresses: Sequence[str]) -> None:
+        """Refuse workers without this cvtgs, which may never answer to a function of it."""
+        from distributed import wait  # noqa: PLC0415 (optional)
+
+        call, answers = self._client.submit, {}
+        for address in addresses:
+            package = call(import_module, "cvtgs", workers=[address], pure=False)
+            version = call(attrgetter("__version__"), package, workers=[address], pure=False)
+            answers[address] = version
+        with suppress(TimeoutError):
+            wait(list(answers.values()), timeout=ANSWER_SECONDS)
+        for address, future in answers.items():
+            found = _told(future.exception()) if future.status == "error" else None
+            if future.status == "finished" and future.result() != cvtgs.__version__:
+                found = str(future.result())
+            if found is not None:
+                raise RunError(
+                    f"{address}: this worker must have cvtgs {cvtgs.__version__}, found {found}; "
+                    "install it in the environment of every worker."
+                )
+
+    def _wait_for_workers(self) -> list[str]:
+        deadline = time.monotonic() + ANSWER_SECONDS
+        while not (addresses := self._addresses()):
+            if time.monotonic() > deadline:
+                where = self._client.scheduler.address if self._client.scheduler else "ADDRESS"
+                raise RunError(
+                    f"{where}: must have workers, found none within {ANSWER_SECONDS:g} s; start "
+                    f"some with: dask worker {where}."
+                )
+            time.sleep(0.2)
+        return addresses
+
+    def _addresses(self) -> list[str]:
+        """Return the addresses of all workers."""
+        return sorted(self._client.scheduler_info(n_workers=-1)["workers"])
 
     def __call__(
         self, function: Callable[[Item], Result], items: Sequence[Item]
@@ -106,19 +252,109 @@ class ClusterWorkers:
         Raises:
             RunError: A task fails again and again.
         """
-        from distributed import KilledWorker  # noqa: PLC0415 (optional)
-
-        futures = [self._client.submit(function, item, pure=False, retries=2) for item in items]
+        call = self._client.submit
+        with _scheduler_errors():
+            futures = [
+                call(_call, function, _versions(), item, pure=False, retries=2) for item in items
+            ]
         try:
             for future in futures:
-                yield self._result_of(future, KilledWorker)
+                with _scheduler_errors():
+                    result = self._result_of(future)
+                yield result
         finally:
-            self._client.cancel(futures)
+            self._cancel(futures)
 
-    def _result_of(self, future: Any, killed: type[BaseException]) -> Any:
+    def _cancel(self, futures: "Sequence[Future[Any]]") -> None:
+        with suppress(Exception):  # the scheduler may be gone
+            self._client.cancel(list(futures))
+
+    def _result_of(self, future: "Future[Any]") -> Any:
+        from distributed import KilledWorker, wait  # noqa: PLC0415 (optional)
+
         for _ in range(MAX_DEATHS):
+            lonely = 0
+            while True:
+                try:
+                    wait([future], timeout=ANSWER_SECONDS)
+                    break
+                except TimeoutError as error:
+                    lonely = 0 if self._is_at_work() else lonely + 1
+                    if lonely > 1:
+                        raise _gone() from error
             try:
                 return future.result()
-            except killed:
+            except KilledWorker:
                 self._client.retry([future])
-        raise RunError(f"{MAX_DEATHS} rounds of workers died with the same piece of work.")
+            except Exception as error:
+                if isinstance(error, CvtgsError) or is_out_of_memory(error):
+                    raise
+                if future.status in ("cancelled", "lost"):
+                    raise _gone() from error
+                raise RunError(
+                    f"a worker could not do its work: {_told(error)}; all need the same packages "
+                    "and access to input and output; the same command continues."
+                ) from error
+        raise RunError(
+            f"{MAX_DEATHS} rounds of workers died with the same piece of work; give them more "
+            "memory, or less to hold by --memory; the same command continues."
+        )
+
+    def _is_at_work(self) -> bool:
+        """Return whether the scheduler answers and has workers."""
+        return self._client.status == "running" and bool(self._addresses())
+
+
+def _check_answer(address: str, future: "Future[Any]", job: Job) -> None:
+    """Refuse a worker that cannot do a job."""
+    if future.status == "error":
+        raise RunError(
+            f"{address}: this worker must have cvtgs {cvtgs.__version__}, found: "
+            f"{_told(future.exception())}."
+        )
+    if future.status != "finished":
+        raise RunError(
+            f"{address}: this worker must answer within {ANSWER_SECONDS:g} s, found nothing; end "
+            "it, install the same cvtgs there, or wait until it has less to do."
+        )
+    found: _Worker = future.result()
+    if found.versions != _versions():
+        raise RunError(_differs(address, found.versions))
+    size = Path(job.source.path).stat().st_size
+    if found.source_bytes != size:
+        seen = "none" if found.source_bytes is None else f"{found.source_bytes} bytes"
+        raise RunError(
+            f"{address}: this worker must see the input {job.source.path} of {size} bytes under "
+            f"the same path, found {seen}."
+        )
+    if not found.sees_folder:
+        folder = Path(job.folder).parent.parent
+        raise RunError(
+            f"{address}: this worker must see and may write the folder of the output under the "
+            f"same path, found no access to {folder}."
+        )
+
+
+@contextmanager
+def _scheduler_errors() -> Iterator[None]:
+    """Turn what a client raises when its scheduler is gone into one sentence."""
+    try:
+        yield
+    except (CancelledError, OSError) as error:
+        if isinstance(error, CvtgsError) or is_out_of_memory(error):
+            raise
+        raise _gone() from error
+
+
+def _gone() -> RunError:
+    return RunError(
+        "the scheduler or all of its workers are gone; start them again, and the same command "
+        "continues."
+    )
+
+
+def _told(error: BaseException | None) -> str:
+    """Return what an error of a library says, in one line."""
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    text = f"{type(error).__name__}: {lines[0].strip()}" if lines else type(error).__name__
+    return text[:200].rstrip(".")

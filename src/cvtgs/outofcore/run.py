@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -63,6 +63,22 @@ class Workers(Protocol):
 
         Returns:
             The results, in the order of the items.
+        """
+        ...
+
+
+@runtime_checkable
+class CheckedWorkers(Workers, Protocol):
+    """Workers that may be elsewhere, and are asked first whether they can do a job."""
+
+    def check(self, job: Job) -> int:
+        """Refuse workers that cannot do a job.
+
+        Args:
+            job: The job; its folder is there.
+
+        Returns:
+            How many workers there are.
         """
         ...
 
@@ -138,6 +154,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     check_config(simplifier.config)
     check_save(output, overwrite=overwrite)
     rows = open_rows(source)
+    rows = replace(rows, path=str(Path(rows.path).absolute()))  # for workers in other folders
     target = target_count(rows.count, rho, count=count, max_count=max_count)
     wanted = blocks or block_count(rows, memory or memory_to_plan(available_memory()))
     job = Job(
@@ -154,8 +171,13 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     job = replace(job, folder=job_folder(output, key))
     clock = StageClock(listener, torch.device("cpu"))
     with output_lock(output):
-        if not job.can_resume(key):
+        is_resumed = job.can_resume(key)
+        if not is_resumed:
             job.start_over()
+        if isinstance(workers, CheckedWorkers):
+            with clock.stage("workers"):
+                workers.check(job)
+        if not is_resumed:
             if simplifier.checkpoint is not None:
                 job.write_network(simplifier.checkpoint)
             with one_thread():
