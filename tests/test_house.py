@@ -31,7 +31,7 @@ LEVELS = [
     {"pipeline", "refinement"},
     {"prepared"},
     {"simplifier", "info"},
-    {"budget", "tradeoff", "levels", "outofcore", "oneshot", "notebooks"},
+    {"budget", "levels", "notebooks", "oneshot", "outofcore", "streams", "tradeoff"},
     {"train"},
     {"cli"},
     {"__main__"},

@@ -36,6 +36,7 @@ NAMES = {
     "cvt",
     "describe",
     "edit",
+    "streams",
     "analysis",
     "errors",
     "evaluate",

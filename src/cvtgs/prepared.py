@@ -166,15 +166,16 @@ class Prepared:
             nested = finest is not None and NESTED_FROM * target <= len(finest.scene)
             start = finest if nested else None
             reduced = self._reduce(valid, analysis, target, clock, finest=start)
-            error = 0.0
+            error, assignment = 0.0, None
             if reduced.grouping is not None:
                 finest = finest or reduced
                 masses = analysis.apparent_areas * analysis.opacities
                 partition = reduced.grouping.partition
                 error = geometric_error(valid, reduced.scene, partition, masses=masses)
+                assignment = partition.labels(len(valid)).cpu()
             matched = self._match(reduced, analysis, clock)
             result = self._result(matched, analysis, target, clock)
-            found[target] = Level(*result, error, nested)
+            found[target] = Level(*result, error, nested, assignment)
         return found
 
     def _check(self, clock: StageClock) -> CheckedScene:

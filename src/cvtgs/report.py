@@ -4,6 +4,8 @@ from pkgutil import resolve_name
 from typing import NamedTuple
 
 import pydantic
+from jaxtyping import Int
+from torch import Tensor
 
 from cvtgs.analysis import EffectPlan
 from cvtgs.clock import StageCost
@@ -187,9 +189,12 @@ class Level(NamedTuple):
         geometric_error: Root mean square distance from Gaussians to the small ones that replace
             them, weighted by apparent mass; scene units.
         nested: Whether every cell consists of whole cells of the finest size.
+        assignment: ``(n,)`` row of the small Gaussian that stands for each valid input row, int32;
+            -1 for those that were left out. None if all are kept.
     """
 
     scene: GaussianScene
     report: SimplifyReport
     geometric_error: float
     nested: bool
+    assignment: Int[Tensor, "n"] | None = None

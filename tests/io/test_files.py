@@ -48,7 +48,8 @@ def test_a_directory_is_no_file(tmp_path: Path, name: str) -> None:
         load(path)
     assert str(caught.value) == (
         f"{path}: must be a file or the folder of a trained model, found a directory without "
-        f"point_cloud/iteration_*/point_cloud.ply, step-*.ckpt, point_cloud.ply or meta.json."
+        f"point_cloud/iteration_*/point_cloud.ply, step-*.ckpt, point_cloud.ply, lod-meta.json "
+        f"or meta.json."
     )
 
 
@@ -81,8 +82,8 @@ def test_unknown_suffix(tmp_path: Path, name: str, found: str) -> None:
     with pytest.raises(FileFormatError) as caught:
         load(path)
     assert str(caught.value) == (
-        f"{path}: the file name must end in .compressed.ply, .ply, .spz, .splat, .sog, meta.json, "
-        f".glb, .gltf, .ckpt or .pt, found {found}."
+        f"{path}: the file name must end in .compressed.ply, .ply, .spz, .splat, .sog, "
+        f"lod-meta.json, meta.json, .glb, .gltf, .ckpt or .pt, found {found}."
     )
 
 

@@ -65,6 +65,24 @@ class Partition:
         """Members of every cell."""
         return self.offsets.diff()
 
+    def labels(self, count: int) -> Int[Tensor, "n"]:
+        """Return the cell of every row, the inverse of :meth:`from_labels`.
+
+        Args:
+            count: Number of rows.
+
+        Returns:
+            Cells, int32; -1 for rows that belong to none.
+
+        Example:
+            >>> Partition.from_labels(torch.tensor([1, 0, 1]), 2).labels(4).tolist()
+            [1, 0, 1, -1]
+        """
+        cells = torch.arange(len(self), dtype=torch.int32, device=self.order.device)
+        found = cells.new_full((count,), -1)
+        found[self.order] = torch.repeat_interleave(cells, self.counts)
+        return found
+
     def select(self, cells: Int[Tensor, "k"] | Bool[Tensor, "m"]) -> Self:
         """Keep some cells.
 

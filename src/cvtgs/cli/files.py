@@ -28,7 +28,7 @@ def add_info(add_parser: AddParser) -> None:
         "trained.",
     )
     parser.set_defaults(run=show_info)
-    add_options(parser, "input", "--json", "--effects", "--trust-sizes")
+    add_options(parser, "input", "--json", "--effects", "--lod", "--trust-sizes")
 
 
 def show_info(options: argparse.Namespace) -> None:
@@ -137,7 +137,7 @@ def add_convert(add_parser: AddParser) -> None:
     parser.set_defaults(run=convert)
     parser.check = check_paths
     add_paths(parser, options="")
-    add_options(parser, "--sh-degree", "--axes", "--trust-sizes", "--overwrite", "--quiet")
+    add_options(parser, "--sh-degree", "--axes", "--lod", "--trust-sizes", "--overwrite", "--quiet")
     parser.add_argument(
         "--spz-version",
         metavar="V",
@@ -164,8 +164,8 @@ def _convert_one(job: SceneJob, edits: SceneEdits) -> Outcome:
     options = job.options
     axes = read_axes(options.axes)
     scenes = [
-        cvtgs.io.load(path, axes=axes.source, trust_sizes=options.trust_sizes)
-        for path in (options.input, *options.merge)
+        cvtgs.io.load(path, axes=axes.source, trust_sizes=options.trust_sizes, lod=lod)
+        for path, lod in [(options.input, options.lod), *((path, None) for path in options.merge)]
     ]
     scene = scenes[0] if len(scenes) == 1 else cvtgs.edit.merge(scenes)
     scene, phrases = edits.apply(scene)

@@ -117,6 +117,11 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
         "help": "axes of the files: where x, y and z point, for example rub (right, up, back) or "
         "rub:rub (default rdf, right, down, forward; of glTF luf; unless IN states its own)",
     },
+    "--lod": {
+        "metavar": "N",
+        "type": int,
+        "help": "level of a streamed SOG (lod-meta.json) to read, 0 (default) for the finest",
+    },
     "--overwrite": {"action": "store_true", "help": "replace existing files"},
     "--quiet": {"action": "store_true", "help": "print only errors and warnings"},
     "--trust-sizes": {
@@ -350,6 +355,7 @@ def read_scene(
         extras=config.effects.extras != "off",
         axes=axes,
         trust_sizes=options.trust_sizes,
+        lod=options.lod,
     )
     return scene if kept is None else scene.with_sh_degree(kept)
 

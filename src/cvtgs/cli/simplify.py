@@ -137,7 +137,14 @@ def add_simplify(add_parser: AddParser) -> None:
         "--report", type=Path, metavar="R.json", help="file for a report of the run in JSON"
     )
     add_options(
-        parser, "--sh-degree", "--axes", "--device", "--trust-sizes", "--overwrite", "--quiet"
+        parser,
+        "--sh-degree",
+        "--axes",
+        "--lod",
+        "--device",
+        "--trust-sizes",
+        "--overwrite",
+        "--quiet",
     )
 
 

@@ -54,6 +54,7 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
     - ``point_cloud/iteration_*/point_cloud.ply``, the largest iteration: a model of INRIA's code;
     - ``nerfstudio_models/step-*.ckpt`` or ``step-*.ckpt``, the largest step: a run of Splatfacto;
     - ``point_cloud.ply``;
+    - ``lod-meta.json``: a streamed SOG;
     - ``meta.json``: an unbundled SOG.
 
     Args:
@@ -80,8 +81,8 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
     if found is None:
         raise InputError(
             f"{folder}: must be a file or the folder of a trained model, found a directory "
-            f"without point_cloud/iteration_*/point_cloud.ply, step-*.ckpt, point_cloud.ply or "
-            f"meta.json."
+            f"without point_cloud/iteration_*/point_cloud.ply, step-*.ckpt, point_cloud.ply, "
+            f"lod-meta.json or meta.json."
         )
     return found
 
@@ -93,7 +94,7 @@ def scene_size(path: str | os.PathLike[str]) -> int:
         path: A file, or a folder that :func:`scene_file` finds a scene in.
 
     Returns:
-        Bytes of its file; of an unbundled SOG, those of its images too.
+        Bytes of its file; of an unbundled or a streamed SOG, those of its images too.
 
     Example:
         >>> import tempfile
@@ -102,7 +103,8 @@ def scene_size(path: str | os.PathLike[str]) -> int:
         0
     """
     file = scene_file(path)
-    parts = file.parent.glob("*.webp") if file.name == "meta.json" else ()
+    patterns = {"meta.json": "*.webp", "lod-meta.json": "**/*.webp"}
+    parts = file.parent.glob(patterns[file.name]) if file.name in patterns else ()
     return sum(part.stat().st_size for part in (file, *parts))
 
 
@@ -111,7 +113,7 @@ def _scenes(folder: Path) -> Iterator[Path]:
     yield from filter(is_file, (part / "point_cloud.ply" for part in iterations))
     for steps in (folder / "nerfstudio_models", folder):
         yield from filter(is_file, _numbered(steps, _STEP))
-    for name in ("point_cloud.ply", "meta.json"):
+    for name in ("point_cloud.ply", "lod-meta.json", "meta.json"):
         if is_file(folder / name):
             yield folder / name
 

@@ -33,6 +33,7 @@ _READERS: Mapping[str, str] = MappingProxyType(
         ".spz": "cvtgs.io.spz:read_spz",
         ".splat": "cvtgs.io.splat:read_splat",
         ".sog": "cvtgs.io.sog:read_sog",
+        "lod-meta.json": "cvtgs.io.sog:read_lod_sog",
         "meta.json": "cvtgs.io.sog:read_sog",
         ".glb": "cvtgs.io.gltf:read_gltf",
         ".gltf": "cvtgs.io.gltf:read_gltf",
@@ -48,6 +49,9 @@ _ADVICE = (
 
 _SIZED = (".compressed.ply", ".splat")
 """Formats besides plain PLY whose files have as many bytes as their rows take."""
+
+_STREAM = "lod-meta.json"
+"""The file of a streamed SOG, the only format of several levels."""
 
 _STATES_AXES = (".spz", ".glb", ".gltf")
 """Formats whose axes their readers know."""
@@ -81,6 +85,7 @@ def load(
     extras: bool = True,
     axes: str | None = None,
     trust_sizes: bool = False,
+    lod: int | None = None,
 ) -> GaussianScene:
     """Read a scene from a file or the folder of a trained model.
 
@@ -90,7 +95,8 @@ def load(
     Args:
         path: The file; its suffix chooses the format: ``.ply`` (plain, or compressed by
             PlayCanvas' tools), ``.spz``, ``.splat``, ``.sog`` or the ``meta.json`` of a SOG,
-            ``.glb`` or ``.gltf`` with ``KHR_gaussian_splatting``, ``.ckpt`` of nerfstudio's
+            the ``lod-meta.json`` of a streamed SOG, ``.glb`` or ``.gltf`` with
+            ``KHR_gaussian_splatting``, ``.ckpt`` of nerfstudio's
             Splatfacto, ``.pt`` of gsplat's trainer. Of a folder, the scene that
             :func:`cvtgs.io.scene_file` finds. Or a file that is open in binary mode, which is read
             to its end; it need not be able to seek.
@@ -106,6 +112,7 @@ def load(
             or its format prescribes (``"luf"`` of glTF); others are taken to be ``"rdf"``.
         trust_sizes: Whether a compressed file may unpack to any size. By default, one that claims
             far more Gaussians than its bytes can hold is refused before it takes memory.
+        lod: Level of a streamed SOG; None for 0, the finest. Other files have none.
 
     Returns:
         The scene: float32, or float64 if the file has double coordinates.
@@ -116,7 +123,8 @@ def load(
         FileFormatError: The format is unknown, or the file is not what its format promises.
         MissingDependencyError: Reading this file needs an optional package.
         DeviceError: The device is not there.
-        InvalidArgumentError: There is no such SH degree, or there are no such axes.
+        InvalidArgumentError: There is no such SH degree, there are no such axes, or there is no
+            such level.
         OutOfMemoryError: The scene does not fit into memory.
 
     Example:
@@ -158,6 +166,12 @@ def load(
         options = {"sh_degree": sh_degree, "extras": extras}
     elif suffix in _STATES_AXES:
         options["axes"] = axes
+    if lod is not None:
+        if suffix != _STREAM:
+            raise InvalidArgumentError(
+                f"lod chooses a level of a streamed SOG ({_STREAM}), found {lod} for {source}."
+            )
+        options["lod"] = lod
     with memory_errors(f"{source}: reading the scene", _ADVICE):
         read: Callable[..., GaussianScene] = resolve_name(_READERS[suffix])
         scene = read(source, **options)

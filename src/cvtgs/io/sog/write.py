@@ -2,14 +2,17 @@
 
 import json
 import zipfile
-from typing import Any, BinaryIO
+from collections.abc import Iterator
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 
+from cvtgs.errors import InvalidSceneError
 from cvtgs.io.arrays import (
     HALF_RANGE,
+    Arrays,
     arrays_of,
     drop_largest,
     morton_rows,
@@ -25,6 +28,19 @@ _TIME = (1980, 1, 1, 0, 0, 0)  # the same scene gives the same bytes
 _QUAT_TAG = 252
 
 Images = dict[str, UInt8[np.ndarray, "h w 4"]]
+
+
+class EncodedSog(NamedTuple):
+    """The files of a SOG before they are written: ``meta.json`` and images by their stems."""
+
+    meta: dict[str, Any]
+    images: Images
+
+    def files(self) -> Iterator[tuple[str, bytes]]:
+        """Return names and contents, the images first; one is encoded at a time."""
+        for name, pixels in self.images.items():
+            yield f"{name}.webp", encode_webp(pixels)
+        yield META, json.dumps(self.meta).encode()
 
 
 def write_sog(scene: GaussianScene, file: BinaryIO) -> None:
@@ -47,12 +63,40 @@ def write_sog(scene: GaussianScene, file: BinaryIO) -> None:
         b'PK'
     """
     arrays = arrays_of(scene)
-    order = morton_rows(arrays.means)
+    encoded = _encoded(arrays, morton_rows(arrays.means), antialiased=scene.antialiased)
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr(zipfile.ZipInfo(META, _TIME), json.dumps(encoded.meta))
+        for name, pixels in encoded.images.items():
+            archive.writestr(zipfile.ZipInfo(f"{name}.webp", _TIME), encode_webp(pixels))
+
+
+def encode_sog(scene: GaussianScene) -> EncodedSog:
+    """Encode an unbundled SOG of version 2 whose rows are in the order of the scene.
+
+    Args:
+        scene: The scene, on any device, of rows that a SOG can hold.
+
+    Returns:
+        What to write.
+
+    Raises:
+        InvalidSceneError: A Gaussian of the scene is not finite.
+    """
+    arrays = arrays_of(scene)
+    if len(arrays.means) < len(scene):
+        raise InvalidSceneError(
+            f"every Gaussian must be finite to be written in the order of the scene, found "
+            f"{len(scene) - len(arrays.means):,} of {len(scene):,} that are not."
+        )
+    return _encoded(arrays, np.arange(len(scene)), antialiased=scene.antialiased)
+
+
+def _encoded(arrays: Arrays, order: Int[np.ndarray, "n"], *, antialiased: bool) -> EncodedSog:
     scales = codebook(arrays.log_scales[order])
     colors = codebook(arrays.sh0[order])
     opacities = opacity_bytes(arrays.logit_opacities)[order]
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "cvtgs"}, "count": len(order)}
-    if scene.antialiased:
+    if antialiased:
         meta |= {"model": "antialiased", "antialias": True}
     images, ranges = _means(arrays.means[order])
     images |= {
@@ -69,7 +113,7 @@ def write_sog(scene: GaussianScene, file: BinaryIO) -> None:
     if arrays.shN.shape[1]:
         more, meta["shN"] = _rest(arrays.shN[order])
         images |= more
-    _write_zip(file, images, meta)
+    return EncodedSog(meta, images)
 
 
 def _means(means: Float[np.ndarray, "n 3"]) -> tuple[Images, dict[str, list[float]]]:
@@ -128,10 +172,3 @@ def _image(
     if opacities is not None:
         pixels[:count, 3] = opacities
     return pixels.reshape(height, width, 4)
-
-
-def _write_zip(file: BinaryIO, images: Images, meta: dict[str, Any]) -> None:
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        archive.writestr(zipfile.ZipInfo(META, _TIME), json.dumps(meta))
-        for name, pixels in images.items():
-            archive.writestr(zipfile.ZipInfo(f"{name}.webp", _TIME), encode_webp(pixels))

@@ -1,0 +1,176 @@
+"""Read a streamed SOG: ``lod-meta.json``, a tree of chunks, and SOGs that hold rows of many."""
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from pydantic import Field
+
+from cvtgs.edit import merge
+from cvtgs.errors import FileFormatError, InvalidArgumentError
+from cvtgs.io.documents import Document, Text, Whole, parse_json, validated
+from cvtgs.io.files import open_input
+from cvtgs.io.sog.container import META
+from cvtgs.io.sog.read import read_sog
+from cvtgs.scene import GaussianScene
+from cvtgs.text import shown
+
+LOD_META = "lod-meta.json"
+
+_Size = Annotated[Whole, Field(ge=0, description="a whole number of at least 0")]
+_Object = Annotated[dict[str, Any], Field(description="a JSON object")]
+
+
+class _LodMeta(Document):
+    version: Annotated[Whole, Field(ge=1, le=1, description="1")] | None = None
+    lodLevels: Annotated[Whole, Field(ge=1, description="1 or more")]  # noqa: N815
+    counts: Annotated[list[_Size], Field(description="a list of whole numbers")] | None = None
+    filenames: Annotated[list[Text], Field(description="a list of texts")]
+    environment: Text | None = None
+    tree: _Object
+
+
+class _Rows(Document):
+    file: _Size
+    offset: _Size = 0
+    count: _Size
+
+
+class _Range(NamedTuple):
+    start: int
+    end: int
+
+
+def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> GaussianScene:
+    """Read one level of a streamed SOG, as splat-transform and PlayCanvas' engine know them.
+
+    Args:
+        path: The ``lod-meta.json``; its SOGs lie in its folder.
+        lod: The level, 0 for the finest. Chunks without it give their next coarser one, or their
+            coarsest.
+        trust_sizes: Whether images may unpack to any size.
+
+    Returns:
+        The Gaussians of the level, file by file, and those of the environment.
+
+    Raises:
+        InputNotFoundError: A file is missing.
+        InputError: A file cannot be opened or read.
+        FileFormatError: It is not a streamed SOG, damaged, or names files outside of its folder.
+        InvalidArgumentError: There is no such level.
+    """
+    with open_input(path) as file:
+        content = parse_json(file.read(), path)
+    meta = validated(_LodMeta, content, str(path))
+    if not 0 <= lod < meta.lodLevels:
+        raise InvalidArgumentError(
+            f"lod must be from 0 to {meta.lodLevels - 1}, the levels of {path}, found {lod}."
+        )
+    ranges: dict[int, list[_Range]] = {}
+    complete = True
+    for chunk, levels in enumerate(_chunks(meta.tree, path)):
+        level = _level_of(levels, lod, f"{path}: chunk {chunk}")
+        if level is None:
+            continue
+        complete &= level == lod
+        rows = validated(_Rows, levels[str(level)], f"{path}: chunk {chunk}, level {level}")
+        if rows.file >= len(meta.filenames):
+            raise FileFormatError(
+                f"{path}: filenames has {len(meta.filenames):,} entries, found a reference to "
+                f"{rows.file}."
+            )
+        if rows.count:
+            part = _Range(rows.offset, rows.offset + rows.count)
+            ranges.setdefault(rows.file, []).append(part)
+    _check_count(meta, ranges, lod if complete else None, path)
+    names = [(meta.filenames[number], parts) for number, parts in sorted(ranges.items())]
+    sources = [(_inside(path, name), parts) for name, parts in names]
+    if meta.environment is not None:
+        sources.append((_inside(path, meta.environment), []))
+    if not sources:
+        raise FileFormatError(f"{path}: level {lod} must hold a Gaussian, found none.")
+    scenes = []
+    for source, parts in sources:
+        scenes.append(_read_rows(source, parts, trust_sizes=trust_sizes))
+    return scenes[0] if len(scenes) == 1 else merge(scenes)
+
+
+def _chunks(tree: dict[str, Any], path: Path) -> Iterator[dict[str, Any]]:
+    """Return the levels of every leaf of the tree."""
+    waiting: list[Any] = [tree]
+    while waiting:
+        node = waiting.pop()
+        if not isinstance(node, dict):
+            raise FileFormatError(f"{path}: a node must be a JSON object, found {shown(node)}.")
+        levels, children = node.get("lods"), node.get("children", [])
+        if levels is not None:
+            if not isinstance(levels, dict):
+                raise FileFormatError(
+                    f"{path}: 'lods' must be a JSON object, found {shown(levels)}."
+                )
+            yield levels
+        elif isinstance(children, list):
+            waiting += reversed(children)
+        else:
+            raise FileFormatError(f"{path}: 'children' must be a list, found {shown(children)}.")
+
+
+def _level_of(levels: dict[str, Any], lod: int, where: str) -> int | None:
+    """Return the level of a chunk to read: that, the next coarser one, or the coarsest."""
+    wrong = [key for key in levels if not (key.isascii() and key.isdigit() and len(key) < 4)]
+    if wrong:
+        raise FileFormatError(f"{where}: levels must be whole numbers, found {shown(wrong[0])}.")
+    numbers = sorted(map(int, levels))
+    return next((number for number in numbers if number >= lod), numbers[-1] if numbers else None)
+
+
+def _check_count(
+    meta: _LodMeta, ranges: dict[int, list[_Range]], lod: int | None, path: Path
+) -> None:
+    """Refuse rows that are in two chunks, and another sum than the file states."""
+    for number, parts in ranges.items():
+        parts.sort()
+        for before, after in pairwise(parts):
+            if after.start < before.end:
+                raise FileFormatError(
+                    f"{path}: each row of a file must be in one chunk, found row {after.start:,} "
+                    f"of {shown(meta.filenames[number])} in two."
+                )
+    if meta.counts is None or lod is None:
+        return
+    total = sum(part.end - part.start for parts in ranges.values() for part in parts)
+    if len(meta.counts) != meta.lodLevels or meta.counts[lod] != total:
+        raise FileFormatError(
+            f"{path}: 'counts' must be those of the chunks of {meta.lodLevels} levels, found "
+            f"{shown(meta.counts)} and {total:,} in level {lod}."
+        )
+
+
+def _inside(path: Path, name: str) -> Path:
+    """Return the path of a SOG of the stream, which must be in its folder."""
+    pure = PurePosixPath(name)
+    plain = name.isprintable() and not set(name) & set("\\:") and name != ""
+    if not plain or pure.is_absolute() or ".." in pure.parts:
+        raise FileFormatError(
+            f"{path}: the files of a stream must be in its folder, found {shown(name)}."
+        )
+    if pure.name != META and pure.suffix != ".sog":
+        raise FileFormatError(
+            f"{path}: the files of a stream must be {META} or .sog, found {shown(name)}."
+        )
+    return path.parent / pure
+
+
+def _read_rows(source: Path, parts: Sequence[_Range], *, trust_sizes: bool) -> GaussianScene:
+    """Read some rows of a SOG, in ascending order; all where no range is given."""
+    scene = read_sog(source, trust_sizes=trust_sizes)
+    if parts and parts[-1].end > len(scene):
+        raise FileFormatError(
+            f"{source}: must have the {parts[-1].end:,} Gaussians that the stream takes of it, "
+            f"found {len(scene):,}."
+        )
+    if not parts or sum(part.end - part.start for part in parts) == len(scene):
+        return scene
+    return scene.select(torch.cat([torch.arange(part.start, part.end) for part in parts]))

@@ -1,0 +1,183 @@
+"""Streamed SOG: ``lod-meta.json`` and the SOGs that it names, as others write it."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from cvtgs import GaussianScene, load, save
+from cvtgs.cli.main import main
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.io import atomic_output, scene_size
+from cvtgs.io.sog import encode_sog
+from format_cases import refusal, storable_scene
+from scenes import same_bits
+
+Change = Callable[[dict[str, Any]], None]
+
+
+def write_folder(scene: GaussianScene, folder: Path) -> None:
+    folder.mkdir()
+    for name, content in encode_sog(scene).files():
+        with atomic_output(folder / name) as file:
+            file.write(content)
+
+
+@pytest.fixture
+def stream(tmp_path: Path) -> Path:
+    """Two chunks; level 0 lies in two files, level 1 in one; rows 3 and 4 are of no chunk."""
+    for name, seed, count in (("0_0", 0, 6), ("0_1", 1, 4), ("1_0", 2, 5), ("env", 3, 2)):
+        write_folder(storable_scene(count, seed=seed, degree=1), tmp_path / name)
+    near = {"0": {"file": 0, "offset": 0, "count": 3}, "1": {"file": 2, "offset": 0, "count": 2}}
+    far = {"0": {"file": 1, "offset": 0, "count": 4}, "1": {"file": 2, "offset": 2, "count": 3}}
+    bound = {"min": [-1, -1, -1], "max": [1, 1, 1]}
+    document = {
+        "version": 1,
+        "lodLevels": 2,
+        "counts": [7, 5],
+        "filenames": ["0_0/meta.json", "0_1/meta.json", "1_0/meta.json"],
+        "environment": "env/meta.json",
+        "tree": {
+            "bound": bound,
+            "children": [{"bound": bound, "lods": near}, {"bound": bound, "lods": far}],
+        },
+    }
+    (tmp_path / "lod-meta.json").write_text(json.dumps(document))
+    return tmp_path
+
+
+def changed(folder: Path, change: Change) -> Path:
+    path = folder / "lod-meta.json"
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+    return path
+
+
+def means(*parts: torch.Tensor) -> list[list[float]]:
+    return torch.cat(parts).tolist()
+
+
+def test_the_finest_level_is_read_with_its_environment(stream: Path) -> None:
+    first, second, coarse, far = (
+        load(stream / name / "meta.json").means for name in ("0_0", "0_1", "1_0", "env")
+    )
+    wanted = means(first[:3], second, far)
+    assert load(stream / "lod-meta.json").means.tolist() == wanted
+    assert load(stream).means.tolist() == load(stream, lod=0).means.tolist() == wanted
+    assert load(stream, lod=1).means.tolist() == means(coarse, far)
+    whole = load(stream)
+    assert (whole.sh_degree, whole.antialiased) == (1, True)
+    images = sum(path.stat().st_size for path in stream.rglob("*.webp"))
+    assert scene_size(stream) == images + (stream / "lod-meta.json").stat().st_size
+
+
+def test_a_chunk_without_a_level_gives_the_next(stream: Path) -> None:
+    def drop(document: dict[str, Any]) -> None:
+        near, far = (child["lods"] for child in document["tree"]["children"])
+        del near["0"], far["1"], document["environment"]
+
+    path = changed(stream, drop)
+    first, coarse = (load(stream / name / "meta.json").means for name in ("0_1", "1_0"))
+    assert load(path).means.tolist() == means(first, coarse[:2])
+    assert load(path, lod=1).means.tolist() == means(first, coarse[:2])
+
+
+def test_option_of_commands(stream: Path, tmp_path: Path) -> None:
+    words = ["convert", str(stream), str(tmp_path / "a.ply"), "--quiet", "--lod", "1"]
+    assert main(words) == 0
+    assert same_bits(load(tmp_path / "a.ply"), load(stream, lod=1))
+    assert main(["info", str(stream), "--lod", "1"]) == 0
+
+
+def test_only_streams_have_levels(stream: Path, tmp_path: Path) -> None:
+    save(storable_scene(3), tmp_path / "a.ply")
+    with pytest.raises(InvalidArgumentError, match=r"level of a streamed SOG \(lod-meta.json\), f"):
+        load(tmp_path / "a.ply", lod=0)
+    for lod in (-1, 2):
+        with pytest.raises(
+            InvalidArgumentError, match=f"from 0 to 1, the levels of .*, found {lod}"
+        ):
+            load(stream, lod=lod)
+
+
+def rows(document: dict[str, Any], chunk: int = 0, level: str = "0") -> dict[str, Any]:
+    return document["tree"]["children"][chunk]["lods"][level]
+
+
+OUTSIDE = "the files of a stream must be in its folder, found "
+DAMAGE: dict[str, tuple[Change, str]] = {
+    "version": (lambda d: d.update(version=2), "'version' must be 1, found 2."),
+    "levels": (lambda d: d.update(lodLevels=0), "'lodLevels' must be 1 or more, found 0."),
+    "tree": (lambda d: d.update(tree=[]), "'tree' must be a JSON object, found []."),
+    "node": (
+        lambda d: d["tree"].update(children=[7]),
+        "a node must be a JSON object, found 7.",
+    ),
+    "children": (
+        lambda d: d["tree"].update(children="many"),
+        "'children' must be a list, found 'many'.",
+    ),
+    "lods": (lambda d: d.update(tree={"lods": 3}), "'lods' must be a JSON object, found 3."),
+    "level": (
+        lambda d: d.update(tree={"lods": {"fine": {}}}),
+        "chunk 0: levels must be whole numbers, found 'fine'.",
+    ),
+    "count": (
+        lambda d: rows(d).update(count=-1),
+        "chunk 0, level 0: 'count' must be a whole number of at least 0, found -1.",
+    ),
+    "file": (
+        lambda d: rows(d).update(file=9),
+        "filenames has 3 entries, found a reference to 9.",
+    ),
+    "sum": (
+        lambda d: d.update(counts=[9, 5]),
+        "'counts' must be those of the chunks of 2 levels, found [9, 5] and 7 in level 0.",
+    ),
+    "twice": (
+        lambda d: rows(d, 1).update(file=0, offset=2),
+        "each row of a file must be in one chunk, found row 2 of '0_0/meta.json' in two.",
+    ),
+    "above": (
+        lambda d: d["filenames"].__setitem__(0, "../0_0/meta.json"),
+        OUTSIDE + "'../0_0/meta.json'.",
+    ),
+    "absolute": (
+        lambda d: d["filenames"].__setitem__(0, "/0_0/meta.json"),
+        OUTSIDE + "'/0_0/meta.json'.",
+    ),
+    "address": (
+        lambda d: d.update(environment="https://x.org/meta.json"),
+        OUTSIDE + "'https://x.org/meta.json'.",
+    ),
+    "foreign": (
+        lambda d: d["filenames"].__setitem__(0, "0_0/scene.ply"),
+        "the files of a stream must be meta.json or .sog, found '0_0/scene.ply'.",
+    ),
+    "nothing": (
+        lambda d: (d.pop("environment"), d.update(tree={}, counts=[0, 0])),
+        "level 0 must hold a Gaussian, found none.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damage(stream: Path, name: str) -> None:
+    change, said = DAMAGE[name]
+    path = changed(stream, change)
+    assert refusal(path) == f"{path}: {said}"
+
+
+def test_missing_and_short_files(stream: Path) -> None:
+    shutil.rmtree(stream / "0_1")
+    path = stream / "0_1" / "meta.json"
+    assert refusal(stream) == f"{path}: the file to read must exist, found none."
+    write_folder(storable_scene(2, degree=1), stream / "0_1")
+    assert refusal(stream) == (
+        f"{path}: must have the 4 Gaussians that the stream takes of it, found 2."
+    )

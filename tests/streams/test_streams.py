@@ -1,0 +1,194 @@
+"""Levels as streams: chunks that fit together, streamed SOG and 3D Tiles."""
+
+import json
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from cvtgs import GaussianScene, Simplifier, load
+from cvtgs.errors import InvalidArgumentError, OutputExistsError
+from cvtgs.progress import ProgressEvent
+from cvtgs.report import Level
+from cvtgs.streams import StreamNode, StreamPlan, plan_stream, write_sog_stream, write_tiles
+from cvtgs.synthetic import scene as make
+
+RHOS = [1.0, 0.25, 0.05, 0.0125]
+
+
+@pytest.fixture(scope="module")
+def scene() -> GaussianScene:
+    return make("courtyard", 4000, sh_degree=1, seed=3)
+
+
+@pytest.fixture(scope="module")
+def levels(scene: GaussianScene) -> tuple[Level, ...]:
+    return Simplifier(preset="fast", device="cpu").levels(scene, RHOS)
+
+
+@pytest.fixture(scope="module")
+def plan(levels: tuple[Level, ...]) -> StreamPlan:
+    return plan_stream(levels[::-1], chunk_gaussians=500)
+
+
+def nodes(node: StreamNode) -> list[StreamNode]:
+    return [node, *(below for child in node.children for below in nodes(child))]
+
+
+def test_levels_say_which_gaussian_stands_for_which(
+    scene: GaussianScene, levels: tuple[Level, ...]
+) -> None:
+    assert levels[0].assignment is None
+    for level in levels[1:]:
+        found = level.assignment
+        assert found is not None
+        assert (found.dtype, found.shape) == (torch.int32, (len(scene),))
+        members = Counter(found.tolist())
+        left_out = members.pop(-1, 0)
+        assert left_out == level.report.filtered_count
+        assert sorted(members) == list(range(len(level.scene)))
+
+
+def test_every_row_of_every_level_is_in_one_chunk(plan: StreamPlan) -> None:
+    assert [len(level.scene) for level in plan.levels] == [4000, 1000, 200, 50]
+    for number, level in enumerate(plan.levels):
+        rows = torch.cat([chunk.rows[number] for chunk in plan.chunks])
+        assert torch.equal(rows.sort().values, torch.arange(len(level.scene)))
+    sizes = [len(chunk.rows[0]) for chunk in plan.chunks]
+    assert 8 <= len(sizes) <= 30
+    single = [len(chunk.rows[3]) == 1 for chunk in plan.chunks]
+    assert all(size <= 500 or alone for size, alone in zip(sizes, single, strict=True))
+
+
+def test_chunks_of_nested_levels_stand_for_the_same_gaussians(plan: StreamPlan) -> None:
+    """The finest merged level and the coarsest, cell by cell; so no seams."""
+    finest, coarsest = plan.levels[1], plan.levels[3]
+    assert coarsest.nested
+    assert finest.assignment is not None
+    assert coarsest.assignment is not None
+    pairs = zip(finest.assignment.tolist(), coarsest.assignment.tolist(), strict=True)
+    chunk_of = [
+        {row: number for number, chunk in enumerate(plan.chunks) for row in chunk.rows[k].tolist()}
+        for k in (1, 3)
+    ]
+    both = [pair for pair in pairs if min(pair) >= 0]
+    assert len(both) > 3000
+    assert all(chunk_of[0][fine] == chunk_of[1][coarse] for fine, coarse in both)
+
+
+def test_boxes_hold_what_is_in_them(plan: StreamPlan) -> None:
+    leaves = [node for node in nodes(plan.root) if node.chunk is not None]
+    assert [leaf.chunk for leaf in leaves] == list(range(len(plan.chunks)))
+    for node in nodes(plan.root):
+        for child in node.children:
+            assert all(a <= b for a, b in zip(node.box_min, child.box_min, strict=True))
+            assert all(a >= b for a, b in zip(node.box_max, child.box_max, strict=True))
+    chunk = plan.chunks[0]
+    for level, rows in zip(plan.levels, chunk.rows, strict=True):
+        for mean, scales in zip(
+            level.scene.means[rows].tolist(), level.scene.scales[rows].tolist(), strict=True
+        ):
+            reach = 3 * min(scales)
+            for axis in range(3):
+                assert chunk.box_min[axis] <= mean[axis] - reach * 0.999
+                assert chunk.box_max[axis] >= mean[axis] + reach * 0.999
+
+
+def test_streamed_sog(plan: StreamPlan, tmp_path: Path) -> None:
+    events: list[ProgressEvent] = []
+    written = write_sog_stream(plan, tmp_path, file_gaussians=700, listener=events.append)
+    document = json.loads((tmp_path / "lod-meta.json").read_text())
+    assert document["version"] == 1
+    assert document["lodLevels"] == 4
+    assert document["counts"] == [4000, 1000, 200, 50]
+    assert [one.gaussians for one in written] == document["counts"]
+    assert [one.files for one in written] == [
+        sum(name.startswith(f"{level}_") for name in document["filenames"]) for level in range(4)
+    ]
+    assert written[0].files >= 6
+    assert written[3].files == 1
+    assert sum(one.bytes for one in written) == sum(
+        path.stat().st_size for path in tmp_path.glob("*/*")
+    )
+    assert (events[-1].done, events[-1].total) == (len(document["filenames"]),) * 2
+    for number, level in enumerate(plan.levels):
+        found = load(tmp_path, lod=number)
+        assert len(found) == len(level.scene)
+        away = torch.cdist(level.scene.means.double(), found.means.double()).amin(dim=1)
+        assert float(away.max()) < 0.02
+        assert math.isclose(
+            float(found.masses.sum()), float(level.scene.masses.sum()), rel_tol=0.05
+        )
+
+
+def test_3d_tiles(plan: StreamPlan, tmp_path: Path) -> None:
+    written = write_tiles(plan, tmp_path, tile_gaussians=400)
+    document = json.loads((tmp_path / "tileset.json").read_text())
+    assert document["asset"]["version"] == "1.1"
+    names = ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
+    assert document["extensions"]["3DTILES_content_gltf"]["extensionsRequired"] == names
+    assert document["root"]["refine"] == "REPLACE"
+    assert len(load(tmp_path / document["root"]["content"]["uri"])) == 50
+
+    finest: list[int] = []
+
+    def check(tile: dict[str, Any]) -> None:
+        count = len(load(tmp_path / tile["content"]["uri"]))
+        below = tile.get("children", [])
+        if not below:
+            assert tile["geometricError"] == 0
+            finest.append(count)
+            return
+        assert sum(len(load(tmp_path / one["content"]["uri"])) for one in below) > count
+        for child in below:
+            assert child["geometricError"] < tile["geometricError"]
+            check(child)
+
+    check(document["root"])
+    assert sum(finest) == 4000 == written[0].gaussians
+    assert document["geometricError"] >= document["root"]["geometricError"] > 0
+    assert sum(one.files for one in written) == len(list(tmp_path.glob("*.glb")))
+
+
+def test_tiles_lie_in_their_boxes(plan: StreamPlan, tmp_path: Path) -> None:
+    """3D Tiles turn a glTF from y up to z up: (x, y, z) to (x, -z, y)."""
+    write_tiles(plan, tmp_path, tile_gaussians=400)
+
+    def check(tile: dict[str, Any]) -> None:
+        x, y, z = load(tmp_path / tile["content"]["uri"], axes="rdf").means.unbind(1)
+        points = torch.stack([x, -z, y], dim=1)  # the axes of the file, not turned
+        box = tile["boundingVolume"]["box"]
+        half = torch.tensor([box[3], box[7], box[11]])
+        assert ((points - torch.tensor(box[:3])).abs() <= half + 1e-3).all()
+        for child in tile.get("children", []):
+            check(child)
+
+    check(json.loads((tmp_path / "tileset.json").read_text())["root"])
+
+
+def test_one_level_and_one_chunk(levels: tuple[Level, ...], tmp_path: Path) -> None:
+    plan = plan_stream(levels[3:])
+    assert len(plan.chunks) == 1
+    write_sog_stream(plan, tmp_path / "sog")
+    write_tiles(plan, tmp_path / "tiles")
+    assert len(load(tmp_path / "sog")) == len(load(tmp_path / "tiles" / "0.glb")) == 50
+
+
+def test_what_is_there_is_not_replaced_unasked(plan: StreamPlan, tmp_path: Path) -> None:
+    write_sog_stream(plan, tmp_path)
+    with pytest.raises(OutputExistsError, match=r"lod-meta.json: the output must not exist yet"):
+        write_sog_stream(plan, tmp_path)
+    write_sog_stream(plan, tmp_path, overwrite=True)
+    with pytest.raises(OutputExistsError, match=r"needs an empty folder, or one with ti"):
+        write_tiles(plan, tmp_path, overwrite=True)
+
+
+def test_wrong_levels(levels: tuple[Level, ...]) -> None:
+    for wrong in ([], [levels[0], levels[0]]):
+        with pytest.raises(InvalidArgumentError, match="needs levels of different sizes"):
+            plan_stream(wrong)
+    with pytest.raises(InvalidArgumentError, match="and chunks of 0"):
+        plan_stream(levels, chunk_gaussians=0)
