@@ -31,7 +31,7 @@ LEVELS = [
     {"pipeline", "refinement"},
     {"prepared"},
     {"simplifier", "info"},
-    {"budget", "levels", "notebooks", "oneshot", "outofcore", "streams", "tradeoff"},
+    {"budget", "levels", "notebooks", "oneshot", "outofcore", "streams", "tradeoff", "viewer"},
     {"train"},
     {"cli"},
     {"__main__"},
@@ -56,6 +56,7 @@ OWNERS = {
     "distributed": "outofcore/distributed.py",
     "filelock": "io/locks.py",
     "psutil": "outofcore/memory.py",
+    "viser": "viewer.py",
 }
 HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "jinja2", "matplotlib", "zstandard")
 HEAVY += ("distributed",)

@@ -19,6 +19,7 @@ from cvtgs.cli.levels import add_levels
 from cvtgs.cli.options import CommandParser
 from cvtgs.cli.simplify import add_simplify
 from cvtgs.cli.train import add_train
+from cvtgs.cli.view import add_view
 from cvtgs.errors import CvtgsError, memory_errors
 
 INTERRUPTED, TERMINATED, PIPE_CLOSED = 130, 143, 141
@@ -128,6 +129,7 @@ def build_parser() -> CommandParser:
         add_evaluate,
         add_render,
         add_compare,
+        add_view,
         add_tradeoff,
         add_demo,
         add_doctor,

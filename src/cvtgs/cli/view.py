@@ -1,0 +1,84 @@
+"""``cvtgs view``: choose the size of a scene in the browser."""
+
+import argparse
+import webbrowser
+from pathlib import Path
+
+import cvtgs
+from cvtgs.cli.display import say
+from cvtgs.cli.options import AddParser, add_options
+from cvtgs.errors import InvalidArgumentError
+
+HOST, PORT = "127.0.0.1", 8080
+
+
+def add_view(add_parser: AddParser) -> None:
+    """Add the command and its options."""
+    parser = add_parser(
+        "view",
+        help="choose the size of a scene in the browser",
+        description="Serve a page that shows IN and, as a slider of rho is moved, IN simplified "
+        "(needs the extra view). It flips between scenes, scores the present view and saves. "
+        "Colors are those of SH degree 0.",
+    )
+    parser.set_defaults(run=view)
+    add_options(parser, "input")
+    parser.add_argument(
+        "small", metavar="SMALL", type=Path, nargs="*", help="scenes to flip to, in any format"
+    )
+    add_options(parser, "--preset")
+    parser.add_argument(
+        "--rho", type=float, metavar="R", default=0.1, help="ratio to start with (default 0.1)"
+    )
+    parser.add_argument(
+        "--page",
+        type=Path,
+        metavar="F.html",
+        help="write the page to a file that needs no server, instead of serving it; its time line "
+        "flips between the scenes",
+    )
+    parser.add_argument(
+        "--host", default=HOST, help=f"address to listen on (default {HOST}: this machine only)"
+    )
+    parser.add_argument(
+        "--port", type=int, metavar="N", default=PORT, help=f"port to listen on (default {PORT})"
+    )
+    parser.add_argument("--no-browser", action="store_true", help="open no browser")
+    add_options(parser, "--device", "--trust-sizes", "--overwrite", "--quiet")
+
+
+def view(options: argparse.Namespace) -> None:
+    """Run ``cvtgs view``."""
+    from cvtgs.viewer import SceneViewer, ViewerServer, check_viewer
+
+    check_viewer()
+    cvtgs.target_count(1, options.rho)
+    if not 0 < options.port < 1 << 16:
+        raise InvalidArgumentError(f"--port must be from 1 to 65535, found {options.port}.")
+    if options.page is not None:
+        cvtgs.io.check_output(options.page, options.overwrite)
+    names = [options.input, *options.small]
+    scene, *others = (cvtgs.load(path, trust_sizes=options.trust_sizes) for path in names)
+    named = {str(path): other for path, other in zip(options.small, others, strict=True)}
+    server = ViewerServer(
+        SceneViewer(scene, named, device=options.device),
+        host=options.host,
+        port=options.port,
+        preset=options.preset or "fast",
+        rho=options.rho,
+    )
+    try:
+        if options.page is not None:
+            server.finish()
+            with cvtgs.io.atomic_output(options.page, overwrite=options.overwrite) as file:
+                file.write(server.page().encode())
+            if not options.quiet:
+                say(f"{options.page}: {len(names) + 1} scenes; open it in a browser.")
+            return
+        if not options.quiet:
+            say(f"{server.address} (end with Ctrl+C)", flush=True)
+        if not options.no_browser:
+            webbrowser.open(server.address)
+        server.wait()
+    finally:
+        server.close()

@@ -1,0 +1,143 @@
+"""The page that shows a scene while its size is chosen, without a browser."""
+
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+import viser_stand_in
+from cvtgs import GaussianScene, Simplifier, load, save
+from cvtgs.cli.main import main
+from cvtgs.errors import InvalidArgumentError, MissingDependencyError
+from cvtgs.viewer import SceneViewer, ViewerServer, camera_of
+from scenes import random_scene, same_bits
+
+FACTS, NOTES = "markdown 0", "markdown 7"
+
+
+@pytest.fixture
+def scene() -> GaussianScene:
+    return random_scene(500, degree=1, size=0.05)
+
+
+@pytest.fixture(autouse=True)
+def without_viser(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "viser", viser_stand_in)
+
+
+@pytest.fixture
+def page(scene: GaussianScene) -> Iterator[Any]:
+    """Return a page at its first result, with another scene beside."""
+    other = random_scene(7, degree=0)
+    viewer = SceneViewer(scene, {"other.ply": other}, device="cpu")
+    server = ViewerServer(viewer, preset="draft", rho=0.1)
+    server.finish()
+    yield SimpleNamespace(server=server, viewer=viewer, stand=viser_stand_in.ViserServer.latest)
+    server.close()
+    assert not viser_stand_in.ViserServer.latest.is_open
+
+
+def control(page: Any, label: str) -> Any:
+    return page.stand.gui.controls[label]
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < end, "nothing came"
+        time.sleep(0.01)
+
+
+def visible(page: Any) -> list[int]:
+    return [node.count for node in page.stand.scene.nodes.values() if node.visible]
+
+
+def test_the_first_page(page: Any) -> None:
+    assert page.server.address == "http://127.0.0.1:8080"
+    assert page.stand.scene.up == "-y"
+    assert visible(page) == [50]
+    assert control(page, FACTS).content.startswith("50 of 500 Gaussians, 0.0052 MB as .ply, ")
+    assert control(page, "show").options == ("simplified", "full scene", "other.ply")
+
+
+def test_a_moved_slider_shows_what_the_simplifier_makes(page: Any, scene: GaussianScene) -> None:
+    control(page, "log10 of rho").value = -2.0
+    until(lambda: visible(page) == [5])
+    until(lambda: control(page, FACTS).content.startswith("5 of 500 Gaussians"))
+    wanted = Simplifier(preset="draft", device="cpu").simplify(scene, 0.01)
+    assert same_bits(page.viewer.scenes["simplified"].scene, wanted)
+
+
+def test_presets_and_flipping(page: Any) -> None:
+    control(page, "preset").value = "fast"
+    until(lambda: control(page, FACTS).content.endswith("with fast"))
+    control(page, "show").value = "full scene"
+    assert visible(page) == [500]
+    assert control(page, FACTS).content == "500 of 500 Gaussians, 0.052 MB as .ply"
+    control(page, "show").value = "other.ply"
+    assert visible(page) == [7]
+
+
+def test_scores_of_the_present_view(page: Any) -> None:
+    camera = SimpleNamespace(wxyz=(1, 0, 0, 0), position=(0, 0, -4), fov=0.8, aspect=1.5)
+    control(page, "PSNR of this view").call(SimpleNamespace(camera=camera))
+    assert control(page, NOTES).content.startswith("simplified: ")
+    view = camera_of((1, 0, 0, 0), (0, 0, -4), fov=0.8, aspect=1.5)
+    assert f"{page.viewer.score('simplified', view):.2f} dB" in control(page, NOTES).content
+    assert page.viewer.score("full scene", view) > 60
+
+
+def test_what_is_shown_is_saved(page: Any, tmp_path: Path) -> None:
+    path = tmp_path / "out.ply"
+    control(page, "file").value = str(path)
+    for said in (f"{path}: 50 Gaussians.", "must not exist yet, found a file"):
+        control(page, "save what is shown").call()
+        assert said in control(page, NOTES).content
+    assert same_bits(load(path), page.viewer.scenes["simplified"].scene)
+    control(page, "file").value = "  "
+    control(page, "save what is shown").call()
+    assert control(page, NOTES).content == "**a file name is needed to save a scene, found none.**"
+
+
+def test_a_page_of_its_own_shows_every_scene(page: Any) -> None:
+    assert page.server.page() == "<html>[[500], [50], [7]] True</html>"
+    assert visible(page) == [50]
+
+
+def test_camera_of_a_view() -> None:
+    """Half a turn about y looks back along z; the point in front is in the middle."""
+    cameras = camera_of((0, 0, 1, 0), (1, 2, 3), fov=math.pi / 2, aspect=2.0)
+    assert (cameras.width, cameras.height) == (480, 240)
+    point = cameras.viewmats[0].double() @ torch.tensor([1, 2, -1, 1], dtype=torch.float64)
+    torch.testing.assert_close(point, torch.tensor([0, 0, 4, 1], dtype=torch.float64))
+    assert cameras.Ks[0].tolist() == [[120, 0, 240], [0, 120, 120], [0, 0, 1]]
+
+
+def test_names_of_its_own_are_taken(scene: GaussianScene) -> None:
+    with pytest.raises(InvalidArgumentError, match="must not be named 'simplified'; rename it"):
+        SceneViewer(scene, {"simplified": scene})
+
+
+def test_command_writes_a_page(
+    tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(scene, tmp_path / "a.ply")
+    words = ["view", str(tmp_path / "a.ply"), "--page", str(tmp_path / "a.html"), "--rho", "0.02"]
+    assert main([*words, "--preset", "draft", "--device", "cpu"]) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'a.html'}: 2 scenes; open it in a browser.\n"
+    assert (tmp_path / "a.html").read_text() == "<html>[[500], [10]] True</html>"
+    assert main(words) == 1
+    assert "a.html: the output must not exist yet" in capsys.readouterr().err
+
+
+def test_without_viser(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'cvtgs\[view\]'"):
+        ViewerServer(SceneViewer(random_scene(3)))
+    assert main(["view", str(tmp_path / "missing.ply")]) == 1
