@@ -213,6 +213,13 @@ def test_buffers_beside_the_file(small: Path, tmp_path: Path) -> None:
         assert refusal(path) == (
             f"{path}: buffers[0] must be in the folder of the file, found {uri!r}."
         )
+    document["buffers"][0]["uri"] = "dat;base64," + "A" * 1000
+    path.write_text(json.dumps(document))
+    assert len(str(refusal(path))) < 200
+    for text in ("A", "\u00e9", "===="):
+        document["buffers"][0]["uri"] = f"data:;base64,{text}"
+        path.write_text(json.dumps(document))
+        assert "buffers[0] must " in str(refusal(path))
 
 
 def accessor(document: dict[str, Any], name: str) -> dict[str, Any]:

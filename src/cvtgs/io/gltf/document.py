@@ -1,7 +1,6 @@
 """The parts of a glTF document that splats need: chunks, buffers, accessors and their checks."""
 
 import base64
-import binascii
 import struct
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -49,6 +48,7 @@ _COMPONENTS: dict[int, np.dtype[Any]] = {
 _LARGEST = {BYTE: 127, UNSIGNED_BYTE: 255, SHORT: 32767, UNSIGNED_SHORT: 65535}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _MOST_STRIDE = 252
+_LONGEST_NAME = 255
 
 
 def coefficient(degree: int, number: int) -> str:
@@ -205,13 +205,14 @@ class GltfFile:
             raise self.error(f"buffers[{index}] must have data in base64, found {shown(head)}")
         try:
             return base64.b64decode(text, validate=True)
-        except binascii.Error as error:
+        except ValueError as error:  # also binascii.Error
             raise self.error(f"buffers[{index}] must be whole base64, found: {error}") from error
 
     def _beside(self, uri: str, index: int, length: int) -> bytes:
         parts = urlsplit(uri)
         name = PurePosixPath(unquote(parts.path))
         outside = name.is_absolute() or ".." in name.parts or not name.parts or "\\" in str(name)
+        outside |= len(uri) > _LONGEST_NAME  # such as damaged data
         if parts.scheme or parts.netloc or parts.query or outside or not str(name).isprintable():
             raise self.error(
                 f"buffers[{index}] must be in the folder of the file, found {shown(uri)}"
