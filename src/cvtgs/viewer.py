@@ -181,7 +181,7 @@ class ViewerServer:
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
-        preset: str = "fast",
+        preset: str = "draft",
         rho: float = 0.1,
     ) -> None:
         module = _viser()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cvtgs
 from cvtgs.cli.display import say
-from cvtgs.cli.options import AddParser, add_options
+from cvtgs.cli.options import PRESET_NAMES, AddParser, add_options
 from cvtgs.errors import InvalidArgumentError
 
 HOST, PORT = "127.0.0.1", 8080
@@ -26,7 +26,11 @@ def add_view(add_parser: AddParser) -> None:
     parser.add_argument(
         "small", metavar="SMALL", type=Path, nargs="*", help="scenes to flip to, in any format"
     )
-    add_options(parser, "--preset")
+    parser.add_argument(
+        "--preset",
+        metavar="NAME",
+        help=f"preset to start with: {PRESET_NAMES} (default draft, for a quick slider)",
+    )
     parser.add_argument(
         "--rho", type=float, metavar="R", default=0.1, help="ratio to start with (default 0.1)"
     )
@@ -64,7 +68,7 @@ def view(options: argparse.Namespace) -> None:
         SceneViewer(scene, named, device=options.device),
         host=options.host,
         port=options.port,
-        preset=options.preset or "fast",
+        preset=options.preset or "draft",
         rho=options.rho,
     )
     try:
