@@ -114,6 +114,15 @@ def speed(session: nox.Session) -> None:
 
 
 @nox.session
+def gpu(session: nox.Session) -> None:
+    """Test and measure on a CUDA device, with torch and gsplat of PyPI; writes docs/gpu.md."""
+    session.install("-e", ".[test,gsplat]")
+    session.run("cvtgs", "doctor", "--device", "cuda")
+    session.run("pytest", "-m", "cuda")
+    session.run("python", "-m", "benchmarks.gpu", *session.posargs)
+
+
+@nox.session
 def fuzz(session: nox.Session) -> None:
     """Read damaged scenes, checkpoints and configurations; takes minutes, needs Linux."""
     session.install(*CONSTRAINTS, "-e", ".[test]")

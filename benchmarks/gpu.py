@@ -1,0 +1,225 @@
+"""Time and memory on a CUDA device beside the CPU: stages, renderers and steps of training.
+
+``python -m benchmarks.gpu`` writes its Markdown tables to docs/gpu.md. ``nox -s gpu`` also runs the
+tests that a device makes sense for, before.
+"""
+
+import argparse
+import math
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import cvtgs
+from benchmarks.measuring import machine, renew_tables
+from cvtgs import GaussianScene, Simplifier, SimplifyConfig
+from cvtgs.devices import device_name
+from cvtgs.errors import CvtgsError
+from cvtgs.progress import ProgressEvent
+from cvtgs.rendering import choose_backend, render
+from cvtgs.report import SimplifyReport
+from cvtgs.train import DataConfig, TrainConfig, TrainFiles, ViewsConfig, train
+from cvtgs.views import automatic_views
+
+PAGE = Path("docs/gpu.md")
+COUNTS = (1_000_000, 4_200_000, 13_600_000)
+HIGH: dict[str, Any] = {"preset": "high"}
+"""The configuration that refines."""
+
+CASE_COUNT = 20_000
+"""Gaussians of the scene to train on."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="Gaussians")
+    parser.add_argument("--rho", type=float, default=0.01)
+    parser.add_argument("--runs", type=int, default=3, help="runs that count, after one more")
+    parser.add_argument("--size", type=int, default=400, help="pixels along both edges")
+    parser.add_argument("--steps", type=int, default=20, help="training steps")
+    parser.add_argument("--page", type=Path, default=PAGE)
+    options = parser.parse_args()
+    device = torch.device(options.device)
+    text = "\n".join(
+        [
+            f"{device_name(device)}; CPU: {machine()}; torch {torch.__version__}, cvtgs "
+            f"{cvtgs.__version__}.\n",
+            *stage_table(device, options.counts, rho=options.rho, runs=options.runs),
+            *refining_table(device, options.counts[0], rho=options.rho),
+            *renderer_table(device, options.counts[0], size=options.size, runs=options.runs),
+            *training_table(device, steps=options.steps),
+        ]
+    )
+    print(text)
+    renew_tables(options.page, text, script="benchmarks.gpu")
+
+
+def stage_table(device: torch.device, counts: Sequence[int], *, rho: float, runs: int) -> list[str]:
+    """Seconds and peak of every stage, the median of runs, and seconds of one run on the CPU."""
+    lines = [
+        "| Gaussians, SH 0 | stage | device s | peak on the device MB | CPU s | CPU / device |",
+        "|---|---|---|---|---|---|",
+    ]
+    notes = []
+    for count in counts:
+        scene = cvtgs.synthetic.scene("courtyard", count, sh_degree=0, seed=0)
+        moved = [seconds(partial(scene.to, device), device) for _ in range(runs + 1)]
+        there = scene.to(device)
+        small, reports = repeat(there, SimplifyConfig(), rho, device=device, runs=runs)
+        on_cpu, report = Simplifier(device="cpu").run(scene, rho)
+        lines.append(row(count, "copy", statistics.median(moved[1:]), 0, None))
+        for stages in zip(*(one.stages for one in reports), strict=True):
+            costs = {stage.stage: stage.seconds for stage in report.stages}
+            name, peak = stages[0].stage, max(one.peak_device_memory_bytes for one in stages)
+            median = statistics.median(one.seconds for one in stages)
+            lines.append(row(count, name, median, peak, costs[name]))
+        all_seconds = statistics.median(one.seconds for one in reports)
+        lines.append(row(count, "all", all_seconds, 0, report.seconds))
+        same = all(equal(small[0], one) for one in small[1:])
+        notes.append(
+            f"{count:,}: runs give {'the same' if same else 'OTHER'} bits; "
+            f"{different_rows(small[0], on_cpu):,} of {len(on_cpu):,} Gaussians differ from the "
+            f"CPU's by more than 1e-3. {reports[0].device_note}".rstrip()
+        )
+    return [*lines, "", *notes, ""]
+
+
+def refining_table(device: torch.device, count: int, *, rho: float) -> list[str]:
+    """Seconds of the preset ``high``."""
+    scene = cvtgs.synthetic.scene("courtyard", count, sh_degree=0, seed=0).to(device)
+    config = SimplifyConfig.from_mapping(HIGH)
+    _, (report,) = repeat(scene, config, rho, device=device, runs=0)
+    refined = report.refinement
+    assert refined is not None
+    return [
+        "| preset `high`, Gaussians | seconds | steps | gain dB | renderer |",
+        "|---|---|---|---|---|",
+        f"| {count:,} | {report.seconds:.2f} | {refined.steps} | {refined.gain:+.2f} "
+        f"| {refined.backend} |",
+        "",
+    ]
+
+
+def renderer_table(device: torch.device, count: int, *, size: int, runs: int) -> list[str]:
+    """Seconds of one image and of its gradient by each renderer that works on the device."""
+    scene = cvtgs.synthetic.scene("courtyard", count, sh_degree=0, seed=0)
+    cameras = automatic_views(scene, 1, width=size, height=size)
+    scene, wanted = scene.to(device), None
+    lines = ["| renderer | image s | with gradient s | largest difference |", "|---|---|---|---|"]
+    for name in ("torch", "gsplat", "numba"):
+        try:
+            choose_backend(name, device)
+        except CvtgsError as error:
+            lines.append(f"| {name} | not here: {error} | | |")
+            continue
+
+        def image(name: str = name) -> torch.Tensor:
+            with torch.no_grad():
+                return render(scene, cameras, backend=name).rgb
+
+        def gradient(name: str = name) -> None:
+            leaf = scene.sh0.detach().requires_grad_()
+            moved = scene.with_tensors({"sh0": leaf}, scene.extras)
+            render(moved, cameras, backend=name).rgb.square().sum().backward()
+
+        found = image().cpu()
+        wanted = found if wanted is None else wanted
+        times = [
+            statistics.median([seconds(work, device) for _ in range(runs + 1)][1:])
+            for work in (image, gradient)
+        ]
+        difference = float((found - wanted).abs().amax())
+        lines.append(f"| {name} | {times[0]:.4f} | {times[1]:.4f} | {difference:.1e} |")
+    return [*lines, ""]
+
+
+def training_table(device: torch.device, *, steps: int) -> list[str]:
+    """Steps a second of both trainings, without the first fifth, on the device and on the CPU."""
+    lines = ["| training | device steps/s | CPU steps/s |", "|---|---|---|"]
+    data = DataConfig(generated=1, generated_validation=1, generated_counts=(CASE_COUNT,))
+    for kind in ("scene", "local"):
+        rates = []
+        for where in (device, torch.device("cpu")):
+            config = TrainConfig(
+                kind=kind,
+                steps=steps,
+                validate_every=steps,
+                data=data.model_copy(update={"ratios": (0.06,), "validation_ratios": (0.06,)}),
+                views=ViewsConfig(count=2, sizes=(256,), validation_count=1, validation_size=64),
+            )
+            rates.append(steps_a_second(config, where))
+        lines.append(f"| {kind} | {rates[0]:.2f} | {rates[1]:.2f} |")
+    return [*lines, ""]
+
+
+def steps_a_second(config: TrainConfig, device: torch.device) -> float:
+    """Train, and count the steps after the first fifth by the clock."""
+    times: list[float] = []
+
+    def listen(event: ProgressEvent) -> None:
+        if event.stage == "train":
+            times.append(time.perf_counter())
+
+    with tempfile.TemporaryDirectory() as folder:
+        files = TrainFiles.beside(Path(folder) / "net.safetensors")
+        train(config, files, device=device, listener=listen)
+    first = len(times) // 5
+    return (len(times) - 1 - first) / (times[-1] - times[first])
+
+
+def repeat(
+    scene: GaussianScene,
+    config: SimplifyConfig,
+    rho: float,
+    *,
+    device: torch.device,
+    runs: int,
+) -> tuple[list[GaussianScene], list[SimplifyReport]]:
+    """Simplify again and again; the first run, which loads kernels, counts only if it is alone."""
+    simplifier = Simplifier(config=config, device=device)
+    results = [simplifier.run(scene, rho) for _ in range(runs + 1)]
+    counted = results[1:] or results
+    return [one.scene.to("cpu") for one in counted], [one.report for one in counted]
+
+
+def seconds(work: Callable[[], object], device: torch.device) -> float:
+    """Return the wall-clock seconds of some work on a device."""
+    start = time.perf_counter()
+    work()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter() - start
+
+
+def row(count: int, stage: str, found: float, peak: int, cpu: float | None) -> str:
+    """Return a line of the table of stages."""
+    ratio = "" if cpu is None else f"{cpu / found:.1f}"
+    beside = "" if cpu is None else f"{cpu:.3f}"
+    return f"| {count:,} | {stage} | {found:.3f} | {peak / 1e6:.0f} | {beside} | {ratio} |"
+
+
+def equal(one: GaussianScene, other: GaussianScene) -> bool:
+    """Return whether two scenes on the CPU have the same bits."""
+    pairs = zip(one.tensors().values(), other.tensors().values(), strict=True)
+    return all(torch.equal(first, second) for first, second in pairs)
+
+
+def different_rows(one: GaussianScene, other: GaussianScene) -> int:
+    """Return how many Gaussians of two scenes on the CPU differ by more than 1e-3 somewhere."""
+    pairs = zip(one.tensors().values(), other.tensors().values(), strict=True)
+    differ = torch.zeros(len(one), dtype=torch.bool)
+    for first, second in pairs:
+        near = torch.isclose(first, second, rtol=1e-3, atol=1e-3)
+        differ |= ~near.reshape(len(one), math.prod(near.shape[1:])).all(dim=1)
+    return int(differ.sum())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""What must hold on a CUDA device; where there is none, on the pretended one.
+
+Devices round differently, so scenes are compared by what they show. ``nox -s gpu`` runs these on a
+card, together with the tests that need one.
+"""
+
+from collections.abc import Iterator
+from contextlib import nullcontext
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.evaluation import EvaluationSettings, evaluate
+from cvtgs.refinement import refine
+from cvtgs.rendering import render
+from cvtgs.views import automatic_views
+from pretended_device import pretended_cuda
+from refine_cases import discolored, full_scene, quick, small_scene
+from scenes import same_bits
+
+pytestmark = pytest.mark.cuda
+DEVICE = torch.device("cuda")
+CLOSE = EvaluationSettings(lpips="off")
+
+
+@pytest.fixture(autouse=True)
+def _device() -> Iterator[None]:
+    with nullcontext() if torch.cuda.is_available() else pretended_cuda():
+        yield
+
+
+def made(count: int = 500, degree: int = 1) -> cvtgs.GaussianScene:
+    return cvtgs.synthetic.scene("object", count, sh_degree=degree, seed=0)
+
+
+def assert_looks_like(found: cvtgs.GaussianScene, wanted: cvtgs.GaussianScene) -> None:
+    assert found.device.type == "cuda"
+    found = found.to("cpu")
+    assert len(found) == len(wanted)
+    cameras = automatic_views(wanted, 2, width=48, height=32)
+    (scores,) = evaluate(wanted, {"found": found}, cameras, settings=CLOSE).scenes
+    assert min(scores.psnr.views) > 35.0
+
+
+@pytest.mark.parametrize("preset", ["draft", "fast", "standard", "paper"])
+def test_presets(preset):
+    scene = made()
+    wanted = Simplifier(config=preset, device="cpu").simplify(scene, 0.1)
+    simplifier = Simplifier(config=preset, device=DEVICE)
+    first, second = (simplifier.simplify(scene.to(DEVICE), 0.1) for _ in range(2))
+    assert same_bits(first.to("cpu"), second.to("cpu"))
+    assert_looks_like(first, wanted)
+
+
+@pytest.mark.slow
+def test_levels_and_protected_regions():
+    scene = made(1000)
+    there, simplifier = scene.to(DEVICE), Simplifier(device=DEVICE)
+    for level, rho in zip(simplifier.levels(there, [0.2, 0.04]), (0.2, 0.04), strict=True):
+        assert len(level.scene) == rho * 1000
+    keep = torch.arange(1000) % 40 == 0
+    small = simplifier.simplify(there, 0.1, keep=keep).to("cpu")
+    assert same_bits(small.select(torch.arange(25)), scene.select(keep))
+
+
+def test_images_and_gradients():
+    scene = made(100)
+    cameras = automatic_views(scene, 1, width=48, height=32)
+
+    def results(scene, backend):
+        leaf = scene.sh0.detach().requires_grad_()
+        moved = scene.with_tensors({"sh0": leaf}, {})
+        image = render(moved, cameras, backend=backend).rgb
+        (gradient,) = torch.autograd.grad(image.square().sum(), leaf)
+        return image.detach().cpu(), gradient.cpu()
+
+    wanted = results(scene, "torch")
+    for backend in ("torch", "auto"):
+        for found, same in zip(results(scene.to(DEVICE), backend), wanted, strict=True):
+            torch.testing.assert_close(found, same, rtol=2e-3, atol=2e-3)
+
+
+@pytest.mark.slow
+def test_refinement_gains():
+    full = full_scene(300)
+    small = discolored(small_scene(full)).to(DEVICE)
+    config = quick(check_every=4)
+    refined = refine(small, full.to(DEVICE), steps=8, config=config, device=DEVICE)
+    assert refined.scene.device.type == "cuda"
+    assert refined.report.gain > 0
+
+
+@pytest.mark.slow
+def test_a_preset_that_refines():
+    changes = {"steps": 2, "check_every": 2, "size": 32, "heldout": 4, "batch": 4}
+    settings = {"preset": "high", "refine": changes, "visibility": {"views": 4, "size": 32}}
+    config = SimplifyConfig.from_mapping(settings)
+    small, report = Simplifier(config=config, device=DEVICE).run(made(300).to(DEVICE), 0.1)
+    assert len(small) == 30
+    assert report.refinement.device.startswith("cuda")
+    assert report.refinement.gain >= 0
