@@ -48,11 +48,6 @@ def protected(kind: str) -> Iterator:
     yield from simplified(kind, SimplifyConfig(), 0.1, keep=mask)
 
 
-def torch_search(kind: str) -> Iterator:
-    values = {"cvt": {"backend": "torch"}}
-    yield from simplified(kind, SimplifyConfig.from_mapping(values), 0.05)
-
-
 def levels(kind: str) -> Iterator:
     sizes = cvtgs.Simplifier(device="cpu").levels(make(kind), [0.2, 0.1, 0.02, 0.001])
     yield from (size.scene for size in sizes)
@@ -106,7 +101,6 @@ CASES = {
         for name in ("high", "max")
     },
     **{f"{kind} protected": partial(protected, kind) for kind in KINDS},
-    **{f"{kind} torch search": partial(torch_search, kind) for kind in ("room", "landscape")},
     **{f"{kind} levels": partial(levels, kind) for kind in KINDS},
     **{f"large {rho}": partial(large, rho) for rho in (0.4, 0.1, 0.003)},
     **{f"{kind} in 1 block": partial(in_blocks, kind, 1) for kind in ("object", "landscape")},

@@ -54,7 +54,7 @@ def test_a_healthy_machine(capsys):
     used = "numba" if version_of("numba") != "not installed" else "torch"
     assert f"images by {used:<7} yes (used: the fastest of those that work here)\n" in printed
     assert printed.count("(used: the fastest") == 1
-    assert "nearest site by scipy (used: a k-d tree on the host" in printed
+    assert "nearest site by scipy (a k-d tree on the host" in printed
     assert "300 generated Gaussians to 10%" in printed
     for step in ("generate", "simplify", "views", "render"):
         assert f"  {step} " in printed

@@ -1,14 +1,13 @@
-"""Nearest site: both backends equal brute force."""
+"""Nearest site: the search equals brute force."""
 
 import numpy as np
 import pytest
 import torch
 
 import oracles
-from cvtgs.cvt import nearest_backend, nearest_scipy, nearest_torch
-from cvtgs.math.frames import morton_order
+from cvtgs.cvt import nearest_scipy
 
-BACKENDS = {"scipy": nearest_scipy, "torch": nearest_torch}
+BACKENDS = {"scipy": nearest_scipy}
 both = pytest.mark.parametrize("backend", BACKENDS.values(), ids=BACKENDS)
 dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
@@ -99,50 +98,6 @@ def test_coincident_points_and_sites(backend):
     assert not bool(squared.any())
 
 
-@pytest.mark.parametrize("n", [50, 700])
-def test_torch_names_the_first_of_equally_near_sites(n):
-    points, sites = cloud("lattice", n, 3), cloud("lattice", 400, 3, seed=2)
-    labels, _ = nearest_torch(points, sites)
-    assert torch.equal(labels, brute_force(points, sites)[0])
-
-
-def test_torch_equals_brute_force_bit_for_bit():
-    points, sites = cloud("far-flung", 900, 3), cloud("clusters", 150, 3)
-    total = torch.zeros(900, 150, dtype=torch.float64)
-    for axis in range(3):
-        total += (points[:, None, axis] - sites[None, :, axis]).square()
-    labels, squared = nearest_torch(points, sites)
-    assert torch.equal(squared, total.amin(dim=1))
-    assert torch.equal(labels, total.argmin(dim=1))
-
-
-@pytest.mark.parametrize("entries", [1, 100_000])
-def test_torch_gives_the_same_answer_in_less_memory(monkeypatch, entries):
-    points, sites = cloud("clusters", 1000, 3), cloud("clusters", 200, 3, seed=1)
-    wanted = nearest_torch(points, sites)
-    monkeypatch.setitem(nearest_torch.__globals__, "MAX_ENTRIES", entries)
-    found = nearest_torch(points, sites)
-    assert torch.equal(found[0], wanted[0])
-    assert torch.equal(found[1], wanted[1])
-
-
-def test_torch_never_holds_more_than_its_bound(monkeypatch):
-    module = nearest_torch.__globals__
-    monkeypatch.setitem(module, "MAX_ENTRIES", 1 << 17)
-    inner, largest = module["_nearest_in_pairs"], []
-
-    def spy(points, sites, ids):
-        largest.append(points.shape[0] * points.shape[1] * sites.shape[1])
-        return inner(points, sites, ids)
-
-    monkeypatch.setitem(module, "_nearest_in_pairs", spy)
-    points, sites = cloud("clusters", 4000, 3), cloud("clusters", 600, 3, seed=1)
-    points = points[morton_order(points)]
-    assert_nearest(points, sites, nearest_torch(points, sites))
-    assert max(largest) <= 1 << 17
-    assert sum(largest) < 0.5 * 4000 * 600  # blocks that are too far away were skipped
-
-
 @both
 def test_same_bits_twice_and_input_unchanged(backend):
     points, sites = cloud("clusters", 1500, 3), cloud("normal", 200, 3)
@@ -152,9 +107,3 @@ def test_same_bits_twice_and_input_unchanged(backend):
     assert torch.equal(first[1], second[1])
     assert torch.equal(points, before[0])
     assert torch.equal(sites, before[1])
-
-
-def test_backends_by_name():
-    assert nearest_backend("auto") == ("scipy", nearest_scipy)
-    assert nearest_backend("scipy") == ("scipy", nearest_scipy)
-    assert nearest_backend("torch") == ("torch", nearest_torch)

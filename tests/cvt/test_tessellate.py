@@ -152,19 +152,6 @@ def test_the_seed_is_for_weighted_seeding_only():
         assert torch.equal(first.labels, second.labels) is equal
 
 
-@each_config
-@pytest.mark.parametrize("d", [3, 6])
-def test_backends_give_the_same_labels(config, d):
-    points, weights = weighted_cloud(1500, d)
-    by_name = {
-        name: tessellate(points, weights, 100, config=config.model_copy(update={"backend": name}))
-        for name in ("scipy", "torch")
-    }
-    assert torch.equal(by_name["scipy"].labels, by_name["torch"].labels)
-    assert by_name["scipy"].energy == pytest.approx(by_name["torch"].energy, rel=1e-12)
-    assert [by_name[name].backend for name in by_name] == ["scipy", "torch"]
-
-
 def test_input_is_not_changed():
     points, weights = weighted_cloud(300)
     before = points.clone(), weights.clone()

@@ -13,7 +13,6 @@ from cvtgs.cvt import (
     embed,
     nearest_neighbors,
     nearest_scipy,
-    nearest_torch,
     stratified_seeds,
     tessellate,
     tessellation_weights,
@@ -24,7 +23,7 @@ from hard_cases import CASES, each_case
 from hard_scenes import DEVICES, PRESETS, dtypes, valid_case
 
 COUNT = 60
-SEARCHES = {"scipy": nearest_scipy, "torch": nearest_torch}
+SEARCHES = {"scipy": nearest_scipy}
 searches = pytest.mark.parametrize("search", SEARCHES.values(), ids=SEARCHES)
 
 

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from cvtgs import Simplifier, SimplifyConfig
-from cvtgs.cvt import nearest_backend, nearest_neighbors, nearest_several
+from cvtgs import Simplifier
+from cvtgs.cvt import nearest_neighbors, nearest_scipy, nearest_several
 from cvtgs.errors import OutOfMemoryError
 from pretended_device import CUDA, DeviceTensor, pretended_cuda
 from scenes import random_scene, same_bits
@@ -57,16 +57,6 @@ def test_auto_takes_the_device_for_a_scene_of_the_cpu():
     with pretended_cuda() as traffic:
         assert same_bits(Simplifier().simplify(scene, 0.1).to("cpu"), wanted)
     assert traffic.copies
-
-
-def test_the_search_by_blocks():
-    scene = random_scene(400)
-    config = SimplifyConfig.from_mapping({"cvt": {"backend": "torch"}})
-    wanted = Simplifier(config=config, device="cpu").simplify(scene, 0.1)
-    with pretended_cuda():
-        small, report = Simplifier(config=config, device="cuda").run(scene.to("cuda"), 0.1)
-        assert same_bits(on_device(small), wanted)
-    assert report.backend == "torch"
 
 
 def test_without_enough_memory_auto_takes_the_cpu():
@@ -131,14 +121,12 @@ def test_protected_regions(preset):
             )
 
 
-@pytest.mark.parametrize("name", ["auto", "scipy", "torch"])
-def test_nearest_sites_of_points_on_a_device(name):
+def test_nearest_sites_of_points_on_a_device():
     points = torch.randn(300, 3, generator=torch.Generator().manual_seed(0))
     sites = torch.cat([points[::7], points[:3]])  # some twice
-    _, search = nearest_backend(name)
-    wanted = search(points, sites)
+    wanted = nearest_scipy(points, sites)
     with pretended_cuda():
-        found = search(points.to("cuda"), sites.to("cuda"))
+        found = nearest_scipy(points.to("cuda"), sites.to("cuda"))
         for one, same in zip(found, wanted, strict=True):
             assert one.device == CUDA
             assert torch.equal(one.cpu(), same)

@@ -91,8 +91,7 @@ def doctor(options: argparse.Namespace) -> None:
         for name in RENDERERS:
             use = " (used: the fastest of those that work here)" if name == taken else ""
             say(f"  images by {name:<7} {_renderer_state(name, one)}{use}")
-        search = cvtgs.cvt.nearest_backend("auto")[0]
-        say(f"  nearest site by {search} (used: a k-d tree on the host, whatever the device)")
+        say(f"  nearest site by {cvtgs.cvt.SEARCH} (a k-d tree on the host, whatever the device)")
     default = chosen_device(options.device)
     say(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one image")
     try:

@@ -81,7 +81,6 @@ class TessellationConfig(Section):
         iterations: Lloyd iterations, at most.
         tolerance: Lloyd stops when an iteration lowers the energy by less than this share.
         samples_per_site: Lloyd looks at this many Gaussians per cell at most; 0 looks at all.
-        backend: What searches the nearest site; ``auto`` takes scipy, whose tree is on the host.
     """
 
     area_power: float = pydantic.Field(default=0.5, ge=0.0, le=2.0)
@@ -94,7 +93,6 @@ class TessellationConfig(Section):
     iterations: int = pydantic.Field(default=4, ge=0)
     tolerance: float = pydantic.Field(default=1e-3, ge=0.0)
     samples_per_site: int = pydantic.Field(default=12, ge=0)
-    backend: Literal["auto", "scipy", "torch"] = "auto"
 
 
 class AllocationConfig(Section):

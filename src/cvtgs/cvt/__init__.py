@@ -2,12 +2,11 @@
 
 from cvtgs.cvt.embedding import embed, gaussian_weights, tessellation_weights
 from cvtgs.cvt.nearest import (
+    SEARCH,
     NearestSite,
-    nearest_backend,
     nearest_neighbors,
     nearest_scipy,
     nearest_several,
-    nearest_torch,
 )
 from cvtgs.cvt.tessellate import (
     LloydResult,
@@ -26,6 +25,7 @@ from cvtgs.cvt.tessellate import (
 )
 
 __all__ = [
+    "SEARCH",
     "LloydResult",
     "NearestSite",
     "Tessellation",
@@ -36,11 +36,9 @@ __all__ = [
     "fill_empty_cells",
     "gaussian_weights",
     "lloyd",
-    "nearest_backend",
     "nearest_neighbors",
     "nearest_scipy",
     "nearest_several",
-    "nearest_torch",
     "sample_points",
     "stratified_seeds",
     "tessellate",

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.config import TessellationConfig
-from cvtgs.cvt.nearest import NearestSite, nearest_backend, search_once_per_position
+from cvtgs.cvt.nearest import SEARCH, NearestSite, nearest_scipy, search_once_per_position
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.segments import label_sums, segment_argmax, sort_by_label
 
@@ -54,7 +54,7 @@ def tessellate(
             stratified seeds follow and which halves the time of the search.
         weights: Weights, at least 0.
         count: Number of cells, 1 to n.
-        config: Seeding, iterations and backend.
+        config: Seeding and iterations.
         seed: Seed of weighted seeding.
         has_duplicates: Whether it pays to search for equal points only once; the result is the
             same.
@@ -76,9 +76,8 @@ def tessellate(
             f"count must be between 1 and the number of points, {len(points)}; found {count}."
         )
     home = points.device
-    backend, nearest = choose_search(config, has_duplicates=has_duplicates)
-    if backend == "scipy":  # the tree is on the host: all that goes with it is done there
-        points, weights = points.cpu(), weights.cpu()
+    nearest = choose_search(has_duplicates=has_duplicates)
+    points, weights = points.cpu(), weights.cpu()  # where the tree is
     seeds = choose_seeds(weights, count, config=config, seed=seed)
     sample, sample_weights = sample_points(points, weights, config.samples_per_site * count)
     settled = lloyd(
@@ -99,14 +98,13 @@ def tessellate(
         energies=settled.energies,
         energy=float((weights * squared).sum()),
         refilled=refilled,
-        backend=backend,
+        backend=SEARCH,
     )
 
 
-def choose_search(config: TessellationConfig, *, has_duplicates: bool) -> tuple[str, NearestSite]:
+def choose_search(*, has_duplicates: bool) -> NearestSite:
     """Choose what searches the nearest site."""
-    backend, nearest = nearest_backend(config.backend)
-    return backend, search_once_per_position(nearest) if has_duplicates else nearest
+    return search_once_per_position(nearest_scipy) if has_duplicates else nearest_scipy
 
 
 def choose_seeds(
@@ -214,10 +212,10 @@ def lloyd(
         The moved sites and the energies.
 
     Example:
-        >>> from cvtgs.cvt import nearest_torch
+        >>> from cvtgs.cvt import nearest_scipy
         >>> points = torch.tensor([[0.0], [1.0], [8.0]])
         >>> lloyd(
-        ...     points, torch.ones(3), points[[0, 2]], nearest=nearest_torch,
+        ...     points, torch.ones(3), points[[0, 2]], nearest=nearest_scipy,
         ...     iterations=2, tolerance=0.0,
         ... ).sites.tolist()
         [[0.5], [8.0]]

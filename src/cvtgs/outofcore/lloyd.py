@@ -152,7 +152,7 @@ def _embedded_rows(job: Job, block: int, order: Tensor | None = None) -> Embedde
 def _assign(job: Job, iteration: int, block: int, points: Tensor) -> tuple[int, Assignment]:
     """Return the number of own sites, and the nearest site of every point in any block."""
     has_duplicates = job.read_scan().plan.duplicates.active
-    _, nearest = choose_search(job.config.cvt, has_duplicates=has_duplicates)
+    nearest = choose_search(has_duplicates=has_duplicates)
     sites = points[:0].double()
     if job.cells[block]:
         sites = map_tensors(job.sites_path(iteration, block))[0]["sites"]

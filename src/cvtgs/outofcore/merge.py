@@ -147,7 +147,7 @@ def correct(job: Job, block: int) -> None:
         largest_cell=int(partition.counts.amax()),
         refilled_cells=int(labels["refilled"]),
         energy=float(labels["energy"]),
-        backend=cvt.nearest_backend(job.config.cvt.backend)[0],
+        backend=cvt.SEARCH,
     )
     _write_block(job, block, small, report)
 
