@@ -35,6 +35,7 @@ def main() -> None:
     parser.add_argument("--kinds", default=",".join(KINDS), help="kinds of generated scenes")
     parser.add_argument("--blocks", default="4,16", help="numbers of blocks to compare")
     parser.add_argument("--memory", default="4GB")
+    parser.add_argument("--workers", default="1", help="processes; their user CPU is not counted")
     parser.add_argument("--rho", type=float, default=0.01)
     parser.add_argument("--folder", type=Path, help="where large files are written")
     options = parser.parse_intermixed_args()
@@ -112,7 +113,8 @@ def blocks(options: argparse.Namespace) -> None:
             output, report = Path(folder) / "small.ply", Path(folder) / "report.json"
             cost = run_python(
                 "-m", "cvtgs", "simplify", str(file), str(output), "--rho", str(options.rho),
-                "--memory", options.memory, "--report", str(report), "--overwrite", "--quiet",
+                "--memory", options.memory, "--workers", options.workers,
+                "--report", str(report), "--overwrite", "--quiet",
             )  # fmt: skip
             said = json.loads(report.read_text())
             print(
