@@ -45,7 +45,7 @@ Result = TypeVar("Result")
 class Prepared:
     """A scene to be made smaller again and again; what does not depend on the count is done once.
 
-    :meth:`Simplifier.prepare` makes these. Every run gives the bits of :meth:`Simplifier.run`;
+    ``Simplifier.prepare`` makes these. Every run gives the bits of ``Simplifier.run``;
     the report of the first one has the stages that are shared.
 
     Args:
@@ -112,7 +112,7 @@ class Prepared:
         max_count: int | None = None,
         keep: Bool[Tensor, "n"] | None = None,
     ) -> Simplified:
-        """Make the scene smaller, and report; arguments and errors as for :meth:`Simplifier.run`.
+        """Make the scene smaller, and report; arguments and errors as for ``Simplifier.run``.
 
         Returns:
             The scene and the report.
@@ -145,7 +145,7 @@ class Prepared:
         return self._result(reduced, analysis, target, clock, kept_count=len(protected))
 
     def levels(self, rhos: Sequence[float]) -> tuple[Level, ...]:
-        """Make the scene smaller in several sizes; see :meth:`Simplifier.levels`.
+        """Make the scene smaller in several sizes; see ``Simplifier.levels``.
 
         Returns:
             One level per ratio, in the order of the ratios.
