@@ -69,6 +69,7 @@ def test_there_are_recipes():
     assert {path.stem for path in RECIPES.glob("*.toml")} == {
         "standard",
         "standard-low",
+        "standard-pairs",
         "paper",
         "paper-local",
     }
