@@ -1,5 +1,6 @@
 """The known range: hand-computed shares, and no correction where a network cannot know."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 
 from cvtgs import GaussianScene
 from cvtgs.mergenet import KnownRange, summarize
-from cvtgs.mergenet.known import MARGIN, NARROWEST, SUMMARY_FEATURES
+from cvtgs.mergenet.known import MARGIN, MEMBERS, NARROWEST, SUMMARY_FEATURES
 from mergenet_cases import case_of, fields_of, lively_net, some_case, some_labels
 from scenes import random_scene
 
@@ -23,9 +24,9 @@ def fitted(*cases: torch.Tensor) -> KnownRange:
 
 
 def test_shares_by_hand():
-    known = fitted(rows(*range(0, 5)))
-    assert float(known.margin[0]) == pytest.approx(4 * MARGIN)
-    found = known(rows(-1.0, -0.4, -0.1, 0.0, 2.0, 4.0, 4.2, 4.4, 1e9)).tolist()
+    known = fitted(rows(0.0, 0.3, 0.5, 1.0))
+    assert float(known.margin[0]) == pytest.approx(MARGIN)
+    found = known(rows(-1.0, -0.1, -0.025, 0.0, 0.5, 1.0, 1.05, 1.1, 1e9)).tolist()
     assert found == pytest.approx([0, 0, 0.75, 1, 1, 1, 0.5, 0, 0], abs=1e-5)
     assert found[0] == found[-1] == 0.0
     assert found[3:6] == [1.0, 1.0, 1.0]
@@ -39,8 +40,8 @@ def test_the_farthest_feature_decides():
 
 
 def test_a_feature_that_never_varied_has_a_margin():
-    known = fitted(rows(2.0, 2.0))
-    found = known(rows(2.0, 2.0 + NARROWEST / 2, 2.1)).tolist()
+    known = fitted(rows(1.5, 1.5))
+    found = known(rows(1.5, 1.5 + NARROWEST / 2, 1.6)).tolist()
     assert found == pytest.approx([1.0, 0.5, 0.0], abs=1e-4)
 
 
@@ -49,6 +50,23 @@ def test_tails_of_a_case_do_not_count_but_a_small_case_does():
     large = rows(*[-90.0, -80.0], *torch.linspace(0, 1, 196).tolist(), *[80.0, 90.0])
     known = fitted(large, rows(3.0))
     assert (float(known.low[0]), float(known.high[0])) == (0.0, 3.0)
+
+
+def test_cells_of_thousands_of_members_are_never_known():
+    """The range ends at 2000 members; corrections vanish over a tenth of its logarithm."""
+    learned = rows(0.0, 0.1 * math.log(2000), 9.0)
+    learned[:, :MEMBERS], learned[:, MEMBERS + 1 :] = 0.0, 0.0
+    known = fitted(learned)
+    seen = torch.zeros(5, SUMMARY_FEATURES)
+    counts = torch.tensor([2.0, 2000.0, 2000.0**1.05, 2000.0**1.11, 1e6])
+    seen[:, MEMBERS] = 0.2 * counts.log()
+    assert known(seen).tolist() == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0], abs=1e-3)
+
+
+def test_that_feature_is_the_number_of_members():
+    scene = random_scene(60, degree=0, dtype=torch.float64, seed=0, size=0.4)
+    seen = case_of(scene, torch.arange(60) % 2).describe()
+    assert seen.cells[:, MEMBERS].tolist() == pytest.approx([0.2 * math.log(30)] * 2)
 
 
 def test_nothing_is_unknown_before_a_training():

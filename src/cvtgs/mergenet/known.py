@@ -1,5 +1,6 @@
 """KnownRange: closes the corrections of cells unlike those that a network has learned from."""
 
+import math
 from collections.abc import Iterable
 
 import torch
@@ -20,6 +21,13 @@ MARGIN = 0.1
 
 NARROWEST = 0.01
 """Smallest width over which they vanish, for a feature that never varied."""
+
+MEMBERS, MOST_MEMBERS = 9, 2000
+"""The feature that is a fifth of the logarithm of the number of members, and its largest known.
+
+Cells of more members than this are those in the middle of an unbounded scene when most cells are
+spent on its sky, whatever a training has seen of them; they cover the cameras when they grow.
+"""
 
 WIDEST = 1e30
 """Both ends of the range of a network that was never told what it knows."""
@@ -81,7 +89,8 @@ class KnownRange(nn.Module):
         """Set the range from the cells of the training cases.
 
         Each case has a say of its own, however few cells it has: the range of a feature goes
-        from the least to the greatest of what the cases hold without their tails.
+        from the least to the greatest of what the cases hold without their tails. Cells of more
+        than :data:`MOST_MEMBERS` members are never known.
 
         Args:
             cases: Summaries of the cells of every case, at least one.
@@ -89,6 +98,7 @@ class KnownRange(nn.Module):
         ends = [_ends(summaries) for summaries in cases]
         low = torch.stack([end[0] for end in ends]).amin(dim=0)
         high = torch.stack([end[1] for end in ends]).amax(dim=0)
+        high[MEMBERS] = high[MEMBERS].clamp(max=0.2 * math.log(MOST_MEMBERS))
         self.low.copy_(low)
         self.high.copy_(high)
         self.margin.copy_((MARGIN * (high - low)).clamp_min(NARROWEST))
