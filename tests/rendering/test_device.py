@@ -92,6 +92,21 @@ def test_presets_that_refine(preset, dtype):
         torch.testing.assert_close(found.tensors()[name], tensor, **REFINED[dtype])
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("_torch_only")
+@dtypes
+def test_the_preset_that_matches(dtype):
+    settings = {"preset": "matched", "visibility": {"views": 4, "size": 32}}
+    config = SimplifyConfig.from_mapping(settings)
+    scene = random_scene(200, degree=1, dtype=dtype)
+    wanted = Simplifier(config=config, device="cpu").simplify(scene, 0.2)
+    with pretended_cuda():
+        small = Simplifier(config=config, device="cuda").simplify(scene.to("cuda"), 0.2)
+        found = small.to("cpu")
+    for name, tensor in wanted.tensors().items():
+        torch.testing.assert_close(found.tensors()[name], tensor, **CLOSE[dtype])
+
+
 @pytest.mark.usefixtures("_torch_only")
 @dtypes
 def test_scores(dtype):
