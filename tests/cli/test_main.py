@@ -217,7 +217,7 @@ def test_a_signal_lost_where_nothing_can_be_raised_is_sent_again(tmp_path, monke
 
     monkeypatch.setattr("cvtgs.cli.files.show_info", run)
     assert main(["info", "a.ply"]) == 130
-    assert capsys.readouterr().err == "cvtgs: interrupted; nothing was half-written.\n"
+    assert capsys.readouterr().err == "cvtgs: interrupted; no incomplete file is left.\n"
 
 
 def test_an_interrupt_that_becomes_another_error_is_an_interrupt(monkeypatch, capsys):

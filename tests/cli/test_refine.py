@@ -86,7 +86,7 @@ def test_an_interrupt_leaves_nothing(source, tmp_path, capsys, monkeypatch):
     words += ["--report", str(tmp_path / "report.json"), "--refine-steps", "50"]
     assert main(words) == 130
     assert len(calls) == 3
-    assert capsys.readouterr().err == "cvtgs: interrupted; nothing was half-written.\n"
+    assert capsys.readouterr().err == "cvtgs: interrupted; no incomplete file is left.\n"
     assert [path.name for path in tmp_path.iterdir()] == ["in.ply"]
 
 

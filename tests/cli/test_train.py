@@ -98,7 +98,7 @@ def test_a_line_per_validation_and_a_summary(again, made, tmp_path, capsys):
         "step 3: loss",
     ]
     assert lines[3].startswith("best at step ")
-    assert lines[3].endswith(" dB on scenes it never learned from")
+    assert lines[3].endswith(" dB on scenes left out of training")
     assert lines[4:] == [f"{tmp_path / 'net.safetensors'}, curves in {tmp_path / 'net.png'}"]
     assert printed.err == ""
     assert (tmp_path / "net.safetensors").read_bytes() == (made / "net.safetensors").read_bytes()

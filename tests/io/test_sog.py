@@ -1,9 +1,11 @@
 """SOG: bundled and not, version 1 and 2."""
 
+import io
 import json
 import math
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,9 @@ from hypothesis import strategies as st
 
 from cvtgs import load, save
 from cvtgs.errors import FileFormatError, InputNotFoundError
-from cvtgs.io.sog.codebook import codebook, palette
+from cvtgs.io.sog.codebook import codebook, palette, palette_size
 from cvtgs.io.sog.container import encode_webp
+from cvtgs.io.sog.write import write_sog
 from format_cases import (
     DATA,
     assert_as_oracle,
@@ -167,6 +170,38 @@ def test_palette_of_many_rows() -> None:
     assert np.abs(entries[labels] - rows).max() < 0.01
     few, same = palette(rows[:5], 64)
     assert np.array_equal(few[same], rows[:5])
+
+
+@pytest.mark.parametrize(
+    ("count", "size"),
+    [(1, 1024), (1024, 1024), (2047, 1024), (15_000, 8192), (65_536, 65_536), (1 << 24, 65_536)],
+)
+def test_sizes_of_palettes(count: int, size: int) -> None:
+    assert palette_size(count) == size
+
+
+def test_a_palette_is_used_whole_and_where_rows_differ_most() -> None:
+    """A wide cloud gets nearly all entries, a tight one hardly any."""
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(3000, 9)).astype(np.float32)
+    rows[:1500] *= 1e-3
+    entries, labels = palette(rows)
+    assert len(entries) == 2048
+    assert len(np.unique(labels[:1500])) < 600
+    wide = np.abs(entries[labels] - rows)[1500:]
+    assert float(np.median(wide)) == 0.0
+
+
+def test_a_small_scene_takes_no_more_bytes_for_colours_than_needed() -> None:
+    scene = replace(storable_scene(3000), comments=())
+    file = io.BytesIO()
+    write_sog(scene, file)
+    with zipfile.ZipFile(file) as archive:
+        sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+        meta = json.loads(archive.read("meta.json"))
+    assert meta["shN"]["count"] == 2048
+    assert sizes["meta.json"] < 4 * 256 * 13
+    assert all(float(str(np.float32(code))) == code for code in meta["shN"]["codebook"])
 
 
 def test_equal_rows_need_one_entry() -> None:

@@ -91,8 +91,8 @@ def test_what_has_no_place_is_said_before_anything_is_written(tmp_path: Path) ->
     assert [str(one.message) for one in caught] == [
         f"{path}: files of this format do not hold extra column 'label'; SH bands above degree 0 "
         f"(the scene has degree 2); the tag 'SplatRenderMode: mip', without which viewers show the "
-        f"scene too sharp; double precision; 1 Gaussian that are not finite or have no rotation; "
-        f"what lies beyond [-1.7794, 1.7794] in a constant SH band of 3 Gaussians."
+        f"scene too sharp; double precision; 1 Gaussian that is not finite or has no rotation; "
+        f"colours (SH band 0) outside [-1.7794, 1.7794], which are clamped (3 Gaussians)."
     ]
     assert caught[0].filename == __file__
     assert len(load(path)) == 3

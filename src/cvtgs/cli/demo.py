@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cvtgs
-from cvtgs.cli.display import file_size, progress_bars, say
-from cvtgs.cli.options import AddParser, add_options
+from cvtgs.cli.display import file_size, progress_bars, say, say_wrapped
+from cvtgs.cli.options import AddParser, add_options, count
 
 if TYPE_CHECKING:
     from cvtgs.clock import StageCost
     from cvtgs.evaluation import SceneScores
 
-RATIOS = (0.1, 0.01, 0.001)
-VIEWS, WIDTH, HEIGHT = 8, 640, 480
+RATIOS = (0.1, 0.01)
+VIEWS, WIDTH, HEIGHT = 6, 480, 360
 
 
 def add_demo(add_parser: AddParser) -> None:
@@ -22,7 +22,7 @@ def add_demo(add_parser: AddParser) -> None:
     parser = add_parser(
         "demo",
         help="simplify a generated scene; needs no files",
-        description="Generate a scene, make it 10, 100 and 1000 times smaller, and write all four "
+        description="Generate a scene, make it 10 and 100 times smaller, and write all three "
         "and a page that shows them side by side.",
     )
     parser.set_defaults(run=demo)
@@ -37,10 +37,10 @@ def add_demo(add_parser: AddParser) -> None:
     )
     parser.add_argument(
         "--count",
-        type=int,
-        default=200_000,
+        type=count,
+        default=100_000,
         metavar="N",
-        help="number of Gaussians to generate (default 200000)",
+        help="number of Gaussians to generate (default 100000)",
     )
     add_options(parser, "--preset")
     parser.add_argument(
@@ -115,7 +115,8 @@ def _print_table(columns: list[dict[str, str]]) -> None:
 def _print_next_steps(folder: Path) -> None:
     say("Look at them side by side: open this page in a browser, it needs no network.")
     say(f"  {(folder / 'index.html').resolve().as_uri()}")
-    say(f"The scenes are in {folder}; any 3DGS viewer opens them. With a scene of your own:")
+    say_wrapped(f"The scenes are in {folder}; any 3DGS viewer opens them.")
+    say("With a scene of your own:")
     say("  cvtgs info scene.ply")
     say("  cvtgs simplify scene.ply small.ply --rho 0.01")
     say("  cvtgs compare scene.ply small.ply -o comparison")

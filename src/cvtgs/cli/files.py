@@ -94,7 +94,13 @@ def _rows(facts: "SceneInfo", path: Path) -> list[tuple[str, str]]:
         ("robust radius", f"{facts.robust_radius:.4g} around {_vector(facts.robust_center)}"),
         ("opacity at", _labelled(QUANTILES, facts.opacity_quantiles, "{:.0%} {:.3f}")),
         ("mass", f"{facts.mass:.4g} square units"),
-        ("heaviest hold", _labelled(HEAVIEST, facts.mass_shares, "{:.1%} {:.1%}")),
+        (
+            "mass shares",
+            ", ".join(
+                f"{mass:.1%} in {'the heaviest ' * (share == HEAVIEST[0])}{100 * share:g}%"
+                for share, mass in zip(HEAVIEST, facts.mass_shares, strict=True)
+            ),
+        ),
         (
             "opacity < 0.1",
             f"{facts.faint_share:.1%} of the Gaussians, {facts.faint_mass_share:.1%} of the mass",

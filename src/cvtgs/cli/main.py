@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if stop.code is not None:
                 signal.signal(signal.SIGINT, signal.SIG_IGN)  # of an impatient user
                 if stop.code == INTERRUPTED:
-                    say("cvtgs: interrupted; nothing was half-written.", file=sys.stderr)
+                    say("cvtgs: interrupted; no incomplete file is left.", file=sys.stderr)
                 return stop.code
             if not isinstance(error, CvtgsError):
                 raise

@@ -76,7 +76,7 @@ def train(options: argparse.Namespace) -> None:
         )
     best = history.best()
     if best is not None and not options.quiet:
-        say(f"best at step {best.step}: {best.mean_gain:+.2f} dB on scenes it never learned from")
+        say(f"best at step {best.step}: {best.mean_gain:+.2f} dB on scenes left out of training")
         curves = f"curves in {files.curves}" if files.curves.is_file() else WITHOUT_CURVES
         say(f"{files.checkpoint}, {curves}")
 

@@ -117,7 +117,7 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
                 "scales, colours and SH coefficients to 256 numbers each",
                 "rotations in steps of 1/180 per component",
                 "opacities in steps of 1/255",
-                "view-dependent colours to a palette of 65,536 (all, in smaller scenes)",
+                "view-dependent colours to a palette of half as many or more, at most 65,536",
             ),
         ),
     }
@@ -125,10 +125,10 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
 """Limits by suffix; a ``.ply`` has none."""
 
 _VALUES = {
-    "means": "centre",
-    "log_scales": "logarithm of a scale",
-    "sh0": "constant SH band",
-    "shN": "view-dependent SH coefficient",
+    "means": "coordinates",
+    "log_scales": "log-scales",
+    "sh0": "colours (SH band 0)",
+    "shN": "view-dependent SH coefficients",
 }
 
 
@@ -158,7 +158,9 @@ def _dropped(scene: GaussianScene, limits: FormatLimits) -> Iterator[str]:
         yield "double precision"
     rows = writable_rows(scene)
     if not bool(rows.all()):
-        yield f"{_counted(int((~rows).sum()), 'Gaussian')} that are not finite or have no rotation"
+        count = int((~rows).sum())
+        verbs = "is not finite or has" if count == 1 else "are not finite or have"
+        yield f"{_counted(count, 'Gaussian')} that {verbs} no rotation"
     ranges = dict(limits.ranges)
     if limits.largest_coordinate is not None:
         largest = limits.largest_coordinate(scene)
@@ -170,8 +172,8 @@ def _dropped(scene: GaussianScene, limits: FormatLimits) -> Iterator[str]:
         count = int(beyond.reshape(len(values), -1).any(dim=1).sum()) if values.numel() else 0
         if count:
             yield (
-                f"what lies beyond [{low:.5g}, {high:.5g}] in a {_VALUES[name]} of "
-                f"{_counted(count, 'Gaussian')}"
+                f"{_VALUES[name]} outside [{low:.5g}, {high:.5g}], which are clamped "
+                f"({_counted(count, 'Gaussian')})"
             )
 
 

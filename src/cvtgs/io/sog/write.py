@@ -106,9 +106,9 @@ def _encoded(arrays: Arrays, order: Int[np.ndarray, "n"], *, antialiased: bool) 
     }
     meta |= {
         "means": {**ranges, "files": ["means_l.webp", "means_u.webp"]},
-        "scales": {"codebook": scales.codes.tolist(), "files": ["scales.webp"]},
+        "scales": {"codebook": _numbers(scales.codes), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
-        "sh0": {"codebook": colors.codes.tolist(), "files": ["sh0.webp"]},
+        "sh0": {"codebook": _numbers(colors.codes), "files": ["sh0.webp"]},
     }
     if arrays.shN.shape[1]:
         more, meta["shN"] = _rest(arrays.shN[order])
@@ -149,10 +149,15 @@ def _rest(rest: Float[np.ndarray, "n k 3"]) -> tuple[Images, dict[str, Any]]:
     meta = {
         "count": len(entries),
         "bands": degree_of(k),
-        "codebook": codes.codes.tolist(),
+        "codebook": _numbers(codes.codes),
         "files": ["shN_centroids.webp", "shN_labels.webp"],
     }
     return images, meta
+
+
+def _numbers(codes: Float[np.ndarray, "256"]) -> list[float]:
+    """Return numbers of float32 with no more digits than tell them apart."""
+    return [float(str(code)) for code in codes]
 
 
 def _two_bytes(labels: Int[np.ndarray, "n"]) -> UInt8[np.ndarray, "n 3"]:
