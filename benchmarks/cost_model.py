@@ -17,8 +17,9 @@ from pathlib import Path
 
 import cvtgs
 from benchmarks.measuring import generated_scenes, machine
+from cvtgs import budget
 from cvtgs.budget import CostModel, Work, cost_model
-from cvtgs.budget.calibrate import CANDIDATES, undisturbed_seconds
+from cvtgs.budget.calibrate import CANDIDATES, SHIPPED_RATES, undisturbed_seconds
 from cvtgs.clock import StageCost
 from cvtgs.tradeoff.runs import Task, run_task
 
@@ -62,8 +63,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--most", type=int, default=1_000_000, help="largest generated scene")
     parser.add_argument("--clock", choices=CLOCKS, default="wall", help="whose seconds")
     parser.add_argument("--recalibrate", action="store_true", help="not what is remembered")
+    parser.add_argument("--ship", action="store_true", help="write the rates of --shipped-rates")
     options = parser.parse_args(arguments)
     model = cost_model(recalibrate=options.recalibrate)
+    if options.ship:
+        path = Path(budget.__file__).with_name(SHIPPED_RATES)
+        path.write_text(model.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        print(f"{machine()}; wrote {path}")
+        return
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scenes = [scene for scene in SCENES if scene[1] <= options.most]

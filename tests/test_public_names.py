@@ -190,6 +190,7 @@ STAGES = {
         "choose_preset",
         "cost_model",
         "find_count",
+        "shipped_model",
     },
     "tradeoff": {
         "Failure",

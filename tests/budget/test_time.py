@@ -172,6 +172,27 @@ def test_a_slow_machine_measures_once():
     assert len(calls) == 1 + 4
 
 
+def test_nothing_is_repeated_after_20_processor_seconds():
+    """Of nine measurements and a start of 3 s each, the sixth ends after 20 s."""
+    calls, events = [], []
+
+    def run(config, scene, count):
+        calls.append(config)
+        return {"check": 3.0}
+
+    calibrate(
+        run,
+        presets=["draft"],
+        trials=TRIALS[:2],
+        clock=lambda: 0.0,
+        cpu=lambda: 3.0 * len(calls),
+        listener=events.append,
+    )
+    assert len(calls) == 7
+    assert events[0].note == "load preset draft"
+    assert events[1].note == "preset draft, 50 to 5 Gaussians"
+
+
 def test_real_seconds_come_from_the_report():
     run = measured_seconds("cpu")
     scene = cvtgs.synthetic.scene("object", 200, sh_degree=0, seed=0)

@@ -75,6 +75,11 @@ def test_a_target_takes_the_place_of_the_ratio(capsys):
         (["--target-psnr", "99"], "the PSNR to reach must be above 0 and at most 60 dB, found"),
         (["--target-ssim", "30"], "the SSIM to reach must be above 0 and below 1, found 30.0."),
         (["--rho", "0.1", "--recalibrate"], "--recalibrate goes with --time-budget."),
+        (["--rho", "0.1", "--shipped-rates"], "--shipped-rates goes with --time-budget."),
+        (
+            ["--rho", "0.1", "--time-budget", "2m", "--shipped-rates", "--recalibrate"],
+            "give --recalibrate or --shipped-rates, found both.",
+        ),
         (
             ["--rho", "0.1", "--time-budget", "2m", "--preset", "fast", "--refine", "3"],
             "--time-budget chooses the preset and cannot go with --preset, --refine.",
@@ -159,7 +164,9 @@ def test_a_budget_knows_what_else_is_set(scene, monkeypatch, words, settings, pr
 def test_the_machine_is_measured_once_or_when_asked(scene, measured, capsys):
     words = ["--rho", "0.1", "--time-budget", "5s"]
     choose_preset(options(*words), scene, {}, silent)
-    assert capsys.readouterr().err == "cvtgs: measuring this machine once, about a minute\n"
+    assert capsys.readouterr().err == (
+        "cvtgs: measuring this machine once, about half a minute (--shipped-rates does without)\n"
+    )
     choose_preset(options(*words), scene, {}, silent)
     assert capsys.readouterr().err == ""
     choose_preset(options(*words, "--recalibrate", "--quiet"), scene, {}, silent)
@@ -183,6 +190,19 @@ def test_a_target_is_searched_and_said(source, capsys, shown):
     assert len(small) < 300
     assert "over views that were held out; found in" in text
     assert "tessellate" not in shown
+
+
+def test_shipped_rates_measure_nothing(scene, measured, capsys):
+    words = ["--rho", "0.1", "--time-budget", "2m", "--shipped-rates"]
+    chosen = choose_preset(options(*words), scene, {}, silent)
+    assert chosen.name in CANDIDATES
+    assert (measured, capsys.readouterr().err) == ([], "")
+    model = cvtgs.budget.shipped_model()
+    assert set(model.presets) <= set(CANDIDATES)
+    work = cvtgs.budget.Work(count=1_000_000, target=10_000)
+    seconds = [model.seconds(name, work) for name in ("draft", "standard", "high", "max")]
+    assert sorted(seconds) == seconds
+    assert 1 < seconds[0] < seconds[-1] < 3600
 
 
 def test_protected_regions_need_a_size():

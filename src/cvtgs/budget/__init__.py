@@ -1,6 +1,6 @@
 """Settings from goals: a time budget, or a quality to reach."""
 
-from cvtgs.budget.calibrate import cost_model
+from cvtgs.budget.calibrate import cost_model, shipped_model
 from cvtgs.budget.choose import Choice, choose_preset
 from cvtgs.budget.costs import CostModel, Work
 from cvtgs.budget.count import Found, Tried, find_count
@@ -14,4 +14,5 @@ __all__ = [
     "choose_preset",
     "cost_model",
     "find_count",
+    "shipped_model",
 ]

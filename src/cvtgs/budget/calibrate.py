@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
@@ -35,6 +36,9 @@ PATIENCE_SECONDS = 1.0
 
 MOST_REPEATS = 3
 
+MOST_CPU_SECONDS = 20.0
+"""Processor seconds after which nothing is repeated; everything is measured once in any case."""
+
 MOST_START_SECONDS = 1.0
 """What takes longer to load was compiled, which happens once in the life of an installation."""
 
@@ -52,6 +56,9 @@ RENDERERS = ("gsplat", "numba")
 
 VERSION: Literal[2] = 2
 """Of the file; raised when features change, so that older files are measured again."""
+
+SHIPPED_RATES = "rates.json"
+"""Beside this file; ``python -m benchmarks.cost_model --ship`` writes it."""
 
 STALE_SECONDS = 90 * 24 * 3600.0
 """Machines change: drivers, limits, neighbours."""
@@ -141,6 +148,20 @@ def cost_model(
     return model
 
 
+def shipped_model() -> CostModel:
+    """Return the cost of presets on the machine that the package was made on: no measuring.
+
+    Returns:
+        The model, of two cores of a server without a GPU.
+
+    Example:
+        >>> "standard" in shipped_model().presets
+        True
+    """
+    text = files("cvtgs.budget").joinpath(SHIPPED_RATES).read_text(encoding="utf-8")
+    return CostModel.model_validate_json(text)
+
+
 def is_calibrated(device: str | torch.device = "auto", *, folder: Path | None = None) -> bool:
     """Report whether the cost model of this machine is cached."""
     key = machine_key(chosen_device(device))
@@ -222,14 +243,15 @@ def calibrate(
     presets: Sequence[str] = CANDIDATES,
     trials: Sequence[Trial] = TRIALS,
     clock: Callable[[], float] = time.perf_counter,
+    cpu: Callable[[], float] = time.process_time,
     listener: ProgressListener = silent,
 ) -> CostModel:
     """Measure presets on generated scenes, and fit their cost.
 
     Every preset is run once to load what it needs. Then every trial is measured up to three times,
-    once if that takes long; of each stage the fastest counts, since other programs only ever make
-    a stage slower. Presets that use images get only a few here, and those that differ in nothing
-    but the number of images are measured once.
+    once if that takes long or 20 processor seconds have passed; of each stage the fastest counts,
+    since other programs only ever make a stage slower. Presets that use images get only a few
+    here, and those that differ in nothing but the number of images are measured once.
     """
     first: dict[SimplifyConfig, str] = {}
     measured_as = {
@@ -245,19 +267,21 @@ def calibrate(
         for number, r in enumerate(trial.ratios)
         for preset in first.values()
     ]
-    total = MOST_REPEATS * len(tasks)
-    listener(ProgressEvent(stage=STAGE, done=0, total=total))
-    loading = [
-        sum(run(config, scene, count).values())
-        for _, config, scene, count in tasks[: len(first)]  # every preset once
-    ]
+    total, begun = MOST_REPEATS * len(tasks), cpu()
+    loading = []
+    for preset, config, scene, count in tasks[: len(first)]:  # every preset once
+        listener(ProgressEvent(stage=STAGE, done=0, total=total, note=f"load preset {preset}"))
+        loading.append(sum(run(config, scene, count).values()))
     best: list[dict[str, float]] = [{} for _ in tasks]
     spent = [0.0 for _ in tasks]
     for number in range(total):
         row = number % len(tasks)
-        if spent[row] <= PATIENCE_SECONDS:
+        preset, config, scene, count = tasks[row]
+        again = number >= len(tasks)
+        if spent[row] <= PATIENCE_SECONDS and not (again and cpu() - begun > MOST_CPU_SECONDS):
+            note = f"preset {preset}, {len(scene):,} to {count:,} Gaussians"
+            listener(ProgressEvent(stage=STAGE, done=number, total=total, note=note))
             begin = clock()
-            _, config, scene, count = tasks[row]
             for stage, seconds in run(config, scene, count).items():
                 best[row][stage] = min(seconds, best[row].get(stage, seconds))
             spent[row] += clock() - begin

@@ -84,7 +84,13 @@ def add_simplify(add_parser: AddParser) -> None:
         "--time-budget",
         metavar="TIME",
         help="time to finish in, for example 20s or 2m, with the best preset that fits; the first "
-        "use measures this machine, which takes about a minute and does not count",
+        "use measures this machine, which takes about half a minute and does not count",
+    )
+    parser.add_argument(
+        "--shipped-rates",
+        action="store_true",
+        help="choose for --time-budget by seconds of another machine, which come with cvtgs, "
+        "instead of measuring this one",
     )
     parser.add_argument(
         "--recalibrate", action="store_true", help="measure this machine again for --time-budget"

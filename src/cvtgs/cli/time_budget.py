@@ -31,9 +31,13 @@ class ChosenPreset(NamedTuple):
 def check_time_budget(options: argparse.Namespace, *, has_target: bool) -> None:
     """Check ``--time-budget``, and the options that exclude it or need it."""
     if options.time_budget is None:
-        if options.recalibrate:
-            raise InvalidArgumentError("--recalibrate goes with --time-budget.")
+        for name in ("recalibrate", "shipped_rates"):
+            if getattr(options, name):
+                option = name.replace("_", "-")
+                raise InvalidArgumentError(f"--{option} goes with --time-budget.")
         return
+    if options.recalibrate and options.shipped_rates:
+        raise InvalidArgumentError("give --recalibrate or --shipped-rates, found both.")
     read_seconds(options.time_budget)
     excluded = {
         "--preset": options.preset is not None,
@@ -81,10 +85,17 @@ def choose_preset(
     target = cvtgs.target_count(
         len(scene), options.rho, count=options.count, max_count=options.max_count
     )
-    again = options.recalibrate or not is_calibrated(options.device)
-    if again and not options.quiet:
-        say("cvtgs: measuring this machine once, about a minute", file=sys.stderr)
-    model = cvtgs.budget.cost_model(options.device, recalibrate=again, listener=listener)
+    if options.shipped_rates:
+        model = cvtgs.budget.shipped_model()
+    else:
+        again = options.recalibrate or not is_calibrated(options.device)
+        if again and not options.quiet:
+            say(
+                "cvtgs: measuring this machine once, about half a minute "
+                "(--shipped-rates does without)",
+                file=sys.stderr,
+            )
+        model = cvtgs.budget.cost_model(options.device, recalibrate=again, listener=listener)
     if options.ckpt == "none":
         settings = {**settings, "merge.network": "false"}
     choice = cvtgs.budget.choose_preset(
