@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from types import FrameType
 from typing import NoReturn, TextIO
 
+from cvtgs.cli.completion import add_completion
 from cvtgs.cli.demo import add_demo
 from cvtgs.cli.display import flush_output, say
 from cvtgs.cli.doctor import ShowVersions, add_doctor
@@ -134,6 +135,7 @@ def build_parser() -> CommandParser:
         add_demo,
         add_doctor,
         add_train,
+        add_completion,
     ):
         add(commands.add_parser)
     return parser

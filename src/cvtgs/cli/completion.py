@@ -1,0 +1,118 @@
+"""``cvtgs completion``: a script that lets a shell complete commands, options and their values."""
+
+import argparse
+from collections.abc import Iterator, Mapping
+
+import cvtgs
+from cvtgs.cli.display import say
+from cvtgs.cli.options import AddParser
+
+SHELLS = ("bash", "zsh", "fish")
+
+_BASH = """\
+_cvtgs() {{
+    local current="${{COMP_WORDS[COMP_CWORD]}}" before="${{COMP_WORDS[COMP_CWORD-1]}}"
+    local command="${{COMP_WORDS[1]}}" words=""
+    if [ "$COMP_CWORD" -eq 1 ]; then
+        COMPREPLY=($(compgen -W "{commands}" -- "$current"))
+        return
+    fi
+    case "$command $before" in
+{values}
+    esac
+    if [ -z "$words" ] && [[ "$current" == -* ]]; then
+        case "$command" in
+{options}
+        esac
+    fi
+    if [ -n "$words" ]; then
+        COMPREPLY=($(compgen -W "$words" -- "$current"))
+    else
+        COMPREPLY=($(compgen -f -- "$current"))
+    fi
+}}
+complete -o filenames -F _cvtgs cvtgs
+"""
+
+
+def add_completion(add_parser: AddParser) -> None:
+    """Add the command and its options."""
+    parser = add_parser(
+        "completion",
+        help="print a script for completion in a shell",
+        description="Print a script that completes commands, options and their values. For bash: "
+        'eval "$(cvtgs completion bash)" in ~/.bashrc; for zsh: the same with zsh in ~/.zshrc; for '
+        "fish: cvtgs completion fish > ~/.config/fish/completions/cvtgs.fish.",
+    )
+    parser.set_defaults(run=completion)
+    parser.add_argument("shell", choices=SHELLS, help="the shell: bash, zsh or fish")
+
+
+def completion(options: argparse.Namespace) -> None:
+    """Run ``cvtgs completion``."""
+    from cvtgs.cli.main import build_parser
+
+    commands = commands_of(build_parser())
+    if options.shell == "fish":
+        say("\n".join(fish_lines(commands)))
+    else:
+        start = "autoload -U +X bashcompinit && bashcompinit\n" if options.shell == "zsh" else ""
+        say(start + bash_script(commands), end="")
+
+
+def commands_of(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
+    """Return the parsers of all commands by name."""
+    groups = [action for action in parser._actions if action.nargs == argparse.PARSER]
+    found = groups[0].choices
+    return found if isinstance(found, Mapping) else {}
+
+
+def values_of(action: argparse.Action) -> list[str]:
+    """Return the words that an option takes; none if it takes others, too."""
+    if action.choices is not None:
+        return [str(choice) for choice in action.choices]
+    return {
+        "preset": list(cvtgs.PRESETS),
+        "ckpt": ["auto", *cvtgs.mergenet.SHIPPED, "none"],
+        "device": ["auto", "cpu", "cuda"],
+        "background": ["black", "gray", "white"],
+    }.get(action.dest, [])
+
+
+def bash_script(commands: Mapping[str, argparse.ArgumentParser]) -> str:
+    """Return the script for bash."""
+    values, options = [], []
+    for command, parser in commands.items():
+        names = [name for action in parser._actions for name in action.option_strings]
+        options.append(f'            {command}) words="{" ".join(names)}" ;;')
+        for action in parser._actions:
+            words = " ".join(values_of(action))
+            if words:
+                cases = [f'"{command} {name}"' for name in action.option_strings or [command]]
+                values.append(f'        {"|".join(cases)}) words="{words}" ;;')
+    return _BASH.format(
+        commands=" ".join(commands), values="\n".join(values), options="\n".join(options)
+    )
+
+
+def fish_lines(commands: Mapping[str, argparse.ArgumentParser]) -> Iterator[str]:
+    """Return the script for fish, line by line."""
+    for command, parser in commands.items():
+        about = (parser.description or "").split(". ")[0]
+        yield f"complete -c cvtgs -n __fish_use_subcommand -x -a {command} -d {_quoted(about)}"
+        for action in parser._actions:
+            names = [name for name in action.option_strings if name.startswith("--")]
+            if not names:
+                continue
+            words = " ".join(values_of(action))
+            takes = f" -x -a {_quoted(words)}" if words else " -r" * (action.nargs != 0)
+            about = (action.help or "").replace("%%", "%").split(";")[0]
+            yield (
+                f"complete -c cvtgs -n '__fish_seen_subcommand_from {command}' -l {names[0][2:]}"
+                f"{takes} -d {_quoted(about)}"
+            )
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{escaped}'"
