@@ -11,7 +11,7 @@ from cvtgs import save
 from ply_files import gaussian_properties, gaussian_rows, write_ply_file
 from scenes import random_scene
 
-SHARED = {"formats", "files", "limits", "atomic", "axes"}
+SHARED = {"formats", "files", "limits", "atomic", "axes", "streams"}
 """Modules that every ``load`` imports, whatever the format."""
 
 FORMATS = {

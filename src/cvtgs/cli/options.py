@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 
 Color = tuple[float, float, float]
 
-READABLE = ".ply, .spz, .splat, .sog, .glb, .gltf, .ckpt, .pt or the folder of a trained model"
+READABLE = (
+    ".ply, .spz, .splat, .ksplat, .sog, .glb, .gltf, .ckpt, .pt or the folder of a trained model"
+)
 WRITABLE = ".ply, .compressed.ply, .spz, .splat, .sog, .glb, .gltf or .spz.glb"
 PRESET_NAMES = "draft, fast, standard, matched, high, max (from the fastest to the best) or paper"
 CAMERA_FILES = "transforms.json, a COLMAP model, cameras.json, or a folder of these"

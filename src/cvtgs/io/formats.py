@@ -31,6 +31,7 @@ _READERS: Mapping[str, str] = MappingProxyType(
         ".compressed.ply": "cvtgs.io.compressed_ply:read_compressed_ply",
         ".ply": "cvtgs.io.ply:read_ply",
         ".spz": "cvtgs.io.spz:read_spz",
+        ".ksplat": "cvtgs.io.ksplat:read_ksplat",
         ".splat": "cvtgs.io.splat:read_splat",
         ".sog": "cvtgs.io.sog:read_sog",
         "lod-meta.json": "cvtgs.io.sog:read_lod_sog",
@@ -47,7 +48,7 @@ _ADVICE = (
     "free some, or simplify a binary .ply block by block: cvtgs simplify IN OUT --memory AMOUNT"
 )
 
-_SIZED = (".compressed.ply", ".splat")
+_SIZED = (".compressed.ply", ".splat", ".ksplat")
 """Formats besides plain PLY whose files have as many bytes as their rows take."""
 
 _STREAM = "lod-meta.json"
@@ -94,8 +95,8 @@ def load(
 
     Args:
         path: The file; its suffix chooses the format: ``.ply`` (plain, or compressed by
-            PlayCanvas' tools), ``.spz``, ``.splat``, ``.sog`` or the ``meta.json`` of a SOG,
-            the ``lod-meta.json`` of a streamed SOG, ``.glb`` or ``.gltf`` with
+            PlayCanvas' tools), ``.spz``, ``.splat``, ``.ksplat``, ``.sog`` or the ``meta.json`` of
+            a SOG, the ``lod-meta.json`` of a streamed SOG, ``.glb`` or ``.gltf`` with
             ``KHR_gaussian_splatting``, ``.ckpt`` of nerfstudio's
             Splatfacto, ``.pt`` of gsplat's trainer. Of a folder, the scene that
             :func:`cvtgs.io.scene_file` finds. Or a file that is open in binary mode, which is read

@@ -1,0 +1,190 @@
+"""Read the ``.ksplat`` files of mkkellogg's GaussianSplats3D, version 0.1."""
+
+import dataclasses
+import os
+import struct
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from cvtgs.errors import FileFormatError
+from cvtgs.io.arrays import Arrays, logits_of_bytes, scene_of, sh0_of_colors, unit_quats
+from cvtgs.io.files import open_input
+from cvtgs.scene import GaussianScene
+
+HEADER_BYTES, SECTION_BYTES = 4096, 1024
+_HEADER = struct.Struct("<BBxxIIIIHxx3fff")
+_SECTION = struct.Struct("<IIIIfHxxIIIIH")
+
+_NUMBERS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
+"""Types of positions, of scales and rotations, and of SH, by level of compression."""
+
+_RANGE = 32767
+"""Positions are whole numbers around this one, unless the section says another."""
+
+_SH_RANGE = (-1.5, 1.5)
+_COMPONENTS = (0, 9, 24)
+"""View-dependent SH components of a Gaussian, by degree."""
+
+
+class _Section(NamedTuple):
+    """The header of a section."""
+
+    used: int
+    room: int
+    """Gaussians that the section has bytes for."""
+    bucket_size: int
+    buckets: int
+    block_size: float
+    bucket_bytes: int
+    scale_range: int
+    stored_bytes: int
+    full_buckets: int
+    partial_buckets: int
+    sh_degree: int
+
+
+def read_ksplat(path: Path) -> GaussianScene:
+    """Read a ``.ksplat`` file.
+
+    Sections of Gaussians in buckets: f32, or positions of 16 bits about the centre of the bucket
+    and halves; opacities and colours are bytes, SH up to degree 2 f32, halves or bytes.
+    """
+    with open_input(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        head = file.read(HEADER_BYTES)
+        if len(head) < HEADER_BYTES:
+            raise FileFormatError(
+                f"{path}: a .ksplat file must begin with {HEADER_BYTES} bytes of header, "
+                f"found {len(head)}."
+            )
+        major, minor, most, _, _, count, level, *_, low, high = _HEADER.unpack_from(head)
+        if (major, minor) != (0, 1) or level >= len(_NUMBERS):
+            raise FileFormatError(
+                f"{path}: must be a .ksplat of version 0.1 and compression 0, 1 or 2, found "
+                f"version {major}.{minor} and compression {level}."
+            )
+        ends = HEADER_BYTES + most * SECTION_BYTES
+        if ends > size:
+            raise FileFormatError(
+                f"{path}: must hold the headers of {most:,} sections, found {size:,} bytes."
+            )
+        headers = file.read(most * SECTION_BYTES)
+        sections = [
+            _Section(*_SECTION.unpack_from(headers, number * SECTION_BYTES))
+            for number in range(most)
+        ]
+        sh_range = (low, high) if low or high else _SH_RANGE
+        degree = max((one.sh_degree for one in sections if one.used), default=0)
+        parts = []
+        for section in sections:
+            if section.used:
+                parts.append(_read_section(file, section, level, degree, sh_range, path))
+            else:
+                file.seek(_section_bytes(section, level, path), os.SEEK_CUR)
+    found = sum(len(part.means) for part in parts)
+    if found != count or not count:
+        raise FileFormatError(
+            f"{path}: the sections must hold the {count:,} Gaussians of the header, at least one, "
+            f"found {found:,}."
+        )
+    names = [field.name for field in dataclasses.fields(Arrays)]
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return scene_of(Arrays(**joined))
+
+
+def _row_type(level: int, degree: int, path: Path) -> np.dtype[Any]:
+    """Return the layout of a Gaussian."""
+    if degree >= len(_COMPONENTS):
+        raise FileFormatError(
+            f"{path}: a .ksplat must have an SH degree of at most {len(_COMPONENTS) - 1}, "
+            f"found {degree}."
+        )
+    mean, half, sh = _NUMBERS[level]
+    fields = [("mean", mean, 3), ("scale", half, 3), ("quat", half, 4)]
+    return np.dtype([*fields, ("rgba", "u1", 4), ("sh", sh, _COMPONENTS[degree])])
+
+
+def _section_bytes(section: _Section, level: int, path: Path) -> int:
+    row = _row_type(level, section.sh_degree, path).itemsize
+    extra = 4 * section.partial_buckets + section.bucket_bytes * section.buckets
+    return extra + row * section.room
+
+
+def _read_section(
+    file: BinaryIO,
+    section: _Section,
+    level: int,
+    degree: int,
+    sh_range: tuple[float, float],
+    path: Path,
+) -> Arrays:
+    row = _row_type(level, section.sh_degree, path)
+    wanted = _section_bytes(section, level, path)
+    here = file.tell()
+    left = os.fstat(file.fileno()).st_size - here
+    needed = wanted - row.itemsize * (section.room - section.used)
+    if section.used > section.room or needed > left:
+        raise FileFormatError(
+            f"{path}: a section of {section.used:,} Gaussians must take {needed:,} bytes, "
+            f"found {left:,}."
+        )
+    lengths = np.fromfile(file, "<u4", section.partial_buckets).astype(np.int64)
+    extra = np.fromfile(file, np.uint8, section.bucket_bytes * section.buckets)
+    rows = np.fromfile(file, row, section.used)
+    file.seek(here + wanted)
+    means = rows["mean"].astype(np.float32)
+    if level:
+        bucket = _buckets(section, lengths)
+        bucket = bucket[: section.used]
+        most = int(bucket.max(initial=0))
+        if section.bucket_bytes < 12 or len(bucket) < section.used or most >= section.buckets:
+            raise FileFormatError(
+                f"{path}: the buckets of a section must hold its {section.used:,} Gaussians, "
+                f"found {section.buckets:,} buckets of {len(bucket):,}."
+            )
+        centers = extra.reshape(section.buckets, -1)[:, :12].copy().view("<f4")
+        middle = section.scale_range or _RANGE
+        step = np.float32(section.block_size / 2 / middle)
+        means = (means - np.float32(middle)) * step + centers[bucket]
+    stored = rows["sh"].astype(np.float32)
+    if level == 2:  # bytes
+        stored = sh_range[0] + stored / np.float32(255) * np.float32(sh_range[1] - sh_range[0])
+    with np.errstate(all="ignore"):
+        log_scales = np.log(np.maximum(rows["scale"].astype(np.float32), np.finfo(np.float32).tiny))
+        quats = unit_quats(rows["quat"].astype(np.float32))
+    return Arrays(
+        means=means,
+        quats=quats,
+        log_scales=log_scales,
+        logit_opacities=logits_of_bytes(rows["rgba"][:, 3]),
+        sh0=sh0_of_colors(rows["rgba"][:, :3].astype(np.float32) / np.float32(255)),
+        shN=_rest(stored, degree),
+    )
+
+
+def _buckets(section: _Section, lengths: Int[np.ndarray, "p"]) -> Int[np.ndarray, "n"]:
+    """Return the bucket of every Gaussian: the full ones first, then those of given lengths."""
+    room = section.used
+    full = min(section.full_buckets, room // max(1, section.bucket_size) + 1)
+    first = np.repeat(np.arange(full), section.bucket_size)[:room]
+    clipped = np.minimum(lengths, room)
+    if int(clipped.sum()) > 2 * room:  # a damaged file
+        return first[:0]
+    rest = np.repeat(section.full_buckets + np.arange(len(lengths)), clipped)
+    return np.concatenate([first, rest])
+
+
+def _rest(stored: Float[np.ndarray, "n c"], degree: int) -> Float[np.ndarray, "n k 3"]:
+    """Sort components, which are by band and then by channel; bands that are missing are 0."""
+    rest = np.zeros((len(stored), _COMPONENTS[degree] // 3, 3), np.float32)
+    start = 0
+    for band in (1, 2):
+        width = 2 * band + 1
+        if stored.shape[1] >= start + 3 * width:
+            part = stored[:, start : start + 3 * width].reshape(len(stored), 3, width)
+            rest[:, start // 3 : start // 3 + width] = part.transpose(0, 2, 1)
+        start += 3 * width
+    return rest

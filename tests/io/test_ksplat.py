@@ -1,0 +1,123 @@
+"""``.ksplat``: all compressions against what was stored, several sections, and damage."""
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import cvtgs
+from cvtgs.errors import FileFormatError
+from cvtgs.math.parameters import quats_to_matrices
+
+COMPONENTS = (0, 9, 24)
+BLOCK, SIZE = 20.0, 256
+
+
+def section(level: int, degree: int, count: int, seed: int) -> tuple[bytes, bytes, dict[str, Any]]:
+    """Return a header, its data and the values in it: full buckets, and two that are not.
+
+    splat-transform 3.7.0 reads files like these as cvtgs does.
+    """
+    rng = np.random.default_rng(seed)
+    values = {
+        "means": rng.normal(size=(count, 3)).astype("f4"),
+        "scales": np.exp(rng.normal(size=(count, 3)) - 3).astype("f4"),
+        "quats": rng.normal(size=(count, 4)).astype("f4"),
+        "rgba": rng.integers(1, 255, (count, 4)).astype("u1"),
+        "sh": rng.uniform(-1, 1, (count, COMPONENTS[degree])).astype("f4"),
+    }
+    full = count // SIZE
+    partial = [30, count % SIZE - 30]
+    centers = rng.normal(size=(full + 2, 3)).astype("<f4")
+    buckets = np.repeat(np.arange(full + 2), [*[SIZE] * full, *partial])
+    steps = np.round((values["means"] - centers[buckets]) / (BLOCK / 2 / 32767)) + 32767
+    means = values["means"].astype("<f4") if level == 0 else steps.astype("<u2")
+    half = "<f4" if level == 0 else "<f2"
+    levels = np.round((values["sh"] + 1.5) / 3 * 255).astype("u1")
+    sh = levels if level == 2 else values["sh"].astype(half)
+    columns = [means, values["scales"].astype(half), values["quats"].astype(half)]
+    columns += [values["rgba"], sh]
+    rows = [np.ascontiguousarray(column).view("u1").reshape(count, -1) for column in columns]
+    joined = np.concatenate(rows, axis=1)
+    numbers = (count, count + 3, SIZE, full + 2, BLOCK, 12, 32767, 0, full, 2, degree)
+    head = struct.pack("<IIIIfHxxIIIIH", *numbers)
+    spare = bytes(3 * joined.shape[1])  # room for three more
+    data = np.array(partial, "<u4").tobytes() + centers.tobytes() + joined.tobytes() + spare
+    return head.ljust(1024, b"\0"), data, values
+
+
+def write(path: Path, level: int, *sections: tuple[bytes, bytes, dict[str, Any]]) -> Path:
+    count = sum(len(values["means"]) for _, _, values in sections)
+    head = struct.pack("<BBxxIIIIHxx3fff", 0, 1, 4, 4, count, count, level, 0, 0, 0, -1.5, 1.5)
+    heads = b"".join(head for head, _, _ in sections).ljust(4 * 1024, b"\0")
+    data = b"".join(data for _, data, _ in sections)
+    path.write_bytes(head.ljust(4096, b"\0") + heads + data)
+    return path
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_every_compression_holds_what_was_stored(tmp_path: Path, level: int, degree: int) -> None:
+    first, second = section(level, degree, 700, 0), section(level, 0, 300, 1)
+    scene = cvtgs.load(write(tmp_path / "a.ksplat", level, first, second))
+    assert (len(scene), scene.sh_degree) == (1000, degree)
+    near = 1e-5 if level == 0 else 2e-3
+    for part, (_, _, values) in ((scene[:700], first), (scene[700:], second)):
+        for found, name in ((part.means, "means"), (part.scales, "scales")):
+            wanted = torch.from_numpy(values[name])
+            torch.testing.assert_close(found, wanted, rtol=near, atol=near)
+        quats = torch.from_numpy(values["quats"])
+        matrices = quats_to_matrices(quats / quats.norm(dim=1, keepdim=True))
+        torch.testing.assert_close(quats_to_matrices(part.quats), matrices, rtol=0, atol=4e-3)
+        rgba = torch.from_numpy(values["rgba"].astype("f4")) / 255
+        torch.testing.assert_close(part.opacities, rgba[:, 3], rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(part.sh0[:, 0] * 0.28209479 + 0.5, rgba[:, :3])
+    stored, step = torch.from_numpy(first[2]["sh"]), 0.007 if level else 1e-6
+    if degree:  # of band 1 those of red, then of green, then of blue
+        torch.testing.assert_close(scene.shN[:700, :3, 1], stored[:, 3:6], rtol=0, atol=step)
+    if degree == 2:
+        torch.testing.assert_close(scene.shN[:700, 3:, 2], stored[:, 19:24], rtol=0, atol=step)
+    assert not scene.shN[700:].any()
+
+
+@pytest.mark.parametrize(
+    ("place", "number", "text"),
+    [
+        (1, struct.pack("<B", 2), "must be a .ksplat of version 0.1 and compression 0, 1 or 2"),
+        (20, struct.pack("<H", 7), "must be a .ksplat of version 0.1 and compression 0, 1 or 2"),
+        (4, struct.pack("<I", 1 << 30), "must hold the headers of 1,073,741,824 sections"),
+        (16, struct.pack("<I", 701), "the sections must hold the 701 Gaussians of the header"),
+        (4096, struct.pack("<I", 1 << 30), "a section of 1,073,741,824 Gaussians must take"),
+        (4096 + 12, struct.pack("<I", 1 << 30), "a section of 700 Gaussians must take"),
+        (4096 + 32, struct.pack("<I", 1), "the buckets of a section must hold its 700 Gaussians"),
+        (4096 + 40, struct.pack("<H", 3), "must have an SH degree of at most 2, found 3"),
+    ],
+)
+def test_damage_is_one_sentence(tmp_path: Path, place: int, number: bytes, text: str) -> None:
+    path = write(tmp_path / "a.ksplat", 1, section(1, 1, 700, 0))
+    content = path.read_bytes()
+    path.write_bytes(content[:place] + number + content[place + len(number) :])
+    with pytest.raises(FileFormatError) as caught:
+        cvtgs.load(path)
+    assert text in str(caught.value)
+
+
+def test_cut_or_random_files_never_end_in_another_error(tmp_path: Path) -> None:
+    content = write(tmp_path / "a.ksplat", 1, section(1, 1, 700, 0)).read_bytes()
+    rng, read = np.random.default_rng(0), 0
+    for case in range(200):
+        damaged = bytearray(content if case % 4 else content[: rng.integers(1, len(content))])
+        heads = [*range(24), *range(4096, 4140), *range(8192, 8400)]
+        for place in rng.choice(heads, 1 + case % 3):
+            if place < len(damaged):
+                damaged[place] = rng.integers(256)
+        (tmp_path / "b.ksplat").write_bytes(damaged)
+        try:
+            cvtgs.load(tmp_path / "b.ksplat")
+            read += 1
+        except FileFormatError:
+            pass
+    assert 0 < read < 200
