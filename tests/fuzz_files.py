@@ -1,12 +1,16 @@
 """Fuzz the readers: scenes of every format, networks and configurations, damaged in every way.
 
 ``python tests/fuzz_files.py --count 100000`` (the nox session ``fuzz``) ends with a line of counts,
-or names the first input that did not end in a result or in one clear sentence, and keeps it. Each
-input has a limit of CPU time, and the process one of memory, so hangs and lying headers are found.
+and with the inputs that did not end in a result or in one clear sentence: they are made small and
+put into ``tests/data/fuzz``, which the tests read. Inputs that end in a way not seen before are
+damaged further. Each input has a limit of CPU time, and the process one of memory, so hangs and
+lying headers are found.
 """
 
 import argparse
+import hashlib
 import io
+import json
 import random
 import re
 import resource
@@ -17,11 +21,13 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 import cvtgs
+from camera_files import inria, transforms
 from cvtgs import SimplifyConfig
 from cvtgs.errors import CvtgsError, DroppedDataWarning
 from cvtgs.mergenet import Architecture, CheckpointInfo, load_checkpoint, save_checkpoint
@@ -31,9 +37,13 @@ from scenes import random_scene
 
 HERE = Path(__file__).parent
 Dice = random.Random
-CPU_SECONDS = 5.0
-MEMORY = 1 << 29
-"""Half a GiB more than the process has when it starts; no seed has more than 100 kB."""
+CORPUS = HERE / "data" / "fuzz"
+CPU_SECONDS = 2.0
+MEMORY = 1 << 30
+"""A GiB more than the process has when it starts; no seed has more than 100 kB."""
+
+MOST_GROWN, MOST_FAILURES, MOST_TRIES = 300, 10, 400
+"""Inputs that a kind may add to its seeds, failures before the end, tries to make one small."""
 
 LIES = (b"-1", b"0", b"1", b"7", b"4294967296", b"999999999999999999", b"9" * 40, b"1e3", b"0x10")
 WORDS = (
@@ -114,6 +124,11 @@ def seeds_of_states() -> list[bytes]:
     return seeds
 
 
+def seeds_of_cameras() -> list[bytes]:
+    """Small files of cameras: of nerfstudio and instant-ngp, and of INRIA's code."""
+    return [json.dumps(found).encode() for found in (transforms(range(3)), inria()[:3])]
+
+
 READERS: dict[str, tuple[str, Callable[[], list[bytes]], Callable[[Path], object]]] = {
     "ply": (".ply", seeds_of_ply, cvtgs.load),
     "compressed": (".compressed.ply", seeds_of_scenes(".compressed.ply"), cvtgs.load),
@@ -125,6 +140,8 @@ READERS: dict[str, tuple[str, Callable[[], list[bytes]], Callable[[Path], object
     "gltf": (".gltf", seeds_of_scenes(".gltf"), cvtgs.load),
     "state": (".pt", seeds_of_states, cvtgs.load),
     "checkpoint": (".safetensors", seeds_of_checkpoints, load_checkpoint),
+    "transforms": (".json", lambda: seeds_of_cameras()[:1], cvtgs.load_cameras),
+    "inria": (".json", lambda: seeds_of_cameras()[1:], cvtgs.load_cameras),
     "config": (".toml", seeds_of_configs, SimplifyConfig.from_toml),
 }
 
@@ -233,15 +250,67 @@ def limit() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (now + MEMORY, now + MEMORY))
 
 
+def signature(read: Callable[[Path], object], path: Path) -> str:
+    """Return how an input ends, without numbers and names: what tells one end from another."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            read(path)
+    except Exception as error:
+        return re.sub(r"'[^']*'|\d+", "#", str(error).replace(str(path), ""))
+    return "read"
+
+
+def made_small(data: bytes, fails: Callable[[bytes], bool]) -> bytes:
+    """Drop pieces of an input, long ones first, as long as it fails."""
+    tries, size = 0, max(1, len(data) // 2)
+    while tries < MOST_TRIES:
+        for start in range(0, len(data), size):
+            shorter = data[:start] + data[start + size :]
+            tries += 1
+            if fails(shorter):
+                data = shorter
+                break
+            if tries >= MOST_TRIES:
+                return data
+        else:
+            if size == 1:
+                return data
+            size = max(1, size // 2)
+    return data
+
+
+def chosen(pool: Sequence[bytes], whole: int, dice: Dice) -> bytes:
+    """Choose a seed: a whole file, the first ones of the pool, twice as often as a damaged one."""
+    return dice.choice(pool[:whole] if dice.random() < 2 / 3 else pool)
+
+
+def corpus(kind: str) -> list[Path]:
+    """Return the inputs of a kind that are kept with the tests."""
+    return sorted((CORPUS / kind).glob("*"))
+
+
+def keep(kind: str, data: bytes) -> Path:
+    """Keep an input with the tests."""
+    path = CORPUS / kind / f"{hashlib.sha256(data).hexdigest()[:12]}{READERS[kind][0]}"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+    return path
+
+
 def main() -> None:
     """Fuzz all readers, and say how it ended."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=100_000, help="inputs of all kinds together")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kinds", nargs="*", choices=[*READERS], help="kinds of files (all)")
+    parser.add_argument("--grow", type=int, default=0, help="new ends per kind to keep with tests")
     options = parser.parse_args()
     dice, ends = random.Random(options.seed), Counter[str]()
     pools = {kind: seeds() for kind, (_, seeds, _) in READERS.items()}
+    whole = {kind: len(pool) for kind, pool in pools.items()}
+    known: dict[str, set[str]] = {kind: set() for kind in READERS}
+    failures = []
     with tempfile.TemporaryDirectory() as folder:
         for kind, pool in pools.items():
             for number, seed in enumerate(pool):
@@ -249,19 +318,38 @@ def main() -> None:
                 path.write_bytes(seed)
                 if verdict(READERS[kind][2], path) != "read":
                     sys.exit(f"{kind} {number} cannot be read before it is damaged.")
+            pool += [path.read_bytes() for path in corpus(kind)]
         limit()
         for number in range(options.count):
             kind = dice.choice(options.kinds or ("ply", "ply", *READERS))
             suffix, _, read = READERS[kind]
-            path = Path(folder) / f"damaged{suffix}"
-            path.write_bytes(mutant(dice.choice(pools[kind]), dice))
+            path, data = (
+                Path(folder) / f"damaged{suffix}",
+                mutant(chosen(pools[kind], whole[kind], dice), dice),
+            )
+            path.write_bytes(data)
             end = verdict(read, path)
-            if end not in ("read", "refused"):
-                kept = Path(tempfile.gettempdir()) / f"fuzzed-{number}{suffix}"
-                kept.write_bytes(path.read_bytes())
-                sys.exit(f"input {number} of seed {options.seed}, kept as {kept}: {end}")
-            ends[f"{kind} {end}"] += 1
+            if end in ("read", "refused"):
+                ends[f"{kind} {end}"] += 1
+                new = signature(read, path)
+                if new not in known[kind] and len(known[kind]) < MOST_GROWN:
+                    known[kind].add(new)
+                    pools[kind].append(data)
+                    if len(corpus(kind)) < options.grow and len(data) < 2000:
+                        keep(kind, data)
+                continue
+
+            def fails(other: bytes, end: str = end, path: Path = path, read: Any = read) -> bool:
+                path.write_bytes(other)
+                return verdict(read, path).split(":")[0] == end.split(":", maxsplit=1)[0]
+
+            kept = keep(kind, made_small(data, fails))
+            failures.append(f"input {number} of seed {options.seed}, kept as {kept}: {end}")
+            if len(failures) >= MOST_FAILURES:
+                break
     print(", ".join(f"{count} {end}" for end, count in sorted(ends.items())))  # noqa: T201
+    if failures:
+        sys.exit("\n".join(failures))
 
 
 if __name__ == "__main__":

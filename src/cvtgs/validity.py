@@ -18,6 +18,9 @@ UNIT_TOLERANCE = 1e-5
 MAX_LOG_SCALE = math.log(torch.finfo(torch.float32).max)
 """The logarithm of the largest scale that files and renderers, which hold float32, can express."""
 
+_FAR = 1e6
+"""Distance from the origin at which float32 keeps steps of a sixteenth of a unit."""
+
 
 class CheckedScene(NamedTuple):
     """The valid rows of a scene, and how many others there were.
@@ -186,3 +189,21 @@ def _finite(values: Tensor) -> Tensor:
     """
     flat = values.flatten(start_dim=1)
     return torch.cat([(part * 0).sum(dim=1) == 0 for part in flat.split(1 << 16)])
+
+
+def warn_of_lost_digits(scene: GaussianScene) -> None:
+    """Warn of a scene so far from its origin that float32 keeps no small differences."""
+    if len(scene) == 0 or scene.means.element_size() > 4:
+        return
+    middle = scene.means.nanmedian(dim=0).values.double()
+    far = float(middle.abs().amax())
+    if _FAR <= far < math.inf:
+        step = 2.0 ** (math.floor(math.log2(far)) - 23)
+        shift = ",".join(f"{-round(value)}" for value in middle.tolist())
+        warnings.warn(
+            f"positions lie {far:.3g} from the origin, where float32 keeps steps of {step:.3g} "
+            f"only: digits are lost already. Write the scene anew from its source, with positions "
+            f"shifted by {shift} before they become float32, and keep that shift beside it.",
+            UserWarning,
+            stacklevel=3,
+        )

@@ -47,6 +47,22 @@ def test_the_same_seed_damages_the_same_way():
     assert len(set(first)) > 40
 
 
+def test_kept_inputs_end_in_a_result_or_one_clear_sentence(tmp_path):
+    ends = {}
+    for kind, (suffix, _, read) in fuzz_files.READERS.items():
+        for kept in fuzz_files.corpus(kind):
+            path = tmp_path / f"kept{suffix}"
+            path.write_bytes(kept.read_bytes())
+            ends[str(kept)] = fuzz_files.verdict(read, path)
+    assert len(ends) > 50
+    assert {kept: end for kept, end in ends.items() if end not in ("read", "refused")} == {}
+
+
+def test_failing_inputs_are_made_small():
+    assert fuzz_files.made_small(b"a" * 500 + b"bug" + b"c" * 300, lambda d: b"bug" in d) == b"bug"
+    assert fuzz_files.made_small(b"", lambda data: True) == b""
+
+
 @pytest.mark.parametrize(
     ("read", "wanted"),
     [
@@ -54,7 +70,7 @@ def test_the_same_seed_damages_the_same_way():
         (cvtgs.load, "refused"),
         (lambda path: {}["x"], "KeyError: 'x'"),
         (lambda path: path.with_name("more").touch(), "files were written"),
-        (lambda path: bytearray(1 << 62), "more than 512 MiB"),
+        (lambda path: bytearray(1 << 62), "more than 1024 MiB"),
         (lambda path: cvtgs.load("elsewhere.ply"), "unclear: "),
     ],
 )

@@ -17,7 +17,7 @@ import zstandard
 from PIL import Image
 
 import cvtgs
-from cvtgs.cli.main import main
+from cvtgs.cli.main import build_parser, main
 from cvtgs.errors import FileFormatError
 from cvtgs.io.sizes import FREE_BYTES, MOST_EXPANSION
 from format_cases import DATA, refusal
@@ -203,3 +203,17 @@ def test_an_unbundled_sog_counts_its_images(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="that take 168,000,000 bytes in a file of"):
         cvtgs.load(tmp_path / "meta.json")
     assert len(cvtgs.load(DATA / "splat-transform.sog")) > 0
+
+
+@pytest.mark.parametrize("command", ["render", "evaluate", "compare", "tradeoff", "info"])
+def test_every_command_that_reads_can_be_told_to_trust_sizes(command):
+    parser = build_parser()
+    words = {
+        "render": ["render", "a.sog", "-o", "b"],
+        "evaluate": ["evaluate", "a.sog", "b.sog"],
+        "compare": ["compare", "a.sog", "b.sog", "-o", "c"],
+        "tradeoff": ["tradeoff", "a.sog", "-o", "c"],
+        "info": ["info", "a.sog"],
+    }[command]
+    assert not parser.parse_args(words).trust_sizes
+    assert parser.parse_args([*words, "--trust-sizes"]).trust_sizes

@@ -1,6 +1,5 @@
 """How much memory a process may still use: machine, control groups, limits of the process."""
 
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -100,6 +99,7 @@ def test_the_least_counts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no ulimit")
 def test_limit_of_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    resource = pytest.importorskip("resource")
     used = psutil.Process().memory_info().vms
     limits = (used + 500_000_000, resource.RLIM_INFINITY)
     monkeypatch.setattr(resource, "getrlimit", lambda kind: limits)

@@ -46,7 +46,7 @@ def add_render(add_parser: AddParser) -> None:
         description="Write one PNG per view into DIR, named after the cameras.",
     )
     parser.set_defaults(run=render)
-    add_options(parser, "input", "-o/--output", "--overwrite")
+    add_options(parser, "input", "-o/--output", "--trust-sizes", "--overwrite")
     add_view_options(parser, size=800)
 
 
@@ -59,7 +59,9 @@ def render(options: argparse.Namespace) -> None:
     from cvtgs.evaluation.images import as_bytes, encode
 
     check_view_options(options)
-    scene = cvtgs.io.load(options.input).to(chosen_device(options.device))
+    scene = cvtgs.io.load(options.input, trust_sizes=options.trust_sizes).to(
+        chosen_device(options.device)
+    )
     cameras = choose_cameras(options, scene)
     make_folder(options.output)
     paths = [options.output / name for name in file_names(cameras.view_names)]
@@ -119,7 +121,8 @@ def _read_scenes(options: argparse.Namespace) -> _Scenes:
     if twice:
         raise InvalidArgumentError(f"every scene must be given once, found {twice[0]} twice.")
     device = chosen_device(options.device)
-    reference, *others = (cvtgs.io.load(path).to(device) for path in paths)
+    trust = options.trust_sizes
+    reference, *others = (cvtgs.io.load(path, trust_sizes=trust).to(device) for path in paths)
     sizes = [cvtgs.io.scene_size(path) for path in paths]
     return _Scenes(
         name=names[0],
@@ -146,7 +149,7 @@ def add_evaluate(add_parser: AddParser) -> None:
         metavar="DIR",
         help="directory of the photographs of --cameras, found by name",
     )
-    add_options(parser, "--json")
+    add_options(parser, "--json", "--trust-sizes")
     add_view_options(parser, size=SCORED_SIZE)
 
 
@@ -223,7 +226,8 @@ def add_compare(add_parser: AddParser) -> None:
         f"--cameras, {MOST_CAMERAS} are shown unless --views sets a number.",
     )
     parser.set_defaults(run=compare)
-    add_options(parser, "reference", "small", "--lpips", "-o/--output", "--overwrite")
+    add_options(parser, "reference", "small", "--lpips", "-o/--output")
+    add_options(parser, "--trust-sizes", "--overwrite")
     add_view_options(parser, size=SCORED_SIZE)
 
 
@@ -270,7 +274,7 @@ def add_tradeoff(add_parser: AddParser) -> None:
     parser.add_argument(
         "--save", action="store_true", help="write the simplified scenes to DIR, too"
     )
-    add_options(parser, "--lpips", "--overwrite")
+    add_options(parser, "--lpips", "--trust-sizes", "--overwrite")
     add_view_options(parser, size=SCORED_SIZE)
 
 
@@ -293,6 +297,7 @@ def tradeoff(options: argparse.Namespace) -> None:
             settings=evaluation_settings(options),
             device=options.device,
             folder=options.output if options.save else None,
+            trust_sizes=options.trust_sizes,
             listener=listener,
         )
         paths, note = cvtgs.tradeoff.write_tradeoff(

@@ -359,6 +359,7 @@ def read_scene(
         trust_sizes=options.trust_sizes,
         lod=options.lod,
     )
+    cvtgs.validity.warn_of_lost_digits(scene)
     return scene if kept is None else scene.with_sh_degree(kept)
 
 

@@ -41,7 +41,7 @@ class Measured(NamedTuple):
     comparison: Comparison
 
 
-def measure_tradeoff(
+def measure_tradeoff(  # noqa: PLR0913 (options by name)
     source: str | os.PathLike[str],
     *,
     presets: Sequence[str] | None = None,
@@ -50,6 +50,7 @@ def measure_tradeoff(
     settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
     device: str = "auto",
     folder: str | os.PathLike[str] | None = None,
+    trust_sizes: bool = False,
     listener: ProgressListener = silent,
 ) -> Measured:
     """Simplify a file by several presets, and measure cost and quality of each.
@@ -70,6 +71,8 @@ def measure_tradeoff(
         device: Where to compute: ``auto``, ``cpu`` or ``cuda``.
         folder: Keep the results there, as ``fast_0.01.ply``, replacing what has that name; None
             keeps none.
+        trust_sizes: Whether to believe a compressed source that claims far more Gaussians than its
+            bytes can hold.
         listener: Called after each run and image.
 
     Returns:
@@ -93,13 +96,17 @@ def measure_tradeoff(
     """
     tasks = tasks_of(presets, ratios)
     where = chosen_device(device)
-    full = load(source).to(where)
+    full = load(source, trust_sizes=trust_sizes).to(where)
     views = cameras(full)
     kept = None if folder is None else nullcontext(folder)
     with kept or TemporaryDirectory(prefix="cvtgs-") as name:
         place = Path(name)
         start = start_seconds()
-        done = list(run_tasks(source, tasks, place, device=device, listener=listener))
+        done = list(
+            run_tasks(
+                source, tasks, place, device=device, trust_sizes=trust_sizes, listener=listener
+            )
+        )
         runs = [one for one in done if isinstance(one, Run)]
         failures = tuple(one for one in done if isinstance(one, Failure))
         if failures and not runs:

@@ -130,6 +130,7 @@ def run_tasks(
     folder: Path,
     *,
     device: str,
+    trust_sizes: bool,
     listener: ProgressListener,
 ) -> Iterator[Run | Failure]:
     """Run every task in a process of its own, one after the other."""
@@ -137,7 +138,7 @@ def run_tasks(
     for done, task in enumerate(tasks):
         listener(ProgressEvent(stage=STAGE, done=done, total=len(tasks), note=task.name))
         try:
-            run = run_task(source, task, folder, device=device)
+            run = run_task(source, task, folder, device=device, trust_sizes=trust_sizes)
         except RunError as error:
             yield Failure(name=task.name, reason=str(error))
         else:
@@ -147,12 +148,18 @@ def run_tasks(
 
 
 def run_task(
-    source: str | os.PathLike[str], task: Task, folder: Path, *, device: str = "auto"
+    source: str | os.PathLike[str],
+    task: Task,
+    folder: Path,
+    *,
+    device: str = "auto",
+    trust_sizes: bool = False,
 ) -> Run:
     """Run one task as ``cvtgs simplify`` does, in a process of its own."""
     path, report = folder / task.file_name, folder / f".{task.file_name}.json"
     words = ["--rho", repr(task.rho), "--preset", task.preset, "--device", device]
     words += ["--report", str(report), "--overwrite", "--quiet"]
+    words += ["--trust-sizes"] * trust_sizes
     try:
         cost = run_process(
             [sys.executable, "-m", "cvtgs", "simplify", os.fspath(source), str(path), *words]

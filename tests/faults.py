@@ -1,0 +1,292 @@
+"""Faults: kills at any moment, two runs at once, full disks, too little memory.
+
+``python tests/faults.py --kills 500 --pairs 100`` (the nox session ``faults``) runs every command
+that writes in forks of this process, and checks how each ends: with its status and one sentence at
+most, its files whole or absent, and after the same command ran again the same bits as ever, and
+nothing else in the folder. It ends with a line of counts, or with the first failure. Needs POSIX.
+"""
+
+import argparse
+import os
+import random
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cvtgs
+import cvtgs.outofcore
+import cvtgs.outofcore.memory
+from cvtgs.cli.main import run_process
+
+SIGNALS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}
+BUSY = ("one run at a time may work on it", "must not exist yet", "must be")
+MOST_SECONDS = 300.0
+
+
+class FaultError(Exception):
+    """Something did not end as it is promised."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """A command that writes.
+
+    Attributes:
+        words: Its words; ``{}`` is the folder.
+        blocks: Number of blocks, as if there were little memory; 0 for one piece.
+        varies: Whether its files say how long something took, so bits differ from run to run.
+    """
+
+    words: tuple[str, ...]
+    blocks: int = 0
+    varies: tuple[str, ...] = field(default=())
+
+
+def words(text: str) -> tuple[str, ...]:
+    return tuple(text.split())
+
+
+COMMANDS = {
+    "plain": Command(words=words("simplify {}/in.ply {}/out.ply --rho 0.1 --quiet --overwrite")),
+    "blocks": Command(
+        words=words("simplify {}/in.ply {}/out.ply --rho 0.1 --quiet --overwrite --memory 2GB"),
+        blocks=5,
+    ),
+    "convert": Command(words=words("convert {}/in.ply {}/out.spz --quiet --overwrite")),
+    "sog": Command(words=words("convert {}/in.ply {}/out.sog --quiet --overwrite")),
+    "levels": Command(
+        words=words("levels {}/in.ply -o {}/levels --rho 0.1,0.02 --no-scores --quiet --overwrite"),
+        varies=("levels.json",),
+    ),
+    "render": Command(
+        words=words("render {}/in.ply -o {}/images --views 2 --size 48 --quiet --overwrite")
+    ),
+    "compare": Command(
+        words=words(
+            "compare {}/in.ply {}/small.ply -o {}/page --views 2 --size 48 --lpips off --quiet "
+            "--overwrite"
+        )
+    ),
+}
+
+
+def started(command: Command, folder: Path, *, limit: Callable[[], None] | None = None) -> int:
+    """Fork a run of a command; what it prints goes to a file of its process."""
+    sys.stdout.flush()
+    process = os.fork()
+    if process:
+        return process
+    code = 70
+    try:
+        errors = os.open(
+            str(folder.parent / f"errors-{os.getpid()}"), os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+        )
+        os.dup2(errors, 2)
+        os.dup2(errors, 1)
+        if command.blocks:
+            cvtgs.outofcore.block_count = lambda *_: command.blocks  # type: ignore[assignment]
+            sys.modules["cvtgs.outofcore.run"].block_count = lambda *_: command.blocks  # type: ignore[attr-defined]
+        if limit is not None:
+            limit()
+        sys.argv = ["cvtgs", *(word.replace("{}", str(folder)) for word in command.words)]
+        run_process()
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    except BaseException:  # what the process would print as a traceback
+        traceback.print_exc()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def ended(process: int, folder: Path) -> tuple[int, str]:
+    """Wait for a fork; return its status and what it printed."""
+    code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+    path = folder.parent / f"errors-{process}"
+    text = path.read_text(errors="replace") if path.exists() else ""
+    path.unlink(missing_ok=True)
+    if "Traceback" in text or "Error:" in text or code == 70:
+        raise FaultError(f"status {code}: {text[-3000:]}")
+    return code, text
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def fresh(home: Path) -> Path:
+    """Make a folder with the inputs only."""
+    folder = home / "work"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    for name in ("in.ply", "small.ply"):
+        shutil.copy(home / name, folder / name)
+    return folder
+
+
+def same(command: Command, found: dict[str, bytes], wanted: dict[str, bytes]) -> bool:
+    """Return whether files are those of a whole run."""
+    if found.keys() != wanted.keys():
+        return False
+    return all(found[name] == wanted[name] or Path(name).name in command.varies for name in wanted)
+
+
+def check_whole(command: Command, folder: Path, wanted: dict[str, bytes]) -> None:
+    """Run the command again, and compare everything in the folder."""
+    code, text = ended(started(command, folder), folder)
+    found = contents(folder)
+    if code or not same(command, found, wanted):
+        differs = [name for name in wanted if found.get(name) != wanted[name]]
+        more = sorted(found.keys() - wanted.keys())
+        raise FaultError(f"the run after it: status {code}, differs {differs}, left {more}: {text}")
+
+
+def check_part(command: Command, folder: Path, wanted: dict[str, bytes]) -> None:
+    """Check that every file that has its name is whole."""
+    for name, content in contents(folder).items():
+        hidden = any(part.startswith(".") for part in Path(name).parts)
+        if not hidden and Path(name).name not in command.varies and content != wanted.get(name):
+            raise FaultError(f"{name} is not whole")
+
+
+def references(home: Path) -> Iterator[tuple[str, float, dict[str, bytes]]]:
+    """Run every command to its end, twice, for its files and its seconds."""
+    for name, command in COMMANDS.items():
+        folder = fresh(home)
+        start = time.perf_counter()
+        code, text = ended(started(command, folder), folder)
+        if code:
+            raise FaultError(f"{name} does not run: {text}")
+        wanted, seconds = contents(folder), time.perf_counter() - start
+        check_whole(command, folder, wanted)
+        yield name, seconds, wanted
+
+
+def kill(command: Command, folder: Path, seconds: float, number: signal.Signals) -> int:
+    """Start a command, send a signal after some seconds, and return its status."""
+    process = started(command, folder)
+    time.sleep(seconds)
+    with suppress(ProcessLookupError):  # it has ended
+        os.kill(process, number)
+    code, text = ended(process, folder)
+    if code not in (0, SIGNALS[number]) and not (code == 130 and not text):
+        raise FaultError(f"status {code} after signal {number}: {text}")
+    sentences = [line for line in text.splitlines() if not line.startswith("cvtgs: warning: ")]
+    if len(sentences) > 1:
+        raise FaultError(f"more than a sentence after signal {number}: {text}")
+    return code
+
+
+def starved(share: float) -> Callable[[], None]:
+    """Return what leaves a process a share of half a gigabyte."""
+
+    def limit() -> None:
+        import resource  # noqa: PLC0415 (not on Windows)
+
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+        now = 1024 * int(re.search(r"VmSize:\s+(\d+) kB", status)[1])  # type: ignore[index]
+        room = now + int(share * (1 << 29))
+        resource.setrlimit(resource.RLIMIT_AS, (room, room))
+
+    return limit
+
+
+def full(share: float) -> Callable[[], None]:
+    """Return what lets no file grow beyond a share of 100 kB."""
+
+    def limit() -> None:
+        import resource  # noqa: PLC0415
+
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * 100_000),) * 2)
+
+    return limit
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Do all faults, and say how they ended."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=500)
+    parser.add_argument("--pairs", type=int, default=100)
+    parser.add_argument("--limits", type=int, default=50, help="of memory, and of the disk")
+    parser.add_argument("--count", type=int, default=6000, help="Gaussians of the scene")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--commands", nargs="*", choices=[*COMMANDS], default=[*COMMANDS])
+    options = parser.parse_args(arguments)
+    dice, ends = random.Random(options.seed), Counter[str]()
+    with tempfile.TemporaryDirectory() as place:
+        home = Path(place)
+        scene = cvtgs.synthetic.scene("object", options.count, sh_degree=1, seed=3)
+        cvtgs.save(scene, home / "in.ply")
+        cvtgs.save(cvtgs.Simplifier(device="cpu").simplify(scene, 0.1), home / "small.ply")
+        known = {name: (seconds, files) for name, seconds, files in references(home)}
+        rounds = ["kill"] * options.kills + ["pair"] * options.pairs
+        rounds += ["memory", "disk"] * options.limits
+        dice.shuffle(rounds)
+        for number, kind in enumerate(rounds):
+            name = dice.choice(options.commands)
+            command, (seconds, wanted) = COMMANDS[name], known[name]
+            folder = fresh(home)
+            if dice.random() < 0.5:  # over the files of an earlier run
+                for path, content in wanted.items():
+                    (folder / path).parent.mkdir(exist_ok=True)
+                    (folder / path).write_bytes(content)
+            try:
+                end = one_fault(kind, command, folder, seconds, wanted, dice)
+            except FaultError as error:
+                sys.exit(f"round {number} of seed {options.seed}, {kind} of {name}: {error}")
+            ends[f"{name} {kind} {end}"] += 1
+    print(", ".join(f"{count} {end}" for end, count in sorted(ends.items())))  # noqa: T201
+
+
+def one_fault(
+    kind: str,
+    command: Command,
+    folder: Path,
+    seconds: float,
+    wanted: dict[str, bytes],
+    dice: random.Random,
+) -> str:
+    """Do one fault, check what is left, run the command again; return how it ended."""
+    if kind == "kill":
+        sent = dice.choice([*SIGNALS])
+        codes = [kill(command, folder, dice.uniform(0, 1.1 * seconds), sent)]
+    elif kind == "pair":
+        both = [started(command, folder)]
+        time.sleep(dice.uniform(0, seconds))
+        both.append(started(command, folder))
+        found = [ended(process, folder) for process in both]
+        for code, text in found:
+            if code not in (0, 1) or (code == 1 and not any(word in text for word in BUSY)):
+                raise FaultError(f"status {code} of two: {text}")
+        codes = [code for code, _ in found]
+        if 0 not in codes:
+            raise FaultError(f"neither of two ended well: {found}")
+    else:
+        limit = (starved if kind == "memory" else full)(dice.random())
+        code, text = ended(started(command, folder, limit=limit), folder)
+        lines = [line for line in text.splitlines() if not line.startswith("cvtgs: warning: ")]
+        if code not in (0, 1) or len(lines) > 1:
+            raise FaultError(f"status {code} under a limit: {text}")
+        codes = [code]
+    if kind in ("kill", "pair"):
+        check_part(command, folder, wanted)
+    check_whole(command, folder, wanted)
+    return " and ".join(map(str, sorted(codes)))
+
+
+if __name__ == "__main__":
+    main()
