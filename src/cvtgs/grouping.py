@@ -15,6 +15,9 @@ from cvtgs.math.frames import RobustFrame, morton_order
 from cvtgs.math.segments import label_sums
 from cvtgs.scene import GaussianScene
 
+MEMBERS_PER_PAIR = 12
+"""The tessellation makes at most one more cell for so many Gaussians that must go."""
+
 REASSIGN = 7
 """Cells around its own that a Gaussian may move to."""
 
@@ -96,8 +99,12 @@ def group_rows(
 
 
 def finer_count(target: int, available: int, config: AllocationConfig) -> int:
-    """Return how many cells the tessellation makes, from which pairs merge."""
-    return min(available, math.ceil(config.oversampling * target))
+    """Return how many cells the tessellation makes, from which pairs merge.
+
+    Where cells have few members, fewer: pairs of single Gaussians are worse cells than Voronoi's.
+    """
+    more = (available - target) // MEMBERS_PER_PAIR
+    return min(math.ceil(config.oversampling * target), target + more)
 
 
 def allocate(

@@ -212,9 +212,11 @@ def test_haze_by_the_mass_of_the_faint(share):
     scene = scene.with_tensors(
         {"log_scales": scene.log_scales * 0, "logit_opacities": torch.logit(opacities)}, {}
     )
-    effect = plan_of(scene).haze
+    config = SimplifyConfig.from_mapping({"filter": {"max_mass_share": 0.01}})
+    effect = plan_effects(scene, scene.masses, distances=distances_in(scene), config=config).haze
     assert effect.figure == pytest.approx(share)
     assert effect.active is (share > 0.01)
+    assert plan_of(scene).haze.active
     assert plan_of(scene, haze="on").haze.active
     assert not plan_of(scene, haze="off").haze.active
 

@@ -149,9 +149,10 @@ def test_faint_gaussians_without_mass_are_not_sorted(monkeypatch):
     scene = random_scene(400)
     opacities = torch.where(torch.arange(400) < 50, 1e-4, 0.5)
     scene = scene.with_tensors({"logit_opacities": torch.logit(opacities)}, {})
-    forced = run_with(scene, effects={"haze": "on"})
+    share = {"max_mass_share": 0.01}
+    forced = run_with(scene, filter=share, effects={"haze": "on"})
     monkeypatch.setattr(filters, "visible_rows", refuse)
-    planned = run_with(scene)
+    planned = run_with(scene, filter=share)
     assert planned.report.filtered_count == 50
     assert same_bits(planned.scene, forced.scene)
 

@@ -182,5 +182,6 @@ def test_cells_of_the_tessellation_stay_where_allocation_is_off():
     members, labels = points([0.0, 1.0, 2.0]), torch.tensor([0, 1, 0])
     assert allocate(members, labels, 2, 2, off) is labels
     assert finer_count(10, 12, off) == 10
-    assert finer_count(10, 12, DEFAULT) == 12
+    assert finer_count(10, 21, DEFAULT) == 10
+    assert finer_count(10, 46, DEFAULT) == 13
     assert finer_count(10, 99, DEFAULT) == 15

@@ -72,7 +72,7 @@ def ball_and_core(count: int = 600) -> cvtgs.GaussianScene:
 
 def test_cells_go_where_images_show_something():
     scene = ball_and_core()
-    settings = {"merge.network": "false", "cvt.hidden_share": "1"}
+    settings = {"merge.network": "false", "cvt.hidden_share": "1", "cvt.area_power": "1"}
     blind = SimplifyConfig.compose(settings=settings)
     seeing = SimplifyConfig.compose(
         settings=settings | {"visibility.views": "6", "visibility.mass_share": "0.1"}
@@ -103,7 +103,7 @@ def test_given_cameras_decide_what_is_seen():
             "merge.network": "false",
             "visibility.views": "4",
             "visibility.mass_share": "0.5",
-            "filter.min_opacity": "0",
+            "cvt.area_power": "1",
         }
     )
     simplifier = Simplifier(config=config, device="cpu")

@@ -25,6 +25,9 @@ from scenes import assert_same_gaussians, moved, random_scene, same_bits
 each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])
 HALF = math.sqrt(0.5)
 
+SEEDS = 47
+"""Cells of the tessellation of which 31 are left, a tenth of 301 Gaussians."""
+
 
 def simplified(
     scene: GaussianScene, config: str | SimplifyConfig, rho: float, *, ckpt: str | None = "auto"
@@ -43,13 +46,14 @@ def ckpt(request, monkeypatch) -> str | None:
 
 
 def dominated_scene(heavy: int, total: int, degree: int) -> GaussianScene:
-    """A few large, opaque Gaussians, each amid many small ones: every seed is certain."""
+    """A few large, opaque Gaussians, each amid many small, faint ones: every seed is certain."""
     scene = random_scene(total, degree=degree, dtype=torch.float64, size=0.01)
     g = torch.Generator().manual_seed(7)
     hubs = 4.0 * torch.rand(heavy, 3, generator=g, dtype=torch.float64)
     owners = torch.arange(total) % heavy
     log_scales, logits = scene.log_scales.clone(), scene.logit_opacities.clone()
     log_scales[:heavy], logits[:heavy] = math.log(0.4) + 0.1 * log_scales[:heavy], 4.0
+    logits[heavy:] -= 6.0
     tensors = {
         "means": 0.05 * scene.means + hubs[owners],
         "log_scales": log_scales,
@@ -103,7 +107,7 @@ def test_shift(preset, shift):
     ids=["x to y to z", "quarter turn about z", "half turn about x"],
 )
 def test_turns_that_keep_the_axes(quat, degree, ckpt):
-    scene = dominated_scene(31, 301, degree)
+    scene = dominated_scene(SEEDS, 301, degree)
     assert_same_gaussians(
         simplified(moved(scene, quat=quat), "standard", 0.1, ckpt=ckpt),
         moved(simplified(scene, "standard", 0.1, ckpt=ckpt), quat=quat),
@@ -114,7 +118,7 @@ def test_turns_that_keep_the_axes(quat, degree, ckpt):
 def test_any_turn_without_colour_and_contraction(quat, ckpt):
     """Colour and contraction are measured in robust radii about the median, which knows axes."""
     config = SimplifyConfig.from_mapping({"cvt": {"color": 0.0}, "effects": {"unbounded": "off"}})
-    scene = dominated_scene(31, 301, 3)
+    scene = dominated_scene(SEEDS, 301, 3)
     motion = {"quat": quat, "shift": (1.0, 2.0, 3.0), "scale": 10.0}
     assert_same_gaussians(
         simplified(moved(scene, **motion), config, 0.1, ckpt=ckpt),

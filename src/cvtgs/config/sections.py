@@ -99,8 +99,8 @@ class AllocationConfig(Section):
     """How the cells of a finer tessellation become as many as are wanted.
 
     Attributes:
-        oversampling: The tessellation makes this many times as many cells; pairs of them merge,
-            cheapest first. 1 keeps the cells of the tessellation.
+        oversampling: The tessellation makes up to this many times as many cells; pairs of them
+            merge, cheapest first. 1 keeps the cells of the tessellation.
         neighbors: A cell may merge with this many of the nearest others, or give members to them.
         color: Weight of squared distances of colours against distances of shape and position.
         mass_power: The cost of a pair counts with the mass that images show to this power.
