@@ -94,7 +94,13 @@ STAGES = {
         "visibility_grid",
         "plan_haze",
     },
-    "views": {"automatic_views", "mixed_views", "random_views"},
+    "views": {
+        "CameraPositions",
+        "automatic_views",
+        "find_view_positions",
+        "mixed_views",
+        "random_views",
+    },
     "cvt": {
         "LloydResult",
         "Tessellation",

@@ -14,7 +14,7 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation.scorer import ViewImage, render_view
 from cvtgs.losses import SSIM_WINDOW
 from cvtgs.scene import GaussianScene
-from cvtgs.views import mixed_views
+from cvtgs.views import find_view_positions, mixed_views
 
 HELDOUT_SEED = 101
 """Added to the seed: held-out views are others than those of evaluations and of training."""
@@ -38,10 +38,11 @@ class RefineViews:
 
 
 def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> RefineViews:
-    """Find views of a scene: a quarter automatic ones, the others from anywhere."""
+    """Find views of a scene: a quarter automatic ones, the others from where one can stand."""
+    positions = find_view_positions(full)
 
     def batch(number: int, seed: int) -> list[Cameras]:
-        return mixed_views(full, number, size=config.size, seed=seed).singles()
+        return mixed_views(positions, number, size=config.size, seed=seed).singles()
 
     def training() -> Iterator[Cameras]:
         for number in count():

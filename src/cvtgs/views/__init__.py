@@ -2,5 +2,12 @@
 
 from cvtgs.views.automatic import automatic_views
 from cvtgs.views.mixed import mixed_views, random_views
+from cvtgs.views.positions import CameraPositions, find_view_positions
 
-__all__ = ["automatic_views", "mixed_views", "random_views"]
+__all__ = [
+    "CameraPositions",
+    "automatic_views",
+    "find_view_positions",
+    "mixed_views",
+    "random_views",
+]

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.views.layout import SceneLayout
+from cvtgs.views.positions import REACH, CameraPositions
 
 _ELEVATIONS = (20.0, 35.0, 12.0, 28.0)
 _OUTSIDE = (
@@ -54,6 +55,7 @@ _WALL_QUANTILE = 0.8
 """Of the surfaces in a direction, the nearest are furniture and the farthest stray."""
 
 _FARTHEST = 1.5
+_FOUND = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,6 +124,27 @@ def inside_candidates(
         rounds.append(_cameras(eyes, directions, layout.up, size=size, field=INSIDE_FIELD))
         distances.append(steps + 0.5 * layout.frame.radius)
     return CandidateCameras(inside=True, rounds=tuple(rounds), distances=tuple(distances))
+
+
+def found_candidates(
+    positions: CameraPositions, count: int, *, size: tuple[int, int], seed: int
+) -> CandidateCameras:
+    """Return cameras at positions that were found to be good, to take where others are not."""
+    layout = positions.layout
+    inside = layout.room is not None
+    reach = REACH if inside else (1.4, REACH[1])
+    eyes = torch.cat([positions.near(count, reach, seed + turn) for turn in range(_FOUND)])
+    directions = layout.center - eyes if layout.room is None else layout.room - eyes
+    cameras = _cameras(
+        eyes, directions, layout.up, size=size, field=INSIDE_FIELD if inside else OUTSIDE_FIELD
+    )
+    rows = torch.arange(len(eyes)).split(count)
+    distances = torch.linalg.vector_norm(directions, dim=1)
+    return CandidateCameras(
+        inside=inside,
+        rounds=tuple(cameras.select(part) for part in rows),
+        distances=tuple(distances[part] for part in rows),
+    )
 
 
 def _distances_to_walls(

@@ -10,7 +10,8 @@ from cvtgs.errors import InvalidSceneError
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import valid_rows, with_finite_opacities
-from cvtgs.views.up import Voxels, find_up, voxelize
+from cvtgs.views.room import SizedPoints, find_room, sized_points
+from cvtgs.views.up import Voxels, among_others, find_floor, find_up, voxelize
 
 SAMPLE_SIZE = 30_000
 """Larger scenes are reduced to a sample of at most this many Gaussians."""
@@ -21,7 +22,7 @@ _VISIBLE = 0.1
 _BOUNDED = 3.2
 _FAR = 4.0
 _FAR_SHARE = 0.02
-_EXTENT = (0.02, 0.98)
+_HEIGHTS = (0.02, 0.98)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,15 +32,20 @@ class SceneLayout:
     Attributes:
         sample: The scene, or a sample of it that covers the same; SH degree 0, on the CPU.
         frame: Robust centre and radius of what is visible.
+        sized: Positions and sizes of Gaussians of the sample.
         voxels: The surfaces near the middle.
         up: Unit vector, float64.
         bounded: Whether nearly all lies within about three robust radii: an object, not a place.
         center: Middle of what views should show, scene units, float64.
         radius: Radius of what views should show, scene units.
         height: Extent along ``up`` of what is near the middle, scene units.
+        floor: Height of the floor along ``up``, scene units; None without one.
+        room: Where somebody in the middle of a room would have the eyes; None if the scene is not
+            seen from inside.
     """
 
     sample: GaussianScene
+    sized: SizedPoints
     frame: RobustFrame
     voxels: Voxels
     up: Float[Tensor, "3"]
@@ -47,6 +53,8 @@ class SceneLayout:
     center: Float[Tensor, "3"]
     radius: float
     height: float
+    floor: float | None
+    room: Float[Tensor, "3"] | None
 
 
 def find_layout(scene: GaussianScene) -> SceneLayout:
@@ -62,21 +70,30 @@ def find_layout(scene: GaussianScene) -> SceneLayout:
     bounded = float(distances.quantile(0.97)) < _BOUNDED
     up = find_up(voxels, _far_directions(local, distances))
     positions = voxels.points if len(voxels.points) else local[:1]
-    low, high = positions.quantile(positions.new_tensor(_EXTENT), dim=0)
-    heights = (positions @ up).quantile(positions.new_tensor(_EXTENT))
+    heights = (positions @ up).quantile(positions.new_tensor(_HEIGHTS))
+    together = among_others(positions)
+    positions = positions[together] if bool(together.any()) else positions
+    low, high = positions.amin(dim=0), positions.amax(dim=0)
     middle = 0.5 * (low + high) if bounded else torch.zeros_like(low)
     spread = torch.linalg.vector_norm(positions - middle, dim=1)
-    radius = float(spread.quantile(0.98)) if bounded else 1.0
+    radius = float(spread.amax()) if bounded else 1.0
     width = 2 * float(sample.scales.amax(dim=1).median())  # where all centres are one, all there is
+    center = frame.center + frame.radius * middle
+    floor = find_floor(voxels, up)
+    sized = sized_points(sample)
+    room = find_room(voxels, sized, frame, middle=middle, up=up)
     return SceneLayout(
         sample=sample,
+        sized=sized,
         frame=frame,
         voxels=voxels,
         up=up,
         bounded=bounded,
-        center=frame.center + frame.radius * middle,
+        center=center,
         radius=max(frame.radius * radius, width),
         height=frame.radius * float(heights[1] - heights[0]),
+        floor=None if floor is None else float(frame.center @ up) + frame.radius * floor,
+        room=None if room is None else frame.center + frame.radius * room,
     )
 
 

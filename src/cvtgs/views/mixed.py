@@ -3,73 +3,97 @@
 import math
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from cvtgs.cameras import Cameras, look_at
-from cvtgs.math.frames import robust_frame
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import SceneLike
 from cvtgs.views.automatic import automatic_views
+from cvtgs.views.positions import CameraPositions, as_positions
 
 NEAR = (0.2, 1.4)
 """Distances of near views, robust radii: some are within the scene."""
 
+_AROUND = (1.1, 3.0)
+_FIELD = 50.0
+_ROOM_FIELD = 65.0
+_AIM = 0.25
+_LEAST_AIM = 0.3
+
 
 def random_views(
-    scene: GaussianScene,
+    scene: SceneLike | CameraPositions,
     count: int,
     *,
     size: int,
     seed: int,
-    reach: tuple[float, float] = (1.1, 3.0),
+    reach: tuple[float, float] = _AROUND,
 ) -> Cameras:
-    """Return cameras at random directions and distances, below the scene and near it too.
+    """Return cameras at random positions from which somebody would look, near ones too.
 
-    A scene optimized on automatic views alone gets worse on all other sides.
+    A scene optimized on automatic views alone gets worse on all other sides. None is beneath a
+    floor or inside matter (:meth:`cvtgs.views.positions.CameraPositions.admit`); where there is
+    no floor, some look from below.
 
     Args:
-        scene: The scene.
+        scene: The scene, or what :func:`find_view_positions` found of it.
         count: Number of views.
         size: Side of the square images, pixels.
         seed: Of the random numbers.
         reach: Smallest and largest distance, robust radii.
 
     Returns:
-        Cameras, float64, in any direction around the middle of the opaque Gaussians. They look at
-        points up to a quarter of a radius from it, with a field of view of 50 degrees.
+        Cameras, float64, upright. They look at points up to a quarter of a radius from the middle,
+        with a field of view of 50 degrees; in a room at any surface, with 65 degrees.
+
+    Raises:
+        InvalidSceneError: The scene has no valid row.
 
     Example:
         >>> from cvtgs.synthetic import scene
         >>> len(random_views(scene("object", 1000), 3, size=64, seed=0))
         3
     """
-    generator = torch.Generator().manual_seed(seed)
-    opaque = scene.opacities > 0.1
-    frame = robust_frame(scene.means[opaque] if bool(opaque.any()) else scene.means)
-    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
-    nearest, farthest = reach
-    steps = torch.rand(count, 1, generator=generator)
-    distances = frame.radius * (nearest + (farthest - nearest) * steps)
-    center = frame.center.cpu()
-    targets = center + 0.25 * frame.radius * (torch.rand(count, 3, generator=generator) - 0.5)
-    up = torch.randn(3, generator=generator).double()
-    focal = 0.5 * size / math.tan(math.radians(25))
+    positions = as_positions(scene)
+    layout = positions.layout
+    eyes = positions.near(count, reach, seed)
+    targets, field = _targets(positions, eyes, seed), _FIELD if layout.room is None else _ROOM_FIELD
+    focal = 0.5 * size / math.tan(math.radians(0.5 * field))
     intrinsics = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
-    eyes = center + distances.double() * directions.double()
     return Cameras(
-        viewmats=look_at(eyes, targets, up),
+        viewmats=look_at(eyes, targets, layout.up),
         Ks=intrinsics.double().repeat(count, 1, 1),
         width=size,
         height=size,
     )
 
 
-def mixed_views(scene: GaussianScene, count: int, *, size: int, seed: int = 0) -> Cameras:
+def _targets(
+    positions: CameraPositions, eyes: Float[Tensor, "c 3"], seed: int
+) -> Float[Tensor, "c 3"]:
+    """Return points near the middle; in a room, points on surfaces that are not too near."""
+    layout = positions.layout
+    center, radius = layout.frame.center, layout.frame.radius
+    generator = torch.Generator().manual_seed(seed + 1)
+    if layout.room is None:
+        return center + _AIM * radius * (torch.rand(len(eyes), 3, generator=generator) - 0.5)
+    points = center + radius * layout.voxels.points
+    far = torch.cdist(eyes, points) > _LEAST_AIM * radius
+    order = torch.rand(far.shape, generator=generator) * far
+    return points[order.argmax(dim=1)]
+
+
+def mixed_views(
+    scene: SceneLike | CameraPositions, count: int, *, size: int, seed: int = 0
+) -> Cameras:
     """Return automatic and random views together.
 
     A quarter are automatic views, a quarter random views from near, within the scene too, and
     half random views from around it.
 
     Args:
-        scene: A scene with at least one valid Gaussian.
+        scene: A scene with at least one valid Gaussian, or what :func:`find_view_positions` found
+            of it.
         count: Number of views, at least 1.
         size: Side of the square images, pixels.
         seed: Of the random numbers.
@@ -86,11 +110,12 @@ def mixed_views(scene: GaussianScene, count: int, *, size: int, seed: int = 0) -
         >>> len(mixed_views(scene("object", 1000), 5, size=64))
         5
     """
+    positions = as_positions(scene)
     usual, near = max(1, count // 4), count // 4
     groups = [
-        automatic_views(scene, usual, width=size, height=size, seed=seed),
-        random_views(scene, near, size=size, seed=seed + 1, reach=NEAR),
-        random_views(scene, max(0, count - usual - near), size=size, seed=seed),
+        automatic_views(positions, usual, width=size, height=size, seed=seed),
+        random_views(positions, near, size=size, seed=seed + 1, reach=NEAR),
+        random_views(positions, max(0, count - usual - near), size=size, seed=seed),
     ]
     return Cameras(
         viewmats=torch.cat([group.viewmats for group in groups]),

@@ -33,19 +33,33 @@ _ALIGNED = 0.85
 _LEAST_SCORE = 0.12
 """Least score of a ground: its share of all voxels, times how round and how wide it is."""
 
-_ONE_SIDED = 0.6
-"""Up is not as usual only if the ground has so much more above it than below."""
+_USUAL = ((0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_USUAL_EVIDENCE = (0.5, 0.3, 0.3)
+"""What captures have as up, and how much that counts beside what the scene shows."""
 
-_TOP_HEAVY = 0.04
-"""Or if what is between floor and ceiling stands this far from the middle, of their distance."""
+_USUAL_BONUS = (1.5, 1.5, 1.25)
+_USUAL_COSINE = 0.85
+_SNAP_COSINE = 0.99  # 8 degrees
 
+_COLUMN = 0.15
+"""Width of the columns whose lowest voxels may be a floor, in robust radii."""
+
+_BARE = 0.25
+"""A column of less than this height shows a floor on which nothing stands."""
+
+_LEVEL = 0.7
+_BENEATH = 3.0
+"""What lies beneath a floor speaks this many times against it."""
+
+_LEAST_FLOOR = 0.25
+"""The least share of all columns that end on a floor."""
+
+_GROWTH_WEIGHT = 0.5
+_MOST_GROWTH = 0.4
 _SKY = 0.12
 """What is far away is a sky if it lies this far above the middle on average, of its distance."""
 
-_USUAL = ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
-_USUAL_BONUS = (1.5, 1.25)
-_USUAL_COSINE = 0.85
-_SNAP_COSINE = 0.9954  # 5.5 degrees
+_SKY_WEIGHT = 0.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,10 +69,12 @@ class Voxels:
     Attributes:
         points: ``(v, 3)`` mean positions, in robust radii from the middle, float64.
         normals: ``(v, 3)`` directions in which the Gaussians there are thinnest, unit length.
+        log_sizes: ``(v,)`` mean log scale of the Gaussians there.
     """
 
     points: Float[Tensor, "v 3"]
     normals: Float[Tensor, "v 3"]
+    log_sizes: Float[Tensor, "v"]
 
 
 def voxelize(scene: GaussianScene, frame: RobustFrame) -> Voxels:
@@ -83,7 +99,19 @@ def voxelize(scene: GaussianScene, frame: RobustFrame) -> Voxels:
     typical = float(divide(amounts.square().sum(), amounts.sum()))
     seen = amounts > min(_OPAQUE, _FAINT_SHARE * typical)
     normals = torch.linalg.eigh(tensors[seen]).eigenvectors[:, :, 2]
-    return Voxels(points=means[seen], normals=normals)
+    log_sizes = part.log_scales.double().mean(dim=1)[order]
+    log_sizes = segment_sum(weights * log_sizes, offsets) / totals
+    return Voxels(points=means[seen], normals=normals, log_sizes=log_sizes[seen])
+
+
+def among_others(points: Float[Tensor, "v 3"]) -> Bool[Tensor, "v"]:
+    """Return which voxels have at least two others within two steps along every axis."""
+    side = round(2 * _EXTENT / VOXEL_SIZE) + 1
+    cells = ((points + _EXTENT) / VOXEL_SIZE).long().clamp(0, side - 1)
+    grid = torch.zeros(1, side, side, side)
+    grid[0].index_put_(tuple(cells.T), torch.ones(len(cells)), accumulate=True)
+    counts = 5**3 * torch.nn.functional.avg_pool3d(grid, 5, stride=1, padding=2)[0]
+    return counts[tuple(cells.T)] > 2.5
 
 
 def _thinnest_axes(scene: GaussianScene) -> Float[Tensor, "n 3"]:
@@ -98,31 +126,97 @@ class _Plane(NamedTuple):
     score: float
 
 
+class Floor(NamedTuple):
+    """The level on which most columns of voxels end.
+
+    Attributes:
+        height: Along up, in robust radii from the middle.
+        share: Share of all columns that end on it, less what lies beneath it.
+        bare: The same of the columns in which nothing stands on it.
+    """
+
+    height: float
+    share: float
+    bare: float
+
+
 def find_up(voxels: Voxels, far: Float[Tensor, "k 3"]) -> Float[Tensor, "3"]:
     """Return the direction that is up, as a unit vector.
 
-    The axis is at right angles to the ground, the plane with the largest area; planes that lie
-    as captures usually have it (y-down, then z-up) are preferred where areas are similar. Up is
-    as captures usually have it, -y or else +z, unless the scene hangs below its ground, or more
-    below a ceiling than on a floor, or the sky is below. Without a ground, up is -y.
+    Both senses of the axes, and of the normal of the largest plane, are compared by what speaks
+    for them: how usual they are in captures (-y most, then +y and +z); a floor that lies bare with
+    nothing beneath it; a large plane; the sky, if what is far away lies on one side. Where no
+    floor lies bare, the sizes of Gaussians count too: captures seldom see a scene from below, and
+    what no image has seen is left with larger Gaussians.
     """
     usual = voxels.points.new_tensor(_USUAL)
     if len(voxels.points) < 8:
         return usual[0]
     voxels = _thinned(voxels)
+    axes = torch.eye(3, dtype=usual.dtype)
+    ups = torch.cat([axes, 0.0 - axes])
     ground = _ground(voxels)
-    if ground is None:
-        return usual[0]
-    axis = _usual_sense(_snapped(ground.normal))
-    at = ground.height * (1.0 if float(axis @ ground.normal) > 0 else -1.0)
-    if len(far) and abs(float((far @ axis).mean())) > _SKY:
-        return axis * torch.sign((far @ axis).mean())
-    return -axis if _is_upside_down(voxels.points @ axis, at) else axis
+    if ground is not None and float((ups @ ground.normal).amax()) < _SNAP_COSINE:
+        ups = torch.cat([ups, ground.normal[None], -ground.normal[None]])
+    evidence = (ups @ usual.T).clamp_min(0).square() * usual.new_tensor(_USUAL_EVIDENCE)
+    bare = usual.new_tensor([_lowest_level(voxels, up).bare for up in ups])
+    scores = evidence.amax(dim=1) + bare
+    if ground is not None:
+        scores += ground.score * ((ups @ ground.normal).abs() > _SNAP_COSINE)
+    growth = (ups @ _growth(voxels)).clamp(-_MOST_GROWTH, _MOST_GROWTH)
+    scores += _GROWTH_WEIGHT * (1 - 3 * bare.amax()).clamp_min(0) * growth
+    if len(far):
+        scores += _SKY_WEIGHT * ((ups @ far.mean(dim=0)) / _SKY).clamp(-1, 1)
+    best: Tensor = ups[scores.argmax()]
+    return best
+
+
+def find_floor(voxels: Voxels, up: Float[Tensor, "3"]) -> float | None:
+    """Return how high the floor lies along ``up``, in robust radii from the middle, if any."""
+    if len(voxels.points) < 8:
+        return None
+    level = _lowest_level(_thinned(voxels), up)
+    return level.height if level.share >= _LEAST_FLOOR else None
+
+
+def _lowest_level(voxels: Voxels, up: Float[Tensor, "3"]) -> Floor:
+    """Return the level on which most columns end that are level where they do."""
+    heights = voxels.points @ up
+    columns = ((voxels.points @ torch.linalg.svd(up[None]).Vh[1:].T) / _COLUMN).floor().long()
+    columns -= columns.amin(dim=0)
+    keys = columns[:, 0] * (int(columns[:, 1].amax()) + 1) + columns[:, 1]
+    numbers, column = torch.unique(keys, return_inverse=True)
+    ends = heights.new_zeros(len(numbers))
+    low = ends.scatter_reduce(0, column, heights, "amin", include_self=False)
+    high = ends.scatter_reduce(0, column, heights, "amax", include_self=False)
+    lowest = heights <= low[column] + _THICKNESS
+    level = (voxels.normals @ up).abs()[lowest]
+    level = ends.scatter_reduce(0, column[lowest], level, "amax", include_self=False)
+    order = torch.sort(low).values
+    counts = torch.searchsorted(order, order + 2 * _THICKNESS) - torch.arange(len(order))
+    height = float(order[counts.argmax()]) + _THICKNESS
+    ending = ((low - height).abs() <= _THICKNESS) & (level > _LEVEL)
+    beneath = float((heights < height - 1.5 * _THICKNESS).double().mean())
+    trust = max(0.0, 1 - _BENEATH * beneath)
+    bare = ending & (high - low < _BARE)
+    return Floor(height, trust * float(ending.double().mean()), trust * float(bare.double().mean()))
+
+
+def _growth(voxels: Voxels) -> Float[Tensor, "3"]:
+    """Return how the sizes of Gaussians fall with each coordinate, as correlations."""
+    sizes = voxels.log_sizes - voxels.log_sizes.mean()
+    points = voxels.points - voxels.points.mean(dim=0)
+    spread = sizes.square().sum().sqrt() * points.square().sum(dim=0).sqrt()
+    return -divide((sizes[:, None] * points).sum(dim=0), spread)
 
 
 def _thinned(voxels: Voxels) -> Voxels:
     step = -(-len(voxels.points) // _MOST_VOXELS)
-    return Voxels(points=voxels.points[::step], normals=voxels.normals[::step])
+    return Voxels(
+        points=voxels.points[::step],
+        normals=voxels.normals[::step],
+        log_sizes=voxels.log_sizes[::step],
+    )
 
 
 def _ground(voxels: Voxels) -> _Plane | None:
@@ -179,35 +273,3 @@ def _bonus(normal: Tensor) -> float:
     cosines = (normal.new_tensor(_USUAL) @ normal).abs().tolist()
     bonuses = zip(cosines, _USUAL_BONUS, strict=True)
     return max([1.0, *(bonus for cosine, bonus in bonuses if cosine > _USUAL_COSINE)])
-
-
-def _usual_sense(axis: Tensor) -> Tensor:
-    """Return the axis or its opposite, whichever captures usually have: -y, else +z."""
-    cosines = axis.new_tensor(_USUAL) @ axis
-    # At right angles to both, either sense is as good: +x.
-    senses = torch.cat([cosines[cosines.abs().argmax()][None], axis[:1]])
-    return axis * torch.sign(senses[senses.abs() > 0][0])
-
-
-def _is_upside_down(heights: Float[Tensor, "v"], ground: float) -> bool:
-    """Return whether there is clear evidence that up is the other way."""
-    low, high = heights.quantile(heights.new_tensor([0.01, 0.99])).tolist()
-    opposite = low if abs(ground - high) < abs(ground - low) else high
-    lid = float(((heights - opposite).abs() < _THICKNESS).double().mean())
-    floor = float(((heights - ground).abs() < _THICKNESS).double().mean())
-    if lid > 0.5 * floor and high - low > 5 * _THICKNESS:
-        between = heights[(heights > low + 2 * _THICKNESS) & (heights < high - 2 * _THICKNESS)]
-        lift = float(between.mean()) - 0.5 * (low + high) if len(between) else 0.0
-        return bool(lift > _TOP_HEAVY * (high - low))
-    above = float((heights > ground + 1.5 * _THICKNESS).double().mean())
-    below = float((heights < ground - 1.5 * _THICKNESS).double().mean())
-    return bool(below - above > _ONE_SIDED * (above + below))
-
-
-def _snapped(normal: Tensor) -> Float[Tensor, "3"]:
-    largest = normal.abs().argmax()
-    if float(normal.abs()[largest]) < _SNAP_COSINE:
-        return torch.nn.functional.normalize(normal, dim=0)
-    axis = torch.zeros_like(normal)
-    axis[largest] = torch.sign(normal[largest])
-    return axis

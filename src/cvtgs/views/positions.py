@@ -1,0 +1,179 @@
+"""Positions from which somebody would look at a scene: above its floor, and not inside matter."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from cvtgs.scene import SceneLike, as_scene
+from cvtgs.views.layout import SceneLayout, find_layout
+from cvtgs.views.room import ENCLOSED, FREE, enclosure, size_growth
+
+REACH = (0.2, 3.0)
+"""Distances of the positions that are tried, in robust radii from the centre of the frame."""
+
+_TRIED = 384
+_SEED = 17
+_ABOVE = 0.1
+"""Least height above a floor, in robust radii."""
+
+_BURIED = 0.75
+"""A position is inside matter if this share of the directions up, and of those down, is hidden."""
+
+_SLACK = 0.25
+"""Growth may be this much less than where it is largest."""
+
+_TOP = 0.98
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CameraPositions:
+    """Where cameras may be.
+
+    Attributes:
+        layout: Of the scene.
+        least_growth: The least mean correlation of sizes with distances of a position.
+        eyes: ``(p, 3)`` positions that were tried and found good, scene units; at least one.
+        distances: ``(p,)`` their distances from the centre of the frame, in robust radii.
+    """
+
+    layout: SceneLayout
+    least_growth: float
+    eyes: Float[Tensor, "p 3"]
+    distances: Float[Tensor, "p"]
+
+    def admit(self, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, "c"]:
+        """Return which of some positions are good.
+
+        Args:
+            eyes: Positions, scene units.
+
+        Returns:
+            A mask. A good position is above the floor, if there is one, and free; it is within
+            the room if the scene is one, else not enclosed; and what is near has smaller
+            Gaussians than what is far, as it has where images were taken.
+        """
+        free = stand_free(self.layout, eyes)
+        rows = free.nonzero()[:, 0]
+        free[rows] = _growths(self.layout, eyes[rows]) >= self.least_growth
+        return free
+
+    def near(self, count: int, reach: tuple[float, float], seed: int) -> Float[Tensor, "c 3"]:
+        """Return positions at random within some distances.
+
+        Args:
+            count: How many.
+            reach: Smallest and largest distance; the nearest to it are taken if none is within.
+            seed: Of the random numbers.
+
+        Returns:
+            Good positions, moved by up to a twentieth of a radius where that stays good.
+        """
+        generator = torch.Generator().manual_seed(seed)
+        low, high = reach
+        beyond = (low - self.distances).clamp_min(self.distances - high).clamp_min(0)
+        within = (beyond <= beyond.amin()).nonzero()[:, 0]
+        picked = within[torch.randint(len(within), (count,), generator=generator)]
+        eyes = self.eyes[picked]
+        shifts = 0.1 * self.layout.frame.radius * (torch.rand(count, 3, generator=generator) - 0.5)
+        moved = eyes + shifts
+        return torch.where(self.admit(moved)[:, None], moved, eyes)
+
+
+def find_view_positions(scene: SceneLike) -> CameraPositions:
+    """Find where cameras may be, once for many sets of views.
+
+    Args:
+        scene: A scene with at least one valid Gaussian, or a file or folder of one.
+
+    Returns:
+        The positions, which functions of views take instead of a scene; if none that was tried is
+        good, one that is above the floor.
+
+    Raises:
+        InvalidSceneError: The scene has no valid row.
+
+    Example:
+        >>> from cvtgs.synthetic import scene
+        >>> positions = find_view_positions(scene("object", 1000))
+        >>> len(positions.near(3, REACH, seed=0))
+        3
+    """
+    layout = find_layout(as_scene(scene))
+    generator = torch.Generator().manual_seed(_SEED)
+    directions = torch.nn.functional.normalize(
+        torch.randn(_TRIED, 3, generator=generator, dtype=torch.float64), dim=1
+    )
+    steps = torch.rand(_TRIED, 1, generator=generator, dtype=torch.float64)
+    low, high = REACH
+    radius, center = layout.frame.radius, layout.frame.center
+    eyes = lifted(layout, center + radius * (low + (high - low) * steps) * directions)
+    free = stand_free(layout, eyes)
+    eyes = eyes[free] if bool(free.any()) else eyes[:1]
+    growths = _growths(layout, eyes)
+    least = float(growths.quantile(_TOP)) - _SLACK
+    eyes = eyes[growths >= least]
+    distances = torch.linalg.vector_norm(eyes - center, dim=1) / radius
+    return CameraPositions(layout=layout, least_growth=least, eyes=eyes, distances=distances)
+
+
+def as_positions(scene: SceneLike | CameraPositions) -> CameraPositions:
+    """Return positions that were found before, or find those of a scene.
+
+    Args:
+        scene: A scene, a file or folder of one, or what was found of it.
+
+    Returns:
+        The positions.
+    """
+    return scene if isinstance(scene, CameraPositions) else find_view_positions(scene)
+
+
+def lifted(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Float[Tensor, "c 3"]:
+    """Return positions with those beneath the floor mirrored at what is just above it.
+
+    Args:
+        layout: Of the scene.
+        eyes: Positions, scene units.
+
+    Returns:
+        Positions of which none is beneath the floor; the same if there is no floor.
+    """
+    if layout.floor is None:
+        return eyes
+    least = layout.floor + _ABOVE * layout.frame.radius
+    lacking = (least - eyes @ layout.up).clamp_min(0)
+    return eyes + (2 * lacking + 1e-9 * layout.frame.radius * (lacking > 0))[:, None] * layout.up
+
+
+def stand_free(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, "c"]:
+    """Return which positions are above the floor, free, and not inside matter.
+
+    Args:
+        layout: Of the scene.
+        eyes: Positions, scene units.
+
+    Returns:
+        A mask.
+    """
+    radius, points = layout.frame.radius, layout.voxels.points
+    free = torch.ones(len(eyes), dtype=torch.bool)
+    if layout.floor is not None:
+        free &= eyes @ layout.up >= layout.floor + _ABOVE * radius
+    if len(points) == 0:
+        return free
+    local = (eyes - layout.frame.center) / radius
+    free &= torch.cdist(local, points).amin(dim=1) >= FREE
+    for row in free.nonzero()[:, 0].tolist():
+        above = enclosure(local[row], points, layout.up)
+        if layout.room is not None:
+            free[row] = above >= ENCLOSED
+        elif above >= _BURIED:
+            free[row] = enclosure(local[row], points, -layout.up) < _BURIED
+    return free
+
+
+def _growths(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Float[Tensor, "c"]:
+    growths = [size_growth(layout.sized, eye, layout.frame.radius) for eye in eyes]
+    return torch.tensor(growths, dtype=torch.float64)

@@ -1,0 +1,137 @@
+"""Where cameras may be: above a floor, in a room, where images were taken, not inside matter."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+import cvtgs
+from cvtgs.math import parameters
+from cvtgs.refinement.images import generated_views
+from cvtgs.views import automatic_views, find_view_positions, mixed_views, random_views
+from cvtgs.views.layout import find_layout
+from cvtgs.views.mixed import NEAR
+
+HALF = math.sqrt(0.5)
+CONVENTIONS = {
+    "y-down": (1.0, 0.0, 0.0, 0.0),
+    "y-up": (0.0, 1.0, 0.0, 0.0),
+    "z-up": (HALF, -HALF, 0.0, 0.0),
+}
+DOWN = torch.tensor([0.0, 1.0, 0.0])
+
+
+def turned(kind: str, quat: tuple[float, ...]) -> cvtgs.GaussianScene:
+    scene = cvtgs.synthetic.scene(kind, 4000, sh_degree=0, seed=1)
+    matrix = parameters.quats_to_matrices(torch.tensor([quat]))[0]
+    frames = parameters.quats_to_matrices(parameters.normalize_quats(scene.quats))
+    tensors = {
+        "means": scene.means @ matrix.T,
+        "quats": parameters.matrices_to_quats(matrix @ frames),
+    }
+    return scene.with_tensors(tensors, {})
+
+
+def blobs(means: Tensor, log_scales: Tensor) -> cvtgs.GaussianScene:
+    """Return grey, nearly opaque, round Gaussians."""
+    count = len(means)
+    return cvtgs.from_dict(
+        {
+            "means": means.float(),
+            "scales": log_scales.float()[:, None].expand(count, 3),
+            "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(count, 4),
+            "opacities": torch.full((count,), 4.0),
+            "sh0": torch.zeros(count, 1, 3),
+            "shN": torch.zeros(count, 0, 3),
+        }
+    )
+
+
+def sphere(count: int, radius: float = 1.0) -> Tensor:
+    points = torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    return radius * torch.nn.functional.normalize(points, dim=1)
+
+
+@pytest.mark.parametrize("kind", ["object", "courtyard"])
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_no_view_is_beneath_the_floor(kind, convention):
+    scene = turned(kind, CONVENTIONS[convention])
+    matrix = parameters.quats_to_matrices(torch.tensor([CONVENTIONS[convention]]))[0]
+    up = -(matrix @ DOWN).double()
+    heights = scene.means.double() @ up
+    floor = float(heights.quantile(0.1))
+    positions = find_view_positions(scene)
+    assert float(positions.layout.up @ up) > 0.99
+    refined = generated_views(scene, config=cvtgs.SimplifyConfig().refine, seed=0)
+    for cameras in (
+        automatic_views(positions, 8, width=32, height=32),
+        random_views(positions, 24, size=32, seed=0),
+        random_views(positions, 24, size=32, seed=1, reach=NEAR),
+        mixed_views(positions, 16, size=32),
+        *refined.heldout,
+        *(next(refined.training) for _ in range(4)),
+    ):
+        assert float((cameras.centers @ up).amin()) > floor
+        assert float((-cameras.viewmats[:, 1, :3] @ up).amin()) > 0, "images are upright"
+
+
+def test_a_scene_without_a_floor_has_none_and_is_seen_from_all_sides():
+    scene = blobs(sphere(4000), torch.full((4000,), math.log(0.05)))
+    positions = find_view_positions(scene)
+    assert positions.layout.floor is None
+    eyes = random_views(positions, 64, size=32, seed=0).centers
+    for axis in range(3):
+        assert float(eyes[:, axis].amin()) < -1
+        assert float(eyes[:, axis].amax()) > 1
+
+
+def test_no_view_is_inside_a_closed_surface():
+    scene = blobs(sphere(4000), torch.full((4000,), math.log(0.05)))
+    positions = find_view_positions(scene)
+    near = random_views(positions, 64, size=32, seed=0, reach=NEAR)
+    assert float(torch.linalg.vector_norm(near.centers, dim=1).amin()) > 1
+    assert not bool(positions.admit(torch.zeros(1, 3, dtype=torch.float64)).any())
+
+
+def test_views_of_a_room_are_inside_of_it():
+    scene = turned("room", CONVENTIONS["y-down"])
+    layout = find_layout(scene)
+    low, high = scene.means.double().quantile(torch.tensor([0.02, 0.98]).double(), dim=0)
+    assert layout.room is not None
+    for cameras in (
+        mixed_views(scene, 16, size=32),
+        random_views(scene, 24, size=32, seed=3),
+        automatic_views(scene, 4, width=32, height=32),
+    ):
+        assert bool(((cameras.centers > low) & (cameras.centers < high)).all())
+
+
+def test_a_wall_that_was_seen_from_one_side_is_looked_at_from_there():
+    """Behind what images show, where none was taken, Gaussians are larger."""
+    generator = torch.Generator().manual_seed(0)
+    means = 2 * torch.rand(6000, 3, generator=generator) - 1
+    means[:, 2] = 0.4 * means[:, 2].abs()
+    scene = blobs(means, math.log(0.02) + 5.0 * means[:, 2])
+    eyes = random_views(scene, 48, size=32, seed=0).centers
+    assert float((eyes[:, 2] < 0).double().mean()) > 0.9
+
+
+def test_same_scene_same_positions():
+    scene = turned("courtyard", CONVENTIONS["y-down"])
+    one, two = (find_view_positions(scene) for _ in range(2))
+    assert torch.equal(one.eyes, two.eyes)
+    views = mixed_views(one, 6, size=32, seed=2).viewmats
+    assert torch.equal(views, mixed_views(scene, 6, size=32, seed=2).viewmats)
+
+
+def test_views_do_not_cut_off_the_top():
+    """A thin rod on a ball: 1 % of all voxels, and as tall as the ball."""
+    rod = torch.stack([torch.zeros(60), -torch.linspace(1, 3, 60), torch.zeros(60)], dim=1)
+    means = torch.cat([sphere(4000), rod])
+    scene = blobs(means, torch.full((4060,), math.log(0.05)))
+    cameras = automatic_views(scene, 6, width=100, height=100)
+    tip = torch.tensor([0.0, -2.9, 0.0, 1.0], dtype=torch.float64)
+    x, y, z = (cameras.Ks @ (cameras.viewmats @ tip)[:, :3, None])[:, :, 0].unbind(1)
+    assert bool((z > 0).all())
+    assert bool(((x / z > 0) & (x / z < 100) & (y / z > 0) & (y / z < 100)).all())
