@@ -96,7 +96,9 @@ STAGES = {
     },
     "views": {
         "CameraPositions",
+        "OwnCameras",
         "automatic_views",
+        "find_own_cameras",
         "find_view_positions",
         "mixed_views",
         "random_views",

@@ -268,6 +268,7 @@ class Prepared:
             checkpoint="none" if self._checkpoint is None else self._checkpoint.name,
             device=str(self._device),
             device_note=self._note,
+            views=self._views(),
             plan=analysis.plan,
             matching=reduced.matching,
             stages=tuple(clock.costs),
@@ -279,6 +280,12 @@ class Prepared:
         if not self._config.refine.enabled or len(small) == len(scene):
             return result
         return self._refine(result, analysis)
+
+    def _views(self) -> str:
+        """Return where images are rendered from."""
+        if not (self._config.uses_renders or self._config.refine.enabled):
+            return "none"
+        return "found" if self._cameras is None else f"{len(self._cameras)} cameras"
 
     def _refine(self, result: Simplified, analysis: SceneAnalysis) -> Simplified:
         from cvtgs.refinement import join_reports, refine  # noqa: PLC0415 (most never need it)

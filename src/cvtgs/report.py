@@ -113,6 +113,8 @@ class SimplifyReport(CellStatistics):
         device: Where it ran.
         device_note: Why it ran elsewhere, or in short chunks: the memory of the chosen device ran
             out; else empty.
+        views: Where images of the scene were rendered from: ``N cameras`` that were given or lay
+            beside it, ``found`` by cvtgs, or ``none`` without images.
         plan: The effects that the scene called for.
         stages: What each stage cost.
         matching: What matching to images of the scene gained; None if there was none.
@@ -135,6 +137,7 @@ class SimplifyReport(CellStatistics):
     checkpoint: str = "none"
     device: str = "cpu"
     device_note: str = ""
+    views: str = "none"
     plan: EffectPlan | None = None
     stages: tuple[StageCost, ...] = ()
     matching: MatchReport | None = None

@@ -16,6 +16,7 @@ from cvtgs.prepared import Prepared
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
+from cvtgs.views import find_own_cameras
 
 
 class Simplifier:
@@ -160,7 +161,8 @@ class Simplifier:
         Args:
             scene: The scene, which is not changed, and must not be while this is used; or a
                 file or folder of one.
-            cameras: Cameras for presets that render the scene; None finds views.
+            cameras: Cameras for presets that render the scene; None takes those that lie beside
+                a file or in a folder (:func:`cvtgs.views.find_own_cameras`), or finds views.
 
         Returns:
             The prepared scene.
@@ -171,8 +173,13 @@ class Simplifier:
             >>> [len(prepared.run(count=count).scene) for count in (10, 20)]
             [10, 20]
         """
+        full = as_scene(scene)
+        renders = self.config.uses_renders or self.config.refine.enabled
+        if cameras is None and renders and not isinstance(scene, GaussianScene):
+            own = find_own_cameras(full, scene)
+            cameras = None if own is None else own.cameras
         return Prepared(
-            as_scene(scene),
+            full,
             self.config,
             checkpoint=self.checkpoint,
             device=self._device,

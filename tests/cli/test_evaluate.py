@@ -110,7 +110,7 @@ def test_render_writes_a_png_per_view(scenes, tmp_path, capsys):
     words = ["render", scenes[0], "-o", str(tmp_path / "new"), *SMALL]
     assert main([*words, "--background", "0,0,1"]) == 0
     names = sorted(path.name for path in (tmp_path / "new").iterdir())
-    assert names == ["view_1.png", "view_2.png"]
+    assert names == ["0.png", "4.png"], "the cameras that lie beside the scene"
     assert "2 images of 48 x 36 pixels" in capsys.readouterr().out
     assert main(words) == 1
     assert "--overwrite" in capsys.readouterr().err

@@ -93,6 +93,9 @@ def levels(options: argparse.Namespace) -> None:
         if options.sh_degree is not None:
             scene = scene.with_sh_degree(options.sh_degree)
         cameras = None if options.cameras is None else cvtgs.load_cameras(options.cameras)
+        if cameras is None and axes.source is None:
+            own = cvtgs.views.find_own_cameras(scene, options.input)
+            cameras = None if own is None else own.cameras
         made = simplifier.levels(scene, rhos, cameras=cameras)
         if options.stream is not None:
             _write_stream(options, made, axes, listener)

@@ -243,8 +243,9 @@ def choose_cameras(
         cameras = cameras.spread(options.views or most or len(cameras))
         return cameras if options.size is None else cameras.fitted(size)
     path = options.reference if "reference" in options else options.input
-    if (path / "cameras.json").is_file():  # beside a scene, as INRIA's code writes them
-        return cvtgs.load_cameras(path / "cameras.json").spread(views).fitted(size)
+    own = cvtgs.views.find_own_cameras(scene, path)
+    if own is not None:
+        return own.cameras.spread(views).fitted(size)
     height = max(1, round(0.75 * size))
     return cvtgs.views.automatic_views(scene, views, width=size, height=height)
 

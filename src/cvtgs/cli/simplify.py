@@ -218,6 +218,11 @@ def _simplify_in_memory(
         chosen = choose_preset(options, scene, settings, listener)
         config = cvtgs.SimplifyConfig.compose(preset=chosen.name, settings=settings)
         notes.append(chosen.reason)
+    if cameras is None and (config.uses_renders or config.refine.enabled):
+        own = cvtgs.views.find_own_cameras(scene, options.input)
+        if own is not None and axes.source is None:
+            cameras = own.cameras
+            notes.append(f"Rendered from the {len(cameras)} cameras of {own.source}.")
     search = _has_target(options)
     simplifier = cvtgs.Simplifier(
         checkpoint, config=config, device=options.device, listener=silent if search else listener

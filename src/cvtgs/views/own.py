@@ -1,0 +1,92 @@
+"""The cameras of a capture, where the folder of its model has them."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from cvtgs.cameras import Cameras
+from cvtgs.errors import CvtgsError
+from cvtgs.io import load_cameras, scene_file
+from cvtgs.scene import GaussianScene
+
+_LEAST_SEEN = 0.01
+"""A camera looks at a scene if it has so much of what is visible in its image."""
+
+_LEAST_LOOKING = 0.5
+_MOST_POINTS = 2000
+_VISIBLE = 0.1
+
+
+class OwnCameras(NamedTuple):
+    """Cameras of a capture, and the file or folder that holds them."""
+
+    cameras: Cameras
+    source: Path
+
+
+def find_own_cameras(scene: GaussianScene, path: str | os.PathLike[str]) -> OwnCameras | None:
+    """Read the cameras that lie beside a scene, if they look at it.
+
+    The folder of the model is searched, of INRIA's layout the one above ``point_cloud``, then the
+    folder of the file, for what :func:`cvtgs.io.load_cameras` reads. Cameras that are in another
+    world than the scene, as those of captures that were moved or scaled since, are left out: at
+    least half of them must have a hundredth of the scene in their images.
+
+    Args:
+        scene: The scene, as it was read.
+        path: The file or the folder it was read from.
+
+    Returns:
+        The cameras, at least two; None if there are none, or none that fit.
+
+    Example:
+        >>> import tempfile
+        >>> from cvtgs.synthetic import scene as make
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     print(find_own_cameras(make("object", 100), Path(folder) / "scene.ply"))
+        None
+    """
+    place = Path(path)
+    for source in _sources(place) if place.exists() else ():
+        try:
+            cameras = load_cameras(source)
+        except CvtgsError:
+            continue
+        looking = float(_looking(cameras, scene).double().mean())
+        if len(cameras) > 1 and looking >= _LEAST_LOOKING:
+            return OwnCameras(cameras, source)
+    return None
+
+
+def _sources(path: Path) -> Iterator[Path]:
+    """Return where cameras may be: files of INRIA's code first, which are in the scene's world."""
+    file = scene_file(path)
+    folders = [path] if path.is_dir() else []
+    if file.parent.parent.name == "point_cloud":
+        folders.append(file.parent.parent.parent)
+    folders.append(file.parent)
+    for folder in dict.fromkeys(folders):
+        if (folder / "cameras.json").is_file():
+            yield folder / "cameras.json"
+        yield folder
+
+
+def _looking(cameras: Cameras, scene: GaussianScene) -> Bool[Tensor, "c"]:
+    """Return which cameras have enough of the visible Gaussians in their images."""
+    rows = (scene.opacities > _VISIBLE).nonzero()[:, 0]
+    rows = rows[:: max(1, -(-len(rows) // _MOST_POINTS))]
+    points = scene.means[rows].double().cpu()
+    points = points[torch.isfinite(points).all(dim=1)]
+    if len(points) == 0:
+        return torch.zeros(len(cameras), dtype=torch.bool)
+    viewmats, intrinsics = cameras.viewmats.double().cpu(), cameras.Ks.double().cpu()
+    local = points @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
+    x, y, z = (local @ intrinsics.transpose(1, 2)).unbind(2)
+    inside = (z > 0) & (x > 0) & (x < cameras.width * z) & (y > 0) & (y < cameras.height * z)
+    seen: Tensor = inside.double().mean(dim=1) >= _LEAST_SEEN
+    return seen

@@ -1,0 +1,100 @@
+"""The cameras of a capture are found beside its scene, and used where they look at it."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs.cli.main import main
+from cvtgs.views import automatic_views, find_own_cameras
+
+
+@pytest.fixture
+def scene() -> cvtgs.GaussianScene:
+    return cvtgs.synthetic.scene("object", 600, sh_degree=0, seed=1)
+
+
+def write_inria(path: Path, cameras: cvtgs.Cameras) -> None:
+    """Write cameras as INRIA's code does: positions, and rotations from camera to world."""
+    entries = [
+        {
+            "id": row, "img_name": f"{row:05}", "width": cameras.width, "height": cameras.height,
+            "fx": float(cameras.Ks[row, 0, 0]), "fy": float(cameras.Ks[row, 1, 1]),
+            "position": cameras.centers[row].tolist(),
+            "rotation": cameras.viewmats[row, :3, :3].T.tolist(),
+        }
+        for row in range(len(cameras))
+    ]  # fmt: skip
+    path.write_text(json.dumps(entries))
+
+
+def write_transforms(path: Path, cameras: cvtgs.Cameras) -> None:
+    """Write cameras as NeRF does: camera to world, OpenGL axes."""
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    poses = torch.linalg.inv(cameras.viewmats.double()) @ flip
+    frames = [
+        {"file_path": f"{row:05}.png", "transform_matrix": pose.tolist()}
+        for row, pose in enumerate(poses)
+    ]
+    focal = float(cameras.Ks[0, 0, 0])
+    document = {"w": cameras.width, "h": cameras.height, "fl_x": focal, "frames": frames}
+    path.write_text(json.dumps(document))
+
+
+def model_of(folder: Path, scene: cvtgs.GaussianScene) -> Path:
+    """Write a model as INRIA's code lays it out, and return its PLY."""
+    file = folder / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    file.parent.mkdir(parents=True)
+    cvtgs.save(scene, file)
+    return file
+
+
+def test_cameras_of_a_model_are_found_from_its_folder_and_its_file(tmp_path, scene):
+    file = model_of(tmp_path, scene)
+    assert find_own_cameras(scene, tmp_path) is None
+    cameras = automatic_views(scene, 5, width=64, height=48)
+    write_inria(tmp_path / "cameras.json", cameras)
+    for path in (tmp_path, str(tmp_path), file):
+        own = find_own_cameras(scene, path)
+        assert own is not None
+        assert own.source == tmp_path / "cameras.json"
+        torch.testing.assert_close(own.cameras.centers.double(), cameras.centers, atol=1e-4, rtol=0)
+
+
+def test_cameras_beside_a_file_are_found(tmp_path, scene):
+    cvtgs.save(scene, tmp_path / "scene.ply")
+    write_transforms(tmp_path / "transforms.json", automatic_views(scene, 3, width=64, height=48))
+    own = find_own_cameras(scene, tmp_path / "scene.ply")
+    assert own is not None
+    assert (len(own.cameras), own.source) == (3, tmp_path)
+
+
+def test_cameras_of_another_world_damaged_ones_and_a_single_one_are_not_taken(tmp_path, scene):
+    file = model_of(tmp_path, scene)
+    cameras = automatic_views(scene, 4, width=64, height=48)
+    moved = cameras.viewmats.clone()
+    moved[:, :3, 3] += torch.tensor([50.0, 0.0, 0.0])
+    path = tmp_path / "cameras.json"
+    write_inria(path, cvtgs.Cameras(viewmats=moved, Ks=cameras.Ks, width=64, height=48))
+    assert find_own_cameras(scene, file) is None
+    path.write_text("[{")
+    assert find_own_cameras(scene, file) is None
+    write_inria(path, cameras.select(torch.tensor([0])))
+    assert find_own_cameras(scene, file) is None
+    assert find_own_cameras(scene, tmp_path / "nowhere.ply") is None
+
+
+def test_a_preset_that_renders_uses_them_and_the_report_says_so(tmp_path, scene, capsys):
+    file = model_of(tmp_path, scene)
+    write_inria(tmp_path / "cameras.json", automatic_views(scene, 5, width=48, height=48))
+    config = cvtgs.SimplifyConfig.compose(settings={"visibility.views": "4"})
+    simplifier = cvtgs.Simplifier(None, config=config, device="cpu")
+    assert simplifier.prepare(file).run(count=20).report.views == "5 cameras"
+    assert simplifier.prepare(scene).run(count=20).report.views == "found"
+    plain = cvtgs.Simplifier(None, config=cvtgs.SimplifyConfig(), device="cpu")
+    assert plain.prepare(file).run(count=20).report.views == "none"
+    words = ["simplify", str(file), str(tmp_path / "small.ply"), "--count", "20", "--ckpt", "none"]
+    assert main([*words, "--set", "visibility.views=4"]) == 0
+    assert "5 cameras of" in " ".join(capsys.readouterr().out.split())
