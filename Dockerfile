@@ -6,7 +6,7 @@ WORKDIR /src
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY src src
 RUN python -m pip install --no-cache-dir --extra-index-url https://download.pytorch.org/whl/cpu \
-        -c constraints.txt ".[numba,plots]" \
+        -c constraints.txt ".[plots]" \
     && rm -rf /src
 
 # Any user may run it: caches of numba and matplotlib and the measured speed of the machine.

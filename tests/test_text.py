@@ -78,7 +78,8 @@ def test_nothing_reaches_the_terminal_raw(
     write_hostile(path)
     if command == "wrong":
         path.write_bytes(b"no ply")
-    words = ["convert", str(path), str(tmp_path / "b.spz")] if command == "convert" else []
+    output = tmp_path / f"b{CLEAR}.spz"
+    words = ["convert", str(path), str(output)] if command == "convert" else []
     main(words or ["info", str(path)])
     printed = capsys.readouterr()
     text = printed.out + printed.err

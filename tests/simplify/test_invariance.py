@@ -153,15 +153,6 @@ def test_the_seed_matters_where_seeds_are_drawn():
         assert same_bits(first, second) is equal
 
 
-def test_both_backends_give_the_same_gaussians():
-    scene = random_scene(900, degree=1)
-    first, second = (
-        simplified(scene, SimplifyConfig.from_mapping({"cvt": {"backend": name}}), 0.1)
-        for name in ("scipy", "torch")
-    )
-    assert_same_gaussians(first, second, tolerance=1e-6)
-
-
 def test_the_input_is_not_changed():
     scene = random_scene(300)
     before = scene.select(torch.arange(300))
