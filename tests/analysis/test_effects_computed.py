@@ -7,9 +7,8 @@ import pytest
 import torch
 
 import cvtgs
-from cvtgs import GaussianScene, Simplifier, SimplifyConfig, filters, pipeline, simplifier
+from cvtgs import GaussianScene, Simplifier, SimplifyConfig, filters, pipeline
 from cvtgs.cells import features
-from cvtgs.cvt import nearest
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.mergenet import MergeNet
@@ -176,9 +175,10 @@ def test_duplicates_are_searched_once(monkeypatch):
     """And the result is the same, also where there are more cells than places."""
     scene = random_scene(300).select(torch.arange(300).repeat(3))
     searched = []
-    original = nearest.nearest_scipy
+    home = import_module("cvtgs.cvt.tessellate")
+    original = home.nearest_scipy
     monkeypatch.setattr(
-        nearest,
+        home,
         "nearest_scipy",
         lambda points, sites: searched.append(len(points)) or original(points, sites),
     )
@@ -214,7 +214,7 @@ def test_columns_only_where_there_are_some():
 
 
 def test_no_image_is_taken_unless_the_preset_asks(monkeypatch):
-    monkeypatch.setattr(simplifier, "measure_visibility", refuse)
+    monkeypatch.setattr("cvtgs.prepared.measure_visibility", refuse)
     scene = random_scene(100)
     run_with(scene)
     run_with(scene, visibility={"views": 4}, effects={"visibility": "off"})

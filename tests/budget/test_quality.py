@@ -129,7 +129,7 @@ def test_the_scene_is_looked_at_once(full, views, simplifier, monkeypatch):
         looks.append(len(scene))
         return analyze(scene, *arguments, **choices)
 
-    monkeypatch.setattr("cvtgs.simplifier.analyze", counting)
+    monkeypatch.setattr("cvtgs.prepared.analyze", counting)
     found = find_count(full, psnr=22.0, simplifier=simplifier, heldout=views)
     assert looks == [len(full)]
     assert len(found.tried) > 2

@@ -23,8 +23,6 @@ from hard_cases import CASES, each_case
 from hard_scenes import DEVICES, PRESETS, dtypes, valid_case
 
 COUNT = 60
-SEARCHES = {"scipy": nearest_scipy}
-searches = pytest.mark.parametrize("search", SEARCHES.values(), ids=SEARCHES)
 
 
 def squared_distances(points, sites):
@@ -45,9 +43,8 @@ def test_each_case(make, dtype, subtests):
             with subtests.test("cells have members, energies fall", device=device, preset=preset):
                 check_that_cells_have_members_and_energies_fall(scene.to(device), preset)
     points = embed(scene.means, frame=robust_frame(scene.means))
-    for name, search in SEARCHES.items():
-        with subtests.test("the nearest site is the nearest", search=name):
-            check_that_the_nearest_site_is_the_nearest(points, search)
+    with subtests.test("the nearest site is the nearest"):
+        check_that_the_nearest_site_is_the_nearest(points)
     with subtests.test("neighbours are the nearest others"):
         check_that_neighbours_are_the_nearest_others(points)
 
@@ -79,20 +76,19 @@ def check_that_cells_have_members_and_energies_fall(scene, preset):
     weights = weights if float(weights.amax()) > 0 else torch.ones_like(weights)
     weights = weights / weights.amax()
     rounding = 1e-12 * float((weights * points.square().sum(dim=1)).sum())
-    for backend in ("auto", "torch"):
-        config = SimplifyConfig.from_mapping({"preset": preset, "cvt": {"backend": backend}}).cvt
-        for count in sorted({1, max(1, len(scene) // 3), max(1, len(scene) - 1), len(scene)}):
-            found = tessellate(points, weights, count, config=config)
-            assert torch.bincount(found.labels, minlength=count).amin() >= 1
-            assert len(found.sites) == count
-            assert bool(found.sites.isfinite().all())
-            energies = [*found.energies, found.energy]
-            assert all(after <= before + rounding for before, after in pairwise(energies))
+    config = SimplifyConfig.from_preset(preset).cvt
+    for count in sorted({1, max(1, len(scene) // 3), max(1, len(scene) - 1), len(scene)}):
+        found = tessellate(points, weights, count, config=config)
+        assert torch.bincount(found.labels, minlength=count).amin() >= 1
+        assert len(found.sites) == count
+        assert bool(found.sites.isfinite().all())
+        energies = [*found.energies, found.energy]
+        assert all(after <= before + rounding for before, after in pairwise(energies))
 
 
-def check_that_the_nearest_site_is_the_nearest(points, search):
+def check_that_the_nearest_site_is_the_nearest(points):
     sites = points[::3]
-    labels, squared = search(points, sites)
+    labels, squared = nearest_scipy(points, sites)
     every = squared_distances(points, sites)
     own = every[np.arange(len(points)), labels.numpy()]
     np.testing.assert_allclose(own, every.min(axis=1), rtol=1e-12, atol=0)
@@ -111,23 +107,15 @@ def check_that_neighbours_are_the_nearest_others(sites):
     np.testing.assert_allclose(own, wanted, rtol=1e-9, atol=0)
 
 
-@searches
-def test_coincident_sites_are_searched_once(search, monkeypatch):
+def test_coincident_sites_are_searched_once(monkeypatch):
     """A tree cannot part them, and would compare every point with every site."""
     sites = torch.tensor([[1.0, 2.0, 3.0]]).repeat(1000, 1)
     sites[700] = 0.0
-    seen = []
-    for module, name in (("nearest", "build_tree"), ("nearest", "_nearest_of_blocks")):
-        home = import_module(f"cvtgs.cvt.{module}")
-        honest = getattr(home, name)
-
-        def spy(*args, honest=honest):
-            seen.append(len(args[0]) if len(args) == 1 else len(args[1]))
-            return honest(*args)
-
-        monkeypatch.setattr(home, name, spy)
-    labels, squared = search(sites, sites)
-    assert seen == [2 if search is nearest_scipy else 1]  # sites, or blocks of sites
+    home, seen = import_module("cvtgs.cvt.nearest"), []
+    honest = home.build_tree
+    monkeypatch.setattr(home, "build_tree", lambda sites: seen.append(len(sites)) or honest(sites))
+    labels, squared = nearest_scipy(sites, sites)
+    assert seen == [2]
     assert labels.tolist() == [700 if row == 700 else 0 for row in range(1000)]
     assert not bool(squared.any())
 

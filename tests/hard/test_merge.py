@@ -10,6 +10,7 @@ import oracles
 from cvtgs import render
 from cvtgs.cells import Partition, merge_cells
 from cvtgs.config import SimplifyConfig
+from cvtgs.mergenet.known import summarize
 from hard_cases import CASES, each_case
 from hard_scenes import DEVICES, PRESETS, dtypes, simplifier, valid_case
 from mergenet_cases import Case, case_of, features_of, lively_net
@@ -157,8 +158,8 @@ def check_that_corrected_cells_are_finite_and_near_the_reference(case, net):
     change = (small.logit_opacities - case.merged.logit_opacities)[several].abs()
     assert several.sum() == 0 or float(growth.amax()) <= limit + 1e-4
     assert several.sum() == 0 or float(change.amax()) <= 2 + 1e-4
-    if len(case.scene) > 3 and case.scene.dtype == torch.float64:
-        assert float(growth.amax()) > 1e-6
+    if bool((net.known(summarize(case.describe())) > 0.1).any()) and len(case.scene) > 3:
+        assert float(growth.amax()) > 1e-6 or case.scene.dtype == torch.float32
 
 
 def check_that_gradients_are_finite(case, net):

@@ -266,6 +266,6 @@ def test_unknown_suffix(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError) as caught:
         save(make_scene(), tmp_path / "s.ckpt")
     assert str(caught.value) == (
-        f"{tmp_path}/s.ckpt: the file name must end in .compressed.ply, .ply, .spz, .splat or "
-        f".sog, found the suffix '.ckpt'."
+        f"{tmp_path}/s.ckpt: the file name must end in .compressed.ply, .ply, .spz, .splat, .sog, "
+        f".spz.glb, .glb or .gltf, found the suffix '.ckpt'."
     )

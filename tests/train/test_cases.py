@@ -198,7 +198,8 @@ def test_random_views_look_at_the_middle_from_around():
     assert 1.1 <= float(distances.amin()) < 1.4
     assert 2.6 < float(distances.amax()) <= 3.0 + 1e-4
     assert float(steps.amin(dim=0).amax()) < -1
-    assert float(steps.amax(dim=0).amin()) > 1
+    around = sorted(steps.amax(dim=0).tolist())
+    assert around[1] > 1  # the views do not look from under the ground
     forward = cameras.viewmats[:, 2, :3]
     # The target is within a quarter of a radius (a box of that side) around the middle.
     off = steps - (steps * forward).sum(dim=1, keepdim=True) * forward
@@ -219,5 +220,5 @@ def test_how_far_away_random_views_are():
     cameras = random_views(scene, 60, size=100, seed=0, reach=(0.2, 1.4))
     steps = (cameras.centers - frame.center.float()) / float(frame.radius)
     distances = torch.linalg.vector_norm(steps, dim=1)
-    assert 0.2 - 1e-4 <= float(distances.amin()) < 0.4
-    assert 1.2 < float(distances.amax()) <= 1.4 + 1e-4
+    assert 0.2 - 1e-4 <= float(distances.amin()) < 0.5
+    assert 1.2 < float(distances.amax()) < 1.5  # some are raised above the ground

@@ -141,9 +141,9 @@ def match_opacities(
         >>> scene = make("object", 200, sh_degree=0, seed=0)
         >>> views = automatic_views(scene, 2, width=32, height=32)
         >>> wanted = 0.5 * contributions(scene, views)
-        >>> config = MatchConfig(opacity_rounds=4)
+        >>> config = MatchConfig(opacity_rounds=8)
         >>> found = match_opacities(scene, views, wanted, config=config)
-        >>> bool((contributions(found, views) / wanted).nanmedian() < 1.2)
+        >>> bool(contributions(found, views).sum() < 1.2 * wanted.sum())
         True
     """
     for _ in range(config.opacity_rounds):

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import CvtgsError
-from cvtgs.io import load_cameras, scene_file
 from cvtgs.scene import GaussianScene
 
 _LEAST_SEEN = 0.01
@@ -51,6 +50,8 @@ def find_own_cameras(scene: GaussianScene, path: str | os.PathLike[str]) -> OwnC
         ...     print(find_own_cameras(make("object", 100), Path(folder) / "scene.ply"))
         None
     """
+    from cvtgs.io import load_cameras  # noqa: PLC0415 (a scene in memory needs no formats)
+
     place = Path(path)
     for source in _sources(place) if place.exists() else ():
         try:
@@ -65,6 +66,8 @@ def find_own_cameras(scene: GaussianScene, path: str | os.PathLike[str]) -> OwnC
 
 def _sources(path: Path) -> Iterator[Path]:
     """Return where cameras may be: files of INRIA's code first, which are in the scene's world."""
+    from cvtgs.io import scene_file  # noqa: PLC0415
+
     file = scene_file(path)
     folders = [path] if path.is_dir() else []
     if file.parent.parent.name == "point_cloud":
