@@ -153,6 +153,7 @@ STAGES = {
         "Evaluation",
         "EvaluationSettings",
         "LpipsWeights",
+        "SceneImages",
         "SceneScores",
         "Score",
         "alpha_bias",

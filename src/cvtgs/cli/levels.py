@@ -144,7 +144,8 @@ def _write_stream(
     listener: "ProgressListener",
 ) -> None:
     """Write levels as a stream, and say what is in it."""
-    from cvtgs.streams import CHUNK_GAUSSIANS, plan_stream, write_sog_stream, write_tiles
+    from cvtgs.streams import plan_stream, write_sog_stream, write_tiles
+    from cvtgs.streams.plan import CHUNK_GAUSSIANS
 
     if axes.target is not None:
         made = [

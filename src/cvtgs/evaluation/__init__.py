@@ -1,6 +1,6 @@
 """How good a simplified scene looks next to the full one: views, scores, pages."""
 
-from cvtgs.evaluation.compare import Comparison, compare, evaluate
+from cvtgs.evaluation.compare import Comparison, SceneImages, compare, evaluate
 from cvtgs.evaluation.comparison_files import write_comparison
 from cvtgs.evaluation.lpips import LPIPS_VARIABLE, LpipsWeights, load_lpips, lpips
 from cvtgs.evaluation.metrics import alpha_bias, alpha_error, psnr, ssim
@@ -14,6 +14,7 @@ __all__ = [
     "Evaluation",
     "EvaluationSettings",
     "LpipsWeights",
+    "SceneImages",
     "SceneScores",
     "Score",
     "alpha_bias",

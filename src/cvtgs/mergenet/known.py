@@ -50,7 +50,7 @@ class KnownRange(nn.Module):
 
     A network that extrapolates does harm: an opaque cell of a hundred thousand members, half of
     them a far sky, grows over the cameras. So a residual is multiplied by 1 within the range, by
-    0 from :data:`MARGIN` beyond it, and linearly in between. The feature that is farthest out
+    0 from ``MARGIN`` beyond it, and linearly in between. The feature that is farthest out
     decides. The range is part of the weights of a network, so training knows of it.
 
     Example:
@@ -90,7 +90,7 @@ class KnownRange(nn.Module):
 
         Each case has a say of its own, however few cells it has: the range of a feature goes
         from the least to the greatest of what the cases hold without their tails. Cells of more
-        than :data:`MOST_MEMBERS` members are never known.
+        than ``MOST_MEMBERS`` members are never known.
 
         Args:
             cases: Summaries of the cells of every case, at least one.

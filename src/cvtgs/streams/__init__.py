@@ -1,11 +1,10 @@
 """Levels of a scene as a tree of chunks that viewers load while they show it."""
 
-from cvtgs.streams.plan import CHUNK_GAUSSIANS, StreamChunk, StreamNode, StreamPlan, plan_stream
+from cvtgs.streams.plan import StreamChunk, StreamNode, StreamPlan, plan_stream
 from cvtgs.streams.sog import StreamLevel, check_stream, write_sog_stream
 from cvtgs.streams.tiles import write_tiles
 
 __all__ = [
-    "CHUNK_GAUSSIANS",
     "StreamChunk",
     "StreamLevel",
     "StreamNode",

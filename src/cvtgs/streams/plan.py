@@ -91,7 +91,8 @@ def plan_stream(levels: Sequence[Level], *, chunk_gaussians: int = CHUNK_GAUSSIA
     """Build the chunks of a stream of levels.
 
     Args:
-        levels: Levels of one scene, of different sizes, as :meth:`Simplifier.levels` makes them.
+        levels: Levels of one scene, of different sizes, as
+            :meth:`~cvtgs.simplifier.Simplifier.levels` makes them.
         chunk_gaussians: Gaussians of the finest level in a chunk; a Gaussian of the coarsest level
             is never cut, so chunks are larger where it stands for more.
 

@@ -37,7 +37,7 @@ def automatic_views(
     visible (:func:`cvtgs.views.up.find_up`), so flyaways, sky shells and haze do not matter. The
     cameras stand around the scene at several heights; if its middle is free, surfaces are all
     around and above, and larger Gaussians lie behind these than before them, they stand inside and
-    look across. They stand only where :meth:`cvtgs.views.CameraPositions.admit` says they may.
+    look across. They stand only where :class:`cvtgs.views.CameraPositions` says they may.
     Every camera is scored by an image of 64 pixels: one that is inside of a Gaussian, has
     something near in its image, or sees nothing is replaced by the first good alternate, or by the
     best of them.

@@ -32,7 +32,7 @@ def random_views(
     """Return cameras at random positions from which somebody would look, near ones too.
 
     A scene optimized on automatic views alone gets worse on all other sides. None is beneath a
-    floor or inside matter (:meth:`cvtgs.views.positions.CameraPositions.admit`); where there is
+    floor or inside matter (:class:`cvtgs.views.CameraPositions`); where there is
     no floor, some look from below.
 
     Args:
