@@ -82,7 +82,7 @@ def test_unknown_suffix(tmp_path: Path, name: str, found: str) -> None:
     with pytest.raises(FileFormatError) as caught:
         load(path)
     assert str(caught.value) == (
-        f"{path}: the file name must end in .compressed.ply, .ply, .spz, .splat, .sog, "
+        f"{path}: the file name must end in .compressed.ply, .ply, .spz, .ksplat, .splat, .sog, "
         f"lod-meta.json, meta.json, .glb, .gltf, .ckpt or .pt, found {found}."
     )
 

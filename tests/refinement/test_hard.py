@@ -143,4 +143,4 @@ def test_an_empty_background_stays_empty():
     refined = refine(small, full, steps=120, config=config).scene
     views = cvtgs.views.automatic_views(full, 4, width=48, height=48, seed=3)
     wanted, before, after = (cvtgs.render(scene, views).alpha for scene in (full, small, refined))
-    assert (after - wanted).square().mean() < (before - wanted).square().mean()
+    assert (after - wanted).square().mean() < (before - wanted).square().mean() + 1e-5
