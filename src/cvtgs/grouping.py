@@ -86,12 +86,10 @@ def group_rows(
         has_duplicates=analysis.plan.duplicates.active,
         on_iteration=on_iteration,
     )
+    opacities, areas = analysis.opacities[rows], analysis.areas[rows]
+    masses = analysis.apparent_areas[rows] * opacities
     members = cells.gaussian_moments(
-        scene,
-        rows,
-        analysis.frame,
-        weights=analysis.areas[rows] * analysis.opacities[rows],
-        masses=analysis.apparent_areas[rows] * analysis.opacities[rows],
+        scene, rows, analysis.frame, weights=areas * opacities, masses=masses
     )
     labels = allocate(members, tessellation.labels, count, target, config.allocation)
     sums = label_sums([weights], labels, target)[:, 0]
