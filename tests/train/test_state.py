@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
+import cvtgs
 from cvtgs.errors import CheckpointError
 from cvtgs.io.tensors import map_tensors, save_tensors
-from cvtgs.mergenet import Architecture, MergeNet
+from cvtgs.mergenet import Architecture, LearnedScene, MergeNet
 from cvtgs.train import Gain, History, LossConfig, TrainConfig, Validation
-from cvtgs.train.state import AVERAGED_STEPS, TrainState
+from cvtgs.train.state import TrainState
 from mergenet_cases import some_case
 from train_cases import bits_of, needs_matplotlib, small_net
 
@@ -103,7 +104,7 @@ def test_the_running_mean_starts_fast_and_becomes_slow():
     state.step = 10**6
     state.average()
     late = next(state.mean_net.parameters()).flatten()[0].item()
-    assert late == pytest.approx(share + (1 - share) / AVERAGED_STEPS)
+    assert late == pytest.approx(share + (1 - share) / CONFIG.averaged_steps)
 
 
 def test_the_running_mean_is_a_network_of_its_own():
@@ -145,6 +146,37 @@ def test_another_configuration_is_one_clear_error(tmp_path, changes):
 def test_note_and_patience_may_change(tmp_path):
     path = saved(tmp_path / "a.state")
     assert loaded(path, CONFIG.model_copy(update={"note": "more", "patience": 3})).step == 3
+
+
+SCENES = (LearnedScene(name="room", count=5, sha256="ab"), LearnedScene(name="exam", count=7))
+
+
+@pytest.mark.parametrize(
+    "scenes", [SCENES[:1], (*SCENES[:1], SCENES[1].model_copy(update={"count": 8}))]
+)
+def test_other_scenes_are_one_clear_error(tmp_path, scenes):
+    """Else the checkpoint would name scenes that only the last steps saw."""
+    path = tmp_path / "a.state"
+    TrainState(small_net(), CONFIG, SCENES).save(path, CONFIG)
+    TrainState(small_net(), CONFIG, reversed(SCENES)).load(path, CONFIG)
+    with pytest.raises(CheckpointError) as caught:
+        TrainState(small_net(), CONFIG, scenes).load(path, CONFIG)
+    assert str(caught.value) == (
+        f"{path}: the state belongs to a training on other scenes, exam is one of them; "
+        f"put the scenes back, or train to another output."
+    )
+
+
+def test_the_state_of_another_version_is_one_clear_error(tmp_path, monkeypatch):
+    path = saved(tmp_path / "a.state")
+    here = cvtgs.__version__
+    monkeypatch.setattr(cvtgs, "__version__", "9.9")
+    with pytest.raises(CheckpointError) as caught:
+        loaded(path)
+    assert str(caught.value) == (
+        f"{path}: the state was made by cvtgs {here}, this is 9.9; "
+        f"remove it, or train to another output."
+    )
 
 
 def damaged(path: Path, kind: str) -> None:

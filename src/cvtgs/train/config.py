@@ -100,6 +100,8 @@ class TrainConfig(Section):
         largest_growth: Largest change of a log scale.
         validate_every: Steps between validations.
         patience: Validations without a new best before training stops.
+        averaged_steps: The network that is kept is a running mean of the weights over about this
+            many steps, and over a ninth of all steps before it at most.
         cells: Cells in one step of a ``local`` training.
         note: Sentence about the training data, for the checkpoint.
         data: Scenes.
@@ -122,6 +124,7 @@ class TrainConfig(Section):
     largest_growth: float = pydantic.Field(default=0.6, gt=0.0, le=3.0)
     validate_every: Count = 500
     patience: Count = 1000
+    averaged_steps: Count = 500
     cells: Count = 49
     note: str = ""
     data: DataConfig = DataConfig()

@@ -130,15 +130,13 @@ def train(
     """
     sources = find_sources(config.data, seed=config.seed)
     device = torch.device(device)
-    state = TrainState(_first_net(config).to(device), config)
+    origins = {source.origin: None for source in sources}
+    state = TrainState(_first_net(config).to(device), config, origins)
     if resume and files.state.is_file():
         state.load(files.state, config)
     _make_folder(files.cache)
     cases, validation_scenes = _prepare_scenes(sources, config, files.cache, listener)
-    state.learn_from(
-        {source.origin: None for source in sources},
-        (summarize(case.descriptors) for case, _ in cases),
-    )
+    state.learn_range(summarize(case.descriptors) for case, _ in cases)
     if not state.history.validations:
         _validate(state, validation_scenes, math.nan, config, files, device)
         on_validation(state.history)
@@ -274,10 +272,8 @@ def _validate(
 
 
 def _description(state: TrainState, config: TrainConfig) -> CheckpointInfo:
-    # Without paths, and without what does not set the weights.
-    told = config.model_dump_json(
-        exclude={"start": True, "note": True, "patience": True, "data": {"folders"}}
-    )
+    # Without paths, and without the note, which is told by itself.
+    told = config.model_dump_json(exclude={"start": True, "note": True, "data": {"folders"}})
     return CheckpointInfo(
         architecture=state.net.architecture,
         preset=config.preset,

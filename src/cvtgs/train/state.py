@@ -11,14 +11,12 @@ import pydantic
 import torch
 from torch import Tensor
 
+import cvtgs
 from cvtgs.errors import CheckpointError
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.mergenet import LearnedScene, MergeNet
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.train.config import TrainConfig
-
-AVERAGED_STEPS = 500
-"""The network that is kept is a running mean over about this many steps."""
 
 CURVES: tuple[tuple[Callable[[list[float]], float], str], ...] = (
     (mean, "mean gain, validation scenes"),
@@ -170,25 +168,27 @@ class History:
 class TrainState:
     """A network in training: its weights, their running mean, the optimiser, the history."""
 
-    def __init__(self, net: MergeNet, config: TrainConfig) -> None:
+    def __init__(
+        self, net: MergeNet, config: TrainConfig, scenes: Iterable[LearnedScene] = ()
+    ) -> None:
         self.net = net
         self.mean_net = copy.deepcopy(net).eval().requires_grad_(False)
         self.optimizer = torch.optim.AdamW(
             net.parameters(), lr=config.learning_rate, betas=(0.9, 0.98), weight_decay=0.0
         )
         self.history = History()
-        self.scenes: tuple[LearnedScene, ...] = ()
-        self.step = 0
-
-    def learn_from(self, scenes: Iterable[LearnedScene], cases: Iterable[Tensor]) -> None:
-        """Note the scenes, and tell both networks the range of the summaries of all cases."""
         self.scenes = tuple(scenes)
+        self.step = 0
+        self.averaged_steps = config.averaged_steps
+
+    def learn_range(self, cases: Iterable[Tensor]) -> None:
+        """Tell both networks the range of the summaries of all cases."""
         self.net.known.fit(cases)
         self.mean_net.known.load_state_dict(self.net.known.state_dict())
 
     def average(self) -> None:
         """Update the running mean of the weights."""
-        share = 1 - min(1 - 1 / AVERAGED_STEPS, (self.step + 1) / (self.step + 10))
+        share = 1 - min(1 - 1 / self.averaged_steps, (self.step + 1) / (self.step + 10))
         with torch.no_grad():
             for average, now in zip(self.mean_net.parameters(), self.net.parameters(), strict=True):
                 average.lerp_(now, share)
@@ -203,6 +203,8 @@ class TrainState:
             "step": self.step,
             "history": self.history.to_json(),
             "config": _fingerprint(config),
+            "version": cvtgs.__version__,
+            "scenes": [scene.model_dump() for scene in self.scenes],
         }
         save_tensors(path, tensors, {"state": json.dumps(record)})
 
@@ -216,6 +218,7 @@ class TrainState:
                     f"{path}: the state belongs to a training with another configuration; "
                     f"remove it, or train to another output."
                 )
+            self._check_origin(path, record["version"], record["scenes"])
             # Mapped tensors must not be written to: load_state_dict copies, the optimiser does not.
             self._load_tensors({name: values.clone() for name, values in tensors.items()})
             self.step = int(record["step"])
@@ -224,6 +227,21 @@ class TrainState:
             if isinstance(error, CheckpointError):
                 raise
             raise CheckpointError(f"{path}: the state of the training is damaged.") from error
+
+    def _check_origin(self, path: Path, version: str, scenes: list[dict[str, Any]]) -> None:
+        """Refuse what would make the checkpoint say what is only true of its last steps."""
+        if version != cvtgs.__version__:
+            raise CheckpointError(
+                f"{path}: the state was made by cvtgs {version}, this is {cvtgs.__version__}; "
+                f"remove it, or train to another output."
+            )
+        theirs = {LearnedScene.model_validate(scene) for scene in scenes}
+        odd = sorted(scene.name for scene in theirs ^ set(self.scenes))
+        if self.scenes and odd:
+            raise CheckpointError(
+                f"{path}: the state belongs to a training on other scenes, {odd[0]} is one of "
+                f"them; put the scenes back, or train to another output."
+            )
 
     def _load_tensors(self, tensors: dict[str, Tensor]) -> None:
         self.net.load_state_dict(under_prefix("net/", tensors))
