@@ -45,6 +45,24 @@ class Grouping(NamedTuple):
     backend: str
 
 
+class WeightedRows(NamedTuple):
+    """Gaussians to group, in the order of the Morton curve.
+
+    Attributes:
+        scene: The Gaussians.
+        rows: ``(k,)`` which of them.
+        weights: ``(k,)`` what each weighs in the tessellation.
+        masses: ``(k,)`` what each weighs in the moments of its cell.
+        apparent_masses: ``(k,)`` mass as images show it, by which merging costs.
+    """
+
+    scene: GaussianScene
+    rows: Int[Tensor, "k"]
+    weights: Float[Tensor, "k"]
+    masses: Float[Tensor, "k"]
+    apparent_masses: Float[Tensor, "k"]
+
+
 def group_rows(
     scene: GaussianScene,
     rows: Int[Tensor, "k"],
@@ -68,32 +86,59 @@ def group_rows(
         The cells.
     """
     masses = analysis.apparent_areas[rows] * analysis.opacities[rows]
-    rows = rows[curve_order(scene, rows, analysis.frame, masses=masses)]
+    order = curve_order(scene, rows, analysis.frame, masses=masses)
+    rows, masses = rows[order], masses[order]
     weights = cvt.tessellation_weights(
         analysis.opacities[rows],
         analysis.apparent_areas[rows],
         area_power=config.cvt.area_power,
         floor=config.cvt.weight_floor,
     )
-    points = embed_rows(scene, rows, analysis, target, config)
-    count = finer_count(target, len(rows), config.allocation)
-    tessellation = cvt.tessellate(
+    points = WeightedRows(
+        scene=scene,
+        rows=rows,
+        weights=weights,
+        masses=analysis.areas[rows] * analysis.opacities[rows],
+        apparent_masses=masses,
+    )
+    tessellation, labels = _tessellate(
         points,
-        weights,
-        count,
-        config=config.cvt,
-        seed=config.seed,
+        analysis,
+        target,
+        config,
         has_duplicates=analysis.plan.duplicates.active,
         on_iteration=on_iteration,
     )
-    opacities, areas = analysis.opacities[rows], analysis.areas[rows]
-    masses = analysis.apparent_areas[rows] * opacities
-    members = cells.gaussian_moments(
-        scene, rows, analysis.frame, weights=areas * opacities, masses=masses
-    )
-    labels = allocate(members, tessellation.labels, count, target, config.allocation)
     sums = label_sums([weights], labels, target)[:, 0]
     return _grouping(tessellation, rows, labels, sums)
+
+
+def _tessellate(
+    points: WeightedRows,
+    analysis: SceneAnalysis,
+    target: int,
+    config: SimplifyConfig,
+    *,
+    has_duplicates: bool,
+    on_iteration: Callable[[int], None],
+) -> tuple[cvt.Tessellation, Int[Tensor, "k"]]:
+    """Tessellate Gaussians in the order of the curve, and allocate the cells; return both."""
+    scene, rows = points.scene, points.rows
+    count = finer_count(target, len(rows), config.allocation)
+    tessellation = cvt.tessellate(
+        embed_rows(scene, rows, analysis, target, config),
+        points.weights,
+        count,
+        config=config.cvt,
+        seed=config.seed,
+        has_duplicates=has_duplicates,
+        on_iteration=on_iteration,
+    )
+    members = cells.gaussian_moments(
+        scene, rows, analysis.frame, weights=points.masses, masses=points.apparent_masses
+    )
+    labels = allocate(members, tessellation.labels, count, target, config.allocation)
+    return tessellation, labels
 
 
 def finer_count(target: int, available: int, config: AllocationConfig) -> int:
@@ -160,20 +205,22 @@ def group_cells(
     fine = torch.arange(len(merged), device=merged.device)
     masses = grouping.weights * merged.opacities
     rows = curve_order(merged, fine, analysis.frame, masses=masses)
-    points, weights = embed_rows(merged, rows, analysis, target, config), grouping.weights[rows]
-    count = finer_count(target, len(rows), config.allocation)
-    tessellation = cvt.tessellate(
+    weights = grouping.weights[rows]
+    points = WeightedRows(
+        scene=merged,
+        rows=rows,
+        weights=weights,
+        masses=merged.masses[rows],
+        apparent_masses=weights,
+    )
+    tessellation, labels = _tessellate(
         points,
-        weights,
-        count,
-        config=config.cvt,
-        seed=config.seed,
+        analysis,
+        target,
+        config,
+        has_duplicates=False,
         on_iteration=on_iteration,
     )
-    members = cells.gaussian_moments(
-        merged, rows, analysis.frame, weights=merged.masses[rows], masses=weights
-    )
-    labels = allocate(members, tessellation.labels, count, target, config.allocation)
     coarse = torch.empty_like(labels)
     coarse[rows] = labels
     partition = grouping.partition
