@@ -21,7 +21,7 @@ from cvtgs.clock import StageClock
 from cvtgs.config import MergeConfig, SimplifyConfig
 from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
-from cvtgs.grouping import Grouping, group_cells, group_rows
+from cvtgs.grouping import Grouping, OrderedRows, group_cells, group_rows, order_rows
 from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import MergeNet, correct_cells
 from cvtgs.report import CellStatistics, MatchReport
@@ -76,6 +76,7 @@ def reduce_scene(
     net: MergeNet | None,
     clock: StageClock,
     finest: Reduced | None = None,
+    ordered: OrderedRows | None = None,
 ) -> Reduced:
     """Run all stages that follow the analysis: filter, tessellate, merge, correct.
 
@@ -87,6 +88,7 @@ def reduce_scene(
         net: Corrects merged Gaussians, on the same device; None for no correction.
         clock: Measures each stage.
         finest: A finer size of the same scene, whose cells are grouped; None groups Gaussians.
+        ordered: What :func:`order_gaussians` computed of the scene; None computes it.
 
     Returns:
         The small scene, with its cells.
@@ -101,7 +103,9 @@ def reduce_scene(
         left_out, left_out_mass_share = filtered.left_out, filtered.left_out_mass_share
         with clock.stage("tessellate", iterations) as advance:
             rows = filtered.rows
-            grouping = group_rows(used, rows, analysis, target, config, on_iteration=advance)
+            grouping = group_rows(
+                used, rows, analysis, target, config, ordered=ordered, on_iteration=advance
+            )
         del filtered, rows
     else:
         left_out = finest.statistics.filtered_count
@@ -144,6 +148,14 @@ def reduce_scene(
         backend=grouping.backend,
     )
     return Reduced(small, statistics, grouping, merged)
+
+
+def order_gaussians(
+    scene: GaussianScene, analysis: SceneAnalysis, config: SimplifyConfig
+) -> OrderedRows:
+    """Compute what grouping needs of a scene whatever its target, for :func:`reduce_scene`."""
+    filtered = filter_rows(scene, analysis, 1, config.filter)
+    return order_rows(scene, filtered.rows, analysis, config)
 
 
 def merge_cells(

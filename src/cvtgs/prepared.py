@@ -23,8 +23,9 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shortfall, target_count
 from cvtgs.devices import chosen_device, within_memory
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.grouping import OrderedRows
 from cvtgs.mergenet import Checkpoint, MergeNet
-from cvtgs.pipeline import Reduced, geometric_error, reduce_scene
+from cvtgs.pipeline import Reduced, geometric_error, order_gaussians, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified, SimplifyReport
 from cvtgs.scene import GaussianScene, concatenate
@@ -43,7 +44,9 @@ Result = TypeVar("Result")
 
 
 class Prepared:
-    """A scene to be made smaller again and again; what does not depend on the count is done once.
+    """A scene to be made smaller again and again; what does not depend on the count is kept.
+
+    From the second run on, 152 more bytes per Gaussian are kept.
 
     ``Simplifier.prepare`` makes these. Every run gives the bits of ``Simplifier.run``;
     the report of the first one has the stages that are shared.
@@ -79,6 +82,8 @@ class Prepared:
         self._net: MergeNet | None = None
         self._checked: CheckedScene | None = None
         self._analysis: SceneAnalysis | None = None
+        self._ordered: OrderedRows | None = None
+        self._has_run = False
 
     @property
     def _used(self) -> GaussianScene:
@@ -127,7 +132,11 @@ class Prepared:
         valid = self._check(clock).scene
         analysis = self._analyze(target, clock)
         if keep is None or not bool(keep.any()):
-            reduced = self._reduce(valid, analysis, target, clock)
+            if self._has_run and self._ordered is None and target < len(valid):
+                with clock.stage("order"):
+                    self._ordered = order_gaussians(valid, analysis, self._config)
+            self._has_run = True
+            reduced = self._reduce(valid, analysis, target, clock, ordered=self._ordered)
             reduced = self._match(reduced, analysis, clock)
             return self._result(reduced, analysis, target, clock)
         keep = keep.to(valid.device)
@@ -209,12 +218,21 @@ class Prepared:
         clock: StageClock,
         *,
         finest: Reduced | None = None,
+        ordered: OrderedRows | None = None,
     ) -> Reduced:
         if target >= len(scene):
             is_whole = target == len(self._scene)
             return Reduced(with_finite_opacities(scene) if is_whole else standardized(scene))
-        config, net = self._config, self._net
-        return reduce_scene(scene, analysis, target, config, net=net, clock=clock, finest=finest)
+        return reduce_scene(
+            scene,
+            analysis,
+            target,
+            self._config,
+            net=self._net,
+            clock=clock,
+            finest=finest,
+            ordered=ordered,
+        )
 
     def _match(self, reduced: Reduced, analysis: SceneAnalysis, clock: StageClock) -> Reduced:
         """Match the small scene to the images of the analysis, if the configuration says so."""

@@ -124,6 +124,15 @@ def test_disjoint_pairs_are_those_of_a_loop_over_all_pairs():
     assert found == wanted
 
 
+@pytest.mark.parametrize("count", [1, 30, 49, 60, 200])
+def test_only_the_cheapest_are_sorted(count: int) -> None:
+    """Ties at the threshold come in the order of the pairs, as a sort of all gives them."""
+    costs = torch.randint(0, 12, (100,), generator=torch.Generator().manual_seed(3)).double()
+    found = merge_pairs.__globals__["_cheapest"](costs, count)
+    wanted = sorted(range(100), key=lambda pair: (float(costs[pair]), pair))[:count]
+    assert found.tolist() == wanted
+
+
 def test_moments_of_groups_are_those_of_the_merge():
     """Two passes about the mean: also where the scene lies far from its centre."""
     members = points([100.0, 100.5, 300.0], weights=[1.0, 3.0, 2.0], size=0.1)

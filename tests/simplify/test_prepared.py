@@ -34,9 +34,29 @@ def test_every_run_gives_the_bits_of_a_run_of_its_own(scene, preset):
 def test_what_is_shared_is_done_in_the_first_run_only(scene):
     simplifier = Simplifier(config=SimplifyConfig(visibility={"views": 2, "size": 16}))
     prepared = simplifier.prepare(scene)
-    first, second = (stages(prepared.run(0.1).report) for _ in range(2))
+    first, second, third = (stages(prepared.run(0.1).report) for _ in range(3))
     assert first >= SHARED
-    assert second == first - SHARED
+    assert second == first - SHARED | {"order"}
+    assert third == first - SHARED
+
+
+def test_rows_are_ordered_once_and_again_where_the_filter_leaves_others(scene, monkeypatch):
+    config = SimplifyConfig(filter={"min_opacity": 0.99, "max_mass_share": 1.0})
+    simplifier = Simplifier(config=config, ckpt=None, device="cpu")
+    prepared, calls = simplifier.prepare(scene), []
+    measure = cvtgs.cells.gaussian_moments
+    monkeypatch.setattr(
+        cvtgs.cells,
+        "gaussian_moments",
+        lambda *args, **more: calls.append(len(args[1])) or measure(*args, **more),
+    )
+    kept = int((scene.opacities >= 0.99).sum())
+    for count in (30, 20, 10, kept + 5):
+        small = prepared.run(count=count).scene
+        seen = len(calls)
+        assert same_bits(small, simplifier.simplify(scene, count=count))
+        del calls[seen:]
+    assert calls == [kept, kept, kept + 5]
 
 
 def test_protected_gaussians_may_differ_from_run_to_run(scene):

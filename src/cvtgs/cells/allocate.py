@@ -154,8 +154,10 @@ def merge_pairs(
         keeps[second] = False
         target = (keeps.cumsum(0) - 1)[target]
         total -= len(first)
-        groups = group_moments(groups, target, total)
         labels = target[labels]
+        if total == count:
+            break
+        groups = group_moments(groups, target, total)
         pairs = _distinct_pairs(target[pairs[0]], target[pairs[1]])
     return labels
 
@@ -209,7 +211,7 @@ def _cheapest_disjoint(
     A pair that is the cheapest one of both its groups is taken, again and again: the same as to
     go through all pairs in order (Preis 1999), in few steps over all of them.
     """
-    order = torch.sort(costs, stable=True).indices[: 6 * wanted]
+    order = _cheapest(costs, 6 * wanted)
     first, second = first[order], second[order]
     ranks = torch.arange(len(order), device=order.device)
     taken = []
@@ -225,6 +227,15 @@ def _cheapest_disjoint(
         ranks = ranks[~(used[first[ranks]] | used[second[ranks]])]
     rows = torch.sort(torch.cat(taken)).values[:wanted]
     return first[rows], second[rows]
+
+
+def _cheapest(costs: Float[Tensor, "p"], count: int) -> Int[Tensor, "k"]:
+    """Return the cheapest, in ascending order, ties as they come; only those are sorted."""
+    if 2 * count >= len(costs) or costs.device.type != "cpu":
+        return torch.sort(costs, stable=True).indices[:count]
+    most = torch.kthvalue(costs, count).values
+    candidates = (~(costs > most)).nonzero()[:, 0]
+    return candidates[torch.sort(costs[candidates], stable=True).indices[:count]]
 
 
 def reassign(

@@ -52,19 +52,26 @@ def nearest_scipy(
     labels = np.empty(len(points), dtype=np.int64)
     squared = np.empty(len(points), dtype=np.float64)
 
-    def search(start: int) -> None:
-        part = slice(start, start + CHUNK)
+    def search(part: slice) -> None:
         distances, labels[part] = tree.query(np.asarray(points[part], np.float64))
         np.square(distances, out=squared[part])
 
-    # Threads of our own: an interrupt waits for them, where scipy's own would be left running.
-    with ThreadPoolExecutor(thread_count()) as pool:
-        for _ in pool.map(search, range(0, len(points), CHUNK)):
-            pass
+    _in_threads(search, len(points))
     found = torch.from_numpy(labels)
     if distinct is not None:
         found = distinct[found]
     return found.to(device), torch.from_numpy(squared).to(device)
+
+
+def _in_threads(search: Callable[[slice], None], count: int) -> None:
+    """Search for all chunks of points, in as many threads as there are cores.
+
+    The threads are our own: an interrupt waits for them, where scipy's own would be left running.
+    """
+    parts = [slice(start, start + CHUNK) for start in range(0, count, CHUNK)]
+    with ThreadPoolExecutor(thread_count()) as pool:
+        for _ in pool.map(search, parts):
+            pass
 
 
 def build_tree(sites: Float[Tensor, "m d"]) -> Any:
@@ -127,8 +134,15 @@ def _apart(sites: Float[Tensor, "m d"]) -> Float[Tensor, "m e"]:
 def _by_tree(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
-    distances, rows = build_tree(sites).query(np.asarray(points), k=[*range(1, count + 1)])
-    return torch.from_numpy(rows.astype(np.int64)), torch.from_numpy(distances)
+    tree, ranks = build_tree(sites), [*range(1, count + 1)]
+    rows = np.empty((len(points), count), dtype=np.int64)
+    distances = np.empty((len(points), count), dtype=np.float64)
+
+    def search(part: slice) -> None:
+        distances[part], rows[part] = tree.query(np.asarray(points[part]), k=ranks)
+
+    _in_threads(search, len(points))
+    return torch.from_numpy(rows), torch.from_numpy(distances)
 
 
 def runs_of_equal(
