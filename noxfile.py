@@ -126,16 +126,19 @@ def gpu(session: nox.Session) -> None:
 def fuzz(session: nox.Session) -> None:
     """Read damaged scenes, checkpoints, cameras and configurations; needs Linux, takes hours.
 
-    Each of 14 kinds gets about 100,000 inputs; ``-- --count 14000`` is a quick look.
+    Each of 19 kinds gets 100,000 inputs; ``-- --count 19000`` is a quick look.
     """
     session.install(*CONSTRAINTS, "-e", ".[test]")
-    words = session.posargs or ["--count", "1500000"]
+    words = session.posargs or ["--count", "1900000"]
     session.run("python", "tests/fuzz_files.py", *words, env={"OMP_NUM_THREADS": "1"})
 
 
 @nox.session
 def faults(session: nox.Session) -> None:
-    """Kill commands, run two at once, fill the disk, take memory away; needs Linux."""
+    """Kill commands, run two at once, fill the disk, take memory away; needs Linux, takes hours.
+
+    ``-- --seconds 600`` ends after ten minutes, ``-- --commands plain train`` takes only these.
+    """
     session.install(*CONSTRAINTS, "-e", ".[test]")
     settings = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     session.run("python", "tests/faults.py", *session.posargs, env=settings)

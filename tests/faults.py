@@ -3,7 +3,8 @@
 ``python tests/faults.py --kills 500 --pairs 100`` (the nox session ``faults``) runs every command
 that writes in forks of this process, and checks how each ends: with its status and one sentence at
 most, its files whole or absent, and after the same command ran again the same bits as ever, and
-nothing else in the folder. It ends with a line of counts, or with the first failure. Needs POSIX.
+nothing else in the folder. It ends with a line of counts, after ``--seconds`` with those that it
+had time for, or with the first failure. Needs POSIX.
 """
 
 import argparse
@@ -12,13 +13,14 @@ import random
 import re
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -43,12 +45,16 @@ class Command:
     Attributes:
         words: Its words; ``{}`` is the folder.
         blocks: Number of blocks, as if there were little memory; 0 for one piece.
-        varies: Whether its files say how long something took, so bits differ from run to run.
+        varies: Files that say how long something took, so bits differ from run to run.
+        continues: Whether a file may be that of an earlier moment: a training replaces its own.
+        rounds: How often it is chosen, compared with others; less for those that take long.
     """
 
     words: tuple[str, ...]
     blocks: int = 0
     varies: tuple[str, ...] = field(default=())
+    continues: bool = False
+    rounds: int = 4
 
 
 def words(text: str) -> tuple[str, ...]:
@@ -76,7 +82,76 @@ COMMANDS = {
             "--overwrite"
         )
     ),
+    "stream": Command(
+        words=words(
+            "levels {}/in.ply -o {}/stream --stream sog --rho 0.2,0.05 --chunk 512 --quiet "
+            "--overwrite"
+        )
+    ),
+    "tiles": Command(
+        words=words(
+            "levels {}/in.ply -o {}/tiles --stream 3dtiles --rho 0.2,0.05 --chunk 512 --quiet "
+            "--overwrite"
+        )
+    ),
+    "workers": Command(
+        words=words(
+            "simplify {}/in.ply {}/out.ply --rho 0.1 --quiet --overwrite --memory 3GB --workers 2"
+        ),
+        blocks=5,
+        rounds=1,
+    ),
+    "dask": Command(
+        words=words(
+            "simplify {}/in.ply {}/out.ply --rho 0.1 --quiet --overwrite --memory 2GB "
+            "--scheduler {scheduler}"
+        ),
+        blocks=5,
+        rounds=2,
+    ),
+    "train": Command(
+        words=words("train {}/tiny.toml -o {}/net.safetensors --resume --overwrite --quiet"),
+        continues=True,
+        rounds=2,
+    ),
+    "tradeoff": Command(
+        words=words(
+            "tradeoff {}/in.ply -o {}/tradeoff --presets draft --rho 0.1 --views 2 --size 48 "
+            "--lpips off --save --quiet --overwrite"
+        ),
+        varies=("tradeoff.csv", "tradeoff.json", "tradeoff.png", "index.html"),
+        rounds=1,
+    ),
 }
+
+TRAINING = """
+steps = 3
+validate_every = 1
+width = 6
+cell_width = 10
+[data]
+folders = ["lessons"]
+validation = ["exam"]
+generated = 0
+generated_validation = 0
+blocks = 0
+ratios = [0.05]
+validation_ratios = [0.06]
+[views]
+count = 2
+sizes = [32]
+validation_count = 2
+validation_size = 32
+"""
+
+CLUSTER = """
+import sys
+from distributed import LocalCluster
+cluster = LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+print(cluster.scheduler_address, flush=True)
+sys.stdin.read()
+cluster.close()
+"""
 
 
 def started(command: Command, folder: Path, *, limit: Callable[[], None] | None = None) -> int:
@@ -97,7 +172,12 @@ def started(command: Command, folder: Path, *, limit: Callable[[], None] | None 
             sys.modules["cvtgs.outofcore.run"].block_count = lambda *_: command.blocks  # type: ignore[attr-defined]
         if limit is not None:
             limit()
-        sys.argv = ["cvtgs", *(word.replace("{}", str(folder)) for word in command.words)]
+        places = {"{}": str(folder), "{scheduler}": os.environ.get("FAULTS_SCHEDULER", "")}
+        sys.argv = ["cvtgs"]
+        for word in command.words:
+            for place, found in places.items():
+                word = word.replace(place, found)  # noqa: PLW2901
+            sys.argv.append(word)
         run_process()
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
@@ -114,7 +194,7 @@ def ended(process: int, folder: Path) -> tuple[int, str]:
     path = folder.parent / f"errors-{process}"
     text = path.read_text(errors="replace") if path.exists() else ""
     path.unlink(missing_ok=True)
-    if "Traceback" in text or "Error:" in text or code == 70:
+    if "Traceback" in text or re.search(r"\b\w+Error:", text) or code == 70:
         raise FaultError(f"status {code}: {text[-3000:]}")
     return code, text
 
@@ -132,8 +212,9 @@ def fresh(home: Path) -> Path:
     folder = home / "work"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
-    for name in ("in.ply", "small.ply"):
+    for name in ("in.ply", "small.ply", "tiny.toml"):
         shutil.copy(home / name, folder / name)
+    shutil.copytree(home / "lessons", folder / "lessons")
     return folder
 
 
@@ -158,13 +239,15 @@ def check_part(command: Command, folder: Path, wanted: dict[str, bytes]) -> None
     """Check that every file that has its name is whole."""
     for name, content in contents(folder).items():
         hidden = any(part.startswith(".") for part in Path(name).parts)
-        if not hidden and Path(name).name not in command.varies and content != wanted.get(name):
+        varies = command.continues or Path(name).name in command.varies
+        if not hidden and not varies and content != wanted.get(name):
             raise FaultError(f"{name} is not whole")
 
 
-def references(home: Path) -> Iterator[tuple[str, float, dict[str, bytes]]]:
-    """Run every command to its end, twice, for its files and its seconds."""
-    for name, command in COMMANDS.items():
+def references(home: Path, names: list[str]) -> Iterator[tuple[str, float, dict[str, bytes]]]:
+    """Run commands to their end, twice, for their files and their seconds."""
+    for name in names:
+        command = COMMANDS[name]
         folder = fresh(home)
         start = time.perf_counter()
         code, text = ended(started(command, folder), folder)
@@ -216,6 +299,38 @@ def full(share: float) -> Callable[[], None]:
     return limit
 
 
+@contextmanager
+def cluster(names: list[str]) -> Iterator[None]:
+    """Run a Dask cluster of two workers, if a command needs one."""
+    if "dask" not in names:
+        yield
+        return
+    place = subprocess.Popen(
+        [sys.executable, "-c", CLUSTER],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env={**os.environ, "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "120s"},
+    )
+    with place:
+        os.environ["FAULTS_SCHEDULER"] = place.stdout.readline().strip()  # type: ignore[union-attr]
+        yield
+        place.communicate()  # closes its input, so it ends
+
+
+def write_inputs(home: Path, count: int) -> None:
+    """Write what commands read: a scene, a small one, and scenes to train on."""
+    scene = cvtgs.synthetic.scene("object", count, sh_degree=1, seed=3)
+    cvtgs.save(scene, home / "in.ply")
+    cvtgs.save(cvtgs.Simplifier(device="cpu").simplify(scene, 0.1), home / "small.ply")
+    (home / "lessons").mkdir()
+    for seed, name in enumerate(("exam", "lesson")):
+        lesson = cvtgs.synthetic.scene("object", 600, sh_degree=seed, seed=seed)
+        cvtgs.save(lesson, home / "lessons" / f"{name}.ply")
+    (home / "tiny.toml").write_text(TRAINING, encoding="utf-8")
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Do all faults, and say how they ended."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -224,32 +339,39 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--limits", type=int, default=50, help="of memory, and of the disk")
     parser.add_argument("--count", type=int, default=6000, help="Gaussians of the scene")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="after which to end")
     parser.add_argument("--commands", nargs="*", choices=[*COMMANDS], default=[*COMMANDS])
     options = parser.parse_args(arguments)
-    dice, ends = random.Random(options.seed), Counter[str]()
-    with tempfile.TemporaryDirectory() as place:
+    dice, ends, begun = random.Random(options.seed), Counter[str](), time.monotonic()
+    names: list[str] = options.commands
+    with tempfile.TemporaryDirectory() as place, cluster(names):
         home = Path(place)
-        scene = cvtgs.synthetic.scene("object", options.count, sh_degree=1, seed=3)
-        cvtgs.save(scene, home / "in.ply")
-        cvtgs.save(cvtgs.Simplifier(device="cpu").simplify(scene, 0.1), home / "small.ply")
-        known = {name: (seconds, files) for name, seconds, files in references(home)}
+        write_inputs(home, options.count)
+        known = {name: (seconds, files) for name, seconds, files in references(home, names)}
         rounds = ["kill"] * options.kills + ["pair"] * options.pairs
         rounds += ["memory", "disk"] * options.limits
         dice.shuffle(rounds)
         for number, kind in enumerate(rounds):
-            name = dice.choice(options.commands)
+            if time.monotonic() - begun > options.seconds:
+                break
+            name = dice.choices(names, [COMMANDS[one].rounds for one in names])[0]
             command, (seconds, wanted) = COMMANDS[name], known[name]
             folder = fresh(home)
             if dice.random() < 0.5:  # over the files of an earlier run
                 for path, content in wanted.items():
-                    (folder / path).parent.mkdir(exist_ok=True)
+                    (folder / path).parent.mkdir(parents=True, exist_ok=True)
                     (folder / path).write_bytes(content)
             try:
                 end = one_fault(kind, command, folder, seconds, wanted, dice)
             except FaultError as error:
+                print(counted(ends))  # noqa: T201
                 sys.exit(f"round {number} of seed {options.seed}, {kind} of {name}: {error}")
             ends[f"{name} {kind} {end}"] += 1
-    print(", ".join(f"{count} {end}" for end, count in sorted(ends.items())))  # noqa: T201
+    print(counted(ends))  # noqa: T201
+
+
+def counted(ends: Counter[str]) -> str:
+    return ", ".join(f"{count} {end}" for end, count in sorted(ends.items()))
 
 
 def one_fault(

@@ -8,9 +8,10 @@ lying headers are found.
 """
 
 import argparse
+import gzip
 import hashlib
 import io
-import json
+import os
 import random
 import re
 import resource
@@ -18,26 +19,20 @@ import signal
 import sys
 import tempfile
 import warnings
+import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
-import numpy as np
 import torch
 
-import cvtgs
-from camera_files import inria, transforms
-from cvtgs import SimplifyConfig
 from cvtgs.errors import CvtgsError, DroppedDataWarning
-from cvtgs.mergenet import Architecture, CheckpointInfo, load_checkpoint, save_checkpoint
-from mergenet_cases import lively_net
-from ply_files import gaussian_properties, gaussian_rows, ply_bytes
-from scenes import random_scene
+from fuzz_seeds import READERS, place
 
-HERE = Path(__file__).parent
 Dice = random.Random
-CORPUS = HERE / "data" / "fuzz"
+CORPUS = Path(__file__).parent / "data" / "fuzz"
 CPU_SECONDS = 2.0
 MEMORY = 1 << 30
 """A GiB more than the process has when it starts; no seed has more than 100 kB."""
@@ -57,93 +52,6 @@ WORDS = (
 
 class HangError(Exception):
     """An input took too long."""
-
-
-def seeds_of_ply() -> list[bytes]:
-    """Small files of every layout: binary of both orders, ASCII, with lists, faces, 2DGS."""
-    plain = gaussian_properties()
-    flat = [(name, kind) for name, kind in gaussian_properties(9) if name != "scale_2"]
-    lists = [*plain, ("seen_by", "list uchar uint")]
-    listed = [[*row, [1.0, 2.0, 3.0]] for row in gaussian_rows(plain, 4)]
-    faces = {"face": ([("corners", "list uint int")], [[[0, 1, 2]], [[2, 1, 0]]])}
-    label = [*gaussian_properties(kind="double"), ("label", "ushort")]
-    seeds = []
-    for encoding in ("binary_little_endian", "binary_big_endian", "ascii"):
-        seeds += [
-            ply_bytes(plain, gaussian_rows(plain, 5), encoding=encoding, comments=["by hand"]),
-            ply_bytes(flat, gaussian_rows(flat, 3), encoding=encoding),
-            ply_bytes(lists, listed, encoding=encoding),
-            ply_bytes(plain, gaussian_rows(plain, 2), encoding=encoding, before=faces),
-            ply_bytes(label, gaussian_rows(label, 2), encoding=encoding, newline="\r\n"),
-        ]
-    return seeds
-
-
-def seeds_of_checkpoints() -> list[bytes]:
-    """One small checkpoint."""
-    shape = Architecture(width=2, cell_width=3)
-    info = CheckpointInfo(architecture=shape, preset="paper")
-    return [save_checkpoint(lively_net(torch.float32, architecture=shape), info)]
-
-
-def seeds_of_configs() -> list[bytes]:
-    """Both presets in full, and a short file."""
-    full = [SimplifyConfig.from_preset(name).to_toml().encode() for name in ("standard", "paper")]
-    return [*full, b'preset = "paper"\nseed = 3\n[cvt]\niterations = 7\n']
-
-
-def seeds_of_scenes(suffix: str) -> Callable[[], list[bytes]]:
-    """Return what makes small files of a compact format, of SH degree 0 and 1."""
-
-    def seeds() -> list[bytes]:
-        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # .splat has no degree 1
-            path = Path(folder) / f"a{suffix}"
-            for degree in (0, 1):
-                cvtgs.save(random_scene(9, degree=degree), path, overwrite=True)
-                found.append(path.read_bytes())
-        return found
-
-    data, found = HERE / "data" / "formats", list[bytes]()
-    found += [path.read_bytes() for path in sorted(data.glob(f"*[!d]{suffix}"))]
-    return seeds
-
-
-def seeds_of_states() -> list[bytes]:
-    """What gsplat and Splatfacto save, with a learning rate of numpy."""
-    tensors = cvtgs.to_dict(random_scene(3, degree=1))
-    older = {f"_model.{name}": values for name, values in tensors.items()}
-    seeds = []
-    for content in (
-        {"step": 1, "splats": tensors},
-        {"step": 1, "pipeline": older, "optimizers": [{"lr": np.float64(0.1)}]},
-    ):
-        file = io.BytesIO()
-        torch.save(content, file)
-        seeds.append(file.getvalue())
-    return seeds
-
-
-def seeds_of_cameras() -> list[bytes]:
-    """Small files of cameras: of nerfstudio and instant-ngp, and of INRIA's code."""
-    return [json.dumps(found).encode() for found in (transforms(range(3)), inria()[:3])]
-
-
-READERS: dict[str, tuple[str, Callable[[], list[bytes]], Callable[[Path], object]]] = {
-    "ply": (".ply", seeds_of_ply, cvtgs.load),
-    "compressed": (".compressed.ply", seeds_of_scenes(".compressed.ply"), cvtgs.load),
-    "spz": (".spz", seeds_of_scenes(".spz"), cvtgs.load),
-    "splat": (".splat", seeds_of_scenes(".splat"), cvtgs.load),
-    "sog": (".sog", seeds_of_scenes(".sog"), cvtgs.load),
-    "glb": (".glb", seeds_of_scenes(".glb"), cvtgs.load),
-    "spz.glb": (".spz.glb", seeds_of_scenes(".spz.glb"), cvtgs.load),
-    "gltf": (".gltf", seeds_of_scenes(".gltf"), cvtgs.load),
-    "state": (".pt", seeds_of_states, cvtgs.load),
-    "checkpoint": (".safetensors", seeds_of_checkpoints, load_checkpoint),
-    "transforms": (".json", lambda: seeds_of_cameras()[:1], cvtgs.load_cameras),
-    "inria": (".json", lambda: seeds_of_cameras()[1:], cvtgs.load_cameras),
-    "config": (".toml", seeds_of_configs, SimplifyConfig.from_toml),
-}
 
 
 def mutant(seed: bytes, dice: Dice) -> bytes:
@@ -206,13 +114,58 @@ def swap_words(data: bytearray, dice: Dice) -> bytes:
     return data[: one.start()] + other[0] + data[one.end() :]
 
 
-DAMAGES: Sequence[Callable[[bytearray, Dice], bytes]] = (
+def inside(data: bytearray, dice: Dice) -> bytes:
+    """Damage what is packed, and pack it again with the right checksums."""
+    whole = bytes(data)
+    try:
+        if whole[:2] == b"\x1f\x8b":
+            return gzip.compress(plainly(gzip.decompress(whole), dice), 1, mtime=0)
+        if whole[:2] != b"PK":
+            return plainly(whole, dice)
+        with zipfile.ZipFile(io.BytesIO(whole)) as archive:
+            names = archive.namelist()
+            contents = {name: archive.read(name) for name in names}
+        name = dice.choice(names)
+        contents[name] = plainly(contents[name], dice)
+        file = io.BytesIO()
+        with zipfile.ZipFile(file, "w") as archive:
+            for entry, content in contents.items():
+                archive.writestr(zipfile.ZipInfo(entry), content)
+        return file.getvalue()
+    except (OSError, EOFError, ValueError, IndexError, KeyError, RuntimeError, UnicodeError):
+        return whole
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError):
+        return whole
+
+
+def plainly(data: bytes, dice: Dice) -> bytes:
+    return dice.choice(PLAIN)(bytearray(data), dice)
+
+
+PLAIN: Sequence[Callable[[bytearray, Dice], bytes]] = (
     flip, cut, insert, lie, lie, swap_lines, swap_words
 )  # fmt: skip
+
+DAMAGES: Sequence[Callable[[bytearray, Dice], bytes]] = (
+    *PLAIN, inside, inside, inside
+)  # fmt: skip
+
+
+class Verdict(NamedTuple):
+    """How reading ended: ``read``, ``refused``, or what is wrong; and what tells it from others."""
+
+    end: str
+    signature: str
 
 
 def verdict(read: Callable[[Path], object], path: Path) -> str:
     """Read a file: ``read``, ``refused``, or what is wrong with how it ended."""
+    return judged(read, path).end
+
+
+def judged(read: Callable[[Path], object], path: Path) -> Verdict:
+    """Read a file, and judge how it ended."""
+    text = "read"
     before = sorted(path.parent.iterdir())
     signal.setitimer(signal.ITIMER_PROF, CPU_SECONDS)
     try:
@@ -224,7 +177,8 @@ def verdict(read: Callable[[Path], object], path: Path) -> str:
         result = f"more than {MEMORY >> 20} MiB"
     except CvtgsError as error:
         text = str(error)
-        clear = text.startswith(f"{path}: ") and text.endswith(".") and "\n" not in text
+        own = (f"{path}: ", f"{path.parent}: ", f"{path.parent}{os.sep}")  # or one beside it
+        clear = text.startswith(own) and text.endswith(".") and "\n" not in text
         result = "refused" if clear and len(text) < 1000 else f"unclear: {text!r}"
     except HangError:
         result = f"more than {CPU_SECONDS:g} s"
@@ -234,7 +188,9 @@ def verdict(read: Callable[[Path], object], path: Path) -> str:
         signal.setitimer(signal.ITIMER_PROF, 0)
     if any(w.category is not DroppedDataWarning for w in caught) or len(caught) > 1:
         result = f"warnings: {[str(w.message) for w in caught]}"
-    return result if sorted(path.parent.iterdir()) == before else "files were written"
+    if sorted(path.parent.iterdir()) != before:
+        result = "files were written"
+    return Verdict(result, re.sub(r"'[^']*'|\d+", "#", text.replace(str(path), "")))
 
 
 def limit() -> None:
@@ -248,17 +204,6 @@ def limit() -> None:
     status = Path("/proc/self/status").read_text(encoding="ascii")
     now = 1024 * int(re.search(r"VmSize:\s+(\d+) kB", status)[1])  # type: ignore[index]
     resource.setrlimit(resource.RLIMIT_AS, (now + MEMORY, now + MEMORY))
-
-
-def signature(read: Callable[[Path], object], path: Path) -> str:
-    """Return how an input ends, without numbers and names: what tells one end from another."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            read(path)
-    except Exception as error:
-        return re.sub(r"'[^']*'|\d+", "#", str(error).replace(str(path), ""))
-    return "read"
 
 
 def made_small(data: bytes, fails: Callable[[bytes], bool]) -> bytes:
@@ -290,9 +235,14 @@ def corpus(kind: str) -> list[Path]:
     return sorted((CORPUS / kind).glob("*"))
 
 
+def suffix_of(kind: str) -> str:
+    name = READERS[kind].name
+    return name if name.startswith(".") else Path(name).suffix
+
+
 def keep(kind: str, data: bytes) -> Path:
     """Keep an input with the tests."""
-    path = CORPUS / kind / f"{hashlib.sha256(data).hexdigest()[:12]}{READERS[kind][0]}"
+    path = CORPUS / kind / f"{hashlib.sha256(data).hexdigest()[:12]}{suffix_of(kind)}"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
     return path
@@ -307,31 +257,28 @@ def main() -> None:
     parser.add_argument("--grow", type=int, default=0, help="new ends per kind to keep with tests")
     options = parser.parse_args()
     dice, ends = random.Random(options.seed), Counter[str]()
-    pools = {kind: seeds() for kind, (_, seeds, _) in READERS.items()}
+    kinds = options.kinds or [*READERS]
+    pools = {kind: READERS[kind].seeds() for kind in kinds}
     whole = {kind: len(pool) for kind, pool in pools.items()}
-    known: dict[str, set[str]] = {kind: set() for kind in READERS}
+    known: dict[str, set[str]] = {kind: set() for kind in kinds}
     failures = []
     with tempfile.TemporaryDirectory() as folder:
+        paths = {kind: place(kind, Path(folder)) for kind in kinds}
         for kind, pool in pools.items():
             for number, seed in enumerate(pool):
-                path = Path(folder) / f"{kind}{number}{READERS[kind][0]}"
-                path.write_bytes(seed)
-                if verdict(READERS[kind][2], path) != "read":
+                paths[kind].write_bytes(seed)
+                if verdict(READERS[kind].read, paths[kind]) != "read":
                     sys.exit(f"{kind} {number} cannot be read before it is damaged.")
             pool += [path.read_bytes() for path in corpus(kind)]
         limit()
         for number in range(options.count):
-            kind = dice.choice(options.kinds or ("ply", "ply", *READERS))
-            suffix, _, read = READERS[kind]
-            path, data = (
-                Path(folder) / f"damaged{suffix}",
-                mutant(chosen(pools[kind], whole[kind], dice), dice),
-            )
+            kind = kinds[number % len(kinds)]
+            path, read = paths[kind], READERS[kind].read
+            data = mutant(chosen(pools[kind], whole[kind], dice), dice)
             path.write_bytes(data)
-            end = verdict(read, path)
+            end, new = judged(read, path)
             if end in ("read", "refused"):
                 ends[f"{kind} {end}"] += 1
-                new = signature(read, path)
                 if new not in known[kind] and len(known[kind]) < MOST_GROWN:
                     known[kind].add(new)
                     pools[kind].append(data)
@@ -339,7 +286,12 @@ def main() -> None:
                         keep(kind, data)
                 continue
 
-            def fails(other: bytes, end: str = end, path: Path = path, read: Any = read) -> bool:
+            def fails(
+                other: bytes,
+                end: str = end,
+                path: Path = path,
+                read: Callable[[Path], object] = read,
+            ) -> bool:
                 path.write_bytes(other)
                 return verdict(read, path).split(":")[0] == end.split(":", maxsplit=1)[0]
 

@@ -1,17 +1,21 @@
 """A few hundred damaged files; ``nox -s fuzz`` reads a hundred thousand."""
 
+import gzip
+import io
 import json
 import os
 import random
 import re
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
 
 import cvtgs
 import fuzz_files
+import fuzz_seeds
 from cvtgs.errors import FileFormatError
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
 
@@ -41,7 +45,7 @@ def test_damaged_files_end_in_a_result_or_one_clear_sentence():
 
 
 def test_the_same_seed_damages_the_same_way():
-    data = fuzz_files.seeds_of_ply()[0]
+    data = fuzz_seeds.seeds_of_ply()[0]
     first, second = ([fuzz_files.mutant(data, random.Random(s)) for s in range(50)] for _ in "ab")
     assert first == second
     assert len(set(first)) > 40
@@ -49,11 +53,11 @@ def test_the_same_seed_damages_the_same_way():
 
 def test_kept_inputs_end_in_a_result_or_one_clear_sentence(tmp_path):
     ends = {}
-    for kind, (suffix, _, read) in fuzz_files.READERS.items():
+    for kind, found in fuzz_seeds.READERS.items():
+        path = fuzz_seeds.place(kind, tmp_path)
         for kept in fuzz_files.corpus(kind):
-            path = tmp_path / f"kept{suffix}"
             path.write_bytes(kept.read_bytes())
-            ends[str(kept)] = fuzz_files.verdict(read, path)
+            ends[str(kept)] = fuzz_files.verdict(found.read, path)
     assert len(ends) > 50
     assert {kept: end for kept, end in ends.items() if end not in ("read", "refused")} == {}
 
@@ -124,7 +128,7 @@ def test_lying_headers_take_no_memory_and_hangs_are_noticed(tmp_path):
 
 
 def test_lying_headers_of_checkpoints_take_no_memory(tmp_path):
-    (content,) = fuzz_files.seeds_of_checkpoints()
+    (content,) = fuzz_seeds.seeds_of_checkpoints()
     length = int.from_bytes(content[:8], "little")
     header = json.loads(content[8 : 8 + length])
     name = next(key for key in header if key != "__metadata__")
@@ -133,7 +137,7 @@ def test_lying_headers_of_checkpoints_take_no_memory(tmp_path):
         text = json.dumps(header | {name: entry}).encode()
         path = tmp_path / "lie.safetensors"
         path.write_bytes(len(text).to_bytes(8, "little") + text + content[8 + length :])
-        assert fuzz_files.verdict(fuzz_files.load_checkpoint, path) == "refused"
+        assert fuzz_files.verdict(fuzz_seeds.load_checkpoint, path) == "refused"
 
 
 @pytest.mark.parametrize(
@@ -151,3 +155,17 @@ def test_sentences_about_endless_headers_are_short(tmp_path, lines):
     with pytest.raises(FileFormatError) as caught:
         cvtgs.load(path)
     assert len(str(caught.value)) < 400 + len(str(path))
+
+
+@pytest.mark.parametrize("kind", ["sog", "spz", "state"])
+def test_what_is_packed_is_damaged_inside(kind):
+    seeds = [seed for seed in fuzz_seeds.READERS[kind].seeds() if seed[:2] in (b"PK", b"\x1f\x8b")]
+    dice = random.Random(3)
+    for seed in seeds:
+        damaged = fuzz_files.inside(bytearray(seed), dice)
+        if kind == "spz":
+            assert gzip.decompress(damaged)
+            continue
+        with zipfile.ZipFile(io.BytesIO(damaged)) as archive:
+            assert archive.testzip() is None
+    assert seeds

@@ -1,5 +1,6 @@
 """``cvtgs``: parse the command line, run a command, turn errors into exit codes."""
 
+import argparse
 import io
 import os
 import signal
@@ -7,6 +8,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from types import FrameType
 from typing import NoReturn, TextIO
 
@@ -22,6 +24,9 @@ from cvtgs.cli.simplify import add_simplify
 from cvtgs.cli.train import add_train
 from cvtgs.cli.view import add_view
 from cvtgs.errors import CvtgsError, memory_errors
+
+WRITE_SEVERAL = ("levels", "render", "compare", "tradeoff", "demo", "train")
+"""Commands whose files belong together, so that one run at a time may write them."""
 
 INTERRUPTED, TERMINATED, PIPE_CLOSED = 130, 143, 141
 MEMORY_ADVICE = (
@@ -67,9 +72,18 @@ def _run(words: Sequence[str]) -> None:
     if not words:
         parser.exit(2, parser.format_help())
     options = parser.parse_args(words)
-    with memory_errors(f"cvtgs {options.command}", MEMORY_ADVICE):
+    with memory_errors(f"cvtgs {options.command}", MEMORY_ADVICE), _lock(options):
         options.run(options)
     flush_output()
+
+
+def _lock(options: argparse.Namespace) -> AbstractContextManager[None]:
+    """Return what keeps a second run from the files of a command that writes several."""
+    if options.command not in WRITE_SEVERAL:
+        return nullcontext()
+    from cvtgs.io.locks import folder_lock
+
+    return folder_lock(options.output)
 
 
 def run_process() -> NoReturn:

@@ -62,9 +62,38 @@ def output_lock(path: str | os.PathLike[str]) -> Iterator[None]:
         lock.release()
 
 
+@contextmanager
+def folder_lock(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Hold the lock of a folder to write several files to, as :func:`output_lock` does.
+
+    There is none where no file can be made, so that whatever writes there says what is wrong.
+
+    Args:
+        path: The folder, which need not be there yet.
+
+    Raises:
+        OutputBusyError: Another run holds it.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as home:
+        ...     with folder_lock(Path(home) / "levels"):
+        ...         [file.name for file in Path(home).iterdir()]
+        ['.levels.lock']
+    """
+    place = lock_path(path).parent
+    if place.is_dir() and os.access(place, os.W_OK | os.X_OK):
+        with output_lock(path):
+            yield
+    else:
+        yield
+
+
 def lock_path(path: str | os.PathLike[str]) -> Path:
-    """Return the lock file of an output."""
+    """Return the lock file of an output: beside it, or in a folder beside which none can be."""
     target = Path(os.path.realpath(path))
+    if target.is_dir() and not os.access(target.parent, os.W_OK | os.X_OK):
+        return target / ".lock"
     return target.with_name(f".{target.name}.lock")
 
 
