@@ -55,3 +55,11 @@ def test_the_docker_context_holds_what_is_copied():
     assert [name for name in copied if not (ROOT / name).exists()] == []
     extras = re.search(r'"\.\[(.*)\]"', read("Dockerfile"))[1].split(",")
     assert set(extras) <= set(PROJECT["optional-dependencies"])
+
+
+def test_actions_are_pinned_by_their_commits():
+    uses = re.findall(r"uses: (.*)", read(".github/workflows/checks.yml"))
+    pinned = r"[\w-]+/[\w-]+@[0-9a-f]{40}  # v\d+\.\d+\.\d+"
+    assert uses
+    assert [line for line in uses if not re.fullmatch(pinned, line)] == []
+    assert len(set(uses)) == len({line.split("@")[0] for line in uses})  # one version of each
