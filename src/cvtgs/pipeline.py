@@ -31,6 +31,9 @@ from cvtgs.validity import standardized, with_finite_opacities
 NEIGHBORS = 8
 """Cells around a cell that may cover its ends, and that the network sees."""
 
+NESTED_FROM = 4
+"""A level is made of finer cells only where there are, on average, so many of them in a cell."""
+
 CHUNK = 1 << 18
 """Gaussians whose distance is measured together, to bound memory."""
 
@@ -220,6 +223,35 @@ def shape_merged(
     return cells.inflate_cells(
         merged, shown, neighbors, everywhere=config.inflation, covered=config.covered_inflation
     )
+
+
+class LevelFacts(NamedTuple):
+    """What is known of one of several sizes.
+
+    Attributes:
+        geometric_error: Root mean square distance from Gaussians to those that replace them,
+            weighted by apparent mass; 0 if all are kept.
+        assignment: ``(n,)`` row of the small Gaussian that stands for each input row, int32, on
+            the CPU; -1 for those that were left out. None if all are kept.
+    """
+
+    geometric_error: float = 0.0
+    assignment: Int[Tensor, "n"] | None = None
+
+
+def level_facts(scene: GaussianScene, analysis: SceneAnalysis, reduced: Reduced) -> LevelFacts:
+    """Measure how far a small scene is from the full one, and say what stands for what."""
+    if reduced.grouping is None:
+        return LevelFacts()
+    partition = reduced.grouping.partition
+    masses = analysis.apparent_areas * analysis.opacities
+    error = geometric_error(scene, reduced.scene, partition, masses=masses)
+    return LevelFacts(error, partition.labels(len(scene)).cpu())
+
+
+def nests_in(target: int, finest: Reduced | None) -> bool:
+    """Return whether a level is to be made of the cells of a finer one."""
+    return finest is not None and NESTED_FROM * target <= len(finest.scene)
 
 
 def geometric_error(

@@ -25,7 +25,7 @@ from cvtgs.devices import chosen_device, within_memory
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.grouping import OrderedRows
 from cvtgs.mergenet import Checkpoint, MergeNet
-from cvtgs.pipeline import Reduced, geometric_error, order_gaussians, reduce_scene
+from cvtgs.pipeline import Reduced, level_facts, nests_in, order_gaussians, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified, SimplifyReport
 from cvtgs.scene import GaussianScene, concatenate
@@ -36,9 +36,6 @@ from cvtgs.validity import (
     valid_rows,
     with_finite_opacities,
 )
-
-NESTED_FROM = 4
-"""A level is made of finer cells only where there are, on average, so many of them in a cell."""
 
 Result = TypeVar("Result")
 
@@ -172,16 +169,12 @@ class Prepared:
             clock = StageClock(self._listener, self._device)
             valid = self._check(clock).scene
             analysis = self._analyze(target, clock)
-            nested = finest is not None and NESTED_FROM * target <= len(finest.scene)
+            nested = nests_in(target, finest)
             start = finest if nested else None
             reduced = self._reduce(valid, analysis, target, clock, finest=start)
-            error, assignment = 0.0, None
             if reduced.grouping is not None:
                 finest = finest or reduced
-                masses = analysis.apparent_areas * analysis.opacities
-                partition = reduced.grouping.partition
-                error = geometric_error(valid, reduced.scene, partition, masses=masses)
-                assignment = partition.labels(len(valid)).cpu()
+            error, assignment = level_facts(valid, analysis, reduced)
             matched = self._match(reduced, analysis, clock)
             result = self._result(matched, analysis, target, clock)
             found[target] = Level(*result, error, nested, assignment)

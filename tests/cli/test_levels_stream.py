@@ -1,5 +1,6 @@
 """``cvtgs levels --stream``."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -28,7 +29,7 @@ def test_a_stream(
         counts = [len(load(tmp_path / "out", lod=lod)) for lod in range(3)]
         assert counts == [2000, 200, 20]
     else:
-        assert len(load(tmp_path / "out" / "0.glb")) == 20
+        assert len(load(tmp_path / "out" / "0_0.glb")) == 20
 
 
 @pytest.mark.parametrize(
@@ -36,6 +37,12 @@ def test_a_stream(
     [
         (["--stream", "sog", "--suffix", ".spz"], "--suffix cannot go with --stream"),
         (["--chunk", "300"], "--chunk goes with --stream."),
+        (["--memory", "2GB"], "--memory goes with --stream."),
+        (["--stream", "sog", "--place", "8,47"], "goes with --stream 3dtiles."),
+        (["--stream", "3dtiles", "--place", "8"], "--place must be 2 or 3 numbers with commas"),
+        (["--stream", "3dtiles", "--place", "8,97"], "a latitude from -90 to 90"),
+        (["--stream", "3dtiles", "--transform", "1,2"], "--transform must be 16 numbers"),
+        (["--stream", "3dtiles", "--workers", "0"], "--workers must be at least 1"),
         (["--stream", "sog", "--chunk", "0"], "--chunk must be at least 1, found 0."),
     ],
 )
@@ -49,3 +56,20 @@ def test_options_that_do_not_fit(
     assert main([*words, *more]) == 1
     assert said in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_blocks(
+    tmp_path: Path,
+    words: list[str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("cvtgs.outofcore.block_count", lambda *_: 2)
+    monkeypatch.setattr("cvtgs.streams.blocks.block_count", lambda *_: 2)
+    more = ["--stream", "3dtiles", "--workers", "1", "--rho", "1,0.1", "--place", "8.5,47.4"]
+    assert main([*words, *more]) == 0
+    first, _, finest, coarsest = capsys.readouterr().out.splitlines()
+    assert first == "a.ply in 2 chunks and 2 blocks, the finest level first:"
+    assert (finest.split()[0], coarsest.split()[0]) == ("2,000", "200")
+    document = json.loads((tmp_path / "out" / "tileset.json").read_text())
+    assert document["root"]["transform"][12:15] == pytest.approx((4276e3, 639e3, 4672e3), abs=2e3)

@@ -13,7 +13,14 @@ from cvtgs import GaussianScene, Simplifier, load
 from cvtgs.errors import InvalidArgumentError, OutputExistsError
 from cvtgs.progress import ProgressEvent
 from cvtgs.report import Level
-from cvtgs.streams import StreamNode, StreamPlan, plan_stream, write_sog_stream, write_tiles
+from cvtgs.streams import (
+    StreamNode,
+    StreamPlan,
+    geo_transform,
+    plan_stream,
+    write_sog_stream,
+    write_tiles,
+)
 from cvtgs.synthetic import scene as make
 
 RHOS = [1.0, 0.25, 0.05, 0.0125]
@@ -174,7 +181,7 @@ def test_one_level_and_one_chunk(levels: tuple[Level, ...], tmp_path: Path) -> N
     assert len(plan.chunks) == 1
     write_sog_stream(plan, tmp_path / "sog")
     write_tiles(plan, tmp_path / "tiles")
-    assert len(load(tmp_path / "sog")) == len(load(tmp_path / "tiles" / "0.glb")) == 50
+    assert len(load(tmp_path / "sog")) == len(load(tmp_path / "tiles" / "0_0.glb")) == 50
 
 
 def test_what_is_there_is_not_replaced_unasked(plan: StreamPlan, tmp_path: Path) -> None:
@@ -192,3 +199,41 @@ def test_wrong_levels(levels: tuple[Level, ...]) -> None:
             plan_stream(wrong)
     with pytest.raises(InvalidArgumentError, match="and chunks of 0"):
         plan_stream(levels, chunk_gaussians=0)
+
+
+def test_a_place_on_the_earth() -> None:
+    """At 90 degrees east on the equator, east is -x, north is z, and up is y."""
+    matrix = torch.tensor(geo_transform(90.0, 0.0, 100.0), dtype=torch.float64).reshape(4, 4).T
+    wanted = [[-1, 0, 0, 0], [0, 0, 1, 6378237], [0, 1, 0, 0], [0, 0, 0, 1]]
+    torch.testing.assert_close(matrix, torch.tensor(wanted, dtype=torch.float64))
+    pole = geo_transform(0.0, 90.0)
+    assert pole[14] == pytest.approx(6356752.314245, abs=1e-6)
+    # 2.2945 E, 48.8584 N, 35 m, by the formulas of EPSG 9602
+    assert geo_transform(2.2945, 48.8584, 35.0)[12:15] == pytest.approx(
+        (4200935.0, 168327.0, 4780231.0), abs=2.0
+    )
+    for wrong in ((0.0, 91.0), (400.0, 0.0), (0.0, math.nan)):
+        with pytest.raises(InvalidArgumentError, match="a latitude from -90 to 90"):
+            geo_transform(*wrong)
+
+
+def test_tiles_stand_where_they_are_told(plan: StreamPlan, tmp_path: Path) -> None:
+    place = geo_transform(8.5, 47.4, 400.0)
+    write_tiles(plan, tmp_path / "a", transform=place)
+    assert json.loads((tmp_path / "a" / "tileset.json").read_text())["root"]["transform"] == [
+        *place
+    ]
+    for wrong in ((1.0,) * 3, (0.0,) * 15 + (1.0,), (1.0,) * 16):
+        with pytest.raises(InvalidArgumentError, match="must be 16 finite numbers"):
+            write_tiles(plan, tmp_path / "b", transform=wrong)
+    assert not (tmp_path / "b").exists()
+
+
+def test_nothing_is_left_of_a_stream_that_fails(plan: StreamPlan, tmp_path: Path) -> None:
+    def fail(event: ProgressEvent) -> None:
+        if event.done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_sog_stream(plan, tmp_path / "out", listener=fail)
+    assert list(tmp_path.iterdir()) == []

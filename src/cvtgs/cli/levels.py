@@ -1,14 +1,13 @@
 """``cvtgs levels``: several sizes of one scene, and an index for viewers."""
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.display import progress_bars, say, size_text
 from cvtgs.cli.options import (
     AddParser,
-    FileAxes,
     add_options,
     add_view_options,
     check_view_options,
@@ -18,17 +17,20 @@ from cvtgs.cli.options import (
     read_ratios,
     read_settings,
 )
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.cli.streams import (
+    add_stream_options,
+    check_stream_options,
+    stream_blocks,
+    stream_levels,
+)
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation
     from cvtgs.levels import LevelsIndex
     from cvtgs.progress import ProgressListener
-    from cvtgs.report import Level
     from cvtgs.scene import GaussianScene
 
 
-STREAMS = ("sog", "3dtiles")
 PLAIN_RHOS, STREAM_RHOS = "0.1,0.01,0.001", "1,0.25,0.06,0.015"
 
 
@@ -50,18 +52,7 @@ def add_levels(add_parser: AddParser) -> None:
         help="ratios of Gaussians to keep (default 0.1,0.01,0.001; of --stream 1,0.25,0.06,0.015)",
     )
     parser.add_argument("--suffix", metavar="END", help="format of the files (default .ply)")
-    parser.add_argument(
-        "--stream",
-        choices=STREAMS,
-        help="write chunks that viewers load while they show them, instead of whole scenes: sog "
-        "(lod-meta.json, for PlayCanvas and SuperSplat) or 3dtiles (tileset.json, for CesiumJS)",
-    )
-    parser.add_argument(
-        "--chunk",
-        type=int,
-        metavar="N",
-        help="Gaussians in a chunk of a stream at its finest level (default 32768)",
-    )
+    add_stream_options(parser)
     add_options(parser, "--preset", "--ckpt", "--config", "--set", "--sh-degree", "--axes")
     parser.add_argument(
         "--no-scores", action="store_true", help="skip rendering and scoring the levels"
@@ -80,11 +71,15 @@ def levels(options: argparse.Namespace) -> None:
         cvtgs.target_count(1, rho)
     suffix = options.suffix or ".ply"
     names = cvtgs.levels.level_names(rhos, suffix)
-    _check_output(options, names)
+    check_stream_options(options)
+    if options.stream is None:
+        cvtgs.levels.check_levels(options.output, names, overwrite=options.overwrite)
     config = cvtgs.SimplifyConfig.compose(
         file=options.config, preset=options.preset, settings=read_settings(options.settings)
     )
     checkpoint = None if options.ckpt == "none" else options.ckpt
+    if options.stream is not None and stream_blocks(options, checkpoint, config, rhos, axes):
+        return
     with progress_bars(quiet=options.quiet) as listener:
         simplifier = cvtgs.Simplifier(
             checkpoint, config=config, device=options.device, listener=listener
@@ -98,7 +93,7 @@ def levels(options: argparse.Namespace) -> None:
             cameras = None if own is None else own.cameras
         made = simplifier.levels(scene, rhos, cameras=cameras)
         if options.stream is not None:
-            _write_stream(options, made, axes, listener)
+            stream_levels(options, made, axes, listener)
             return
         index = cvtgs.levels.write_levels(
             made,
@@ -118,52 +113,6 @@ def levels(options: argparse.Namespace) -> None:
             index = cvtgs.levels.add_scores(options.output, evaluation)
     if not options.quiet:
         _print_index(index)
-
-
-def _check_output(options: argparse.Namespace, names: Sequence[str]) -> None:
-    """Check options and outputs of levels or of a stream, before the long work that comes first."""
-    from cvtgs.levels import check_levels
-    from cvtgs.streams import check_stream
-
-    if options.stream is None:
-        if options.chunk is not None:
-            raise InvalidArgumentError("--chunk goes with --stream.")
-        check_levels(options.output, names, overwrite=options.overwrite)
-        return
-    if options.suffix is not None:
-        raise InvalidArgumentError("--suffix cannot go with --stream, which sets the format.")
-    if options.chunk is not None and options.chunk < 1:
-        raise InvalidArgumentError(f"--chunk must be at least 1, found {options.chunk}.")
-    check_stream(options.output, options.stream, overwrite=options.overwrite)
-
-
-def _write_stream(
-    options: argparse.Namespace,
-    made: "Sequence[Level]",
-    axes: "FileAxes",
-    listener: "ProgressListener",
-) -> None:
-    """Write levels as a stream, and say what is in it."""
-    from cvtgs.streams import plan_stream, write_sog_stream, write_tiles
-    from cvtgs.streams.plan import CHUNK_GAUSSIANS
-
-    if axes.target is not None:
-        made = [
-            level._replace(scene=cvtgs.io.change_axes(level.scene, "rdf", axes.target))
-            for level in made
-        ]
-    plan = plan_stream(made, chunk_gaussians=options.chunk or CHUNK_GAUSSIANS)
-    write = write_sog_stream if options.stream == "sog" else write_tiles
-    written = write(plan, options.output, overwrite=options.overwrite, listener=listener)
-    if options.quiet:
-        return
-    say(f"{options.input.name} in {len(plan.chunks):,} chunks, the finest level first:")
-    say(f"  {'Gaussians':>12}  {'size':>9}  {'files':>6}  {'error':>9}")
-    for level, one in zip(plan.levels, written, strict=True):
-        say(
-            f"  {one.gaussians:>12,}  {size_text(one.bytes):>9}  {one.files:>6,}  "
-            f"{level.geometric_error:>9.3g}"
-        )
 
 
 def _score(

@@ -3,11 +3,11 @@
 import argparse
 import time
 from collections.abc import Mapping
-from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cvtgs
+from cvtgs.cli.blocks import add_block_options, block_workers, memory_of
 from cvtgs.cli.display import TIE, progress_bars
 from cvtgs.cli.jobs import Outcome, SceneJob, add_paths, check_paths, open_jobs, run_jobs
 from cvtgs.cli.options import (
@@ -34,7 +34,6 @@ from cvtgs.progress import ProgressListener, silent
 
 if TYPE_CHECKING:
     from cvtgs.config import SimplifyConfig
-    from cvtgs.outofcore import Workers
     from cvtgs.report import SimplifyReport
     from cvtgs.simplifier import Simplifier
 
@@ -120,25 +119,7 @@ def add_simplify(add_parser: AddParser) -> None:
         help="boxes whose Gaussians stay unchanged, come first in OUT and count: "
         '{"min": [x, y, z], "max": [x, y, z]}, or a list of these',
     )
-    parser.add_argument(
-        "--memory",
-        metavar="AMOUNT",
-        help="memory to use, for example 4GB (default: what is free); a binary .ply that needs "
-        "more is simplified block by block, and the same command resumes an interrupted run",
-    )
-    parser.add_argument(
-        "--workers",
-        type=int,
-        metavar="N",
-        help="processes that work on blocks and share --memory (default: one for each core, as "
-        "far as memory allows)",
-    )
-    parser.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="address of a Dask cluster that simplifies the blocks; its workers need access to "
-        "IN and OUT, and --memory is the memory of each task",
-    )
+    add_block_options(parser)
     parser.add_argument(
         "--report", type=Path, metavar="R.json", help="file for a report of the run in JSON"
     )
@@ -323,20 +304,11 @@ def check_goals(options: argparse.Namespace) -> None:
 def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int | None:
     """Return the memory for simplifying block by block; None if it is not needed or possible."""
     from cvtgs.io.ply import open_rows
-    from cvtgs.outofcore import available_memory, block_count, check_config, read_bytes
-    from cvtgs.outofcore.memory import memory_to_plan
+    from cvtgs.outofcore import block_count, check_config
 
-    if options.workers is not None and (options.workers < 1 or options.scheduler is not None):
-        raise InvalidArgumentError(
-            "--workers must be at least 1, and goes with blocks on this machine, not with "
-            f"--scheduler; found {options.workers}."
-        )
+    memory = memory_of(options)
     names = ("target_psnr", "target_ssim", "time_budget", "cameras", "axes", "sh_degree")
     excluded = [name for name in names if getattr(options, name) is not None]
-    if options.memory is None:
-        memory = memory_to_plan(available_memory())
-    else:
-        memory = read_bytes(options.memory)
     if options.memory is None and options.scheduler is None:
         try:
             if excluded or block_count(open_rows(options.input), memory) == 1:
@@ -361,24 +333,17 @@ def _simplify_blocks(
     listener: ProgressListener,
 ) -> "SimplifyReport":
     """Simplify a file block by block, in processes of this machine or on a cluster."""
-    from cvtgs.outofcore import ClusterWorkers, LocalWorkers, connect, worker_count
-
-    with ExitStack() as stack:
-        workers: Workers | None = None
-        if options.scheduler is not None:
-            workers = ClusterWorkers(stack.enter_context(closing(connect(options.scheduler))))
-        elif (count := worker_count(memory, options.workers)) > 1:
-            workers, memory = stack.enter_context(LocalWorkers(count)), memory // count
+    with block_workers(options, memory) as blocks:
         return cvtgs.outofcore.simplify_file(
             options.input,
             options.output,
             options.rho,
             count=options.count,
             max_count=options.max_count,
-            memory=memory,
+            memory=blocks.memory,
             boxes=() if options.keep is None else cvtgs.boxes.read_boxes(options.keep),
             simplifier=simplifier,
-            workers=workers,
+            workers=blocks.workers,
             overwrite=options.overwrite,
             listener=listener,
         )

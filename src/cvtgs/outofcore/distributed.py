@@ -18,7 +18,8 @@ import torch
 import cvtgs
 from cvtgs.errors import CvtgsError, MissingDependencyError, RunError, is_out_of_memory
 from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.run import Item, Result, simplify_file
+from cvtgs.outofcore.run import simplify_file
+from cvtgs.outofcore.workers import Item, Result
 from cvtgs.report import SimplifyReport
 
 if TYPE_CHECKING:

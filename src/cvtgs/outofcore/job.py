@@ -235,15 +235,20 @@ class Job:
         """
         try:
             self.read_scan()
-            if self._manifest().key != key:
-                return False
-            text = self.path("sorted.json").read_text(encoding="utf-8")
-            if not all(self._is_whole(name, *facts) for name, facts in json.loads(text).items()):
+            if self._manifest().key != key or not self.has_sorted_rows():
                 return False
         except (OSError, ValueError, KeyError, TypeError):
             return False
         self._remove_damaged()
         return True
+
+    def has_sorted_rows(self) -> bool:
+        """Return whether the rows that were sorted into blocks are still there, and whole."""
+        try:
+            text = self.path("sorted.json").read_text(encoding="utf-8")
+            return all(self._is_whole(name, *facts) for name, facts in json.loads(text).items())
+        except (OSError, ValueError, TypeError, AttributeError):
+            return False
 
     def start_over(self) -> None:
         """Make an empty folder; what earlier jobs of this output have left is removed."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cvtgs import cells, cvt, validity
-from cvtgs.analysis import SceneAnalysis, drop_unused_bands, restore_columns, select_columns
+from cvtgs.analysis import drop_unused_bands, restore_columns, select_columns
 from cvtgs.clock import StageClock
 from cvtgs.devices import one_thread
 from cvtgs.grouping import allocate
@@ -19,7 +19,7 @@ from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.mergenet import correct_cells
 from cvtgs.outofcore.halo import bounding_box, halo_cells, other_blocks
 from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.rows import BlockRows, read_members, read_rows
+from cvtgs.outofcore.rows import BlockRows, analysis_of, read_members, read_rows
 from cvtgs.pipeline import merge_members, neighbor_count, reduce_scene, shape_merged
 from cvtgs.progress import silent
 from cvtgs.report import CellStatistics
@@ -158,17 +158,9 @@ def simplify_block(job: Job, block: int) -> None:
     if job.small_path(block).exists():
         return
     scan = job.read_scan()
-    scene, apparent_areas, visibility = read_rows(job, block)
-    scene = select_columns(scene, job.config.effects)
-    analysis = SceneAnalysis(
-        frame=scan.frame,
-        farthest=0.0,  # flyaways are left out already
-        opacities=scene.opacities,
-        areas=scene.areas,
-        apparent_areas=apparent_areas,
-        visibility=visibility,
-        plan=scan.plan,
-    )
+    rows = read_rows(job, block)
+    scene = select_columns(rows.scene, job.config.effects)
+    analysis = analysis_of(scan, rows)
     no_filter = {"min_opacity": 0.0, "max_flyaway_share": 0.0}  # rows are filtered when sorted
     filter_config = job.config.filter.model_copy(update=no_filter)
     config = job.config.model_copy(update={"filter": filter_config})

@@ -14,7 +14,7 @@ from typing import Self
 from cvtgs.devices import core_count
 from cvtgs.errors import RunError
 from cvtgs.outofcore.memory import BASE_BYTES
-from cvtgs.outofcore.run import Item, Result
+from cvtgs.outofcore.workers import Item, Result
 
 
 def worker_count(memory: int, wanted: int | None = None) -> int:

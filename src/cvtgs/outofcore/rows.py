@@ -131,6 +131,20 @@ def read_rows(job: Job, block: int, *, is_slim: bool = False) -> BlockRows:
     return _assembled(job, _row_pieces(job, block), sum(counts), is_slim=is_slim)
 
 
+def analysis_of(scan: SceneScan, rows: BlockRows) -> analysis.SceneAnalysis:
+    """Return what is known of the Gaussians of a block, by the scan of the whole scene."""
+    scene = rows.scene
+    return analysis.SceneAnalysis(
+        frame=scan.frame,
+        farthest=float(scan.frame.distances(scene.means).amax()),
+        opacities=scene.opacities,
+        areas=scene.areas,
+        apparent_areas=rows.apparent_areas,
+        visibility=rows.visibility,
+        plan=scan.plan,
+    )
+
+
 def read_members(job: Job, block: int) -> tuple[BlockRows, Tensor]:
     """Read the rows in the cells of a block, and the cell of each."""
     labels = map_tensors(job.labels_path(block))[0]["labels"].long()

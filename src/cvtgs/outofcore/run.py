@@ -4,17 +4,17 @@ import math
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cvtgs.boxes import Box, check_room
+from cvtgs.boxes import Box
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, shortfall, target_count
@@ -22,21 +22,19 @@ from cvtgs.devices import one_thread
 from cvtgs.errors import (
     ConfigError,
     DroppedDataWarning,
-    InvalidArgumentError,
-    InvalidSceneError,
 )
 from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import join_plys, open_rows
 from cvtgs.io.tensors import map_tensors
-from cvtgs.math.frames import robust_frame
-from cvtgs.outofcore.job import Job, SortedFile, job_folder
+from cvtgs.outofcore.job import Job, job_folder
 from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
 from cvtgs.outofcore.memory import available_memory, block_count, memory_to_plan
 from cvtgs.outofcore.merge import BlockReport, correct, inflate, merge, simplify_block
-from cvtgs.outofcore.rows import sort_range
-from cvtgs.outofcore.scan import CHUNK, RowRange, add_totals, read_sample, scan_range, scan_scene
+from cvtgs.outofcore.scan import CHUNK
+from cvtgs.outofcore.sort import sort_into_blocks
+from cvtgs.outofcore.workers import CheckedWorkers, Result, Workers, sequentially, with_progress
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport
 from cvtgs.scene import concatenate
@@ -44,48 +42,6 @@ from cvtgs.simplifier import Simplifier
 
 RANGE_ROWS, MOST_RANGES = 1 << 20, 64
 """Rows of the file that one process reads in one call, at least, and number of such calls."""
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
-
-
-class Workers(Protocol):
-    """Calls a function for every item, in this process or in others."""
-
-    def __call__(
-        self, function: Callable[[Item], Result], items: Sequence[Item]
-    ) -> Iterable[Result]:
-        """Call the function for every item.
-
-        Args:
-            function: A function that can be pickled.
-            items: Its arguments; the calls are independent.
-
-        Returns:
-            The results, in the order of the items.
-        """
-        ...
-
-
-@runtime_checkable
-class CheckedWorkers(Workers, Protocol):
-    """Workers that may be elsewhere, and are asked first whether they can do a job."""
-
-    def check(self, job: Job) -> int:
-        """Refuse workers that cannot do a job.
-
-        Args:
-            job: The job; its folder is there.
-
-        Returns:
-            How many workers there are.
-        """
-        ...
-
-
-def sequentially(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
-    """Call a function for one item after the other, in this process."""
-    yield from map(function, items)
 
 
 def simplify_file(  # noqa: PLR0913 (options by name)
@@ -218,36 +174,7 @@ def _scan_and_sort(job: Job, workers: Workers, clock: StageClock) -> tuple[list[
 
     Returns how many Gaussians each block keeps, and how many cells its tessellation makes.
     """
-    ranges = job.ranges()
-    with clock.stage("scan", len(ranges)) as advance:
-        sample = read_sample(job.source)
-        if len(sample) == 0:
-            raise InvalidSceneError(f"{job.source.path}: found no valid Gaussian.")
-        frame = robust_frame(sample.means)
-        scan_rows = partial(scan_range, job.source, frame, job.boxes)
-        totals = add_totals(_with_progress(workers(scan_rows, ranges), advance))
-        valid, kept = totals.valid_count, totals.kept_count
-        check_room(kept, target=job.target, total=valid)
-        if kept == valid:
-            raise InvalidArgumentError(
-                f"all {kept} valid Gaussians are to be kept as they are; none is left."
-            )
-        rest = min(job.target, valid) - kept
-        scan = scan_scene(
-            sample,
-            totals,
-            boxes=job.boxes,
-            target=max(1, rest),
-            blocks=job.blocks,
-            config=job.config,
-            frame=frame,
-        )
-    with clock.stage("sort", len(ranges)) as advance:
-        job.write_scan(scan)
-        rows, cells = _sort(job, workers, ranges, advance)
-        if sum(rows) < rest:  # the filter was too strict for so large a target
-            job.write_scan(replace(scan, min_opacity=0.0, max_flyaway_mass=-1.0))
-            rows, cells = _sort(job, workers, ranges, advance)
+    rest, rows, cells = sort_into_blocks(job, workers, clock)
     if rest < sum(1 for count in rows if count):  # tiny targets: the heaviest blocks get one each
         order = sorted(range(job.blocks), key=lambda block: -cells[block])
         targets = [int(block in order[:rest]) for block in range(job.blocks)]
@@ -270,20 +197,6 @@ def _run_blocks(job: Job, workers: Workers, clock: StageClock) -> int:
     with clock.stage("blocks", len(with_cells)) as advance:
         _run_all(workers, partial(last, job), with_cells, advance)
     return resumed
-
-
-def _sort(
-    job: Job, workers: Workers, ranges: Sequence[RowRange], advance: Callable[[int], None]
-) -> tuple[list[int], list[float]]:
-    """Sort all rows into blocks; return how many each has, and their weight in cells."""
-    rows, cells, files = [0] * job.blocks, [0.0] * job.blocks, list[SortedFile]()
-    for part in _with_progress(workers(partial(sort_range, job), ranges), advance):
-        rows = [a + b for a, b in zip(rows, part.rows, strict=True)]
-        for chunk in part.cells:  # one after the other: the same bits whatever the ranges
-            cells = [a + b for a, b in zip(cells, chunk, strict=True)]
-        files += part.files
-    job.adopt(files)
-    return rows, cells
 
 
 def _tessellate_and_merge(job: Job, workers: Workers, clock: StageClock) -> None:
@@ -320,14 +233,7 @@ def _run_all(
     blocks: Sequence[int],
     advance: Callable[[int], None],
 ) -> list[Result]:
-    return list(_with_progress(workers(step, blocks), advance))
-
-
-def _with_progress(results: Iterable[Result], advance: Callable[[int], None]) -> Iterator[Result]:
-    """Return the results, and report how many there are so far."""
-    for done, result in enumerate(results, start=1):
-        yield result
-        advance(done)
+    return list(with_progress(workers(step, blocks), advance))
 
 
 def _assemble(job: Job, output: str | os.PathLike[str], *, overwrite: bool) -> None:

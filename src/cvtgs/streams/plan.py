@@ -8,7 +8,7 @@ another level nothing is missing and nothing is there twice.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float, Int
@@ -17,7 +17,6 @@ from torch import Tensor
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.arrays import morton_rows
 from cvtgs.math.parameters import rotation_matrices
-from cvtgs.report import Level
 from cvtgs.scene import GaussianScene
 
 CHUNK_GAUSSIANS = 1 << 15
@@ -33,6 +32,25 @@ _SAMPLE = 1 << 16
 """Points that are looked at for that."""
 
 Corner = tuple[float, float, float]
+
+
+class StreamedLevel(Protocol):
+    """What a stream takes of a level, such as :class:`cvtgs.report.Level`."""
+
+    @property
+    def scene(self) -> GaussianScene:
+        """The Gaussians."""
+        ...
+
+    @property
+    def geometric_error(self) -> float:
+        """How far they are from those of the full scene, scene units."""
+        ...
+
+    @property
+    def assignment(self) -> Int[Tensor, "n"] | None:
+        """Row of the Gaussian that stands for each input row; -1 for none, None if all are kept."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -75,7 +93,7 @@ class StreamPlan(NamedTuple):
         root: The tree.
     """
 
-    levels: tuple[Level, ...]
+    levels: tuple[StreamedLevel, ...]
     chunks: tuple[StreamChunk, ...]
     root: StreamNode
 
@@ -87,7 +105,9 @@ class _Cut(NamedTuple):
     sides: tuple["_Cut", ...] = ()
 
 
-def plan_stream(levels: Sequence[Level], *, chunk_gaussians: int = CHUNK_GAUSSIANS) -> StreamPlan:
+def plan_stream(
+    levels: Sequence[StreamedLevel], *, chunk_gaussians: int = CHUNK_GAUSSIANS
+) -> StreamPlan:
     """Build the chunks of a stream of levels.
 
     Args:
@@ -116,6 +136,11 @@ def plan_stream(levels: Sequence[Level], *, chunk_gaussians: int = CHUNK_GAUSSIA
             f"a stream needs levels of different sizes and chunks of at least one Gaussian, found "
             f"levels of {counts} and chunks of {chunk_gaussians}."
         )
+    return plan_part(ordered, chunk_gaussians=chunk_gaussians)
+
+
+def plan_part(ordered: Sequence[StreamedLevel], *, chunk_gaussians: int) -> StreamPlan:
+    """Build the chunks of a part of a scene; sizes of levels may be equal, the finest is first."""
     coarsest = ordered[-1]
     means = coarsest.scene.means.double().cpu()
     weights = torch.ones(len(means), dtype=torch.int64)
@@ -125,10 +150,10 @@ def plan_stream(levels: Sequence[Level], *, chunk_gaussians: int = CHUNK_GAUSSIA
     tree, count = _cut(means, weights, labels, most=chunk_gaussians)
     members = [_rows(labels[_parents(level, coarsest)], level.scene, count) for level in ordered]
     chunks = tuple(_chunk(ordered, rows) for rows in zip(*members, strict=True))
-    return StreamPlan(ordered, chunks, _node(tree, chunks))
+    return StreamPlan(tuple(ordered), chunks, _node(tree, chunks))
 
 
-def _parents(level: Level, coarsest: Level) -> Int[Tensor, "m"]:
+def _parents(level: StreamedLevel, coarsest: StreamedLevel) -> Int[Tensor, "m"]:
     """Return the Gaussian of the coarsest level that stands for most rows of each of a level."""
     count, wide = len(level.scene), len(coarsest.scene)
     if level is coarsest:
@@ -147,7 +172,7 @@ def _parents(level: Level, coarsest: Level) -> Int[Tensor, "m"]:
     return parents
 
 
-def _assignment(level: Level) -> Int[Tensor, "n"]:
+def _assignment(level: StreamedLevel) -> Int[Tensor, "n"]:
     if level.assignment is not None:
         return level.assignment.to(torch.int64)
     return torch.arange(len(level.scene))
@@ -194,7 +219,7 @@ def _rows(labels: Int[Tensor, "m"], scene: GaussianScene, count: int) -> list[In
     return list(order.split(sizes))
 
 
-def _chunk(levels: Sequence[Level], rows: tuple[Int[Tensor, "k"], ...]) -> StreamChunk:
+def _chunk(levels: Sequence[StreamedLevel], rows: tuple[Int[Tensor, "k"], ...]) -> StreamChunk:
     """Build a chunk with the box of its Gaussians at all levels."""
     lows, highs = [], []
     for level, own in zip(levels, rows, strict=True):

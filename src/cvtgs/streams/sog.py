@@ -1,8 +1,8 @@
 """Write a streamed SOG: ``lod-meta.json`` of version 1 and the SOGs that it names."""
 
-import json
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,33 +10,23 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from cvtgs.errors import OutputExistsError
-from cvtgs.io import atomic_output, check_output
+from cvtgs.io import atomic_output
 from cvtgs.io.sog import encode_sog
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.streams.plan import StreamNode, StreamPlan
+from cvtgs.streams.files import (
+    StreamLevel,
+    StreamPart,
+    join_levels,
+    join_trees,
+    make_folder,
+    write_stream,
+)
+from cvtgs.streams.plan import Corner, StreamNode, StreamPlan
 
-__all__ = ["INDEX_NAMES", "StreamLevel", "check_stream", "write_sog_stream"]
-
-INDEX_NAMES = {"sog": "lod-meta.json", "3dtiles": "tileset.json"}
-"""The file that a viewer opens, by the kind of the stream."""
+__all__ = ["write_sog_stream"]
 
 FILE_GAUSSIANS = 1 << 18
 """Gaussians in a file, at most, unless a chunk has more."""
-
-
-class StreamLevel(NamedTuple):
-    """What was written of a level.
-
-    Attributes:
-        gaussians: How many.
-        files: Files, or folders of files.
-        bytes: Bytes of all of them.
-    """
-
-    gaussians: int
-    files: int
-    bytes: int
 
 
 class _Unit(NamedTuple):
@@ -48,35 +38,62 @@ class _Unit(NamedTuple):
     rows: Int[Tensor, "n"]
 
 
-def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool = False) -> None:
-    """Check that a stream could be written, before the long work that comes first.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SogFormat:
+    """Streamed SOG, as PlayCanvas' engine and SuperSplat's viewer load it.
 
-    Args:
-        folder: Where to write; made if it is missing.
-        kind: ``sog`` or ``3dtiles``.
-        overwrite: Whether files of an earlier stream may be replaced.
-
-    Raises:
-        OutputExistsError: There is a stream that may not be replaced, or something else that is
-            not a stream of this kind.
-        OutputError: Nothing can be written there.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as parent:
-        ...     check_stream(Path(parent) / "new", "sog")
+    Attributes:
+        file_gaussians: Gaussians in a SOG, at most; a chunk is never cut.
+        kind: Its name.
     """
-    place = Path(folder)
-    if not place.exists():
-        check_output(place)  # its parent is there and writable
-        return
-    index = place / INDEX_NAMES[kind]
-    check_output(index, overwrite)
-    if not index.exists() and any(place.iterdir()):
-        raise OutputExistsError(
-            f"{place}: a stream needs an empty folder, or one with {INDEX_NAMES[kind]} to replace, "
-            f"found other files."
+
+    file_gaussians: int = FILE_GAUSSIANS
+    kind: str = "sog"
+
+    def write_part(
+        self, plan: StreamPlan, folder: Path, *, part: int = 0, listener: ProgressListener = silent
+    ) -> StreamPart:
+        """Write chunks of a level one behind the other, so that what is near is in one file."""
+        units = list(_units(plan, part, self.file_gaussians))
+        sizes = [0] * len(plan.levels)
+        for number, unit in enumerate(units):
+            scene = plan.levels[unit.level].scene
+            encoded = encode_sog(scene.select(unit.rows.to(scene.device)))
+            make_folder(folder / unit.name)
+            for name, content in encoded.files():
+                with atomic_output(folder / unit.name / name, overwrite=True) as file:
+                    file.write(content)
+                sizes[unit.level] += len(content)
+            listener(ProgressEvent(stage="write", done=number + 1, total=len(units)))
+        levels = tuple(
+            StreamLevel(len(level.scene), sum(unit.level == number for unit in units), size)
+            for number, (level, size) in enumerate(zip(plan.levels, sizes, strict=True))
         )
+        return StreamPart(
+            levels=levels,
+            chunks=len(plan.chunks),
+            names=tuple(f"{unit.name}/meta.json" for unit in units),
+            tree=_tree(plan, units),
+            box_min=plan.root.box_min,
+            box_max=plan.root.box_max,
+        )
+
+    def index(self, parts: Sequence[StreamPart]) -> dict[str, Any]:
+        """Return the content of ``lod-meta.json``."""
+        counts = [level.gaussians for level in join_levels(parts)]
+        before = [0]
+        for part in parts:
+            before.append(before[-1] + len(part.names))
+        return {
+            "version": 1,
+            "asset": {"generator": "cvtgs"},
+            "count": sum(counts),
+            "counts": counts,
+            "lodLevels": len(counts),
+            "lodErrors": False,
+            "filenames": [name for part in parts for name in part.names],
+            "tree": join_trees(parts, lambda part: _shifted(parts[part].tree, before[part]), _node),
+        }
 
 
 def write_sog_stream(
@@ -90,7 +107,7 @@ def write_sog_stream(
     """Write a streamed SOG, as PlayCanvas' engine and SuperSplat's viewer load it.
 
     Chunks of a level lie one behind the other in SOGs of bounded size, so that what is near is in
-    one file. ``lod-meta.json`` is written at last.
+    one file. All files are there at the end, or none.
 
     Args:
         plan: Levels and chunks.
@@ -118,36 +135,18 @@ def write_sog_stream(
         ...     [len(cvtgs.load(folder, lod=lod)) for lod in (0, 1)]
         [250, 25]
     """
-    place = Path(folder)
-    check_stream(place, "sog", overwrite=overwrite)
-    place.mkdir(exist_ok=True)
-    units = list(_units(plan, file_gaussians))
-    sizes = [0] * len(plan.levels)
-    for number, unit in enumerate(units):
-        scene = plan.levels[unit.level].scene
-        encoded = encode_sog(scene.select(unit.rows.to(scene.device)))
-        (place / unit.name).mkdir(exist_ok=True)
-        for name, content in encoded.files():
-            with atomic_output(place / unit.name / name, overwrite=True) as file:
-                file.write(content)
-            sizes[unit.level] += len(content)
-        listener(ProgressEvent(stage="write", done=number + 1, total=len(units)))
-    with atomic_output(place / INDEX_NAMES["sog"], overwrite=overwrite) as file:
-        file.write(json.dumps(_document(plan, units), separators=(",", ":")).encode())
-    return tuple(
-        StreamLevel(len(level.scene), sum(unit.level == number for unit in units), size)
-        for number, (level, size) in enumerate(zip(plan.levels, sizes, strict=True))
-    )
+    form = SogFormat(file_gaussians=file_gaussians)
+    return write_stream(form, plan, folder, overwrite=overwrite, listener=listener)
 
 
-def _units(plan: StreamPlan, most: int) -> Iterator[_Unit]:
+def _units(plan: StreamPlan, part: int, most: int) -> Iterator[_Unit]:
     """Return the SOGs of all levels, the coarsest level first."""
     for level in reversed(range(len(plan.levels))):
         counts = [len(chunk.rows[level]) for chunk in plan.chunks]
         for number, chunks in enumerate(_packed(counts, most)):
             rows = torch.cat([plan.chunks[chunk].rows[level] for chunk in chunks])
             if len(rows):
-                yield _Unit(f"{level}_{number}", level, chunks, rows)
+                yield _Unit(f"{level}_{part}_{number}", level, chunks, rows)
 
 
 def _packed(counts: Sequence[int], most: int) -> Iterator[range]:
@@ -161,7 +160,8 @@ def _packed(counts: Sequence[int], most: int) -> Iterator[range]:
     yield range(start, len(counts))
 
 
-def _document(plan: StreamPlan, units: Sequence[_Unit]) -> dict[str, Any]:
+def _tree(plan: StreamPlan, units: Sequence[_Unit]) -> dict[str, Any]:
+    """Return the tree of the chunks of a part, which counts files from 0."""
     places: list[dict[str, Any]] = [{} for _ in plan.chunks]
     for number, unit in enumerate(units):
         offset = 0
@@ -171,21 +171,30 @@ def _document(plan: StreamPlan, units: Sequence[_Unit]) -> dict[str, Any]:
                 place = {"file": number, "offset": offset, "count": count}
                 places[chunk][str(unit.level)] = place
             offset += count
-    counts = [len(level.scene) for level in plan.levels]
 
     def node(one: StreamNode) -> dict[str, Any]:
-        bound = {"min": list(one.box_min), "max": list(one.box_max)}
-        if one.chunk is not None:
-            return {"bound": bound, "lods": dict(sorted(places[one.chunk].items()))}
-        return {"bound": bound, "children": [node(child) for child in one.children]}
+        if one.chunk is None:
+            return _node(one.box_min, one.box_max, [node(child) for child in one.children])
+        lods = dict(sorted(places[one.chunk].items()))
+        return {"bound": _bound(one.box_min, one.box_max), "lods": lods}
 
+    return node(plan.root)
+
+
+def _node(low: Corner, high: Corner, children: list[dict[str, Any]]) -> dict[str, Any]:
+    return {"bound": _bound(low, high), "children": children}
+
+
+def _bound(low: Corner, high: Corner) -> dict[str, Any]:
+    return {"min": list(low), "max": list(high)}
+
+
+def _shifted(node: dict[str, Any], before: int) -> dict[str, Any]:
+    """Return the tree of a part whose files follow others."""
+    if "children" in node:
+        return {**node, "children": [_shifted(child, before) for child in node["children"]]}
+    lods = node["lods"].items()
     return {
-        "version": 1,
-        "asset": {"generator": "cvtgs"},
-        "count": sum(counts),
-        "counts": counts,
-        "lodLevels": len(counts),
-        "lodErrors": False,
-        "filenames": [f"{unit.name}/meta.json" for unit in units],
-        "tree": node(plan.root),
+        **node,
+        "lods": {level: {**place, "file": place["file"] + before} for level, place in lods},
     }

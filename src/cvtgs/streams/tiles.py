@@ -1,6 +1,5 @@
 """Write 3D Tiles 1.1: ``tileset.json``, and glTF tiles with SPZ inside, as CesiumJS loads them."""
 
-import json
 import math
 import os
 from collections.abc import Iterator, Sequence
@@ -10,18 +9,22 @@ from typing import Any
 
 import torch
 
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.io import atomic_output
 from cvtgs.io.axes import SCENE_AXES, change_axes
 from cvtgs.io.gltf import write_spz_glb
 from cvtgs.io.gltf.document import AXES, SPLATS, SPZ
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
+from cvtgs.streams.files import StreamLevel, StreamPart, join_boxes, join_trees, write_stream
 from cvtgs.streams.plan import Corner, StreamNode, StreamPlan
-from cvtgs.streams.sog import INDEX_NAMES, StreamLevel, check_stream
 
-__all__ = ["write_tiles"]
+__all__ = ["check_transform", "geo_transform", "write_tiles"]
 
 TILE_GAUSSIANS = 1 << 16
 """Gaussians in a tile, at most, unless it holds the coarsest level or a single chunk."""
+
+EARTH_RADIUS, FLATTENING = 6378137.0, 1 / 298.257223563
+"""Equatorial radius, metres, and flattening of WGS 84."""
 
 ERROR_PIXELS = 16.0
 """Viewers refine where the error of a tile covers more pixels than this, by default; it is to be
@@ -38,11 +41,70 @@ class _Tile:
     children: list["_Tile"] = field(default_factory=list)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TilesFormat:
+    """3D Tiles 1.1 as CesiumJS loads them.
+
+    Attributes:
+        tile_gaussians: Gaussians in a tile, at most; a chunk is never cut.
+        transform: From the axes of the tileset (x, y, z up; metres) to where it stands, 16 numbers
+            column by column; None leaves it where it is.
+        kind: Its name.
+    """
+
+    tile_gaussians: int = TILE_GAUSSIANS
+    transform: tuple[float, ...] | None = None
+    kind: str = "3dtiles"
+
+    def write_part(
+        self, plan: StreamPlan, folder: Path, *, part: int = 0, listener: ProgressListener = silent
+    ) -> StreamPart:
+        """Write the tiles of a part; the first has the coarsest level of all of it."""
+        root = _tiles(plan, self.tile_gaussians)
+        tiles = list(_listed(root))
+        names = {id(tile): f"{part}_{number}.glb" for number, tile in enumerate(tiles)}
+        counts, files, sizes = ([0] * len(plan.levels) for _ in range(3))
+        for number, tile in enumerate(tiles):
+            scene = plan.levels[tile.level].scene
+            rows = torch.cat([plan.chunks[chunk].rows[tile.level] for chunk in tile.chunks])
+            turned = change_axes(scene.select(rows.to(scene.device)), SCENE_AXES, AXES)
+            path = folder / names[id(tile)]
+            with atomic_output(path, overwrite=True) as file:
+                write_spz_glb(turned, file)
+            counts[tile.level] += len(rows)
+            files[tile.level] += 1
+            sizes[tile.level] += path.stat().st_size
+            listener(ProgressEvent(stage="write", done=number + 1, total=len(tiles)))
+        return StreamPart(
+            levels=tuple(StreamLevel(*three) for three in zip(counts, files, sizes, strict=True)),
+            chunks=len(plan.chunks),
+            names=tuple(names.values()),
+            tree=_entry(plan, root, names),
+            box_min=plan.root.box_min,
+            box_max=plan.root.box_max,
+        )
+
+    def index(self, parts: Sequence[StreamPart]) -> dict[str, Any]:
+        """Return the content of ``tileset.json``."""
+        low, high = join_boxes([part.box_min for part in parts], [part.box_max for part in parts])
+        root = join_trees(parts, lambda part: parts[part].tree, _parent)
+        placed = {} if self.transform is None else {"transform": list(self.transform)}
+        extensions = {"extensionsUsed": [SPLATS, SPZ], "extensionsRequired": [SPLATS, SPZ]}
+        return {
+            "asset": {"version": "1.1", "generator": "cvtgs"},
+            "extensionsUsed": ["3DTILES_content_gltf"],
+            "extensions": {"3DTILES_content_gltf": extensions},
+            "geometricError": max(root["geometricError"], math.dist(low, high)),
+            "root": {"refine": "REPLACE", **placed, **root},
+        }
+
+
 def write_tiles(
     plan: StreamPlan,
     folder: str | os.PathLike[str],
     *,
     tile_gaussians: int = TILE_GAUSSIANS,
+    transform: Sequence[float] | None = None,
     overwrite: bool = False,
     listener: ProgressListener = silent,
 ) -> tuple[StreamLevel, ...]:
@@ -50,12 +112,14 @@ def write_tiles(
 
     The root holds the coarsest level of the whole scene. Each tile is replaced by those of its
     parts at a finer level, down to the finest level of single chunks. Tiles have the axes of glTF,
-    boxes those of 3D Tiles (z up). ``tileset.json`` is written at last.
+    boxes those of 3D Tiles (z up). All files are there at the end, or none.
 
     Args:
         plan: Levels and chunks.
         folder: Where to write; made if it is missing.
         tile_gaussians: Gaussians in a tile, at most; a chunk is never cut.
+        transform: Where the tileset stands, 16 numbers column by column, as :func:`geo_transform`
+            makes them; None leaves it where it is.
         overwrite: Whether files of an earlier stream may be replaced.
         listener: Called after each tile.
 
@@ -64,6 +128,7 @@ def write_tiles(
         the tree; its tiles are counted once each.
 
     Raises:
+        InvalidArgumentError: The transform is none.
         OutputExistsError: There is something that may not be replaced.
         OutputError: A file cannot be written.
         InvalidSceneError: No Gaussian of a tile is finite.
@@ -76,38 +141,86 @@ def write_tiles(
         >>> levels = cvtgs.Simplifier(device="cpu").levels(scene, [0.5, 0.05])
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     written = write_tiles(plan_stream(levels, chunk_gaussians=100), folder)
-        ...     len(cvtgs.load(f"{folder}/0.glb")), written[0].gaussians
+        ...     len(cvtgs.load(f"{folder}/0_0.glb")), written[0].gaussians
         (25, 250)
     """
-    place = Path(folder)
-    check_stream(place, "3dtiles", overwrite=overwrite)
-    place.mkdir(exist_ok=True)
-    root = _tiles(plan, tile_gaussians)
-    tiles = list(_listed(root))
-    names = {id(tile): f"{number}.glb" for number, tile in enumerate(tiles)}
-    counts, files, sizes = ([0] * len(plan.levels) for _ in range(3))
-    for number, tile in enumerate(tiles):
-        scene = plan.levels[tile.level].scene
-        rows = torch.cat([plan.chunks[chunk].rows[tile.level] for chunk in tile.chunks])
-        part = change_axes(scene.select(rows.to(scene.device)), SCENE_AXES, AXES)
-        path = place / names[id(tile)]
-        with atomic_output(path, overwrite=True) as file:
-            write_spz_glb(part, file)
-        counts[tile.level] += len(rows)
-        files[tile.level] += 1
-        sizes[tile.level] += path.stat().st_size
-        listener(ProgressEvent(stage="write", done=number + 1, total=len(tiles)))
-    extensions = {"extensionsUsed": [SPLATS, SPZ], "extensionsRequired": [SPLATS, SPZ]}
-    document = {
-        "asset": {"version": "1.1", "generator": "cvtgs"},
-        "extensionsUsed": ["3DTILES_content_gltf"],
-        "extensions": {"3DTILES_content_gltf": extensions},
-        "geometricError": max(_error(plan, root), math.dist(root.node.box_min, root.node.box_max)),
-        "root": {"refine": "REPLACE", **_entry(plan, root, names)},
-    }
-    with atomic_output(place / INDEX_NAMES["3dtiles"], overwrite=overwrite) as out:
-        out.write(json.dumps(document, separators=(",", ":")).encode())
-    return tuple(StreamLevel(*three) for three in zip(counts, files, sizes, strict=True))
+    form = TilesFormat(
+        tile_gaussians=tile_gaussians,
+        transform=None if transform is None else check_transform(transform),
+    )
+    return write_stream(form, plan, folder, overwrite=overwrite, listener=listener)
+
+
+def geo_transform(longitude: float, latitude: float, height: float = 0.0) -> tuple[float, ...]:
+    """Return the transform of a tileset that stands somewhere on the Earth.
+
+    Its x goes to the east, y to the north, z up; its units are metres. The ellipsoid is that of
+    WGS 84 (EPSG 4978).
+
+    Args:
+        longitude: Degrees, east is positive.
+        latitude: Degrees, north is positive.
+        height: Metres above the ellipsoid.
+
+    Returns:
+        16 numbers, column by column.
+
+    Raises:
+        InvalidArgumentError: There is no such place.
+
+    Example:
+        >>> [round(number) for number in geo_transform(0.0, 0.0)[12:]]
+        [6378137, 0, 0, 1]
+    """
+    if not (abs(longitude) <= 360.0 and abs(latitude) <= 90.0 and math.isfinite(height)):
+        raise InvalidArgumentError(
+            "a place on the Earth needs a longitude from -360 to 360 degrees, a latitude from -90 "
+            f"to 90 and a height in metres, found {longitude!r}, {latitude!r} and {height!r}."
+        )
+    east, north = math.radians(longitude), math.radians(latitude)
+    sin_east, cos_east = math.sin(east), math.cos(east)
+    sin_north, cos_north = math.sin(north), math.cos(north)
+    squared = FLATTENING * (2.0 - FLATTENING)
+    across = EARTH_RADIUS / math.sqrt(1.0 - squared * sin_north**2)
+    columns = (
+        (-sin_east, cos_east, 0.0),
+        (-sin_north * cos_east, -sin_north * sin_east, cos_north),
+        (cos_north * cos_east, cos_north * sin_east, sin_north),
+        (
+            (across + height) * cos_north * cos_east,
+            (across + height) * cos_north * sin_east,
+            (across * (1.0 - squared) + height) * sin_north,
+        ),
+    )
+    last = (0.0, 0.0, 0.0, 1.0)
+    return tuple(
+        number for column, end in zip(columns, last, strict=True) for number in (*column, end)
+    )
+
+
+def check_transform(numbers: Sequence[float]) -> tuple[float, ...]:
+    """Return the transform of a tileset, if it is one.
+
+    Args:
+        numbers: 16 numbers, column by column.
+
+    Returns:
+        The same.
+
+    Raises:
+        InvalidArgumentError: It is no affine transform that can be undone.
+    """
+    values = tuple(map(float, numbers))
+    is_matrix = len(values) == 16 and all(map(math.isfinite, values))
+    last = values[3::4]
+    if is_matrix and last == (0.0, 0.0, 0.0, 1.0):
+        matrix = torch.tensor(values, dtype=torch.float64).reshape(4, 4)[:3, :3]
+        if abs(float(torch.linalg.det(matrix))) > 0.0:
+            return values
+    raise InvalidArgumentError(
+        "the transform of a tileset must be 16 finite numbers, column by column, that can be "
+        f"undone, each fourth 0 but for the last, which is 1; found {list(values)[:17]}."
+    )
 
 
 def _tiles(plan: StreamPlan, most: int) -> _Tile:
@@ -172,6 +285,16 @@ def _entry(plan: StreamPlan, tile: _Tile, names: dict[int, str]) -> dict[str, An
     if tile.children:
         entry["children"] = [_entry(plan, child, names) for child in tile.children]
     return entry
+
+
+def _parent(low: Corner, high: Corner, children: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return a tile without content, which viewers never stop at."""
+    errors = [child["geometricError"] for child in children]
+    return {
+        "boundingVolume": {"box": _box(low, high)},
+        "geometricError": max(math.dist(low, high), *errors),
+        "children": children,
+    }
 
 
 def _box(low: Corner, high: Corner) -> Sequence[float]:

@@ -1,0 +1,76 @@
+"""Options of commands that work block by block, and the workers that these name."""
+
+import argparse
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from typing import TYPE_CHECKING, NamedTuple
+
+from cvtgs.errors import InvalidArgumentError
+
+if TYPE_CHECKING:
+    from cvtgs.outofcore import Workers
+
+
+class BlockWorkers(NamedTuple):
+    """What calls functions for blocks.
+
+    Attributes:
+        workers: Processes or a cluster; None for this process alone.
+        memory: Bytes that each of them may use.
+    """
+
+    workers: "Workers | None"
+    memory: int
+
+
+def add_block_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--memory``, ``--workers`` and ``--scheduler``."""
+    parser.add_argument(
+        "--memory",
+        metavar="AMOUNT",
+        help="memory to use, for example 4GB (default: what is free); a binary .ply that needs "
+        "more is worked on block by block, and the same command resumes an interrupted run",
+    )
+    parser.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="processes that work on blocks and share --memory (default: one for each core, as "
+        "far as memory allows)",
+    )
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="address of a Dask cluster that works on the blocks; its workers need access to "
+        "the files, and --memory is the memory of each task",
+    )
+
+
+def memory_of(options: argparse.Namespace) -> int:
+    """Return the bytes to work with, and refuse workers that cannot be."""
+    from cvtgs.outofcore import available_memory, read_bytes
+    from cvtgs.outofcore.memory import memory_to_plan
+
+    if options.workers is not None and (options.workers < 1 or options.scheduler is not None):
+        raise InvalidArgumentError(
+            "--workers must be at least 1, and goes with blocks on this machine, not with "
+            f"--scheduler; found {options.workers}."
+        )
+    if options.memory is None:
+        return memory_to_plan(available_memory())
+    return read_bytes(options.memory)
+
+
+@contextmanager
+def block_workers(options: argparse.Namespace, memory: int) -> Iterator[BlockWorkers]:
+    """Start processes of this machine, or connect to a cluster."""
+    from cvtgs.outofcore import ClusterWorkers, LocalWorkers, connect, worker_count
+
+    with ExitStack() as stack:
+        if options.scheduler is not None:
+            client = stack.enter_context(closing(connect(options.scheduler)))
+            yield BlockWorkers(ClusterWorkers(client), memory)
+        elif (count := worker_count(memory, options.workers)) > 1:
+            yield BlockWorkers(stack.enter_context(LocalWorkers(count)), memory // count)
+        else:
+            yield BlockWorkers(None, memory)

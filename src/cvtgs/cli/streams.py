@@ -1,0 +1,189 @@
+"""``cvtgs levels --stream``: levels as chunks that viewers load while they show them."""
+
+import argparse
+from collections.abc import Sequence
+from itertools import zip_longest
+from typing import TYPE_CHECKING
+
+import cvtgs
+from cvtgs.cli.blocks import add_block_options, block_workers, memory_of
+from cvtgs.cli.display import progress_bars, say, size_text
+from cvtgs.errors import ConfigError, FileFormatError, InputError, InvalidArgumentError
+
+if TYPE_CHECKING:
+    from cvtgs.cli.options import FileAxes
+    from cvtgs.config import SimplifyConfig
+    from cvtgs.progress import ProgressListener
+    from cvtgs.report import Level
+    from cvtgs.streams import StreamLevel
+
+STREAMS = ("sog", "3dtiles")
+OF_STREAMS = ("chunk", "memory", "workers", "scheduler", "place", "transform")
+
+
+def add_stream_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--stream`` and what goes with it."""
+    parser.add_argument(
+        "--stream",
+        choices=STREAMS,
+        help="write chunks that viewers load while they show them, instead of whole scenes: sog "
+        "(lod-meta.json, for PlayCanvas and SuperSplat) or 3dtiles (tileset.json, for CesiumJS)",
+    )
+    parser.add_argument(
+        "--chunk",
+        type=int,
+        metavar="N",
+        help="Gaussians in a chunk of a stream at its finest level (default 32768)",
+    )
+    parser.add_argument(
+        "--place",
+        metavar="LON,LAT[,H]",
+        help="longitude, latitude (degrees) and height (metres) at which 3D Tiles stand, with "
+        "x to the east and z up",
+    )
+    parser.add_argument(
+        "--transform",
+        metavar="16 NUMBERS",
+        help="transform of the root of 3D Tiles, column by column, instead of --place",
+    )
+    add_block_options(parser)
+
+
+def check_stream_options(options: argparse.Namespace) -> None:
+    """Check options of streams, before the long work that comes first."""
+    from cvtgs.streams import check_stream
+
+    if options.stream is None:
+        for name in OF_STREAMS:
+            if getattr(options, name) is not None:
+                raise InvalidArgumentError(f"--{name} goes with --stream.")
+        return
+    if options.suffix is not None:
+        raise InvalidArgumentError("--suffix cannot go with --stream, which sets the format.")
+    if options.chunk is not None and options.chunk < 1:
+        raise InvalidArgumentError(f"--chunk must be at least 1, found {options.chunk}.")
+    read_transform(options)
+    check_stream(options.output, options.stream, overwrite=options.overwrite)
+
+
+def read_transform(options: argparse.Namespace) -> tuple[float, ...] | None:
+    """Read ``--place`` or ``--transform``; None without them."""
+    from cvtgs.streams import check_transform, geo_transform
+
+    if options.place is None and options.transform is None:
+        return None
+    if options.stream != "3dtiles" or None not in (options.place, options.transform):
+        raise InvalidArgumentError("--place or --transform, not both, goes with --stream 3dtiles.")
+    if options.transform is not None:
+        numbers = _numbers(options.transform, "--transform", (16,))
+        return check_transform(numbers)
+    longitude, latitude, *height = _numbers(options.place, "--place", (2, 3))
+    return geo_transform(longitude, latitude, *height)
+
+
+def _numbers(text: str, name: str, counts: Sequence[int]) -> list[float]:
+    try:
+        numbers = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in counts:
+        wanted = " or ".join(map(str, counts))
+        raise InvalidArgumentError(
+            f"{name} must be {wanted} numbers with commas between, found {text!r}."
+        )
+    return numbers
+
+
+def stream_blocks(
+    options: argparse.Namespace,
+    checkpoint: str | None,
+    config: "SimplifyConfig",
+    rhos: Sequence[float],
+    axes: "FileAxes",
+) -> bool:
+    """Write a stream block by block, if the scene does not fit into memory; return whether so."""
+    from cvtgs.io.axes import SCENE_AXES
+    from cvtgs.io.ply import open_rows
+    from cvtgs.outofcore import block_count, check_config
+    from cvtgs.streams import stream_file
+    from cvtgs.streams.plan import CHUNK_GAUSSIANS
+
+    memory, asked = memory_of(options), options.memory is not None
+    try:
+        if options.scheduler is None and block_count(open_rows(options.input), memory) == 1:
+            return False
+        check_config(config)
+    except (InputError, FileFormatError, ConfigError):
+        if options.scheduler is not None or (asked and options.input.suffix == ".ply"):
+            raise
+        return False
+    if options.cameras is not None:
+        raise InvalidArgumentError("blocks cannot go with --cameras, which need the whole scene.")
+    with progress_bars(quiet=options.quiet) as listener, block_workers(options, memory) as blocks:
+        report = stream_file(
+            options.input,
+            options.output,
+            rhos,
+            kind=options.stream,
+            memory=blocks.memory,
+            chunk_gaussians=options.chunk or CHUNK_GAUSSIANS,
+            transform=read_transform(options),
+            axes=(axes.source or SCENE_AXES, axes.target or SCENE_AXES),
+            sh_degree=options.sh_degree,
+            simplifier=cvtgs.Simplifier(checkpoint, config=config, device="cpu"),
+            workers=blocks.workers,
+            overwrite=options.overwrite,
+            listener=listener,
+        )
+    done = f", {report.resumed_blocks} of them done before" if report.resumed_blocks else ""
+    _print_levels(options, report.chunks, report.levels, f" and {report.blocks} blocks{done}")
+    return True
+
+
+def stream_levels(
+    options: argparse.Namespace,
+    made: "Sequence[Level]",
+    axes: "FileAxes",
+    listener: "ProgressListener",
+) -> None:
+    """Write levels that are in memory as a stream, and say what is in it."""
+    from cvtgs.streams import plan_stream, write_sog_stream, write_tiles
+    from cvtgs.streams.plan import CHUNK_GAUSSIANS
+
+    if axes.target is not None:
+        made = [
+            level._replace(scene=cvtgs.io.change_axes(level.scene, "rdf", axes.target))
+            for level in made
+        ]
+    plan = plan_stream(made, chunk_gaussians=options.chunk or CHUNK_GAUSSIANS)
+    if options.stream == "sog":
+        written = write_sog_stream(
+            plan, options.output, overwrite=options.overwrite, listener=listener
+        )
+    else:
+        written = write_tiles(
+            plan,
+            options.output,
+            transform=read_transform(options),
+            overwrite=options.overwrite,
+            listener=listener,
+        )
+    errors = [level.geometric_error for level in plan.levels]
+    _print_levels(options, len(plan.chunks), written, errors=errors)
+
+
+def _print_levels(
+    options: argparse.Namespace,
+    chunks: int,
+    levels: "Sequence[StreamLevel]",
+    more: str = "",
+    *,
+    errors: Sequence[float] = (),
+) -> None:
+    if options.quiet:
+        return
+    say(f"{options.input.name} in {chunks:,} chunks{more}, the finest level first:")
+    say(f"  {'Gaussians':>12}  {'size':>9}  {'files':>6}" + f"  {'error':>9}" * bool(errors))
+    for one, error in zip_longest(levels, errors):
+        last = "" if error is None else f"  {error:>9.3g}"
+        say(f"  {one.gaussians:>12,}  {size_text(one.bytes):>9}  {one.files:>6,}{last}")

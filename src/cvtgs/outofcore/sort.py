@@ -1,0 +1,95 @@
+"""Sort a file into blocks: one pass that scans it, one that writes the rows of every block."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+from cvtgs.boxes import check_room
+from cvtgs.clock import StageClock
+from cvtgs.errors import InvalidArgumentError, InvalidSceneError
+from cvtgs.math.frames import robust_frame
+from cvtgs.outofcore.job import Job, SortedFile
+from cvtgs.outofcore.rows import sort_range
+from cvtgs.outofcore.scan import RowRange, add_totals, read_sample, scan_range, scan_scene
+from cvtgs.outofcore.workers import Workers, with_progress
+
+
+class SortedBlocks(NamedTuple):
+    """The blocks, after all rows are sorted into them.
+
+    Attributes:
+        rest: Gaussians that all blocks are to keep together.
+        rows: Gaussians in each block.
+        cells: Their weight in cells, none above 1.
+    """
+
+    rest: int
+    rows: list[int]
+    cells: list[float]
+
+
+def sort_into_blocks(
+    job: Job, workers: Workers, clock: StageClock, *, keep_all: bool = False
+) -> SortedBlocks:
+    """Scan the file and sort its rows into blocks.
+
+    Args:
+        job: The job, whose folder is empty.
+        workers: Calls functions for ranges of the file.
+        clock: Measures both stages.
+        keep_all: Whether the filter leaves nothing out.
+
+    Returns:
+        How many Gaussians there are in each block.
+
+    Raises:
+        InvalidSceneError: No row is valid.
+        InvalidArgumentError: There is no Gaussian left beside those in boxes.
+    """
+    ranges = job.ranges()
+    with clock.stage("scan", len(ranges)) as advance:
+        sample = read_sample(job.source)
+        if len(sample) == 0:
+            raise InvalidSceneError(f"{job.source.path}: found no valid Gaussian.")
+        frame = robust_frame(sample.means)
+        scan_rows = partial(scan_range, job.source, frame, job.boxes)
+        totals = add_totals(with_progress(workers(scan_rows, ranges), advance))
+        valid, kept = totals.valid_count, totals.kept_count
+        check_room(kept, target=job.target, total=valid)
+        if kept == valid:
+            raise InvalidArgumentError(
+                f"all {kept} valid Gaussians are to be kept as they are; none is left."
+            )
+        rest = min(job.target, valid) - kept
+        scan = scan_scene(
+            sample,
+            totals,
+            boxes=job.boxes,
+            target=max(1, rest),
+            blocks=job.blocks,
+            config=job.config,
+            frame=frame,
+        )
+    unfiltered = replace(scan, min_opacity=0.0, max_flyaway_mass=-1.0)
+    with clock.stage("sort", len(ranges)) as advance:
+        job.write_scan(unfiltered if keep_all else scan)
+        rows, cells = _sort(job, workers, ranges, advance)
+        if sum(rows) < rest:  # the filter was too strict for so large a target
+            job.write_scan(unfiltered)
+            rows, cells = _sort(job, workers, ranges, advance)
+    return SortedBlocks(rest, rows, cells)
+
+
+def _sort(
+    job: Job, workers: Workers, ranges: Sequence[RowRange], advance: Callable[[int], None]
+) -> tuple[list[int], list[float]]:
+    """Sort all rows into blocks; return how many each has, and their weight in cells."""
+    rows, cells, files = [0] * job.blocks, [0.0] * job.blocks, list[SortedFile]()
+    for part in with_progress(workers(partial(sort_range, job), ranges), advance):
+        rows = [a + b for a, b in zip(rows, part.rows, strict=True)]
+        for chunk in part.cells:  # one after the other: the same bits whatever the ranges
+            cells = [a + b for a, b in zip(cells, chunk, strict=True)]
+        files += part.files
+    job.adopt(files)
+    return rows, cells

@@ -1,0 +1,338 @@
+"""A stream of a file that need not fit into memory: blocks of space, each a part of the stream."""
+
+import hashlib
+import json
+import os
+import shutil
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from cvtgs.analysis import SceneAnalysis, select_columns
+from cvtgs.clock import StageClock
+from cvtgs.config import SimplifyConfig
+from cvtgs.counts import shared_out, target_count
+from cvtgs.devices import one_thread
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
+from cvtgs.io import atomic_output, change_axes
+from cvtgs.io.axes import SCENE_AXES
+from cvtgs.io.locks import output_lock
+from cvtgs.io.ply import open_rows
+from cvtgs.mergenet import MergeNet
+from cvtgs.outofcore import Workers, available_memory, block_count, check_config
+from cvtgs.outofcore.job import Job, job_folder
+from cvtgs.outofcore.memory import memory_to_plan
+from cvtgs.outofcore.rows import analysis_of, read_rows
+from cvtgs.outofcore.run import rows_per_range
+from cvtgs.outofcore.sort import sort_into_blocks
+from cvtgs.outofcore.workers import CheckedWorkers, sequentially, with_progress
+from cvtgs.pipeline import Reduced, level_facts, nests_in, reduce_scene
+from cvtgs.progress import ProgressListener, silent
+from cvtgs.scene import GaussianScene
+from cvtgs.simplifier import Simplifier
+from cvtgs.streams.files import (
+    StreamFormat,
+    StreamLevel,
+    StreamPart,
+    check_stream,
+    join_levels,
+    make_folder,
+    publish,
+    write_index,
+)
+from cvtgs.streams.plan import CHUNK_GAUSSIANS, plan_part
+from cvtgs.streams.sog import SogFormat
+from cvtgs.streams.tiles import TilesFormat
+from cvtgs.validity import with_finite_opacities
+
+__all__ = ["StreamReport", "stream_file"]
+
+
+class StreamReport(NamedTuple):
+    """What was written.
+
+    Attributes:
+        levels: Of each level, the finest first.
+        chunks: Number of chunks.
+        blocks: Number of blocks.
+        resumed_blocks: Blocks that an earlier run had finished.
+    """
+
+    levels: tuple[StreamLevel, ...]
+    chunks: int
+    blocks: int
+    resumed_blocks: int
+
+
+class BlockLevel(NamedTuple):
+    """A level of a block; see :class:`cvtgs.report.Level`."""
+
+    scene: GaussianScene
+    geometric_error: float
+    assignment: Int[Tensor, "n"] | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamJob:
+    """What is to be done, small enough to be sent to every process.
+
+    Attributes:
+        job: The file, its blocks, and the folder of their files.
+        form: Kind of the stream.
+        chunk_gaussians: Gaussians of the finest level in a chunk.
+        axes: Axes of the file, and of what is written.
+        sh_degree: Highest SH degree to keep; None keeps all.
+    """
+
+    job: Job
+    form: StreamFormat
+    chunk_gaussians: int
+    axes: tuple[str, str]
+    sh_degree: int | None
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the files of the stream until all are there."""
+        return self.job.path("stream")
+
+    def part_path(self, block: int) -> Path:
+        """Return the file that says what was written of a block."""
+        return self.job.path(f"part_{block:05d}.json")
+
+    def finished(self, block: int) -> StreamPart | None:
+        """Return what was written of a block, if all of it is there."""
+        try:
+            part = StreamPart.model_validate_json(self.part_path(block).read_bytes())
+            sizes = [_bytes_of((self.folder / name), self.form.kind) for name in part.names]
+        except (OSError, ValueError):
+            return None
+        return part if sum(sizes) == sum(level.bytes for level in part.levels) else None
+
+    def targets(self) -> list[list[int]]:
+        """Return how many Gaussians each block has at each level, the finest first."""
+        found: list[list[int]] = json.loads(self.job.path("targets.json").read_bytes())["targets"]
+        return found
+
+
+def _bytes_of(path: Path, kind: str) -> int:
+    """Return the size of a file that an index names, or of the folder of a SOG."""
+    if kind == "sog":
+        return sum(file.stat().st_size for file in path.parent.iterdir())
+    return path.stat().st_size
+
+
+def stream_file(  # noqa: PLR0913 (options by name)
+    source: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    rhos: Sequence[float],
+    *,
+    kind: str,
+    memory: int | None = None,
+    blocks: int | None = None,
+    chunk_gaussians: int = CHUNK_GAUSSIANS,
+    transform: tuple[float, ...] | None = None,
+    axes: tuple[str, str] = (SCENE_AXES, SCENE_AXES),
+    sh_degree: int | None = None,
+    simplifier: Simplifier | None = None,
+    workers: Workers | None = None,
+    overwrite: bool = False,
+    listener: ProgressListener = silent,
+) -> StreamReport:
+    """Write a file that need not fit into memory as a stream of levels.
+
+    The file is sorted into blocks of space, which lie in a hidden folder beside the output; each
+    block is made smaller to its exact share of every level, by the analysis of the whole scene, and
+    written as a part of the stream. If this is interrupted, the same call continues with the
+    blocks that are not finished. The result depends on the number of blocks, not on the workers.
+
+    Args:
+        source: A binary PLY file.
+        folder: Where to write; made if it is missing. All files are there at the end, or none.
+        rhos: Ratios of the levels, in (0, 1].
+        kind: ``sog`` or ``3dtiles``.
+        memory: Bytes that one process may use; None for what is free.
+        blocks: Number of blocks, instead of ``memory``.
+        chunk_gaussians: Gaussians of the finest level in a chunk.
+        transform: Where 3D Tiles stand (:func:`cvtgs.streams.geo_transform`).
+        axes: Axes of the file, and of what is written.
+        sh_degree: Highest SH degree to keep; None keeps all.
+        simplifier: Configuration and network; None for the defaults.
+        workers: Calls functions for ranges of the file and for blocks; None calls them here, one
+            after the other.
+        overwrite: Whether files of an earlier stream may be replaced.
+        listener: Called with progress events.
+
+    Returns:
+        What was written.
+
+    Raises:
+        ConfigError: The configuration takes images of the scene, which needs all of it.
+        InvalidArgumentError: Ratios are out of range or give one size twice.
+        InvalidSceneError: No row is valid.
+        FileFormatError: The file cannot be read in parts.
+        OutputExistsError: There is something that may not be replaced.
+        OutputBusyError: Another run is at work on this output.
+
+    Example:
+        >>> import tempfile
+        >>> from cvtgs import load, save, synthetic
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file, out = Path(folder) / "scene.ply", Path(folder) / "out"
+        ...     save(synthetic.scene("object", 2000, sh_degree=0), file)
+        ...     report = stream_file(file, out, [1.0, 0.1], kind="sog", blocks=3)
+        ...     [len(load(out, lod=lod)) for lod in (0, 1)], report.blocks
+        ([2000, 200], 3)
+    """
+    simplifier, workers = simplifier or Simplifier(device="cpu"), workers or sequentially
+    check_config(simplifier.config)
+    rows = open_rows(source)
+    rows = replace(rows, path=str(Path(rows.path).absolute()))  # for workers in other folders
+    targets = sorted({target_count(rows.count, rho) for rho in rhos}, reverse=True)
+    if len(targets) < len(rhos) or not targets:
+        raise InvalidArgumentError(
+            f"a stream needs levels of different sizes, found ratios {list(rhos)} of "
+            f"{rows.count:,} Gaussians."
+        )
+    merged = [target for target in targets if target < rows.count] or targets
+    wanted = blocks or block_count(rows, memory or memory_to_plan(available_memory()))
+    job = Job(
+        folder="",
+        source=rows,
+        target=merged[0],
+        blocks=max(1, min(wanted, targets[-1])),
+        boxes=(),
+        config=simplifier.config,
+        has_network=simplifier.checkpoint is not None,
+        range_rows=rows_per_range(rows.count),
+    )
+    form = SogFormat() if kind == "sog" else TilesFormat(transform=transform)
+    spec = StreamJob(
+        job=job, form=form, chunk_gaussians=chunk_gaussians, axes=axes, sh_degree=sh_degree
+    )
+    facts = [job.key(simplifier.checkpoint), targets, repr(form), chunk_gaussians, axes, sh_degree]
+    key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+    spec = replace(spec, job=replace(job, folder=job_folder(folder, key)))
+    check_stream(folder, kind, overwrite=overwrite)
+    with output_lock(folder):
+        parts, resumed = _run(spec, targets, simplifier, workers, StageClock(listener, _CPU))
+        write_index(form, parts, spec.folder)
+        publish(spec.folder, Path(folder), kind, overwrite=overwrite)
+        shutil.rmtree(Path(spec.job.folder).parent, ignore_errors=True)
+    chunks = sum(part.chunks for part in parts)
+    return StreamReport(join_levels(parts), chunks, len(parts), resumed)
+
+
+_CPU = torch.device("cpu")
+
+
+def _run(
+    spec: StreamJob,
+    targets: Sequence[int],
+    simplifier: Simplifier,
+    workers: Workers,
+    clock: StageClock,
+) -> tuple[list[StreamPart], int]:
+    """Sort the file, and write the parts that are not there yet; return all of them."""
+    job = spec.job
+    is_resumed = job.has_sorted_rows() and job.path("targets.json").exists()
+    if not is_resumed:
+        job.start_over()
+    if isinstance(workers, CheckedWorkers):
+        with clock.stage("workers"):
+            workers.check(job)
+    if not is_resumed:
+        if simplifier.checkpoint is not None:
+            job.write_network(simplifier.checkpoint)
+        with one_thread():
+            found = sort_into_blocks(job, workers, clock, keep_all=True)
+        _write_targets(spec, targets, found.rows, found.cells)
+    make_folder(spec.folder)
+    blocks = [block for block, counts in enumerate(spec.targets()) if counts[0]]
+    unfinished = [block for block in blocks if spec.finished(block) is None]
+    with clock.stage("blocks", len(unfinished)) as advance:
+        for _ in with_progress(workers(partial(write_block, spec), unfinished), advance):
+            pass
+    parts = [StreamPart.model_validate_json(spec.part_path(block).read_bytes()) for block in blocks]
+    return parts, len(blocks) - len(unfinished)
+
+
+def _write_targets(
+    spec: StreamJob, targets: Sequence[int], rows: Sequence[int], cells: Sequence[float]
+) -> None:
+    """Share every level out to the blocks: by their weight, at least one where there are rows."""
+    total = sum(rows)
+    if total < spec.job.source.count:
+        warnings.warn(
+            f"dropped {spec.job.source.count - total} of {spec.job.source.count} Gaussians with "
+            "NaN, infinite or zero values.",
+            DroppedDataWarning,
+            stacklevel=4,
+        )
+    rooms, levels = list(rows), []
+    for target in targets:
+        least = sum(1 for room in rooms if room)
+        rooms = shared_out(max(least, min(target, sum(rooms))), cells, rooms=rooms)
+        levels.append(rooms)
+    with atomic_output(spec.job.path("targets.json"), overwrite=True) as file:
+        file.write(json.dumps({"targets": list(zip(*levels, strict=True))}).encode())
+
+
+@one_thread()
+def write_block(spec: StreamJob, block: int) -> None:
+    """Make a block smaller to all of its sizes, and write it as a part of the stream."""
+    job, targets = spec.job, spec.targets()[block]
+    rows = read_rows(job, block)
+    checkpoint = job.read_network()
+    net = None if checkpoint is None else checkpoint.net.to(rows.scene.dtype)
+    scene = select_columns(rows.scene, job.config.effects)
+    analysis = analysis_of(job.read_scan(), rows)
+    if spec.sh_degree is not None:
+        scene = scene.with_sh_degree(min(spec.sh_degree, scene.sh_degree))
+    levels = reduce_levels(scene, analysis, targets, job.config, net=net)
+    if spec.axes[0] != spec.axes[1]:
+        levels = [level._replace(scene=change_axes(level.scene, *spec.axes)) for level in levels]
+    plan = plan_part(levels, chunk_gaussians=spec.chunk_gaussians)
+    part = spec.form.write_part(plan, spec.folder, part=block, listener=silent)
+    with atomic_output(spec.part_path(block), overwrite=True) as file:
+        file.write(part.model_dump_json().encode())
+
+
+def reduce_levels(
+    scene: GaussianScene,
+    analysis: SceneAnalysis,
+    targets: Sequence[int],
+    config: SimplifyConfig,
+    *,
+    net: MergeNet | None,
+) -> list[BlockLevel]:
+    """Make a scene smaller to several sizes, the finest first; coarse ones of cells of the finest.
+
+    Args:
+        scene: The Gaussians, with valid rows.
+        analysis: What is known of them.
+        targets: The sizes, descending.
+        config: Every choice.
+        net: Corrects merged Gaussians; None for no correction.
+
+    Returns:
+        One level per size.
+    """
+    found: list[BlockLevel] = []
+    finest: Reduced | None = None
+    clock = StageClock(silent, scene.device)
+    for target in targets:
+        if target >= len(scene):
+            found.append(BlockLevel(with_finite_opacities(scene), 0.0, None))
+            continue
+        start = finest if nests_in(target, finest) else None
+        reduced = reduce_scene(scene, analysis, target, config, net=net, clock=clock, finest=start)
+        finest = finest or reduced
+        found.append(BlockLevel(reduced.scene, *level_facts(scene, analysis, reduced)))
+    return found

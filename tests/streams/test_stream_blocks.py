@@ -1,0 +1,182 @@
+"""Streams of files that do not fit into memory: parts, resumption, workers."""
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from cvtgs import GaussianScene, Simplifier, load, save
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
+from cvtgs.outofcore import LocalWorkers
+from cvtgs.streams import stream_file
+from cvtgs.synthetic import scene as make
+
+RHOS = [1.0, 0.25, 0.05, 0.0125]
+COUNTS = [4000, 1000, 200, 50]
+FAST = Simplifier(preset="draft", device="cpu")
+
+
+@pytest.fixture(scope="module")
+def scene() -> GaussianScene:
+    return make("courtyard", 4000, sh_degree=0, seed=3)
+
+
+@pytest.fixture
+def source(tmp_path: Path, scene: GaussianScene) -> Path:
+    save(scene, tmp_path / "scene.ply")
+    return tmp_path / "scene.ply"
+
+
+def stream(source: Path, folder: Path, **more: Any) -> Any:
+    options = {"kind": "sog", "blocks": 3, "chunk_gaussians": 300, "simplifier": FAST} | more
+    return stream_file(source, folder, RHOS, **options)
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_counts_are_exact_and_the_finest_level_is_the_scene(
+    tmp_path: Path, source: Path, scene: GaussianScene
+) -> None:
+    report = stream(source, tmp_path / "out")
+    assert report.blocks == 3
+    assert [level.gaussians for level in report.levels] == COUNTS
+    assert json.loads((tmp_path / "out" / "lod-meta.json").read_text())["counts"] == COUNTS
+    assert [len(load(tmp_path / "out", lod=lod)) for lod in range(4)] == COUNTS
+    finest = load(tmp_path / "out")
+    away = torch.cdist(scene.means.double(), finest.means.double()).amin(dim=1)
+    assert float(away.max()) < 0.02
+    assert names_in(tmp_path) == ["out", "scene.ply"]
+
+
+def test_every_level_paints_as_much_as_that_of_one_piece(
+    tmp_path: Path, source: Path, scene: GaussianScene
+) -> None:
+    stream(source, tmp_path / "out")
+    for lod, level in enumerate(FAST.levels(scene, RHOS)):
+        mass = float(load(tmp_path / "out", lod=lod).masses.sum())
+        assert math.isclose(mass, float(level.scene.masses.sum()), rel_tol=0.05)
+
+
+def test_parts_of_3d_tiles_share_a_root_without_content(tmp_path: Path, source: Path) -> None:
+    report = stream(source, tmp_path / "out", kind="3dtiles")
+    document = json.loads((tmp_path / "out" / "tileset.json").read_text())
+    finest: list[int] = []
+
+    def check(tile: dict[str, Any], error: float) -> None:
+        assert tile["geometricError"] <= error
+        children = tile.get("children", [])
+        assert children or tile["geometricError"] == 0
+        for child in children:
+            check(child, tile["geometricError"])
+        if not children:
+            finest.append(len(load(tmp_path / "out" / tile["content"]["uri"])))
+
+    assert "content" not in document["root"]
+    check(document["root"], document["geometricError"])
+    assert sum(finest) == 4000 == report.levels[0].gaussians
+
+
+@pytest.mark.slow
+def test_workers_give_the_same_bytes(tmp_path: Path, source: Path) -> None:
+    stream(source, tmp_path / "alone")
+    with LocalWorkers(2) as workers:
+        stream(source, tmp_path / "two", workers=workers)
+    assert files_of(tmp_path / "alone") == files_of(tmp_path / "two")
+
+
+class StoppedError(RuntimeError):
+    """What ends a run in the middle."""
+
+
+def until(most: int, done: list[int]) -> Callable[..., Iterator[Any]]:
+    """Return workers that fail when so many blocks are written."""
+
+    def work(function: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[Any]:
+        for item in items:
+            if isinstance(item, int):
+                if len(done) == most:
+                    raise StoppedError
+                done.append(item)
+            yield function(item)
+
+    return work
+
+
+def test_an_interrupted_run_is_continued(tmp_path: Path, source: Path) -> None:
+    stream(source, tmp_path / "whole")
+    out, done = tmp_path / "out", list[int]()
+    with pytest.raises(StoppedError):
+        stream(source, out, workers=until(2, done))
+    assert not out.exists()
+    assert ".out.blocks" in names_in(tmp_path)
+    report = stream(source, out, workers=until(9, done))
+    assert done == [0, 1, 2]
+    assert report.resumed_blocks == 2
+    assert files_of(out) == files_of(tmp_path / "whole")
+    assert names_in(tmp_path) == ["out", "scene.ply", "whole"]
+
+
+def test_a_damaged_part_is_written_again(tmp_path: Path, source: Path) -> None:
+    done: list[int] = []
+    with pytest.raises(StoppedError):
+        stream(source, tmp_path / "out", workers=until(2, done))
+    image = next((tmp_path / ".out.blocks").rglob("0_1_0/means_l.webp"))
+    image.write_bytes(image.read_bytes()[:10])
+    assert stream(source, tmp_path / "out").resumed_blocks == 1
+    assert len(load(tmp_path / "out")) == 4000
+
+
+def test_another_choice_starts_anew(tmp_path: Path, source: Path) -> None:
+    with pytest.raises(StoppedError):
+        stream(source, tmp_path / "out", workers=until(2, []))
+    assert stream(source, tmp_path / "out", chunk_gaussians=200).resumed_blocks == 0
+
+
+def test_a_stream_is_replaced_only_if_asked(tmp_path: Path, source: Path) -> None:
+    out = tmp_path / "out"
+    stream(source, out)
+    with pytest.raises(OutputExistsError, match=r"lod-meta.json: the output must not exist yet"):
+        stream(source, out)
+    (out / "index.html").write_text("a page of somebody's own")
+    stream(source, out, blocks=2, overwrite=True)
+    assert len(load(out)) == 4000
+    assert (out / "index.html").exists()
+
+
+def test_invalid_rows_are_counted(tmp_path: Path, scene: GaussianScene) -> None:
+    means = scene.means.clone()
+    means[[5, 77]] = torch.nan
+    save(scene.with_tensors({"means": means}, {}), tmp_path / "bad.ply")
+    with pytest.warns(DroppedDataWarning, match="dropped 2 of 4000 Gaussians"):
+        report = stream(tmp_path / "bad.ply", tmp_path / "out")
+    assert [level.gaussians for level in report.levels] == [3998, 1000, 200, 50]
+
+
+def test_axes_and_degree(tmp_path: Path) -> None:
+    save(make("courtyard", 1000, sh_degree=1, seed=3), tmp_path / "scene.ply")
+    stream(tmp_path / "scene.ply", tmp_path / "a")
+    stream(tmp_path / "scene.ply", tmp_path / "b", axes=("rdf", "rub"), sh_degree=0)
+    plain, turned = (load(tmp_path / name, lod=3) for name in "ab")
+    assert (plain.sh_degree, turned.sh_degree) == (1, 0)
+    flipped = plain.means * torch.tensor([1.0, -1.0, -1.0])
+    assert float(torch.cdist(flipped, turned.means).amin(dim=1).max()) < 0.05
+
+
+def test_wrong_sizes(tmp_path: Path, source: Path) -> None:
+    with pytest.raises(InvalidArgumentError, match="needs levels of different sizes"):
+        stream_file(source, tmp_path / "out", [0.1, 0.1], kind="sog", simplifier=FAST)
+    assert names_in(tmp_path) == ["scene.ply"]
