@@ -208,9 +208,10 @@ def test_a_place_on_the_earth() -> None:
     torch.testing.assert_close(matrix, torch.tensor(wanted, dtype=torch.float64))
     pole = geo_transform(0.0, 90.0)
     assert pole[14] == pytest.approx(6356752.314245, abs=1e-6)
-    # 2.2945 E, 48.8584 N, 35 m, by the formulas of EPSG 9602
-    assert geo_transform(2.2945, 48.8584, 35.0)[12:15] == pytest.approx(
-        (4200935.0, 168327.0, 4780231.0), abs=2.0
+    # the example of EPSG method 9602: 53 48' 33.820" N, 2 07' 46.380" E, 73 m
+    north, east = 53 + 48 / 60 + 33.820 / 3600, 2 + 7 / 60 + 46.380 / 3600
+    assert geo_transform(east, north, 73.0)[12:15] == pytest.approx(
+        (3771793.968, 140253.342, 5124304.349), abs=2e-3
     )
     for wrong in ((0.0, 91.0), (400.0, 0.0), (0.0, math.nan)):
         with pytest.raises(InvalidArgumentError, match="a latitude from -90 to 90"):

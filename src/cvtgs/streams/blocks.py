@@ -220,7 +220,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
     key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
     spec = replace(spec, job=replace(job, folder=job_folder(folder, key)))
     check_stream(folder, kind, overwrite=overwrite)
-    with output_lock(folder):
+    with output_lock(Path(spec.job.folder).parent):  # commands hold the lock of the folder
         parts, resumed = _run(spec, targets, simplifier, workers, StageClock(listener, _CPU))
         write_index(form, parts, spec.folder)
         publish(spec.folder, Path(folder), kind, overwrite=overwrite)
