@@ -10,11 +10,12 @@ from pathlib import Path
 import torch
 
 import cvtgs
-from benchmarks.before_after import camera
+from cvtgs.cameras import Cameras, look_at
 from cvtgs.evaluation import psnr
 from docs.drawings.saving import figure, save_small
 
 COUNT, RHO, CROP = 100_000, 0.05, (slice(70, 430), slice(40, 440))
+SIZE = 480
 
 
 def main() -> None:
@@ -49,6 +50,19 @@ def main() -> None:
     for axes in panels.flat:
         axes.set(xticks=[], yticks=[])
     save_small(canvas, options.output)
+
+
+def camera() -> Cameras:
+    """Stand at the edge of the courtyard (y points down) and look at its middle."""
+    eye, target = torch.tensor([[2.9, -2.3, -4.0]]), torch.tensor([[-0.2, -0.8, 0.0]])
+    focal = 0.95 * SIZE
+    intrinsics = torch.tensor([[[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]]])
+    return Cameras(
+        viewmats=look_at(eye, target, torch.tensor([0.0, -1.0, 0.0])),
+        Ks=intrinsics,
+        width=SIZE,
+        height=SIZE,
+    )
 
 
 if __name__ == "__main__":

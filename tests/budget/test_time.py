@@ -4,6 +4,7 @@ import json
 import math
 import os
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -11,6 +12,7 @@ import cvtgs
 from cvtgs.budget import CostModel, Work, choose_preset, cost_model
 from cvtgs.budget.calibrate import (
     CANDIDATES,
+    LEAST_MEASURED,
     SHORT,
     STALE_SECONDS,
     Trial,
@@ -172,8 +174,8 @@ def test_a_slow_machine_measures_once():
     assert len(calls) == 1 + 4
 
 
-def test_nothing_is_repeated_after_20_processor_seconds():
-    """Of nine measurements and a start of 3 s each, the sixth ends after 20 s."""
+def test_nothing_is_repeated_after_15_processor_seconds():
+    """A start, four measurements and one that is repeated take 3 s each."""
     calls, events = [], []
 
     def run(config, scene, count):
@@ -188,9 +190,30 @@ def test_nothing_is_repeated_after_20_processor_seconds():
         cpu=lambda: 3.0 * len(calls),
         listener=events.append,
     )
-    assert len(calls) == 7
+    assert len(calls) == 6
     assert events[0].note == "load preset draft"
     assert events[1].note == "preset draft, 50 to 5 Gaussians"
+
+
+def test_the_last_trials_are_left_out_where_time_is_up():
+    """Each preset is measured on a small and a large scene, whatever that takes."""
+    calls = []
+
+    def run(config, scene, count):
+        calls.append((config.preset, len(scene), count))
+        return {"check": 9.0}
+
+    trials = [replace(trial, count=trial.count // 20) for trial in TRIALS]
+    model = calibrate(
+        run,
+        presets=["draft", "fast"],
+        trials=trials,
+        clock=lambda: 0.0,
+        cpu=lambda: 9.0 * len(calls),
+    )
+    assert len(calls) == 2 + 2 * LEAST_MEASURED
+    assert {size for _, size, _ in calls} == {trials[0].count, trials[1].count}
+    assert model.presets == ("draft", "fast")
 
 
 def test_real_seconds_come_from_the_report():

@@ -165,7 +165,7 @@ def test_the_machine_is_measured_once_or_when_asked(scene, measured, capsys):
     words = ["--rho", "0.1", "--time-budget", "5s"]
     choose_preset(options(*words), scene, {}, silent)
     assert capsys.readouterr().err == (
-        "cvtgs: measuring this machine once, about half a minute (--shipped-rates does without)\n"
+        "cvtgs: measuring this machine once, about 20 seconds (--shipped-rates does without)\n"
     )
     choose_preset(options(*words), scene, {}, silent)
     assert capsys.readouterr().err == ""

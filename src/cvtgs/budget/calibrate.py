@@ -36,8 +36,11 @@ PATIENCE_SECONDS = 1.0
 
 MOST_REPEATS = 3
 
-MOST_CPU_SECONDS = 20.0
-"""Processor seconds after which nothing is repeated; everything is measured once in any case."""
+MOST_CPU_SECONDS = 15.0
+"""Processor seconds after which nothing is repeated, and no more is measured than must be."""
+
+LEAST_MEASURED = 3
+"""Trials that every preset is measured on in any case: small and large, many cells and few."""
 
 MOST_START_SECONDS = 1.0
 """What takes longer to load was compiled, which happens once in the life of an installation."""
@@ -46,10 +49,13 @@ CANDIDATES = tuple(name for name in PRESETS if name != "paper")
 """Presets to choose from; ``paper`` is there to compare with."""
 
 SHORT = (
-    {"views": 3, "steps": 8, "batch": 8, "heldout": 4},
-    {"views": 6, "steps": 16, "batch": 16, "heldout": 4},
+    {"views": 3, "steps": 4, "batch": 4, "heldout": 2, "size": 128},
+    {"views": 5, "steps": 5, "batch": 5, "heldout": 2, "size": 176},
 )
-"""Images and refinements are cut to so many, in turn: their cost grows with their number."""
+"""Images and refinements are cut to this, in turn: their cost grows with number and pixels."""
+
+SHORTEST = {"views": 1, "steps": 1, "batch": 4, "heldout": 1, "size": 32}
+"""Enough to load what a preset needs."""
 
 RENDERERS = ("gsplat", "numba")
 """Packages that render faster than torch; importing one to ask takes longer than many a run."""
@@ -80,9 +86,9 @@ class Trial:
 
 
 TRIALS = (
-    Trial(kind="object", count=20_000, sh_degree=0, ratios=(0.02, 0.2)),
-    Trial(kind="courtyard", count=60_000, sh_degree=3, ratios=(0.01, 0.2)),
-    Trial(kind="room", count=200_000, sh_degree=1, ratios=(0.002, 0.05)),
+    Trial(kind="object", count=20_000, sh_degree=0, ratios=(0.02, 0.15)),
+    Trial(kind="room", count=100_000, sh_degree=3, ratios=(0.003, 0.05)),
+    Trial(kind="courtyard", count=60_000, sh_degree=1, ratios=(0.01, 0.2)),
 )
 """Small and large, with few and many colours, a few and many cells: no two alike."""
 
@@ -113,7 +119,7 @@ def cost_model(
     Args:
         device: Where presets compute.
         recalibrate: Whether to measure again in any case.
-        calibration: Measures; None for the real one, which takes about a minute.
+        calibration: Measures; None for the real one, which takes about 20 seconds.
         folder: Where to cache; None for ``cvtgs`` in the user's cache folder.
         listener: Called after each measurement.
 
@@ -249,9 +255,10 @@ def calibrate(
     """Measure presets on generated scenes, and fit their cost.
 
     Every preset is run once to load what it needs. Then every trial is measured up to three times,
-    once if that takes long or 20 processor seconds have passed; of each stage the fastest counts,
-    since other programs only ever make a stage slower. Presets that use images get only a few
-    here, and those that differ in nothing but the number of images are measured once.
+    once if that takes long; of each stage the fastest counts, since other programs only ever make a
+    stage slower. After 15 processor seconds nothing is repeated, and the last trials are left out.
+    Presets that use images get only a few small ones here, and those that differ in nothing but the
+    number of images are measured once.
     """
     first: dict[SimplifyConfig, str] = {}
     measured_as = {
@@ -269,16 +276,18 @@ def calibrate(
     ]
     total, begun = MOST_REPEATS * len(tasks), cpu()
     loading = []
+    starting = {_uses_images(preset): preset for preset in reversed(first.values())}
     for preset, config, scene, count in tasks[: len(first)]:  # every preset once
         listener(ProgressEvent(stage=STAGE, done=0, total=total, note=f"load preset {preset}"))
-        loading.append(sum(run(config, scene, count).values()))
+        tried = config if preset in starting.values() else _shortened(preset, SHORTEST)
+        loading.append(sum(run(tried, scene, count).values()))
     best: list[dict[str, float]] = [{} for _ in tasks]
     spent = [0.0 for _ in tasks]
     for number in range(total):
         row = number % len(tasks)
         preset, config, scene, count = tasks[row]
-        again = number >= len(tasks)
-        if spent[row] <= PATIENCE_SECONDS and not (again and cpu() - begun > MOST_CPU_SECONDS):
+        must = number < LEAST_MEASURED * len(first)
+        if spent[row] <= PATIENCE_SECONDS and (must or cpu() - begun <= MOST_CPU_SECONDS):
             note = f"preset {preset}, {len(scene):,} to {count:,} Gaussians"
             listener(ProgressEvent(stage=STAGE, done=number, total=total, note=note))
             begin = clock()
@@ -288,8 +297,9 @@ def calibrate(
         listener(ProgressEvent(stage=STAGE, done=number + 1, total=total))
     measured: dict[str, list[Measurement]] = {preset: [] for preset in first.values()}
     for (preset, config, scene, count), stages in zip(tasks, best, strict=True):
-        work = Work.of(scene, count)
-        measured[preset].append(Measurement(work=work, config=config, seconds=stages))
+        if stages:
+            work = Work.of(scene, count)
+            measured[preset].append(Measurement(work=work, config=config, seconds=stages))
     # What a new process loads: the first preset shows it, and the first with images.
     starts = {False: 0.0, True: 0.0}
     for preset, seconds, stages in reversed(list(zip(first.values(), loading, best, strict=False))):
@@ -308,7 +318,7 @@ def _shortened(preset: str, short: Mapping[str, int]) -> SimplifyConfig:
     if config.uses_renders:
         changes["visibility"] = config.visibility.model_copy(update={"views": short["views"]})
     if config.refine.enabled:
-        update = {name: short[name] for name in ("steps", "batch", "heldout")} | {"seconds": 0}
+        update = {name: short[name] for name in short if name != "views"} | {"seconds": 0}
         update["half_after"] = RefineConfig().half_after  # it costs nothing
         changes["refine"] = config.refine.model_copy(update=update)
     return config.model_copy(update=changes)

@@ -83,7 +83,7 @@ def add_simplify(add_parser: AddParser) -> None:
         "--time-budget",
         metavar="TIME",
         help="time to finish in, for example 20s or 2m, with the best preset that fits; the first "
-        "use measures this machine, which takes about half a minute and does not count",
+        "use measures this machine, which takes about 20 seconds and does not count",
     )
     parser.add_argument(
         "--shipped-rates",

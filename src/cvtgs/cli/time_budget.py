@@ -91,7 +91,7 @@ def choose_preset(
         again = options.recalibrate or not is_calibrated(options.device)
         if again and not options.quiet:
             say(
-                "cvtgs: measuring this machine once, about half a minute "
+                "cvtgs: measuring this machine once, about 20 seconds "
                 "(--shipped-rates does without)",
                 file=sys.stderr,
             )
