@@ -23,7 +23,7 @@ from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
 from cvtgs.grouping import Grouping, OrderedRows, group_cells, group_rows, order_rows
 from cvtgs.math.segments import segment_ids
-from cvtgs.mergenet import MergeNet, correct_cells
+from cvtgs.mergenet import MergeNet, PublishedMergeNet, correct_cells
 from cvtgs.report import CellStatistics, MatchReport
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities
@@ -76,7 +76,7 @@ def reduce_scene(
     target: int,
     config: SimplifyConfig,
     *,
-    net: MergeNet | None,
+    net: MergeNet | PublishedMergeNet | None,
     clock: StageClock,
     finest: Reduced | None = None,
     ordered: OrderedRows | None = None,
@@ -122,7 +122,7 @@ def reduce_scene(
             grouping.partition,
             config.merge,
             areas=analysis.areas,
-            with_network=net is not None,
+            with_network=net is not None and net.sees_surroundings,
             on_cells=advance,
         )
     small = merged.scene
@@ -217,7 +217,8 @@ def shape_merged(
     config: MergeConfig,
 ) -> GaussianScene:
     """Align axes and inflate; merged Gaussians beyond the partition are neighbours only."""
-    merged = cells.align_axes(merged, shown, neighbors)
+    if config.align_axes:
+        merged = cells.align_axes(merged, shown, neighbors)
     if config.inflation == 0.0 and config.covered_inflation == 0.0:
         return merged
     return cells.inflate_cells(

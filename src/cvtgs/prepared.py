@@ -24,7 +24,7 @@ from cvtgs.counts import shortfall, target_count
 from cvtgs.devices import chosen_device, within_memory
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.grouping import OrderedRows
-from cvtgs.mergenet import Checkpoint, MergeNet
+from cvtgs.mergenet import Checkpoint, MergeNet, PublishedMergeNet
 from cvtgs.pipeline import Reduced, level_facts, nests_in, order_gaussians, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified, SimplifyReport
@@ -76,7 +76,7 @@ class Prepared:
     def _forget(self) -> None:
         """Let go of all that is on the device."""
         self._placed: GaussianScene | None = None
-        self._net: MergeNet | None = None
+        self._net: MergeNet | PublishedMergeNet | None = None
         self._checked: CheckedScene | None = None
         self._analysis: SceneAnalysis | None = None
         self._ordered: OrderedRows | None = None
@@ -193,8 +193,8 @@ class Prepared:
         valid = self._check(clock).scene
         is_whole = target >= len(valid)
         with clock.stage("plan"):
-            with_visibility = self._net is not None and not is_whole
-            analysis = analyze(valid, self._config, with_visibility=with_visibility)
+            sees = self._net is not None and self._net.sees_surroundings
+            analysis = analyze(valid, self._config, with_visibility=sees and not is_whole)
         if is_whole:
             return analysis
         if analysis.plan.visibility.active:

@@ -39,7 +39,9 @@ def twins(cells: int = 16) -> Case:
 
 def grid_of(case: Case, *, seed: int = 0, changed: dict[str, Tensor] | None = None) -> CellGrid:
     same = case.reference.merged.select(case.cells).tensors()
-    return lay_out_cells(case, changed or same, rng=random.Random(seed))
+    return lay_out_cells(
+        case.reference, case.cells, case.part, changed or same, rng=random.Random(seed)
+    )
 
 
 def image(scene: GaussianScene, grid: CellGrid) -> Tensor:

@@ -71,7 +71,8 @@ def test_there_are_recipes():
         "standard-low",
         "standard-pairs",
         "paper",
-        "paper-local",
+        "paper-gated",
+        "paper-gated-local",
     }
 
 

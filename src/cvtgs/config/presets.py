@@ -32,6 +32,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
             "area_power": 0.0,
             "opacity": "union",
             "representatives": False,
+            "align_axes": False,
             "inflation": 0.0,
             "covered_inflation": 0.0,
         },

@@ -165,6 +165,8 @@ class MergeConfig(Section):
             members that lie exactly behind one another, ``1 - prod(1 - a)``.
         representatives: Whether a cell whose members hardly touch keeps the one that shows most,
             instead of their moments.
+        align_axes: Whether axes of equal length turn to where the neighbours are
+            (:func:`cvtgs.cells.align_axes`).
         inflation: How much wider than its moments an opaque cell of many members becomes, along
             every axis.
         covered_inflation: How much more it becomes so along an axis on which other cells paint at
@@ -175,6 +177,7 @@ class MergeConfig(Section):
     area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)
     opacity: Literal["saturating", "union"] = "saturating"
     representatives: bool = True
+    align_axes: bool = True
     inflation: float = pydantic.Field(default=0.1, ge=0.0, le=2.0)
     covered_inflation: float = pydantic.Field(default=0.4, ge=0.0, le=2.0)
     network: bool = True

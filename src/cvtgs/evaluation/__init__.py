@@ -4,7 +4,7 @@ from cvtgs.evaluation.compare import Comparison, SceneImages, compare, evaluate
 from cvtgs.evaluation.comparison_files import write_comparison
 from cvtgs.evaluation.lpips import LPIPS_VARIABLE, LpipsWeights, load_lpips, lpips
 from cvtgs.evaluation.metrics import alpha_bias, alpha_error, psnr, ssim
-from cvtgs.evaluation.photographs import load_photographs
+from cvtgs.evaluation.photographs import fit_cameras, load_photographs
 from cvtgs.evaluation.report import Evaluation, SceneScores, Score
 from cvtgs.evaluation.scorer import EvaluationSettings
 
@@ -21,6 +21,7 @@ __all__ = [
     "alpha_error",
     "compare",
     "evaluate",
+    "fit_cameras",
     "load_lpips",
     "load_photographs",
     "lpips",

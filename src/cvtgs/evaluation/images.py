@@ -1,6 +1,8 @@
 """Images of 8 bits: encoding, resizing, reading, and the colours of differences."""
 
 import io
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -88,15 +90,36 @@ def resized(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> np.ndar
     return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.LANCZOS))
 
 
+def image_size(path: Path) -> tuple[int, int]:
+    """Read the width and the height of an image, without its pixels."""
+    from PIL import Image  # noqa: PLC0415
+
+    with _opened(path), Image.open(path) as file:
+        width, height = file.size
+    return width, height
+
+
 def read_image(
     path: Path, size: tuple[int, int], background: tuple[float, float, float]
 ) -> Float[np.ndarray, "h w 3"]:
     """Read an image at a width and height, over a background."""
-    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415
+    from PIL import Image  # noqa: PLC0415
+
+    with _opened(path), Image.open(path) as file:
+        whole = file.convert("RGBA")
+    pixels = np.asarray(whole.resize(size, Image.Resampling.LANCZOS), dtype=np.float32) / 255
+    alpha = pixels[:, :, 3:]
+    colors = pixels[:, :, :3] * alpha + np.asarray(background, dtype=np.float32) * (1 - alpha)
+    return colors.astype(np.float32)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[None]:
+    """Say in one sentence why an image cannot be read."""
+    from PIL import UnidentifiedImageError  # noqa: PLC0415
 
     try:
-        with Image.open(path) as file:
-            whole = file.convert("RGBA")
+        yield
     except UnidentifiedImageError as error:
         raise FileFormatError(f"{path}: must be an image, found something else.") from error
     except (OSError, SyntaxError, ValueError) as error:
@@ -104,10 +127,6 @@ def read_image(
             reason = (error.strerror or str(error)).lower()
             raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
         raise FileFormatError(f"{path}: must be a whole image, found a damaged one.") from error
-    pixels = np.asarray(whole.resize(size, Image.Resampling.LANCZOS), dtype=np.float32) / 255
-    alpha = pixels[:, :, 3:]
-    colors = pixels[:, :, :3] * alpha + np.asarray(background, dtype=np.float32) * (1 - alpha)
-    return colors.astype(np.float32)
 
 
 def error_map(

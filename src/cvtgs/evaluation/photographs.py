@@ -1,6 +1,7 @@
 """The photographs that belong to cameras, found by name."""
 
 import os
+from collections import Counter
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.errors import InputNotFoundError, InvalidArgumentError
-from cvtgs.evaluation.images import read_image
+from cvtgs.evaluation.images import image_size, read_image
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
@@ -54,7 +55,51 @@ def load_photographs(
         ...     load_photographs(images, cameras).shape
         torch.Size([1, 2, 4, 3])
     """
-    place = Path(folder)
+    size = (cameras.width, cameras.height)
+    paths = _find_all(Path(folder), cameras)
+    return torch.from_numpy(np.stack([read_image(path, size, background) for path in paths]))
+
+
+def fit_cameras(cameras: Cameras, folder: str | os.PathLike[str]) -> Cameras:
+    """Give cameras the size of their photographs, such as those of ``images_4``.
+
+    Args:
+        cameras: Cameras with names.
+        folder: Where the photographs are, as :func:`load_photographs` finds them.
+
+    Returns:
+        Cameras with scaled intrinsics; of several sizes the most frequent one counts.
+
+    Raises:
+        InvalidArgumentError: The cameras have no names, or the photographs another shape.
+        InputNotFoundError: There is no such folder, or a camera has no photograph in it.
+        FileFormatError: A photograph is no image.
+
+    Example:
+        >>> import tempfile
+        >>> from cvtgs.evaluation.images import encode
+        >>> cameras = Cameras(viewmats=torch.eye(4)[None], Ks=torch.eye(3)[None], width=16,
+        ...                   height=8, names=("a",))
+        >>> with tempfile.TemporaryDirectory() as images:
+        ...     _ = (Path(images) / "a.png").write_bytes(encode(np.zeros((4, 8, 3), "u1"), "png"))
+        ...     fit_cameras(cameras, images).width
+        8
+    """
+    paths = _find_all(Path(folder), cameras)
+    (width, height), _ = Counter(image_size(path) for path in paths).most_common(1)[0]
+    # Sizes were rounded when the photographs were scaled.
+    if abs(width * cameras.height - height * cameras.width) > 1.5 * max(
+        cameras.width, cameras.height
+    ):
+        raise InvalidArgumentError(
+            f"{folder}: photographs must have the shape of the cameras' images, {cameras.width} x "
+            f"{cameras.height} or smaller, found {width} x {height}."
+        )
+    return cameras.resized(width, height)
+
+
+def _find_all(place: Path, cameras: Cameras) -> list[Path]:
+    """Find the photograph of every camera."""
     if not cameras.names:
         raise InvalidArgumentError(
             "photographs are matched by the names of the cameras, but these have none."
@@ -68,9 +113,7 @@ def load_photographs(
             f"{place}: must hold a photograph of every camera; {len(missing)} of "
             f"{len(found)} cameras have none, the first is {missing[0]!r}."
         )
-    size = (cameras.width, cameras.height)
-    photographs = [read_image(path, size, background) for path in found.values() if path]
-    return torch.from_numpy(np.stack(photographs))
+    return [path for path in found.values() if path]
 
 
 def _find(folder: Path, name: str) -> Path | None:

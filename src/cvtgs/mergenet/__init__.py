@@ -1,28 +1,44 @@
 """MergeNet: learned corrections of merged Gaussians, predicted from descriptors alone."""
 
-from cvtgs.mergenet.apply import compose, correct_cells
+from cvtgs.mergenet.apply import compose, compose_published, correct_cells
 from cvtgs.mergenet.checkpoint import (
     SHIPPED,
     Checkpoint,
     CheckpointInfo,
     LearnedScene,
+    build_network,
     load_checkpoint,
     save_checkpoint,
 )
 from cvtgs.mergenet.known import KnownRange, summarize
-from cvtgs.mergenet.model import Architecture, MergeNet, Residuals
+from cvtgs.mergenet.model import Architecture, CellNetwork, MergeNet, Residuals
+from cvtgs.mergenet.published import (
+    PublishedArchitecture,
+    PublishedDescriptors,
+    PublishedMergeNet,
+    PublishedResiduals,
+    describe_published,
+)
 
 __all__ = [
     "SHIPPED",
     "Architecture",
+    "CellNetwork",
     "Checkpoint",
     "CheckpointInfo",
     "KnownRange",
     "LearnedScene",
     "MergeNet",
+    "PublishedArchitecture",
+    "PublishedDescriptors",
+    "PublishedMergeNet",
+    "PublishedResiduals",
     "Residuals",
+    "build_network",
     "compose",
+    "compose_published",
     "correct_cells",
+    "describe_published",
     "load_checkpoint",
     "save_checkpoint",
     "summarize",

@@ -1,6 +1,6 @@
 """Apply MergeNet: correct every cell of a scene by the residuals that the network predicts."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import torch
 from jaxtyping import Float, Int
@@ -12,6 +12,11 @@ from cvtgs.devices import chunk_length
 from cvtgs.math import parameters
 from cvtgs.math.segments import segment_sum, segment_sum_of
 from cvtgs.mergenet.model import MergeNet, Residuals
+from cvtgs.mergenet.published import (
+    PublishedMergeNet,
+    PublishedResiduals,
+    describe_published,
+)
 from cvtgs.scene import GaussianScene
 
 CHUNK_MEMBERS = 1 << 15
@@ -19,7 +24,7 @@ CHUNK_MEMBERS = 1 << 15
 
 
 def correct_cells(
-    net: MergeNet,
+    net: MergeNet | PublishedMergeNet,
     scene: GaussianScene,
     merged: GaussianScene,
     partition: Partition,
@@ -61,43 +66,89 @@ def correct_cells(
         >>> bool((corrected.means == merged.means).all())
         True
     """
-    counts, near = partition.counts, neighbors.shape[1]
+    counts = partition.counts
     sizes = counts if sizes is None else sizes
     cells = (counts > 1).nonzero()[:, 0]
     several = partition.select(cells)
     done = len(counts) - len(cells)
     originals = merged.tensors()
     tensors = {name: values.clone() for name, values in originals.items() if values.numel()}
-    chunk = chunk_length(CHUNK_MEMBERS, scene.device)
-    step = max(1, chunk // max(1, near))
     with torch.no_grad():
-        for block in (slice(start, start + step) for start in range(0, len(cells), step)):
-            context = neighbor_context(
-                merged, cells=cells[block], neighbors=neighbors[cells[block]], sizes=sizes
+        if isinstance(net, PublishedMergeNet):
+            corrections = _correct_as_published(net, scene, merged, several, cells=cells)
+        else:
+            corrections = _correct_gated(
+                net,
+                scene,
+                merged,
+                several,
+                cells=cells,
+                neighbors=neighbors,
+                visibility=visibility,
+                sizes=sizes,
             )
-            for run, part in several.cut(block).chunks(chunk, cell_cost=near):
-                rows = cells[block][run]
-                descriptors = describe_members(
-                    scene, part, context=context.cut(run), visibility=visibility
-                )
-                corrected = compose(
-                    scene,
-                    merged,
-                    part,
-                    cells=rows,
-                    neighbors=neighbors[rows],
-                    residuals=net(descriptors),
-                )
-                for name, values in tensors.items():
-                    values[rows] = corrected[name]
-                done += run.stop - run.start
-                on_cells(done)
+        for rows, corrected in corrections:
+            for name, values in tensors.items():
+                values[rows] = corrected[name]
+            done += len(rows)
+            on_cells(done)
     # Near the limits of the dtype (a flyaway at 3e38) a correction may overflow.
     tensors = {
         name: torch.where(values.isfinite(), values, originals[name])
         for name, values in tensors.items()
     }
     return merged.with_tensors(tensors, merged.extras)
+
+
+def _correct_gated(
+    net: MergeNet,
+    scene: GaussianScene,
+    merged: GaussianScene,
+    several: Partition,
+    *,
+    cells: Int[Tensor, "m"],
+    neighbors: Int[Tensor, "m_all k"],
+    visibility: Float[Tensor, "n"],
+    sizes: Int[Tensor, "m_all"],
+) -> Iterator[tuple[Int[Tensor, "r"], dict[str, Tensor]]]:
+    """Yield runs of cells and their corrected tensors."""
+    chunk, near = chunk_length(CHUNK_MEMBERS, scene.device), neighbors.shape[1]
+    step = max(1, chunk // max(1, near))
+    for block in (slice(start, start + step) for start in range(0, len(cells), step)):
+        context = neighbor_context(
+            merged, cells=cells[block], neighbors=neighbors[cells[block]], sizes=sizes
+        )
+        for run, part in several.cut(block).chunks(chunk, cell_cost=near):
+            rows = cells[block][run]
+            descriptors = describe_members(
+                scene, part, context=context.cut(run), visibility=visibility
+            )
+            yield (
+                rows,
+                compose(
+                    scene,
+                    merged,
+                    part,
+                    cells=rows,
+                    neighbors=neighbors[rows],
+                    residuals=net(descriptors),
+                ),
+            )
+
+
+def _correct_as_published(
+    net: PublishedMergeNet,
+    scene: GaussianScene,
+    merged: GaussianScene,
+    several: Partition,
+    *,
+    cells: Int[Tensor, "m"],
+) -> Iterator[tuple[Int[Tensor, "r"], dict[str, Tensor]]]:
+    """Yield runs of cells and their corrected tensors."""
+    for run, part in several.chunks(chunk_length(CHUNK_MEMBERS, scene.device)):
+        rows = cells[run]
+        descriptors = describe_published(scene, merged, part, cells=rows)
+        yield rows, compose_published(merged, cells=rows, residuals=net(descriptors))
 
 
 def compose(
@@ -144,18 +195,7 @@ def compose(
         >>> bool(torch.isclose(tensors["sh0"][0], scene.sh0[1], atol=1e-6).all())
         True
     """
-    means, quats, log_scales, logits = (
-        values.index_select(0, cells)
-        for values in (merged.means, merged.quats, merged.log_scales, merged.logit_opacities)
-    )
-    axes = parameters.rotation_matrices(quats)
-    moves = torch.einsum("mij,mj->mi", axes, torch.exp(log_scales) * residuals.d_means)
-    tensors = {
-        "means": means + moves,
-        "quats": _rotate(quats, residuals.d_rotvecs),
-        "log_scales": log_scales + residuals.d_log_scales,
-        "logit_opacities": logits + residuals.d_logit_opacities,
-    }
+    tensors = _reshape(merged, cells, residuals)
     ends = torch.arange(len(cells) + 1, device=cells.device) * neighbors.shape[1]
     others, pair_shares = neighbors.flatten(), residuals.pair_colors.flatten()
     member_totals = segment_sum(residuals.member_colors, part.offsets)[:, None, None]
@@ -172,6 +212,59 @@ def compose(
             bands = bands + (mixed - bands * member_totals) + (borrowed - bands * pair_totals)
         tensors[name] = bands
     return tensors
+
+
+def compose_published(
+    merged: GaussianScene, *, cells: Int[Tensor, "m"], residuals: PublishedResiduals
+) -> dict[str, Tensor]:
+    """Correct some merged Gaussians by free residuals.
+
+    As :func:`compose`, but SH coefficients of every band are added to. Residuals of zero give the
+    merged Gaussians bit for bit. Differentiable in the residuals.
+
+    Args:
+        merged: One Gaussian per cell, of all cells.
+        cells: Which cells to correct.
+        residuals: What to change of them.
+
+    Returns:
+        The standard tensors of these cells, by name.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> merged, none = make("object", 1, sh_degree=0, seed=0), torch.zeros(1, 3)
+        >>> residuals = PublishedResiduals(
+        ...     d_means=none, d_log_scales=none + 0.5, d_rotvecs=none, d_logit_opacities=none[:, 0],
+        ...     d_sh=torch.ones(1, 16, 3),
+        ... )
+        >>> tensors = compose_published(merged, cells=torch.tensor([0]), residuals=residuals)
+        >>> bool((tensors["sh0"] == merged.sh0 + 1).all()), tuple(tensors["shN"].shape)
+        (True, (1, 0, 3))
+    """
+    rest = merged.shN.shape[1]
+    bands = {
+        "sh0": merged.sh0.index_select(0, cells) + residuals.d_sh[:, :1],
+        "shN": merged.shN.index_select(0, cells) + residuals.d_sh[:, 1 : 1 + rest],
+    }
+    return _reshape(merged, cells, residuals) | bands
+
+
+def _reshape(
+    merged: GaussianScene, cells: Int[Tensor, "m"], residuals: Residuals | PublishedResiduals
+) -> dict[str, Tensor]:
+    """Return all but the colours of corrected cells."""
+    means, quats, log_scales, logits = (
+        values.index_select(0, cells)
+        for values in (merged.means, merged.quats, merged.log_scales, merged.logit_opacities)
+    )
+    axes = parameters.rotation_matrices(quats)
+    moves = torch.einsum("mij,mj->mi", axes, torch.exp(log_scales) * residuals.d_means)
+    return {
+        "means": means + moves,
+        "quats": _rotate(quats, residuals.d_rotvecs),
+        "log_scales": log_scales + residuals.d_log_scales,
+        "logit_opacities": logits + residuals.d_logit_opacities,
+    }
 
 
 def _rotate(quats: Float[Tensor, "m 4"], rotvecs: Float[Tensor, "m 3"]) -> Float[Tensor, "m 4"]:

@@ -15,6 +15,7 @@ from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.errors import CheckpointError, ConfigError, FileFormatError
 from cvtgs.io.tensors import pack_tensors, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet
+from cvtgs.mergenet.published import PublishedArchitecture, PublishedMergeNet
 from cvtgs.text import printable
 
 SHIPPED = ("standard", "paper")
@@ -50,11 +51,23 @@ class LearnedScene(pydantic.BaseModel):
     is_validation: bool = False
 
 
+KINDS = {"gated": Architecture, "published": PublishedArchitecture}
+"""Shapes of the networks that there are, by their kind."""
+
+
+class _Kind(pydantic.BaseModel):
+    kind: str = "gated"  # files of 0.1 do not say
+
+
+class _Described(pydantic.BaseModel):
+    architecture: _Kind
+
+
 class CheckpointInfo(pydantic.BaseModel):
     """Description of a checkpoint.
 
     Attributes:
-        architecture: Shape of the network.
+        architecture: Kind and shape of the network.
         preset: The preset that the network corrects.
         training: On what and how it was trained, in words.
         seed: Seed of the training.
@@ -67,7 +80,7 @@ class CheckpointInfo(pydantic.BaseModel):
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
-    architecture: Architecture
+    architecture: Architecture | PublishedArchitecture
     preset: str
     training: str = ""
     seed: int = 0
@@ -89,7 +102,7 @@ class Checkpoint:
         digest: SHA-256 of the weights and the description, hexadecimal.
     """
 
-    net: MergeNet
+    net: MergeNet | PublishedMergeNet
     info: CheckpointInfo
     name: str
     digest: str
@@ -128,7 +141,7 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
     )
 
 
-def save_checkpoint(net: MergeNet, info: CheckpointInfo) -> bytes:
+def save_checkpoint(net: MergeNet | PublishedMergeNet, info: CheckpointInfo) -> bytes:
     """Return the bytes of a checkpoint file.
 
     The same network and description give the same bytes.
@@ -204,6 +217,12 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
             f"{FORMAT_VERSION}; update cvtgs."
         )
     try:
+        kind = _Described.model_validate_json(metadata.get("info", "")).architecture.kind
+        if kind not in KINDS:
+            raise CheckpointError(
+                f"{name}: the checkpoint is of another architecture: its kind must be "
+                f"{' or '.join(KINDS)}, found {printable(kind)!r}."
+            )
         info = CheckpointInfo.model_validate_json(metadata.get("info", ""))
     except pydantic.ValidationError as error:
         raise CheckpointError(f"{name}: the checkpoint does not say what it is.") from error
@@ -212,9 +231,9 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
             f"{name}: the preset of the checkpoint must be one of {', '.join(SHIPPED)}, "
             f"found {info.preset!r}."
         )
-    ours, theirs = Architecture(), info.architecture
+    ours, theirs = KINDS[info.architecture.kind](), info.architecture
     for feature in ("member_features", "pair_features", "cell_features"):
-        if getattr(ours, feature) != getattr(theirs, feature):
+        if getattr(ours, feature, 0) != getattr(theirs, feature, 0):
             raise CheckpointError(
                 f"{name}: the checkpoint is of another architecture: {feature} must be "
                 f"{getattr(ours, feature)}, found {getattr(theirs, feature)}."
@@ -222,9 +241,31 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
     return info
 
 
-def _build_net(info: CheckpointInfo, tensors: dict[str, Tensor], name: str) -> MergeNet:
-    net = MergeNet(info.architecture)
-    if not any(key.startswith(KNOWN) for key in tensors):
+def build_network(
+    architecture: Architecture | PublishedArchitecture,
+) -> MergeNet | PublishedMergeNet:
+    """Build an untrained network, which changes nothing.
+
+    Args:
+        architecture: Its kind and shape.
+
+    Returns:
+        The network.
+
+    Example:
+        >>> type(build_network(Architecture())).__name__
+        'MergeNet'
+    """
+    if isinstance(architecture, PublishedArchitecture):
+        return PublishedMergeNet(architecture)
+    return MergeNet(architecture)
+
+
+def _build_net(
+    info: CheckpointInfo, tensors: dict[str, Tensor], name: str
+) -> MergeNet | PublishedMergeNet:
+    net = build_network(info.architecture)
+    if isinstance(net, MergeNet) and not any(key.startswith(KNOWN) for key in tensors):
         own = net.state_dict()
         tensors = tensors | {key: own[key] for key in own if key.startswith(KNOWN)}
     wanted = {key: (values.shape, values.dtype) for key, values in net.state_dict().items()}

@@ -2,7 +2,7 @@
 
 import copy
 from dataclasses import dataclass
-from typing import Self
+from typing import Literal, Self
 
 import pydantic
 import torch
@@ -31,6 +31,7 @@ class Architecture(pydantic.BaseModel):
     """The shape of a MergeNet.
 
     Attributes:
+        kind: Tells it from the shape of the published network.
         member_features: Numbers that describe a member.
         pair_features: Numbers that describe a neighbour.
         cell_features: Numbers that describe a cell.
@@ -41,6 +42,7 @@ class Architecture(pydantic.BaseModel):
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
+    kind: Literal["gated"] = "gated"
     member_features: int = MEMBER_FEATURES
     pair_features: int = PAIR_FEATURES
     cell_features: int = CELL_FEATURES
@@ -104,7 +106,40 @@ class Residuals:
         )
 
 
-class MergeNet(nn.Module):
+class CellNetwork(nn.Module):
+    """A network that corrects merged Gaussians, cell by cell.
+
+    Attributes:
+        sees_surroundings: Whether it asks for the neighbours of a cell and for the ambient
+            visibility of its members.
+    """
+
+    sees_surroundings = True
+
+    def copy_to(self, device: torch.device, dtype: torch.dtype) -> Self:
+        """Return a copy on a device; all parameters go there in one piece.
+
+        Args:
+            device: Where to.
+            dtype: Precision of the copy.
+
+        Returns:
+            The copy.
+        """
+        copied = copy.deepcopy(self).to(dtype)
+        if device.type == "cpu":
+            return copied
+        state = copied.state_dict()
+        # Each starts at a multiple of 16 numbers: matrix products want them aligned.
+        padded = [pad(values.flatten(), (0, -values.numel() % 16)) for values in state.values()]
+        parts = torch.cat(padded).to(device).split([len(values) for values in padded])
+        for (name, values), part in zip(state.items(), parts, strict=True):
+            state[name] = part[: values.numel()].view(values.shape)
+        copied.load_state_dict(state, assign=True)
+        return copied
+
+
+class MergeNet(CellNetwork):
     """Predicts residuals from descriptors.
 
     After CVT-GS: a pointwise network over members, pooled by mean, maximum and mass, and a
@@ -137,28 +172,6 @@ class MergeNet(nn.Module):
         self.known = KnownRange()
         nn.init.zeros_(self.decoder.weight)
         nn.init.zeros_(self.decoder.bias)
-
-    def copy_to(self, device: torch.device, dtype: torch.dtype) -> Self:
-        """Return a copy on a device; all parameters go there in one piece.
-
-        Args:
-            device: Where to.
-            dtype: Precision of the copy.
-
-        Returns:
-            The copy.
-        """
-        copied = copy.deepcopy(self).to(dtype)
-        if device.type == "cpu":
-            return copied
-        state = copied.state_dict()
-        # Each starts at a multiple of 16 numbers: matrix products want them aligned.
-        padded = [pad(values.flatten(), (0, -values.numel() % 16)) for values in state.values()]
-        parts = torch.cat(padded).to(device).split([len(values) for values in padded])
-        for (name, values), part in zip(state.items(), parts, strict=True):
-            state[name] = part[: values.numel()].view(values.shape)
-        copied.load_state_dict(state, assign=True)
-        return copied
 
     def forward(self, descriptors: Descriptors) -> Residuals:
         """Predict the residuals of some cells.

@@ -50,6 +50,8 @@ def prepare_scene(source: Source, config: TrainConfig, folder: Path) -> Training
     simplify = SimplifyConfig.from_preset(config.preset)
     ratios = config.data.validation_ratios if source.is_validation else config.data.ratios
     sizes = (config.views.validation_size,) if source.is_validation else config.views.sizes
+    if config.kind == "published" and not source.is_validation:
+        sizes = ()  # it learns from images of single cells
     count = config.views.validation_count if source.is_validation else config.views.count
     scene = cache(source.make)
     views = _cached(

@@ -15,7 +15,14 @@ from cvtgs.counts import target_count
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.filters import filter_rows
 from cvtgs.grouping import group_rows
-from cvtgs.mergenet import Residuals, compose
+from cvtgs.mergenet import (
+    MergeNet,
+    PublishedMergeNet,
+    Residuals,
+    compose,
+    compose_published,
+    describe_published,
+)
 from cvtgs.pipeline import merge_cells
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
@@ -105,10 +112,21 @@ class Case:
             residuals=residuals,
         )
 
+    def correct_by(self, net: MergeNet | PublishedMergeNet) -> GaussianScene:
+        """Return the whole small scene with its cells corrected by a network."""
+        if isinstance(net, MergeNet):
+            return self.correct_scene(net(self.descriptors))
+        scene, merged, _, _, _ = self.reference
+        descriptors = describe_published(scene, merged, self.part, cells=self.cells)
+        changed = compose_published(merged, cells=self.cells, residuals=net(descriptors))
+        return self._with_cells(changed)
+
     def correct_scene(self, residuals: Residuals) -> GaussianScene:
         """Return the whole small scene with its cells corrected, differentiably."""
+        return self._with_cells(self.correct_cells(residuals))
+
+    def _with_cells(self, changed: dict[str, Tensor]) -> GaussianScene:
         merged = self.reference.merged
-        changed = self.correct_cells(residuals)
         return merged.with_tensors(
             {
                 name: values.index_copy(0, self.cells, changed[name])

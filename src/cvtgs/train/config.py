@@ -89,20 +89,24 @@ class TrainConfig(Section):
     """The settings of a training; frozen, unknown keys are errors.
 
     Attributes:
-        kind: ``scene``: whole simplified scenes are rendered; ``local``: single cells.
+        kind: ``scene``: whole simplified scenes are rendered; ``local``: single cells;
+            ``published``: the network and the training of CVT-GS on crops of single cells.
         preset: The preset whose merged Gaussians the network learns to correct.
         start: Checkpoint to start from; its widths and largest growth must be the same.
         seed: Seed of all random numbers.
         steps: Training steps.
         learning_rate: Largest learning rate of AdamW; it falls to zero along a cosine.
         width: Units of the layers for members and neighbours.
-        cell_width: Units of the layers for cells.
+        cell_width: Units of the layers for cells; ``largest_growth`` does not concern the
+            published network.
         largest_growth: Largest change of a log scale.
         validate_every: Steps between validations.
         patience: Validations without a new best before training stops.
         averaged_steps: The network that is kept is a running mean of the weights over about this
             many steps, and over a ninth of all steps before it at most.
-        cells: Cells in one step of a ``local`` training.
+        cells: Cells in one step of a ``local`` or ``published`` training.
+        members: Members of all cells in one step of a ``published`` training.
+        tile: Side of the crop that shows a cell in a ``published`` training, pixels.
         note: Sentence about the training data, for the checkpoint.
         data: Scenes.
         views: Images.
@@ -113,7 +117,7 @@ class TrainConfig(Section):
         0.15
     """
 
-    kind: Literal["scene", "local"] = "scene"
+    kind: Literal["scene", "local", "published"] = "scene"
     preset: Literal["standard", "paper"] = "standard"
     start: Path | None = None
     seed: int = pydantic.Field(default=0, ge=0, lt=1 << 63)
@@ -126,6 +130,8 @@ class TrainConfig(Section):
     patience: Count = 1000
     averaged_steps: Count = 500
     cells: Count = 49
+    members: Count = 4096
+    tile: int = pydantic.Field(default=24, ge=11, le=256)
     note: str = ""
     data: DataConfig = DataConfig()
     views: ViewsConfig = ViewsConfig()

@@ -17,6 +17,9 @@ from cvtgs.mergenet import (
     Architecture,
     CheckpointInfo,
     MergeNet,
+    PublishedArchitecture,
+    PublishedMergeNet,
+    build_network,
     load_checkpoint,
     save_checkpoint,
     summarize,
@@ -25,7 +28,7 @@ from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.train.cache import TrainingScene, prepare_scene
 from cvtgs.train.cases import Case, TargetViews
 from cvtgs.train.config import TrainConfig
-from cvtgs.train.losses import local_loss, scene_loss, validation_psnr
+from cvtgs.train.losses import local_loss, published_loss, scene_loss, validation_psnr
 from cvtgs.train.sources import Source, find_sources
 from cvtgs.train.state import Gain, History, TrainState, Validation
 
@@ -136,7 +139,8 @@ def train(
         state.load(files.state, config)
     _make_folder(files.cache)
     cases, validation_scenes = _prepare_scenes(sources, config, files.cache, listener)
-    state.learn_range(summarize(case.descriptors) for case, _ in cases)
+    if config.kind != "published":
+        state.learn_range(summarize(case.descriptors) for case, _ in cases)
     if not state.history.validations:
         _validate(state, validation_scenes, math.nan, config, files, device)
         on_validation(state.history)
@@ -152,23 +156,29 @@ def train(
     return state.history
 
 
-def _first_net(config: TrainConfig) -> MergeNet:
-    shape = Architecture(
-        width=config.width, cell_width=config.cell_width, largest_growth=config.largest_growth
-    )
+def _first_net(config: TrainConfig) -> MergeNet | PublishedMergeNet:
+    shape = _shape(config)
     if config.start is not None:
         net = copy.deepcopy(load_checkpoint(config.start).net).requires_grad_(True).train()
         if net.architecture != shape:
-            names = ("width", "cell_width", "largest_growth")
+            names = ("kind", "width", "cell_width", "largest_growth")
             theirs, ours = (
-                ", ".join(f"{name} {getattr(one, name):g}" for name in names)
+                ", ".join(f"{name} {getattr(one, name)}" for name in names if hasattr(one, name))
                 for one in (net.architecture, shape)
             )
             raise ConfigError(f"start: {config.start} has {theirs}; the configuration has {ours}.")
         return net
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        return MergeNet(shape)
+        return build_network(shape)
+
+
+def _shape(config: TrainConfig) -> Architecture | PublishedArchitecture:
+    if config.kind == "published":
+        return PublishedArchitecture(width=config.width, cell_width=config.cell_width)
+    return Architecture(
+        width=config.width, cell_width=config.cell_width, largest_growth=config.largest_growth
+    )
 
 
 def _make_folder(path: Path) -> None:
@@ -210,10 +220,10 @@ def _step(
 ) -> float:
     rng = random.Random(f"{config.seed}/{state.step}")
     case, views = rng.choice(cases)
-    some_views = rng.choice(views)
+    some_views = rng.choice(views) if views else None
     for group in state.optimizer.param_groups:
         group["lr"] = _learning_rate(config, state.step)
-    loss = _loss(state.net, case.to(device), some_views.to(device), config, rng)
+    loss = _loss(state.net, case.to(device), some_views, config, rng)
     state.optimizer.zero_grad()
     loss.backward()
     length = torch.nn.utils.clip_grad_norm_(state.net.parameters(), LARGEST_GRADIENT)
@@ -231,10 +241,18 @@ def _step(
 
 
 def _loss(
-    net: MergeNet, case: Case, views: TargetViews, config: TrainConfig, rng: random.Random
+    net: MergeNet | PublishedMergeNet,
+    case: Case,
+    views: TargetViews | None,
+    config: TrainConfig,
+    rng: random.Random,
 ) -> Tensor:
+    if isinstance(net, PublishedMergeNet) or views is None:
+        assert isinstance(net, PublishedMergeNet)
+        return published_loss(net, case, config=config, rng=rng)
     if config.kind == "local":
         return local_loss(net, case, config=config, rng=rng)
+    views = views.to(case.cells.device)
     return scene_loss(net, case, views, config=config, rng=rng)
 
 

@@ -1,22 +1,30 @@
-"""Losses of a training step: images of whole scenes, or of single cells in a grid."""
+"""Losses of a training step: images of whole scenes, of single cells in a grid, or in crops."""
 
 import math
 import random
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
+from cvtgs.cells import Partition
 from cvtgs.evaluation import psnr
-from cvtgs.losses import relative_loss
-from cvtgs.math import parameters
+from cvtgs.losses import image_loss, relative_loss
+from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.math.segments import segment_ids
-from cvtgs.mergenet import MergeNet, Residuals
+from cvtgs.mergenet import (
+    MergeNet,
+    PublishedMergeNet,
+    Residuals,
+    compose_published,
+    describe_published,
+)
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
-from cvtgs.train.cases import Case, TargetViews
+from cvtgs.train.cases import Case, MergedScene, TargetViews
 from cvtgs.train.config import LossConfig, TrainConfig
 
 TILE = 32
@@ -60,12 +68,56 @@ def local_loss(
     rows = torch.tensor(sorted(rng.sample(range(len(case.cells)), number)))
     chosen = case.select(rows)
     residuals: Residuals = net(chosen.descriptors)
-    grid = lay_out_cells(chosen, chosen.correct_cells(residuals), rng=rng)
+    corrected = chosen.correct_cells(residuals)
+    grid = lay_out_cells(chosen.reference, chosen.cells, chosen.part, corrected, rng=rng)
     background = _random_color(rng, case)
     with torch.no_grad():
         target = render(grid.members, grid.camera, background=background).rgb
     image = render(grid.corrected, grid.camera, background=background).rgb
     return view_loss(image, target, config.loss) + _residual_penalty(residuals, config.loss)
+
+
+def published_loss(
+    net: PublishedMergeNet, case: Case, *, config: TrainConfig, rng: random.Random
+) -> Float[Tensor, ""]:
+    """Compare crops of single cells, members against the corrected Gaussian, as CVT-GS does.
+
+    ``0.8 L1 + 0.2 (1 - SSIM) + 0.2 gradient`` of each crop by itself, with all SH bands. Each
+    cell is seen from a random direction, larger or smaller at random, over a random background.
+    """
+    scene, merged, _, _, _ = case.reference
+    rows = _draw_cells(case.part.counts, config, rng)
+    cells, part = case.cells[rows], case.part.select(rows)
+    descriptors = describe_published(scene, merged, part, cells=cells)
+    corrected = compose_published(merged, cells=cells, residuals=net(descriptors))
+    background = _random_color(rng, case)
+    grid = lay_out_cells(
+        case.reference, cells, part, corrected, rng=rng, tile=config.tile, apart=2, all_bands=True
+    )
+    with torch.no_grad():
+        target = render(grid.members, grid.camera, background=background).rgb
+    image = render(grid.corrected, grid.camera, background=background).rgb
+    return image_loss(*(cut_crops(one, len(rows), config.tile, 2) for one in (image, target)))
+
+
+def _draw_cells(counts: Int[Tensor, "r"], config: TrainConfig, rng: random.Random) -> Tensor:
+    """Draw cells until they are enough, or have enough members; ascending."""
+    rows = rng.sample(range(len(counts)), min(config.cells, len(counts)))
+    drawn = torch.tensor(rows, device=counts.device)
+    fitting = counts[drawn].cumsum(0) <= config.members
+    if not bool(fitting.any()):  # the first is larger than a step
+        return drawn[:1]
+    return drawn[fitting].sort().values
+
+
+def cut_crops(
+    image: Float[Tensor, "1 h w 3"], count: int, tile: int, apart: int
+) -> Float[Tensor, "m t t 3"]:
+    """Cut the tiles of the first cells out of the image of a grid, one image each."""
+    side, step = image.shape[1] // (tile * apart), tile * apart
+    grid = image[0].reshape(side, step, side, step, 3).permute(0, 2, 1, 3, 4).flatten(0, 1)
+    margin = (step - tile) // 2
+    return grid[:count, margin : margin + tile, margin : margin + tile]
 
 
 def view_loss(
@@ -82,14 +134,16 @@ def view_loss(
 
 
 @torch.no_grad()
-def validation_psnr(net: MergeNet, case: Case, views: TargetViews) -> tuple[float, float]:
+def validation_psnr(
+    net: MergeNet | PublishedMergeNet, case: Case, views: TargetViews
+) -> tuple[float, float]:
     """Return the mean PSNR over grey without and with the network, in decibels."""
     merged = case.reference.merged
     grey = merged.means.new_full((3,), 0.5)
     target = views.over(grey)
     before, after = (
         float(psnr(render(scene, views.cameras, background=grey).rgb, target).mean())
-        for scene in (merged, case.correct_scene(net(case.descriptors)))
+        for scene in (merged, case.correct_by(net))
     )
     return before, after
 
@@ -121,23 +175,35 @@ class CellGrid:
     camera: Cameras
 
 
-def lay_out_cells(case: Case, corrected: dict[str, Tensor], *, rng: random.Random) -> CellGrid:
+def lay_out_cells(
+    reference: MergedScene,
+    cells: Int[Tensor, "m"],
+    part: Partition,
+    corrected: dict[str, Tensor],
+    *,
+    rng: random.Random,
+    tile: int = TILE,
+    apart: int = 1,
+    all_bands: bool = False,
+) -> CellGrid:
     """Put cells in the tiles of a grid, each rotated, zoomed and shifted at random.
 
-    Colours are those of the constant band: the network mixes all bands alike.
+    Tiles are ``tile`` pixels wide and ``apart`` widths from one another. Colours are those of
+    the constant band, or those of all bands as seen by the camera.
     """
-    reference, count = case.reference, len(case.cells)
+    count = len(cells)
     side = math.ceil(math.sqrt(count))
-    merged = reference.merged.select(case.cells)
-    placement = _Placement.draw(merged, side, rng)
-    ids = segment_ids(case.part.offsets, len(case.part.order))
-    members = reference.scene.select(case.part.order)
+    merged = reference.merged.select(cells)
+    placement = _Placement.draw(merged, side, rng, apart)
+    ids = segment_ids(part.offsets, len(part.order))
+    members = reference.scene.select(part.order)
     own = torch.arange(count, device=ids.device)
+    place = partial(placement.apply, all_bands=all_bands)
     return CellGrid(
-        members=placement.apply(members.tensors(), ids),
-        merged=placement.apply(merged.tensors(), own),
-        corrected=placement.apply(corrected, own),
-        camera=_grid_camera(side, merged.means),
+        members=place(members.tensors(), ids),
+        merged=place(merged.tensors(), own),
+        corrected=place(corrected, own),
+        camera=_grid_camera(side * apart, merged.means, tile),
     )
 
 
@@ -151,7 +217,9 @@ class _Placement:
     positions: Float[Tensor, "m 3"]
 
     @classmethod
-    def draw(cls, merged: GaussianScene, side: int, rng: random.Random) -> "_Placement":
+    def draw(
+        cls, merged: GaussianScene, side: int, rng: random.Random, apart: int = 1
+    ) -> "_Placement":
         count = len(merged)
         generator = torch.Generator().manual_seed(rng.getrandbits(62))
         quats = torch.randn(count, 4, generator=generator)
@@ -159,8 +227,8 @@ class _Placement:
         tiles = torch.arange(count)
         positions = torch.stack(
             [
-                tiles % side + 0.5 - side / 2 + 0.3 * (draws[:, 0] - 0.5),
-                tiles // side + 0.5 - side / 2 + 0.3 * (draws[:, 1] - 0.5),
+                apart * (tiles % side + 0.5 - side / 2) + 0.3 * (draws[:, 0] - 0.5),
+                apart * (tiles // side + 0.5 - side / 2) + 0.3 * (draws[:, 1] - 0.5),
                 torch.zeros(count),
             ],
             dim=1,
@@ -174,24 +242,32 @@ class _Placement:
             positions=positions.to(like),
         )
 
-    def apply(self, tensors: dict[str, Tensor], ids: Int[Tensor, "n"]) -> GaussianScene:
+    def apply(
+        self, tensors: dict[str, Tensor], ids: Int[Tensor, "n"], *, all_bands: bool = False
+    ) -> GaussianScene:
         quats, zooms = self.quats[ids], self.zooms[ids]
         local = (tensors["means"] - self.centers[ids]) * zooms[:, None]
-        rotated = torch.einsum("nij,nj->ni", parameters.quats_to_matrices(quats), local)
+        rotations = parameters.quats_to_matrices(quats)
+        rotated = torch.einsum("nij,nj->ni", rotations, local)
+        sh0 = tensors["sh0"]
+        if all_bands and tensors["shN"].shape[1]:
+            # The camera looks along z, which is the last row in the frame of the scene.
+            colors = spherical_harmonics.evaluate(sh0, tensors["shN"], rotations[:, 2])
+            sh0 = ((colors - 0.5) / spherical_harmonics.SH_C0)[:, None]
         return GaussianScene(
             means=rotated + self.positions[ids],
             quats=parameters.multiply_quats(quats, parameters.normalize_quats(tensors["quats"])),
             log_scales=tensors["log_scales"] + torch.log(zooms)[:, None],
             logit_opacities=tensors["logit_opacities"],
-            sh0=tensors["sh0"],
-            shN=tensors["sh0"][:, :0],
+            sh0=sh0,
+            shN=sh0[:, :0],
         )
 
 
-def _grid_camera(side: int, like: Tensor) -> Cameras:
-    distance, pixels = DISTANCE * side, TILE * side
+def _grid_camera(side: int, like: Tensor, tile: int) -> Cameras:
+    distance, pixels = DISTANCE * side, tile * side
     viewmats = torch.eye(4)[None]
     viewmats[:, 2, 3] = distance
-    focal, middle = TILE * distance, pixels / 2
+    focal, middle = tile * distance, pixels / 2
     intrinsics = torch.tensor([[[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]]])
     return Cameras(viewmats=viewmats.to(like), Ks=intrinsics.to(like), width=pixels, height=pixels)

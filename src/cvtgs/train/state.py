@@ -14,7 +14,7 @@ from torch import Tensor
 import cvtgs
 from cvtgs.errors import CheckpointError
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
-from cvtgs.mergenet import LearnedScene, MergeNet
+from cvtgs.mergenet import LearnedScene, MergeNet, PublishedMergeNet
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.train.config import TrainConfig
 
@@ -169,7 +169,10 @@ class TrainState:
     """A network in training: its weights, their running mean, the optimiser, the history."""
 
     def __init__(
-        self, net: MergeNet, config: TrainConfig, scenes: Iterable[LearnedScene] = ()
+        self,
+        net: MergeNet | PublishedMergeNet,
+        config: TrainConfig,
+        scenes: Iterable[LearnedScene] = (),
     ) -> None:
         self.net = net
         self.mean_net = copy.deepcopy(net).eval().requires_grad_(False)
@@ -183,8 +186,9 @@ class TrainState:
 
     def learn_range(self, cases: Iterable[Tensor]) -> None:
         """Tell both networks the range of the summaries of all cases."""
-        self.net.known.fit(cases)
-        self.mean_net.known.load_state_dict(self.net.known.state_dict())
+        if isinstance(self.net, MergeNet) and isinstance(self.mean_net, MergeNet):
+            self.net.known.fit(cases)
+            self.mean_net.known.load_state_dict(self.net.known.state_dict())
 
     def average(self) -> None:
         """Update the running mean of the weights."""

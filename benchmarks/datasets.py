@@ -1,0 +1,293 @@
+"""Datasets of posed photographs, and the models that were trained on them, found below a folder.
+
+A scene is a folder of its published name (``garden``) with cameras: ``sparse/0`` of COLMAP,
+``transforms_test.json``, or ``transforms.json``. Its model is any other folder of that name, or one
+within the scene's, with the files of a training code:
+
+- INRIA: ``point_cloud/iteration_*/point_cloud.ply``
+- nerfstudio: ``splat.ply`` or ``step-*.ckpt``, with ``dataparser_transforms.json`` beside or above
+- gsplat: ``ply/point_cloud_*.ply`` or ``ckpts/ckpt_*_rank0.pt``, trained without
+  ``--normalize-world-space``
+"""
+
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+import cvtgs
+from cvtgs.cameras import Cameras
+from cvtgs.errors import CvtgsError
+from cvtgs.evaluation import fit_cameras, load_photographs
+from cvtgs.evaluation.scorer import Color
+
+WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+DEEPEST = 5
+"""Folders are searched to this depth below the one that is given."""
+
+DOWNSCALED = ("images_2", "images_4", "images_8", "images")
+"""Folders of photographs, in the order in which one is taken where the published one is missing."""
+
+TRANSFORM = "dataparser_transforms.json"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dataset:
+    """A published set of scenes.
+
+    Attributes:
+        name: Its name.
+        scenes: The folder of the photographs of each scene, by the scene's name.
+        background: Colour behind transparent pixels and scenes.
+        source: Where it is to be had.
+    """
+
+    name: str
+    scenes: Mapping[str, str]
+    background: Color = BLACK
+    source: str
+
+
+INRIA_DATA = "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting (tandt_db.zip)"
+DATASETS = (
+    Dataset(
+        name="NeRF-Synthetic",
+        scenes=dict.fromkeys(
+            ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship"), "."
+        ),
+        background=WHITE,
+        source="https://www.matthewtancik.com/nerf (nerf_synthetic.zip)",
+    ),
+    Dataset(
+        name="Mip-NeRF 360",
+        scenes=dict.fromkeys(("bicycle", "flowers", "garden", "stump", "treehill"), "images_4")
+        | dict.fromkeys(("bonsai", "counter", "kitchen", "room"), "images_2"),
+        source="https://jonbarron.info/mipnerf360",
+    ),
+    Dataset(
+        name="Tanks and Temples",
+        scenes=dict.fromkeys(("train", "truck"), "images"),
+        source=INRIA_DATA,
+    ),
+    Dataset(
+        name="Deep Blending",
+        scenes=dict.fromkeys(("drjohnson", "playroom"), "images"),
+        source=INRIA_DATA,
+    ),
+)
+"""The sets of the evaluation of CVT-GS, with the scenes and image sizes of that of 3DGS."""
+
+LAYOUTS: Mapping[str, Sequence[re.Pattern[str]]] = {
+    "INRIA": (re.compile(r"point_cloud/iteration_(\d+)/point_cloud\.ply"),),
+    "gsplat": (
+        re.compile(r"ply/point_cloud_(\d+)\.ply"),
+        re.compile(r"ckpts/ckpt_(\d+)_rank0\.pt"),
+    ),
+    "nerfstudio": (re.compile(r"splat\.ply"), re.compile(r"(?:\w+/)?step-(\d+)\.ckpt")),
+}
+"""How each training code names its models; the number is that of the step."""
+
+
+class Model(NamedTuple):
+    """A trained model: its file, and the code that wrote it."""
+
+    path: Path
+    layout: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Capture:
+    """A scene of a dataset with its model.
+
+    Attributes:
+        dataset: The dataset.
+        name: Name of the scene.
+        folder: Folder of its cameras.
+        model: Its trained model.
+    """
+
+    dataset: Dataset
+    name: str
+    folder: Path
+    model: Model
+
+
+class Found(NamedTuple):
+    """The scenes below a folder, and a sentence about each that is missing or incomplete."""
+
+    captures: tuple[Capture, ...]
+    notes: tuple[str, ...]
+
+
+class TestViews(NamedTuple):
+    """The cameras that were held out, their photographs, and the folder of these."""
+
+    cameras: Cameras
+    photographs: Float[Tensor, "c h w 3"]
+    folder: Path
+
+
+def find_captures(root: Path, datasets: Sequence[Dataset] = DATASETS) -> Found:
+    """Find the scenes of the datasets below a folder, and the model of each."""
+    if not root.is_dir():
+        raise SystemExit(f"{root}: must be a folder of datasets, found none.")
+    known = {name for dataset in datasets for name in dataset.scenes}
+    folders: dict[str, list[Path]] = {name: [] for name in known}
+    for folder in _folders(root):
+        if folder.name.lower() in known:
+            folders[folder.name.lower()].append(folder)
+    captures, notes = [], []
+    for dataset in datasets:
+        there = {
+            name: [path for path in folders[name] if _has_cameras(path)] for name in dataset.scenes
+        }
+        if not any(there.values()):
+            notes.append(
+                f"{dataset.name}: no scene of it was found in {root}; it is to be had from "
+                f"{dataset.source}."
+            )
+            continue
+        for name, places in there.items():
+            model = _find_model([*places, *folders[name]]) if places else None
+            if model is not None:
+                captures.append(Capture(dataset=dataset, name=name, folder=places[0], model=model))
+            elif places:
+                notes.append(
+                    f"{name}: {places[0]} has cameras, but no trained model of INRIA's code, "
+                    f"nerfstudio or gsplat is in it or in another folder named {name}."
+                )
+            else:
+                notes.append(f"{name}: of {dataset.name}, was not found in {root}.")
+    return Found(tuple(captures), tuple(notes))
+
+
+def read_test_views(capture: Capture) -> TestViews:
+    """Read the held-out cameras of a scene, in the world of its model, and their photographs."""
+    folder, dataset = capture.folder, capture.dataset
+    if (folder / "transforms_train.json").is_file() and not (
+        folder / "transforms_test.json"
+    ).is_file():
+        raise SystemExit(
+            f"{folder}: must hold the test split, transforms_test.json; "
+            f"found that of training only."
+        )
+    images = _photograph_folder(folder, dataset.scenes[capture.name])
+    try:
+        cameras = cvtgs.load_cameras(folder, split="test")
+        cameras = fit_cameras(cameras, images)
+        photographs = load_photographs(images, cameras, background=dataset.background)
+    except CvtgsError as error:
+        raise SystemExit(f"{capture.name}: {error}") from None
+    return TestViews(_in_world_of(capture.model, cameras), photographs, images)
+
+
+def check_model(capture: Capture, scene: cvtgs.GaussianScene, cameras: Cameras) -> None:
+    """Refuse a model that is not where its cameras look.
+
+    The boxes of the cameras and of the Gaussians between the 2 % and 98 % quantiles, each half as
+    large again, must meet, and half of the cameras must have some of these Gaussians before them.
+    """
+    means = scene.means[scene.opacities > 0.1].double()
+    means = means[torch.isfinite(means).all(dim=1)]
+    means = means[:: max(1, len(means) // 4096)]
+    if not len(means):
+        raise SystemExit(f"{capture.model.path}: must hold Gaussians that show, found none.")
+    low, high = means.quantile(torch.tensor([0.02, 0.98], dtype=means.dtype), dim=0)
+    centers = cameras.centers.double()
+    near, far = centers.amin(dim=0), centers.amax(dim=0)
+    apart = (low + high - near - far).abs() / 2 > 0.75 * ((high - low) + (far - near))
+    local = means @ cameras.viewmats[:, :3, :3].double().mT + cameras.viewmats[:, None, :3, 3]
+    x, y, z = (local @ cameras.Ks.double().mT).unbind(2)
+    inside = (z > 0) & (x > 0) & (x < cameras.width * z) & (y > 0) & (y < cameras.height * z)
+    looking = float((inside.double().mean(dim=1) > 0.01).double().mean())
+    if bool(apart.any()) or looking < 0.5:
+        raise SystemExit(
+            f"{capture.model.path}: must be a model of {capture.folder}, but its Gaussians are not "
+            f"where the cameras look; the model of another scene, or of a world that the training "
+            f"normalized."
+        )
+
+
+def _folders(root: Path) -> Iterator[Path]:
+    depth = len(root.parts)
+    for name, inner, _ in os.walk(root, followlinks=True):
+        folder = Path(name)
+        yield folder
+        if len(folder.parts) - depth >= DEEPEST:
+            inner.clear()
+        inner.sort()
+
+
+def _has_cameras(folder: Path) -> bool:
+    names = ("transforms_test.json", "transforms_train.json", "transforms.json", "sparse")
+    return any((folder / name).exists() for name in names)
+
+
+def _find_model(folders: Sequence[Path]) -> Model | None:
+    """Return the model of most steps: of the folders in order, INRIA's first."""
+    for folder in dict.fromkeys(folders):
+        files = sorted(
+            path
+            for part in _folders(folder)
+            for path in part.iterdir()
+            if path.suffix in (".ply", ".ckpt", ".pt") and path.is_file()
+        )
+        for layout, patterns in LAYOUTS.items():
+            for pattern in patterns:
+                matches = [(path, _match(pattern, path)) for path in files]
+                steps = [
+                    (int(match[1]) if match.re.groups else 0, path)
+                    for path, match in matches
+                    if match
+                ]
+                if steps:
+                    return Model(max(steps)[1], layout)
+    return None
+
+
+def _match(pattern: re.Pattern[str], path: Path) -> re.Match[str] | None:
+    """Match the end of a path, whole parts of it."""
+    parts = pattern.pattern.count("/") + 1
+    for count in (parts, parts - 1):
+        found = pattern.fullmatch("/".join(path.parts[-count:])) if count else None
+        if found:
+            return found
+    return None
+
+
+def _photograph_folder(folder: Path, published: str) -> Path:
+    for name in (published, *DOWNSCALED):
+        if (folder / name).is_dir():
+            return folder / name
+    return folder
+
+
+def _in_world_of(model: Model, cameras: Cameras) -> Cameras:
+    """Move and scale cameras as nerfstudio did before it trained."""
+    if model.layout != "nerfstudio":
+        return cameras
+    places = [parent / TRANSFORM for parent in model.path.parents[:3]]
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
+        return cameras
+    told = json.loads(path.read_text(encoding="utf-8"))
+    transform = torch.tensor(told["transform"], dtype=torch.float64)
+    return moved_cameras(cameras, transform, float(told["scale"]))
+
+
+def moved_cameras(cameras: Cameras, transform: Float[Tensor, "3 4"], scale: float) -> Cameras:
+    """Return cameras of a world whose points ``x`` became ``scale (A x + b)``."""
+    turn, shift = transform[:, :3], transform[:, 3]
+    viewmats = cameras.viewmats.double().clone()
+    centers = (cameras.centers.double() @ turn.T + shift) * scale
+    rotations = viewmats[:, :3, :3] @ turn.T
+    viewmats[:, :3, :3] = rotations
+    viewmats[:, :3, 3] = -(rotations @ centers[:, :, None])[:, :, 0]
+    return replace(cameras, viewmats=viewmats.to(cameras.viewmats.dtype))

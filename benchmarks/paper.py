@@ -1,0 +1,261 @@
+"""The evaluation of CVT-GS against photographs: ``python -m benchmarks.paper DATASETS -o DIR``.
+
+DATASETS is a folder with NeRF-Synthetic, Mip-NeRF 360, Tanks and Temples and Deep Blending, or some
+of their scenes, and with models that were trained on them by INRIA's code, nerfstudio or gsplat
+(``benchmarks.datasets`` says how they are found). Every method gets each model and writes 10 %,
+1 % and 0.1 % of its Gaussians, in a process of its own, without fine-tuning. Images from the
+cameras that were held out (every eighth, or ``transforms_test.json``) are compared with their
+photographs at the published size: PSNR, SSIM, LPIPS. Seconds are those of the process, from start
+to end.
+
+DIR gets ``paper.md``, the tables with the published figures beside them (``published.json``),
+``results.json``, and the small scenes in ``scenes``. A run that was interrupted goes on where it
+stopped: start it again. Scenes that are missing or cannot be used are named and left out.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import mean
+from typing import NamedTuple
+
+import pydantic
+
+import cvtgs
+from benchmarks.baselines import BASELINES
+from benchmarks.compare import Task, attempt, own_methods
+from benchmarks.compare_tables import Result, Table, joined, markdown, read_results, results_json
+from benchmarks.datasets import (
+    DATASETS,
+    Capture,
+    TestViews,
+    check_model,
+    find_captures,
+    read_test_views,
+)
+from benchmarks.measuring import Cost, machine, write_file
+from benchmarks.quality import RATIOS, Quality, markdown_rows
+from cvtgs.errors import CvtgsError
+from cvtgs.evaluation.scorer import Metrics, chosen_metrics, render_view, scene_scores
+
+FULL = "full scene"
+MERGED = "paper, no network"
+OURS = ("paper", MERGED, "standard")
+PUBLISHED = Path(__file__).with_name("published.json")
+
+
+class Gain(pydantic.BaseModel):
+    """A published difference of PSNR, by ratio."""
+
+    name: str
+    of: str
+    over: str
+    psnr: Mapping[str, float]
+
+
+class Published(pydantic.BaseModel):
+    """Published figures, and where they are from."""
+
+    source: str
+    gains: tuple[Gain, ...]
+
+
+class Judge(NamedTuple):
+    """What images are compared with, and how."""
+
+    views: TestViews
+    background: tuple[float, float, float]
+    metrics: Metrics
+
+    def score(self, scene: cvtgs.GaussianScene) -> Quality:
+        """Return the means over the photographs."""
+        color = scene.means.new_tensor(self.background)
+        rows = [
+            self.metrics.compare(
+                render_view(scene, camera).over(color).clamp(0, 1),
+                self.views.photographs[number : number + 1],
+            )
+            for number, camera in enumerate(self.views.cameras.singles())
+        ]
+        return Quality.of(scene_scores("", len(scene), rows))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    options = parser().parse_args(arguments)
+    found = find_captures(options.datasets)
+    notes = list(found.notes)
+    for note in notes:
+        print(note, file=sys.stderr)
+    if not found.captures:
+        raise SystemExit(f"{options.datasets}: no scene with a trained model was found in it.")
+    results = options.output / "results.json"
+    table = read_results(results)
+    network = ""
+    for capture in found.captures:
+        try:
+            for part, name in measure(capture, table, options):
+                table, network = joined(table, part), name
+                write_file(results, results_json(table).encode())
+        except (SystemExit, CvtgsError) as error:
+            notes.append(f"{capture.name}: left out. {error}")
+            print(notes[-1], file=sys.stderr)
+        write_file(
+            options.output / "paper.md",
+            report(table, found.captures, notes, options, network).encode(),
+        )
+    print((options.output / "paper.md").read_text(encoding="utf-8"))
+
+
+def parser() -> argparse.ArgumentParser:
+    found = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    found.add_argument("datasets", type=Path, metavar="DATASETS", help="folder to search")
+    found.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
+    found.add_argument("--rho", type=float, nargs="+", default=list(RATIOS))
+    found.add_argument(
+        "--methods", nargs="+", choices=[*OURS, *BASELINES], default=[*OURS, *BASELINES],
+        metavar="NAME", help=f"some of: {'; '.join([*OURS, *BASELINES])} (all of them)",
+    )  # fmt: skip
+    found.add_argument(
+        "--lpips", choices=("auto", "vgg", "alex", "off"), default="auto", help="network of LPIPS"
+    )
+    return found
+
+
+def commands(methods: Sequence[str]) -> dict[str, list[str]]:
+    """Return the command of every method, with places to fill in."""
+    own = own_methods([])
+    baseline = [sys.executable, "-m", "benchmarks.baselines"]
+    known = {
+        "paper": own["paper"],
+        MERGED: [*own["paper"], "--set", "merge.network=false"],
+        "standard": own["standard"],
+    } | {name: [*baseline, name, "{IN}", "{OUT}", "--count", "{COUNT}"] for name in BASELINES}
+    return {name: known[name] for name in methods}
+
+
+def measure(capture: Capture, table: Table, options: argparse.Namespace):
+    """Yield each new result of a scene as a table, and the network of LPIPS."""
+    known = table.get(key_of(capture), {})
+    todo = [
+        (method, rho)
+        for rho in options.rho
+        for method in commands(options.methods)
+        if known.get(method, {}).get(rho) is None
+    ]
+    has_full = known.get(FULL, {}).get(1.0) is not None
+    if has_full and not todo:
+        return
+    scene = cvtgs.load(capture.model.path)
+    views = read_test_views(capture)
+    check_model(capture, scene, views.cameras)
+    metrics = chosen_metrics(options.lpips, (views.cameras.width, views.cameras.height))
+    judge = Judge(views, capture.dataset.background, metrics)
+    network = metrics.lpips.network if metrics.lpips else f"none: {metrics.note}"
+    print(
+        f"{capture.name}: {len(scene):,} Gaussians of {capture.model.layout}'s layout, "
+        f"{len(views.cameras)} photographs of {views.cameras.width} x {views.cameras.height} in "
+        f"{views.folder}",
+        file=sys.stderr,
+    )
+    if not has_full:
+        nothing = Cost(user_seconds=0.0, wall_seconds=0.0, peak_bytes=0, output="")
+        yield one_row(capture, FULL, 1.0, result_of(judge, scene, nothing, len(scene))), network
+    for method, rho in todo:
+        count = cvtgs.target_count(len(scene), rho)
+        task = Task(
+            source=capture.model.path.resolve(),
+            rho=rho,
+            count=count,
+            output=(options.output / "scenes" / f"{capture.name} {rho:g} {method}.ply").resolve(),
+        )
+        made = attempt(commands([method])[method], task, keep=True)
+        found = made and result_of(judge, made[0], made[1], count)
+        yield one_row(capture, method, rho, found), network
+
+
+def result_of(judge: Judge, scene: cvtgs.GaussianScene, cost: Cost, wanted: int) -> Result:
+    return Result(
+        quality=judge.score(scene),
+        wall_seconds=cost.wall_seconds,
+        cpu_seconds=cost.user_seconds,
+        count=len(scene),
+        wanted=wanted,
+    )
+
+
+def one_row(capture: Capture, method: str, rho: float, result: Result | None) -> Table:
+    return {key_of(capture): {method: {rho: result}}}
+
+
+def key_of(capture: Capture) -> str:
+    return f"{capture.dataset.name}: {capture.name}"
+
+
+def report(
+    table: Table,
+    captures: Sequence[Capture],
+    notes: Sequence[str],
+    options: argparse.Namespace,
+    network: str,
+) -> str:
+    """Write the page: published gains first, then a part per dataset."""
+    layouts = ", ".join(sorted({capture.model.layout for capture in captures}))
+    parts = [
+        "# The evaluation of CVT-GS\n",
+        f"Against photographs that were held out; models of {layouts}; "
+        f"LPIPS: {network or 'as before'}. Seconds: wall clock, one process per run, reading and "
+        f"writing included; {machine()}. cvtgs {cvtgs.__version__}.\n",
+        gains_table(table, options.rho),
+    ]
+    for dataset in DATASETS:
+        names = [key_of(one) for one in captures if one.dataset == dataset]
+        rows = {name: spread_full(table[name], options.rho) for name in names if name in table}
+        if rows:
+            parts.append(f"## {dataset.name}: {len(rows)} of {len(dataset.scenes)} scenes\n")
+            parts.append(markdown(rows, options.rho))
+    if notes:
+        parts.append("## Left out\n")
+        parts.append("".join(f"- {note}\n" for note in notes))
+    return "\n".join(parts)
+
+
+def spread_full(
+    rows: Mapping[str, Mapping[float, Result | None]], ratios: Sequence[float]
+) -> dict[str, Mapping[float, Result | None]]:
+    """Show the full scene beside every ratio."""
+    full = rows.get(FULL, {}).get(1.0)
+    others = {name: row for name, row in rows.items() if name != FULL}
+    return {FULL: dict.fromkeys(ratios, full), **others}
+
+
+def gains_table(table: Table, ratios: Sequence[float]) -> str:
+    """Compare differences of PSNR with the published ones, means over the scenes that have both."""
+    published = Published.model_validate(json.loads(PUBLISHED.read_text(encoding="utf-8")))
+    lines = []
+    for gain in published.gains:
+        for rho in ratios:
+            pairs = [
+                (rows.get(gain.of, {}).get(rho), rows.get(gain.over, {}).get(rho))
+                for rows in table.values()
+            ]
+            found = [one.quality.psnr - two.quality.psnr for one, two in pairs if one and two]
+            told = gain.psnr.get(f"{rho:g}")
+            lines.append(
+                [
+                    gain.name,
+                    f"{rho:g}",
+                    f"{mean(found):+.2f}" if found else "-",
+                    str(len(found)),
+                    "-" if told is None else f"{told:+.2f}",
+                ]
+            )
+    heads = ["gain, dB", "ratio", "here", "scenes", "published"]
+    return f"{markdown_rows(heads, lines)}\nPublished: {published.source}.\n"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""The MergeNet of CVT-GS as published: its descriptor, its network, its residuals."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import pydantic
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from cvtgs.cells import Partition
+from cvtgs.math import parameters
+from cvtgs.math.segments import segment_ids, segment_max, segment_sum
+from cvtgs.mergenet.model import CellNetwork
+from cvtgs.scene import GaussianScene
+
+SH_COEFFICIENTS = 16
+"""Coefficients per colour channel of degree 3; scenes of a lower degree have zeros for the rest."""
+
+PUBLISHED_FEATURES = 3 + 3 + 4 + 1 + 1 + 3 * SH_COEFFICIENTS
+"""Numbers that describe a member: position, log scale, quaternion, opacity, share, SH."""
+
+PUBLISHED_RESIDUALS = 3 + 3 + 3 + 1 + 3 * SH_COEFFICIENTS
+"""Numbers that the decoder returns: position, log scale, rotation, opacity logit, SH."""
+
+LARGEST_FEATURE = 50.0
+"""Positions and differences of log scales are limited to this, so that all stays finite."""
+
+
+class PublishedArchitecture(pydantic.BaseModel):
+    """The shape of a MergeNet as published; the publication does not give its widths.
+
+    Attributes:
+        kind: Tells it from the shape of :class:`cvtgs.mergenet.MergeNet`.
+        member_features: Numbers that describe a member.
+        width: Units of the layers of members.
+        cell_width: Units of the layers of the decoder.
+    """
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["published"] = "published"
+    member_features: int = PUBLISHED_FEATURES
+    width: int = pydantic.Field(default=64, ge=1, le=1024)
+    cell_width: int = pydantic.Field(default=128, ge=1, le=4096)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PublishedDescriptors:
+    """Some cells as the published network sees them: their members, relative to the merged ones.
+
+    Attributes:
+        members: ``(n, 60)`` position in the frame and the standard deviations of the merged
+            Gaussian (3), log scales less those of the merged one (3), the relative quaternion of
+            positive real part (4), opacity (1), its share of the sum of the opacities of the cell
+            (1), and SH coefficients of all bands less those of the merged one (48).
+        shares: ``(n,)`` the same shares; those of one cell sum to 1.
+        offsets: ``(m + 1,)`` where each cell starts, and the end of the last one.
+    """
+
+    members: Float[Tensor, "n 60"]
+    shares: Float[Tensor, "n"]
+    offsets: Int[Tensor, "m_plus_1"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PublishedResiduals:
+    """Free changes of the merged Gaussians, without limits; zeros change nothing.
+
+    Attributes:
+        d_means: ``(m, 3)`` moves of the centres, in the frame and the standard deviations of each.
+        d_log_scales: ``(m, 3)`` added to the log scales.
+        d_rotvecs: ``(m, 3)`` rotation vectors in the frame of each, radians.
+        d_logit_opacities: ``(m,)`` added to the opacity logits.
+        d_sh: ``(m, 16, 3)`` added to the SH coefficients of all bands.
+    """
+
+    d_means: Float[Tensor, "m 3"]
+    d_log_scales: Float[Tensor, "m 3"]
+    d_rotvecs: Float[Tensor, "m 3"]
+    d_logit_opacities: Float[Tensor, "m"]
+    d_sh: Float[Tensor, "m 16 3"]
+
+
+def describe_published(
+    scene: GaussianScene, merged: GaussianScene, part: Partition, *, cells: Int[Tensor, "m"]
+) -> PublishedDescriptors:
+    """Describe some cells as CVT-GS does.
+
+    Memory: about ``1 kB`` per member.
+
+    Args:
+        scene: The Gaussians.
+        merged: One Gaussian per cell, of all cells.
+        part: Members of the cells to describe.
+        cells: Which cells those are.
+
+    Returns:
+        The descriptors, in the dtype of the scene.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 2, sh_degree=0, seed=0)
+        >>> part = Partition.from_labels(torch.tensor([0, 0]), 1)
+        >>> found = describe_published(
+        ...     scene, scene.select(torch.tensor([0])), part, cells=torch.tensor([0])
+        ... )
+        >>> tuple(found.members.shape), found.members[0, :10].tolist()
+        ((2, 60), [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    """
+    rows, ids = part.order, segment_ids(part.offsets, len(part.order))
+    own = cells.index_select(0, ids)
+    own_quats = parameters.normalize_quats(merged.quats).index_select(0, own)
+    axes = parameters.quats_to_matrices(own_quats)
+    shifts = scene.means.index_select(0, rows) - merged.means.index_select(0, own)
+    log_scales = merged.log_scales.index_select(0, own)
+    positions = torch.einsum("nji,nj->ni", axes, shifts) * torch.exp(-log_scales)
+    quats = parameters.normalize_quats(scene.quats.index_select(0, rows))
+    relative = parameters.multiply_quats(own_quats * own_quats.new_tensor([1, -1, -1, -1]), quats)
+    relative = torch.where(relative[:, :1] < 0, -relative, relative)
+    opacities = torch.sigmoid(parameters.clamp_logits(scene.logit_opacities.index_select(0, rows)))
+    totals = segment_sum(opacities.double(), part.offsets).to(opacities.dtype)
+    shares = opacities / totals.index_select(0, ids)
+    columns = [
+        positions.clamp(-LARGEST_FEATURE, LARGEST_FEATURE),
+        (scene.log_scales.index_select(0, rows) - log_scales).clamp(
+            -LARGEST_FEATURE, LARGEST_FEATURE
+        ),
+        relative,
+        opacities[:, None],
+        shares[:, None],
+        *(
+            (
+                getattr(scene, name).index_select(0, rows)
+                - getattr(merged, name).index_select(0, own)
+            ).flatten(1)
+            for name in ("sh0", "shN")
+        ),
+    ]
+    members = torch.cat(columns, dim=1)
+    missing = PUBLISHED_FEATURES - members.shape[1]
+    return PublishedDescriptors(
+        members=nn.functional.pad(members, (0, missing)), shares=shares, offsets=part.offsets
+    )
+
+
+class PublishedMergeNet(CellNetwork):
+    """MergeNet as CVT-GS (Li et al. 2026) describes it.
+
+    A pointwise network shared by all members, pooled by mean, maximum and opacity, and a decoder
+    of free residuals of position, log scale, rotation, opacity and all SH coefficients, whose last
+    layer starts at zero. It sees neither neighbours nor how large a cell is.
+    Widths and activations, which the publication leaves open, are ours.
+
+    Args:
+        architecture: Its shape.
+
+    Example:
+        >>> net = PublishedMergeNet(PublishedArchitecture())
+        >>> sum(parameter.numel() for parameter in net.parameters())
+        56762
+    """
+
+    sees_surroundings = False
+
+    def __init__(self, architecture: PublishedArchitecture) -> None:
+        super().__init__()
+        self.architecture = architecture
+        width, cell_width = architecture.width, architecture.cell_width
+        self.member_layers = nn.Sequential(
+            nn.Linear(architecture.member_features, width),
+            nn.SiLU(),
+            nn.Linear(width, width),
+            nn.SiLU(),
+        )
+        self.decoder = nn.Sequential(
+            nn.Linear(3 * width, cell_width),
+            nn.SiLU(),
+            nn.Linear(cell_width, cell_width),
+            nn.SiLU(),
+        )
+        self.residuals = nn.Linear(cell_width, PUBLISHED_RESIDUALS)
+        nn.init.zeros_(self.residuals.weight)
+        nn.init.zeros_(self.residuals.bias)
+
+    def forward(self, descriptors: PublishedDescriptors) -> PublishedResiduals:
+        """Predict the residuals of some cells.
+
+        Args:
+            descriptors: Any number of cells, each with at least one member.
+
+        Returns:
+            Residuals of each cell.
+        """
+        offsets = descriptors.offsets
+        members = self.member_layers(descriptors.members)
+        pooled = [
+            segment_sum(members, offsets) / offsets.diff()[:, None],
+            segment_max(members, offsets),
+            segment_sum(members, offsets, descriptors.shares),
+        ]
+        changes = self.residuals(self.decoder(torch.cat(pooled, dim=1)))
+        return PublishedResiduals(
+            d_means=changes[:, :3],
+            d_log_scales=changes[:, 3:6],
+            d_rotvecs=changes[:, 6:9],
+            d_logit_opacities=changes[:, 9],
+            d_sh=changes[:, 10:].unflatten(1, (SH_COEFFICIENTS, 3)),
+        )
