@@ -72,7 +72,12 @@ def test_a_partial_file_takes_the_rest_from_its_preset(tmp_path):
     path.write_text('preset = "paper"\n[merge]\ninflation = 0.5\n', encoding="utf-8")
     config = SimplifyConfig.from_toml(path)
     assert config.merge == MergeConfig(
-        area_power=0.0, opacity="union", representatives=False, inflation=0.5, covered_inflation=0.0
+        area_power=0.0,
+        opacity="union",
+        representatives=False,
+        align_axes=False,
+        inflation=0.5,
+        covered_inflation=0.0,
     )
     assert config.cvt == SimplifyConfig.from_preset("paper").cvt
 

@@ -161,6 +161,7 @@ STAGES = {
         "compare",
         "evaluate",
         "load_lpips",
+        "fit_cameras",
         "load_photographs",
         "lpips",
         "psnr",

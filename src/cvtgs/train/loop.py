@@ -220,10 +220,9 @@ def _step(
 ) -> float:
     rng = random.Random(f"{config.seed}/{state.step}")
     case, views = rng.choice(cases)
-    some_views = rng.choice(views) if views else None
     for group in state.optimizer.param_groups:
         group["lr"] = _learning_rate(config, state.step)
-    loss = _loss(state.net, case.to(device), some_views, config, rng)
+    loss = _loss(state.net, case.to(device), views, config, rng)
     state.optimizer.zero_grad()
     loss.backward()
     length = torch.nn.utils.clip_grad_norm_(state.net.parameters(), LARGEST_GRADIENT)
@@ -243,17 +242,16 @@ def _step(
 def _loss(
     net: MergeNet | PublishedMergeNet,
     case: Case,
-    views: TargetViews | None,
+    views: Sequence[TargetViews],
     config: TrainConfig,
     rng: random.Random,
 ) -> Tensor:
-    if isinstance(net, PublishedMergeNet) or views is None:
-        assert isinstance(net, PublishedMergeNet)
+    if isinstance(net, PublishedMergeNet):
         return published_loss(net, case, config=config, rng=rng)
+    some_views = rng.choice(views).to(case.cells.device)
     if config.kind == "local":
         return local_loss(net, case, config=config, rng=rng)
-    views = views.to(case.cells.device)
-    return scene_loss(net, case, views, config=config, rng=rng)
+    return scene_loss(net, case, some_views, config=config, rng=rng)
 
 
 def _learning_rate(config: TrainConfig, step: int) -> float:
