@@ -25,7 +25,7 @@ from cvtgs.io import atomic_output, change_axes
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
-from cvtgs.mergenet import MergeNet
+from cvtgs.mergenet import MergeNet, PublishedMergeNet
 from cvtgs.outofcore import Workers, available_memory, block_count, check_config
 from cvtgs.outofcore.job import Job, job_folder
 from cvtgs.outofcore.memory import memory_to_plan
@@ -310,7 +310,7 @@ def reduce_levels(
     targets: Sequence[int],
     config: SimplifyConfig,
     *,
-    net: MergeNet | None,
+    net: MergeNet | PublishedMergeNet | None,
 ) -> list[BlockLevel]:
     """Make a scene smaller to several sizes, the finest first; coarse ones of cells of the finest.
 
