@@ -50,3 +50,11 @@ def test_every_option_of_every_command_is_in_every_script(capsys):
                 for name in action.option_strings[-1:]:
                     assert (f"-l {name[2:]} " if shell == "fish" else name) in script
     assert "__fish_seen_subcommand_from simplify' -l preset -x -a 'draft fast" in script
+    assert "__fish_seen_subcommand_from completion' -x -a 'bash zsh fish'" in script
+
+
+def test_zsh_completes_also_where_compinit_was_not_called(capsys):
+    assert main(["completion", "zsh"]) == 0
+    first, second, *_ = capsys.readouterr().out.splitlines()
+    assert first == "(( $+functions[compdef] )) || { autoload -U compinit && compinit }"
+    assert "bashcompinit" in second  # which calls compdef

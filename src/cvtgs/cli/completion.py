@@ -9,6 +9,10 @@ from cvtgs.cli.options import AddParser
 
 SHELLS = ("bash", "zsh", "fish")
 
+_ZSH = """(( $+functions[compdef] )) || { autoload -U compinit && compinit }
+autoload -U +X bashcompinit && bashcompinit
+"""
+
 _BASH = """\
 _cvtgs() {{
     local current="${{COMP_WORDS[COMP_CWORD]}}" before="${{COMP_WORDS[COMP_CWORD-1]}}"
@@ -56,8 +60,7 @@ def completion(options: argparse.Namespace) -> None:
     if options.shell == "fish":
         say("\n".join(fish_lines(commands)))
     else:
-        start = "autoload -U +X bashcompinit && bashcompinit\n" if options.shell == "zsh" else ""
-        say(start + bash_script(commands), end="")
+        say((_ZSH if options.shell == "zsh" else "") + bash_script(commands), end="")
 
 
 def commands_of(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
@@ -102,9 +105,12 @@ def fish_lines(commands: Mapping[str, argparse.ArgumentParser]) -> Iterator[str]
         yield f"complete -c cvtgs -n __fish_use_subcommand -x -a {command} -d {_quoted(about)}"
         for action in parser._actions:
             names = [name for name in action.option_strings if name.startswith("--")]
-            if not names:
-                continue
             words = " ".join(values_of(action))
+            if not names:
+                if words:
+                    where = f"-n '__fish_seen_subcommand_from {command}'"
+                    yield f"complete -c cvtgs {where} -x -a {_quoted(words)}"
+                continue
             takes = f" -x -a {_quoted(words)}" if words else " -r" * (action.nargs != 0)
             about = (action.help or "").replace("%%", "%").split(";")[0]
             yield (
