@@ -15,7 +15,7 @@ import viser_stand_in
 from cvtgs import GaussianScene, Simplifier, load, save
 from cvtgs.cli.main import main
 from cvtgs.errors import InvalidArgumentError, MissingDependencyError
-from cvtgs.viewer import SceneViewer, ViewerServer, camera_of
+from cvtgs.viewer import SceneViewer, ViewerServer, camera_of, scene_page
 from scenes import random_scene, same_bits
 
 FACTS, NOTES = "markdown 0", "markdown 7"
@@ -108,6 +108,37 @@ def test_what_is_shown_is_saved(page: Any, tmp_path: Path) -> None:
 def test_a_page_of_its_own_shows_every_scene(page: Any) -> None:
     assert page.server.page() == "<html>[[500], [50], [7]] True</html>"
     assert visible(page) == [50]
+
+
+def test_a_page_starts_where_the_scene_is_seen(scene: GaussianScene) -> None:
+    assert scene_page({"a": scene, "b": random_scene(7)}) == "<html>[[500], [7]] True</html>"
+    stand = viser_stand_in.ViserServer.latest
+    assert not stand.is_open
+    assert list(stand.scene.labels.values()) == ["a: 500 Gaussians", "b: 7 Gaussians"]
+    eye, target = stand.initial_camera.position, stand.initial_camera.look_at
+    toward = [b - a for a, b in zip(eye, target, strict=True)]
+    middle = scene.means.median(dim=0).values.tolist()
+    assert math.dist(eye, target) == pytest.approx(math.dist(eye, middle), rel=0.3)
+    assert sum(x * (m - e) for x, m, e in zip(toward, middle, eye, strict=True)) > 0
+
+
+def test_compare_and_levels_write_a_page(
+    tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    full, small = tmp_path / "a.ply", tmp_path / "b.ply"
+    save(scene, full)
+    save(scene.select(torch.arange(40)), small)
+    views = ["--views", "1", "--size", "32", "--device", "cpu", "--viewer"]
+    folder = tmp_path / "compared"
+    assert main(["compare", str(full), str(small), "-o", str(folder), *views]) == 0
+    assert (folder / "viewer.html").read_text() == "<html>[[500], [40]] True</html>"
+    assert "viewer.html: 2 scenes in 3D" in capsys.readouterr().out
+    folder = tmp_path / "levels"
+    words = ["levels", str(full), "-o", str(folder), "--rho", "0.1,0.02", "--no-scores", *views]
+    assert main([*words, "--preset", "draft"]) == 0
+    assert (folder / "viewer.html").read_text() == "<html>[[500], [50], [10]] True</html>"
+    assert main([*words, "--stream", "sog"]) == 1
+    assert "--viewer cannot go with --stream" in capsys.readouterr().err
 
 
 def test_camera_of_a_view() -> None:

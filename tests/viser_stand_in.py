@@ -58,10 +58,15 @@ class Gui:
 
 class Scene:
     def __init__(self, server):
-        self.server, self.nodes, self.up = server, {}, None
+        self.server, self.nodes, self.labels, self.up = server, {}, {}, None
 
     def set_up_direction(self, direction):
         self.up = direction
+
+    def add_label(self, name, text, *, position):
+        assert name.rpartition("/")[0] in self.nodes
+        assert len(position) == 3
+        self.labels[name] = text
 
     def add_gaussian_splats(self, name, centers, covariances, rgbs, opacities, *, visible):
         n = len(centers)
@@ -88,7 +93,7 @@ class ViserServer:
 
     def __init__(self, host, port, *, label, verbose):
         self.host, self.port, self.log, self.is_open = host, port, [], True
-        self.gui, self.scene = Gui(self), Scene(self)
+        self.gui, self.scene, self.initial_camera = Gui(self), Scene(self), SimpleNamespace()
         ViserServer.latest = self
         print("a box with addresses")  # noqa: T201 (as viser does)
 

@@ -19,6 +19,7 @@ from cvtgs.cli.options import (
     read_ratios,
     read_words,
 )
+from cvtgs.cli.view import check_page, write_page
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import windows_fault
 from cvtgs.progress import ProgressEvent
@@ -227,7 +228,7 @@ def add_compare(add_parser: AddParser) -> None:
     )
     parser.set_defaults(run=compare)
     add_options(parser, "reference", "small", "--lpips", "-o/--output")
-    add_options(parser, "--trust-sizes", "--overwrite")
+    add_options(parser, "--viewer", "--trust-sizes", "--overwrite")
     add_view_options(parser, size=SCORED_SIZE)
 
 
@@ -237,6 +238,7 @@ def compare(options: argparse.Namespace) -> None:
 
     check_view_options(options)
     check_comparison_files(options.output, overwrite=options.overwrite)
+    check_page(options)
     scenes = _read_scenes(options)
     with progress_bars(quiet=options.quiet) as listener:
         comparison = cvtgs.evaluation.compare(
@@ -255,6 +257,7 @@ def compare(options: argparse.Namespace) -> None:
     if not options.quiet:
         _print_scores(comparison.evaluation, scenes.sizes)
         say(f"Wrote {', '.join(path.name for path in paths)}. Open {paths[-1]} in a browser.")
+    write_page(options, {scenes.name: scenes.reference, **scenes.others})
 
 
 def add_tradeoff(add_parser: AddParser) -> None:

@@ -23,6 +23,7 @@ from cvtgs.cli.streams import (
     stream_blocks,
     stream_levels,
 )
+from cvtgs.cli.view import check_page, write_page
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation
@@ -57,7 +58,7 @@ def add_levels(add_parser: AddParser) -> None:
     parser.add_argument(
         "--no-scores", action="store_true", help="skip rendering and scoring the levels"
     )
-    add_options(parser, "--trust-sizes", "--overwrite")
+    add_options(parser, "--viewer", "--trust-sizes", "--overwrite")
     add_view_options(parser, size=400)
 
 
@@ -72,6 +73,7 @@ def levels(options: argparse.Namespace) -> None:
     suffix = options.suffix or ".ply"
     names = cvtgs.levels.level_names(rhos, suffix)
     check_stream_options(options)
+    check_page(options)
     if options.stream is None:
         cvtgs.levels.check_levels(options.output, names, overwrite=options.overwrite)
     config = cvtgs.SimplifyConfig.compose(
@@ -113,6 +115,8 @@ def levels(options: argparse.Namespace) -> None:
             index = cvtgs.levels.add_scores(options.output, evaluation)
     if not options.quiet:
         _print_index(index)
+    small = {name: level.scene for name, level in zip(names, made, strict=True)}
+    write_page(options, {options.input.name: scene, **small})
 
 
 def _score(

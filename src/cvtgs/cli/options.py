@@ -131,6 +131,10 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
         "help": "read compressed files that claim far more Gaussians than their bytes can hold",
     },
     "--json": {"action": "store_true", "help": "print JSON"},
+    "--viewer": {
+        "action": "store_true",
+        "help": "write viewer.html, too: the scenes in 3D, in one file (needs the extra view)",
+    },
 }
 
 

@@ -58,6 +58,8 @@ def check_stream_options(options: argparse.Namespace) -> None:
             if getattr(options, name) is not None:
                 raise InvalidArgumentError(f"--{name} goes with --stream.")
         return
+    if options.viewer:
+        raise InvalidArgumentError("--viewer cannot go with --stream, which viewers load by parts.")
     if options.suffix is not None:
         raise InvalidArgumentError("--suffix cannot go with --stream, which sets the format.")
     if options.chunk is not None and options.chunk < 1:

@@ -3,12 +3,19 @@
 import argparse
 import webbrowser
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.display import say
 from cvtgs.cli.options import PRESET_NAMES, AddParser, add_options
 from cvtgs.errors import InvalidArgumentError
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from cvtgs.scene import GaussianScene
+
+PAGE = "viewer.html"
 HOST, PORT = "127.0.0.1", 8080
 
 
@@ -49,6 +56,29 @@ def add_view(add_parser: AddParser) -> None:
     )
     parser.add_argument("--no-browser", action="store_true", help="open no browser")
     add_options(parser, "--device", "--trust-sizes", "--overwrite", "--quiet")
+
+
+def check_page(options: argparse.Namespace) -> None:
+    """Check that the page of ``--viewer`` could be written, before the long work."""
+    from cvtgs.viewer import check_viewer
+
+    if options.viewer:
+        check_viewer()
+        if options.output.exists():
+            cvtgs.io.check_output(options.output / PAGE, options.overwrite)
+
+
+def write_page(options: argparse.Namespace, scenes: "Mapping[str, GaussianScene]") -> None:
+    """Write the page of ``--viewer`` beside the other files of a command, and say so."""
+    from cvtgs.viewer import scene_page
+
+    if not options.viewer:
+        return
+    path = options.output / PAGE
+    with cvtgs.io.atomic_output(path, overwrite=options.overwrite) as file:
+        file.write(scene_page(scenes).encode())
+    if not options.quiet:
+        say(f"{path}: {len(scenes)} scenes in 3D, in one file that works offline.")
 
 
 def view(options: argparse.Namespace) -> None:

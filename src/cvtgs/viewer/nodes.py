@@ -1,0 +1,147 @@
+"""Scenes on a server of viser, and a page of its own that shows them.
+
+No other file imports viser.
+"""
+
+import io
+from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from cvtgs.errors import MissingDependencyError
+from cvtgs.math.frames import robust_frame
+from cvtgs.math.parameters import build_covariances, normalize_quats
+from cvtgs.math.spherical_harmonics import SH_C0
+from cvtgs.scene import GaussianScene
+from cvtgs.validity import valid_rows
+from cvtgs.views import automatic_views
+
+if TYPE_CHECKING:
+    import viser
+
+__all__ = ["check_viewer", "scene_page"]
+
+_FLIP_SECONDS = 2.0
+"""How long a page of its own shows each scene."""
+
+_ANY_PORT = 8999
+"""Where the search for a free port begins, for a page that is not served."""
+
+_ABOVE = 1.8
+"""Labels are so many robust radii above the middle of their scene."""
+
+
+def scene_page(scenes: Mapping[str, GaussianScene]) -> str:
+    """Return a page of its own with a 3D viewer, whose time line flips between scenes.
+
+    Colours are those of the constant SH band.
+
+    Args:
+        scenes: The scenes by name; the camera starts where the first is seen well.
+
+    Returns:
+        HTML that needs no server and fetches nothing.
+
+    Raises:
+        MissingDependencyError: viser is not installed.
+    """
+    server = start_server("127.0.0.1", _ANY_PORT)
+    try:
+        nodes = {name: SceneNode(server, name, f"/scene {k}") for k, name in enumerate(scenes)}
+        for name, scene in scenes.items():
+            nodes[name].draw(scene, visible=False)
+        look_at(server, next(iter(scenes.values())))
+        return record_page(server, list(nodes.values()))
+    finally:
+        stop_server(server)
+
+
+class SceneNode:
+    """A scene on a server, and a label with its name that is seen when it is."""
+
+    def __init__(self, server: "viser.ViserServer", name: str, path: str) -> None:
+        self._server, self._name, self._path = server, name, path
+        self._splats: Any = None
+
+    def draw(self, scene: GaussianScene, *, visible: bool) -> None:
+        """Show a scene, instead of the one before."""
+        part = scene.select(valid_rows(scene)).to("cpu")
+        covariances = build_covariances(part.scales, normalize_quats(part.quats))
+        self._splats = self._server.scene.add_gaussian_splats(
+            self._path,
+            centers=part.means.float().numpy(),
+            covariances=covariances.float().numpy(),
+            rgbs=(0.5 + SH_C0 * part.sh0[:, 0]).clamp(0, 1).float().numpy(),
+            opacities=part.opacities[:, None].float().numpy(),
+            visible=visible,
+        )
+        frame = robust_frame(part.means)
+        above = (frame.center.double() - torch.tensor([0.0, _ABOVE * frame.radius, 0.0])).tolist()
+        self._server.scene.add_label(
+            f"{self._path}/name", f"{self._name}: {len(part):,} Gaussians", position=tuple(above)
+        )
+
+    def show(self, visible: bool) -> None:
+        """Show or hide it, with its label."""
+        self._splats.visible = visible
+
+
+def record_page(server: "viser.ViserServer", nodes: Sequence[SceneNode]) -> str:
+    """Record one scene after the other, and return the page."""
+    recorder = server.get_scene_serializer()
+    for shown in nodes:
+        for node in nodes:
+            node.show(node is shown)
+        recorder.insert_sleep(_FLIP_SECONDS)
+    return str(recorder.as_html(dark_mode=True))
+
+
+def look_at(server: "viser.ViserServer", scene: GaussianScene) -> None:
+    """Let cameras start where a scene is seen well."""
+    camera = automatic_views(scene.to("cpu"), 1)
+    rotation, center = camera.viewmats[0, :3, :3], camera.centers[0]
+    depth = float(rotation[2] @ (robust_frame(scene.means).center.cpu().double() - center))
+    target = center + rotation[2] * max(depth, 1e-3)
+    server.initial_camera.position = _three(center)
+    server.initial_camera.look_at = _three(target)
+
+
+def _three(point: torch.Tensor) -> tuple[float, float, float]:
+    x, y, z = point.tolist()
+    return x, y, z
+
+
+def start_server(host: str, port: int) -> "viser.ViserServer":
+    module = _viser()
+    with redirect_stdout(io.StringIO()):  # viser prints, whatever verbose is
+        server: viser.ViserServer = module.ViserServer(
+            host=host, port=port, label="cvtgs", verbose=False
+        )
+    server.scene.set_up_direction("-y")
+    return server
+
+
+def stop_server(server: "viser.ViserServer") -> None:
+    with redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def check_viewer() -> None:
+    """Check that a page could be served, before scenes are read.
+
+    Raises:
+        MissingDependencyError: viser is not installed.
+    """
+    _viser()
+
+
+def _viser() -> Any:
+    try:
+        import viser  # noqa: PLC0415 (optional)
+    except ImportError as error:
+        raise MissingDependencyError(
+            "the viewer needs the package viser; install it with: pip install 'cvtgs[view]'."
+        ) from error
+    return viser

@@ -1,0 +1,168 @@
+"""The scenes of a page: simplified again and again, scored and saved."""
+
+import math
+import os
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+
+from cvtgs.cameras import Cameras
+from cvtgs.errors import InvalidArgumentError, OutputError
+from cvtgs.evaluation.metrics import psnr
+from cvtgs.io import save
+from cvtgs.math.parameters import rotation_matrices
+from cvtgs.prepared import Prepared
+from cvtgs.rendering import render
+from cvtgs.scene import GaussianScene
+from cvtgs.simplifier import Simplifier
+from cvtgs.validity import valid_rows
+
+__all__ = ["SceneViewer", "ShownScene"]
+
+FULL, SIMPLIFIED = "full scene", "simplified"
+
+SCORE_SIDE = 480
+"""Longer side of the images that a view is scored on, pixels."""
+
+
+class ShownScene(NamedTuple):
+    """A scene on the page, and what is said of it.
+
+    Attributes:
+        scene: The scene.
+        facts: A line of text.
+    """
+
+    scene: GaussianScene
+    facts: str
+
+
+class SceneViewer:
+    """Simplifies one scene again and again; what does not depend on the size is done once.
+
+    Args:
+        scene: The full scene.
+        others: Scenes to look at beside it, by name.
+        device: Where to compute, as :class:`cvtgs.Simplifier` takes it.
+
+    Raises:
+        InvalidArgumentError: A name of another scene is one of the viewer's own.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> viewer = SceneViewer(make("object", 1000), device="cpu")
+        >>> viewer.simplify("draft", 0.01).facts.startswith("10 of 1,000 ")
+        True
+    """
+
+    def __init__(
+        self,
+        scene: GaussianScene,
+        others: Mapping[str, GaussianScene] | None = None,
+        *,
+        device: str = "auto",
+    ) -> None:
+        taken = {FULL, SIMPLIFIED} & set(others or {})
+        if taken:
+            raise InvalidArgumentError(
+                f"a scene beside the full one must not be named {taken.pop()!r}; rename it."
+            )
+        self._scene, self._device = scene, device
+        self._prepared: dict[str, Prepared] = {}
+        self.scenes = {FULL: ShownScene(scene, _counted(scene, scene))}
+        for name, other in (others or {}).items():
+            self.scenes[name] = ShownScene(other, _counted(other, scene))
+
+    def simplify(self, preset: str, rho: float) -> ShownScene:
+        """Simplify the scene, and keep the result among the scenes.
+
+        Args:
+            preset: Name of a preset.
+            rho: Ratio of Gaussians to keep, in (0, 1].
+
+        Returns:
+            The small scene.
+
+        Raises:
+            InvalidArgumentError: The ratio is out of range.
+            ConfigError: There is no such preset.
+        """
+        if preset not in self._prepared:
+            simplifier = Simplifier(preset=preset, device=self._device)
+            self._prepared[preset] = simplifier.prepare(self._scene)
+        small, report = self._prepared[preset].run(rho)
+        facts = f"{_counted(small, self._scene)}, {report.seconds:.2f} s with {preset}"
+        self.scenes[SIMPLIFIED] = ShownScene(small, facts)
+        return self.scenes[SIMPLIFIED]
+
+    def score(self, name: str, cameras: Cameras) -> float:
+        """Return the mean PSNR of a scene against the full one, dB.
+
+        Args:
+            name: Which scene.
+            cameras: From where.
+
+        Returns:
+            The mean over the cameras; infinite for the full scene itself.
+        """
+        images = [
+            render(one.select(valid_rows(one)), cameras).rgb.clamp(0, 1)
+            for one in (self.scenes[name].scene, self._scene)
+        ]
+        return float(psnr(*images).mean())
+
+    def save(self, name: str, path: str | os.PathLike[str]) -> str:
+        """Write a scene to a new file.
+
+        Args:
+            name: Which scene.
+            path: The file; its suffix chooses the format.
+
+        Returns:
+            A line that says what was written.
+
+        Raises:
+            CvtgsError: What :func:`cvtgs.save` raises.
+        """
+        if not os.fspath(path).strip():
+            raise OutputError("a file name is needed to save a scene, found none.")
+        save(self.scenes[name].scene, path)
+        return f"{os.fspath(path)}: {len(self.scenes[name].scene):,} Gaussians."
+
+
+def _counted(scene: GaussianScene, full: GaussianScene) -> str:
+    columns = 17 + 3 * scene.shN.shape[1]
+    size = 4e-6 * columns * len(scene)
+    return f"{len(scene):,} of {len(full):,} Gaussians, {size:,.3g} MB as .ply"
+
+
+def camera_of(
+    wxyz: tuple[float, ...], position: tuple[float, ...], *, fov: float, aspect: float
+) -> Cameras:
+    """Return the camera of a view of the page.
+
+    Args:
+        wxyz: Rotation from the camera (x right, y down, z forward) to the world.
+        position: Of the camera, scene units.
+        fov: Vertical field of view, radians.
+        aspect: Width by height.
+
+    Returns:
+        One camera of a small image.
+    """
+    quat = torch.tensor([wxyz], dtype=torch.float64)
+    rotation = rotation_matrices(quat)[0]
+    view = torch.eye(4, dtype=torch.float64)
+    view[:3, :3] = rotation.T
+    view[:3, 3] = -rotation.T @ torch.tensor(position, dtype=torch.float64)
+    width = SCORE_SIDE if aspect >= 1 else max(16, round(SCORE_SIDE * aspect))
+    height = max(16, round(width / aspect))
+    focal = height / 2 / math.tan(fov / 2)
+    intrinsics = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
+    return Cameras(
+        viewmats=view.float()[None],
+        Ks=torch.tensor([intrinsics], dtype=torch.float32),
+        width=width,
+        height=height,
+    )
