@@ -9,7 +9,6 @@ import torch
 from cvtgs import Simplifier, load, save
 from cvtgs.cli.main import main
 from cvtgs.io import Losses, losses
-from cvtgs.outofcore import read_bytes
 from format_cases import DATA, assert_within, storable_scene
 from scenes import same_bits
 
@@ -148,16 +147,6 @@ def test_simplify_and_levels_take_axes(tmp_path: Path) -> None:
     (level,) = (tmp_path / "levels").glob("*.ply")
     one = Simplifier(None, device="cpu").levels(load(tmp_path / "plain.ply"), [0.0667])[0]
     assert same_bits(load(level, axes="luf"), one.scene)
-
-
-def test_axes_are_not_for_blocks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(read_bytes.__globals__, "BASE_BYTES", 10)
-    save(storable_scene(3000), tmp_path / "a.ply")
-    words = ["simplify", str(tmp_path / "a.ply"), str(tmp_path / "b.ply"), "--rho", "0.1"]
-    assert main([*words, "--memory", "300kB", "--axes", "rub"]) == 1
-    assert "blocks cannot go with --axes, which need the whole scene" in capsys.readouterr().err
 
 
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")

@@ -119,7 +119,7 @@ def test_no_process_is_left_behind_and_the_run_continues(source, tmp_path, sign)
 
 @pytest.mark.parametrize(
     ("memory", "wanted", "found"),
-    [(10**9, None, 1), (10**11, 3, 3), (4 * 10**9, 8, 3), (2**60, None, None)],
+    [(10**9, None, 1), (10**11, 3, 3), (4 * 10**9, 8, 4), (2**60, None, None)],
 )
 def test_how_many(memory, wanted, found):
     assert worker_count(memory, wanted) == (found or core_count())

@@ -64,14 +64,14 @@ def test_a_killed_run_continues_with_the_missing_blocks(source, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
-@pytest.mark.parametrize("step", ["sums_02", "labels", "merged", "inflated"])
+@pytest.mark.parametrize("step", ["sums_02", "parts", "groups", "labels", "merged", "inflated"])
 def test_a_run_killed_between_steps_of_all_blocks_continues(source, tmp_path, step):
     output, folder = tmp_path / "out.ply", tmp_path / ".out.ply.blocks"
     whole = tmp_path / "whole.ply"
     simplify_file(source, whole, 0.05, blocks=8)
     assert kill_when(start(source, output), lambda: len(list(folder.glob(f"*/{step}_*"))) >= 3)
     assert not output.exists()
-    names = ("sample", "sites", "sums", "labels", "merged", "inflated")
+    names = ("sample", "sites", "sums", "parts", "groups", "labels", "merged", "inflated")
     files = [path for name in names for path in folder.glob(f"*/{name}_*")]
     done = {path: path.stat().st_mtime_ns for path in files}
     seen = {}
@@ -137,14 +137,17 @@ def test_blocks_of_another_job_are_not_used(source, tmp_path, change):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["labels", "sent", "merged", "inflated", "small"])
+@pytest.mark.parametrize(
+    "kind", ["parts", "groups", "targets", "labels", "sent", "merged", "inflated", "small"]
+)
 def test_damaged_files_of_steps_are_made_again(source, tmp_path, kind):
     output, folder, whole = tmp_path / "out.ply", tmp_path / ".out.ply.blocks", tmp_path / "w.ply"
     simplify_file(source, whole, 0.05, blocks=8)
     with pytest.raises(StoppedError):
         simplify_file(source, output, 0.05, blocks=8, listener=stop_in_blocks)
-    path = next(path for path in sorted(folder.glob(f"*/{kind}_*")) if path.stat().st_size > 99)
+    paths = sorted(folder.glob(f"*/{kind}[._]*"))
+    path = next(path for path in paths if path.stat().st_size)
     os.truncate(path, path.stat().st_size // 2)
     report = simplify_file(source, output, 0.05, blocks=8)
-    assert report.resumed_blocks == (2 if kind == "small" else 3)
+    assert report.resumed_blocks == {"small": 2, "targets": 0}.get(kind, 3)
     assert output.read_bytes() == whole.read_bytes()

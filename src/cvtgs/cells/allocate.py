@@ -7,7 +7,7 @@ tessellation makes more cells than are wanted, and the pairs that lose least mer
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.config import AllocationConfig
@@ -68,6 +68,7 @@ def gaussian_moments(
     *,
     weights: Float[Tensor, "n"],
     masses: Float[Tensor, "n"],
+    unit: float | None = None,
 ) -> Moments:
     """Return the moments of single Gaussians.
 
@@ -77,6 +78,7 @@ def gaussian_moments(
         frame: Centre and radius of the scene, the unit of length.
         weights: Mass of each.
         masses: Mass of each as images show it.
+        unit: What both are divided by; None for their means.
 
     Returns:
         Their moments, in the order of the rows.
@@ -89,9 +91,12 @@ def gaussian_moments(
     colors = (0.5 + SH_C0 * scene.sh0[rows, 0].double()).clamp(0.0, 1.5)
     tiny = torch.finfo(torch.float64).tiny
     weights, masses = weights.double(), masses.double()
+    units = [
+        values.mean() if unit is None else values.new_tensor(unit) for values in (weights, masses)
+    ]
     return Moments(
-        weights=(weights / weights.mean().clamp_min(tiny)).clamp_min(1e-12),
-        masses=masses / masses.mean().clamp_min(tiny),
+        weights=(weights / units[0].clamp_min(tiny)).clamp_min(1e-12),
+        masses=masses / units[1].clamp_min(tiny),
         means=(means / frame.radius).T.contiguous(),
         covariances=covariances,
         colors=colors.T.contiguous(),
@@ -244,19 +249,22 @@ def reassign(
     groups: Moments,
     neighbors: Int[Tensor, "m k"],
     config: AllocationConfig,
+    *,
+    must_stay: Bool[Tensor, "m"] | None = None,
 ) -> Int[Tensor, "n"]:
     """Move every member once to the group that explains it best, its own or a neighbouring one.
 
     A group explains a member by the Kullback-Leibler divergence of the two Gaussians, plus the
     squared distance of their colours. The member that fits its group best stays, so that no group
-    becomes empty.
+    with members becomes empty.
 
     Args:
         members: Moments of the members.
         labels: Group of each.
-        groups: Moments of the groups.
+        groups: Moments of the groups; those without members stay so, or get some.
         neighbors: Other groups that the members of each may move to.
         config: Weight of colour.
+        must_stay: Groups of which a member stays; None for all.
 
     Returns:
         The new group of every member.
@@ -265,7 +273,7 @@ def reassign(
     own = torch.arange(count, device=labels.device)
     candidates = torch.cat([own[:, None], neighbors], dim=1)
     inverse, volumes = _inverse(groups.covariances)
-    found = torch.empty_like(labels)
+    found = labels.new_empty(len(labels) + 1)  # the last is of groups without members
     own_costs = torch.empty(len(labels), dtype=torch.float64, device=labels.device)
     chunk = chunk_length(CHUNK, labels.device)
     for start in range(0, len(labels), chunk):
@@ -296,8 +304,10 @@ def reassign(
     rows = torch.where(own_costs == lowest[labels], rows, len(labels))
     anchors = torch.full((count,), len(labels), device=labels.device)
     anchors = anchors.scatter_reduce(0, labels, rows, "amin")
+    if must_stay is not None:
+        anchors = torch.where(must_stay, anchors, len(labels))
     found[anchors] = own
-    return found
+    return found[:-1]
 
 
 def _inverse(covariances: Float[Tensor, "6 n"]) -> tuple[Float[Tensor, "6 n"], Float[Tensor, "n"]]:

@@ -307,7 +307,7 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
     from cvtgs.outofcore import block_count, check_config
 
     memory = memory_of(options)
-    names = ("target_psnr", "target_ssim", "time_budget", "cameras", "axes", "sh_degree")
+    names = ("target_psnr", "target_ssim", "time_budget", "cameras")
     excluded = [name for name in names if getattr(options, name) is not None]
     if options.memory is None and options.scheduler is None:
         try:
@@ -333,6 +333,7 @@ def _simplify_blocks(
     listener: ProgressListener,
 ) -> "SimplifyReport":
     """Simplify a file block by block, in processes of this machine or on a cluster."""
+    axes = read_axes(options.axes)
     with block_workers(options, memory) as blocks:
         return cvtgs.outofcore.simplify_file(
             options.input,
@@ -342,6 +343,9 @@ def _simplify_blocks(
             max_count=options.max_count,
             memory=blocks.memory,
             boxes=() if options.keep is None else cvtgs.boxes.read_boxes(options.keep),
+            sh_degree=options.sh_degree,
+            source_axes=axes.source,
+            output_axes=axes.target,
             simplifier=simplifier,
             workers=blocks.workers,
             overwrite=options.overwrite,

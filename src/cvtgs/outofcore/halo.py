@@ -1,6 +1,6 @@
 """The halo of a block: the nearest sites and cells of other blocks."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,6 @@ from torch import Tensor
 
 from cvtgs.cvt import NearestSite, nearest_several
 from cvtgs.io.tensors import map_tensors
-from cvtgs.outofcore.job import Job
 
 RUN = 1 << 9
 """Consecutive balls that are compared with a box together, before each of them is."""
@@ -32,14 +31,11 @@ class OtherBlock(NamedTuple):
     load: Callable[[], Tensor]
 
 
-def other_blocks(
-    job: Job, block: int, path: Callable[[int], Path], *, name: str
-) -> Iterator[OtherBlock]:
-    """Return the other blocks that have cells; positions are the tensor ``name`` of their file."""
-    for other in job.blocks_with_cells():
-        if other != block:
-            tensors, _ = map_tensors(path(other))
-            yield OtherBlock(other, tensors["bounds"], partial(tensors.__getitem__, name))
+def other_blocks(paths: Mapping[int, Path], *, name: str) -> Iterator[OtherBlock]:
+    """Return blocks by the paths of their files; positions are the tensor ``name`` in these."""
+    for block, path in paths.items():
+        tensors, _ = map_tensors(path)
+        yield OtherBlock(block, tensors["bounds"], partial(tensors.__getitem__, name))
 
 
 def bounding_box(points: Float[Tensor, "n d"]) -> Float[Tensor, "2 d"]:

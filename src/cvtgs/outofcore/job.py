@@ -19,6 +19,7 @@ from cvtgs.boxes import Box
 from cvtgs.config import SimplifyConfig
 from cvtgs.errors import CvtgsError, OutputError, RunError
 from cvtgs.io import atomic_output
+from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import Checkpoint, load_checkpoint, save_checkpoint
@@ -34,16 +35,20 @@ class Manifest(pydantic.BaseModel):
     Attributes:
         key: Digest of all that the result depends on.
         source: Path of the source.
-        targets: Number of Gaussians that each block keeps.
-        cells: Number of cells that the tessellation makes in each block, at least as many.
+        total: Number of Gaussians that all blocks keep.
+        cells: Number of cells that the tessellation makes in each block, at least as many in all.
+        cell_room: Cells that may merge together.
+        left_out_mass: Mass of what the filter leaves out.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
     key: str
     source: str
-    targets: tuple[int, ...]
+    total: int
     cells: tuple[int, ...]
+    cell_room: int
+    left_out_mass: float
 
 
 class SortedFile(NamedTuple):
@@ -103,6 +108,7 @@ class Job:
         boxes: Protected regions.
         config: Every choice.
         has_network: Whether the folder holds a checkpoint.
+        axes: Where x, y and z of the file to write are to point.
         range_rows: Rows of the file that one process reads in one call.
     """
 
@@ -114,6 +120,7 @@ class Job:
     config: SimplifyConfig
     has_network: bool
     range_rows: int
+    axes: str = SCENE_AXES
 
     def path(self, name: str) -> Path:
         """Return the path of a file of the job."""
@@ -139,12 +146,20 @@ class Job:
         """Return the file with the sums of the points of a block by site, own and remote."""
         return self.path(f"sums_{iteration:02d}_{block:05d}")
 
+    def parts_path(self, block: int) -> Path:
+        """Return the file with the cell of every row, and the moments of the parts of cells."""
+        return self.path(f"parts_{block:05d}")
+
+    def groups_path(self, block: int) -> Path:
+        """Return the file with the group of every cell of a block, and the block's groups."""
+        return self.path(f"groups_{block:05d}")
+
     def labels_path(self, block: int) -> Path:
-        """Return the file with the own cell of every row, and how many rows go to other blocks."""
+        """Return the file with the own group of every row, and how many rows go to other blocks."""
         return self.path(f"labels_{block:05d}")
 
     def sent_path(self, block: int) -> Path:
-        """Return the file with the rows of a block that belong to remote cells."""
+        """Return the file with the rows of a block that belong to remote groups."""
         return self.path(f"sent_{block:05d}")
 
     def merged_path(self, block: int) -> Path:
@@ -170,14 +185,25 @@ class Job:
         return [RowRange(k, start, min(start + step, total)) for k, start in enumerate(starts)]
 
     @property
-    def targets(self) -> tuple[int, ...]:
-        """Number of Gaussians that each block keeps."""
-        return self._manifest().targets
+    def total(self) -> int:
+        """Number of Gaussians that all blocks keep."""
+        return self._manifest().total
 
     @property
     def cells(self) -> tuple[int, ...]:
         """Number of cells that the tessellation makes in each block."""
         return self._manifest().cells
+
+    @property
+    def targets(self) -> tuple[int, ...]:
+        """Number of Gaussians that each block keeps, which is known when groups are."""
+        if self.blocks == 1:
+            return (self.total,)
+        return tuple(json.loads(self.path("targets.json").read_bytes()))
+
+    def blocks_with_sites(self) -> list[int]:
+        """Return the blocks in which the tessellation has sites."""
+        return [block for block, count in enumerate(self.cells) if count]
 
     def blocks_with_cells(self) -> list[int]:
         """Return the blocks that keep at least one Gaussian."""
@@ -188,8 +214,8 @@ class Job:
         numbers = [rows.number for rows in self.ranges()]
         return [
             block
-            for block, target in enumerate(self.targets)
-            if target or any(self.rows_path(block, number).exists() for number in numbers)
+            for block, count in enumerate(self.cells)
+            if count or any(self.rows_path(block, number).exists() for number in numbers)
         ]
 
     def read_network(self) -> Checkpoint | None:
@@ -221,6 +247,8 @@ class Job:
             "target": self.target,
             "blocks": self.blocks,
             "ranges": self.range_rows,
+            "axes": [self.source.axes, self.axes],
+            "sh_degree": self.source.sh_degree,
             "boxes": [box.model_dump() for box in self.boxes],
             "config": self.config.model_dump(),
             "network": checkpoint and checkpoint.digest,
@@ -284,11 +312,18 @@ class Job:
         with atomic_output(self.path("sorted.json"), overwrite=True) as output:
             output.write(json.dumps(facts).encode())
 
-    def write_manifest(self, key: str, targets: list[int], cells: list[int]) -> None:
-        """Write that all rows are sorted, and how many cells and Gaussians each block makes."""
-        manifest = Manifest(
-            key=key, source=self.source.path, targets=tuple(targets), cells=tuple(cells)
-        )
+    @property
+    def cell_room(self) -> int:
+        """How many cells of the tessellation may merge together."""
+        return self._manifest().cell_room
+
+    @property
+    def left_out_mass(self) -> float:
+        """Mass of what the filter leaves out, squared scene units."""
+        return self._manifest().left_out_mass
+
+    def write_manifest(self, manifest: Manifest) -> None:
+        """Write that all rows are sorted."""
         with atomic_output(self.path("manifest.json"), overwrite=True) as file:
             file.write(manifest.model_dump_json(indent=2).encode())
 
@@ -304,7 +339,7 @@ class Job:
 
     def _remove_damaged(self) -> None:
         """Remove the files of steps that are not whole: the steps are done again."""
-        for kind in ("sample", "sites", "sums", "labels", "merged", "inflated"):
+        for kind in ("sample", "sites", "sums", "parts", "groups", "labels", "merged", "inflated"):
             for path in self.path("").glob(f"{kind}_*"):
                 try:
                     _, facts = map_tensors(path)
@@ -316,7 +351,13 @@ class Job:
                     whole = False
                 if not whole:
                     path.unlink(missing_ok=True)
-        for block in self.blocks_with_cells():
+        try:
+            blocks = self.blocks_with_cells()
+        except (OSError, ValueError, TypeError):  # without them no finished block can be checked
+            for path in (self.path("targets.json"), *self.path("").glob("small_*")):
+                path.unlink(missing_ok=True)
+            return
+        for block in blocks:
             try:
                 json.loads(self.report_path(block).read_bytes())
                 whole = open_rows(self.small_path(block)).count == self.targets[block]

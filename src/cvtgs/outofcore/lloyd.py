@@ -18,9 +18,10 @@ from cvtgs.cvt import (
 from cvtgs.devices import one_thread
 from cvtgs.grouping import curve_order, embed_rows
 from cvtgs.io.tensors import map_tensors, save_tensors
+from cvtgs.outofcore.allocate import cell_parts
 from cvtgs.outofcore.halo import Assignment, assign_points, bounding_box, other_blocks
-from cvtgs.outofcore.job import SENT_BYTES, Job
-from cvtgs.outofcore.rows import read_rows, send_rows
+from cvtgs.outofcore.job import Job
+from cvtgs.outofcore.rows import read_rows
 
 
 class EmbeddedRows(NamedTuple):
@@ -82,7 +83,7 @@ def accumulate(job: Job, iteration: int, block: int) -> float:
 
 def move_sites(job: Job, iteration: int) -> None:
     """Move the sites of all blocks to their centroids; holds one block and all remote sums."""
-    blocks = job.blocks_with_cells()
+    blocks = job.blocks_with_sites()
     left = [block for block in blocks if not job.sites_path(iteration + 1, block).exists()]
     if not left:
         return
@@ -104,11 +105,11 @@ def move_sites(job: Job, iteration: int) -> None:
 
 @one_thread()
 def assign(job: Job, iterations: int, block: int) -> None:
-    """Write the cell of every Gaussian of a block, and the rows that belong to remote cells.
+    """Write the cell of every Gaussian of a block, and the moments of its part of each cell.
 
     Every own site keeps at least one Gaussian of the block, so no cell is empty.
     """
-    if job.labels_path(block).exists():
+    if job.parts_path(block).exists():
         return
     order = map_tensors(job.sample_path(block))[0]["order"]
     order, points, weights = _embedded_rows(job, block, order)
@@ -118,11 +119,10 @@ def assign(job: Job, iterations: int, block: int) -> None:
     rows = order.long()
     owners, labels = torch.empty_like(rows), torch.empty_like(rows)
     owners[rows], labels[rows] = found.blocks, found.labels
-    sent = send_rows(job, block, owners, labels)
-    labels = torch.where(owners < 0, labels, -1).int()
-    result = {"labels": labels, "sent": sent, "energy": energy, "refilled": torch.tensor(refilled)}
-    facts = {SENT_BYTES: str(job.sent_path(block).stat().st_size)}
-    save_tensors(job.labels_path(block), result, facts)
+    del order, points, weights, found, rows
+    parts = cell_parts(job, block, read_rows(job, block, is_slim=True), owners, labels)
+    facts = {"energy": energy, "refilled": torch.tensor(refilled)}
+    save_tensors(job.parts_path(block), parts | facts, {})
 
 
 def _embedded_rows(job: Job, block: int, order: Tensor | None = None) -> EmbeddedRows:
@@ -143,7 +143,7 @@ def _embedded_rows(job: Job, block: int, order: Tensor | None = None) -> Embedde
         masses = areas * analysis.opacities
         order = curve_order(scene, everything, scan.frame, masses=masses).int()
     rows = order.long()
-    points = embed_rows(scene, rows, analysis, sum(job.targets), job.config)
+    points = embed_rows(scene, rows, analysis, job.total, job.config)
     weights = gaussian_weights(analysis.opacities[rows], areas[rows], scan.area_power)
     weights = (weights / scan.mean_weight).clamp_min(job.config.cvt.weight_floor)
     return EmbeddedRows(order, points, weights)
@@ -156,7 +156,12 @@ def _assign(job: Job, iteration: int, block: int, points: Tensor) -> tuple[int, 
     sites = points[:0].double()
     if job.cells[block]:
         sites = map_tensors(job.sites_path(iteration, block))[0]["sites"]
-    others = other_blocks(job, block, lambda other: job.sites_path(iteration, other), name="sites")
+    paths = {
+        other: job.sites_path(iteration, other)
+        for other in job.blocks_with_sites()
+        if other != block
+    }
+    others = other_blocks(paths, name="sites")
     return len(sites), assign_points(points, sites, others, nearest=nearest)
 
 

@@ -9,8 +9,17 @@ from typing import NamedTuple
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.ply import PlyRows
 
-BASE_BYTES = 600_000_000
-"""Interpreter, torch, network, the grid of depths, and one chunk of rows."""
+BASE_BYTES = 450_000_000
+"""Interpreter, torch and scipy (280 MB), network, sample, grid of depths, and a chunk of rows."""
+
+LEAST_BYTES = 500_000_000
+"""The same and a small block: no run in blocks takes less."""
+
+CELL_BYTES = 1500
+"""What a cell of the tessellation takes while pairs of cells merge; some 1,030 were measured."""
+
+CELL_ROOM = 1_000_000
+"""Cells that merge together if no memory is stated."""
 
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 
@@ -38,11 +47,10 @@ def read_bytes(text: str) -> int:
     if match[3]:
         unit = 1024 ** " KMGT".index(match[2] or " ")
     amount = int(float(match[1]) * unit)
-    least = 2 * BASE_BYTES
-    if amount < least:
+    if amount < LEAST_BYTES:
         raise InvalidArgumentError(
-            f"memory must be at least {least / 1e9:g} GB, which torch and one block need; "
-            f"found {text!r}."
+            f"memory must be at least {LEAST_BYTES / 1e6:g} MB: torch and scipy take 280 MB of it, "
+            f"the sample, grids and a small block the rest; found {text!r}."
         )
     return amount
 
@@ -77,7 +85,7 @@ def memory_to_plan(free: int) -> int:
 
     The estimates are twice what is used, so less than that would only make more blocks.
     """
-    return max(free, BASE_BYTES + BASE_BYTES // 4)
+    return max(free, LEAST_BYTES)
 
 
 def control_group_rooms(root: Path) -> list[int]:
@@ -145,6 +153,11 @@ def needed_memory(source: PlyRows, rows: int) -> int:
     return BASE_BYTES + rows * (250 + 2 * source.dtype.itemsize)
 
 
+def cell_room(memory: int | None) -> int:
+    """Return how many cells of the tessellation may merge together."""
+    return CELL_ROOM if memory is None else max(0, memory - BASE_BYTES) // CELL_BYTES
+
+
 def block_count(source: PlyRows, memory: int) -> int:
     """Choose how many blocks fit into memory one after the other.
 
@@ -159,5 +172,5 @@ def block_count(source: PlyRows, memory: int) -> int:
     """
     if needed_memory(source, source.count) <= memory:
         return 1
-    room = memory - BASE_BYTES if memory > BASE_BYTES else BASE_BYTES // 4
+    room = (memory if memory > BASE_BYTES else LEAST_BYTES) - BASE_BYTES
     return max(2, math.ceil(2 * (needed_memory(source, source.count) - BASE_BYTES) / room))

@@ -13,13 +13,12 @@ from cvtgs import cells, cvt, validity
 from cvtgs.analysis import drop_unused_bands, restore_columns, select_columns
 from cvtgs.clock import StageClock
 from cvtgs.devices import one_thread
-from cvtgs.grouping import allocate
 from cvtgs.io import atomic_output, save
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.mergenet import correct_cells
 from cvtgs.outofcore.halo import bounding_box, halo_cells, other_blocks
 from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.rows import BlockRows, analysis_of, read_members, read_rows
+from cvtgs.outofcore.rows import analysis_of, read_members, read_rows
 from cvtgs.pipeline import merge_members, neighbor_count, reduce_scene, shape_merged
 from cvtgs.progress import silent
 from cvtgs.report import CellStatistics
@@ -75,19 +74,16 @@ class WithHalo(NamedTuple):
 
 @one_thread()
 def merge(job: Job, block: int) -> None:
-    """Merge cells of the tessellation until the target of a block is met, and merge these."""
+    """Merge the members of every cell of a block."""
     if job.merged_path(block).exists():
         return
-    rows, labels = read_members(job, block)
-    labels = _allocate(job, block, rows, labels)
-    _, scene, _, partition = _block_cells(job, block, rows, labels)
+    _, scene, _, partition = read_cells(job, block)
     merged, shown = merge_members(scene, partition, job.config.merge, areas=scene.areas)
     first = shown.order[shown.offsets[:-1]]
     more = {
         "sizes": shown.counts,
         "representatives": torch.where(shown.counts < partition.counts, first, -1),
         "bounds": bounding_box(merged.means),
-        "labels": labels.int(),
     }
     tensors = merged.tensors() | add_prefix(EXTRA, merged.extras) | more
     save_tensors(job.merged_path(block), tensors, {})
@@ -101,7 +97,8 @@ def inflate(job: Job, block: int) -> None:
         return
     own, _ = map_tensors(job.merged_path(block))
     near = neighbor_count(job.config.merge, with_network=job.has_network)
-    others = other_blocks(job, block, job.merged_path, name="means")
+    paths = {other: job.merged_path(other) for other in job.blocks_with_cells() if other != block}
+    others = other_blocks(paths, name="means")
     remote = halo_cells(own["means"], others, count=near)
     merged, _, own_count = _with_halo(job, block, remote, job.merged_path)
     neighbors = cvt.nearest_neighbors(merged.means, near)[:own_count]
@@ -139,14 +136,11 @@ def correct(job: Job, block: int) -> None:
     tensors = {name: values[:own_count] for name, values in small.tensors().items()}
     small = scene.with_tensors(tensors, under_prefix(EXTRA, own))
     small = restore_columns(validity.standardized(small), original, job.read_scan().plan)
-    labels, _ = map_tensors(job.labels_path(block))
     report = BlockReport(
         input_count=len(scene),
         mass_out=float(small.masses.sum()),
         single_member_cells=int((shown.counts == 1).sum()),
         largest_cell=int(partition.counts.amax()),
-        refilled_cells=int(labels["refilled"]),
-        energy=float(labels["energy"]),
         backend=cvt.SEARCH,
     )
     _write_block(job, block, small, report)
@@ -176,28 +170,9 @@ def simplify_block(job: Job, block: int) -> None:
     _write_block(job, block, reduced.scene, report)
 
 
-def _allocate(job: Job, block: int, rows: BlockRows, labels: Tensor) -> Tensor:
-    """Return the final cell of every Gaussian in the cells of a block."""
-    scene = rows.scene
-    members = cells.gaussian_moments(
-        scene,
-        torch.arange(len(scene)),
-        job.read_scan().frame,
-        weights=scene.masses,
-        masses=rows.apparent_areas * scene.opacities,
-    )
-    count, target = job.cells[block], job.targets[block]
-    return allocate(members, labels, count, target, job.config.allocation)
-
-
 def read_cells(job: Job, block: int) -> BlockCells:
-    """Read the Gaussians in the final cells of a block, which is merged."""
-    rows, _ = read_members(job, block)
-    labels = map_tensors(job.merged_path(block))[0]["labels"].long()
-    return _block_cells(job, block, rows, labels)
-
-
-def _block_cells(job: Job, block: int, rows: BlockRows, labels: Tensor) -> BlockCells:
+    """Read the Gaussians in the cells of a block."""
+    rows, labels = read_members(job, block)
     original = select_columns(rows.scene, job.config.effects)
     scene = drop_unused_bands(original, job.read_scan().plan)
     partition = cells.Partition.from_labels(labels, job.targets[block])
@@ -226,4 +201,4 @@ def _write_block(job: Job, block: int, small: GaussianScene, report: BlockReport
         file.write(report.model_dump_json().encode())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        save(small, job.small_path(block), overwrite=True)
+        save(small, job.small_path(block), overwrite=True, axes=job.axes)

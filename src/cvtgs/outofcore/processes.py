@@ -13,7 +13,7 @@ from typing import Self
 
 from cvtgs.devices import core_count
 from cvtgs.errors import RunError
-from cvtgs.outofcore.memory import BASE_BYTES
+from cvtgs.outofcore.memory import LEAST_BYTES
 from cvtgs.outofcore.workers import Item, Result
 
 
@@ -25,13 +25,13 @@ def worker_count(memory: int, wanted: int | None = None) -> int:
         wanted: How many there should be; None for one on each core.
 
     Returns:
-        At least 1, and no more than have 1.2 GB each, which torch and one block need.
+        At least 1, and no more than have 1 GB each, for torch and a block of some size.
 
     Example:
         >>> worker_count(4_000_000_000, 8)
-        3
+        4
     """
-    return max(1, min(wanted or core_count(), memory // (2 * BASE_BYTES)))
+    return max(1, min(wanted or core_count(), memory // (2 * LEAST_BYTES)))
 
 
 class LocalWorkers:

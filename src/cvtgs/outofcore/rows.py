@@ -14,7 +14,6 @@ from cvtgs.boxes import inside
 from cvtgs.config import TessellationConfig
 from cvtgs.devices import one_thread
 from cvtgs.io import atomic_output
-from cvtgs.io.ply import assemble
 from cvtgs.io.tensors import map_tensors
 from cvtgs.outofcore.job import Attempt, Job, SortedFile
 from cvtgs.outofcore.scan import CHUNK, RowRange, SceneScan
@@ -47,11 +46,13 @@ class SortedCounts(NamedTuple):
     Attributes:
         rows: Number of Gaussians.
         cells: Their weight in cells, none above 1, for each chunk of rows.
+        left_out: Mass of what the filter leaves out, for each chunk of rows.
         files: Where the rows are.
     """
 
     rows: list[int]
     cells: list[list[float]]
+    left_out: list[float]
     files: tuple[SortedFile, ...]
 
 
@@ -60,7 +61,7 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
     """Write the rows of a range into one file per block, which nobody else writes to."""
     scan, attempt = job.read_scan(), Attempt(job.folder)
     row_counts = torch.zeros(job.blocks, dtype=torch.int64)
-    cell_counts = []
+    cell_counts, left_out = [], []
     for start in range(rows.start, rows.stop, CHUNK):
         records = job.source.read(start, min(start + CHUNK, rows.stop))
         scene = job.source.scene(records)
@@ -69,9 +70,11 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
         if bool(protected.any()):
             kept = _kept_rows(records, scene, protected)
             attempt.append(job.kept_path(rows.number).name, kept)
-        chosen, areas, visibility = _filtered(
-            scan, job.config.cvt, scene, (valid & ~protected).nonzero()[:, 0]
-        )
+        free = (valid & ~protected).nonzero()[:, 0]
+        chosen, areas, visibility = _filtered(scan, job.config.cvt, scene, free)
+        if len(chosen) < len(free):
+            masses = scene.masses
+            left_out.append(float(masses[free].sum() - masses[chosen].sum()))
         weights = cvt.gaussian_weights(scene.opacities[chosen], areas, scan.area_power)
         weights = weights.clamp_min(scan.min_weight)
         per_cell = scan.cell_weight
@@ -91,7 +94,7 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
             if count:
                 name = job.rows_path(block, rows.number).name
                 attempt.append(name, table[end - count : end].tobytes())
-    return SortedCounts(row_counts.tolist(), cell_counts, attempt.files())
+    return SortedCounts(row_counts.tolist(), cell_counts, left_out, attempt.files())
 
 
 def _filtered(
@@ -225,12 +228,5 @@ def _assembled(job: Job, pieces: Iterator[NDArray[Any]], count: int, *, is_slim:
             start += len(rows)
             yield rows
 
-    scene = assemble(
-        copied(),
-        count=count,
-        layout=job.source.layout,
-        comments=job.source.comments,
-        sh_degree=0 if is_slim else None,
-        with_extras=not is_slim,
-    )
+    scene = job.source.assemble(copied(), count, is_slim=is_slim)
     return BlockRows(scene, areas, visibility)

@@ -3,41 +3,37 @@
 import math
 import os
 import shutil
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from cvtgs.boxes import Box
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
-from cvtgs.counts import shared_out, shortfall, target_count
+from cvtgs.counts import shared_out, target_count
 from cvtgs.devices import one_thread
 from cvtgs.errors import (
     ConfigError,
-    DroppedDataWarning,
 )
 from cvtgs.grouping import finer_count
-from cvtgs.io import atomic_output, check_save, load, save
+from cvtgs.io import check_save
+from cvtgs.io.axes import SCENE_AXES, checked_axes
 from cvtgs.io.locks import output_lock
-from cvtgs.io.ply import join_plys, open_rows
-from cvtgs.io.tensors import map_tensors
-from cvtgs.outofcore.job import Job, job_folder
+from cvtgs.io.ply import open_rows
+from cvtgs.outofcore.allocate import allocate, join
+from cvtgs.outofcore.assemble import assemble_blocks, is_plain_ply, report_blocks
+from cvtgs.outofcore.job import Job, Manifest, job_folder
 from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
-from cvtgs.outofcore.memory import available_memory, block_count, memory_to_plan
-from cvtgs.outofcore.merge import BlockReport, correct, inflate, merge, simplify_block
+from cvtgs.outofcore.memory import available_memory, block_count, cell_room, memory_to_plan
+from cvtgs.outofcore.merge import correct, inflate, merge, simplify_block
 from cvtgs.outofcore.scan import CHUNK
 from cvtgs.outofcore.sort import sort_into_blocks
 from cvtgs.outofcore.workers import CheckedWorkers, Result, Workers, sequentially, with_progress
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport
-from cvtgs.scene import concatenate
 from cvtgs.simplifier import Simplifier
 
 RANGE_ROWS, MOST_RANGES = 1 << 20, 64
@@ -54,6 +50,9 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     memory: int | None = None,
     blocks: int | None = None,
     boxes: Sequence[Box] = (),
+    sh_degree: int | None = None,
+    source_axes: str | None = None,
+    output_axes: str | None = None,
     simplifier: Simplifier | None = None,
     workers: Workers | None = None,
     range_rows: int | None = None,
@@ -76,6 +75,9 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         memory: Bytes that one process may use; None for what is free.
         blocks: Number of blocks, instead of ``memory``.
         boxes: Gaussians with their centres in these are kept as they are, and come first.
+        sh_degree: SH bands above this degree are dropped; None keeps all.
+        source_axes: Where x, y and z of the source point; None for those of PLY files.
+        output_axes: Where they are to point in the output; None for those of its format.
         simplifier: Configuration and network; None for the defaults.
         workers: Calls functions for ranges of the file and for blocks; None calls them here, one
             after the other.
@@ -109,7 +111,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     workers = workers or sequentially
     check_config(simplifier.config)
     check_save(output, overwrite=overwrite)
-    rows = open_rows(source)
+    rows = open_rows(source, sh_degree=sh_degree, axes=source_axes)
     rows = replace(rows, path=str(Path(rows.path).absolute()))  # for workers in other folders
     target = target_count(rows.count, rho, count=count, max_count=max_count)
     wanted = blocks or block_count(rows, memory or memory_to_plan(available_memory()))
@@ -122,6 +124,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         config=simplifier.config,
         has_network=simplifier.checkpoint is not None,
         range_rows=range_rows or rows_per_range(rows.count),
+        axes=checked_axes(output_axes or SCENE_AXES) if is_plain_ply(output) else SCENE_AXES,
     )
     key = job.key(simplifier.checkpoint)
     job = replace(job, folder=job_folder(output, key))
@@ -137,12 +140,12 @@ def simplify_file(  # noqa: PLR0913 (options by name)
             if simplifier.checkpoint is not None:
                 job.write_network(simplifier.checkpoint)
             with one_thread():
-                targets, finer = _scan_and_sort(job, workers, clock)
-            job.write_manifest(key, targets, finer)
+                job.write_manifest(_scan_and_sort(job, key, workers, clock, room=cell_room(memory)))
+        energies = _tessellate_and_merge(job, workers, clock) if job.blocks > 1 else ()
         resumed = _run_blocks(job, workers, clock)
         with clock.stage("assemble"):
-            _assemble(job, output, overwrite=overwrite)
-        report = _report(job, simplifier, clock, resumed=resumed)
+            assemble_blocks(job, output, axes=output_axes, overwrite=overwrite)
+        report = report_blocks(job, simplifier, clock, energies=energies, resumed=resumed)
         shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
     return report
 
@@ -169,41 +172,43 @@ def check_config(config: SimplifyConfig) -> None:
         )
 
 
-def _scan_and_sort(job: Job, workers: Workers, clock: StageClock) -> tuple[list[int], list[int]]:
-    """Scan the file and sort its rows into blocks.
-
-    Returns how many Gaussians each block keeps, and how many cells its tessellation makes.
-    """
-    rest, rows, cells = sort_into_blocks(job, workers, clock)
-    if rest < sum(1 for count in rows if count):  # tiny targets: the heaviest blocks get one each
-        order = sorted(range(job.blocks), key=lambda block: -cells[block])
-        targets = [int(block in order[:rest]) for block in range(job.blocks)]
+def _scan_and_sort(
+    job: Job, key: str, workers: Workers, clock: StageClock, *, room: int
+) -> Manifest:
+    """Scan the file and sort its rows into blocks; return what is to be made of them."""
+    found = sort_into_blocks(job, workers, clock)
+    finer = finer_count(found.rest, sum(found.rows), job.config.allocation)
+    if finer < sum(1 for count in found.rows if count):  # so few: the heaviest blocks get one each
+        order = sorted(range(job.blocks), key=lambda block: -found.cells[block])
+        cells = [int(block in order[:finer]) for block in range(job.blocks)]
     else:
-        targets = shared_out(rest, cells, rooms=rows)
-    finer = [
-        finer_count(kept, available, job.config.allocation)
-        for kept, available in zip(targets, rows, strict=True)
-    ]
-    return targets, finer
+        cells = shared_out(finer, found.cells, rooms=found.rows)
+    return Manifest(
+        key=key,
+        source=job.source.path,
+        total=found.rest,
+        cells=tuple(cells),
+        cell_room=room,
+        left_out_mass=found.left_out_mass,
+    )
 
 
 def _run_blocks(job: Job, workers: Workers, clock: StageClock) -> int:
     """Simplify the blocks that are not finished; return how many were."""
     with_cells = job.blocks_with_cells()
     resumed = sum(job.small_path(block).exists() for block in with_cells)
-    if job.blocks > 1:
-        _tessellate_and_merge(job, workers, clock)
     last = correct if job.blocks > 1 else simplify_block
     with clock.stage("blocks", len(with_cells)) as advance:
         _run_all(workers, partial(last, job), with_cells, advance)
     return resumed
 
 
-def _tessellate_and_merge(job: Job, workers: Workers, clock: StageClock) -> None:
+def _tessellate_and_merge(job: Job, workers: Workers, clock: StageClock) -> tuple[float, ...]:
     """Group the Gaussians of all blocks into cells, merge and inflate these.
 
     Each step is done for all blocks before the next, so the result has no seams: the sites of
-    Lloyd move together, and neighbours are those of the whole scene.
+    Lloyd move together, cells merge across borders, and neighbours are those of the whole scene.
+    Returns the energy before every Lloyd iteration.
     """
     blocks, iterations = job.blocks_with_rows(), job.config.cvt.iterations
     with clock.stage("tessellate", (iterations + 2) * len(blocks)) as advance:
@@ -213,18 +218,22 @@ def _tessellate_and_merge(job: Job, workers: Workers, clock: StageClock) -> None
             return _run_all(workers, step, blocks, lambda done: advance(first + done))
 
         run(partial(seed, job), 0)
-        moves, energy, least = 0, math.inf, 1.0 - job.config.cvt.tolerance
+        moves, energies, least = 0, [math.inf], 1.0 - job.config.cvt.tolerance
         for iteration in range(iterations):
-            before, energy = energy, sum(run(partial(accumulate, job, iteration), iteration + 1))
-            if energy >= least * before:
+            energies.append(sum(run(partial(accumulate, job, iteration), iteration + 1)))
+            if energies[-1] >= least * energies[-2]:
                 break
             move_sites(job, iteration)
             moves = iteration + 1
         run(partial(assign, job, moves), iterations + 1)
+    with clock.stage("allocate", len(blocks)) as advance:
+        allocate(job)
+        _run_all(workers, partial(join, job), blocks, advance)
     with_cells = job.blocks_with_cells()
     for name, step in (("merge", merge), ("inflate", inflate)):
         with clock.stage(name, len(with_cells)) as advance:
             _run_all(workers, partial(step, job), with_cells, advance)
+    return tuple(energies[1:])
 
 
 def _run_all(
@@ -234,65 +243,3 @@ def _run_all(
     advance: Callable[[int], None],
 ) -> list[Result]:
     return list(with_progress(workers(step, blocks), advance))
-
-
-def _assemble(job: Job, output: str | os.PathLike[str], *, overwrite: bool) -> None:
-    """Write protected rows and blocks behind one another."""
-    blocks = [job.small_path(block) for block in job.blocks_with_cells()]
-    name = Path(output).name.lower()
-    if name.endswith(".ply") and not name.endswith(".compressed.ply"):
-        with atomic_output(output, overwrite=overwrite) as file:
-            join_plys(blocks, file, before=_kept_rows(job))
-        return
-    kept = [job.source.scene(rows) for rows in _kept_rows(job)]
-    save(concatenate([*kept, *map(load, blocks)]), output, overwrite=overwrite)
-
-
-def _kept_rows(job: Job) -> list[NDArray[Any]]:
-    """Map the protected rows of every range."""
-    paths = [job.kept_path(rows.number) for rows in job.ranges()]
-    return [np.memmap(path, job.source.dtype, "r") for path in paths if path.exists()]
-
-
-def _report(job: Job, simplifier: Simplifier, clock: StageClock, *, resumed: int) -> SimplifyReport:
-    """Add up the reports of all blocks."""
-    scan, with_cells = job.read_scan(), job.blocks_with_cells()
-    reports = [
-        BlockReport.model_validate_json(job.report_path(block).read_bytes()) for block in with_cells
-    ]
-    total, valid = job.source.count, scan.row_count + scan.kept_count
-    if valid < total:
-        warnings.warn(
-            f"dropped {total - valid} of {total} Gaussians with NaN, infinite or zero values.",
-            DroppedDataWarning,
-            stacklevel=3,
-        )
-    energy_elsewhere = sum(  # of Gaussians in blocks without cells, which have no report
-        float(map_tensors(job.labels_path(block))[0]["energy"])
-        for block in job.blocks_with_rows()
-        if block not in with_cells
-    )
-    kept_mass = sum(float(job.source.scene(rows).masses.sum()) for rows in _kept_rows(job))
-    return SimplifyReport(
-        input_count=total,
-        output_count=min(job.target, valid),
-        target_count=job.target,
-        rho=job.target / total,
-        invalid_count=total - valid,
-        shortfall=shortfall(valid, total, job.target),
-        filtered_count=scan.row_count - sum(report.input_count for report in reports),
-        kept_count=scan.kept_count,
-        single_member_cells=sum(report.single_member_cells for report in reports),
-        largest_cell=max((report.largest_cell for report in reports), default=0),
-        refilled_cells=sum(report.refilled_cells for report in reports),
-        mass_in=scan.mass,
-        mass_out=sum(report.mass_out for report in reports) + kept_mass,
-        energy=sum(report.energy for report in reports) + energy_elsewhere,
-        backend=reports[0].backend if reports else "none",
-        checkpoint="none" if simplifier.checkpoint is None else simplifier.checkpoint.name,
-        plan=scan.plan,
-        stages=tuple(clock.costs),
-        blocks=job.blocks,
-        resumed_blocks=resumed,
-        config=simplifier.config,
-    )

@@ -1,6 +1,7 @@
 """The scan: what all blocks need of the whole scene, from a sample and one pass over the file."""
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import reduce
@@ -54,6 +55,7 @@ class RangeTotals(NamedTuple):
             scene units; one after the other they add up to the same bits whatever the ranges.
         falloff_masses: ``(c,)`` sums of the same times the perspective falloff.
         far_masses: ``(f,)`` the latter of each Gaussian beyond the distance of flyaways.
+        invalid_rows: Numbers of other rows, by the attribute that is NaN, infinite or zero.
         valid_count: Number of valid rows.
         kept_count: Number of those in boxes.
     """
@@ -62,6 +64,7 @@ class RangeTotals(NamedTuple):
     masses: tuple[float, ...]
     falloff_masses: tuple[float, ...]
     far_masses: Float[Tensor, "f"]
+    invalid_rows: dict[str, int]
     valid_count: int
     kept_count: int
 
@@ -93,6 +96,7 @@ class SceneScan:
         area_power: Power of the area in the weight.
         partition: The blocks, in contracted space.
         mass: Opacity times mean projected area of all valid Gaussians, squared scene units.
+        invalid_rows: Rows that are dropped, by the attribute that is NaN, infinite or zero.
         row_count: Number of valid Gaussians outside boxes.
         kept_count: Number of valid Gaussians in boxes.
     """
@@ -108,6 +112,7 @@ class SceneScan:
     area_power: float
     partition: KdPartition
     mass: float
+    invalid_rows: dict[str, int]
     row_count: int
     kept_count: int
 
@@ -130,12 +135,13 @@ def scan_range(
     """Sum optical depths, masses and counts over a range of the source."""
     depths = analysis.empty_depth_grid(torch.device("cpu"))
     all_masses, falloff_masses, valid_count, kept_count = list[float](), list[float](), 0, 0
-    far_masses = [torch.zeros(0, dtype=torch.float64)]
+    far_masses, found = [torch.zeros(0, dtype=torch.float64)], Counter[str]()
     for start in range(rows.start, rows.stop, CHUNK):
         scene = source.scene(source.read(start, min(start + CHUNK, rows.stop)))
-        valid = validity.valid_rows(scene)
-        if not bool(valid.all()):
-            scene = scene.select(valid)
+        invalid = validity.invalid_rows(scene)
+        if invalid:
+            found.update({name: int(mask.sum()) for name, mask in invalid.items()})
+            scene = scene.select(~torch.stack(list(invalid.values())).any(dim=0))
         masses = scene.masses
         analysis.add_depths(depths, scene.means, masses, frame)
         distances = frame.distances(scene.means)
@@ -150,6 +156,7 @@ def scan_range(
         tuple(all_masses),
         tuple(falloff_masses),
         torch.cat(far_masses),
+        dict(found),
         valid_count,
         kept_count,
     )
@@ -165,6 +172,7 @@ def add_totals(parts: Iterable[RangeTotals]) -> RangeTotals:
             depths=total.depths.add_(part.depths),
             masses=total.masses + part.masses,
             falloff_masses=total.falloff_masses + part.falloff_masses,
+            invalid_rows=dict(Counter(total.invalid_rows) + Counter(part.invalid_rows)),
             valid_count=total.valid_count + part.valid_count,
             kept_count=total.kept_count + part.kept_count,
         )
@@ -177,14 +185,16 @@ def scan_scene(
     *,
     boxes: tuple[Box, ...],
     target: int,
+    cells: int,
     blocks: int,
     config: SimplifyConfig,
     frame: RobustFrame,
 ) -> SceneScan:
     """Choose filter thresholds, scale of the weights and partition from the sample.
 
-    The measure of a block is half its number of Gaussians and half their weight, so none has
-    more than about twice the mean of either.
+    So many Gaussians as the target stay at least; the tessellation makes as many cells or more. The
+    measure of a block is half its number of Gaussians and half their weight, so none has more than
+    about twice the mean of either.
     """
     grid = analysis.visibility_grid(totals.depths)
     sample = analysis.select_columns(sample, config.effects)
@@ -207,9 +217,9 @@ def scan_scene(
     mean_weight = float(weights.mean()) or 1.0
     min_weight = mean_weight * config.cvt.weight_floor
     weights = weights.clamp_min(min_weight)
-    cell_weight = _cell_weight(weights, target / rows_per_sample)
-    cells = (weights / cell_weight).clamp_max(1.0) if cell_weight > 0 else torch.ones_like(weights)
-    measure = 0.5 / len(cells) + 0.5 * cells / cells.sum()
+    cell_weight = _cell_weight(weights, cells / rows_per_sample)
+    shares = (weights / cell_weight).clamp_max(1.0) if cell_weight > 0 else torch.ones_like(weights)
+    measure = 0.5 / len(shares) + 0.5 * shares / shares.sum()
     return SceneScan(
         frame=frame,
         plan=known.plan,
@@ -222,6 +232,7 @@ def scan_scene(
         area_power=power,
         partition=partition_space(frame.contract(sample.means[rows]), measure, blocks),
         mass=totals.mass,
+        invalid_rows=totals.invalid_rows,
         row_count=row_count,
         kept_count=totals.kept_count,
     )
@@ -268,7 +279,7 @@ def write_scan(scan: SceneScan, path: Path) -> None:
     save_tensors(path, tensors, texts)
 
 
-_ADAPTERS = {kind: pydantic.TypeAdapter(kind) for kind in (float, int, EffectPlan)}
+_ADAPTERS = {kind: pydantic.TypeAdapter(kind) for kind in (float, int, dict[str, int], EffectPlan)}
 
 
 def read_scan(path: Path) -> SceneScan:

@@ -5,9 +5,11 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
+from cvtgs import validity
 from cvtgs.boxes import check_room
 from cvtgs.clock import StageClock
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
+from cvtgs.grouping import finer_count
 from cvtgs.math.frames import robust_frame
 from cvtgs.outofcore.job import Job, SortedFile
 from cvtgs.outofcore.rows import sort_range
@@ -22,11 +24,13 @@ class SortedBlocks(NamedTuple):
         rest: Gaussians that all blocks are to keep together.
         rows: Gaussians in each block.
         cells: Their weight in cells, none above 1.
+        left_out_mass: Mass of what the filter leaves out, squared scene units.
     """
 
     rest: int
     rows: list[int]
     cells: list[float]
+    left_out_mass: float
 
 
 def sort_into_blocks(
@@ -52,6 +56,7 @@ def sort_into_blocks(
         sample = read_sample(job.source)
         if len(sample) == 0:
             raise InvalidSceneError(f"{job.source.path}: found no valid Gaussian.")
+        validity.warn_of_lost_digits(sample)
         frame = robust_frame(sample.means)
         scan_rows = partial(scan_range, job.source, frame, job.boxes)
         totals = add_totals(with_progress(workers(scan_rows, ranges), advance))
@@ -67,6 +72,7 @@ def sort_into_blocks(
             totals,
             boxes=job.boxes,
             target=max(1, rest),
+            cells=finer_count(max(1, rest), valid - kept, job.config.allocation),
             blocks=job.blocks,
             config=job.config,
             frame=frame,
@@ -74,22 +80,29 @@ def sort_into_blocks(
     unfiltered = replace(scan, min_opacity=0.0, max_flyaway_mass=-1.0)
     with clock.stage("sort", len(ranges)) as advance:
         job.write_scan(unfiltered if keep_all else scan)
-        rows, cells = _sort(job, workers, ranges, advance)
-        if sum(rows) < rest:  # the filter was too strict for so large a target
+        found = _sort(job, rest, workers, ranges, advance)
+        if sum(found.rows) < rest:  # the filter was too strict for so large a target
             job.write_scan(unfiltered)
-            rows, cells = _sort(job, workers, ranges, advance)
-    return SortedBlocks(rest, rows, cells)
+            found = _sort(job, rest, workers, ranges, advance)
+    return found
 
 
 def _sort(
-    job: Job, workers: Workers, ranges: Sequence[RowRange], advance: Callable[[int], None]
-) -> tuple[list[int], list[float]]:
-    """Sort all rows into blocks; return how many each has, and their weight in cells."""
+    job: Job,
+    rest: int,
+    workers: Workers,
+    ranges: Sequence[RowRange],
+    advance: Callable[[int], None],
+) -> SortedBlocks:
+    """Sort all rows into blocks."""
     rows, cells, files = [0] * job.blocks, [0.0] * job.blocks, list[SortedFile]()
+    left_out_mass = 0.0
     for part in with_progress(workers(partial(sort_range, job), ranges), advance):
         rows = [a + b for a, b in zip(rows, part.rows, strict=True)]
         for chunk in part.cells:  # one after the other: the same bits whatever the ranges
             cells = [a + b for a, b in zip(cells, chunk, strict=True)]
+        for mass in part.left_out:
+            left_out_mass += mass
         files += part.files
     job.adopt(files)
-    return rows, cells
+    return SortedBlocks(rest, rows, cells, left_out_mass)

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cvtgs.errors import FileFormatError
+from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
 from cvtgs.io.files import open_input
 from cvtgs.io.ply.header import SCALARS, Layout, header_bytes, read_header
 from cvtgs.io.ply.properties import check_size, find_vertices, layout_of
@@ -29,6 +30,8 @@ class PlyRows:
         layout: Names and PLY types, as a scene keeps them.
         comments: Comment lines of the file.
         offset: Where the first row starts, in bytes.
+        sh_degree: Scenes have no SH bands above this degree; None for all of the file.
+        axes: Where x, y and z of the file point.
     """
 
     path: str
@@ -37,6 +40,8 @@ class PlyRows:
     layout: Layout
     comments: tuple[str, ...]
     offset: int
+    sh_degree: int | None = None
+    axes: str = SCENE_AXES
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -67,19 +72,51 @@ class PlyRows:
         Returns:
             A scene as :func:`cvtgs.load` makes it.
         """
-        return assemble([rows], count=len(rows), layout=self.layout, comments=self.comments)
+        return self.assemble([rows], len(rows))
+
+    def assemble(
+        self, parts: Iterable[NDArray[Any]], count: int, *, is_slim: bool = False
+    ) -> GaussianScene:
+        """Make a scene of rows that come in parts.
+
+        Args:
+            parts: Structured arrays with at least the columns of the file.
+            count: How many rows all of them have.
+            is_slim: Whether SH bands above the constant one and extra columns are left out.
+
+        Returns:
+            A scene as :func:`cvtgs.load` makes it.
+        """
+        degree = 0 if is_slim else self.sh_degree
+        scene = assemble(
+            parts,
+            count=count,
+            layout=self.layout,
+            comments=self.comments,
+            sh_degree=degree,
+            with_extras=not is_slim,
+        )
+        return change_axes(
+            scene if degree is None else scene.with_sh_degree(degree), self.axes, SCENE_AXES
+        )
 
 
-def open_rows(path: str | os.PathLike[str]) -> PlyRows:
+def open_rows(
+    path: str | os.PathLike[str], *, sh_degree: int | None = None, axes: str | None = None
+) -> PlyRows:
     """Open a PLY file without reading its rows.
 
     Args:
         path: The file.
+        sh_degree: SH bands above this degree are left out of scenes; None for none.
+        axes: Where x, y and z of the file point; None for those of PLY files. Scenes are turned to
+            these.
 
     Returns:
         Its rows.
 
     Raises:
+        InvalidArgumentError: There are no such axes.
         InputNotFoundError: There is no such file.
         InputError: It cannot be opened.
         FileFormatError: It is no binary little endian PLY of a 3DGS scene, with vertices first.
@@ -102,22 +139,18 @@ def open_rows(path: str | os.PathLike[str]) -> PlyRows:
         layout=layout_of(vertex),
         comments=header.comments,
         offset=header.data_offset,
+        sh_degree=sh_degree,
+        axes=SCENE_AXES if axes is None else checked_axes(axes),
     )
 
 
-def join_plys(
-    paths: Sequence[str | os.PathLike[str]],
-    file: BinaryIO,
-    *,
-    before: Sequence[NDArray[Any]] = (),
-) -> int:
+def join_plys(paths: Sequence[str | os.PathLike[str]], file: BinaryIO) -> int:
     """Write the rows of PLY files behind one another; memory is one buffer.
 
     Args:
-        paths: Files that :func:`cvtgs.save` has written, with the same columns and comments; at
-            least one.
+        paths: Files that :func:`cvtgs.save` has written, with the same columns; at least one. The
+            comments are those of the first.
         file: Where to, open for writing.
-        before: Rows that come first, with these columns and perhaps others.
 
     Returns:
         Number of rows.
@@ -126,18 +159,11 @@ def join_plys(
         FileFormatError: The files differ in their columns.
     """
     parts = [open_rows(path) for path in paths]
-    first, total = parts[0], sum(part.count for part in parts) + sum(map(len, before))
+    first, total = parts[0], sum(part.count for part in parts)
     for part in parts:
         if part.names != first.names:
             raise FileFormatError(f"{part.path}: must have the columns of {first.path}.")
     file.write(header_bytes(first.comments, [("vertex", total, first.layout)]))
-    for table in before:
-        for start in range(0, len(table), 1 << 14):
-            rows = table[start : start + (1 << 14)]
-            block = np.zeros(len(rows), first.dtype)
-            for name, _ in first.names:
-                block[name] = rows[name]
-            file.write(block.tobytes())
     for part in parts:
         with Path(part.path).open("rb") as content:
             content.seek(part.offset)

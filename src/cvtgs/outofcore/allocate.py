@@ -1,0 +1,224 @@
+"""Allocation over all blocks: cells merge wherever they lie, and Gaussians move to those that fit.
+
+Blocks describe the parts of cells that they hold. One process adds these up, merges pairs of cells
+until as many groups are left as are wanted, and gives each group to the block of its heaviest cell.
+"""
+
+import json
+import warnings
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from cvtgs import cells, cvt
+from cvtgs.cells import Moments
+from cvtgs.counts import shared_out
+from cvtgs.devices import one_thread
+from cvtgs.grouping import REASSIGN
+from cvtgs.io import atomic_output
+from cvtgs.io.tensors import map_tensors, save_tensors
+from cvtgs.math.segments import segment_argmax, sort_by_label
+from cvtgs.outofcore.job import SENT_BYTES, Job
+from cvtgs.outofcore.rows import BlockRows, read_rows, send_rows
+
+KEY = 1 << 32
+"""A cell or group is known everywhere by its block times this, plus its number in the block."""
+
+
+def cell_parts(
+    job: Job, block: int, rows: BlockRows, owners: Int[Tensor, "n"], labels: Int[Tensor, "n"]
+) -> dict[str, Tensor]:
+    """Return the part of every cell that lies in a block, by name of its tensor.
+
+    Args:
+        job: The job.
+        block: The block.
+        rows: Its Gaussians.
+        owners: Block of the cell of each; -1 is this block.
+        labels: Number of the cell in its block.
+
+    Returns:
+        ``parts``: the part that each Gaussian belongs to, own cells first. ``remote``: block and
+        number of the cell of every other part. The moments of all parts.
+    """
+    count = job.cells[block]
+    away = (owners >= 0).nonzero()[:, 0]
+    pairs = torch.stack([owners[away], labels[away]], dim=1)
+    remote, numbers = torch.unique(pairs, dim=0, return_inverse=True)
+    parts = labels.clone()
+    parts[away] = count + numbers
+    moments = cells.group_moments(_members(job, rows), parts, count + len(remote))
+    return {"parts": parts.int(), "remote": remote, **moments._asdict()}
+
+
+def _members(job: Job, rows: BlockRows) -> Moments:
+    """Return the moments of Gaussians, in units that are the same in all blocks."""
+    scan, scene = job.read_scan(), rows.scene
+    return cells.gaussian_moments(
+        scene,
+        torch.arange(len(scene)),
+        scan.frame,
+        weights=scene.masses,
+        masses=rows.apparent_areas * scene.opacities,
+        unit=scan.mass / (scan.row_count + scan.kept_count),
+    )
+
+
+@one_thread()
+def allocate(job: Job) -> None:
+    """Choose which cells of all blocks become one, and write the groups of every block."""
+    if job.path("targets.json").exists() and all(
+        job.groups_path(block).exists() for block in job.blocks_with_sites()
+    ):
+        return
+    regions = _regions(job)
+    if len(regions) > 1:
+        warnings.warn(
+            f"{sum(job.cells)} cells do not fit into memory together, so costs of merging are "
+            f"compared within {len(regions)} parts of the scene; give more --memory if there is.",
+            UserWarning,
+            stacklevel=4,
+        )
+    sizes = [sum(job.cells[block] for block in region) for region in regions]
+    counts = shared_out(job.total, sizes, rooms=sizes)
+    targets = [0] * job.blocks
+    for region, count in zip(regions, counts, strict=True):
+        for block, target in zip(region, _allocate_region(job, region, count), strict=True):
+            targets[block] = target
+    with atomic_output(job.path("targets.json"), overwrite=True) as file:
+        file.write(json.dumps(targets).encode())
+
+
+def _regions(job: Job) -> list[list[int]]:
+    """Return runs of blocks whose cells fit into memory together: one if all do."""
+    regions: list[list[int]] = []
+    held = 0
+    for block in job.blocks_with_sites():
+        held += job.cells[block]
+        if not regions or held > job.cell_room:
+            regions.append([])
+            held = job.cells[block]
+        regions[-1].append(block)
+    return regions
+
+
+def _allocate_region(job: Job, region: Sequence[int], count: int) -> list[int]:
+    """Merge the cells of some blocks, write the groups, and return how many each block gets."""
+    config = job.config.allocation
+    sizes = torch.tensor([job.cells[block] for block in region])
+    fine = _add_parts(job, region)
+    labels = torch.arange(len(fine.weights))
+    if len(labels) > count:
+        near = cvt.nearest_neighbors(fine.means.T, config.neighbors)
+        labels = cells.merge_pairs(fine, near, count, config)
+    order, offsets = sort_by_label(labels, count)
+    heaviest = order[segment_argmax(fine.weights[order], offsets)]
+    owners = torch.repeat_interleave(torch.arange(len(region)), sizes)[heaviest]
+    owners, order = torch.sort(owners, stable=True)
+    ranks = torch.empty_like(order)
+    ranks[order] = torch.arange(count)
+    labels = ranks[labels]
+    groups = cells.group_moments(fine, labels, count)
+    near = torch.arange(count).expand(REASSIGN, -1).clone()  # none but itself
+    if config.reassign:
+        found = cvt.nearest_neighbors(groups.means.T, REASSIGN)
+        near[: found.shape[1]] = found.T
+    counts = torch.bincount(owners, minlength=len(region))
+    numbers = torch.arange(count) - (counts.cumsum(0) - counts)[owners]
+    keys = torch.tensor(region)[owners] * KEY + numbers
+    tables = [table.split(counts.tolist(), dim=-1) for table in (*groups, keys[near])]
+    for block, own, *table in zip(region, keys[labels].split(sizes.tolist()), *tables, strict=True):
+        named = dict(zip((*Moments._fields, "near"), table, strict=True))
+        save_tensors(job.groups_path(block), {"groups": own, **named}, {})
+    targets: list[int] = counts.tolist()
+    return targets
+
+
+def _add_parts(job: Job, region: Sequence[int]) -> Moments:
+    """Return the cells of some blocks, of which other blocks may hold parts."""
+    starts, total = torch.full((job.blocks,), -1), 0
+    for block in region:
+        starts[block] = total
+        total += job.cells[block]
+    found, labels = list[Moments](), list[Tensor]()
+    for block in job.blocks_with_rows():
+        tensors, _ = map_tensors(job.parts_path(block))
+        owners, numbers = _cells_of_parts(job, block, tensors["remote"])
+        rows = (starts[owners] >= 0).nonzero()[:, 0]
+        found.append(Moments(*(tensors[name] for name in Moments._fields)).take(rows))
+        labels.append(starts[owners[rows]] + numbers[rows])
+    joined = Moments(*(torch.cat(columns, dim=-1) for columns in zip(*found, strict=True)))
+    return cells.group_moments(joined, torch.cat(labels), total)
+
+
+def _cells_of_parts(job: Job, block: int, remote: Int[Tensor, "r 2"]) -> tuple[Tensor, Tensor]:
+    """Return block and number of the cell of every part that a block holds."""
+    count = job.cells[block]
+    owners = torch.cat([torch.full((count,), block), remote[:, 0]])
+    return owners, torch.cat([torch.arange(count), remote[:, 1]])
+
+
+@one_thread()
+def join(job: Job, block: int) -> None:
+    """Write the group of every Gaussian of a block, and the rows that belong to remote groups.
+
+    Of those in the block of a group, the one that fits it best stays, so no group is empty.
+    """
+    if job.labels_path(block).exists():
+        return
+    tensors, _ = map_tensors(job.parts_path(block))
+    owners, numbers = _cells_of_parts(job, block, tensors["remote"])
+    (groups,) = _take(job, owners * KEY + numbers, "groups")
+    found = groups[tensors["parts"].long()]
+    if job.config.allocation.reassign:
+        rows = read_rows(job, block, is_slim=True)
+        found = _reassigned(job, block, _members(job, rows), found)
+        del rows
+    owners, labels = found // KEY, found % KEY
+    owners = torch.where(owners == block, -1, owners)
+    sent = send_rows(job, block, owners, labels)
+    labels = torch.where(owners < 0, labels, -1).int()
+    facts = {SENT_BYTES: str(job.sent_path(block).stat().st_size)}
+    save_tensors(job.labels_path(block), {"labels": labels, "sent": sent}, facts)
+
+
+def _reassigned(
+    job: Job, block: int, members: Moments, found: Int[Tensor, "n"]
+) -> Int[Tensor, "n"]:
+    """Move every Gaussian once to the group that explains it best, in any block."""
+    used = torch.unique(found)
+    (near,) = _take(job, used, "near")
+    keys = torch.unique(torch.cat([used, near.flatten()]))
+    groups = Moments(*_take(job, keys, *Moments._fields))
+    neighbors = torch.arange(len(keys))[:, None].repeat(1, len(near))
+    neighbors[torch.searchsorted(keys, used)] = torch.searchsorted(keys, near.T.contiguous())
+    labels = torch.searchsorted(keys, found)
+    labels = cells.reassign(
+        members,
+        labels,
+        groups,
+        neighbors,
+        job.config.allocation,
+        must_stay=keys // KEY == block,
+    )
+    moved: Tensor = keys[labels]
+    return moved
+
+
+def _take(job: Job, keys: Int[Tensor, "k"], *names: str) -> list[Tensor]:
+    """Read columns of tables in the files of groups, in whatever blocks they are."""
+    ascending, inverse = torch.unique(keys, return_inverse=True)
+    parts: list[list[Tensor]] = [[] for _ in names]
+    for block, rows in _by_block(ascending):
+        tensors, _ = map_tensors(job.groups_path(block))
+        for name, values in zip(names, parts, strict=True):
+            values.append(tensors[name].index_select(-1, rows))
+    return [torch.cat(values, dim=-1).index_select(-1, inverse) for values in parts]
+
+
+def _by_block(keys: Int[Tensor, "k"]) -> list[tuple[int, Tensor]]:
+    """Return the blocks of ascending keys, and the numbers in each."""
+    blocks, counts = torch.unique_consecutive(keys // KEY, return_counts=True)
+    return list(zip(blocks.tolist(), (keys % KEY).split(counts.tolist()), strict=True))

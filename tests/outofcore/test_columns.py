@@ -1,0 +1,90 @@
+"""Blocks read and write what one piece does: SH degrees, axes, and what the report says of rows."""
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs import Simplifier
+from cvtgs.boxes import Box
+from cvtgs.cli.main import main
+from cvtgs.outofcore import simplify_file
+from scenes import random_scene, same_bits
+
+BOX = Box(min=(-1e9, -1e9, 0.6), max=(1e9, 1e9, 1e9))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return random_scene(700, degree=2, seed=3)
+
+
+def in_blocks(folder, scene, name="out.ply", *, axes=None, **options):
+    """Return what three blocks make of a scene, and the report."""
+    cvtgs.save(scene, folder / "in.ply", axes=axes, overwrite=True)
+    report = simplify_file(folder / "in.ply", folder / name, 0.3, blocks=3, **options)
+    return folder / name, report
+
+
+def test_dropped_bands_are_those_of_a_scene_without_them(scene, tmp_path):
+    wanted, _ = in_blocks(tmp_path, scene.with_sh_degree(1), "wanted.ply", boxes=[BOX])
+    found, report = in_blocks(tmp_path, scene, "found.ply", boxes=[BOX], sh_degree=1)
+    assert 10 < report.kept_count < 200
+    assert found.read_bytes() == wanted.read_bytes()
+    assert cvtgs.load(found).sh_degree == 1
+
+
+def test_axes_turn_the_scene_and_its_boxes(scene, tmp_path):
+    wanted, _ = in_blocks(tmp_path, scene, "wanted.ply", boxes=[BOX])
+    found, report = in_blocks(
+        tmp_path, scene, "rub.ply", axes="rub", boxes=[BOX], source_axes="rub", output_axes="ruf"
+    )
+    assert report.kept_count > 10
+    assert not same_bits(cvtgs.load(found), cvtgs.load(wanted))
+    assert same_bits(cvtgs.load(found, axes="ruf"), cvtgs.load(wanted))
+    plain = scene.with_sh_degree(0)
+    wanted, _ = in_blocks(tmp_path, plain, "plain.ply", boxes=[BOX])
+    packed, _ = in_blocks(tmp_path, plain, "out.spz", boxes=[BOX], output_axes="lub")
+    turned = cvtgs.load(packed)  # which states its axes
+    torch.testing.assert_close(turned.means, cvtgs.load(wanted).means, atol=1e-3, rtol=0.0)
+
+
+def test_the_command_passes_axes_and_degree_to_blocks(scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("cvtgs.outofcore.memory.BASE_BYTES", 10)
+    monkeypatch.setattr("cvtgs.outofcore.memory.LEAST_BYTES", 20)
+    source = tmp_path / "source.ply"
+    cvtgs.save(scene, source, axes="rub")
+    words = ["--memory", "150kB", "--workers", "1", "--axes", "rub:rub", "--sh-degree", "0"]
+    assert main(["simplify", str(source), str(tmp_path / "o.ply"), "--rho", "0.3", *words]) == 0
+    assert "blocks" in capsys.readouterr().out
+    small = cvtgs.load(tmp_path / "o.ply", axes="rub")
+    assert (len(small), small.sh_degree) == (210, 0)
+    lows = small.means.amin(dim=0) - scene.means.amin(dim=0)
+    highs = scene.means.amax(dim=0) - small.means.amax(dim=0)
+    assert float(torch.minimum(lows, highs).amin()) > -0.1
+
+
+def test_the_report_is_that_of_one_piece(tmp_path):
+    scene = random_scene(900, degree=0, seed=1)
+    means, quats, logits = scene.means.clone(), scene.quats.clone(), scene.logit_opacities.clone()
+    means[[7, 300]], quats[[7, 20]] = torch.nan, 0.0
+    logits[400:500] = -9.0
+    broken = scene.with_tensors({"means": means, "quats": quats, "logit_opacities": logits}, {})
+    simplifier = Simplifier("paper", device="cpu")
+    with pytest.warns(UserWarning, match=r"dropped 3 of 900 .*\(means 2, quats 2\)"):
+        _, report = in_blocks(tmp_path, broken, simplifier=simplifier, range_rows=250)
+    with pytest.warns(UserWarning, match=r"dropped 3 of 900 .*\(means 2, quats 2\)"):
+        whole = simplifier.run(broken, 0.3).report
+    assert report.invalid_rows == whole.invalid_rows == {"means": 2, "quats": 2}
+    assert report.filtered_count == whole.filtered_count > 90
+    assert report.filtered_mass_share == pytest.approx(whole.filtered_mass_share)
+    assert len(report.energies) == len(whole.energies)
+    assert report.energies == pytest.approx(whole.energies, rel=0.2)
+    assert sorted(report.energies, reverse=True) == list(report.energies)
+    assert report.energy == pytest.approx(whole.energy, rel=0.2)
+
+
+def test_scenes_far_from_the_origin_are_warned_of(tmp_path):
+    scene = random_scene(300, degree=0)
+    far = scene.with_tensors({"means": scene.means + 3e6}, {})
+    with pytest.warns(UserWarning, match="float32 keeps steps of 0.25"):
+        in_blocks(tmp_path, far)
