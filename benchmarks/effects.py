@@ -19,7 +19,7 @@ import cvtgs
 from benchmarks.measuring import fastest, machine, renew_tables, run_python
 from benchmarks.quality import score_views
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
-from cvtgs.analysis import BAND_LOSS, band_losses, duplicate_share, far_share, plan_haze
+from cvtgs.analysis import BAND_LOSS, band_losses, duplicate_share, far_share, haze_share
 from cvtgs.math.frames import robust_frame
 from cvtgs.scene import ANTIALIASED_TAG, FLAT_LOG_SCALE
 from cvtgs.synthetic import scene as make
@@ -195,7 +195,7 @@ def figure_table(count: int) -> str:
     parts: Mapping[str, Callable[[], object]] = {
         "sh": lambda: band_losses(scene, enough=BAND_LOSS),
         "unbounded": lambda: far_share(frame.distances(scene.means), masses),
-        "haze": lambda: plan_haze(opacities, masses, config=SimplifyConfig()),
+        "haze": lambda: haze_share(opacities, masses, SimplifyConfig()),
         "duplicates": lambda: duplicate_share(scene.means, scene.sh0),
     }
     simplifier = Simplifier(device="cpu")

@@ -85,6 +85,7 @@ STAGES = {
         "duplicate_share",
         "empty_depth_grid",
         "far_share",
+        "haze_share",
         "measure_visibility",
         "perspective_falloff",
         "plan_effects",
@@ -123,7 +124,6 @@ STAGES = {
         "stratified_seeds",
         "tessellate",
         "tessellation_weights",
-        "weighted_centroids",
         "weighted_seeds",
     },
     "cells": {

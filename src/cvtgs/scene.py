@@ -23,14 +23,7 @@ FLAT_LOG_SCALE = -20.0
 
 _CHUNK = 1 << 16
 
-_SHAPES: dict[str, tuple[int | None, ...]] = {
-    "means": (3,),
-    "quats": (4,),
-    "log_scales": (3,),
-    "logit_opacities": (),
-    "sh0": (1, 3),
-    "shN": (None, 3),
-}
+_TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,7 +70,40 @@ class GaussianScene:
     layout: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
-        _check(self)
+        """Refuse shapes, dtypes and devices that do not fit together."""
+        for name, tensor in self.tensors().items():
+            if not isinstance(tensor, Tensor):
+                raise InvalidSceneError(
+                    f"{name} must be a torch.Tensor, found {type(tensor).__name__}; "
+                    f"use cvtgs.from_dict for numpy arrays."
+                )
+        n, dtype, device = len(self.means), self.means.dtype, self.means.device
+        if dtype not in (torch.float32, torch.float64):
+            raise InvalidSceneError(f"means must be float32 or float64, found {dtype}.")
+        bands = self.shN.shape[1] if self.shN.ndim == 3 else 0
+        shapes = (n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, bands, 3)
+        for (name, tensor), shape in zip(self.tensors().items(), shapes, strict=True):
+            if tuple(tensor.shape) != shape:
+                sizes = (n, "k", 3) if name == "shN" else shape
+                raise InvalidSceneError(
+                    f"{name} must have shape ({', '.join(map(str, sizes))}), "
+                    f"found {tuple(tensor.shape)}."
+                )
+            if tensor.dtype != dtype or tensor.device != device:
+                raise InvalidSceneError(
+                    f"{name} must be {dtype} on {device} like means, "
+                    f"found {tensor.dtype} on {tensor.device}."
+                )
+        if bands not in spherical_harmonics.REST_COUNTS:
+            raise InvalidSceneError(
+                f"shN must hold 0, 3, 8 or 15 coefficients per channel, found {bands}."
+            )
+        for name, column in self.extras.items():
+            if column.shape != (n,) or column.device != device:
+                raise InvalidSceneError(
+                    f"extra column {name!r} must have shape ({n},) on {device}, "
+                    f"found {tuple(column.shape)} on {column.device}."
+                )
         object.__setattr__(self, "extras", MappingProxyType(dict(self.extras)))
 
     def __len__(self) -> int:
@@ -97,16 +123,16 @@ class GaussianScene:
     @property
     def areas(self) -> Float[Tensor, "n"]:
         """Mean projected areas of the one-sigma ellipsoids, squared scene units, float64."""
-        parts = [
-            parameters.mean_projected_area(torch.exp(part.double()))
-            for part in self.log_scales.split(_CHUNK)
-        ]
-        return torch.cat([self.log_scales.new_empty(0, dtype=torch.float64), *parts])
+        areas = self.log_scales.new_empty(len(self.means), dtype=torch.float64)
+        for start in range(0, len(areas), _CHUNK):
+            part = self.log_scales[start : start + _CHUNK].double()
+            areas[start : start + _CHUNK] = parameters.mean_projected_area(torch.exp(part))
+        return areas
 
     @property
     def masses(self) -> Float[Tensor, "n"]:
         """Opacity times mean projected area, squared scene units, float64."""
-        return self.areas.mul_(self.opacities)
+        return self.areas.mul_(parameters.opacity_from_logit(self.logit_opacities))
 
     @property
     def sh(self) -> Float[Tensor, "n k_plus_1 3"]:
@@ -116,12 +142,12 @@ class GaussianScene:
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
-        return spherical_harmonics.degree_of(self.shN.shape[1])
+        return spherical_harmonics.REST_COUNTS.index(self.shN.shape[1])
 
     @property
     def antialiased(self) -> bool:
         """Whether the scene was trained with anti-aliasing and must be shown so."""
-        return any(ANTIALIASED_TAG.lower() in comment.lower() for comment in self.comments)
+        return ANTIALIASED_TAG.lower() in "\n".join(self.comments).lower()
 
     @property
     def has_two_scales(self) -> bool:
@@ -144,7 +170,14 @@ class GaussianScene:
         Returns:
             A new dictionary: means, quats, log_scales, logit_opacities, sh0, shN.
         """
-        return {name: getattr(self, name) for name in _SHAPES}
+        return {
+            "means": self.means,
+            "quats": self.quats,
+            "log_scales": self.log_scales,
+            "logit_opacities": self.logit_opacities,
+            "sh0": self.sh0,
+            "shN": self.shN,
+        }
 
     def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> Self:
         """Take some Gaussians, with all that belongs to them.
@@ -157,9 +190,15 @@ class GaussianScene:
         """
         if rows.dtype == torch.bool:
             rows = rows.nonzero()[:, 0]
-        return self.with_tensors(
-            {name: tensor.index_select(0, rows) for name, tensor in self.tensors().items()},
-            {name: column.index_select(0, rows) for name, column in self.extras.items()},
+        return replace(
+            self,
+            means=self.means.index_select(0, rows),
+            quats=self.quats.index_select(0, rows),
+            log_scales=self.log_scales.index_select(0, rows),
+            logit_opacities=self.logit_opacities.index_select(0, rows),
+            sh0=self.sh0.index_select(0, rows),
+            shN=self.shN.index_select(0, rows),
+            extras={name: column.index_select(0, rows) for name, column in self.extras.items()},
         )
 
     def __getitem__(self, rows: slice | Sequence[int] | Tensor) -> Self:
@@ -255,10 +294,10 @@ class GaussianScene:
             InvalidSceneError: There is no such tensor, or they do not fit together.
         """
         given = {**(tensors or {}), **named}
-        unknown = sorted(given.keys() - _SHAPES.keys())
+        unknown = sorted(given.keys() - set(_TENSORS))
         if unknown:
             raise InvalidSceneError(
-                f"tensors of a scene are {', '.join(_SHAPES)}, found {unknown[0]}; give other "
+                f"tensors of a scene are {', '.join(_TENSORS)}, found {unknown[0]}; give other "
                 f"columns as extras."
             )
         changes: dict[str, Any] = {**given, "extras": self.extras if extras is None else extras}
@@ -351,40 +390,3 @@ def concatenate(scenes: Sequence[GaussianScene]) -> GaussianScene:
         {name: torch.cat([each[name] for each in tensors]) for name in tensors[0]},
         {name: torch.cat([scene.extras[name] for scene in scenes]) for name in first.extras},
     )
-
-
-def _check(scene: GaussianScene) -> None:
-    for name, tensor in scene.tensors().items():
-        if not isinstance(tensor, Tensor):
-            raise InvalidSceneError(
-                f"{name} must be a torch.Tensor, found {type(tensor).__name__}; "
-                f"use cvtgs.from_dict for numpy arrays."
-            )
-    n, dtype, device = len(scene.means), scene.means.dtype, scene.means.device
-    if dtype not in (torch.float32, torch.float64):
-        raise InvalidSceneError(f"means must be float32 or float64, found {dtype}.")
-    for name, tensor in scene.tensors().items():
-        wanted = (n, *_SHAPES[name])
-        fits = tensor.ndim == len(wanted) and all(
-            want is None or have == want for have, want in zip(tensor.shape, wanted, strict=True)
-        )
-        if not fits:
-            shape = ", ".join("k" if want is None else str(want) for want in wanted)
-            raise InvalidSceneError(
-                f"{name} must have shape ({shape}), found {tuple(tensor.shape)}."
-            )
-        if tensor.dtype != dtype or tensor.device != device:
-            raise InvalidSceneError(
-                f"{name} must be {dtype} on {device} like means, "
-                f"found {tensor.dtype} on {tensor.device}."
-            )
-    if scene.shN.shape[1] not in spherical_harmonics.REST_COUNTS:
-        raise InvalidSceneError(
-            f"shN must hold 0, 3, 8 or 15 coefficients per channel, found {scene.shN.shape[1]}."
-        )
-    for name, column in scene.extras.items():
-        if column.shape != (n,) or column.device != device:
-            raise InvalidSceneError(
-                f"extra column {name!r} must have shape ({n},) on {device}, "
-                f"found {tuple(column.shape)} on {column.device}."
-            )

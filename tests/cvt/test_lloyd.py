@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from cvtgs.cvt import lloyd, nearest_scipy, weighted_centroids, weighted_seeds
+from cvtgs.cvt import centroids, lloyd, nearest_scipy, weighted_seeds, weighted_sums
 from cvtgs.cvt.tessellate import stratified_seeds
 from cvtgs.math.frames import morton_order
 
@@ -26,10 +26,8 @@ def start(points: torch.Tensor, weights: torch.Tensor, count: int, seeding: str)
 def test_centroid_of_weighted_points():
     points = torch.tensor([[0.0, 0.0], [4.0, 8.0], [1.0, 1.0]])
     fallback = torch.tensor([[9.0, 9.0], [5.0, 6.0], [7.0, 7.0]])
-    centroids = weighted_centroids(
-        points, torch.tensor([3.0, 1.0, 0.0]), torch.tensor([2, 2, 0]), fallback
-    )
-    assert centroids.tolist() == [[9.0, 9.0], [5.0, 6.0], [1.0, 2.0]]
+    totals, sums = weighted_sums(points, torch.tensor([3.0, 1.0, 0.0]), torch.tensor([2, 2, 0]), 3)
+    assert centroids(totals, sums, fallback).tolist() == [[9.0, 9.0], [5.0, 6.0], [1.0, 2.0]]
 
 
 def test_energies_of_three_points_on_a_line():

@@ -1,9 +1,12 @@
 """What a scene is like: frame, areas, visibility, and the effects that it calls for."""
 
-from cvtgs.analysis.analyze import SceneAnalysis, analyze, apparent_areas, measure_visibility
-from cvtgs.analysis.columns import (
+from cvtgs.analysis.analyze import (
+    SceneAnalysis,
+    analyze,
+    apparent_areas,
     drop_mip_tag,
     drop_unused_bands,
+    measure_visibility,
     restore_columns,
     select_columns,
 )
@@ -20,6 +23,7 @@ from cvtgs.analysis.effects import (
     band_losses,
     duplicate_share,
     far_share,
+    haze_share,
     plan_effects,
     plan_haze,
 )
@@ -53,6 +57,7 @@ __all__ = [
     "duplicate_share",
     "empty_depth_grid",
     "far_share",
+    "haze_share",
     "measure_visibility",
     "perspective_falloff",
     "plan_effects",

@@ -1,6 +1,7 @@
 """EffectPlan: which effects a scene calls for, and the figures that decide."""
 
 import math
+from itertools import pairwise
 
 import pydantic
 import torch
@@ -139,19 +140,20 @@ def plan_effects(
     choices = config.effects
     apparent = masses if apparent_masses is None else apparent_masses
     shares = [
-        _far_share(distances, masses),
-        _haze_share(scene.opacities, apparent, config),
-        _duplicate_share(scene.means, scene.sh0),
+        far_share(distances, masses),
+        haze_share(scene.opacities, apparent, config),
+        duplicate_share(scene.means, scene.sh0),
     ]
     far, hazy, duplicates = torch.stack(shares).tolist()  # a device is asked only once
+    antialiased, two_scales = scene.antialiased, scene.has_two_scales
     above = (far - UNBOUNDED_SHARE) / (FULLY_UNBOUNDED_SHARE - UNBOUNDED_SHARE)
     beyond = f"share of mass beyond {UNBOUNDED_DISTANCE:g} robust radii"
     unbounded = _by_share(far, choices.unbounded, UNBOUNDED_SHARE, beyond)
     return EffectPlan(
         sh=_plan_bands(scene, choices.sh),
         mip=Effect(
-            active=scene.antialiased and choices.mip != "off",
-            figure=float(scene.antialiased),
+            active=antialiased and choices.mip != "off",
+            figure=float(antialiased),
             meaning="1 if the comment SplatRenderMode: mip is there, on at 1",
             forced=choices.mip != "auto",
         ),
@@ -159,10 +161,10 @@ def plan_effects(
             **unbounded.model_dump(),
             strength=min(1.0, max(0.0, above)) if unbounded.active else 0.0,
         ),
-        haze=_plan_haze(hazy, config),
+        haze=plan_haze(hazy, config),
         flat=Effect(
-            active=scene.has_two_scales and choices.flat != "off",
-            figure=float(scene.has_two_scales),
+            active=two_scales and choices.flat != "off",
+            figure=float(two_scales),
             meaning="1 if the file has two scales per Gaussian, on at 1",
             forced=choices.flat != "auto",
         ),
@@ -187,33 +189,16 @@ def plan_effects(
     )
 
 
-def plan_haze(
-    opacities: Float[Tensor, "n"],
-    apparent_masses: Float[Tensor, "n"],
-    *,
-    config: SimplifyConfig,
-) -> Effect:
-    """Decide whether faint Gaussians are the haze of a scene.
-
-    Args:
-        opacities: Opacities.
-        apparent_masses: Masses as they count in images.
-        config: The thresholds of the filter, and what overrides the decision.
-
-    Returns:
-        The effect.
-    """
-    return _plan_haze(float(_haze_share(opacities, apparent_masses, config)), config)
-
-
-def _haze_share(
+def haze_share(
     opacities: Float[Tensor, "n"], apparent_masses: Float[Tensor, "n"], config: SimplifyConfig
 ) -> Float[Tensor, ""]:
+    """Return the share of apparent mass that faint Gaussians hold."""
     masses = apparent_masses.double()
     return divide((masses * (opacities < config.filter.min_opacity)).sum(), masses.sum())
 
 
-def _plan_haze(share: float, config: SimplifyConfig) -> Effect:
+def plan_haze(share: float, config: SimplifyConfig) -> Effect:
+    """Decide by the share of apparent mass whether faint Gaussians are the haze of a scene."""
     choice, most = config.effects.haze, config.filter.max_mass_share
     below = config.filter.min_opacity
     return Effect(
@@ -276,14 +261,22 @@ def band_losses(scene: GaussianScene, *, enough: float) -> tuple[float, ...]:
         >>> band_losses(scene, enough=1e-4)[0] > 1e-4, band_losses(dull, enough=1e-4)
         (True, (0.0,))
     """
-    if scene.sh_degree == 0:
+    losses = [0.0] * scene.sh_degree
+    if not losses:
         return ()
-    step = len(scene) // SAMPLE
+    step = max(1, len(scene.means) // SAMPLE)
+    colors = SH_C0 * scene.sh0[::step, 0].double()
+    shares = opacity_from_logit(scene.logit_opacities[::step]).double()
+    shares = (shares / shares.sum())[:, None]
+    mean = (shares * colors).sum(dim=0)
+    contrast = (shares * (colors - mean).square()).sum(dim=0).mean().sqrt()
     spread = [scene.shN[::step]] if step > 1 else []
-    contrast, losses = _contrast(scene), [0.0] * scene.sh_degree
-    for part in (*spread, *scene.shN.split(chunk_length(CHUNK, scene.device))):
-        largest = [_largest_square(part, degree) for degree in range(1, len(losses) + 1)]
-        deviation, *squares = torch.stack([contrast, *largest]).tolist()
+    for part in (*spread, *scene.shN.split(chunk_length(CHUNK, scene.means.device))):
+        figures = [contrast]
+        for low, high in pairwise(REST_COUNTS[: len(losses) + 1]):
+            sums = part[:, low:high].square().sum(dim=(1, 2))  # of whole rows, which is fast
+            figures.append(torch.nn.functional.pad(sums, (0, 1)).amax().double())
+        deviation, *squares = torch.stack(figures).tolist()
         unit = min(1.0, max(deviation, LEAST_CONTRAST))
         for band, square in enumerate(squares):
             change = math.sqrt((2 * band + 3) / (4 * math.pi) * square)
@@ -293,7 +286,7 @@ def band_losses(scene: GaussianScene, *, enough: float) -> tuple[float, ...]:
     return tuple(losses)
 
 
-def far_share(distances: Float[Tensor, "n"], masses: Float[Tensor, "n"]) -> float:
+def far_share(distances: Float[Tensor, "n"], masses: Float[Tensor, "n"]) -> Float[Tensor, ""]:
     """Return the share of mass that lies far away.
 
     Args:
@@ -304,17 +297,13 @@ def far_share(distances: Float[Tensor, "n"], masses: Float[Tensor, "n"]) -> floa
         A number in [0, 1].
 
     Example:
-        >>> far_share(torch.tensor([0.0, 9.0]), torch.tensor([1.0, 3.0]))
+        >>> float(far_share(torch.tensor([0.0, 9.0]), torch.tensor([1.0, 3.0])))
         0.75
     """
-    return float(_far_share(distances, masses))
-
-
-def _far_share(distances: Float[Tensor, "n"], masses: Float[Tensor, "n"]) -> Float[Tensor, ""]:
     return divide((masses * (distances > UNBOUNDED_DISTANCE)).sum(), masses.sum()).double()
 
 
-def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) -> float:
+def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) -> Float[Tensor, ""]:
     """Return the share of Gaussians that lie exactly where another of the same colour does.
 
     Large scenes are estimated from a sample by a hash of the position, which duplicates share.
@@ -327,13 +316,9 @@ def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) ->
         A number in [0, 1).
 
     Example:
-        >>> duplicate_share(torch.zeros(4, 3), torch.zeros(4, 1, 3))
+        >>> float(duplicate_share(torch.zeros(4, 3), torch.zeros(4, 1, 3)))
         0.75
     """
-    return float(_duplicate_share(means, sh0))
-
-
-def _duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) -> Float[Tensor, ""]:
     bits = max(0, math.floor(math.log2(max(1, len(means)) / HASHED)))
     rows, hashes = [], []
     chunk = chunk_length(CHUNK << 2, means.device)
@@ -347,23 +332,6 @@ def _duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) -
     place, color = means[sample], sh0[sample, 0]
     same = (place[1:] == place[:-1]).all(dim=1) & (color[1:] == color[:-1]).all(dim=1)
     return same.sum().double() / max(1, len(sample))
-
-
-def _largest_square(rest: Float[Tensor, "n k 3"], degree: int) -> Float[Tensor, ""]:
-    """Return the largest sum of squares of a band; sums over whole rows are fast."""
-    band = rest[:, REST_COUNTS[degree - 1] : REST_COUNTS[degree]]
-    squares = torch.nn.functional.pad(band.square().sum(dim=(1, 2)), (0, 1))
-    return squares.amax().double()
-
-
-def _contrast(scene: GaussianScene) -> Float[Tensor, ""]:
-    """Return the standard deviation of the constant colours of some Gaussians."""
-    rows = slice(None, None, max(1, len(scene) // SAMPLE))
-    colors = SH_C0 * scene.sh0[rows, 0].double()
-    shares = opacity_from_logit(scene.logit_opacities[rows]).double()
-    shares = (shares / shares.sum())[:, None]
-    mean = (shares * colors).sum(dim=0)
-    return (shares * (colors - mean).square()).sum(dim=0).mean().sqrt()
 
 
 def _hash(means: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:

@@ -50,10 +50,7 @@ def ambient_visibility(
     """
     depths = empty_depth_grid(means.device)
     voxels = add_depths(depths, means, masses, frame)
-    visibility = visibility_grid(depths)
-    del depths
-    parts = voxels.split(chunk_length(CHUNK, means.device))
-    return torch.cat([visibility[part.long()] for part in parts]).double()
+    return visibility_grid(depths).index_select(0, voxels).double()
 
 
 def empty_depth_grid(device: torch.device) -> Int[Tensor, "voxels"]:
@@ -124,7 +121,15 @@ def visibility_grid(sums: Int[Tensor, "voxels"]) -> Float[Tensor, "voxels"]:
     """
     size = 2 * HALF_GRID
     grid = (sums[:-1].to(torch.float32) / FIXED_POINT).reshape(size, size, size)
-    return torch.nn.functional.pad(_visible_through(grid).flatten(), (0, 1), value=1.0)
+    visible = torch.zeros_like(grid)
+    for axis in range(3):  # the transmittance of the next voxels, averaged over six directions
+        across = 1 if axis == 0 else 0  # slabs of another axis, to bound memory
+        slabs = zip(grid.split(SLAB, across), visible.split(SLAB, across), strict=True)
+        for slab, target in slabs:
+            through = torch.exp(-_windows(slab, axis))
+            target.add_(through.narrow(axis, 0, size))
+            target.add_(through.narrow(axis, REACH + 1, size))
+    return torch.nn.functional.pad(visible.div_(6).flatten(), (0, 1), value=1.0)
 
 
 def visibility_at(
@@ -155,26 +160,13 @@ def _voxels_of(
     means: Float[Tensor, "n 3"], frame: RobustFrame
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
     """Return the voxel of each position, and how much smaller things are there when contracted."""
-    size = 2 * HALF_GRID
-    voxels = (frame.contract(means) / VOXEL).floor().to(torch.int64) + HALF_GRID
+    size, local = 2 * HALF_GRID, frame.normalize(means)
+    distance = torch.linalg.vector_norm(local, dim=1).clamp_min(1.0)
+    shrinkage = (1.0 + torch.log(distance)) / distance
+    voxels = (local * shrinkage[:, None] / VOXEL).floor().to(torch.int64) + HALF_GRID
     inside = ((voxels >= 0) & (voxels < size)).all(dim=1)
     i, j, k = voxels.unbind(1)
-    distance = frame.distances(means).clamp_min(1.0)
-    shrinkage = (1.0 + torch.log(distance)) / distance
     return torch.where(inside, (i * size + j) * size + k, size**3), shrinkage
-
-
-def _visible_through(grid: Float[Tensor, "g g g"]) -> Float[Tensor, "g g g"]:
-    """Average the transmittance of the next voxels in the six directions."""
-    visible = torch.zeros_like(grid)
-    for axis in range(3):
-        across = 1 if axis == 0 else 0  # slabs of another axis, to bound memory
-        slabs = zip(grid.split(SLAB, across), visible.split(SLAB, across), strict=True)
-        for slab, target in slabs:
-            through = torch.exp(-_windows(slab, axis))
-            target.add_(through.narrow(axis, 0, len(grid)))
-            target.add_(through.narrow(axis, REACH + 1, len(grid)))
-    return visible.div_(6)
 
 
 def _windows(slab: Float[Tensor, "a b c"], axis: int) -> Float[Tensor, "d e f"]:

@@ -50,7 +50,13 @@ class Moments(NamedTuple):
 
     def take(self, rows: Int[Tensor, "k"]) -> "Moments":
         """Return some of them."""
-        return Moments(*(column.index_select(-1, rows) for column in self))
+        return Moments(
+            self.weights.index_select(0, rows),
+            self.masses.index_select(0, rows),
+            self.means.index_select(1, rows),
+            self.covariances.index_select(1, rows),
+            self.colors.index_select(1, rows),
+        )
 
     def on_host(self) -> "Moments":
         """Return them on the CPU; they go there in one piece."""

@@ -121,6 +121,8 @@ class NeighborContext(NamedTuple):
 
     def cut(self, run: slice) -> Self:
         """Keep some consecutive cells."""
+        if run.start == 0 and run.stop >= len(self.cover):
+            return self
         merged = ActivatedGaussians(*(values[run] for values in self.merged))
         return type(self)(merged, *(values[run] for values in self[1:]))
 
@@ -208,10 +210,13 @@ def neighbor_context(
     back = _local_positions(other.rotations, other.log_scales, relative.shifts)
     crowding = sizes[others].to(positions.dtype) / sizes[cells][ids].to(positions.dtype)
     sides = difference.T.contiguous().index_select(1, ids).T
+    uncovered = 0.5 * sides * (positions / (1 + positions.abs()))
     pairs = _columns(
-        *_distances(positions),
+        torch.log1p(positions.abs().clamp_max(LARGEST_DISTANCE)),
+        _distance(positions),
         0.3 * relative.extents,
-        *_uncovered(positions / (1 + positions.abs()), sides),
+        uncovered,
+        uncovered.sum(dim=1),
         _distance(back),
         other.opacities,
         0.2 * relative.log_areas,
@@ -246,10 +251,13 @@ def describe_members(
     sides = sides.index_select(1, ids)
     counts, contrasts, mean_visible = torch.stack(totals[:3]).index_select(1, ids)
     positions = relative.positions
+    uncovered = 0.5 * sides[:3].T * positions.clamp(-4, 4)
     features = _columns(
-        *_distances(positions),
+        torch.log1p(positions.abs().clamp_max(LARGEST_DISTANCE)),
+        _distance(positions),
         0.3 * relative.extents,
-        *_uncovered(positions.clamp(-4, 4), sides[:3].T),
+        uncovered,
+        uncovered.sum(dim=1),
         0.3 * parameters.positive_log(weights * counts).clamp(-14, 14),
         members.opacities,
         0.2 * relative.log_areas,
@@ -377,22 +385,15 @@ def _sum(values: Tensor, offsets: Tensor) -> Tensor:
 
 def _columns(*features: Tensor) -> Tensor:
     """Join features, each a column or several, in memory column by column."""
-    return torch.cat([part.T if part.ndim == 2 else part[None] for part in features]).T
-
-
-def _distances(positions: Tensor) -> tuple[Tensor, Tensor]:
-    """Return distances along every axis and as a whole, compressed."""
-    return torch.log1p(positions.abs().clamp_max(LARGEST_DISTANCE)), _distance(positions)
+    rows = list(features)
+    for number, part in enumerate(features):
+        rows[number] = part.T if part.ndim == 2 else part[None]
+    return torch.cat(rows).T
 
 
 def _distance(positions: Tensor) -> Tensor:
+    """Return compressed distances."""
     return torch.log1p(positions.square().sum(dim=1).sqrt().clamp_max(LARGEST_DISTANCE))
-
-
-def _uncovered(positions: Tensor, cover_difference: Tensor) -> tuple[Tensor, Tensor]:
-    """Return how far positions lie on the side of less cover, by axis and as a whole."""
-    by_axis = 0.5 * cover_difference * positions
-    return by_axis, by_axis.sum(dim=1)
 
 
 def _density(positions: Tensor) -> Tensor:

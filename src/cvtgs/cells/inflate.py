@@ -53,9 +53,10 @@ def align_axes(
         >>> align_axes(scene, cells, torch.tensor([[1], [0]])) is scene
         True
     """
-    log_scales = merged.log_scales[: len(partition)]
+    counts = partition.counts
+    log_scales = merged.log_scales[: len(counts)]
     is_open = (2 * log_scales.diff(dim=1).abs() < EQUAL_SHARE).any(dim=1)
-    rows = (is_open & (partition.counts > 1)).nonzero()[:, 0]
+    rows = (is_open & (counts > 1)).nonzero()[:, 0]
     if len(rows) == 0 or neighbors.shape[1] == 0:
         return merged
     logs = log_scales[rows].double()
@@ -138,7 +139,8 @@ def inflate_cells(
     counts = partition.counts
     log_scales = merged.log_scales.clone()
     crowding = (counts.double().log10() / 2).clamp_max(1.0)
-    strength = merged.opacities[: len(counts)].double().square() * crowding
+    opacities = parameters.opacity_from_logit(merged.logit_opacities)[: len(counts)]
+    strength = opacities.double().square() * crowding
     chunk = chunk_length(CHUNK, counts.device)
     for part in (counts > 1).nonzero()[:, 0].split(chunk):
         cover = side_cover(merged, part, neighbors[part]).amin(dim=2)
@@ -197,7 +199,6 @@ def project_on_axes(
 
 def _frames(scene: GaussianScene, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return centres, axes (columns) and scales of some Gaussians in float64."""
-    tables = gather_columns(rows, scene.means, scene.quats, scene.log_scales)
-    means, quats, log_scales = (values.double() for values in tables)
-    rotations = parameters.rotation_matrices(quats)
-    return means, rotations, torch.exp(log_scales)
+    means, quats, log_scales = gather_columns(rows, scene.means, scene.quats, scene.log_scales)
+    rotations = parameters.rotation_matrices(quats.double())
+    return means.double(), rotations, torch.exp(log_scales.double())

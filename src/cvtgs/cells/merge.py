@@ -55,51 +55,41 @@ def merge_cells(
         >>> len(merge_cells(scene, cells, config=MergeConfig()))
         2
     """
+    counts = partition.counts
     merged = scene.select(partition.order[partition.offsets[:-1]])
-    cells = (partition.counts > 1).nonzero()[:, 0]
-    done = len(partition) - len(cells)
+    cells = (counts > 1).nonzero()[:, 0]
+    done = len(counts) - len(cells)
     tensors, extras = merged.tensors(), dict(merged.extras)
-    chunk = chunk_length(CHUNK_MEMBERS, scene.device)
+    chunk = chunk_length(CHUNK_MEMBERS, scene.means.device)
     for run, part in partition.select(cells).chunks(chunk):
-        new_tensors, new_extras = _merge_chunk(scene, part, config)
-        for name, values in new_tensors.items():
-            tensors[name][cells[run]] = values.to(tensors[name].dtype)
-        for name, values in new_extras.items():
-            extras[name][cells[run]] = values
+        rows, offsets, of_cells = part.order, part.offsets, cells[run]
+        members = gather_members(scene, part)
+        weights = members.weights(config.area_power)
+        means, matrices = mean_and_covariance(members, weights)
+        scales, quats = parameters.decompose_covariances(matrices)
+        depths = merged_depth(members, parameters.mean_projected_area(scales), rule=config.opacity)
+        new = {
+            "means": means,
+            "quats": quats,
+            "log_scales": parameters.positive_log(scales),
+            "logit_opacities": parameters.logit_from_optical_depth(depths),
+            "sh0": weighted_mean(scene.sh0.index_select(0, rows), weights, offsets),
+        }
+        if scene.shN.shape[1]:
+            new["shN"] = weighted_mean(scene.shN.index_select(0, rows), weights, offsets)
+        for name, values in new.items():
+            tensors[name][of_cells] = values.to(tensors[name].dtype)
+        if extras:
+            heaviest = rows[segment_argmax(members.opacities * members.areas, offsets)]
+        for name, column in scene.extras.items():
+            if column.is_floating_point():
+                values = weighted_mean(column[rows], weights, offsets).to(column.dtype)
+                extras[name][of_cells] = values
+            else:
+                extras[name][of_cells] = column[heaviest]
         done += run.stop - run.start
         on_cells(done)
     return merged.with_tensors(tensors, extras)
-
-
-def _merge_chunk(
-    scene: GaussianScene, part: Partition, config: MergeConfig
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Return tensors and extra columns of some cells, by name."""
-    rows, offsets = part.order, part.offsets
-    members = gather_members(scene, part)
-    weights = members.weights(config.area_power)
-    means, matrices = mean_and_covariance(members, weights)
-    scales, quats = parameters.decompose_covariances(matrices)
-    depths = merged_depth(members, parameters.mean_projected_area(scales), rule=config.opacity)
-    tensors = {
-        "means": means,
-        "quats": quats,
-        "log_scales": parameters.positive_log(scales),
-        "logit_opacities": parameters.logit_from_optical_depth(depths),
-        "sh0": weighted_mean(scene.sh0.index_select(0, rows), weights, offsets),
-    }
-    if scene.shN.shape[1]:
-        tensors["shN"] = weighted_mean(scene.shN.index_select(0, rows), weights, offsets)
-    if not scene.extras:
-        return tensors, {}
-    heaviest = rows[segment_argmax(members.opacities * members.areas, offsets)]
-    extras = {
-        name: weighted_mean(column[rows], weights, offsets).to(column.dtype)
-        if column.is_floating_point()
-        else column[heaviest]
-        for name, column in scene.extras.items()
-    }
-    return tensors, extras
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -153,12 +143,12 @@ def gather_members(scene: GaussianScene, part: Partition) -> Members:
         The members in float64.
     """
     rows = part.order
-    tables = gather_columns(rows, scene.means, scene.quats, scene.log_scales)
-    means, quats, log_scales = (values.double() for values in tables)
+    means, quats, log_scales = gather_columns(rows, scene.means, scene.quats, scene.log_scales)
+    log_scales = log_scales.double()
     logits = scene.logit_opacities.index_select(0, rows).double()
     return Members(
-        means=means,
-        quats=parameters.normalize_quats(quats),
+        means=means.double(),
+        quats=parameters.normalize_quats(quats.double()),
         scales=torch.exp(log_scales),
         opacities=parameters.opacity_from_logit(logits),
         depths=parameters.optical_depth_from_logit(logits),

@@ -19,7 +19,6 @@ from cvtgs.cvt.tessellate import (
     sample_points,
     stratified_seeds,
     tessellate,
-    weighted_centroids,
     weighted_seeds,
     weighted_sums,
 )
@@ -43,7 +42,6 @@ __all__ = [
     "stratified_seeds",
     "tessellate",
     "tessellation_weights",
-    "weighted_centroids",
     "weighted_seeds",
     "weighted_sums",
 ]

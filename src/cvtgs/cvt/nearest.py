@@ -47,7 +47,10 @@ def nearest_scipy(
         [1]
     """
     device, points, sites = points.device, points.cpu(), sites.cpu()
-    distinct = distinct_rows(sites)  # a tree cannot part coincident sites: it would compare all
+    distinct, runs = None, runs_of_equal(sites)
+    if runs is not None:  # a tree cannot part coincident sites: it would compare all
+        order, ranks = runs
+        distinct = torch.sort(order[ranks == 0]).values
     tree = build_tree(sites if distinct is None else sites[distinct])
     labels = np.empty(len(points), dtype=np.int64)
     squared = np.empty(len(points), dtype=np.float64)
@@ -165,15 +168,6 @@ def runs_of_equal(
     places = torch.arange(len(sites), device=sites.device)
     starts = torch.where(repeated, 0, places).cummax(0).values
     return order, places - starts
-
-
-def distinct_rows(sites: Float[Tensor, "m d"]) -> Int[Tensor, "k"] | None:
-    """Return one row number for each place at which there are sites."""
-    runs = runs_of_equal(sites)
-    if runs is None:
-        return None
-    order, ranks = runs
-    return torch.sort(order[ranks == 0]).values
 
 
 def search_once_per_position(nearest: NearestSite) -> NearestSite:

@@ -227,37 +227,10 @@ def lloyd(
         energies.append(float((weights * squared).sum()))
         if done > 0 and energies[-2] - energies[-1] <= tolerance * energies[-2]:
             break
-        sites = weighted_centroids(points, weights, labels, sites)
+        totals, sums = weighted_sums(points, weights, labels, len(sites))
+        sites = centroids(totals, sums, sites)
         on_iteration(done + 1)
     return LloydResult(sites=sites, energies=tuple(energies))
-
-
-def weighted_centroids(
-    points: Float[Tensor, "n d"],
-    weights: Float[Tensor, "n"],
-    labels: Int[Tensor, "n"],
-    fallback: Float[Tensor, "m d"],
-) -> Float[Tensor, "m d"]:
-    """Average the points of every label.
-
-    Args:
-        points: Positions.
-        weights: Weights, at least 0.
-        labels: Label of every point, 0 to m - 1.
-        fallback: Result for labels without points or without weight.
-
-    Returns:
-        Weighted means in float64.
-
-    Example:
-        >>> weighted_centroids(
-        ...     torch.tensor([[0.0], [1.0]]), torch.tensor([1.0, 3.0]), torch.tensor([0, 0]),
-        ...     torch.tensor([[7.0], [7.0]]),
-        ... ).tolist()
-        [[0.75], [7.0]]
-    """
-    totals, sums = weighted_sums(points, weights, labels, len(fallback))
-    return centroids(totals, sums, fallback)
 
 
 def weighted_sums(
@@ -266,9 +239,10 @@ def weighted_sums(
     labels: Int[Tensor, "n"],
     count: int,
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m d"]]:
-    """Add up the points of every label."""
-    weights = weights.double()
-    columns = [weights, *(column.double() * weights for column in points.unbind(1))]
+    """Return summed weights and weighted sums of the points of every label, in float64."""
+    columns = [weights.double()]
+    for column in points.unbind(1):
+        columns.append(column.double() * columns[0])
     sums = label_sums(columns, labels, count)
     return sums[:, 0], sums[:, 1:]
 
@@ -276,7 +250,7 @@ def weighted_sums(
 def centroids(
     totals: Float[Tensor, "m"], sums: Float[Tensor, "m d"], fallback: Float[Tensor, "m d"]
 ) -> Float[Tensor, "m d"]:
-    """Divide sums of points by their weight."""
+    """Divide sums of points by their weight; labels without weight give ``fallback``."""
     filled = totals > 0
     means = sums / totals.where(filled, 1.0)[:, None]
     return torch.where(filled[:, None], means, fallback)
@@ -313,11 +287,21 @@ def stratified_seeds(
         heavier = ~certain & (weights >= step)
         if free == 0 or not bool(heavier.any()) or step == 0.0:
             break
-        certain = _take_heaviest(certain, heavier, weights, count)
-    shares = torch.where(certain, weights, step)
-    rows = torch.cat([certain.nonzero()[:, 0], _systematic(weights, ~certain, free)])
-    rows = torch.sort(rows).values
-    return rows, shares[rows]
+        heavy = heavier.nonzero()[:, 0]
+        heaviest = torch.sort(weights[heavy], stable=True, descending=True).indices[:free]
+        certain[heavy[heaviest]] = True
+    rows, others = certain.nonzero()[:, 0], (~certain).nonzero()[:, 0]
+    if free:  # the middles of equal steps of accumulated weight
+        total = weights[others].cumsum(0)
+        middles = (torch.arange(free, device=weights.device) + 0.5) * (total[-1] / free)
+        picks = torch.searchsorted(total, middles).clamp_max(len(others) - 1)
+        # Picks of weights below one step are distinct but for rounding and for weights of zero:
+        # equal ones move to the next free place.
+        places = torch.arange(free, device=weights.device)
+        picks = (picks - places).cummax(0).values + places
+        picks = torch.minimum(picks, len(others) - free + places)
+        rows = torch.sort(torch.cat([rows, others[picks]])).values
+    return rows, torch.where(certain, weights, step)[rows]
 
 
 def weighted_seeds(
@@ -343,34 +327,3 @@ def weighted_seeds(
     keys = -torch.log(uniform.clamp_min(1e-300)).to(weights.device) / weights.double()
     chosen = torch.sort(keys, stable=True).indices[:count]
     return torch.sort(chosen).values
-
-
-def _take_heaviest(certain: Tensor, heavier: Tensor, weights: Tensor, count: int) -> Tensor:
-    """Mark the heavier points as certain, the heaviest first, never more than ``count``."""
-    rows = heavier.nonzero()[:, 0]
-    heaviest = torch.sort(weights[rows], stable=True, descending=True).indices
-    result = certain.clone()
-    result[rows[heaviest[: count - int(certain.sum())]]] = True
-    return result
-
-
-def _systematic(weights: Tensor, allowed: Tensor, count: int) -> Tensor:
-    """Take the allowed points at the middle of ``count`` equal steps of accumulated weight."""
-    rows = allowed.nonzero()[:, 0]
-    if count == 0:
-        return rows[:0]
-    total = weights[rows].cumsum(0)
-    steps = (torch.arange(count, device=rows.device) + 0.5) * (total[-1] / count)
-    picks = torch.searchsorted(total, steps).clamp_max(len(rows) - 1)
-    return rows[_ascending(picks, len(rows))]
-
-
-def _ascending(picks: Tensor, n: int) -> Tensor:
-    """Separate equal picks by moving them to the next free place, within 0 to n - 1.
-
-    Picks of weights below one step are distinct but for rounding and for weights of zero.
-    """
-    places = torch.arange(len(picks), device=picks.device)
-    forward = (picks - places).cummax(0).values + places
-    latest = n - len(picks) + places
-    return torch.minimum(forward, latest)

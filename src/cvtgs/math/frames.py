@@ -57,10 +57,11 @@ class RobustFrame:
         Returns:
             Distances in float64.
         """
-        parts = [
-            torch.linalg.vector_norm(self.normalize(part), dim=1) for part in points.split(CHUNK)
-        ]
-        return torch.cat(parts)
+        found = torch.empty(len(points), dtype=torch.float64, device=points.device)
+        for start in range(0, len(points), CHUNK):
+            local = self.normalize(points[start : start + CHUNK])
+            found[start : start + CHUNK] = torch.linalg.vector_norm(local, dim=1)
+        return found
 
     def contract(self, points: Float[Tensor, "n 3"], strength: float = 1.0) -> Float[Tensor, "n 3"]:
         """Express points in radii and pull in those beyond the first radius, logarithmically.
@@ -97,7 +98,7 @@ def robust_frame(points: Float[Tensor, "n 3"]) -> RobustFrame:
         >>> frame.center.tolist(), frame.radius
         ([1.0, 0.0, 0.0], 1.0)
     """
-    center = torch.stack([column.median() for column in points.unbind(1)]).double()
+    center = torch.stack(list(map(torch.median, points.unbind(1)))).double()
     distances = RobustFrame(center=center, radius=1.0).distances(points)
     rank = max(1, math.ceil(RADIUS_QUANTILE * len(points)))
     radius = float(distances.kthvalue(rank).values) or float(distances.amax()) or 1.0
