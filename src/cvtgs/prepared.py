@@ -1,7 +1,7 @@
 """Prepared: a scene to be made smaller again and again, on a device with enough memory."""
 
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+from collections.abc import Sequence
+from functools import partial
 
 import torch
 from jaxtyping import Bool
@@ -33,11 +33,9 @@ from cvtgs.validity import (
     CheckedScene,
     check_rows,
     standardized,
-    valid_rows,
     with_finite_opacities,
 )
 
-Result = TypeVar("Result")
 
 
 class Prepared:
@@ -68,43 +66,27 @@ class Prepared:
         listener: ProgressListener = silent,
     ) -> None:
         self._scene, self._config, self._checkpoint = scene, config, checkpoint
+        self._refines = config.refine.enabled
         self._cameras, self._listener = cameras, listener
         self._device = chosen_device(device or "auto", scene.device)
         self._may_leave, self._moved, self._note = device is None, "", ""
         self._forget()
 
+    def _place(self, device: torch.device, note: str) -> None:
+        """Choose where the next attempt computes; after a failed one, let go of its tensors."""
+        if note:
+            self._forget()
+        if device != self._device:
+            self._device, self._moved = device, note
+        self._note = note or self._moved
+
     def _forget(self) -> None:
         """Let go of all that is on the device."""
-        self._placed: GaussianScene | None = None
         self._net: MergeNet | PublishedMergeNet | None = None
         self._checked: CheckedScene | None = None
         self._analysis: SceneAnalysis | None = None
         self._ordered: OrderedRows | None = None
         self._has_run = False
-
-    @property
-    def _used(self) -> GaussianScene:
-        """The scene to compute with, on the device; the network goes there together with it."""
-        if self._placed is None:
-            placed = select_columns(self._scene, self._config.effects).to(self._device)
-            if self._checkpoint is not None:
-                self._net = self._checkpoint.net.copy_to(self._device, self._scene.dtype)
-            self._placed = placed
-        return self._placed
-
-    def _within_memory(self, compute: Callable[[], Result]) -> Result:
-        """Compute on the device, or where there is enough memory."""
-
-        def attempt(device: torch.device, note: str) -> Result:
-            if note:
-                self._forget()
-            if device != self._device:
-                self._device, self._moved = device, note
-            self._note = note or self._moved
-            return compute()
-
-        work = f"simplifying {len(self._scene):,} Gaussians"
-        return within_memory(attempt, self._device, work=work, may_leave=self._may_leave)
 
     def run(
         self,
@@ -119,25 +101,38 @@ class Prepared:
         Returns:
             The scene and the report.
         """
-        target = target_count(len(self._scene), rho, count=count, max_count=max_count)
+        total = len(self._scene)
+        target = target_count(total, rho, count=count, max_count=max_count)
         if keep is not None:
-            check_mask(keep, len(self._scene))
-        return self._within_memory(lambda: self._run(target, keep))
+            check_mask(keep, total)
+        return within_memory(
+            partial(self._run, target, keep),
+            self._device,
+            work=f"simplifying {total:,} Gaussians",
+            may_leave=self._may_leave,
+        )
 
-    def _run(self, target: int, keep: Bool[Tensor, "n"] | None) -> Simplified:
-        clock = StageClock(self._listener, self._device)
-        valid = self._check(clock).scene
-        analysis = self._analyze(target, clock)
+    def _run(
+        self, target: int, keep: Bool[Tensor, "n"] | None, device: torch.device, note: str
+    ) -> Simplified:
+        self._place(device, note)
+        clock = StageClock(self._listener, device)
+        checked, analysis = self._analyze(target, clock)
+        valid = checked.scene
+        reduce = partial(reduce_scene, config=self._config, net=self._net, clock=clock)
         if keep is None or not bool(keep.any()):
             if self._has_run and self._ordered is None and target < len(valid):
                 with clock.stage("order"):
                     self._ordered = order_gaussians(valid, analysis, self._config)
             self._has_run = True
-            reduced = self._reduce(valid, analysis, target, clock, ordered=self._ordered)
+            if target >= len(valid):
+                reduced = self._keep_all(valid, target)
+            else:
+                reduced = reduce(valid, analysis, target, ordered=self._ordered)
             reduced = self._match(reduced, analysis, clock)
-            return self._result(reduced, analysis, target, clock)
+            return self._result(reduced, checked, analysis, target, clock)
         keep = keep.to(valid.device)
-        kept = keep if len(keep) == len(valid) else keep[valid_rows(self._used)]
+        kept = keep if checked.is_valid is None else keep[checked.is_valid]
         check_room(int(kept.sum()), target=target, total=len(valid))
         first, rest = kept.nonzero()[:, 0], (~kept).nonzero()[:, 0]
         protected = with_finite_opacities(valid.select(first))
@@ -145,10 +140,10 @@ class Prepared:
         if target >= len(valid):
             others = Reduced(with_finite_opacities(valid.select(rest)))
         else:
-            others = self._reduce(valid.select(rest), part, room, clock)
+            others = reduce(valid.select(rest), part, room)
         reduced = others._replace(scene=concatenate([protected, others.scene]))
         reduced = self._match(reduced, part, clock)
-        return self._result(reduced, analysis, target, clock, kept_count=len(protected))
+        return self._result(reduced, checked, analysis, target, clock, kept_count=len(protected))
 
     def levels(self, rhos: Sequence[float]) -> tuple[Level, ...]:
         """Make the scene smaller in several sizes; see ``Simplifier.levels``.
@@ -159,73 +154,73 @@ class Prepared:
         targets = [target_count(len(self._scene), rho) for rho in rhos]
         if not targets:
             raise InvalidArgumentError("levels need at least one ratio, found none.")
-        found = self._within_memory(lambda: self._run_levels(targets))
+        found = within_memory(
+            partial(self._run_levels, targets),
+            self._device,
+            work=f"simplifying {len(self._scene):,} Gaussians",
+            may_leave=self._may_leave,
+        )
         return tuple(found[target] for target in targets)
 
-    def _run_levels(self, targets: Sequence[int]) -> dict[int, Level]:
+    def _run_levels(
+        self, targets: Sequence[int], device: torch.device, note: str
+    ) -> dict[int, Level]:
+        self._place(device, note)
         found: dict[int, Level] = {}
         finest: Reduced | None = None
         for target in sorted(set(targets), reverse=True):
-            clock = StageClock(self._listener, self._device)
-            valid = self._check(clock).scene
-            analysis = self._analyze(target, clock)
-            nested = nests_in(target, finest)
-            start = finest if nested else None
-            reduced = self._reduce(valid, analysis, target, clock, finest=start)
+            clock = StageClock(self._listener, device)
+            checked, analysis = self._analyze(target, clock)
+            valid, nested = checked.scene, nests_in(target, finest)
+            if target >= len(valid):
+                reduced = self._keep_all(valid, target)
+            else:
+                reduced = reduce_scene(
+                    valid,
+                    analysis,
+                    target,
+                    self._config,
+                    net=self._net,
+                    clock=clock,
+                    finest=finest if nested else None,
+                )
             if reduced.grouping is not None:
                 finest = finest or reduced
             error, assignment = level_facts(valid, analysis, reduced)
             matched = self._match(reduced, analysis, clock)
-            result = self._result(matched, analysis, target, clock)
+            result = self._result(matched, checked, analysis, target, clock)
             found[target] = Level(*result, error, nested, assignment)
         return found
 
-    def _check(self, clock: StageClock) -> CheckedScene:
+    def _analyze(self, target: int, clock: StageClock) -> tuple[CheckedScene, SceneAnalysis]:
+        """Check and analyze the scene, once; one that stays whole needs its effect plan only."""
         if self._checked is None:
             with clock.stage("check"):
-                self._checked = check_rows(self._used)
-        return self._checked
-
-    def _analyze(self, target: int, clock: StageClock) -> SceneAnalysis:
-        """Analyze the valid rows, once; a scene that stays whole needs its effect plan only."""
-        if self._analysis is not None:
-            return self._analysis
-        valid = self._check(clock).scene
+                used = select_columns(self._scene, self._config.effects).to(self._device)
+                if self._checkpoint is not None:
+                    self._net = self._checkpoint.net.copy_to(self._device, used.means.dtype)
+                self._checked = check_rows(used)
+        checked, analysis = self._checked, self._analysis
+        if analysis is not None:
+            return checked, analysis
+        valid = checked.scene
         is_whole = target >= len(valid)
         with clock.stage("plan"):
             sees = self._net is not None and self._net.sees_surroundings
             analysis = analyze(valid, self._config, with_visibility=sees and not is_whole)
-        if is_whole:
-            return analysis
-        if analysis.plan.visibility.active:
-            with clock.stage("visibility"):
-                analysis = measure_visibility(valid, analysis, self._config, cameras=self._cameras)
-        self._analysis = analysis
-        return analysis
+        if not is_whole:
+            if analysis.plan.visibility.active:
+                with clock.stage("visibility"):
+                    analysis = measure_visibility(
+                        valid, analysis, self._config, cameras=self._cameras
+                    )
+            self._analysis = analysis
+        return checked, analysis
 
-    def _reduce(
-        self,
-        scene: GaussianScene,
-        analysis: SceneAnalysis,
-        target: int,
-        clock: StageClock,
-        *,
-        finest: Reduced | None = None,
-        ordered: OrderedRows | None = None,
-    ) -> Reduced:
-        if target >= len(scene):
-            is_whole = target == len(self._scene)
-            return Reduced(with_finite_opacities(scene) if is_whole else standardized(scene))
-        return reduce_scene(
-            scene,
-            analysis,
-            target,
-            self._config,
-            net=self._net,
-            clock=clock,
-            finest=finest,
-            ordered=ordered,
-        )
+    def _keep_all(self, valid: GaussianScene, target: int) -> Reduced:
+        """Return all valid Gaussians: as they are if none was to go, else as standard ones."""
+        is_whole = target == len(self._scene)
+        return Reduced(with_finite_opacities(valid) if is_whole else standardized(valid))
 
     def _match(self, reduced: Reduced, analysis: SceneAnalysis, clock: StageClock) -> Reduced:
         """Match the small scene to the images of the analysis, if the configuration says so."""
@@ -255,6 +250,7 @@ class Prepared:
     def _result(
         self,
         reduced: Reduced,
+        checked: CheckedScene,
         analysis: SceneAnalysis,
         target: int,
         clock: StageClock,
@@ -262,41 +258,38 @@ class Prepared:
         kept_count: int = 0,
     ) -> Simplified:
         """Report, restore what was not computed with, and refine if the configuration says so."""
-        checked, scene = self._check(clock), self._scene
+        scene, total = self._scene, len(self._scene)
         masses = [(analysis.areas * analysis.opacities).sum(), reduced.scene.masses.sum()]
         mass_in, mass_out = torch.stack(masses).tolist()
+        views = "none"
+        if self._refines or analysis.plan.visibility.active:
+            views = "found" if self._cameras is None else f"{len(self._cameras)} cameras"
         report = SimplifyReport(
-            input_count=len(scene),
+            input_count=total,
             output_count=len(reduced.scene),
             target_count=target,
-            rho=target / len(scene),
+            rho=target / total,
             invalid_rows=checked.invalid_rows,
             invalid_count=checked.invalid_count,
-            shortfall=shortfall(len(checked.scene), len(scene), target),
+            shortfall=shortfall(total - checked.invalid_count, total, target),
             kept_count=kept_count,
             mass_in=mass_in,
             mass_out=mass_out,
             checkpoint="none" if self._checkpoint is None else self._checkpoint.name,
             device=str(self._device),
             device_note=self._note,
-            views=self._views(),
+            views=views,
             plan=analysis.plan,
             matching=reduced.matching,
             stages=tuple(clock.costs),
             config=self._config,
             **reduced.statistics.model_dump(),
         )
-        small = restore_columns(reduced.scene, scene, analysis.plan).to(scene.device)
+        small = restore_columns(reduced.scene, scene, analysis.plan).to(scene.means.device)
         result = Simplified(small, report)
-        if not self._config.refine.enabled or len(small) == len(scene):
+        if not self._refines or report.output_count == total:
             return result
         return self._refine(result, analysis)
-
-    def _views(self) -> str:
-        """Return where images are rendered from."""
-        if not (self._config.uses_renders or self._config.refine.enabled):
-            return "none"
-        return "found" if self._cameras is None else f"{len(self._cameras)} cameras"
 
     def _refine(self, result: Simplified, analysis: SceneAnalysis) -> Simplified:
         from cvtgs.refinement import join_reports, refine  # noqa: PLC0415 (most never need it)

@@ -98,9 +98,8 @@ class Simplifier:
             InvalidArgumentError: Ratio or count is out of range, or not exactly one is given.
             InvalidSceneError: The scene has no valid row.
         """
-        return self.run(
-            scene, rho, count=count, max_count=max_count, cameras=cameras, keep=keep
-        ).scene
+        prepared = self.prepare(scene, cameras=cameras)
+        return prepared.run(rho, count=count, max_count=max_count, keep=keep).scene
 
     def run(
         self,
@@ -173,14 +172,15 @@ class Simplifier:
             >>> [len(prepared.run(count=count).scene) for count in (10, 20)]
             [10, 20]
         """
-        full = as_scene(scene)
-        renders = self.config.uses_renders or self.config.refine.enabled
-        if cameras is None and renders and not isinstance(scene, GaussianScene):
-            own = find_own_cameras(full, scene)
+        full, config = as_scene(scene), self.config
+        if cameras is None and not isinstance(scene, GaussianScene):
+            own = None
+            if config.uses_renders or config.refine.enabled:
+                own = find_own_cameras(full, scene)
             cameras = None if own is None else own.cameras
         return Prepared(
             full,
-            self.config,
+            config,
             checkpoint=self.checkpoint,
             device=self._device,
             cameras=cameras,

@@ -29,11 +29,13 @@ class CheckedScene(NamedTuple):
         scene: The valid Gaussians.
         invalid_rows: Rows that were dropped, by the attribute that is NaN, infinite or zero.
         invalid_count: Rows that were dropped.
+        is_valid: ``(n,)`` mask of the others; None if no row was dropped.
     """
 
     scene: GaussianScene
     invalid_rows: dict[str, int]
     invalid_count: int
+    is_valid: Bool[Tensor, "n"] | None = None
 
 
 def check_rows(scene: GaussianScene) -> CheckedScene:
@@ -67,7 +69,7 @@ def check_rows(scene: GaussianScene) -> CheckedScene:
         DroppedDataWarning,
         stacklevel=2,
     )
-    return CheckedScene(scene.select(~dropped), reasons, count)
+    return CheckedScene(scene.select(~dropped), reasons, count, ~dropped)
 
 
 def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
@@ -88,14 +90,17 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
         >>> invalid_rows(scene("object", 10, sh_degree=0, seed=0))
         {}
     """
-    masks = {
-        "means": ~_finite(scene.means),
-        "quats": ~_finite(scene.quats) | (scene.quats == 0).all(dim=1),
-        "log_scales": ~_finite(scene.log_scales) | (scene.log_scales > MAX_LOG_SCALE).any(dim=1),
-        "logit_opacities": scene.logit_opacities.isnan(),
-        "sh0": ~_finite(scene.sh0),
-        "shN": ~_finite(scene.shN),
-    }
+    masks: dict[str, Tensor] = {}
+    for name, values in scene.tensors().items():
+        if name == "logit_opacities":
+            masks[name] = values.isnan()
+            continue
+        # Without an array of booleans per value: a finite number times 0 is 0, any other is NaN,
+        # and a sum with a NaN is NaN.
+        parts = values.flatten(start_dim=1).split(1 << 16)
+        masks[name] = torch.cat([(part * 0).sum(dim=1) != 0 for part in parts])
+    masks["quats"] |= (scene.quats == 0).all(dim=1)
+    masks["log_scales"] |= (scene.log_scales > MAX_LOG_SCALE).any(dim=1)
     # One answer for all masks: a device is asked only once.
     any_bad = torch.stack([mask.any() for mask in masks.values()]).tolist()
     return {name: mask for (name, mask), bad in zip(masks.items(), any_bad, strict=True) if bad}
@@ -180,15 +185,6 @@ def standardized(scene: GaussianScene) -> GaussianScene:
     quats = torch.where(is_unit, scene.quats, parameters.normalize_quats(scene.quats))
     logits = parameters.clamp_logits(scene.logit_opacities)
     return scene.with_tensors({"quats": quats, "logit_opacities": logits}, scene.extras)
-
-
-def _finite(values: Tensor) -> Tensor:
-    """Return the rows without NaN or infinity, without an array of booleans per value.
-
-    A finite number times 0 is 0, any other is NaN, and a sum with a NaN is NaN.
-    """
-    flat = values.flatten(start_dim=1)
-    return torch.cat([(part * 0).sum(dim=1) == 0 for part in flat.split(1 << 16)])
 
 
 def warn_of_lost_digits(scene: GaussianScene) -> None:
