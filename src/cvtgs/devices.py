@@ -24,40 +24,12 @@ _SHORT_CHUNKS = ContextVar("short_chunks", default=False)
 
 
 def resolve_device(device: str | torch.device) -> torch.device | None:
-    """Turn a name that may be ``auto`` into a device that is there.
-
-    Args:
-        device: ``auto``, ``cpu``, ``cuda``, or any torch device.
-
-    Returns:
-        The device; None for ``auto``.
-
-    Raises:
-        DeviceError: There is no such device.
-
-    Example:
-        >>> resolve_device("cpu")
-        device(type='cpu')
-    """
+    """Return the device of a name, None for ``auto``; raise DeviceError if it is not there."""
     return None if device == "auto" else usable_device(device)
 
 
 def usable_device(device: str | torch.device) -> torch.device:
-    """Turn the name of a device into a device that is there.
-
-    Args:
-        device: ``cpu``, ``cuda``, or any torch device.
-
-    Returns:
-        The device.
-
-    Raises:
-        DeviceError: There is no such device.
-
-    Example:
-        >>> usable_device("cpu")
-        device(type='cpu')
-    """
+    """Return the device of a name; raise DeviceError if it is not there."""
     try:
         resolved = torch.device(device)
         torch.empty(0, device=resolved)
@@ -68,22 +40,7 @@ def usable_device(device: str | torch.device) -> torch.device:
 
 
 def chosen_device(device: str | torch.device, home: str | torch.device = "cpu") -> torch.device:
-    """Choose where to compute.
-
-    Args:
-        device: ``auto``, ``cpu``, ``cuda``, or any torch device.
-        home: Where the data are.
-
-    Returns:
-        The device; for ``auto`` CUDA if the data are on the CPU and there is one, else ``home``.
-
-    Raises:
-        DeviceError: There is no such device.
-
-    Example:
-        >>> chosen_device("auto", "meta")
-        device(type='meta')
-    """
+    """Return the device of a name; for ``auto`` CUDA if the data are on the CPU, else ``home``."""
     resolved, home = resolve_device(device), torch.device(home)
     if resolved is not None:
         return resolved
@@ -91,18 +48,7 @@ def chosen_device(device: str | torch.device, home: str | torch.device = "cpu") 
 
 
 def device_name(device: torch.device) -> str:
-    """Name what a device is made of.
-
-    Args:
-        device: The device.
-
-    Returns:
-        The model of the processor or of the GPU, as far as the system tells.
-
-    Example:
-        >>> len(device_name(torch.device("cpu"))) > 0
-        True
-    """
+    """Name what a device is made of."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     if device.type != "cpu":
@@ -193,30 +139,14 @@ def within_memory(
 
 
 def core_count() -> int:
-    """Return how many cores this process may use.
-
-    Returns:
-        A number, at least 1.
-
-    Example:
-        >>> core_count() >= 1
-        True
-    """
+    """Return how many cores this process may use."""
     if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def thread_count() -> int:
-    """Return how many threads a search may use: one for each core, or ``OMP_NUM_THREADS``.
-
-    Returns:
-        A number, at least 1.
-
-    Example:
-        >>> thread_count() >= 1
-        True
-    """
+    """Return how many threads a search may use: one for each core, or ``OMP_NUM_THREADS``."""
     limit = os.environ.get("OMP_NUM_THREADS", "")
     return max(1, min(core_count(), int(limit))) if limit.isdecimal() else core_count()
 
@@ -227,14 +157,6 @@ def one_thread() -> Iterator[None]:
 
     Sums then do not depend on the number of cores, and pieces too small to be shared do not wait
     for one another.
-
-    Yields:
-        Nothing.
-
-    Example:
-        >>> with one_thread():
-        ...     torch.get_num_threads()
-        1
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

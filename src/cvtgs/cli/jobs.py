@@ -114,11 +114,7 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
 
 
 def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> None:
-    """Do the work for every scene, and say what came of it and where it is.
-
-    Raises:
-        RunError: Some of many scenes failed; the others are written.
-    """
+    """Do the work for every scene, and say what came of it and where it is."""
     first = jobs[0]
     if not first.is_one_of_many:
         _run_one(first, work)

@@ -72,34 +72,12 @@ def explain(error: pydantic.ValidationError) -> str:
 
 
 def named(key: str) -> str:
-    """Return a key as texts show it: short, in one line.
-
-    Args:
-        key: Any text, dots included.
-
-    Returns:
-        The key itself if it is one.
-
-    Example:
-        >>> named("cvt.color"), len(named("x" * 1000))
-        ('cvt.color', 80)
-    """
+    """Return a key as texts show it: short, in one line."""
     return shortened(key, 80) if key.isprintable() else shortened(repr(key), 80)
 
 
 def shown(value: object) -> str:
-    """Return a value as texts show it: as Python would, but short.
-
-    Args:
-        value: What a file or a caller gave.
-
-    Returns:
-        At most 120 characters.
-
-    Example:
-        >>> shown("many"), len(shown("x" * 1000)), len(shown(list(range(1000))))
-        ("'many'", 120, 120)
-    """
+    """Return a value as texts show it: as Python would, but short."""
     try:
         return shortened(repr(value), 120)
     except ValueError:  # Python writes no number of thousands of digits
@@ -107,17 +85,5 @@ def shown(value: object) -> str:
 
 
 def shortened(text: str, length: int) -> str:
-    """Cut a text that is too long.
-
-    Args:
-        text: Any text.
-        length: Characters to keep, the dots that stand for the rest included.
-
-    Returns:
-        The text.
-
-    Example:
-        >>> shortened("a long text", 8)
-        'a lon...'
-    """
+    """Cut a text that is too long."""
     return text if len(text) <= length else f"{text[: length - 3]}..."

@@ -168,13 +168,6 @@ class Scorer:
     """Scores scenes against images of a full one, each of which is rendered once.
 
     Memory: ``(12 b + 4) c h w`` bytes for ``c`` views over ``b`` backgrounds in float32.
-
-    Args:
-        full: The full scene.
-        cameras: Single cameras.
-        metrics: What to compute.
-        backgrounds: Every image is scored over each of these.
-        progress: Called with the number of views that are rendered.
     """
 
     def __init__(

@@ -205,22 +205,6 @@ def write_compressed_ply(scene: GaussianScene, file: BinaryIO) -> None:
 
     Rows are sorted along a Morton curve, so that the 256 Gaussians of a chunk lie close together
     and their common ranges are small.
-
-    Args:
-        scene: The scene, on any device.
-        file: Where to, open for writing.
-
-    Raises:
-        InvalidSceneError: No Gaussian of the scene is finite, or a comment has two lines.
-        OSError: The file cannot be written.
-
-    Example:
-        >>> import io
-        >>> from cvtgs.synthetic import scene
-        >>> file = io.BytesIO()
-        >>> write_compressed_ply(scene("object", 5, sh_degree=0, seed=0), file)
-        >>> file.getvalue()[:3]
-        b'ply'
     """
     arrays = arrays_of(scene)
     order = morton_rows(arrays.means)

@@ -18,20 +18,6 @@ def output_lock(path: str | os.PathLike[str]) -> Iterator[None]:
 
     The system releases it when the process ends, however it ends; the file is removed with it, or
     by the next run after a kill.
-
-    Args:
-        path: The file or folder to work on; symbolic links are followed.
-
-    Raises:
-        OutputBusyError: Another run holds it.
-        OutputError: The lock file cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with output_lock(Path(folder) / "out.ply"):
-        ...         len(list(Path(folder).iterdir()))
-        1
     """
     from filelock import FileLock, SoftFileLock, Timeout  # noqa: PLC0415 (loaded when used)
 
@@ -67,19 +53,6 @@ def folder_lock(path: str | os.PathLike[str]) -> Iterator[None]:
     """Hold the lock of a folder to write several files to, as :func:`output_lock` does.
 
     There is none where no file can be made, so that whatever writes there says what is wrong.
-
-    Args:
-        path: The folder, which need not be there yet.
-
-    Raises:
-        OutputBusyError: Another run holds it.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.TemporaryDirectory() as home:
-        ...     with folder_lock(Path(home) / "levels"):
-        ...         [file.name for file in Path(home).iterdir()]
-        ['.levels.lock']
     """
     place = lock_path(path).parent
     if place.is_dir() and os.access(place, os.W_OK | os.X_OK):

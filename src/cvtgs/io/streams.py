@@ -36,26 +36,7 @@ class ByteSink(Protocol):
 
 @contextmanager
 def file_of(stream: ByteSource, format: str | None = None) -> Iterator[Path]:
-    """Copy what is left of a stream to a file, which is there while the context is.
-
-    Args:
-        stream: An open binary file; it need not be able to seek.
-        format: The suffix of the format, such as ``.spz``; None finds out by the first bytes.
-
-    Yields:
-        The file, with the suffix of its format.
-
-    Raises:
-        FileFormatError: The first bytes are of no known format.
-        InputError: The stream cannot be read.
-        OutputError: There is no space for the copy.
-
-    Example:
-        >>> import io
-        >>> with file_of(io.BytesIO(b"ply...")) as path:
-        ...     path.suffix, path.read_bytes()
-        ('.ply', b'ply...')
-    """
+    """Copy what is left of a stream to a file, which is there while the context is."""
     with TemporaryDirectory(prefix="cvtgs-") as folder:
         path = Path(folder) / "stream"
         with _opened(path) as file:
@@ -85,25 +66,7 @@ def file_of(stream: ByteSource, format: str | None = None) -> Iterator[Path]:
 
 @contextmanager
 def written_to(stream: ByteSink) -> Iterator[BinaryIO]:
-    """Open a file that can seek, and copy it to a stream when it is complete.
-
-    Args:
-        stream: An open binary file; it need not be able to seek.
-
-    Yields:
-        A file to write to.
-
-    Raises:
-        OutputError: The stream cannot be written to.
-
-    Example:
-        >>> import io
-        >>> stream = io.BytesIO()
-        >>> with written_to(stream) as file:
-        ...     _ = file.write(b"done")
-        >>> stream.getvalue()
-        b'done'
-    """
+    """Open a file that can seek, and copy it to a stream when it is complete."""
     with SpooledTemporaryFile(max_size=MEMORY_BYTES) as file:
         yield cast(BinaryIO, file)
         file.seek(0)

@@ -119,27 +119,12 @@ def find_view_positions(scene: SceneLike) -> CameraPositions:
 
 
 def as_positions(scene: SceneLike | CameraPositions) -> CameraPositions:
-    """Return positions that were found before, or find those of a scene.
-
-    Args:
-        scene: A scene, a file or folder of one, or what was found of it.
-
-    Returns:
-        The positions.
-    """
+    """Return positions that were found before, or find those of a scene."""
     return scene if isinstance(scene, CameraPositions) else find_view_positions(scene)
 
 
 def lifted(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Float[Tensor, "c 3"]:
-    """Return positions with those beneath the floor mirrored at what is just above it.
-
-    Args:
-        layout: Of the scene.
-        eyes: Positions, scene units.
-
-    Returns:
-        Positions of which none is beneath the floor; the same if there is no floor.
-    """
+    """Return positions with those beneath the floor mirrored at what is just above it."""
     if layout.floor is None:
         return eyes
     least = layout.floor + _ABOVE * layout.frame.radius
@@ -148,15 +133,7 @@ def lifted(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Float[Tensor, "c 
 
 
 def stand_free(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, "c"]:
-    """Return which positions are above the floor, free, and not inside matter.
-
-    Args:
-        layout: Of the scene.
-        eyes: Positions, scene units.
-
-    Returns:
-        A mask.
-    """
+    """Return which positions are above the floor, free, and not inside matter."""
     radius, points = layout.frame.radius, layout.voxels.points
     free = torch.ones(len(eyes), dtype=torch.bool)
     if layout.floor is not None:

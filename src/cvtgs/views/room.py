@@ -42,14 +42,7 @@ class SizedPoints(NamedTuple):
 
 
 def sized_points(sample: GaussianScene) -> SizedPoints:
-    """Return every k-th Gaussian that is not faint, at most 10,000.
-
-    Args:
-        sample: The Gaussians.
-
-    Returns:
-        Their positions and sizes.
-    """
+    """Return every k-th Gaussian that is not faint, at most 10,000."""
     rows = (sample.opacities > _VISIBLE).nonzero()[:, 0]
     rows = rows[:: max(1, -(-len(rows) // _MOST_POINTS))]
     return SizedPoints(sample.means[rows].double(), sample.log_scales[rows].double().mean(dim=1))
@@ -63,18 +56,7 @@ def find_room(
     middle: Float[Tensor, "3"],
     up: Float[Tensor, "3"],
 ) -> Float[Tensor, "3"] | None:
-    """Return the middle at the height of the eyes if there is room and surfaces are all around.
-
-    Args:
-        voxels: The surfaces.
-        sized: Gaussians, scene units.
-        frame: Of the scene.
-        middle: Of what is near, in robust radii from the centre of the frame.
-        up: Unit vector.
-
-    Returns:
-        The point in robust radii from the centre of the frame; None if the scene is not a room.
-    """
+    """Return the middle at the height of the eyes if there is room and surfaces are all around."""
     points = voxels.points
     if len(points) == 0:
         return None
@@ -98,16 +80,7 @@ def find_room(
 def enclosure(
     eye: Float[Tensor, "3"], points: Float[Tensor, "v 3"], up: Float[Tensor, "3"]
 ) -> float:
-    """Return the share of the upper half of all directions in which there is a surface.
-
-    Args:
-        eye: Where from, in robust radii.
-        points: Points on surfaces, in robust radii.
-        up: Unit vector.
-
-    Returns:
-        From 0 to 1.
-    """
+    """Return the share of the upper half of all directions in which there is a surface."""
     offsets = points - eye
     offsets = offsets[torch.linalg.vector_norm(offsets, dim=1) < _NEAR]
     directions = torch.nn.functional.normalize(offsets, dim=1)
@@ -122,16 +95,7 @@ def enclosure(
 
 
 def size_growth(sized: SizedPoints, eye: Float[Tensor, "3"], radius: float) -> float:
-    """Return the mean correlation of sizes with distances from a point, direction by direction.
-
-    Args:
-        sized: Gaussians, scene units.
-        eye: Where from, scene units.
-        radius: Of the scene, scene units.
-
-    Returns:
-        From -1 to 1; positive where cameras were.
-    """
+    """Return the mean correlation of sizes with distances from a point, direction by direction."""
     offsets = sized.means - eye
     distances = torch.linalg.vector_norm(offsets, dim=1)
     near = (distances < _FARTHEST * radius) & (distances > 0)

@@ -98,22 +98,7 @@ class _Placed(NamedTuple):
 
 
 def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False) -> GaussianScene:
-    """Read the Gaussians of a ``.glb`` or ``.gltf``.
-
-    Args:
-        path: The file.
-        axes: Its axes, as :func:`cvtgs.io.change_axes` names them; None for those of glTF.
-        trust_sizes: Whether the file may unpack to any size.
-
-    Returns:
-        The Gaussians of all nodes of the scene, with the SH bands of the fullest.
-
-    Raises:
-        InputNotFoundError: There is no such file, or a buffer beside it is missing.
-        InputError: A file cannot be opened or read.
-        FileFormatError: It is not a glTF of Gaussians, or damaged.
-        InvalidArgumentError: There are no axes of this name.
-    """
+    """Read the Gaussians of a ``.glb`` or ``.gltf``."""
     axes = AXES if axes is None else checked_axes(axes)
     file = open_gltf(path)
     strange = [name for name in file.root.extensionsRequired if name not in _KNOWN]

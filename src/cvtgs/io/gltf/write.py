@@ -66,24 +66,7 @@ class _Attribute:
 
 
 def write_glb(scene: GaussianScene, file: BinaryIO) -> None:
-    """Write a ``.glb`` with ``KHR_gaussian_splatting``, in the order and the axes of the scene.
-
-    Args:
-        scene: The scene, on any device.
-        file: Where to, open for writing.
-
-    Raises:
-        InvalidSceneError: No Gaussian of the scene is finite, or there are too many for a file.
-        OSError: The file cannot be written.
-
-    Example:
-        >>> import io
-        >>> from cvtgs.synthetic import scene
-        >>> file = io.BytesIO()
-        >>> write_glb(scene("object", 5, sh_degree=0, seed=0), file)
-        >>> file.getvalue()[:4]
-        b'glTF'
-    """
+    """Write a ``.glb`` with ``KHR_gaussian_splatting``, in the order and the axes of the scene."""
     arrays = arrays_of(scene)
     attributes, count = _attributes(arrays), len(arrays.means)
     document = _document(scene, arrays, attributes)
@@ -97,24 +80,7 @@ def write_glb(scene: GaussianScene, file: BinaryIO) -> None:
 
 
 def write_gltf(scene: GaussianScene, file: BinaryIO) -> None:
-    r"""Write a ``.gltf``: as :func:`write_glb`, but as one JSON text with the numbers in base64.
-
-    Args:
-        scene: The scene, on any device.
-        file: Where to, open for writing.
-
-    Raises:
-        InvalidSceneError: No Gaussian of the scene is finite.
-        OSError: The file cannot be written.
-
-    Example:
-        >>> import io
-        >>> from cvtgs.synthetic import scene
-        >>> file = io.BytesIO()
-        >>> write_gltf(scene("object", 5, sh_degree=0, seed=0), file)
-        >>> file.getvalue()[:2]
-        b'{"'
-    """
+    r"""Write a ``.gltf``: as :func:`write_glb`, but as one JSON text with the numbers in base64."""
     arrays = arrays_of(scene)
     attributes, count = _attributes(arrays), len(arrays.means)
     document = _document(scene, arrays, attributes)
@@ -130,14 +96,6 @@ def write_spz_glb(scene: GaussianScene, file: BinaryIO) -> None:
 
     The SPZ has the axes of the glTF, as CesiumJS reads it. Readers without the extension show
     nothing.
-
-    Args:
-        scene: The scene, on any device.
-        file: Where to, open for writing.
-
-    Raises:
-        InvalidSceneError: No Gaussian of the scene is finite, or there are too many for a file.
-        OSError: The file cannot be written.
     """
     arrays = arrays_of(scene)
     packed = io.BytesIO()

@@ -78,10 +78,6 @@ def palette(rows: Float[np.ndarray, "n d"], most: int | None = None) -> Palette:
     split, each at the mean of its most varied column (after Wu 1991, many groups at once), until
     there are ``most``; entries are means of groups. This takes seconds for a million rows, where
     k-means would take an hour on a CPU. Memory: three copies of the rows.
-
-    Args:
-        rows: The rows.
-        most: Number of entries; None for that of :func:`palette_size`.
     """
     most = palette_size(len(rows)) if most is None else most
     if len(rows) <= most:

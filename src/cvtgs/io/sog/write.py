@@ -44,24 +44,7 @@ class EncodedSog(NamedTuple):
 
 
 def write_sog(scene: GaussianScene, file: BinaryIO) -> None:
-    """Write a bundled SOG of version 2.
-
-    Args:
-        scene: The scene, on any device.
-        file: Where to, open for writing.
-
-    Raises:
-        InvalidSceneError: No Gaussian of the scene is finite.
-        OSError: The file cannot be written.
-
-    Example:
-        >>> import io
-        >>> from cvtgs.synthetic import scene
-        >>> file = io.BytesIO()
-        >>> write_sog(scene("object", 5, sh_degree=0, seed=0), file)
-        >>> file.getvalue()[:2]
-        b'PK'
-    """
+    """Write a bundled SOG of version 2."""
     arrays = arrays_of(scene)
     encoded = _encoded(arrays, morton_rows(arrays.means), antialiased=scene.antialiased)
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
