@@ -1,5 +1,7 @@
 """Scenes of 2DGS: Gaussians without a third scale, in and out."""
 
+from importlib import import_module
+
 import cvtgs
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.scene import FLAT_LOG_SCALE
@@ -48,5 +50,5 @@ def test_flat_gaussians_of_a_file_with_three_scales_may_become_thick():
 
 
 def test_thick_gaussians_stay_thick(monkeypatch):
-    monkeypatch.setattr("cvtgs.analysis.analyze.FLAT_LOG_SCALE", None)
+    monkeypatch.setattr(import_module("cvtgs.analysis.analyze"), "FLAT_LOG_SCALE", None)
     simplified(random_scene(400), "auto")
