@@ -26,7 +26,7 @@ from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import MergeNet, PublishedMergeNet, correct_cells
 from cvtgs.report import CellStatistics, MatchReport
 from cvtgs.scene import GaussianScene
-from cvtgs.validity import standardized
+from cvtgs.validity import standardized, with_finite_opacities
 
 NEIGHBORS = 8
 """Cells around a cell that may cover its ends, and that the network sees."""
@@ -86,7 +86,7 @@ def reduce_scene(
     Args:
         scene: The Gaussians, with valid rows, on the device to compute on.
         analysis: What is known of them.
-        target: Number of Gaussians to keep, fewer than there are.
+        target: Number of Gaussians to keep.
         config: Every choice.
         net: Corrects merged Gaussians, on the same device; None for no correction.
         clock: Measures each stage.
@@ -96,6 +96,8 @@ def reduce_scene(
     Returns:
         The small scene, with its cells.
     """
+    if target >= len(scene.means):
+        return Reduced(with_finite_opacities(scene))
     used = drop_unused_bands(scene, analysis.plan)
     iterations = config.cvt.iterations + 1
     if finest is None or finest.merged is None or finest.grouping is None:

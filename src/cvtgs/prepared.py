@@ -37,7 +37,6 @@ from cvtgs.validity import (
 )
 
 
-
 class Prepared:
     """A scene to be made smaller again and again; what does not depend on the count is kept.
 

@@ -385,10 +385,7 @@ def _sum(values: Tensor, offsets: Tensor) -> Tensor:
 
 def _columns(*features: Tensor) -> Tensor:
     """Join features, each a column or several, in memory column by column."""
-    rows = list(features)
-    for number, part in enumerate(features):
-        rows[number] = part.T if part.ndim == 2 else part[None]
-    return torch.cat(rows).T
+    return torch.cat(list(map(torch.atleast_2d, map(torch.t, features)))).T
 
 
 def _distance(positions: Tensor) -> Tensor:
