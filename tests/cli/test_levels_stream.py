@@ -37,6 +37,8 @@ def test_a_stream(
     [
         (["--stream", "sog", "--suffix", ".spz"], "--suffix cannot go with --stream"),
         (["--chunk", "300"], "--chunk goes with --stream."),
+        (["--stream", "3dtiles", "--environment", "9"], "and goes with --stream sog; found 9."),
+        (["--stream", "sog", "--environment", "-1"], "--environment must be above 0"),
         (["--memory", "2GB"], "--memory goes with --stream."),
         (["--stream", "sog", "--place", "8,47"], "goes with --stream 3dtiles."),
         (["--stream", "3dtiles", "--place", "8"], "--place must be 2 or 3 numbers with commas"),

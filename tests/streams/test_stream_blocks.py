@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from cvtgs import GaussianScene, Simplifier, load, save
+from cvtgs import GaussianScene, Simplifier, concatenate, load, save
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
 from cvtgs.outofcore import LocalWorkers
 from cvtgs.streams import stream_file
@@ -180,3 +180,15 @@ def test_wrong_sizes(tmp_path: Path, source: Path) -> None:
     with pytest.raises(InvalidArgumentError, match="needs levels of different sizes"):
         stream_file(source, tmp_path / "out", [0.1, 0.1], kind="sog", simplifier=FAST)
     assert names_in(tmp_path) == ["scene.ply"]
+
+
+def test_blocks_share_one_environment(tmp_path: Path) -> None:
+    near, far = make("object", 3000, sh_degree=0, seed=1), make("object", 200, sh_degree=0, seed=2)
+    directions = torch.nn.functional.normalize(far.means - far.means.mean(dim=0))
+    radius = float(near.means.norm(dim=1).quantile(0.7))
+    sky = far.with_tensors({"means": 40 * radius * directions}, {})
+    save(concatenate([near, sky]), tmp_path / "scene.ply")
+    report = stream(tmp_path / "scene.ply", tmp_path / "out", environment_radii=10)
+    assert 2500 < report.levels[0].gaussians <= 3000
+    assert len(load(tmp_path / "out")) == 3200
+    assert sorted(path.name for path in (tmp_path / "out").glob("[.e]*")) == ["environment"]

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from cvtgs import GaussianScene, Simplifier, load
+from cvtgs import GaussianScene, Simplifier, concatenate, load
 from cvtgs.errors import InvalidArgumentError, OutputExistsError
 from cvtgs.progress import ProgressEvent
 from cvtgs.report import Level
@@ -238,3 +238,52 @@ def test_nothing_is_left_of_a_stream_that_fails(plan: StreamPlan, tmp_path: Path
     with pytest.raises(KeyboardInterrupt):
         write_sog_stream(plan, tmp_path / "out", listener=fail)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def open_levels() -> tuple[Level, ...]:
+    """Two levels of a lawn under a sky of 200 Gaussians, 40 times as far."""
+    near, far = make("object", 3000, sh_degree=0, seed=1), make("object", 200, sh_degree=0, seed=2)
+    directions = torch.nn.functional.normalize(far.means - far.means.mean(dim=0))
+    radius = float(near.means.norm(dim=1).quantile(0.7))
+    far = far.with_tensors({"means": 40 * radius * directions}, {})
+    scene = concatenate([near, far])
+    return Simplifier(preset="draft", device="cpu").levels(scene, [1.0, 0.25, 0.05])
+
+
+def test_what_is_far_is_the_environment_of_all_levels(
+    open_levels: tuple[Level, ...], tmp_path: Path
+) -> None:
+    plan = plan_stream(open_levels, chunk_gaussians=500, environment_radii=10)
+    assert plan.environment is not None
+    assert len(plan.environment) == 200
+    assert plan.counts[0] == 3000
+    reach = max(math.dist(chunk.box_min, chunk.box_max) for chunk in plan.chunks)
+    assert reach < 5 * float(open_levels[0].scene.means[:3000].norm(dim=1).quantile(0.7))
+    written = write_sog_stream(plan, tmp_path)
+    assert [one.gaussians for one in written] == list(plan.counts)
+    document = json.loads((tmp_path / "lod-meta.json").read_text())
+    assert document["environment"] == "environment/meta.json"
+    assert document["counts"] == list(plan.counts)
+    for lod, count in enumerate(plan.counts):
+        found = load(tmp_path, lod=lod)
+        assert len(found) == count + 200
+    assert len(load(tmp_path)) == len(open_levels[0].scene)
+    assert sorted(path.name for path in tmp_path.glob(".*")) == []
+
+
+def test_no_environment_where_nothing_is_far(levels: tuple[Level, ...], tmp_path: Path) -> None:
+    plan = plan_stream(levels, environment_radii=1e6)
+    assert plan.environment is None
+    write_sog_stream(plan, tmp_path)
+    assert "environment" not in json.loads((tmp_path / "lod-meta.json").read_text())
+
+
+def test_of_a_large_environment_a_coarser_level_is_taken(
+    open_levels: tuple[Level, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cvtgs.streams.plan.ENVIRONMENT_GAUSSIANS", 100)
+    plan = plan_stream(open_levels, environment_radii=10)
+    assert plan.environment is not None
+    assert 1 <= len(plan.environment) <= 100
+    assert plan.counts[0] == 3000

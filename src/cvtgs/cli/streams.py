@@ -1,6 +1,7 @@
 """``cvtgs levels --stream``: levels as chunks that viewers load while they show them."""
 
 import argparse
+import math
 from collections.abc import Sequence
 from itertools import zip_longest
 from typing import TYPE_CHECKING
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from cvtgs.streams import StreamLevel
 
 STREAMS = ("sog", "3dtiles")
-OF_STREAMS = ("chunk", "memory", "workers", "scheduler", "place", "transform")
+OF_STREAMS = ("chunk", "environment", "memory", "workers", "scheduler", "place", "transform")
 
 
 def add_stream_options(parser: argparse.ArgumentParser) -> None:
@@ -34,6 +35,13 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
         type=int,
         metavar="N",
         help="Gaussians in a chunk of a stream at its finest level (default 32768)",
+    )
+    parser.add_argument(
+        "--environment",
+        type=float,
+        metavar="RADII",
+        help="what lies farther from the middle than so many robust radii (which hold 70 %% of the "
+        "Gaussians) becomes the environment of a streamed SOG, for all levels; 10 is a sky",
     )
     parser.add_argument(
         "--place",
@@ -64,6 +72,11 @@ def check_stream_options(options: argparse.Namespace) -> None:
         raise InvalidArgumentError("--suffix cannot go with --stream, which sets the format.")
     if options.chunk is not None and options.chunk < 1:
         raise InvalidArgumentError(f"--chunk must be at least 1, found {options.chunk}.")
+    far = options.environment
+    if far is not None and not (options.stream == "sog" and 0 < far < math.inf):
+        raise InvalidArgumentError(
+            f"--environment must be above 0, and goes with --stream sog; found {far:g}."
+        )
     read_transform(options)
     check_stream(options.output, options.stream, overwrite=options.overwrite)
 
@@ -129,6 +142,7 @@ def stream_blocks(
             kind=options.stream,
             memory=blocks.memory,
             chunk_gaussians=options.chunk or CHUNK_GAUSSIANS,
+            environment_radii=options.environment,
             transform=read_transform(options),
             axes=(axes.source or SCENE_AXES, axes.target or SCENE_AXES),
             sh_degree=options.sh_degree,
@@ -157,7 +171,11 @@ def stream_levels(
             level._replace(scene=cvtgs.io.change_axes(level.scene, "rdf", axes.target))
             for level in made
         ]
-    plan = plan_stream(made, chunk_gaussians=options.chunk or CHUNK_GAUSSIANS)
+    plan = plan_stream(
+        made,
+        chunk_gaussians=options.chunk or CHUNK_GAUSSIANS,
+        environment_radii=options.environment,
+    )
     if options.stream == "sog":
         written = write_sog_stream(
             plan, options.output, overwrite=options.overwrite, listener=listener

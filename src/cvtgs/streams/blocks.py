@@ -47,7 +47,7 @@ from cvtgs.streams.files import (
     publish,
     write_index,
 )
-from cvtgs.streams.plan import CHUNK_GAUSSIANS, plan_part
+from cvtgs.streams.plan import CHUNK_GAUSSIANS, near_rows, plan_part
 from cvtgs.streams.sog import SogFormat
 from cvtgs.streams.tiles import TilesFormat
 from cvtgs.validity import with_finite_opacities
@@ -89,6 +89,7 @@ class StreamJob:
         chunk_gaussians: Gaussians of the finest level in a chunk.
         axes: Axes of the file, and of what is written.
         sh_degree: Highest SH degree to keep; None keeps all.
+        environment_radii: What lies farther away is the environment; None for none.
     """
 
     job: Job
@@ -96,6 +97,7 @@ class StreamJob:
     chunk_gaussians: int
     axes: tuple[str, str]
     sh_degree: int | None
+    environment_radii: float | None
 
     @property
     def folder(self) -> Path:
@@ -137,6 +139,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
     memory: int | None = None,
     blocks: int | None = None,
     chunk_gaussians: int = CHUNK_GAUSSIANS,
+    environment_radii: float | None = None,
     transform: tuple[float, ...] | None = None,
     axes: tuple[str, str] = (SCENE_AXES, SCENE_AXES),
     sh_degree: int | None = None,
@@ -160,6 +163,8 @@ def stream_file(  # noqa: PLR0913 (options by name)
         memory: Bytes that one process may use; None for what is free.
         blocks: Number of blocks, instead of ``memory``.
         chunk_gaussians: Gaussians of the finest level in a chunk.
+        environment_radii: What lies farther from the middle than so many robust radii is the
+            environment of a streamed SOG, in one size for all levels; None for none.
         transform: Where 3D Tiles stand (:func:`cvtgs.streams.geo_transform`).
         axes: Axes of the file, and of what is written.
         sh_degree: Highest SH degree to keep; None keeps all.
@@ -214,9 +219,15 @@ def stream_file(  # noqa: PLR0913 (options by name)
     )
     form = SogFormat() if kind == "sog" else TilesFormat(transform=transform)
     spec = StreamJob(
-        job=job, form=form, chunk_gaussians=chunk_gaussians, axes=axes, sh_degree=sh_degree
+        job=job,
+        form=form,
+        chunk_gaussians=chunk_gaussians,
+        axes=axes,
+        sh_degree=sh_degree,
+        environment_radii=environment_radii,
     )
-    facts = [job.key(simplifier.checkpoint), targets, repr(form), chunk_gaussians, axes, sh_degree]
+    choices = repr((form, chunk_gaussians, axes, sh_degree, environment_radii))
+    facts = [job.key(simplifier.checkpoint), targets, choices]
     key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
     spec = replace(spec, job=replace(job, folder=job_folder(folder, key)))
     check_stream(folder, kind, overwrite=overwrite)
@@ -292,13 +303,15 @@ def write_block(spec: StreamJob, block: int) -> None:
     checkpoint = job.read_network()
     net = None if checkpoint is None else checkpoint.net.to(rows.scene.dtype)
     scene = select_columns(rows.scene, job.config.effects)
-    analysis = analysis_of(job.read_scan(), rows)
+    scan = job.read_scan()
+    analysis = analysis_of(scan, rows)
     if spec.sh_degree is not None:
         scene = scene.with_sh_degree(min(spec.sh_degree, scene.sh_degree))
     levels = reduce_levels(scene, analysis, targets, job.config, net=net)
+    near = near_rows(levels[-1].scene, scan.frame, spec.environment_radii)
     if spec.axes[0] != spec.axes[1]:
         levels = [level._replace(scene=change_axes(level.scene, *spec.axes)) for level in levels]
-    plan = plan_part(levels, chunk_gaussians=spec.chunk_gaussians)
+    plan = plan_part(levels, near, chunk_gaussians=spec.chunk_gaussians)
     part = spec.form.write_part(plan, spec.folder, part=block, listener=silent)
     with atomic_output(spec.part_path(block), overwrite=True) as file:
         file.write(part.model_dump_json().encode())

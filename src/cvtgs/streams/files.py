@@ -44,6 +44,7 @@ class StreamPart(Record):
         tree: The node of the index that holds the part.
         box_min: Least coordinates of its chunks.
         box_max: Largest coordinates.
+        environment: File with its part of the environment; None if it has none.
     """
 
     levels: tuple[StreamLevel, ...]
@@ -52,6 +53,7 @@ class StreamPart(Record):
     tree: dict[str, Any]
     box_min: Corner
     box_max: Corner
+    environment: str | None = None
 
 
 class StreamFormat(Protocol):
@@ -78,11 +80,12 @@ class StreamFormat(Protocol):
         """
         ...
 
-    def index(self, parts: Sequence[StreamPart]) -> dict[str, Any]:
+    def index(self, parts: Sequence[StreamPart], folder: Path) -> dict[str, Any]:
         """Return the content of the index, of parts in an order in which neighbours are near.
 
         Args:
             parts: All parts.
+            folder: Where they are, and where files that all parts share are written.
 
         Returns:
             What is written as JSON.
@@ -110,7 +113,7 @@ def write_stream(
 
 def write_index(form: StreamFormat, parts: Sequence[StreamPart], folder: Path) -> None:
     """Write the index of parts that are in a folder."""
-    content = json.dumps(form.index(parts), separators=(",", ":"))
+    content = json.dumps(form.index(parts, folder), separators=(",", ":"))
     with atomic_output(folder / INDEX_NAMES[form.kind], overwrite=True) as file:
         file.write(content.encode())
 

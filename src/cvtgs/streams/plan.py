@@ -11,16 +11,20 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.arrays import morton_rows
+from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import rotation_matrices
 from cvtgs.scene import GaussianScene
 
 CHUNK_GAUSSIANS = 1 << 15
 """Gaussians of the finest level in a chunk, at most, unless a coarse one stands for more."""
+
+ENVIRONMENT_GAUSSIANS = 1 << 16
+"""Gaussians of the environment, at most, unless the coarsest level has more so far away."""
 
 _SIGMAS = 3.0
 """Boxes of chunks hold Gaussians up to here, in standard deviations."""
@@ -91,11 +95,20 @@ class StreamPlan(NamedTuple):
         levels: The levels, the finest first.
         chunks: The chunks.
         root: The tree.
+        environment: What is so far away that all levels share it, and no chunk has it; None if
+            nothing is.
     """
 
     levels: tuple[StreamedLevel, ...]
     chunks: tuple[StreamChunk, ...]
     root: StreamNode
+    environment: GaussianScene | None = None
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Gaussians in the chunks of each level."""
+        rows = zip(*(chunk.rows for chunk in self.chunks), strict=True)
+        return tuple(sum(map(len, level)) for level in rows)
 
 
 class _Cut(NamedTuple):
@@ -106,7 +119,10 @@ class _Cut(NamedTuple):
 
 
 def plan_stream(
-    levels: Sequence[StreamedLevel], *, chunk_gaussians: int = CHUNK_GAUSSIANS
+    levels: Sequence[StreamedLevel],
+    *,
+    chunk_gaussians: int = CHUNK_GAUSSIANS,
+    environment_radii: float | None = None,
 ) -> StreamPlan:
     """Build the chunks of a stream of levels.
 
@@ -115,9 +131,12 @@ def plan_stream(
             :meth:`~cvtgs.simplifier.Simplifier.levels` makes them.
         chunk_gaussians: Gaussians of the finest level in a chunk; a Gaussian of the coarsest level
             is never cut, so chunks are larger where it stands for more.
+        environment_radii: What lies farther from the middle than so many robust radii is the
+            environment, in one size for all levels; None leaves everything in chunks.
 
     Returns:
-        The plan. Every row of every level is in one chunk.
+        The plan. Every row of every level is in one chunk, or so far away that the environment
+        stands for it.
 
     Raises:
         InvalidArgumentError: There is no level, two have one size, or chunks are to be empty.
@@ -136,21 +155,50 @@ def plan_stream(
             f"a stream needs levels of different sizes and chunks of at least one Gaussian, found "
             f"levels of {counts} and chunks of {chunk_gaussians}."
         )
-    return plan_part(ordered, chunk_gaussians=chunk_gaussians)
+    near = near_rows(ordered[-1].scene, robust_frame(ordered[0].scene.means), environment_radii)
+    return plan_part(ordered, near, chunk_gaussians=chunk_gaussians)
 
 
-def plan_part(ordered: Sequence[StreamedLevel], *, chunk_gaussians: int) -> StreamPlan:
+def near_rows(
+    coarsest: GaussianScene, frame: RobustFrame, radii: float | None
+) -> Bool[Tensor, "c"]:
+    """Return which Gaussians go into chunks, at least one; the others are the environment."""
+    near = torch.ones(len(coarsest), dtype=torch.bool)
+    if radii is not None:
+        distances = frame.distances(coarsest.means).cpu()
+        near = distances <= max(radii, float(distances.min()))
+    return near
+
+
+def plan_part(
+    ordered: Sequence[StreamedLevel], near: Bool[Tensor, "c"], *, chunk_gaussians: int
+) -> StreamPlan:
     """Build the chunks of a part of a scene; sizes of levels may be equal, the finest is first."""
     coarsest = ordered[-1]
     means = coarsest.scene.means.double().cpu()
     weights = torch.ones(len(means), dtype=torch.int64)
     if len(ordered) > 1:
         weights = torch.bincount(_parents(ordered[0], coarsest), minlength=len(means)).clamp_min(1)
-    labels = torch.empty(len(means), dtype=torch.int64)
-    tree, count = _cut(means, weights, labels, most=chunk_gaussians)
-    members = [_rows(labels[_parents(level, coarsest)], level.scene, count) for level in ordered]
+    labels = torch.full((len(means),), -1)
+    tree, count = _cut(means, weights, labels, near.nonzero()[:, 0], most=chunk_gaussians)
+    of_levels = [labels[_parents(level, coarsest)] for level in ordered]
+    members = [
+        _rows(own, level.scene, count) for level, own in zip(ordered, of_levels, strict=True)
+    ]
     chunks = tuple(_chunk(ordered, rows) for rows in zip(*members, strict=True))
-    return StreamPlan(tuple(ordered), chunks, _node(tree, chunks))
+    environment = None if bool(near.all()) else _environment(ordered, of_levels)
+    return StreamPlan(tuple(ordered), chunks, _node(tree, chunks), environment)
+
+
+def _environment(
+    levels: Sequence[StreamedLevel], labels: Sequence[Int[Tensor, "m"]]
+) -> GaussianScene:
+    """Return what is in no chunk, of the finest level at which it is not too much."""
+    far = [(own < 0).nonzero()[:, 0] for own in labels]
+    fitting = (level for level, rows in enumerate(far) if len(rows) <= ENVIRONMENT_GAUSSIANS)
+    level = next(fitting, len(levels) - 1)
+    scene = levels[level].scene
+    return scene.select(far[level].to(scene.device))
 
 
 def _parents(level: StreamedLevel, coarsest: StreamedLevel) -> Int[Tensor, "m"]:
@@ -182,10 +230,11 @@ def _cut(
     means: Float[Tensor, "c 3"],
     weights: Int[Tensor, "c"],
     labels: Int[Tensor, "c"],
+    near: Int[Tensor, "k"],
     *,
     most: int,
 ) -> tuple[_Cut, int]:
-    """Cut the Gaussians of the coarsest level in two until no part stands for too many."""
+    """Cut near Gaussians of the coarsest level in two until no part stands for too many."""
     count = 0
 
     def part(rows: Int[Tensor, "k"]) -> _Cut:
@@ -200,7 +249,7 @@ def _cut(
         half = min(max(half, 1), len(rows) - 1)
         return _Cut(sides=(part(order[:half]), part(order[half:])))
 
-    return part(torch.arange(len(means))), count
+    return part(near), count
 
 
 def _widest(points: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
@@ -214,8 +263,9 @@ def _widest(points: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
 def _rows(labels: Int[Tensor, "m"], scene: GaussianScene, count: int) -> list[Int[Tensor, "k"]]:
     """Return the rows of every chunk, along a Morton curve of the whole level."""
     curve = torch.from_numpy(morton_rows(scene.means.cpu().float().numpy()))
+    curve = curve[labels[curve] >= 0]
     order = curve[torch.sort(labels[curve], stable=True).indices]
-    sizes = torch.bincount(labels, minlength=count).tolist()
+    sizes = torch.bincount(labels[curve], minlength=count).tolist()
     return list(order.split(sizes))
 
 

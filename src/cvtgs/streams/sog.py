@@ -10,9 +10,10 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from cvtgs.io import atomic_output
+from cvtgs.io import atomic_output, load, save
 from cvtgs.io.sog import encode_sog
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
+from cvtgs.scene import GaussianScene, concatenate
 from cvtgs.streams.files import (
     StreamLevel,
     StreamPart,
@@ -27,6 +28,9 @@ __all__ = ["write_sog_stream"]
 
 FILE_GAUSSIANS = 1 << 18
 """Gaussians in a file, at most, unless a chunk has more."""
+
+
+_FAR = "environment"
 
 
 class _Unit(NamedTuple):
@@ -58,17 +62,17 @@ class SogFormat:
         sizes = [0] * len(plan.levels)
         for number, unit in enumerate(units):
             scene = plan.levels[unit.level].scene
-            encoded = encode_sog(scene.select(unit.rows.to(scene.device)))
-            make_folder(folder / unit.name)
-            for name, content in encoded.files():
-                with atomic_output(folder / unit.name / name, overwrite=True) as file:
-                    file.write(content)
-                sizes[unit.level] += len(content)
+            part_of = scene.select(unit.rows.to(scene.device))
+            sizes[unit.level] += _write_sog(part_of, folder / unit.name)
             listener(ProgressEvent(stage="write", done=number + 1, total=len(units)))
         levels = tuple(
-            StreamLevel(len(level.scene), sum(unit.level == number for unit in units), size)
-            for number, (level, size) in enumerate(zip(plan.levels, sizes, strict=True))
+            StreamLevel(count, sum(unit.level == number for unit in units), size)
+            for number, (count, size) in enumerate(zip(plan.counts, sizes, strict=True))
         )
+        environment = None
+        if plan.environment is not None:
+            environment = f".environment_{part}.ply"
+            save(plan.environment, folder / environment, overwrite=True)
         return StreamPart(
             levels=levels,
             chunks=len(plan.chunks),
@@ -76,17 +80,26 @@ class SogFormat:
             tree=_tree(plan, units),
             box_min=plan.root.box_min,
             box_max=plan.root.box_max,
+            environment=environment,
         )
 
-    def index(self, parts: Sequence[StreamPart]) -> dict[str, Any]:
-        """Return the content of ``lod-meta.json``."""
+    def index(self, parts: Sequence[StreamPart], folder: Path) -> dict[str, Any]:
+        """Return the content of ``lod-meta.json``, and write the environment of all parts."""
         counts = [level.gaussians for level in join_levels(parts)]
         before = [0]
         for part in parts:
             before.append(before[-1] + len(part.names))
+        far = [folder / part.environment for part in parts if part.environment is not None]
+        more = {}
+        if far:
+            _write_sog(concatenate([load(path, trust_sizes=True) for path in far]), folder / _FAR)
+            for path in far:
+                path.unlink()
+            more = {"environment": f"{_FAR}/meta.json"}
         return {
             "version": 1,
             "asset": {"generator": "cvtgs"},
+            **more,
             "count": sum(counts),
             "counts": counts,
             "lodLevels": len(counts),
@@ -137,6 +150,17 @@ def write_sog_stream(
     """
     form = SogFormat(file_gaussians=file_gaussians)
     return write_stream(form, plan, folder, overwrite=overwrite, listener=listener)
+
+
+def _write_sog(scene: GaussianScene, folder: Path) -> int:
+    """Write an unbundled SOG; return its bytes."""
+    make_folder(folder)
+    total = 0
+    for name, content in encode_sog(scene).files():
+        with atomic_output(folder / name, overwrite=True) as file:
+            file.write(content)
+        total += len(content)
+    return total
 
 
 def _units(plan: StreamPlan, part: int, most: int) -> Iterator[_Unit]:

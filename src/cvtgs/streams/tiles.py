@@ -84,8 +84,8 @@ class TilesFormat:
             box_max=plan.root.box_max,
         )
 
-    def index(self, parts: Sequence[StreamPart]) -> dict[str, Any]:
-        """Return the content of ``tileset.json``."""
+    def index(self, parts: Sequence[StreamPart], folder: Path) -> dict[str, Any]:
+        """Return the content of ``tileset.json``; there are no other files beside the tiles."""
         low, high = join_boxes([part.box_min for part in parts], [part.box_max for part in parts])
         root = join_trees(parts, lambda part: parts[part].tree, _parent)
         placed = {} if self.transform is None else {"transform": list(self.transform)}
