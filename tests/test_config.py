@@ -39,7 +39,7 @@ def test_paper_is_cvt_gs():
 def test_standard_is_mass_everywhere():
     standard = SimplifyConfig()
     assert standard.filter.max_mass_share == 0.0
-    assert (standard.cvt.area_power, standard.merge.area_power) == (0.5, 1.0)
+    assert (standard.cvt.area_power, standard.merge.area_power) == (0.4, 1.0)
     assert standard.cvt.perspective
     assert standard.cvt.seeding == "stratified"
     assert standard.merge.opacity == "saturating"

@@ -15,8 +15,8 @@ from cvtgs.math.frames import RobustFrame, morton_order
 from cvtgs.math.segments import label_sums
 from cvtgs.scene import GaussianScene
 
-MEMBERS_PER_PAIR = 12
-"""The tessellation makes at most one more cell for so many Gaussians that must go."""
+MEMBERS_PER_CELL = 4
+"""A tessellation whose cells would have fewer Gaussians on average is left out."""
 
 REASSIGN = 7
 """Cells around its own that a Gaussian may move to."""
@@ -131,6 +131,7 @@ def group_rows(
         analysis,
         target,
         config,
+        total=len(rows),
         has_duplicates=analysis.plan.duplicates.active,
         on_iteration=on_iteration,
     )
@@ -176,10 +177,14 @@ def _tessellate(
     target: int,
     config: SimplifyConfig,
     *,
+    total: int,
     has_duplicates: bool,
     on_iteration: Callable[[int], None],
 ) -> tuple[cvt.Tessellation, Int[Tensor, "k"]]:
-    """Tessellate Gaussians in the order of the curve, and allocate the cells; return both."""
+    """Tessellate Gaussians in the order of the curve, and allocate the cells; return both.
+
+    ``total`` is the number of Gaussians that all cells hold.
+    """
     scene, rows = points.scene, points.rows
     count = finer_count(target, len(rows), config.allocation)
     tessellation = cvt.tessellate(
@@ -192,17 +197,24 @@ def _tessellate(
         on_iteration=on_iteration,
     )
     members = points.moments or _moments(points, analysis)
-    labels = allocate(members, tessellation.labels, count, target, config.allocation)
-    return tessellation, labels
+    costs = allocation_at(target / total, config.allocation)
+    return tessellation, allocate(members, tessellation.labels, count, target, costs)
 
 
 def finer_count(target: int, available: int, config: AllocationConfig) -> int:
     """Return how many cells the tessellation makes, from which pairs merge.
 
-    Where cells have few members, fewer: pairs of single Gaussians are worse cells than Voronoi's.
+    Where its cells would have few members, pairs merge from single Gaussians: all that are there.
     """
-    more = (available - target) // MEMBERS_PER_PAIR
-    return min(math.ceil(config.oversampling * target), target + more)
+    if config.oversampling == 1.0:
+        return target
+    count = math.ceil(config.oversampling * target)
+    return available if count * MEMBERS_PER_CELL > available else count
+
+
+def allocation_at(ratio: float, config: AllocationConfig) -> AllocationConfig:
+    """Return the configuration with the weight of colour for a ratio of cells to Gaussians."""
+    return config.model_copy(update={"color": config.color * ratio**config.color_power})
 
 
 def allocate(
@@ -273,6 +285,7 @@ def group_cells(
         analysis,
         target,
         config,
+        total=len(grouping.partition.order),
         has_duplicates=False,
         on_iteration=on_iteration,
     )

@@ -182,7 +182,7 @@ def test_duplicates_are_searched_once(monkeypatch):
         "nearest_scipy",
         lambda points, sites: searched.append(len(points)) or original(points, sites),
     )
-    settings = {"filter": {"max_mass_share": 0.0}, "cvt": {"iterations": 1}}
+    settings = {"cvt": {"iterations": 1}, "allocation": {"oversampling": 1.0}}
     for rho in (0.1, 0.5):
         planned = run_with(scene, rho, **settings)
         assert planned.report.plan.duplicates.active

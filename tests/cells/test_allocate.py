@@ -9,7 +9,7 @@ from cvtgs import SimplifyConfig, cvt
 from cvtgs.analysis import analyze
 from cvtgs.cells import Moments, gaussian_moments, group_moments, merge_pairs, reassign
 from cvtgs.config import AllocationConfig
-from cvtgs.grouping import allocate, finer_count, group_rows
+from cvtgs.grouping import allocate, allocation_at, finer_count, group_rows
 from cvtgs.synthetic import scene as make
 from scenes import random_scene
 
@@ -175,7 +175,7 @@ def test_moving_members_explains_them_better(kind):
 def test_merged_cells_lose_less_than_those_of_the_tessellation():
     scene, target = make("object", 4000, sh_degree=0, seed=2), 200
     members, losses = scene_moments(scene), []
-    for oversampling in (1.5, 1.0):
+    for oversampling in (2.0, 1.0):
         allocation = {"oversampling": oversampling, "reassign": False}
         config = SimplifyConfig.from_mapping({"allocation": allocation})
         analysis = analyze(scene, config)
@@ -191,6 +191,18 @@ def test_cells_of_the_tessellation_stay_where_allocation_is_off():
     members, labels = points([0.0, 1.0, 2.0]), torch.tensor([0, 1, 0])
     assert allocate(members, labels, 2, 2, off) is labels
     assert finer_count(10, 12, off) == 10
-    assert finer_count(10, 21, DEFAULT) == 10
-    assert finer_count(10, 46, DEFAULT) == 13
-    assert finer_count(10, 99, DEFAULT) == 15
+    assert finer_count(10, 80, DEFAULT) == 20
+    assert finer_count(10, 79, DEFAULT) == 79
+
+
+def test_colours_count_more_where_cells_are_small():
+    config = AllocationConfig(color=100.0, color_power=0.5)
+    assert allocation_at(0.25, config).color == pytest.approx(50.0)
+    assert allocation_at(0.01, config).color == pytest.approx(10.0)
+
+
+def test_a_round_halves_the_groups_at_most():
+    """Ten pairs alike: with larger rounds or smaller ones, groups would grow unevenly."""
+    moments = points([place for pair in range(10) for place in (9.0 * pair, 9.0 * pair + 0.5)])
+    labels = merge_pairs(moments, all_others(20), 10, DEFAULT)
+    assert torch.bincount(labels).tolist() == [2] * 10

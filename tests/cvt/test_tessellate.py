@@ -52,7 +52,7 @@ def test_coincident_points(count, config):
     result = tessellate(torch.ones(100, 3).double(), torch.ones(100).double(), count, config=config)
     assert_complete(result, 100, count)
     assert result.energy == 0.0
-    assert result.refilled == count - 1
+    assert result.refilled == (count - 1 if count < 100 else 0)  # one each: nothing to fill
 
 
 @each_config

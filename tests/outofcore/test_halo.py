@@ -9,7 +9,7 @@ import cvtgs
 from cvtgs import Simplifier, cells, cvt, validity
 from cvtgs.cvt import nearest_several
 from cvtgs.evaluation import EvaluationSettings
-from cvtgs.grouping import allocate
+from cvtgs.grouping import allocate, allocation_at
 from cvtgs.io.ply import open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import correct_cells
@@ -211,7 +211,8 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
         weights=scene.masses,
         masses=torch.cat(areas) * scene.opacities,
     )
-    config, fine = job.config.allocation, sum(job.cells)
+    config = allocation_at(TARGET / COUNT, job.config.allocation)
+    fine = sum(job.cells)
     assert fine > TARGET + 50
     whole = cells.group_moments(members, labels, fine)
     near = cvt.nearest_neighbors(whole.means.T, config.neighbors)
@@ -233,7 +234,7 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
 def test_cells_that_do_not_fit_into_memory_merge_by_parts(tmp_path, monkeypatch):
     cvtgs.save(cvtgs.synthetic.scene("room", 900, sh_degree=0, seed=2), tmp_path / "in.ply")
     monkeypatch.setattr("cvtgs.outofcore.memory.CELL_ROOM", 50)
-    with pytest.warns(UserWarning, match="compared within 3 parts"):
+    with pytest.warns(UserWarning, match="compared within 5 parts"):
         report = simplify_file(tmp_path / "in.ply", tmp_path / "out.ply", count=70, blocks=5)
     assert len(cvtgs.load(tmp_path / "out.ply")) == 70 == report.output_count
 

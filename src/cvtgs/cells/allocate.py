@@ -21,7 +21,7 @@ from cvtgs.scene import GaussianScene
 CHUNK = 1 << 15
 """Gaussians whose costs are computed together, to bound memory."""
 
-SHARE_PER_ROUND = 0.2
+SHARE_PER_ROUND = 0.5
 """Pairs that merge before costs are computed again, as a share of the cells."""
 
 FLOOR = 1e-4

@@ -83,7 +83,7 @@ class TessellationConfig(Section):
         samples_per_site: Lloyd looks at this many Gaussians per cell at most; 0 looks at all.
     """
 
-    area_power: float = pydantic.Field(default=0.5, ge=0.0, le=2.0)
+    area_power: float = pydantic.Field(default=0.4, ge=0.0, le=2.0)
     perspective: bool = True
     hidden_share: Share = 0.1
     weight_floor: float = pydantic.Field(default=1e-3, ge=0.0)
@@ -99,18 +99,22 @@ class AllocationConfig(Section):
     """How the cells of a finer tessellation become as many as are wanted.
 
     Attributes:
-        oversampling: The tessellation makes up to this many times as many cells; pairs of them
-            merge, cheapest first. 1 keeps the cells of the tessellation.
-        neighbors: A cell may merge with this many of the nearest others, or give members to them.
-        color: Weight of squared distances of colours against distances of shape and position.
+        oversampling: The tessellation makes this many times as many cells; pairs of them merge,
+            cheapest first. 1 keeps the cells of the tessellation.
+        neighbors: A cell may merge with this many of the nearest others.
+        color: Weight of squared distances of colours against distances of shape and position, for
+            as many cells as Gaussians.
+        color_power: The weight grows with the ratio of cells to Gaussians to this power; in large
+            cells colours differ anyway.
         mass_power: The cost of a pair counts with the mass that images show to this power.
         reassign: Whether every Gaussian then moves to the cell that explains it best.
     """
 
-    oversampling: float = pydantic.Field(default=1.5, ge=1.0, le=8.0)
-    neighbors: int = pydantic.Field(default=12, ge=1, le=64)
-    color: float = pydantic.Field(default=15.0, ge=0.0)
-    mass_power: float = pydantic.Field(default=0.25, ge=0.0, le=2.0)
+    oversampling: float = pydantic.Field(default=2.0, ge=1.0, le=8.0)
+    neighbors: int = pydantic.Field(default=6, ge=1, le=64)
+    color: float = pydantic.Field(default=75.0, ge=0.0)
+    color_power: float = pydantic.Field(default=0.3, ge=0.0, le=1.0)
+    mass_power: float = pydantic.Field(default=0.1, ge=0.0, le=2.0)
     reassign: bool = True
 
 

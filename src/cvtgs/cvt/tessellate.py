@@ -76,6 +76,16 @@ def tessellate(
             f"count must be between 1 and the number of points, {len(points)}; found {count}."
         )
     home = points.device
+    if count == len(points):  # nothing to group
+        own = torch.arange(count, device=home)
+        return Tessellation(
+            labels=own,
+            sites=points.double(),
+            energies=(0.0,),
+            energy=0.0,
+            refilled=0,
+            backend=SEARCH,
+        )
     nearest = choose_search(has_duplicates=has_duplicates)
     points, weights = points.cpu(), weights.cpu()  # where the tree is
     seeds = choose_seeds(weights, count, config=config, seed=seed)

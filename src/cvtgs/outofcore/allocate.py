@@ -14,9 +14,10 @@ from torch import Tensor
 
 from cvtgs import cells, cvt
 from cvtgs.cells import Moments
+from cvtgs.config import AllocationConfig
 from cvtgs.counts import shared_out
 from cvtgs.devices import one_thread
-from cvtgs.grouping import REASSIGN
+from cvtgs.grouping import REASSIGN, allocation_at
 from cvtgs.io import atomic_output
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.math.segments import segment_argmax, sort_by_label
@@ -106,7 +107,7 @@ def _regions(job: Job) -> list[list[int]]:
 
 def _allocate_region(job: Job, region: Sequence[int], count: int) -> list[int]:
     """Merge the cells of some blocks, write the groups, and return how many each block gets."""
-    config = job.config.allocation
+    config = _costs(job)
     sizes = torch.tensor([job.cells[block] for block in region])
     fine = _add_parts(job, region)
     labels = torch.arange(len(fine.weights))
@@ -134,6 +135,11 @@ def _allocate_region(job: Job, region: Sequence[int], count: int) -> list[int]:
         save_tensors(job.groups_path(block), {"groups": own, **named}, {})
     targets: list[int] = counts.tolist()
     return targets
+
+
+def _costs(job: Job) -> AllocationConfig:
+    """Return what merging costs at the ratio of all blocks together."""
+    return allocation_at(job.total / job.read_scan().row_count, job.config.allocation)
 
 
 def _add_parts(job: Job, region: Sequence[int]) -> Moments:
@@ -200,7 +206,7 @@ def _reassigned(
         labels,
         groups,
         neighbors,
-        job.config.allocation,
+        _costs(job),
         must_stay=keys // KEY == block,
     )
     moved: Tensor = keys[labels]

@@ -177,7 +177,9 @@ def _scan_and_sort(
 ) -> Manifest:
     """Scan the file and sort its rows into blocks; return what is to be made of them."""
     found = sort_into_blocks(job, workers, clock)
-    finer = finer_count(found.rest, sum(found.rows), job.config.allocation)
+    total = sum(found.rows)
+    finer = finer_count(found.rest, total, job.config.allocation)
+    finer = min(finer, max(found.rest, total // 2))  # sites of Lloyd, held by one process
     if finer < sum(1 for count in found.rows if count):  # so few: the heaviest blocks get one each
         order = sorted(range(job.blocks), key=lambda block: -found.cells[block])
         cells = [int(block in order[:finer]) for block in range(job.blocks)]
