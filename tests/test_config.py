@@ -165,6 +165,10 @@ def test_unknown_presets_are_errors(name):
     assert error_of({"preset": name}) == wanted
 
 
+def test_a_mistyped_preset_gets_a_suggestion():
+    assert error_of({"preset": "standart"}).endswith("; found 'standart'; did you mean standard?")
+
+
 def test_an_unknown_preset_by_name_is_an_error():
     with pytest.raises(ConfigError) as caught:
         SimplifyConfig.from_preset("best")

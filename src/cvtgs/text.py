@@ -2,6 +2,8 @@
 
 import json
 import re
+from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import Any
 
 _UNSAFE = re.compile(
@@ -42,3 +44,9 @@ def shown(value: Any) -> str:
     except RecursionError:  # lists in lists in lists
         return f"a deeply nested {type(value).__name__}"
     return text if len(text) <= MOST_LETTERS else f"{text[: MOST_LETTERS - 3]}..."
+
+
+def suggestion(word: str, choices: Iterable[str], *, likeness: float = 0.6) -> str:
+    """Return "; did you mean X?" with the choice most like a word; empty if none is alike."""
+    near = get_close_matches(word, list(choices), n=1, cutoff=likeness)
+    return f"; did you mean {near[0]}?" if near else ""

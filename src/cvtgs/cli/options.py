@@ -4,9 +4,8 @@ import argparse
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 import cvtgs
 from cvtgs.cli.display import say
 from cvtgs.errors import ConfigError, InvalidArgumentError
+from cvtgs.text import suggestion
 
 if TYPE_CHECKING:
     import pydantic
@@ -173,12 +173,6 @@ class CommandParser(argparse.ArgumentParser):
 
 AddParser = Callable[..., CommandParser]
 """``add_parser`` of the subparsers of ``cvtgs``: makes the parser of one command."""
-
-
-def suggestion(word: str, choices: Iterable[str], *, likeness: float = 0.6) -> str:
-    """Return "; did you mean X?" with the choice most like a word; empty if none is alike."""
-    near = get_close_matches(word, list(choices), n=1, cutoff=likeness)
-    return f"; did you mean {near[0]}?" if near else ""
 
 
 def add_options(parser: argparse.ArgumentParser, *names: str) -> None:

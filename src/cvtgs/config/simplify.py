@@ -19,6 +19,14 @@ from cvtgs.config.sections import (
     VisibilityConfig,
 )
 from cvtgs.errors import ConfigError
+from cvtgs.text import suggestion
+
+
+def unknown_preset(name: object) -> ConfigError:
+    """Return the error about a preset that is none."""
+    near = suggestion(name, PRESETS) if isinstance(name, str) else ""
+    end = near or "."
+    return ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {shown(name)}{end}")
 
 
 class SimplifyConfig(Section):
@@ -71,7 +79,7 @@ class SimplifyConfig(Section):
             ConfigError: There is no such preset.
         """
         if name not in PRESETS:
-            raise ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {shown(name)}.")
+            raise unknown_preset(name)
         return cls.from_mapping({"preset": name})
 
     @classmethod
@@ -89,7 +97,7 @@ class SimplifyConfig(Section):
         """
         name = values.get("preset", "standard")
         if not isinstance(name, str) or name not in PRESETS:
-            raise ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {shown(name)}.")
+            raise unknown_preset(name)
         try:
             return cls.model_validate(_merged(PRESETS[name], values))
         except pydantic.ValidationError as error:

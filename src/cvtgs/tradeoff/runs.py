@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cvtgs.config import PRESETS
+from cvtgs.config.simplify import unknown_preset
 from cvtgs.counts import target_count
-from cvtgs.errors import ConfigError, InvalidArgumentError, RunError
+from cvtgs.errors import InvalidArgumentError, RunError
 from cvtgs.progress import ProgressEvent, ProgressListener
 from cvtgs.report import SimplifyReport
 from cvtgs.tradeoff.results import Failure
@@ -110,7 +111,7 @@ def tasks_of(presets: Sequence[str] | None, ratios: Sequence[float]) -> tuple[Ta
     names = list(PRESETS) if presets is None else list(presets)
     for name in names:
         if name not in PRESETS:
-            raise ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {name!r}.")
+            raise unknown_preset(name)
     for rho in ratios:
         target_count(1, rho)
     tasks = tuple(Task(preset=name, rho=rho) for rho in ratios for name in names)
