@@ -8,6 +8,7 @@ from typing import Self
 import torch
 
 from cvtgs.config.base import Record
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import Evaluation, SceneScores
 from cvtgs.evaluation.report import mean_of
 from cvtgs.io import atomic_output, check_output, check_save, load, save
@@ -158,6 +159,12 @@ def check_levels(
     folder: str | os.PathLike[str], names: Sequence[str], *, overwrite: bool = False
 ) -> None:
     """Check that levels could be written, before the long work that comes first."""
+    for name in names:
+        if name.endswith(".usda"):  # the only format that is written and not read
+            raise InvalidArgumentError(
+                "levels need a format that can be read again, found '.usda'; write them as .ply, "
+                "and convert these."
+            )
     place = Path(folder)
     if not place.exists():
         check_output(place)  # its parent is there and writable

@@ -71,7 +71,7 @@ def test_what_cannot_be_written_is_refused_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     assert main(["convert", str(tmp_path / "missing.ply"), str(tmp_path / name)]) == 1
-    ends = ".compressed.ply, .ply, .spz, .splat, .sog, .spz.glb, .glb or .gltf"
+    ends = ".compressed.ply, .ply, .spz, .splat, .sog, .spz.glb, .glb, .gltf or .usda"
     assert f"must end in {ends}" in capsys.readouterr().err
 
 

@@ -276,7 +276,7 @@ def test_early_check_of_what_cannot_work(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_early_check_of_the_suffix(tmp_path: Path) -> None:
-    ends = r"\.compressed\.ply, \.ply, \.spz, \.splat, \.sog, \.spz\.glb, \.glb or \.gltf"
+    ends = r"\.compressed\.ply, \.ply, \.spz, \.splat, \.sog, \.spz\.glb, \.glb, \.gltf or \.usda"
     with pytest.raises(FileFormatError, match=f"the file name must end in {ends}, found no suffix"):
         check_save(tmp_path / "scene")
 

@@ -267,5 +267,5 @@ def test_unknown_suffix(tmp_path: Path) -> None:
         save(make_scene(), tmp_path / "s.ckpt")
     assert str(caught.value) == (
         f"{tmp_path}/s.ckpt: the file name must end in .compressed.ply, .ply, .spz, .splat, .sog, "
-        f".spz.glb, .glb or .gltf, found the suffix '.ckpt'."
+        f".spz.glb, .glb, .gltf or .usda, found the suffix '.ckpt'."
     )

@@ -28,7 +28,7 @@ Color = tuple[float, float, float]
 READABLE = (
     ".ply, .spz, .splat, .ksplat, .sog, .glb, .gltf, .ckpt, .pt or the folder of a trained model"
 )
-WRITABLE = ".ply, .compressed.ply, .spz, .splat, .sog, .glb, .gltf or .spz.glb"
+WRITABLE = ".ply, .compressed.ply, .spz, .splat, .sog, .glb, .gltf, .spz.glb or .usda"
 PRESET_NAMES = "draft, fast, standard, matched, high, max (from the fastest to the best) or paper"
 CAMERA_FILES = "transforms.json, a COLMAP model, cameras.json, or a folder of these"
 COLORS: Mapping[str, Color] = {

@@ -57,7 +57,7 @@ _STREAM = "lod-meta.json"
 _STATES_AXES = (".spz", ".glb", ".gltf")
 """Formats whose axes their readers know."""
 
-_FILE_AXES = {".spz.glb": "luf", ".glb": "luf", ".gltf": "luf"}
+_FILE_AXES = {".spz.glb": "luf", ".glb": "luf", ".gltf": "luf", ".usda": "rub"}
 """Axes that a format prescribes, by suffix."""
 
 _WRITERS: Mapping[str, str] = MappingProxyType(
@@ -70,6 +70,7 @@ _WRITERS: Mapping[str, str] = MappingProxyType(
         ".spz.glb": "cvtgs.io.gltf:write_spz_glb",
         ".glb": "cvtgs.io.gltf:write_glb",
         ".gltf": "cvtgs.io.gltf:write_gltf",
+        ".usda": "cvtgs.io.usd:write_usda",
     }
 )
 
@@ -204,16 +205,16 @@ def save(
     Args:
         scene: The scene, on any device.
         path: The file to write; its suffix chooses the format: ``.ply``,
-            ``.compressed.ply``, ``.spz``, ``.splat``, ``.sog``, ``.glb``, ``.gltf``, or
-            ``.spz.glb``, which is a glTF with an SPZ inside. Or a file that is open for writing in
-            binary mode, to which all bytes go once the scene is ready.
+            ``.compressed.ply``, ``.spz``, ``.splat``, ``.sog``, ``.glb``, ``.gltf``,
+            ``.spz.glb``, which is a glTF with an SPZ inside, or ``.usda`` (OpenUSD). Or a file
+            that is open for writing in binary mode, to which all bytes go once the scene is ready.
         format: The suffix of the format, for example ``".spz"``, whatever the file is called.
             None goes by the name; an open file is given a ``.ply``.
         overwrite: Whether an existing file may be replaced.
         axes: Where x, y and z of the file are to point, as :func:`cvtgs.io.change_axes` names
             them; the scene, whose own are ``"rdf"``, is turned to them. None for those of the
-            format: ``"luf"`` of glTF, ``"rdf"`` of the others. ``.spz`` files of version 4 state
-            them.
+            format: ``"luf"`` of glTF, ``"rub"`` of OpenUSD, ``"rdf"`` of the others. ``.spz``
+            files of version 4 state them.
         spz_version: Version of ``.spz`` files: 4, or 3 or 2 for older readers.
 
     Raises:

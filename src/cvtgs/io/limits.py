@@ -97,6 +97,7 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
         ".spz.glb": replace(_SPZ, comments=True),
         ".glb": _GLTF,
         ".gltf": _GLTF,
+        ".usda": _GLTF,
         ".splat": FormatLimits(
             sh_degree=0,
             antialiased=False,

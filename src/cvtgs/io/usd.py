@@ -1,0 +1,94 @@
+"""Write OpenUSD text (``.usda``) with a ParticleField3DGaussianSplat, which OpenUSD 26.03 added."""
+
+from collections.abc import Iterator
+from typing import BinaryIO
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from cvtgs.io.arrays import Arrays, Floats, arrays_of
+from cvtgs.math.parameters import build_covariances, opacity_from_logit
+from cvtgs.math.spherical_harmonics import degree_of
+from cvtgs.scene import GaussianScene
+from cvtgs.text import printable
+
+AXES = "rub"
+"""Right, up, back: axes of a stage whose up axis is Y."""
+
+_CHUNK_ROWS = 1 << 15
+_SIGMAS = 3.0
+"""Bounds hold Gaussians up to here, in standard deviations."""
+
+
+def write_usda(scene: GaussianScene, file: BinaryIO) -> None:
+    """Write a stage with one prim, in the order and the axes of the scene; numbers keep float32.
+
+    Args:
+        scene: The scene, on any device.
+        file: Where to, open for writing.
+
+    Raises:
+        InvalidSceneError: No Gaussian of the scene is finite.
+        OSError: The file cannot be written.
+
+    Example:
+        >>> import io
+        >>> from cvtgs.synthetic import scene
+        >>> file = io.BytesIO()
+        >>> write_usda(scene("object", 5, sh_degree=0, seed=0), file)
+        >>> file.getvalue().splitlines()[0]
+        b'#usda 1.0'
+    """
+    arrays = arrays_of(scene)
+    for text in _document(scene, arrays):
+        file.write(text.encode())
+
+
+def _document(scene: GaussianScene, arrays: Arrays) -> Iterator[str]:
+    yield '#usda 1.0\n(\n    defaultPrim = "Splats"\n    metersPerUnit = 1\n    upAxis = "Y"\n'
+    if scene.comments:
+        lines = ", ".join(_quoted(line) for line in scene.comments)
+        yield f"    customLayerData = {{\n        string[] comments = [{lines}]\n    }}\n"
+    yield ')\n\ndef ParticleField3DGaussianSplat "Splats"\n{\n'
+    yield from _array("float3[] extent", _extent(arrays))
+    yield from _array("point3f[] positions", arrays.means)
+    yield from _array("quatf[] orientations", arrays.quats)
+    yield from _array("float3[] scales", np.exp(arrays.log_scales))
+    logits = torch.from_numpy(arrays.logit_opacities)
+    yield from _array("float[] opacities", opacity_from_logit(logits).numpy())
+    degree = degree_of(arrays.shN.shape[1])
+    yield f"    uniform int radiance:sphericalHarmonicsDegree = {degree}\n"
+    bands = np.concatenate([arrays.sh0[:, None], arrays.shN], axis=1).reshape(-1, 3)
+    yield from _array("float3[] radiance:sphericalHarmonicsCoefficients", bands)
+    yield "}\n"
+
+
+def _array(name: str, values: Floats) -> Iterator[str]:
+    """Return an attribute, a part at a time; rows of several numbers are tuples."""
+    row = "%.9g" if values.ndim == 1 else f"({', '.join(['%.9g'] * values.shape[1])})"
+    yield f"    {name} = ["
+    for start in range(0, len(values), _CHUNK_ROWS):
+        part = values[start : start + _CHUNK_ROWS]
+        text = ", ".join([row] * len(part)) % tuple(part.ravel().tolist())
+        yield f", {text}" if start else text
+    yield "]\n"
+
+
+def _extent(arrays: Arrays) -> Float[np.ndarray, "2 3"]:
+    """Return the corners of a box around all Gaussians."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for start in range(0, len(arrays.means), _CHUNK_ROWS):
+        part = slice(start, start + _CHUNK_ROWS)
+        scales = torch.from_numpy(np.exp(arrays.log_scales[part].astype(np.float64)))
+        quats = torch.from_numpy(arrays.quats[part].astype(np.float64))
+        variances = build_covariances(scales, quats).diagonal(dim1=1, dim2=2).numpy()
+        reach = _SIGMAS * np.sqrt(variances)
+        low = np.minimum(low, (arrays.means[part] - reach).min(axis=0))
+        high = np.maximum(high, (arrays.means[part] + reach).max(axis=0))
+    return np.stack([low, high])
+
+
+def _quoted(text: str) -> str:
+    plain = printable(text).replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{plain}"'
