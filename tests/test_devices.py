@@ -2,17 +2,20 @@
 
 import os
 import platform
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 
+import cvtgs
 from cvtgs.devices import (
     chosen_device,
     chunk_length,
     core_count,
     device_name,
+    in_threads,
     one_thread,
     resolve_device,
     thread_count,
@@ -20,6 +23,7 @@ from cvtgs.devices import (
     within_memory,
 )
 from cvtgs.errors import DeviceError, OutOfMemoryError
+from scenes import same_bits
 
 
 def test_a_name_is_taken_at_its_word():
@@ -122,3 +126,45 @@ def test_threads_come_back_after_an_error():
     with pytest.raises(ZeroDivisionError), one_thread():
         divmod(torch.get_num_threads(), 0)
     assert torch.get_num_threads() == before
+
+
+@pytest.fixture
+def two_threads(monkeypatch):
+    monkeypatch.setattr("cvtgs.devices.thread_count", lambda: 2)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_chunks_are_computed_by_one_thread_each_and_stay_in_order(two_threads):
+    together = threading.Barrier(2, timeout=30)
+
+    def function(number):
+        if number < 2:
+            together.wait()  # only two that run at the same time get past this
+        return number, torch.get_num_threads(), torch.is_grad_enabled()
+
+    with torch.no_grad():
+        found = list(in_threads(function, range(9), torch.device("cpu")))
+    assert found == [(number, 1, False) for number in range(9)]
+    assert torch.get_num_threads() == 2
+    with pytest.raises(ZeroDivisionError):
+        list(in_threads(lambda number: 1 / number, [1, 0, 2], torch.device("cpu")))
+    assert torch.get_num_threads() == 2
+
+
+def test_one_thread_computes_where_it_is():
+    with one_thread():
+        found = in_threads(lambda _: threading.get_ident(), range(3), torch.device("cpu"))
+        assert set(found) == {threading.get_ident()}
+
+
+def test_stages_give_the_same_bits_in_two_threads(two_threads, monkeypatch):
+    for name in ("cells.allocate.CHUNK", "cells.merge.CHUNK_MEMBERS"):
+        monkeypatch.setattr(f"cvtgs.{name}", 100)
+    monkeypatch.setattr("cvtgs.mergenet.apply.CHUNK_MEMBERS", 100)
+    scene = cvtgs.synthetic.scene("object", 2000, sh_degree=1, seed=0)
+    two = cvtgs.Simplifier(device="cpu").simplify(scene, 0.1)
+    with one_thread():
+        assert same_bits(two, cvtgs.Simplifier(device="cpu").simplify(scene, 0.1))

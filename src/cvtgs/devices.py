@@ -3,7 +3,9 @@
 import gc
 import os
 import platform
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -19,6 +21,7 @@ LONGER_CHUNKS = 32
 CHUNK_BYTES = 1 << 28
 """Device memory for each chunk as long as on a CPU, which takes a quarter of it at most."""
 
+Item = TypeVar("Item")
 Result = TypeVar("Result")
 _SHORT_CHUNKS = ContextVar("short_chunks", default=False)
 
@@ -149,6 +152,52 @@ def thread_count() -> int:
     """Return how many threads a search may use: one for each core, or ``OMP_NUM_THREADS``."""
     limit = os.environ.get("OMP_NUM_THREADS", "")
     return max(1, min(core_count(), int(limit))) if limit.isdecimal() else core_count()
+
+
+def in_threads(
+    function: Callable[[Item], Result], items: Iterable[Item], device: torch.device
+) -> Iterator[Result]:
+    """Call a function for chunks, as many at a time as torch uses threads; each call uses one.
+
+    Chunks are too short for torch to split its operations on them well. Every chunk gives the
+    same bits whatever the number of threads.
+
+    Args:
+        function: Computes on one chunk; several calls run at the same time.
+        items: The chunks.
+        device: Where it computes: others than CPUs get one chunk after the other.
+
+    Yields:
+        The results, in the order of the items.
+
+    Example:
+        >>> list(in_threads(abs, [-1, 2, -3], torch.device("cpu")))
+        [1, 2, 3]
+    """
+    threads = min(torch.get_num_threads(), thread_count())
+    if device.type != "cpu" or threads == 1:
+        yield from map(function, items)
+        return
+
+    before, has_gradients = torch.get_num_threads(), torch.is_grad_enabled()
+
+    def start() -> None:
+        torch.set_num_threads(1)
+        torch.set_grad_enabled(has_gradients)
+
+    waiting: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(threads, initializer=start) as pool:
+        try:
+            for item in items:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) > 2 * threads:  # so that few results wait at any time
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
+            torch.set_num_threads(before)  # threads that start later would have one, too
 
 
 @contextmanager

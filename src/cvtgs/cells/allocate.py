@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.config import AllocationConfig
-from cvtgs.devices import chunk_length
+from cvtgs.devices import chunk_length, in_threads
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.parameters import normalize_quats, quats_to_matrices
 from cvtgs.math.segments import label_sums
@@ -282,7 +282,8 @@ def reassign(
     found = labels.new_empty(len(labels) + 1)  # the last is of groups without members
     own_costs = torch.empty(len(labels), dtype=torch.float64, device=labels.device)
     chunk = chunk_length(CHUNK, labels.device)
-    for start in range(0, len(labels), chunk):
+
+    def search(start: int) -> None:
         part = slice(start, min(start + chunk, len(labels)))
         cells = labels[part]
         mean, covariance = members.means[:, part], members.covariances[:, part]
@@ -305,6 +306,9 @@ def reassign(
             closer = cost < least
             least, best = torch.where(closer, cost, least), torch.where(closer, group, best)
         found[part] = best
+
+    for _ in in_threads(search, range(0, len(labels), chunk), labels.device):
+        pass
     lowest = own_costs.new_full((count,), torch.inf).scatter_reduce(0, labels, own_costs, "amin")
     rows = torch.arange(len(labels), device=labels.device)
     rows = torch.where(own_costs == lowest[labels], rows, len(labels))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cvtgs.cells.partition import Partition
 from cvtgs.config import MergeConfig
-from cvtgs.devices import chunk_length
+from cvtgs.devices import chunk_length, in_threads
 from cvtgs.math import parameters
 from cvtgs.math.segments import (
     gather_columns,
@@ -61,7 +61,9 @@ def merge_cells(
     done = len(counts) - len(cells)
     tensors, extras = merged.tensors(), dict(merged.extras)
     chunk = chunk_length(CHUNK_MEMBERS, scene.means.device)
-    for run, part in partition.select(cells).chunks(chunk):
+
+    def merge_chunk(item: tuple[slice, Partition]) -> int:
+        run, part = item
         rows, offsets, of_cells = part.order, part.offsets, cells[run]
         members = gather_members(scene, part)
         weights = members.weights(config.area_power)
@@ -87,7 +89,12 @@ def merge_cells(
                 extras[name][of_cells] = values
             else:
                 extras[name][of_cells] = column[heaviest]
-        done += run.stop - run.start
+        count: int = run.stop - run.start
+        return count
+
+    chunks = partition.select(cells).chunks(chunk)
+    for count in in_threads(merge_chunk, chunks, scene.means.device):
+        done += count
         on_cells(done)
     return merged.with_tensors(tensors, extras)
 

@@ -7,8 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cells import Partition
-from cvtgs.cells.features import describe_members, neighbor_context
-from cvtgs.devices import chunk_length
+from cvtgs.cells.features import NeighborContext, describe_members, neighbor_context
+from cvtgs.devices import chunk_length, in_threads
 from cvtgs.math import parameters
 from cvtgs.math.segments import segment_sum, segment_sum_of
 from cvtgs.mergenet.model import MergeNet, Residuals
@@ -118,22 +118,26 @@ def _correct_gated(
         context = neighbor_context(
             merged, cells=cells[block], neighbors=neighbors[cells[block]], sizes=sizes
         )
-        for run, part in several.cut(block).chunks(chunk, cell_cost=near):
+
+        def correct(
+            item: tuple[slice, Partition],
+            block: slice = block,
+            context: NeighborContext = context,
+        ) -> tuple[Tensor, dict[str, Tensor]]:
+            run, part = item
             rows = cells[block][run]
             descriptors = describe_members(
                 scene, part, context=context.cut(run), visibility=visibility
             )
-            yield (
-                rows,
-                compose(
-                    scene,
-                    merged,
-                    part,
-                    cells=rows,
-                    neighbors=neighbors[rows],
-                    residuals=net(descriptors),
-                ),
+            residuals = net(descriptors)
+            near = neighbors[rows]
+            corrected = compose(
+                scene, merged, part, cells=rows, neighbors=near, residuals=residuals
             )
+            return rows, corrected
+
+        chunks = several.cut(block).chunks(chunk, cell_cost=near)
+        yield from in_threads(correct, chunks, scene.device)
 
 
 def _correct_as_published(

@@ -36,7 +36,7 @@ from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport
 from cvtgs.simplifier import Simplifier
 
-RANGE_ROWS, MOST_RANGES = 1 << 20, 64
+RANGE_ROWS, MOST_RANGES = 1 << 18, 64
 """Rows of the file that one process reads in one call, at least, and number of such calls."""
 
 
@@ -81,7 +81,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         simplifier: Configuration and network; None for the defaults.
         workers: Calls functions for ranges of the file and for blocks; None calls them here, one
             after the other.
-        range_rows: Rows of the file that one process reads in one call; None for a million, or a
+        range_rows: Rows of the file that one process reads in one call; None for 260,000, or a
             64th of the file.
         overwrite: Whether an existing output may be replaced.
         listener: Called with progress events.
