@@ -13,7 +13,8 @@ Methods are the presets of cvtgs, ``standard, no network``, the baselines of
         --methods standard "mass pruning" NanoGS \
         --tool "other=other-tool {IN} -o {OUT} --keep {RHO} --max {COUNT}"
 
-Scenes and judges are chosen as in ``benchmarks.quality``. Let it run once on a small scene first:
+Scenes and judges are chosen as in ``benchmarks.quality``; with ``--cameras CAPTURE --split test
+--images DIR`` the judge compares with photographs. Let it run once on a small scene first:
 what compiles itself does so then. ``--results FILE`` adds the results to those that the file has,
 and shows all of them, so that methods can be run one by one; with ``--methods`` and no name, it
 only shows them. ``--outputs DIR`` keeps every file that a method wrote with its seconds, and does
@@ -231,6 +232,9 @@ def report(table: Table, options: argparse.Namespace) -> str:
         if options.files and all(cameras_file(file).is_file() for file in options.files)
         else f"{VIEWS} automatic views of {SIZE} x {SIZE} pixels where none are beside a scene"
     )
+    if options.cameras is not None:
+        judge = "cvtgs' own renderer, the cameras of --cameras"
+        judge += " against photographs" if options.images is not None else ""
     if options.scorer:
         judge = "the command of --scorer"
     clock = "wall-clock" if options.clock == "wall" else "user CPU"

@@ -19,7 +19,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import mean
-from typing import NamedTuple
 
 import pydantic
 
@@ -30,15 +29,14 @@ from benchmarks.compare_tables import Result, Table, joined, markdown, read_resu
 from benchmarks.datasets import (
     DATASETS,
     Capture,
-    TestViews,
     check_model,
     find_captures,
     read_test_views,
 )
 from benchmarks.measuring import Cost, machine, write_file
-from benchmarks.quality import RATIOS, Quality, markdown_rows
+from benchmarks.quality import RATIOS, PhotographJudge, markdown_rows
 from cvtgs.errors import CvtgsError
-from cvtgs.evaluation.scorer import Metrics, chosen_metrics, render_view, scene_scores
+from cvtgs.evaluation.scorer import chosen_metrics
 
 FULL = "full scene"
 MERGED = "paper, no network"
@@ -60,26 +58,6 @@ class Published(pydantic.BaseModel):
 
     source: str
     gains: tuple[Gain, ...]
-
-
-class Judge(NamedTuple):
-    """What images are compared with, and how."""
-
-    views: TestViews
-    background: tuple[float, float, float]
-    metrics: Metrics
-
-    def score(self, scene: cvtgs.GaussianScene) -> Quality:
-        """Return the means over the photographs."""
-        color = scene.means.new_tensor(self.background)
-        rows = [
-            self.metrics.compare(
-                render_view(scene, camera).over(color).clamp(0, 1),
-                self.views.photographs[number : number + 1],
-            )
-            for number, camera in enumerate(self.views.cameras.singles())
-        ]
-        return Quality.of(scene_scores("", len(scene), rows))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -153,7 +131,7 @@ def measure(capture: Capture, table: Table, options: argparse.Namespace):
     views = read_test_views(capture)
     check_model(capture, scene, views.cameras)
     metrics = chosen_metrics(options.lpips, (views.cameras.width, views.cameras.height))
-    judge = Judge(views, capture.dataset.background, metrics)
+    judge = PhotographJudge(views.cameras, views.photographs, capture.dataset.background, metrics)
     network = metrics.lpips.network if metrics.lpips else f"none: {metrics.note}"
     print(
         f"{capture.name}: {len(scene):,} Gaussians of {capture.model.layout}'s layout, "
@@ -177,7 +155,9 @@ def measure(capture: Capture, table: Table, options: argparse.Namespace):
         yield one_row(capture, method, rho, found), network
 
 
-def result_of(judge: Judge, scene: cvtgs.GaussianScene, cost: Cost, wanted: int) -> Result:
+def result_of(
+    judge: PhotographJudge, scene: cvtgs.GaussianScene, cost: Cost, wanted: int
+) -> Result:
     return Result(
         quality=judge.score(scene),
         wall_seconds=cost.wall_seconds,

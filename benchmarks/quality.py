@@ -4,7 +4,8 @@
 views. Scenes of your own: name the files; cameras that lie beside a file (``benchmarks.cameras``)
 are used. LPIPS: ``--lpips WEIGHTS``. Another judge: ``--scorer
 "python score.py --json {full} {small}"``; it gets the full scene and the small ones, and prints a
-JSON list of objects with ``psnr``, ``ssim`` and perhaps ``lpips``, in that order.
+JSON list of objects with ``psnr``, ``ssim`` and perhaps ``lpips``, in that order. One scene with
+cameras: ``--cameras CAPTURE``; with photographs: ``--images DIR``, to score against them.
 
 ``--choices`` changes one choice of ``standard`` at a time instead; ``--set merge.network=false``
 measures the choices without a network, which was trained for all of them as they are.
@@ -21,13 +22,23 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean
-from typing import Self
+from typing import NamedTuple, Self
+
+from jaxtyping import Float
+from torch import Tensor
 
 import cvtgs
 from benchmarks.cameras import cameras_beside, cameras_file
 from cvtgs.cameras import Cameras
 from cvtgs.errors import FileFormatError
-from cvtgs.evaluation import EvaluationSettings, LpipsWeights, SceneScores, load_lpips
+from cvtgs.evaluation import (
+    EvaluationSettings,
+    LpipsWeights,
+    SceneScores,
+    fit_cameras,
+    load_lpips,
+    load_photographs,
+)
 from cvtgs.evaluation import scorer as scorers
 from cvtgs.evaluation.report import mean_of
 from cvtgs.views import automatic_views
@@ -94,6 +105,14 @@ def scoring_parser(description: str | None) -> argparse.ArgumentParser:
         "--scorer", help="command with {full} and {small}; prints a JSON list with psnr and ssim"
     )
     judges.add_argument("--lpips", type=Path, help="weights file: measure LPIPS too")
+    parser.add_argument(
+        "--cameras", type=Path, help="cameras of the one scene, as cvtgs reads them"
+    )
+    parser.add_argument("--split", choices=("train", "test"), help="some of --cameras")
+    parser.add_argument(
+        "--images", type=Path, metavar="DIR", help="photographs of --cameras, to score against"
+    )
+    parser.add_argument("--white", action="store_true", help="white behind scenes and --images")
     return parser
 
 
@@ -140,8 +159,57 @@ def make_scorer(options: argparse.Namespace, file: Path | None) -> Scorer:
     if options.scorer:
         return command_scorer(options.scorer)
     weights = None if options.lpips is None else any_lpips(options.lpips)
+    if options.cameras is not None:
+        return given_scorer(options, weights)
+    if options.images is not None:
+        raise SystemExit("--images needs the cameras of the photographs: --cameras.")
     beside = file is not None and cameras_file(file).is_file()
     return own_scorer(weights, cameras_beside(file) if file and beside else None)
+
+
+def given_scorer(options: argparse.Namespace, weights: LpipsWeights | None) -> Scorer:
+    """Score from given cameras, against the full scene or against photographs."""
+    if len(options.files) != 1:
+        raise SystemExit(f"--cameras are those of one scene, found {len(options.files)} scenes.")
+    try:
+        cameras = cvtgs.load_cameras(options.cameras, split=options.split)
+        if options.images is None:
+            return own_scorer(weights, cameras)
+        cameras = fit_cameras(cameras, options.images)
+        background = (1.0, 1.0, 1.0) if options.white else (0.0, 0.0, 0.0)
+        photographs = load_photographs(options.images, cameras, background=background)
+    except cvtgs.CvtgsError as error:
+        raise SystemExit(str(error)) from None
+    judge = PhotographJudge(cameras, photographs, background, scorers.Metrics(lpips=weights))
+    return lambda full, small: [judge.score(scene) for scene in small]
+
+
+class PhotographJudge(NamedTuple):
+    """Scores scenes against photographs.
+
+    Attributes:
+        cameras: From where they were taken.
+        photographs: One per camera, of the size of the cameras.
+        background: Colour behind scenes.
+        metrics: What to compute.
+    """
+
+    cameras: Cameras
+    photographs: Float[Tensor, "c h w 3"]
+    background: scorers.Color
+    metrics: scorers.Metrics
+
+    def score(self, scene: cvtgs.GaussianScene) -> Quality:
+        """Return the means over the photographs."""
+        color = scene.means.new_tensor(self.background)
+        rows = [
+            self.metrics.compare(
+                scorers.render_view(scene, camera).over(color).clamp(0, 1),
+                self.photographs[number : number + 1],
+            )
+            for number, camera in enumerate(self.cameras.singles())
+        ]
+        return Quality.of(scorers.scene_scores("", len(scene), rows))
 
 
 def any_lpips(path: Path) -> LpipsWeights:

@@ -1,5 +1,7 @@
 """The comparison from end to end on a tiny scene, and how its tables and plots are made."""
 
+import json
+import re
 import sys
 
 import pytest
@@ -9,10 +11,14 @@ import cvtgs
 import lpips_cases
 from benchmarks import compare, compare_tables, quality
 from benchmarks.baselines import BASELINES, baseline
+from cvtgs.evaluation.images import as_bytes, encode
+from cvtgs.views import automatic_views
 
 pytestmark = pytest.mark.slow
 
 COPY = """
+import json
+import re
 import sys
 
 import torch
@@ -224,3 +230,42 @@ def test_the_plot_shows_what_succeeded_everywhere(monkeypatch):
     assert lines == {"x": ([2.0, 2.0], [20.0, 10.0], True), "y": ([2.0], [9.0], True)}
     assert drawn[0].log_x
     assert compare_tables.chart({"a": {"z": {0.1: None}}}, [0.1]) is None
+
+
+def test_photographs_judge_instead_of_the_full_scene(file, tmp_path, capsys):
+    """The photographs are images of the copy that the tool makes: it is as good as equal."""
+    full = cvtgs.load(file)
+    cameras = automatic_views(full, 2, width=48, height=36)
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    frames = []
+    for number, camera in enumerate(cameras.singles()):
+        pose = torch.linalg.inv(camera.viewmats[0].double())
+        pose[:, 1:3] *= -1
+        frames.append({"file_path": f"{number}.png", "transform_matrix": pose.tolist()})
+        image = cvtgs.render(full.select(torch.arange(500)), camera).rgb[0]
+        (folder / f"{number}.png").write_bytes(encode(as_bytes(image), "png"))
+    told = {"w": 48, "h": 36, "fl_x": float(cameras.Ks[0, 0, 0]), "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(told))
+    (tmp_path / "first_rows.py").write_text(COPY)
+    tool = f"copy={sys.executable} {tmp_path / 'first_rows.py'} {{IN}} {{OUT}} {{COUNT}} 0"
+    words = [str(file), "--rho", "0.5", "--methods", "mass pruning", "--tool", tool]
+    words += ["--cameras", str(folder), "--images", str(folder)]
+    compare.main(words)
+    text = capsys.readouterr().out
+    head, _, pruned, copied = rows_of(text)[:4]
+    assert head == ["method", "PSNR", "SSIM", "s"]
+    assert float(copied[1]) > 45 > float(pruned[1])
+    assert "the cameras of --cameras against photographs" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--images", "."], "--images needs the cameras of the photographs: --cameras."),
+        (["--cameras", "."], "--cameras are those of one scene, found 0 scenes."),
+    ],
+)
+def test_cameras_and_photographs_that_cannot_be_used(words, text):
+    with pytest.raises(SystemExit, match=re.escape(text)):
+        compare.main([*words, "--count", "50", "--rho", "0.5", "--methods", "mass pruning"])

@@ -69,6 +69,45 @@ def test_evaluate_against_photographs(folder, scenes, capsys):
     assert "alpha" not in against_photographs
 
 
+def test_downscaled_photographs_are_found_without_a_size(folder, scenes, capsys):
+    half = folder / "images_2"
+    half.mkdir()
+    for number in range(9):
+        image = np.full((24, 32, 3), 20 * number, np.uint8)
+        (half / f"{number}.png").write_bytes(encode(image, "png"))
+    words = ["--cameras", str(folder), "--images", str(half), "--views", "2", "--lpips", "off"]
+    assert main(["evaluate", *scenes[:2], *words, "--json"]) == 0
+    evaluation = Evaluation.model_validate_json(capsys.readouterr().out)
+    assert (evaluation.width, evaluation.height) == (32, 24)
+    assert main(["evaluate", *scenes[:2], *words, "--json", "--size", "64"]) == 0
+    evaluation = Evaluation.model_validate_json(capsys.readouterr().out)
+    assert (evaluation.width, evaluation.height) == (64, 48)
+
+
+def test_photographs_of_another_shape_are_one_sentence(folder, scenes, tmp_path, capsys):
+    for number in range(9):
+        (tmp_path / f"{number}.png").write_bytes(encode(np.zeros((48, 48, 3), np.uint8), "png"))
+    words = ["--cameras", str(folder), "--images", str(tmp_path)]
+    assert main(["evaluate", *scenes[:2], *words]) == 1
+    assert capsys.readouterr().err == (
+        f"cvtgs: error: {tmp_path}: photographs must have the shape of the cameras' images, "
+        f"64 x 48 or smaller, found 48 x 48.\n"
+    )
+
+
+@pytest.mark.slow
+def test_tradeoff_against_photographs(folder, scenes, tmp_path, capsys):
+    words = ["--cameras", str(folder), "--images", str(folder), "--views", "2", "--lpips", "off"]
+    words += ["--presets", "draft", "--rho", "0.1", "-o", str(tmp_path)]
+    assert main(["tradeoff", scenes[0], *words]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"photo PSNR, dB +\d+\.\d\d\n", printed)
+    assert re.search(r"photo SSIM +0\.\d{4}\n", printed)
+    assert "against the photographs" in printed
+    told = json.loads((tmp_path / "tradeoff.json").read_text())["evaluation"]["photographs"]
+    assert [scores["name"] for scores in told] == ["full.ply", "draft 0.1"]
+
+
 @pytest.mark.parametrize(
     ("words", "text"),
     [

@@ -3,7 +3,8 @@
 import argparse
 import re
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from functools import partial
+from pathlib import PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING, NamedTuple
 
 import cvtgs
@@ -16,6 +17,7 @@ from cvtgs.cli.options import (
     check_view_options,
     choose_cameras,
     evaluation_settings,
+    read_photographs,
     read_ratios,
     read_words,
 )
@@ -144,30 +146,18 @@ def add_evaluate(add_parser: AddParser) -> None:
     )
     parser.set_defaults(run=evaluate)
     add_options(parser, "reference", "small", "--lpips")
-    parser.add_argument(
-        "--images",
-        type=Path,
-        metavar="DIR",
-        help="directory of the photographs of --cameras, found by name",
-    )
-    add_options(parser, "--json", "--trust-sizes")
+    add_options(parser, "--images", "--json", "--trust-sizes")
     add_view_options(parser, size=SCORED_SIZE)
 
 
 def evaluate(options: argparse.Namespace) -> None:
     """Run ``cvtgs evaluate``."""
     check_view_options(options)
-    if options.images is not None and options.cameras is None:
-        raise InvalidArgumentError("--images needs the cameras of the photographs: --cameras.")
     settings = evaluation_settings(options)
     scenes = _read_scenes(options)
     with progress_bars(quiet=options.quiet) as listener:
         cameras = choose_cameras(options, scenes.reference)
-        photographs = None
-        if options.images is not None:
-            photographs = cvtgs.evaluation.load_photographs(
-                options.images, cameras, background=settings.background
-            )
+        photographs = None if options.images is None else read_photographs(options, cameras)
         evaluation = cvtgs.evaluate(
             scenes.reference,
             scenes.others,
@@ -277,7 +267,7 @@ def add_tradeoff(add_parser: AddParser) -> None:
     parser.add_argument(
         "--save", action="store_true", help="write the simplified scenes to DIR, too"
     )
-    add_options(parser, "--lpips", "--trust-sizes", "--overwrite")
+    add_options(parser, "--lpips", "--images", "--trust-sizes", "--overwrite")
     add_view_options(parser, size=SCORED_SIZE)
 
 
@@ -297,6 +287,7 @@ def tradeoff(options: argparse.Namespace) -> None:
             presets=presets,
             ratios=ratios,
             cameras=lambda scene: choose_cameras(options, scene, most=MOST_CAMERAS),
+            photographs=None if options.images is None else partial(read_photographs, options),
             settings=evaluation_settings(options),
             device=options.device,
             folder=options.output if options.save else None,

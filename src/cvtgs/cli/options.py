@@ -17,6 +17,7 @@ from cvtgs.text import suggestion
 
 if TYPE_CHECKING:
     import pydantic
+    from torch import Tensor
 
     from cvtgs.cameras import Cameras
     from cvtgs.config import SimplifyConfig
@@ -86,6 +87,12 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
         "type": Path,
         "help": f"cameras to render from: {CAMERA_FILES} (default: those in the folder of REF or "
         "IN if it is a model of INRIA's code, else automatic views)",
+    },
+    "--images": {
+        "metavar": "DIR",
+        "type": Path,
+        "help": "photographs of --cameras, found by name, to score against too; their size is that "
+        "of the images unless --size is given",
     },
     "--split": {"choices": ("train", "test"), "help": "part of the cameras of --cameras to use"},
     "--views": {
@@ -202,6 +209,8 @@ def check_view_options(options: argparse.Namespace) -> None:
             raise InvalidArgumentError(f"--{name} must be at least 1, found {value}.")
     if options.split is not None and options.cameras is None:
         raise InvalidArgumentError("--split chooses among cameras and needs --cameras.")
+    if getattr(options, "images", None) is not None and options.cameras is None:
+        raise InvalidArgumentError("--images needs the cameras of the photographs: --cameras.")
     background_color(options)
 
 
@@ -239,6 +248,9 @@ def choose_cameras(
     if options.cameras is not None:
         cameras = cvtgs.load_cameras(options.cameras, split=options.split)
         cameras = cameras.spread(options.views or most or len(cameras))
+        images = getattr(options, "images", None)
+        if images is not None and options.size is None:
+            return cvtgs.evaluation.fit_cameras(cameras, images)
         return cameras if options.size is None else cameras.fitted(size)
     path = options.reference if "reference" in options else options.input
     own = cvtgs.views.find_own_cameras(scene, path)
@@ -246,6 +258,12 @@ def choose_cameras(
         return own.cameras.spread(views).fitted(size)
     height = max(1, round(0.75 * size))
     return cvtgs.views.automatic_views(scene, views, width=size, height=height)
+
+
+def read_photographs(options: argparse.Namespace, cameras: "Cameras") -> "Tensor":
+    """Read the photographs of ``--images``."""
+    background = background_color(options)
+    return cvtgs.evaluation.load_photographs(options.images, cameras, background=background)
 
 
 def read_words(text: str) -> list[str]:

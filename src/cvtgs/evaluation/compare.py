@@ -130,7 +130,7 @@ def evaluate(
     )
 
 
-def compare(
+def compare(  # noqa: PLR0913 (options by name)
     reference: SceneLike,
     small: Mapping[str, SceneLike],
     cameras: Cameras,
@@ -138,6 +138,7 @@ def compare(
     reference_name: str = "full",
     sizes: Mapping[str, int] | None = None,
     most_images: int | None = None,
+    photographs: Float[Tensor, "c h w 3"] | None = None,
     settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
     listener: ProgressListener = silent,
 ) -> Comparison:
@@ -153,6 +154,7 @@ def compare(
         sizes: Bytes of the files, by name.
         most_images: Keep images of as many views at most, spread over their order; the scores
             are those of all views. None keeps all.
+        photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too.
         settings: Background, which LPIPS, and what renders.
         listener: Called after each image.
 
@@ -160,8 +162,8 @@ def compare(
         The images and the scores.
 
     Raises:
-        InvalidArgumentError: There is no camera, two scenes share a name, or ``most_images`` is
-            below 1.
+        InvalidArgumentError: There is no camera, two scenes share a name, ``most_images`` is
+            below 1, or the photographs have another shape than the images.
         DeviceError: The backend does not work on a scene's device.
         MissingDependencyError: The backend's package or the chosen LPIPS is missing.
 
@@ -189,7 +191,14 @@ def compare(
             images[name].colors[places[view]] = as_bytes(image.color[0])
             images[name].alphas[places[view]] = alpha_as_bytes(image.alpha[0])
 
-    evaluation = _score_images(scenes, cameras, keep=keep, settings=settings, listener=listener)
+    evaluation = _score_images(
+        scenes,
+        cameras,
+        photographs=photographs,
+        keep=keep,
+        settings=settings,
+        listener=listener,
+    )
     full = images.pop(reference_name)
     return Comparison(
         evaluation=evaluation, shown=shown, full=full, small=images, sizes=dict(sizes or {})

@@ -61,14 +61,14 @@ def load_photographs(
 
 
 def fit_cameras(cameras: Cameras, folder: str | os.PathLike[str]) -> Cameras:
-    """Give cameras the size of their photographs, such as those of ``images_4``.
+    """Give cameras the size of their photographs if that is smaller, as in ``images_4``.
 
     Args:
         cameras: Cameras with names.
         folder: Where the photographs are, as :func:`load_photographs` finds them.
 
     Returns:
-        Cameras with scaled intrinsics; of several sizes the most frequent one counts.
+        Cameras with scaled intrinsics, or the same; of several sizes the most frequent counts.
 
     Raises:
         InvalidArgumentError: The cameras have no names, or the photographs another shape.
@@ -95,7 +95,7 @@ def fit_cameras(cameras: Cameras, folder: str | os.PathLike[str]) -> Cameras:
             f"{folder}: photographs must have the shape of the cameras' images, {cameras.width} x "
             f"{cameras.height} or smaller, found {width} x {height}."
         )
-    return cameras.resized(width, height)
+    return cameras.resized(width, height) if width < cameras.width else cameras
 
 
 def _find_all(place: Path, cameras: Cameras) -> list[Path]:

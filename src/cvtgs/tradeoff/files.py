@@ -208,6 +208,7 @@ def cells(tradeoff: Tradeoff, result: TradeoffResult) -> Mapping[str, str]:
         "PSNR, dB": _score(result, "psnr", result.psnr, 2),
         "SSIM": _score(result, "ssim", result.ssim, 4),
         **distance,
+        **_against_photograph(tradeoff, result.name),
         "alpha error": "" if result.alpha_error is None else f"{result.alpha_error:.4f}",
         "alpha bias": "" if result.alpha_bias is None else f"{result.alpha_bias:+.4f}",
         "file": bytes_text(result.bytes),
@@ -224,11 +225,34 @@ def heading(tradeoff: Tradeoff, rho: float) -> str:
 def how_measured(tradeoff: Tradeoff) -> str:
     """Report where and how this was measured."""
     evaluation = tradeoff.evaluation
+    against = next(
+        (
+            f"The full scene has {full.psnr.mean:.2f} dB and an SSIM of {full.ssim.mean:.4f} "
+            f"against the photographs. "
+            for full in evaluation.photographs
+            if full.name == evaluation.reference
+        ),
+        "",
+    )
     return (
         f"{len(evaluation.views)} views of {evaluation.width} x {evaluation.height} pixels, "
         f"rendered by {evaluation.backend}. Every run is a process of its own on "
-        f"{tradeoff.machine}. {evaluation.lpips_sentence}"
+        f"{tradeoff.machine}. {against}{evaluation.lpips_sentence}"
     ).rstrip()
+
+
+def _against_photograph(tradeoff: Tradeoff, name: str) -> Mapping[str, str]:
+    """Return the columns of scores against photographs, if there were any."""
+    scores = {scores.name: scores for scores in tradeoff.evaluation.photographs}
+    if name not in scores:
+        return {}
+    found = scores[name]
+    distance = {} if found.lpips is None else {"photo LPIPS": f"{found.lpips.mean:.4f}"}
+    return {
+        "photo PSNR, dB": f"{found.psnr.mean:.2f}",
+        "photo SSIM": f"{found.ssim.mean:.4f}",
+        **distance,
+    }
 
 
 def _seconds(value: float | None) -> str:

@@ -10,6 +10,8 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.devices import chosen_device, device_name
@@ -27,6 +29,9 @@ RATIOS = (0.1, 0.01, 0.001)
 
 CameraChoice = Callable[[GaussianScene], Cameras]
 """Returns the views of a scene."""
+
+PhotographChoice = Callable[[Cameras], Float[Tensor, "c h w 3"]]
+"""Returns the photograph of every camera, at the size of the cameras."""
 
 
 class Measured(NamedTuple):
@@ -47,6 +52,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
     presets: Sequence[str] | None = None,
     ratios: Sequence[float] = RATIOS,
     cameras: CameraChoice = automatic_views,
+    photographs: PhotographChoice | None = None,
     settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
     device: str = "auto",
     folder: str | os.PathLike[str] | None = None,
@@ -67,6 +73,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         presets: Names; None for all, from the fastest to the best.
         ratios: Ratios of Gaussians to keep, each in (0, 1].
         cameras: Returns the views of it.
+        photographs: Returns their photographs, to score all scenes against too; None for none.
         settings: Background, which LPIPS, and what renders.
         device: Where to compute: ``auto``, ``cpu`` or ``cuda``.
         folder: Keep the results there, as ``fast_0.01.ply``, replacing what has that name; None
@@ -121,6 +128,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
             views,
             reference_name=source_name,
             sizes=sizes | {source_name: Path(source).stat().st_size},
+            photographs=None if photographs is None else photographs(views),
             settings=settings,
             listener=listener,
         )

@@ -1,0 +1,330 @@
+"""The evaluation against photographs, on small generated datasets in every layout."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import cvtgs
+from benchmarks import paper
+from benchmarks.datasets import (
+    DATASETS,
+    Capture,
+    check_model,
+    find_captures,
+    moved_cameras,
+    read_test_views,
+)
+from benchmarks.quality import PhotographJudge, Quality
+from camera_files import NAMES, colmap_txt, transforms, write_json
+from cvtgs.cameras import Cameras
+from cvtgs.edit import Motion, move
+from cvtgs.evaluation.scorer import Metrics
+
+HALF = (32, 24)
+"""Pixels of the photographs, of cameras of twice the size."""
+
+
+@pytest.fixture(scope="module")
+def scene() -> cvtgs.GaussianScene:
+    """A ball of Gaussians about the point that the cameras look at."""
+    g = torch.Generator().manual_seed(0)
+    made = cvtgs.synthetic.scene("object", 600, sh_degree=0, seed=0)
+    return made.with_tensors(
+        {
+            "means": 0.5 * torch.randn(600, 3, generator=g),
+            "log_scales": torch.full((600, 3), math.log(0.08)),
+        },
+        {},
+    )
+
+
+def shoot(scene: cvtgs.GaussianScene, cameras: Cameras, folder: Path, *, alpha: bool = False):
+    """Write a photograph of every camera, by the last part of its name."""
+    cameras = cameras.resized(*HALF)
+    images = cvtgs.render(scene, cameras)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, rgb, opacity in zip(cameras.names, images.rgb, images.alpha, strict=True):
+        colors = rgb / opacity.clamp_min(1e-3)[..., None] if alpha else rgb
+        pixels = torch.cat([colors, opacity[..., None]], dim=2) if alpha else colors
+        values = (pixels.clamp(0, 1) * 255).round().byte().numpy()
+        path = folder / Path(name).with_suffix(".png").name
+        Image.fromarray(values).save(path)
+
+
+def colmap_dataset(scene: cvtgs.GaussianScene, folder: Path, images: str = "images_4") -> Path:
+    colmap_txt(folder / "sparse" / "0", names=[Path(NAMES[row]).name for row in range(9, -1, -1)])
+    shoot(scene, cvtgs.load_cameras(folder), folder / images)
+    return folder
+
+
+def nerf_dataset(scene: cvtgs.GaussianScene, folder: Path) -> Path:
+    """Transparent pictures, and the split of NeRF-Synthetic."""
+    for split, rows in (("train", range(2, 10)), ("test", range(2))):
+        told = transforms(rows)
+        for row, frame in zip(rows, told["frames"], strict=True):
+            frame["file_path"] = f"./{split}/r_{row}"
+        write_json(folder / f"transforms_{split}.json", told)
+        cameras = cvtgs.load_cameras(folder / f"transforms_{split}.json")
+        shoot(scene, cameras, folder / split, alpha=True)
+    return folder
+
+
+def inria_model(scene: cvtgs.GaussianScene, folder: Path) -> Path:
+    for step in (7000, 30000):
+        path = folder / "point_cloud" / f"iteration_{step}" / "point_cloud.ply"
+        path.parent.mkdir(parents=True)
+        cvtgs.save(scene, path)
+    return path
+
+
+def gsplat_model(scene: cvtgs.GaussianScene, folder: Path) -> Path:
+    path = folder / "ply" / "point_cloud_29999.ply"
+    path.parent.mkdir(parents=True)
+    cvtgs.save(scene, path)
+    return path
+
+
+TURN = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+SHIFT, SCALE = torch.tensor([0.5, -0.25, 1.0]), 0.4
+
+
+def nerfstudio_model(scene: cvtgs.GaussianScene, folder: Path) -> Path:
+    """A scene that was turned, moved and then scaled, and the file that says so."""
+    moved = scene.with_tensors(
+        {
+            "means": (scene.means @ TURN.T + SHIFT) * SCALE,
+            "log_scales": scene.log_scales + math.log(SCALE),
+        },
+        {},
+    )
+    folder.mkdir(parents=True)
+    cvtgs.save(moved, folder / "splat.ply")
+    transform = torch.cat([TURN, SHIFT[:, None]], dim=1).tolist()
+    write_json(folder / "dataparser_transforms.json", {"transform": transform, "scale": SCALE})
+    return folder / "splat.ply"
+
+
+@pytest.fixture
+def root(tmp_path, scene) -> Path:
+    """One scene of each dataset, each with a model of another layout."""
+    root = tmp_path / "datasets"
+    nerf_dataset(scene, root / "nerf_synthetic" / "lego")
+    colmap_dataset(scene, root / "360_v2" / "garden")
+    colmap_dataset(scene, root / "tandt" / "truck", "images")
+    colmap_dataset(scene, root / "db" / "playroom", "images")
+    nerfstudio_model(scene, root / "exports" / "lego")
+    inria_model(scene, root / "models" / "garden")
+    gsplat_model(scene, root / "results" / "truck")
+    inria_model(scene, root / "db" / "playroom" / "output")
+    return root
+
+
+def capture_of(root: Path, name: str) -> Capture:
+    return next(one for one in find_captures(root).captures if one.name == name)
+
+
+def score_of(capture: Capture) -> float:
+    full = cvtgs.load(capture.model.path)
+    views = read_test_views(capture)
+    check_model(capture, full, views.cameras)
+    return (
+        PhotographJudge(views.cameras, views.photographs, capture.dataset.background, Metrics())
+        .score(full)
+        .psnr
+    )
+
+
+def test_every_layout_is_found_and_shows_what_was_photographed(root):
+    found = find_captures(root)
+    assert [(one.dataset.name, one.name, one.model.layout) for one in found.captures] == [
+        ("NeRF-Synthetic", "lego", "nerfstudio"),
+        ("Mip-NeRF 360", "garden", "INRIA"),
+        ("Tanks and Temples", "truck", "gsplat"),
+        ("Deep Blending", "playroom", "INRIA"),
+    ]
+    assert "iteration_30000" in str(found.captures[1].model.path)
+    for capture in found.captures:
+        assert score_of(capture) > 35, capture.name
+
+
+def test_the_split_is_the_published_one(root):
+    assert read_test_views(capture_of(root, "garden")).cameras.names == (
+        "frame_00.jpg",
+        "frame_08.jpg",
+    )
+    views = read_test_views(capture_of(root, "lego"))
+    assert [Path(name).name for name in views.cameras.names] == ["r_0", "r_1"]
+
+
+def test_the_published_folder_of_photographs_sets_the_size(root):
+    garden = capture_of(root, "garden")
+    views = read_test_views(garden)
+    assert views.folder.name == "images_4"
+    assert (views.cameras.width, views.cameras.height) == HALF
+    assert tuple(views.photographs.shape) == (2, 24, 32, 3)
+    (garden.folder / "images_4").rename(garden.folder / "images_8")
+    assert read_test_views(garden).folder.name == "images_8"
+
+
+def test_pictures_of_nerf_are_over_white(root):
+    photographs = read_test_views(capture_of(root, "lego")).photographs
+    assert photographs[:, 0, 0].tolist() == [[1.0] * 3] * 2
+
+
+def test_cameras_move_with_points():
+    """A point falls on the same pixel before and after both were moved."""
+    g = torch.Generator().manual_seed(0)
+    points = torch.randn(5, 3, generator=g)
+    cameras = Cameras(
+        viewmats=torch.tensor(
+            [[[0.6, 0, -0.8, 0.1], [0, 1, 0, 0.2], [0.8, 0, 0.6, 5], [0, 0, 0, 1.0]]]
+        ),
+        Ks=torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]]),
+        width=64,
+        height=48,
+    )
+    transform = torch.cat([TURN, SHIFT[:, None]], dim=1).double()
+    moved = moved_cameras(cameras, transform, SCALE)
+    places = []
+    for view, xyz in ((cameras, points), (moved, (points @ TURN.T + SHIFT) * SCALE)):
+        local = xyz @ view.viewmats[0, :3, :3].T + view.viewmats[0, :3, 3]
+        pixels = local @ view.Ks[0].T
+        places.append(pixels[:, :2] / pixels[:, 2:])
+    torch.testing.assert_close(*places, rtol=1e-4, atol=1e-3)
+
+
+def test_what_is_missing_is_one_sentence_each(root):
+    for path in (root / "db" / "playroom" / "output", root / "tandt"):
+        path.rename(path.with_name("gone"))
+    (root / "gone" / "truck").rename(root / "gone" / "lorry")
+    notes = find_captures(root).notes
+    playroom = root / "db" / "playroom"
+    inside = playroom / "gone"
+    inside.rename(root / "elsewhere")
+    notes = find_captures(root).notes
+    source = DATASETS[2].source
+    assert (
+        f"Tanks and Temples: no scene of it was found in {root}; it is to be had from {source}."
+        in notes
+    )
+    assert (
+        f"playroom: {playroom} has cameras, but no trained model of INRIA's code, nerfstudio or "
+        f"gsplat is in it or in another folder named playroom." in notes
+    )
+    assert f"chair: of NeRF-Synthetic, was not found in {root}." in notes
+    assert all("\n" not in note and note.endswith(".") for note in notes)
+
+
+def refusal(capture: Capture) -> str:
+    with pytest.raises(SystemExit) as caught:
+        score_of(capture)
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+def test_a_dataset_without_a_test_split(root):
+    lego = capture_of(root, "lego")
+    (lego.folder / "transforms_test.json").unlink()
+    assert refusal(lego) == (
+        f"{lego.folder}: must hold the test split, transforms_test.json; "
+        f"found that of training only."
+    )
+
+
+def test_photographs_without_a_camera_and_cameras_without_a_photograph(root):
+    garden = capture_of(root, "garden")
+    photograph = garden.folder / "images_4" / "frame_08.png"
+    photograph.rename(photograph.with_name("another.png"))
+    assert refusal(garden) == (
+        f"garden: {garden.folder / 'images_4'}: must hold a photograph of every camera; "
+        f"1 of 2 cameras have none, the first is 'frame_08.jpg'."
+    )
+
+
+def test_photographs_of_another_shape(root):
+    garden = capture_of(root, "garden")
+    for path in (garden.folder / "images_4").iterdir():
+        Image.fromarray(np.zeros((24, 40, 3), np.uint8)).save(path)
+    assert refusal(garden) == (
+        f"garden: {garden.folder / 'images_4'}: photographs must have the shape of the cameras' "
+        f"images, 64 x 48 or smaller, found 40 x 24."
+    )
+
+
+@pytest.mark.parametrize("shift", [(40.0, 0.0, 0.0), (0.0, 0.0, 9.0)])
+def test_the_model_of_another_scene(root, scene, shift):
+    garden = capture_of(root, "garden")
+    cvtgs.save(move(scene, Motion(shift=shift)), garden.model.path, overwrite=True)
+    assert refusal(garden) == (
+        f"{garden.model.path}: must be a model of {garden.folder}, but its Gaussians are not "
+        f"where its cameras look; it is the model of another scene, or of a world that was "
+        f"normalized for the training."
+    )
+
+
+def test_no_folder_and_nothing_in_it(tmp_path):
+    with pytest.raises(SystemExit, match="must be a folder of datasets, found none"):
+        find_captures(tmp_path / "none")
+    with pytest.raises(SystemExit, match="no scene with a trained model was found in it"):
+        paper.main([str(tmp_path), "-o", str(tmp_path / "out")])
+
+
+def test_gains_stand_beside_the_published_ones():
+    def result(psnr: float):
+        found = Quality(psnr=psnr, ssim=0.5)
+        return paper.Result(quality=found, wall_seconds=1, cpu_seconds=1, count=1, wanted=1)
+
+    table = {
+        "a": {"paper": {0.1: result(25.0)}, "paper, no network": {0.1: result(23.0)}},
+        "b": {"paper": {0.1: result(27.0)}, "paper, no network": {0.1: result(26.0)}},
+        "c": {"paper": {0.1: result(27.0)}, "paper, no network": {0.1: None}},
+    }
+    lines = paper.gains_table(table, [0.1, 0.05]).splitlines()
+    assert lines[2] == "| network over merged Gaussians | 0.1 | +1.50 | 2 | +1.90 |"
+    assert lines[3] == "| network over merged Gaussians | 0.05 | - | 0 | - |"
+    assert lines[4] == "| CVT-GS over NanoGS | 0.1 | - | 0 | +1.57 |"
+    assert lines[-1].startswith("Published: B. Li et al. 2026, CVT-GS")
+
+
+@pytest.mark.slow
+def test_from_end_to_end_and_on_after_an_interruption(root, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    colmap_dataset(cvtgs.load(capture_of(root, "garden").model.path), root / "360_v2" / "room")
+    arguments = [str(root), "-o", str(out), "--rho", "0.1", "--lpips", "off"]
+    arguments += ["--methods", "paper, no network", "mass pruning"]
+    runs, attempt = [], paper.attempt
+
+    def counted(command, task, *, keep):
+        if len(runs) == 5:
+            raise KeyboardInterrupt
+        runs.append(task.output.name)
+        return attempt(command, task, keep=keep)
+
+    monkeypatch.setattr(paper, "attempt", counted)
+    with pytest.raises(KeyboardInterrupt):
+        paper.main(arguments)
+    first, runs[:] = list(runs), []
+    paper.main(arguments)
+    assert len(first) == 5
+    assert len(runs) == 3
+    assert not set(first) & set(runs)
+    runs.clear()
+    paper.main(arguments)
+    assert runs == []
+    page = (out / "paper.md").read_text()
+    assert capsys.readouterr().out.strip().endswith(page.strip())
+    assert "## NeRF-Synthetic: 1 of 8 scenes" in page
+    assert "- room: " in page
+    records = json.loads((out / "results.json").read_text())
+    psnrs = {(one["scene"], one["method"]): one["result"]["quality"]["psnr"] for one in records}
+    assert len(psnrs) == 4 * 3
+    for name in ("Mip-NeRF 360: garden", "Deep Blending: playroom"):
+        full = psnrs[name, "full scene"]
+        assert full > 35
+        assert all(15 < psnrs[name, one] < full for one in ("paper, no network", "mass pruning"))
