@@ -12,16 +12,18 @@ from cvtgs.cli.display import progress_bars, say, size_text
 from cvtgs.cli.options import (
     AddParser,
     add_options,
+    read_ratios,
+    read_words,
+)
+from cvtgs.cli.view import check_page, write_page
+from cvtgs.cli.view_options import (
     add_view_options,
     background_color,
     check_view_options,
     choose_cameras,
     evaluation_settings,
     read_photographs,
-    read_ratios,
-    read_words,
 )
-from cvtgs.cli.view import check_page, write_page
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import windows_fault
 from cvtgs.progress import ProgressEvent

@@ -9,10 +9,6 @@ from cvtgs.cli.display import progress_bars, say, size_text
 from cvtgs.cli.options import (
     AddParser,
     add_options,
-    add_view_options,
-    check_view_options,
-    choose_cameras,
-    evaluation_settings,
     read_axes,
     read_ratios,
     read_settings,
@@ -24,6 +20,12 @@ from cvtgs.cli.streams import (
     stream_levels,
 )
 from cvtgs.cli.view import check_page, write_page
+from cvtgs.cli.view_options import (
+    add_view_options,
+    check_view_options,
+    choose_cameras,
+    evaluation_settings,
+)
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation

@@ -1,0 +1,103 @@
+"""Options of cameras, images and scores, and reading their values."""
+
+import argparse
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import cvtgs
+from cvtgs.cli.options import add_options
+from cvtgs.errors import InvalidArgumentError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from cvtgs.cameras import Cameras
+    from cvtgs.evaluation import EvaluationSettings
+    from cvtgs.scene import GaussianScene
+
+Color = tuple[float, float, float]
+
+COLORS: Mapping[str, Color] = {
+    "black": (0.0, 0.0, 0.0),
+    "gray": (0.5, 0.5, 0.5),
+    "white": (1.0, 1.0, 1.0),
+}
+AUTOMATIC_VIEWS = 8
+
+
+def add_view_options(parser: argparse.ArgumentParser, *, size: int) -> None:
+    """Add the options of cameras and images; ``size`` is the default of ``--size``."""
+    add_options(parser, "--cameras", "--split", "--views")
+    parser.add_argument(
+        "--size",
+        type=int,
+        metavar="N",
+        help=f"longer side of the images in pixels (default {size}, or that of --cameras)",
+    )
+    add_options(parser, "--background", "--backend", "--device", "--quiet")
+    parser.set_defaults(default_size=size)
+
+
+def check_view_options(options: argparse.Namespace) -> None:
+    """Check the options of :func:`add_view_options` before any file is read."""
+    for name in ("views", "size"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise InvalidArgumentError(f"--{name} must be at least 1, found {value}.")
+    if options.split is not None and options.cameras is None:
+        raise InvalidArgumentError("--split chooses among cameras and needs --cameras.")
+    if getattr(options, "images", None) is not None and options.cameras is None:
+        raise InvalidArgumentError("--images needs the cameras of the photographs: --cameras.")
+    background_color(options)
+
+
+def background_color(options: argparse.Namespace) -> Color:
+    """Read ``--background``."""
+    word = options.background.strip().lower()
+    if word in COLORS:
+        return COLORS[word]
+    try:
+        red, green, blue = (float(part) for part in word.split(","))
+    except ValueError:
+        red = green = blue = -1.0
+    if not all(0 <= part <= 1 for part in (red, green, blue)):
+        raise InvalidArgumentError(
+            f"--background must be {', '.join(COLORS)} or red,green,blue from 0 to 1, "
+            f"found {options.background!r}."
+        )
+    return red, green, blue
+
+
+def evaluation_settings(options: argparse.Namespace) -> "EvaluationSettings":
+    """Return how to render and score; a command without ``--lpips`` measures it if it can."""
+    return cvtgs.evaluation.EvaluationSettings(
+        background=background_color(options),
+        lpips=getattr(options, "lpips", "auto"),
+        backend=options.backend,
+    )
+
+
+def choose_cameras(
+    options: argparse.Namespace, scene: "GaussianScene", *, most: int | None = None
+) -> "Cameras":
+    """Read the cameras of an option or of the scene's folder, or find views of the scene."""
+    size, views = options.size or options.default_size, options.views or AUTOMATIC_VIEWS
+    if options.cameras is not None:
+        cameras = cvtgs.load_cameras(options.cameras, split=options.split)
+        cameras = cameras.spread(options.views or most or len(cameras))
+        images = getattr(options, "images", None)
+        if images is not None and options.size is None:
+            return cvtgs.evaluation.fit_cameras(cameras, images)
+        return cameras if options.size is None else cameras.fitted(size)
+    path = options.reference if "reference" in options else options.input
+    own = cvtgs.views.find_own_cameras(scene, path)
+    if own is not None:
+        return own.cameras.spread(views).fitted(size)
+    height = max(1, round(0.75 * size))
+    return cvtgs.views.automatic_views(scene, views, width=size, height=height)
+
+
+def read_photographs(options: argparse.Namespace, cameras: "Cameras") -> "Tensor":
+    """Read the photographs of ``--images``."""
+    background = background_color(options)
+    return cvtgs.evaluation.load_photographs(options.images, cameras, background=background)
