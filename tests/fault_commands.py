@@ -12,6 +12,7 @@ class Command:
         blocks: Number of blocks, as if there were little memory; 0 for one piece.
         varies: Files that say how long something took, so bits differ from run to run.
         continues: Whether a file may be that of an earlier moment: a training replaces its own.
+        leaves_none: Whether also a kill leaves nothing in the folder for temporary files.
         rounds: How often it is chosen, compared with others; less for those that take long.
     """
 
@@ -19,6 +20,7 @@ class Command:
     blocks: int = 0
     varies: tuple[str, ...] = field(default=())
     continues: bool = False
+    leaves_none: bool = True
     rounds: int = 4
 
 
@@ -85,6 +87,7 @@ COMMANDS = {
             "--lpips off --save --quiet --overwrite"
         ),
         varies=("tradeoff.csv", "tradeoff.json", "tradeoff.png", "index.html"),
+        leaves_none=False,
         rounds=1,
     ),
 }

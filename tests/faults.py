@@ -51,6 +51,7 @@ def started(command: Command, folder: Path, *, limit: Callable[[], None] | None 
         )
         os.dup2(errors, 2)
         os.dup2(errors, 1)
+        tempfile.tempdir = os.environ["TMPDIR"] = str(temporary(folder))
         if command.blocks:
             cvtgs.outofcore.block_count = lambda *_: command.blocks  # type: ignore[assignment]
             sys.modules["cvtgs.outofcore.run"].block_count = lambda *_: command.blocks  # type: ignore[attr-defined]
@@ -81,6 +82,13 @@ def ended(process: int, folder: Path) -> tuple[int, str]:
     if "Traceback" in text or re.search(r"\b\w+Error:", text) or code == 70:
         raise FaultError(f"status {code}: {text[-3000:]}")
     return code, text
+
+
+def temporary(folder: Path) -> Path:
+    """Return the folder for temporary files of a run."""
+    path = folder.parent / "temporary"
+    path.mkdir(exist_ok=True)
+    return path
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -117,6 +125,8 @@ def check_whole(command: Command, folder: Path, wanted: dict[str, bytes]) -> Non
         differs = [name for name in wanted if found.get(name) != wanted[name]]
         more = sorted(found.keys() - wanted.keys())
         raise FaultError(f"the run after it: status {code}, differs {differs}, left {more}: {text}")
+    if command.leaves_none and (left := [*temporary(folder).iterdir()]):
+        raise FaultError(f"temporary files are left: {left}")
 
 
 def check_part(command: Command, folder: Path, wanted: dict[str, bytes]) -> None:

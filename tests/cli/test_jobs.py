@@ -186,3 +186,13 @@ def test_nothing_binary_goes_to_a_terminal(
     assert capsys.readouterr().err == (
         "cvtgs: error: the OUT - must be a pipe or a file, found a terminal.\n"
     )
+
+
+def test_a_plain_run_makes_no_temporary_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kill would leave it in the system's folder for ever."""
+    cvtgs.save(cvtgs.synthetic.scene("object", 100, sh_degree=0), tmp_path / "in.ply")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
+    assert main(["convert", str(tmp_path / "in.ply"), str(tmp_path / "out.ply"), "--quiet"]) == 0
+    assert (tmp_path / "out.ply").exists()

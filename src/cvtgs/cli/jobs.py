@@ -6,7 +6,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -101,16 +101,18 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
         yield _folder_jobs(options)
         return
     source, target = options.paths
-    with TemporaryDirectory(prefix="cvtgs-") as folder:
-        if target == STREAM:
+    to_stream = target == STREAM
+    with ExitStack() as stack:
+        if to_stream:
             if sys.stdout.isatty():
                 raise OutputError("the OUT - must be a pipe or a file, found a terminal.")
-            target = Path(folder) / f"standard-output{options.suffix or '.ply'}"
-        if source != STREAM:
-            yield [_job(options, Path(source), Path(target), folder)]
-            return
-        with file_of(sys.stdin.buffer) as path:
-            yield [_job(options, path, Path(target), folder)]
+            folder = stack.enter_context(TemporaryDirectory(prefix="cvtgs-"))
+            target = f"{folder}/standard-output{options.suffix or '.ply'}"
+        piped = source == STREAM
+        path = stack.enter_context(file_of(sys.stdin.buffer)) if piped else Path(source)
+        own = {"input": path, "output": Path(target)}
+        job = argparse.Namespace(**{**vars(options), **own})
+        yield [SceneJob(options=job, to_stream=to_stream)]
 
 
 def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> None:
@@ -177,11 +179,6 @@ def _bytes_of(path: Path) -> int:
         return cvtgs.io.scene_size(path)
     except OSError:
         return 0
-
-
-def _job(options: argparse.Namespace, source: Path, target: Path, folder: str) -> SceneJob:
-    own = argparse.Namespace(**{**vars(options), "input": source, "output": target})
-    return SceneJob(options=own, to_stream=target.parent == Path(folder))
 
 
 def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
