@@ -9,6 +9,8 @@ are those of ``benchmarks.quality``: name files, give ``--lpips WEIGHTS`` or ``-
 - w/o filter: every valid Gaussian enters the tessellation.
 - w/o MergeNet: merged by moments (and inflation) alone.
 - full: ``Simplifier("paper")`` and ``Simplifier("standard")``.
+- our network: the cells of ``paper`` with a network of the design of ``standard``, trained on them
+  (``benchmarks/paper-gated.safetensors``): what design and training make of the same cells.
 """
 
 import argparse
@@ -36,7 +38,7 @@ from benchmarks.quality import (
     scoring_parser,
 )
 from cvtgs import cells
-from cvtgs.mergenet import MergeNet, correct_cells, load_checkpoint
+from cvtgs.mergenet import MergeNet, PublishedMergeNet, correct_cells, load_checkpoint
 from cvtgs.pipeline import merge_cells
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.train.cases import MergedScene, merge_scene
@@ -44,6 +46,8 @@ from cvtgs.validity import standardized
 
 PRESETS = ("paper", "standard")
 PARTS = ("w/o CVT", "w/o filter", "w/o MergeNet", "full")
+OUR_NETWORK = "our network"
+GATED = Path(__file__).with_name("paper-gated.safetensors")
 WITHOUT_FILTER = {"filter.max_mass_share": "0", "filter.max_flyaway_share": "0"}
 METRICS = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS (less is better)"}
 
@@ -75,6 +79,8 @@ def variants(options: argparse.Namespace) -> dict[str, Simplify]:
             cvtgs.Simplifier(preset, config=config).simplify,
         )
         rows |= {row(preset, part): each for part, each in zip(PARTS, parts, strict=True)}
+        if preset == "paper" and config.merge.network:
+            rows[row(preset, OUR_NETWORK)] = cvtgs.Simplifier(GATED, config=config).simplify
     return rows
 
 
@@ -86,7 +92,10 @@ def report(table: Table, options: argparse.Namespace) -> str:
     """Report what was measured, then how it came out."""
     images = f"cvtgs' own renderer, {VIEWS} automatic views of {SIZE} x {SIZE} pixels"
     scenes = "FILES" if options.files else f"--count {options.count}"
-    nets = ", ".join(f"{name} {described(name)}" for name in PRESETS)
+    nets = ", ".join(
+        [f"{name} {described(name)}" for name in PRESETS]
+        + [f"our network of paper {described(GATED)}"]
+    )
     return (
         "# Ablation\n\n"
         f"`python -m benchmarks.ablation {scenes} -o FOLDER` makes this table (with "
@@ -98,7 +107,7 @@ def report(table: Table, options: argparse.Namespace) -> str:
     )
 
 
-def described(name: str) -> str:
+def described(name: str | Path) -> str:
     checkpoint = load_checkpoint(name)
     return f"{checkpoint.digest[:12]} ({checkpoint.info.steps} steps)"
 
@@ -121,7 +130,8 @@ def chart(averages: Mapping[str, Sequence[Quality]], ratios: Sequence[float]) ->
                     y=[getattr(quality, field) for quality in averages[row(preset, part)]],
                     markers=True,
                 )
-                for part in PARTS
+                for part in (*PARTS, OUR_NETWORK)
+                if row(preset, part) in averages
             ],
             title=preset,
             x_label="share of Gaussians kept",
@@ -195,7 +205,9 @@ def nearest_free(
         looked_at *= 2
 
 
-def grouped_simplifier(config: cvtgs.SimplifyConfig, net: MergeNet | None) -> Simplify:
+def grouped_simplifier(
+    config: cvtgs.SimplifyConfig, net: MergeNet | PublishedMergeNet | None
+) -> Simplify:
     """Simplify with k-NN groups instead of the tessellation; all else as configured."""
 
     def simplify(scene: cvtgs.GaussianScene, rho: float) -> cvtgs.GaussianScene:
@@ -217,7 +229,7 @@ def regroup(
     partition: cells.Partition,
     config: cvtgs.SimplifyConfig,
     *,
-    net: MergeNet | None,
+    net: MergeNet | PublishedMergeNet | None,
 ) -> cvtgs.GaussianScene:
     """Merge, inflate and correct the cells of any grouping, as the pipeline does.
 
@@ -229,7 +241,7 @@ def regroup(
         partition,
         config.merge,
         areas=scene.areas,
-        with_network=net is not None,
+        with_network=net is not None and net.sees_surroundings,
     )
     if net is None:
         return standardized(merged.scene)

@@ -114,7 +114,10 @@ def test_the_table_has_its_rows_and_the_folder_its_files(file, tmp_path, capsys)
     names = ("PSNR", "SSIM", "LPIPS", "alpha error")
     assert head == ["scene", "variant", *(f"{name} at 0.05" for name in names)]
     parts = ["w/o CVT", "w/o filter", "w/o MergeNet", "full"]
-    variants = [f"{preset}, {part}" for preset in ("paper", "standard") for part in parts]
+    variants = [
+        *(f"paper, {part}" for part in [*parts, "our network"]),
+        *(f"standard, {part}" for part in parts),
+    ]
     assert [row[:2] for row in rows] == [
         [scene, variant] for scene in ("mean", "thing") for variant in variants
     ]

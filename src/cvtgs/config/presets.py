@@ -40,6 +40,5 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 }
 """What each preset changes of the defaults: ``standard`` nothing.
 
-``paper`` follows CVT-GS (Li et al. 2026) up to the merged Gaussian; the descriptor, loss and
-training of its network are ours.
+``paper`` is CVT-GS (Li et al. 2026) as published, with a network that was trained here.
 """
