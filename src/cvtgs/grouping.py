@@ -143,12 +143,15 @@ def _weighted(
     scene: GaussianScene, rows: Int[Tensor, "k"], analysis: SceneAnalysis, config: SimplifyConfig
 ) -> WeightedRows:
     """Bring Gaussians into the order of the curve, and weigh them."""
-    masses = analysis.apparent_areas[rows] * analysis.opacities[rows]
+    # Advanced indexing (`values[rows]`) takes three to five times as long as `index_select`.
+    opacities = analysis.opacities.index_select(0, rows)
+    masses = analysis.apparent_areas.index_select(0, rows) * opacities
     order = curve_order(scene, rows, analysis.frame, masses=masses)
-    rows, masses = rows[order], masses[order]
+    rows, masses = rows.index_select(0, order), masses.index_select(0, order)
+    opacities = opacities.index_select(0, order)
     weights = cvt.tessellation_weights(
-        analysis.opacities[rows],
-        analysis.apparent_areas[rows],
+        opacities,
+        analysis.apparent_areas.index_select(0, rows),
         area_power=config.cvt.area_power,
         floor=config.cvt.weight_floor,
     )
@@ -156,7 +159,7 @@ def _weighted(
         scene=scene,
         rows=rows,
         weights=weights,
-        masses=analysis.areas[rows] * analysis.opacities[rows],
+        masses=analysis.areas.index_select(0, rows) * opacities,
         apparent_masses=masses,
     )
 
@@ -239,7 +242,8 @@ def allocate(
     if count > target:
         groups = cells.group_moments(members, labels, count).on_host()  # many small steps
         near = cvt.nearest_neighbors(groups.means.T, config.neighbors)
-        labels = cells.merge_pairs(groups, near, target, config).to(labels.device)[labels]
+        merged = cells.merge_pairs(groups, near, target, config).to(labels.device)
+        labels = merged.index_select(0, labels)
     if config.reassign and target < len(labels):
         groups = cells.group_moments(members, labels, target)
         near = cvt.nearest_neighbors(groups.means.T, REASSIGN)
@@ -303,7 +307,7 @@ def _grouping(
     """Return the rows of every cell, with its weight; the labels of the points are let go."""
     local = cells.Partition.from_labels(labels, len(weights))
     return Grouping(
-        partition=cells.Partition(order=rows[local.order], offsets=local.offsets),
+        partition=cells.Partition(order=rows.index_select(0, local.order), offsets=local.offsets),
         weights=weights,
         refilled=tessellation.refilled,
         energies=tessellation.energies,
@@ -323,7 +327,7 @@ def curve_order(
 
     The curve runs through contracted space: it stays fine where the bulk is, whatever flies away.
     """
-    points = cvt.embed(scene.means[rows], frame=frame, contraction=1.0)
+    points = cvt.embed(scene.means.index_select(0, rows), frame=frame, contraction=1.0)
     return morton_order(points, ties=masses)
 
 
@@ -336,8 +340,8 @@ def embed_rows(
 ) -> Float[Tensor, "k d"]:
     """Embed Gaussians in the space of the tessellation; colour counts more with fewer cells."""
     return cvt.embed(
-        scene.means[rows],
-        scene.sh0[rows],
+        scene.means.index_select(0, rows),
+        scene.sh0.index_select(0, rows),
         frame=analysis.frame,
         contraction=analysis.plan.unbounded.strength,
         color=config.cvt.color * (target / COLOR_CELLS) ** config.cvt.color_power,

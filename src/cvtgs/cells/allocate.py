@@ -89,12 +89,22 @@ def gaussian_moments(
     Returns:
         Their moments, in the order of the rows.
     """
-    means = scene.means[rows].double() - frame.center.to(scene.device)
-    scales = torch.exp(scene.log_scales[rows].double()) / frame.radius
-    axes = quats_to_matrices(normalize_quats(scene.quats[rows].double())) * scales[:, None, :]
-    columns = axes.permute(1, 2, 0).contiguous()
-    covariances = torch.stack([(columns[i] * columns[j]).sum(0) for i, j in UPPER])
-    colors = (0.5 + SH_C0 * scene.sh0[rows, 0].double()).clamp(0.0, 1.5)
+    count, device, center = len(rows), rows.device, frame.center.to(rows.device)
+    means = torch.empty(3, count, dtype=torch.float64, device=device)
+    covariances, colors = means.new_empty(6, count), torch.empty_like(means)
+    chunk = chunk_length(CHUNK, device)
+    for start in range(0, count, chunk):  # a few columns fit into a cache
+        part = slice(start, start + chunk)
+        some = rows[part]
+        positions = scene.means.index_select(0, some).double() - center
+        means[:, part] = (positions / frame.radius).T
+        scales = torch.exp(scene.log_scales.index_select(0, some).double()) / frame.radius
+        quats = normalize_quats(scene.quats.index_select(0, some).double())
+        columns = (quats_to_matrices(quats) * scales[:, None, :]).permute(1, 2, 0).contiguous()
+        for number, (i, j) in enumerate(UPPER):
+            covariances[number, part] = (columns[i] * columns[j]).sum(0)
+        bands = scene.sh0.index_select(0, some)[:, 0]
+        colors[:, part] = (0.5 + SH_C0 * bands.double()).clamp(0.0, 1.5).T
     tiny = torch.finfo(torch.float64).tiny
     weights, masses = weights.double(), masses.double()
     units = [
@@ -103,9 +113,9 @@ def gaussian_moments(
     return Moments(
         weights=(weights / units[0].clamp_min(tiny)).clamp_min(1e-12),
         masses=masses / units[1].clamp_min(tiny),
-        means=(means / frame.radius).T.contiguous(),
+        means=means,
         covariances=covariances,
-        colors=colors.T.contiguous(),
+        colors=colors,
     )
 
 
@@ -277,7 +287,7 @@ def reassign(
     """
     count = len(groups.weights)
     own = torch.arange(count, device=labels.device)
-    candidates = torch.cat([own[:, None], neighbors], dim=1)
+    candidates = torch.cat([own[None], neighbors.T]).contiguous()
     inverse, volumes = _inverse(groups.covariances)
     found = labels.new_empty(len(labels) + 1)  # the last is of groups without members
     own_costs = torch.empty(len(labels), dtype=torch.float64, device=labels.device)
@@ -289,8 +299,7 @@ def reassign(
         mean, covariance = members.means[:, part], members.covariances[:, part]
         color = members.colors[:, part]
         least, best = None, cells
-        for nth in range(candidates.shape[1]):
-            group = candidates[cells, nth]
+        for group in candidates.index_select(1, cells):
             shifts = mean - groups.means.index_select(1, group)
             matrix = inverse.index_select(1, group)
             cost = volumes.index_select(0, group)
@@ -311,7 +320,7 @@ def reassign(
         pass
     lowest = own_costs.new_full((count,), torch.inf).scatter_reduce(0, labels, own_costs, "amin")
     rows = torch.arange(len(labels), device=labels.device)
-    rows = torch.where(own_costs == lowest[labels], rows, len(labels))
+    rows = torch.where(own_costs == lowest.index_select(0, labels), rows, len(labels))
     anchors = torch.full((count,), len(labels), device=labels.device)
     anchors = anchors.scatter_reduce(0, labels, rows, "amin")
     if must_stay is not None:
