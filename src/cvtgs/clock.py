@@ -37,7 +37,7 @@ class StageClock:
     """Measures stages one after the other and tells a listener about them.
 
     Args:
-        listener: Told when a stage starts, advances and ends.
+        listener: Called when a stage starts, advances and ends.
         device: Where the stages compute; CUDA work is waited for.
     """
 

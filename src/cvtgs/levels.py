@@ -186,7 +186,7 @@ def write_levels(
     axes: str | None = None,
     overwrite: bool = False,
 ) -> LevelsIndex:
-    """Write levels and, at last, the index that names them.
+    """Write levels and, last, the index that names them.
 
     Args:
         levels: The levels.

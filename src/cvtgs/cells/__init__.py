@@ -19,7 +19,7 @@ from cvtgs.cells.merge import (
     normalized_weights,
     weighted_mean,
 )
-from cvtgs.cells.partition import Partition
+from cvtgs.math.segments import Partition
 
 __all__ = [
     "Descriptors",

@@ -4,10 +4,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cells.partition import Partition
 from cvtgs.devices import chunk_length
 from cvtgs.math import parameters
-from cvtgs.math.segments import gather_columns
+from cvtgs.math.segments import Partition, gather_columns
 from cvtgs.scene import GaussianScene
 
 EQUAL_SHARE = 1e-2

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cells.partition import Partition
 from cvtgs.config import MergeConfig
 from cvtgs.devices import chunk_length, in_threads
 from cvtgs.math import parameters
 from cvtgs.math.segments import (
+    Partition,
     gather_columns,
     segment_argmax,
     segment_ids,

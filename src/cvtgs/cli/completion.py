@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Iterator, Mapping
+from functools import partial
 
 import cvtgs
 from cvtgs.cli.display import say
@@ -39,8 +40,8 @@ complete -o filenames -F _cvtgs cvtgs
 """
 
 
-def add_completion(add_parser: AddParser) -> None:
-    """Add the command and its options."""
+def add_completion(add_parser: AddParser, commands: Mapping[str, argparse.ArgumentParser]) -> None:
+    """Add the command and its options; ``commands`` are the parsers of all commands by name."""
     parser = add_parser(
         "completion",
         help="print a script for completion in a shell",
@@ -48,26 +49,18 @@ def add_completion(add_parser: AddParser) -> None:
         'eval "$(cvtgs completion bash)" in ~/.bashrc; for zsh: the same with zsh in ~/.zshrc; for '
         "fish: cvtgs completion fish > ~/.config/fish/completions/cvtgs.fish.",
     )
-    parser.set_defaults(run=completion)
+    parser.set_defaults(run=partial(completion, commands))
     parser.add_argument("shell", choices=SHELLS, help="the shell: bash, zsh or fish")
 
 
-def completion(options: argparse.Namespace) -> None:
+def completion(
+    commands: Mapping[str, argparse.ArgumentParser], options: argparse.Namespace
+) -> None:
     """Run ``cvtgs completion``."""
-    from cvtgs.cli.main import build_parser
-
-    commands = commands_of(build_parser())
     if options.shell == "fish":
         say("\n".join(fish_lines(commands)))
     else:
         say((_ZSH if options.shell == "zsh" else "") + bash_script(commands), end="")
-
-
-def commands_of(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
-    """Return the parsers of all commands by name."""
-    groups = [action for action in parser._actions if action.nargs == argparse.PARSER]
-    found = groups[0].choices
-    return found if isinstance(found, Mapping) else {}
 
 
 def values_of(action: argparse.Action) -> list[str]:

@@ -96,7 +96,7 @@ def run_process() -> NoReturn:
     try:
         if sys.stdout is not None:
             sys.stdout.flush()
-    except OSError:  # told already; Python would tell again when it ends
+    except OSError:  # reported already; Python would report it again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     sys.exit(code)
 
@@ -149,9 +149,9 @@ def build_parser() -> CommandParser:
         add_demo,
         add_doctor,
         add_train,
-        add_completion,
     ):
         add(commands.add_parser)
+    add_completion(commands.add_parser, commands.choices)
     return parser
 
 

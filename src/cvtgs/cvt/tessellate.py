@@ -58,7 +58,7 @@ def tessellate(
         seed: Seed of weighted seeding.
         has_duplicates: Whether it pays to search for equal points only once; the result is the
             same.
-        on_iteration: Told how many Lloyd moves are done.
+        on_iteration: Called with the number of Lloyd moves that are done.
 
     Returns:
         Labels and sites; exactly ``count`` cells, none empty.
@@ -216,7 +216,7 @@ def lloyd(
         nearest: Search of the nearest site.
         iterations: Moves at most.
         tolerance: Stops when the energy fell by less than this share since the last move.
-        on_iteration: Told how many moves are done.
+        on_iteration: Called with the number of moves that are done.
 
     Returns:
         The moved sites and the energies.

@@ -30,7 +30,7 @@ spent on its sky, whatever a training has seen of them; they cover the cameras w
 """
 
 WIDEST = 1e30
-"""Both ends of the range of a network that was never told what it knows."""
+"""Both ends of the range of a network without a fitted range."""
 
 
 def summarize(descriptors: Descriptors) -> Float[Tensor, "m f"]:

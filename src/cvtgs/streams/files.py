@@ -212,7 +212,7 @@ def make_folder(folder: Path) -> None:
 
 
 def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
-    """Move the files of a finished stream to where they belong, the index at last."""
+    """Move the files of a finished stream to where they belong, the index last."""
     check_stream(place, kind, overwrite=overwrite)
     make_folder(place)
     index = INDEX_NAMES[kind]
