@@ -143,7 +143,9 @@ def test_a_training_may_start_from_a_checkpoint(scenes, cache, tmp_path):
 def test_a_start_of_another_size_is_an_error(scenes, cache, tmp_path, change):
     first = tmp_path / "a.safetensors"
     run(config_of(scenes, steps=1), first, cache)
-    with pytest.raises(ConfigError, match=r"has width 6, cell_width 10, largest_growth 0\.6; the"):
+    with pytest.raises(
+        ConfigError, match=r"has kind gated, width 6, cell_width 10, largest_growth 0\.6; the"
+    ):
         run(config_of(scenes, start=first, **change), tmp_path / "b.safetensors", cache)
 
 
