@@ -16,7 +16,7 @@ stopped: start it again. Scenes that are missing or cannot be used are named and
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import mean
 
@@ -36,11 +36,14 @@ from benchmarks.datasets import (
 from benchmarks.measuring import Cost, machine, write_file
 from benchmarks.quality import RATIOS, PhotographJudge, markdown_rows
 from cvtgs.errors import CvtgsError
-from cvtgs.evaluation.scorer import chosen_metrics
+from cvtgs.evaluation.scorer import Metrics, chosen_metrics
 
 FULL = "full scene"
 MERGED = "paper, no network"
 OURS = ("paper", MERGED, "standard")
+LARGE = (800, 800)
+"""Pixels of images on which any network of LPIPS can be measured."""
+
 PUBLISHED = Path(__file__).with_name("published.json")
 
 
@@ -70,11 +73,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise SystemExit(f"{options.datasets}: no scene with a trained model was found in it.")
     results = options.output / "results.json"
     table = read_results(results)
-    network = ""
+    metrics = chosen_metrics(options.lpips, LARGE)
+    network = metrics.lpips.network if metrics.lpips else f"none: {metrics.note}"
+    keep_network(options.output / "lpips.txt", network)
     for capture in found.captures:
         try:
-            for part, name in measure(capture, table, options):
-                table, network = joined(table, part), name
+            for part in measure(capture, table, options, metrics):
+                table = joined(table, part)
                 write_file(results, results_json(table).encode())
         except (SystemExit, CvtgsError) as error:
             notes.append(f"{capture.name}: left out. {error}")
@@ -84,6 +89,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
             report(table, found.captures, notes, options, network).encode(),
         )
     print((options.output / "paper.md").read_text(encoding="utf-8"))
+
+
+def keep_network(path: Path, network: str) -> None:
+    """Note the network of LPIPS; refuse to go on with another one."""
+    before = path.read_text(encoding="utf-8") if path.is_file() else network
+    if before != network:
+        raise SystemExit(
+            f"{path.parent}: its results were scored with LPIPS {before}, now it would be "
+            f"{network}; choose it with --lpips, or another folder."
+        )
+    write_file(path, network.encode())
 
 
 def parser() -> argparse.ArgumentParser:
@@ -115,8 +131,10 @@ def commands(methods: Sequence[str]) -> dict[str, list[str]]:
     return {name: known[name] for name in methods}
 
 
-def measure(capture: Capture, table: Table, options: argparse.Namespace):
-    """Yield each new result of a scene as a table, and the network of LPIPS."""
+def measure(
+    capture: Capture, table: Table, options: argparse.Namespace, metrics: Metrics
+) -> Iterator[Table]:
+    """Yield each new result of a scene as a table."""
     known = table.get(key_of(capture), {})
     todo = [
         (method, rho)
@@ -130,9 +148,7 @@ def measure(capture: Capture, table: Table, options: argparse.Namespace):
     scene = cvtgs.load(capture.model.path)
     views = read_test_views(capture)
     check_model(capture, scene, views.cameras)
-    metrics = chosen_metrics(options.lpips, (views.cameras.width, views.cameras.height))
     judge = PhotographJudge(views.cameras, views.photographs, capture.dataset.background, metrics)
-    network = metrics.lpips.network if metrics.lpips else f"none: {metrics.note}"
     print(
         f"{capture.name}: {len(scene):,} Gaussians of {capture.model.layout}'s layout, "
         f"{len(views.cameras)} photographs of {views.cameras.width} x {views.cameras.height} in "
@@ -141,7 +157,7 @@ def measure(capture: Capture, table: Table, options: argparse.Namespace):
     )
     if not has_full:
         nothing = Cost(user_seconds=0.0, wall_seconds=0.0, peak_bytes=0, output="")
-        yield one_row(capture, FULL, 1.0, result_of(judge, scene, nothing, len(scene))), network
+        yield one_row(capture, FULL, 1.0, result_of(judge, scene, nothing, len(scene)))
     for method, rho in todo:
         count = cvtgs.target_count(len(scene), rho)
         task = Task(
@@ -152,7 +168,7 @@ def measure(capture: Capture, table: Table, options: argparse.Namespace):
         )
         made = attempt(commands([method])[method], task, keep=True)
         found = made and result_of(judge, made[0], made[1], count)
-        yield one_row(capture, method, rho, found), network
+        yield one_row(capture, method, rho, found)
 
 
 def result_of(
@@ -187,7 +203,7 @@ def report(
     parts = [
         "# The evaluation of CVT-GS\n",
         f"Against photographs that were held out; models of {layouts}; "
-        f"LPIPS: {network or 'as before'}. Seconds: wall clock, one process per run, reading and "
+        f"LPIPS: {network}. Seconds: wall clock, one process per run, reading and "
         f"writing included; {machine()}. cvtgs {cvtgs.__version__}.\n",
         gains_table(table, options.rho),
     ]

@@ -292,6 +292,17 @@ def test_gains_stand_beside_the_published_ones():
     assert lines[-1].startswith("Published: B. Li et al. 2026, CVT-GS")
 
 
+def test_results_of_two_networks_of_lpips_are_not_mixed(tmp_path):
+    paper.keep_network(tmp_path / "lpips.txt", "vgg")
+    paper.keep_network(tmp_path / "lpips.txt", "vgg")
+    with pytest.raises(SystemExit) as caught:
+        paper.keep_network(tmp_path / "lpips.txt", "alex")
+    assert str(caught.value) == (
+        f"{tmp_path}: its results were scored with LPIPS vgg, now it would be alex; choose it with "
+        f"--lpips, or another folder."
+    )
+
+
 @pytest.mark.slow
 def test_from_end_to_end_and_on_after_an_interruption(root, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
