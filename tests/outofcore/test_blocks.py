@@ -228,11 +228,17 @@ def test_extra_columns_and_other_formats(tmp_path):
         simplify_file(tmp_path / "in.splat", tmp_path / "no.ply", 0.5, blocks=3)
 
 
-def test_presets_that_render_are_refused(source, tmp_path):
-    for preset in ("high", "max"):
-        simplifier = Simplifier(config=preset, device="cpu")
-        with pytest.raises(ConfigError, match="blocks need a preset that takes no images"):
-            simplify_file(source, tmp_path / "no.ply", 0.1, blocks=2, simplifier=simplifier)
+@pytest.mark.parametrize(
+    ("settings", "problem"),
+    [
+        ({"refine": {"seconds": 3.0}}, "number of steps .* found 3 s"),
+        ({"visibility": {"views": 8}}, "not to weigh Gaussians; found 8 views"),
+    ],
+)
+def test_images_that_blocks_cannot_use_are_refused(source, tmp_path, settings, problem):
+    simplifier = Simplifier(config=SimplifyConfig.from_mapping(settings), device="cpu")
+    with pytest.raises(ConfigError, match=problem):
+        simplify_file(source, tmp_path / "no.ply", 0.1, blocks=2, simplifier=simplifier)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -280,5 +286,5 @@ def test_command(source, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("cvtgs.outofcore.available_memory", lambda: 3_000_000)
     assert main(words) == 0
     assert "In 5 blocks." in capsys.readouterr().out
-    assert main([*words, "--memory", "2MB", "--preset", "max"]) == 1
+    assert main([*words, "--memory", "2MB", "--refine", "3"]) == 1
     assert main([*words, "--memory", "2MB", "--time-budget", "20s"]) == 1

@@ -127,7 +127,7 @@ def stream_blocks(
     try:
         if options.scheduler is None and block_count(open_rows(options.input), memory) == 1:
             return False
-        check_config(config)
+        check_config(config, with_images=False)
     except (InputError, FileFormatError, ConfigError):
         if options.scheduler is not None or (asked and options.input.suffix == ".ply"):
             raise

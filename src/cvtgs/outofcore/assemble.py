@@ -2,12 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from cvtgs.analysis import select_columns
 from cvtgs.clock import StageClock
@@ -16,9 +11,10 @@ from cvtgs.errors import DroppedDataWarning
 from cvtgs.io import atomic_output, load, save
 from cvtgs.io.ply import join_plys
 from cvtgs.io.tensors import map_tensors
+from cvtgs.outofcore.improve import join_matchings, join_refinements
 from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.merge import BlockReport
-from cvtgs.outofcore.scan import CHUNK
+from cvtgs.outofcore.merge import read_report
+from cvtgs.outofcore.rows import kept_rows
 from cvtgs.report import SimplifyReport
 from cvtgs.scene import concatenate
 from cvtgs.simplifier import Simplifier
@@ -28,12 +24,12 @@ def assemble_blocks(
     job: Job, output: str | os.PathLike[str], *, axes: str | None, overwrite: bool
 ) -> None:
     """Write protected rows and blocks behind one another."""
-    blocks = [job.small_path(block) for block in job.blocks_with_cells()]
+    blocks = [job.finished_path(block) for block in job.blocks_with_cells()]
     if is_plain_ply(output):
         with atomic_output(output, overwrite=overwrite) as file:
             join_plys([*_kept_files(job), *blocks], file)
         return
-    kept = [job.source.scene(rows) for rows in _kept_rows(job)]
+    kept = [job.source.scene(rows) for rows in kept_rows(job)]
     scene = concatenate([*kept, *map(load, blocks)])
     save(scene, output, overwrite=overwrite, axes=axes)
 
@@ -44,19 +40,10 @@ def is_plain_ply(output: str | os.PathLike[str]) -> bool:
     return name.endswith(".ply") and not name.endswith(".compressed.ply")
 
 
-def _kept_rows(job: Job) -> Iterator[NDArray[Any]]:
-    """Map the protected rows of every range, in parts."""
-    for rows in job.ranges():
-        path = job.kept_path(rows.number)
-        if path.exists():
-            table = np.memmap(path, job.source.dtype, "r").view(np.ndarray)
-            yield from (table[start : start + CHUNK] for start in range(0, len(table), CHUNK))
-
-
 def _kept_files(job: Job) -> list[Path]:
     """Write the protected rows as blocks are written: with these columns and axes."""
     paths = []
-    for number, rows in enumerate(_kept_rows(job)):
+    for number, rows in enumerate(kept_rows(job)):
         paths.append(job.path(f"unchanged_{number:05d}.ply"))
         scene = select_columns(job.source.scene(rows), job.config.effects)
         save(scene, paths[-1], overwrite=True, axes=job.axes)
@@ -73,9 +60,9 @@ def report_blocks(
 ) -> SimplifyReport:
     """Add up the reports of all blocks."""
     scan, with_cells = job.read_scan(), job.blocks_with_cells()
-    reports = [
-        BlockReport.model_validate_json(job.report_path(block).read_bytes()) for block in with_cells
-    ]
+    reports = [read_report(job, block) for block in with_cells]
+    matchings = [report.matching for report in reports if report.matching is not None]
+    refinements = [report.refinement for report in reports if report.refinement is not None]
     total, valid = job.source.count, scan.row_count + scan.kept_count
     if valid < total:
         reasons = ", ".join(f"{name} {number}" for name, number in scan.invalid_rows.items())
@@ -85,9 +72,9 @@ def report_blocks(
             DroppedDataWarning,
             stacklevel=4,
         )
-    tessellated = job.blocks_with_rows() if job.blocks > 1 else []
+    tessellated = job.blocks_with_rows() if job.goes_by_steps else []
     parts = [map_tensors(job.parts_path(block))[0] for block in tessellated]
-    kept_mass = sum(float(job.source.scene(rows).masses.sum()) for rows in _kept_rows(job))
+    kept_mass = sum(float(job.source.scene(rows).masses.sum()) for rows in kept_rows(job))
     return SimplifyReport(
         input_count=total,
         output_count=min(job.target, valid),
@@ -111,7 +98,10 @@ def report_blocks(
         backend=reports[0].backend if reports else "none",
         checkpoint="none" if simplifier.checkpoint is None else simplifier.checkpoint.name,
         plan=scan.plan,
+        views="found" if matchings or refinements else "none",
         stages=tuple(clock.costs),
+        matching=join_matchings(matchings) if matchings else None,
+        refinement=join_refinements(refinements) if refinements else None,
         blocks=job.blocks,
         resumed_blocks=resumed,
         config=simplifier.config,

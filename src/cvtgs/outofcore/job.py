@@ -3,13 +3,12 @@
 import hashlib
 import json
 import os
-import secrets
 import shutil
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import NamedTuple
 
 import pydantic
 import torch
@@ -23,6 +22,7 @@ from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import Checkpoint, load_checkpoint, save_checkpoint
+from cvtgs.outofcore.attempts import SortedFile
 from cvtgs.outofcore.scan import RowRange, SceneScan, read_scan, write_scan
 
 SENT_BYTES = "sent_bytes"
@@ -49,51 +49,6 @@ class Manifest(pydantic.BaseModel):
     cells: tuple[int, ...]
     cell_room: int
     left_out_mass: float
-
-
-class SortedFile(NamedTuple):
-    """A file that one attempt to sort a range has written, before it is adopted.
-
-    Attributes:
-        name: Name that it gets in the folder of the job.
-        attempt: Name that it has.
-        size: Bytes.
-        checksum: CRC-32 of its content.
-    """
-
-    name: str
-    attempt: str
-    size: int
-    checksum: int
-
-
-class Attempt:
-    """The files that one call writes for a range; a second call for it writes others.
-
-    So a worker that was taken for dead and still writes cannot damage those that are used.
-    """
-
-    def __init__(self, folder: str) -> None:
-        self._folder = Path(folder)
-        self._token = secrets.token_hex(8)
-        self._found: dict[str, tuple[int, int]] = {}
-
-    def append(self, name: str, content: bytes) -> None:
-        """Append to the file that is to get a name."""
-        with (self._folder / self._name(name)).open("ab") as file:
-            file.write(content)
-        size, checksum = self._found.get(name, (0, 0))
-        self._found[name] = (size + len(content), zlib.crc32(content, checksum))
-
-    def files(self) -> tuple[SortedFile, ...]:
-        """Return what was written."""
-        return tuple(
-            SortedFile(name, self._name(name), size, checksum)
-            for name, (size, checksum) in self._found.items()
-        )
-
-    def _name(self, name: str) -> str:
-        return f"attempt_{name}_{self._token}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -174,6 +129,25 @@ class Job:
         """Return the file of a finished block."""
         return self.path(f"small_{block:05d}.ply")
 
+    def improved_path(self, block: int) -> Path:
+        """Return the file of a finished block that was matched to images or refined."""
+        return self.path(f"improved_{block:05d}.ply")
+
+    def finished_path(self, block: int) -> Path:
+        """Return the last of the files of a finished block."""
+        return self.improved_path(block) if self.uses_images else self.small_path(block)
+
+    @property
+    def uses_images(self) -> bool:
+        """Whether blocks are matched to images of the scene, or refined."""
+        config = self.config
+        return (config.uses_renders and config.match.enabled) or config.refine.enabled
+
+    @property
+    def goes_by_steps(self) -> bool:
+        """Whether every step runs for all blocks before the next; one block may need only one."""
+        return self.blocks > 1 or self.uses_images
+
     def report_path(self, block: int) -> Path:
         """Return the file with the report of a finished block."""
         return self.path(f"small_{block:05d}.json")
@@ -197,7 +171,7 @@ class Job:
     @property
     def targets(self) -> tuple[int, ...]:
         """Number of Gaussians that each block keeps, which is known when groups are."""
-        if self.blocks == 1:
+        if not self.goes_by_steps:
             return (self.total,)
         return tuple(json.loads(self.path("targets.json").read_bytes()))
 
@@ -357,14 +331,15 @@ class Job:
             for path in (self.path("targets.json"), *self.path("").glob("small_*")):
                 path.unlink(missing_ok=True)
             return
-        for block in blocks:
+        for block, is_improved in product(blocks, (False, True)):
+            name = self.improved_path(block) if is_improved else self.small_path(block)
             try:
                 json.loads(self.report_path(block).read_bytes())
-                whole = open_rows(self.small_path(block)).count == self.targets[block]
+                whole = open_rows(name).count == self.targets[block]
             except (CvtgsError, OSError, ValueError):
                 whole = False
             if not whole:
-                self.small_path(block).unlink(missing_ok=True)
+                name.unlink(missing_ok=True)
 
     def _manifest(self) -> Manifest:
         return Manifest.model_validate_json(self.path("manifest.json").read_bytes())

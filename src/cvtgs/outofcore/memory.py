@@ -15,6 +15,9 @@ BASE_BYTES = 450_000_000
 LEAST_BYTES = 500_000_000
 """The same and a small block: no run in blocks takes less."""
 
+IMAGE_BYTES = 400_000_000
+"""Set aside for images of the scene and what they are made of."""
+
 CELL_BYTES = 1500
 """What a cell of the tessellation takes while pairs of cells merge; some 1,030 were measured."""
 

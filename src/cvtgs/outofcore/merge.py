@@ -14,6 +14,7 @@ from cvtgs.analysis import drop_unused_bands, restore_columns, select_columns
 from cvtgs.clock import StageClock
 from cvtgs.devices import one_thread
 from cvtgs.io import atomic_output, save
+from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
 from cvtgs.mergenet import correct_cells
 from cvtgs.outofcore.halo import bounding_box, halo_cells, other_blocks
@@ -21,7 +22,7 @@ from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.rows import analysis_of, read_members, read_rows
 from cvtgs.pipeline import merge_members, neighbor_count, reduce_scene, shape_merged
 from cvtgs.progress import silent
-from cvtgs.report import CellStatistics
+from cvtgs.report import CellStatistics, MatchReport, RefineReport
 from cvtgs.scene import GaussianScene
 
 EXTRA = "extra/"
@@ -34,12 +35,16 @@ class BlockReport(CellStatistics):
     Attributes:
         input_count: Gaussians in the cells of the block.
         mass_out: Opacity times mean projected area of the result, squared scene units.
+        matching: What matching to images gained; None if there was none.
+        refinement: What a refinement gained; None if there was none.
     """
 
     model_config = pydantic.ConfigDict(ser_json_inf_nan="constants")
 
     input_count: int
     mass_out: float
+    matching: MatchReport | None = None
+    refinement: RefineReport | None = None
 
 
 class BlockCells(NamedTuple):
@@ -143,7 +148,7 @@ def correct(job: Job, block: int) -> None:
         largest_cell=int(partition.counts.amax()),
         backend=cvt.SEARCH,
     )
-    _write_block(job, block, small, report)
+    write_block(job, block, small, report)
 
 
 @one_thread()
@@ -167,7 +172,7 @@ def simplify_block(job: Job, block: int) -> None:
         mass_out=float(reduced.scene.masses.sum()),
         **reduced.statistics.model_dump(),
     )
-    _write_block(job, block, reduced.scene, report)
+    write_block(job, block, reduced.scene, report)
 
 
 def read_cells(job: Job, block: int) -> BlockCells:
@@ -195,10 +200,19 @@ def _with_halo(job: Job, block: int, remote: Tensor, path: Callable[[int], Path]
     return WithHalo(scene, sizes, len(own["sizes"]))
 
 
-def _write_block(job: Job, block: int, small: GaussianScene, report: BlockReport) -> None:
+def read_report(job: Job, block: int) -> BlockReport:
+    """Read the report of a finished block."""
+    return BlockReport.model_validate_json(job.report_path(block).read_bytes())
+
+
+def write_block(
+    job: Job, block: int, small: GaussianScene, report: BlockReport, *, is_improved: bool = False
+) -> None:
     """Write a finished block: the report first, because its scene says that it is finished."""
+    path = job.improved_path(block) if is_improved else job.small_path(block)
+    axes = job.axes if path == job.finished_path(block) else SCENE_AXES
     with atomic_output(job.report_path(block), overwrite=True) as file:
         file.write(report.model_dump_json().encode())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        save(small, job.small_path(block), overwrite=True, axes=job.axes)
+        save(small, path, overwrite=True, axes=axes)

@@ -15,7 +15,8 @@ from cvtgs.config import TessellationConfig
 from cvtgs.devices import one_thread
 from cvtgs.io import atomic_output
 from cvtgs.io.tensors import map_tensors
-from cvtgs.outofcore.job import Attempt, Job, SortedFile
+from cvtgs.outofcore.attempts import Attempt, SortedFile
+from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.scan import CHUNK, RowRange, SceneScan
 from cvtgs.scene import GaussianScene
 
@@ -165,6 +166,15 @@ def read_members(job: Job, block: int) -> tuple[BlockRows, Tensor]:
     count = int(stays.sum()) + sum(map(len, received))
     rows = _assembled(job, pieces(), count, is_slim=False)
     return rows, torch.cat([labels[stays], *cells])
+
+
+def kept_rows(job: Job) -> Iterator[NDArray[Any]]:
+    """Map the protected rows of every range, in parts."""
+    for rows in job.ranges():
+        path = job.kept_path(rows.number)
+        if path.exists():
+            table = np.memmap(path, job.source.dtype, "r").view(np.ndarray)
+            yield from (table[start : start + CHUNK] for start in range(0, len(table), CHUNK))
 
 
 def send_rows(job: Job, block: int, owners: Tensor, labels: Tensor) -> Tensor:

@@ -15,9 +15,7 @@ from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, target_count
 from cvtgs.devices import one_thread
-from cvtgs.errors import (
-    ConfigError,
-)
+from cvtgs.errors import ConfigError, InvalidArgumentError
 from cvtgs.grouping import finer_count
 from cvtgs.io import check_save
 from cvtgs.io.axes import SCENE_AXES, checked_axes
@@ -25,9 +23,17 @@ from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
 from cvtgs.outofcore.allocate import allocate, join
 from cvtgs.outofcore.assemble import assemble_blocks, is_plain_ply, report_blocks
+from cvtgs.outofcore.improve import improve
 from cvtgs.outofcore.job import Job, Manifest, job_folder
 from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
-from cvtgs.outofcore.memory import available_memory, block_count, cell_room, memory_to_plan
+from cvtgs.outofcore.memory import (
+    IMAGE_BYTES,
+    LEAST_BYTES,
+    available_memory,
+    block_count,
+    cell_room,
+    memory_to_plan,
+)
 from cvtgs.outofcore.merge import correct, inflate, merge, simplify_block
 from cvtgs.outofcore.scan import CHUNK
 from cvtgs.outofcore.sort import sort_into_blocks
@@ -90,7 +96,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         The report; statistics of cells are those of all blocks, seconds those of every process.
 
     Raises:
-        ConfigError: The configuration takes images of the scene, which needs all of it.
+        ConfigError: The configuration refines for seconds instead of steps.
         InvalidArgumentError: Ratio, count or boxes cannot be met.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
@@ -114,7 +120,15 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     rows = open_rows(source, sh_degree=sh_degree, axes=source_axes)
     rows = replace(rows, path=str(Path(rows.path).absolute()))  # for workers in other folders
     target = target_count(rows.count, rho, count=count, max_count=max_count)
-    wanted = blocks or block_count(rows, memory or memory_to_plan(available_memory()))
+    room = memory or memory_to_plan(available_memory())
+    if simplifier.config.uses_renders or simplifier.config.refine.enabled:
+        room -= IMAGE_BYTES
+        if memory is not None and room < LEAST_BYTES:
+            raise InvalidArgumentError(
+                f"memory must be at least {(LEAST_BYTES + IMAGE_BYTES) / 1e6:g} MB for images of "
+                f"the scene; found {memory / 1e6:g} MB, use preset standard or more memory."
+            )
+    wanted = blocks or block_count(rows, room)
     job = Job(
         folder="",
         source=rows,
@@ -141,7 +155,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
                 job.write_network(simplifier.checkpoint)
             with one_thread():
                 job.write_manifest(_scan_and_sort(job, key, workers, clock, room=cell_room(memory)))
-        energies = _tessellate_and_merge(job, workers, clock) if job.blocks > 1 else ()
+        energies = _tessellate_and_merge(job, workers, clock) if job.goes_by_steps else ()
         resumed = _run_blocks(job, workers, clock)
         with clock.stage("assemble"):
             assemble_blocks(job, output, axes=output_axes, overwrite=overwrite)
@@ -155,20 +169,32 @@ def rows_per_range(count: int) -> int:
     return max(RANGE_ROWS, CHUNK * math.ceil(count / MOST_RANGES / CHUNK))
 
 
-def check_config(config: SimplifyConfig) -> None:
-    """Refuse a configuration that needs the whole scene in one piece.
+def check_config(config: SimplifyConfig, *, with_images: bool = True) -> None:
+    """Refuse a configuration that cannot be followed block by block.
 
     Args:
         config: Every choice.
+        with_images: Whether blocks may be matched to images of the scene, or refined.
 
     Raises:
-        ConfigError: It takes images of the scene, or refines.
+        ConfigError: It takes images of the scene where it may not, or refines for seconds, which
+            would give other bits every time.
     """
-    if config.uses_renders or config.refine.enabled:
+    if not with_images and (config.uses_renders or config.refine.enabled):
         raise ConfigError(
             "blocks need a preset that takes no images of the scene (draft, fast, standard, "
             f"paper) and no refinement; found {config.preset!r} with {config.visibility.views} "
             f"views and {config.refine.steps} steps of refinement."
+        )
+    if config.uses_renders and not (config.match.enabled or config.refine.enabled):
+        raise ConfigError(
+            "blocks take images of the scene to match or refine what was merged, not to weigh "
+            f"Gaussians; found {config.visibility.views} views and neither."
+        )
+    if config.refine.seconds:
+        raise ConfigError(
+            "blocks are refined for a number of steps (--refine-steps, refine.steps), not of "
+            f"seconds; found {config.refine.seconds:g} s."
         )
 
 
@@ -198,10 +224,13 @@ def _scan_and_sort(
 def _run_blocks(job: Job, workers: Workers, clock: StageClock) -> int:
     """Simplify the blocks that are not finished; return how many were."""
     with_cells = job.blocks_with_cells()
-    resumed = sum(job.small_path(block).exists() for block in with_cells)
-    last = correct if job.blocks > 1 else simplify_block
+    resumed = sum(job.finished_path(block).exists() for block in with_cells)
+    last = correct if job.goes_by_steps else simplify_block
     with clock.stage("blocks", len(with_cells)) as advance:
         _run_all(workers, partial(last, job), with_cells, advance)
+    if job.uses_images:
+        with clock.stage("images", len(with_cells)) as advance:
+            _run_all(workers, partial(improve, job), with_cells, advance)
     return resumed
 
 

@@ -11,7 +11,8 @@ from cvtgs.clock import StageClock
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.grouping import finer_count
 from cvtgs.math.frames import robust_frame
-from cvtgs.outofcore.job import Job, SortedFile
+from cvtgs.outofcore.attempts import SortedFile
+from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.rows import sort_range
 from cvtgs.outofcore.scan import RowRange, add_totals, read_sample, scan_range, scan_scene
 from cvtgs.outofcore.workers import Workers, with_progress

@@ -196,7 +196,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
         ([2000, 200], 3)
     """
     simplifier, workers = simplifier or Simplifier(device="cpu"), workers or sequentially
-    check_config(simplifier.config)
+    check_config(simplifier.config, with_images=False)
     rows = open_rows(source)
     rows = replace(rows, path=str(Path(rows.path).absolute()))  # for workers in other folders
     targets = sorted({target_count(rows.count, rho) for rho in rhos}, reverse=True)

@@ -1,0 +1,100 @@
+"""Blocks are matched to images and refined with the others drawn but fixed: no seams, same bits."""
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.boxes import Box
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.evaluation import EvaluationSettings
+from cvtgs.outofcore import LocalWorkers, simplify_file
+from cvtgs.views import automatic_views
+
+COUNT = 200
+MATCHED = {"preset": "matched", "visibility": {"views": 12, "size": 64}}
+REFINED = {
+    "preset": "high",
+    "refine": {"steps": 12, "size": 48, "images": 12, "heldout": 2, "check_every": 6},
+}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return cvtgs.synthetic.scene("object", 4000, sh_degree=1, seed=4)
+
+
+@pytest.fixture(scope="module")
+def source(scene, tmp_path_factory):
+    path = tmp_path_factory.mktemp("improve") / "in.ply"
+    cvtgs.save(scene, path)
+    return path
+
+
+def simplifier_of(settings):
+    return Simplifier(config=SimplifyConfig.from_mapping(settings), device="cpu")
+
+
+def in_blocks(source, output, settings, *, blocks=3, **options):
+    simplifier = simplifier_of(settings)
+    return simplify_file(
+        source, output, count=COUNT, blocks=blocks, simplifier=simplifier, **options
+    )
+
+
+def psnr_of(scene, small):
+    cameras = automatic_views(scene, 4, width=96, height=72)
+    settings = EvaluationSettings(lpips="off")
+    return [
+        one.psnr.mean for one in cvtgs.evaluate(scene, small, cameras, settings=settings).scenes
+    ]
+
+
+def test_matched_blocks_are_nearly_as_good_as_one_piece(scene, source, tmp_path):
+    report = in_blocks(source, tmp_path / "matched.ply", MATCHED)
+    small = {
+        "one": simplifier_of(MATCHED).simplify(scene, count=COUNT),
+        "blocks": cvtgs.load(tmp_path / "matched.ply"),
+    }
+    assert len(small["blocks"]) == COUNT == report.output_count
+    assert report.matching.views == 3 * 12
+    assert report.matching.psnr_after > report.matching.psnr_before
+    one, blocks = psnr_of(scene, small)
+    assert blocks > one - 0.3
+
+
+@pytest.mark.parametrize("settings", [MATCHED, REFINED])
+def test_the_order_of_blocks_does_not_matter(source, tmp_path, settings):
+    def backwards(function, items):
+        results = {item: function(item) for item in reversed(items)}
+        return [results[item] for item in items]
+
+    in_blocks(source, tmp_path / "a.ply", settings, blocks=2)
+    in_blocks(source, tmp_path / "b.ply", settings, blocks=2, workers=backwards)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_images_need_some_memory(source, tmp_path):
+    with pytest.raises(InvalidArgumentError, match="at least 900 MB for images"):
+        in_blocks(source, tmp_path / "no.ply", MATCHED, blocks=None, memory=600_000_000)
+
+
+@pytest.mark.slow
+def test_two_workers_give_the_same_bits(source, tmp_path):
+    in_blocks(source, tmp_path / "a.ply", REFINED, blocks=3)
+    with LocalWorkers(2) as workers:
+        in_blocks(source, tmp_path / "b.ply", REFINED, blocks=3, workers=workers)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_refined_blocks_gain_and_protected_gaussians_stay(scene, source, tmp_path):
+    lowest = float(scene.means[:, 2].kthvalue(len(scene) - 40).values)
+    box = Box(min=(-99, -99, lowest), max=(99, 99, 99))
+    kept = scene.select(cvtgs.boxes.inside([box], scene.means))
+    assert len(kept) > 40
+    report = in_blocks(source, tmp_path / "out.ply", REFINED, boxes=[box])
+    small = cvtgs.load(tmp_path / "out.ply")
+    assert (len(small), report.refinement.steps) == (COUNT, 3 * 12)
+    assert report.refinement.psnr_after > report.refinement.psnr_before
+    first = small.select(torch.arange(len(kept)))
+    assert all(torch.equal(a, kept.tensors()[name]) for name, a in first.tensors().items())
