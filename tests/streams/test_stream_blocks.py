@@ -62,13 +62,13 @@ def test_counts_are_exact_and_the_finest_level_is_the_scene(
     assert names_in(tmp_path) == ["out", "scene.ply"]
 
 
-def test_every_level_paints_as_much_as_that_of_one_piece(
-    tmp_path: Path, source: Path, scene: GaussianScene
-) -> None:
-    stream(source, tmp_path / "out")
-    for lod, level in enumerate(FAST.levels(scene, RHOS)):
+def test_every_level_paints_as_much_as_that_of_one_piece(tmp_path: Path) -> None:
+    room = make("room", 4000, sh_degree=0, seed=3)
+    save(room, tmp_path / "room.ply")
+    stream(tmp_path / "room.ply", tmp_path / "out")
+    for lod, level in enumerate(FAST.levels(room, RHOS)):
         mass = float(load(tmp_path / "out", lod=lod).masses.sum())
-        assert math.isclose(mass, float(level.scene.masses.sum()), rel_tol=0.05)
+        assert math.isclose(mass, float(level.scene.masses.sum()), rel_tol=0.08)
 
 
 def test_parts_of_3d_tiles_share_a_root_without_content(tmp_path: Path, source: Path) -> None:
@@ -182,13 +182,23 @@ def test_wrong_sizes(tmp_path: Path, source: Path) -> None:
     assert names_in(tmp_path) == ["scene.ply"]
 
 
-def test_blocks_share_one_environment(tmp_path: Path) -> None:
+def test_blocks_share_one_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a run ends after all blocks, and another one takes them over."""
     near, far = make("object", 3000, sh_degree=0, seed=1), make("object", 200, sh_degree=0, seed=2)
     directions = torch.nn.functional.normalize(far.means - far.means.mean(dim=0))
     radius = float(near.means.norm(dim=1).quantile(0.7))
     sky = far.with_tensors({"means": 40 * radius * directions}, {})
     save(concatenate([near, sky]), tmp_path / "scene.ply")
+
+    def stop(*_: Any, **__: Any) -> None:
+        raise StoppedError
+
+    with monkeypatch.context() as patch:
+        patch.setattr("cvtgs.streams.blocks.publish", stop)
+        with pytest.raises(StoppedError):
+            stream(tmp_path / "scene.ply", tmp_path / "out", environment_radii=10)
     report = stream(tmp_path / "scene.ply", tmp_path / "out", environment_radii=10)
+    assert report.resumed_blocks == 3
     assert 2500 < report.levels[0].gaussians <= 3000
     assert len(load(tmp_path / "out")) == 3200
     assert sorted(path.name for path in (tmp_path / "out").glob("[.e]*")) == ["environment"]

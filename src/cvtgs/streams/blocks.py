@@ -113,6 +113,8 @@ class StreamJob:
         try:
             part = StreamPart.model_validate_json(self.part_path(block).read_bytes())
             sizes = [_bytes_of((self.folder / name), self.form.kind) for name in part.names]
+            if part.environment is not None and not (self.folder / part.environment).exists():
+                return None
         except (OSError, ValueError):
             return None
         return part if sum(sizes) == sum(level.bytes for level in part.levels) else None

@@ -182,7 +182,7 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
         return
     index = place / INDEX_NAMES[kind]
     check_output(index, overwrite)
-    if not index.exists() and any(place.iterdir()):
+    if not index.exists() and _has_files(place):
         raise OutputExistsError(
             f"{place}: a stream needs an empty folder, or one with {INDEX_NAMES[kind]} to replace, "
             f"found other files."
@@ -194,6 +194,8 @@ def _hidden_folder(place: Path) -> Iterator[Path]:
     """Make a hidden folder beside a folder to write; it is gone at the end."""
     target = Path(os.path.realpath(place))
     hidden = target.with_name(f".{target.name}.stream")
+    if target.is_dir() and not os.access(target.parent, os.W_OK | os.X_OK):
+        hidden = target / ".stream"
     shutil.rmtree(hidden, ignore_errors=True)
     make_folder(hidden)
     try:
@@ -212,16 +214,38 @@ def make_folder(folder: Path) -> None:
 
 
 def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
-    """Move the files of a finished stream to where they belong, the index last."""
+    """Move the files of a finished stream to where they belong, the index last.
+
+    Hidden files stay: they are for a run that continues.
+    """
     check_stream(place, kind, overwrite=overwrite)
-    make_folder(place)
-    index = INDEX_NAMES[kind]
-    names = [path.name for path in hidden.iterdir() if path.name != index]
+    index, target = INDEX_NAMES[kind], Path(os.path.realpath(place))
+    try:
+        if not target.exists() or not any(target.iterdir()):  # then all of them at once
+            if target.exists():
+                target.rmdir()
+            hidden.rename(target)
+            for path in target.glob(".*"):
+                path.unlink()
+            return
+    except OSError as error:
+        raise _refused(place, error) from error
+    found = [path.name for path in hidden.iterdir()]
+    names = [name for name in found if name != index and not name.startswith(".")]
     try:
         for name in [*names, index]:
             if (place / name).is_dir():
                 shutil.rmtree(place / name)
             (hidden / name).replace(place / name)
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise OutputError(f"{place}: must take the files of a stream, found: {reason}.") from error
+        raise _refused(place, error) from error
+
+
+def _refused(place: Path, error: OSError) -> OutputError:
+    reason = (error.strerror or str(error)).lower()
+    return OutputError(f"{place}: must take the files of a stream, found: {reason}.")
+
+
+def _has_files(folder: Path) -> bool:
+    """Return whether there is anything but hidden files, such as locks."""
+    return any(not path.name.startswith(".") for path in folder.iterdir())

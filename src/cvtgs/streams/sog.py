@@ -93,8 +93,6 @@ class SogFormat:
         more = {}
         if far:
             _write_sog(concatenate([load(path, trust_sizes=True) for path in far]), folder / _FAR)
-            for path in far:
-                path.unlink()
             more = {"environment": f"{_FAR}/meta.json"}
         return {
             "version": 1,
