@@ -1,4 +1,4 @@
-"""Cameras: what cannot be a camera is refused."""
+"""Cameras: what cannot be a camera is refused; every so manyth pixel."""
 
 import pytest
 import torch
@@ -26,6 +26,7 @@ GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "h
             "torch.float64 on cpu.",
         ),
         ({"width": 0}, "width and height must be at least 1 pixel, found 0 x 3."),
+        ({"stride": 0}, "stride must be at least 1 pixel, found 0."),
         ({"names": ("a", "b")}, "names must hold one name per camera, 1; found 2."),
     ],
 )
@@ -33,3 +34,14 @@ def test_what_is_no_camera(changes, text):
     with pytest.raises(InvalidArgumentError) as caught:
         Cameras(**GOOD | changes)
     assert str(caught.value) == text
+
+
+def test_every_second_pixel_by_hand():
+    """Pixel 3 of a row, the second of those from 1 on, is where it was: at 3.5, now at 1.5."""
+    Ks = torch.tensor([[[10.0, 0, 4], [0, 12, 3], [0, 0, 1]]])  # noqa: N806
+    found = Cameras(viewmats=torch.eye(4)[None], Ks=Ks, width=8, height=5).every(2, first=(1, 0))
+    assert (found.width, found.height, found.stride) == (4, 3, 2)
+    assert found.Ks[0].tolist() == [[5, 0, 1.75], [0, 6, 1.75], [0, 0, 1]]
+    slope = (3.5 - 4) / 10
+    assert 5 * slope + 1.75 == 1.5
+    assert found.every(2).stride == 4

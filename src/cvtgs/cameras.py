@@ -20,6 +20,8 @@ class Cameras:
         width: Pixels per row.
         height: Rows.
         names: Name of each camera, such as its photograph's file name; empty if they have none.
+        stride: Above 1, the images are every so manyth pixel of finer ones, in both directions;
+            ``Ks``, width and height are those of the coarser grid (:meth:`every`).
 
     Raises:
         InvalidArgumentError: Shapes, dtypes, devices or sizes do not fit together.
@@ -37,6 +39,7 @@ class Cameras:
     width: int
     height: int
     names: tuple[str, ...] = ()
+    stride: int = 1
 
     def __post_init__(self) -> None:
         count = len(self.viewmats)
@@ -58,6 +61,8 @@ class Cameras:
             raise InvalidArgumentError(
                 f"width and height must be at least 1 pixel, found {self.width} x {self.height}."
             )
+        if self.stride < 1:
+            raise InvalidArgumentError(f"stride must be at least 1 pixel, found {self.stride}.")
         if self.names and len(self.names) != count:
             raise InvalidArgumentError(
                 f"names must hold one name per camera, {count}; found {len(self.names)}."
@@ -135,6 +140,31 @@ class Cameras:
         factor = side / max(self.width, self.height)
         return self.resized(
             max(least, round(factor * self.width)), max(least, round(factor * self.height))
+        )
+
+    def every(self, stride: int, *, first: tuple[int, int] = (0, 0)) -> Self:
+        """Return cameras that see only every so manyth pixel, as sharp as in the whole image.
+
+        What they render is ``image[:, row::stride, column::stride]``: splats are as wide as in the
+        whole image, while smaller images (:meth:`resized`) swell them.
+
+        Args:
+            stride: Pixels from one to the next, along rows and columns.
+            first: Column and row of the first pixel, each below the stride.
+
+        Returns:
+            Cameras of smaller images.
+        """
+        shifts = self.Ks.new_tensor([first[0] + 0.5, first[1] + 0.5])
+        Ks = self.Ks.clone()  # noqa: N806 (the name that gsplat gives it)
+        Ks[:, :2] /= stride
+        Ks[:, :2, 2] += 0.5 - shifts / stride
+        return replace(
+            self,
+            Ks=Ks,
+            width=-(-(self.width - first[0]) // stride),
+            height=-(-(self.height - first[1]) // stride),
+            stride=self.stride * stride,
         )
 
     def spread(self, count: int) -> Self:

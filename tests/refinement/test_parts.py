@@ -173,11 +173,71 @@ def test_images_are_taken_when_needed_and_used_again(endless):
         drawn.append(images.draw())
         taken.append(images.rendered)
     assert taken == [1, 1, 1, 2, 2, 2, 3, 3, 3, 3, 3, 3]
-    assert all(image is drawn[0] for image in drawn[:3])
-    assert len({id(image) for image in drawn[6:]}) == 2
+    eyes = [tuple(image.camera.centers[0].tolist()) for image in drawn]
+    assert (len(set(eyes[:3])), len(set(eyes[6:]))) == (1, 2)
     assert drawn[0].rgb.dtype == torch.float16
     exact = render_view(full, drawn[0].camera)
     torch.testing.assert_close(drawn[0].rgb.float(), exact.rgb, rtol=1e-3, atol=1e-3)
+
+
+def test_first_steps_have_images_of_their_own_and_all_come_up_in_turn():
+    config = quick(first_images=8, steps_per_image=100)
+    views = RefineViews(heldout=(), training=iter(ring(8).singles()), endless=True)
+    images = ImageBuffer(full_scene(50), views, config=config, seed=0)
+    eyes = [tuple(images.draw().camera.centers[0].tolist()) for _ in range(8 + 64)]
+    assert images.rendered == len(set(eyes[:8])) == 8
+    # An image that was just used comes up again after half of the others, and not much later.
+    for eye in set(eyes):
+        uses = [step for step, other in enumerate(eyes) if other == eye]
+        gaps = torch.tensor(uses).diff()
+        assert int(gaps.amin()) > 4
+        assert int(gaps.amax()) < 24
+
+
+def test_a_step_sees_some_pixels_of_an_image_as_they_are_in_the_whole():
+    full = full_scene(200)
+    cameras = ring(1, width=47, height=33)
+    views = RefineViews(heldout=(), training=iter([cameras]), endless=False)
+    images = ImageBuffer(full, views, config=quick(stride=3), seed=0)
+    whole = render_view(full, cameras).rgb
+    seen = set()
+    for _ in range(40):
+        found = images.draw()
+        column, row = (
+            round(3 * float(0.5 - shift) - 0.5)
+            for shift in found.camera.Ks[0, :2, 2] - cameras.Ks[0, :2, 2] / 3
+        )
+        seen.add((column, row))
+        torch.testing.assert_close(
+            found.rgb.float(), whole[:, row::3, column::3], rtol=1e-3, atol=1e-3
+        )
+    assert len(seen) == 9
+
+
+def test_held_out_views_are_thinned_like_images_to_learn_from():
+    full = full_scene(50)
+    views = generated_views(full, config=quick(size=48, stride=2), seed=0)
+    assert all(camera.stride == 2 for camera in views.heldout)
+    assert {(camera.width, camera.height) for camera in views.heldout} == {(24, 24)}
+    assert next(views.training).width == 48
+    tiny = generated_views(full, config=quick(size=16, stride=3), seed=0)
+    assert next(tiny.training).width == 33  # as many as SSIM needs of the pixels that are left
+    given = split_views(ring(8), config=quick(stride=2), seed=0)
+    assert [(camera.width, camera.height) for camera in given.heldout] == [(16, 12)]
+
+
+def test_how_many_images_some_steps_take():
+    config = RefineConfig(first_images=32, steps_per_image=8)
+    assert [config.new_images(steps) for steps in (0, 5, 32, 39, 40, 48)] == [0, 5, 32, 32, 33, 34]
+    config = quick(first_images=3, steps_per_image=3)
+    views = RefineViews(heldout=(), training=iter(ring(8).singles()), endless=True)
+    images = ImageBuffer(full_scene(50), views, config=config, seed=0)
+    taken = []
+    for steps in range(1, 10):
+        images.draw()
+        taken.append(images.rendered)
+        assert taken[-1] == config.new_images(steps)
+    assert taken == [1, 2, 3, 3, 3, 4, 4, 4, 5]
 
 
 def test_images_that_are_never_used_again_are_not_kept():

@@ -107,6 +107,24 @@ def test_any_size_and_number_of_cameras(backend, width, height):
 
 
 @backends
+@pytest.mark.parametrize("comments", [(), MIP])
+@pytest.mark.parametrize(("stride", "first"), [(2, (0, 1)), (2, (1, 0)), (3, (2, 1))])
+def test_every_so_manyth_pixel_is_as_in_the_whole_image(backend, comments, stride, first):
+    scene = replace(random_scene(60, degree=1), comments=comments)
+    cameras = around()
+    whole = render(scene, cameras, backend=backend)
+    some = render(scene, cameras.every(stride, first=first), backend=backend)
+    column, row = first
+    torch.testing.assert_close(
+        some.rgb, whole.rgb[:, row::stride, column::stride], rtol=1e-3, atol=1e-4
+    )
+    torch.testing.assert_close(
+        some.alpha, whole.alpha[:, row::stride, column::stride], rtol=1e-3, atol=1e-4
+    )
+    assert float((some.rgb - whole.rgb[:, : some.rgb.shape[1], : some.rgb.shape[2]]).std()) > 0.01
+
+
+@backends
 def test_no_gaussians_and_none_in_view(backend):
     background = torch.tensor([0.1, 0.2, 0.3])
     behind = scene_of(((0, 0, -2), (0.5, 0.5, 0.5), 0.9, (1.0, 1.0, 1.0)), dtype=torch.float32)

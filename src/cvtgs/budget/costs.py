@@ -89,7 +89,7 @@ class Work:
         sample = self.count if sample >= self.count // 2 else sample
         searched = self.count + config.cvt.iterations * sample
         visibility, refine = config.visibility, config.refine
-        new_images = math.ceil(refine.steps / refine.steps_per_image)
+        new_images = refine.new_images(refine.steps)
         checks = 1 + math.ceil(refine.steps / refine.check_every)
         renders = refine.steps + SHARE_OF_A_STEP * refine.heldout * checks
         renders += STEPS_OF_A_BATCH * (1 + math.ceil(new_images / refine.batch))
@@ -104,7 +104,7 @@ class Work:
             "views_out": float(visibility.views * self.target),
             "view_values": float(visibility.views * self.target * self.colors),
             "images_in": (refine.heldout + new_images) * self.count,
-            "look_pixels": renders * refine.size**2,
+            "look_pixels": renders * (refine.size / refine.stride) ** 2,
             "looks_out": renders * self.target,
             "search": searched * math.log2(self.target + 2),
         }

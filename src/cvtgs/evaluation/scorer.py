@@ -68,6 +68,16 @@ class ViewImage:
         rgb, alpha = self.rgb.to(background.dtype), self.alpha.to(background.dtype)
         return rgb + (1 - alpha)[..., None] * background
 
+    def every(self, stride: int, *, first: tuple[int, int]) -> Self:
+        """Return every so manyth pixel, from a first column and row on."""
+        column, row = first
+        return replace(
+            self,
+            camera=self.camera.every(stride, first=first),
+            rgb=self.rgb[:, row::stride, column::stride],
+            alpha=self.alpha[:, row::stride, column::stride],
+        )
+
     def half(self) -> Self:
         """Return the image in half precision."""
         return replace(self, rgb=self.rgb.half(), alpha=self.alpha.half())

@@ -1,7 +1,7 @@
 """The views and images of a refinement: some to learn from, and others that are held out."""
 
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import count
 
@@ -40,9 +40,10 @@ class RefineViews:
 def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> RefineViews:
     """Find views of a scene: a quarter automatic ones, the others from where one can stand."""
     positions = find_view_positions(full)
+    side = max(config.size, SSIM_WINDOW * config.stride)
 
     def batch(number: int, seed: int) -> list[Cameras]:
-        return mixed_views(positions, number, size=config.size, seed=seed).singles()
+        return mixed_views(positions, number, size=side, seed=seed).singles()
 
     def training() -> Iterator[Cameras]:
         for number in count():
@@ -50,7 +51,7 @@ def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> 
             random.Random(seed + number).shuffle(views)
             yield from views
 
-    heldout = tuple(batch(config.heldout, seed + HELDOUT_SEED))
+    heldout = _thinned(batch(config.heldout, seed + HELDOUT_SEED), config.stride)
     return RefineViews(heldout=heldout, training=training(), endless=True)
 
 
@@ -62,18 +63,28 @@ def split_views(cameras: Cameras, *, config: RefineConfig, seed: int) -> RefineV
             f"{len(cameras)}."
         )
     side = min(config.size, max(cameras.width, cameras.height))
-    views = cameras.fitted(side, least=SSIM_WINDOW).singles()
+    views = cameras.fitted(side, least=SSIM_WINDOW * config.stride).singles()
     number = max(1, min(config.heldout, len(views) // 8))
     held = {(2 * k + 1) * len(views) // (2 * number) for k in range(number)}
     others = [view for row, view in enumerate(views) if row not in held]
     random.Random(seed).shuffle(others)
-    return RefineViews(
-        heldout=tuple(views[row] for row in sorted(held)), training=iter(others), endless=False
+    heldout = _thinned([views[row] for row in sorted(held)], config.stride)
+    return RefineViews(heldout=heldout, training=iter(others), endless=False)
+
+
+def _thinned(views: Sequence[Cameras], stride: int) -> tuple[Cameras, ...]:
+    """Return every so manyth pixel of each view, from another first pixel on in each."""
+    return tuple(
+        view.every(stride, first=(row % stride, row // stride % stride))
+        for row, view in enumerate(views)
     )
 
 
 class ImageBuffer:
-    """Images to learn from: now and then a new one, else one that was rendered before.
+    """Images to learn from: a new one at first and then now and again, else one from before.
+
+    What was rendered before comes up in turn: it is drawn at random from the half of it that was
+    not used for longest. A step sees every ``config.stride``-th pixel, from a random one on.
 
     Memory: 8 bytes per pixel of at most ``config.images`` images; of one, if every step has a
     new one.
@@ -85,7 +96,7 @@ class ImageBuffer:
         always_new = views.endless and config.steps_per_image == 1
         self._full = full
         self._cameras = views.training
-        self._steps_per_image = config.steps_per_image
+        self._config = config
         self._capacity = 1 if always_new else config.images
         self._rng = random.Random(seed)
         self._kept: list[ViewImage] = []
@@ -94,11 +105,21 @@ class ImageBuffer:
 
     def draw(self) -> ViewImage:
         """Return an image to learn from, in half precision."""
-        is_due = self._drawn % self._steps_per_image == 0
+        stride = self._config.stride
+        if stride == 1:
+            return self._next()
+        first = (self._rng.randrange(stride), self._rng.randrange(stride))
+        return self._next().every(stride, first=first)
+
+    def _next(self) -> ViewImage:
         self._drawn += 1
+        later = self._drawn - self._config.first_images
+        is_due = later <= 0 or later % self._config.steps_per_image == 0
         camera = next(self._cameras, None) if is_due else None
         if camera is None:
-            return self._rng.choice(self._kept)
+            used = self._kept.pop(self._rng.randrange((len(self._kept) + 1) // 2))
+            self._kept.append(used)
+            return used
         if len(self._kept) == self._capacity:
             self._kept.pop(self._rng.randrange(len(self._kept)))
         self._kept.append(render_view(self._full, camera).half())

@@ -83,7 +83,8 @@ class RasterSettings(NamedTuple):
 
     Attributes:
         camera: ``(9, 3)`` rotation (rows 0 to 2), centre (3), focal lengths (4), principal point
-            (5), slope bounds along x (6) and along y (7), width and height (8); pairs end with 0.
+            (5), slope bounds along x (6) and along y (7), width and height (8); pairs end with 0,
+            the last with the variance that splats gain, squared pixels.
         size: Width and height, pixels.
         sh_degree: Degree up to which colours depend on the direction.
         antialiased: Whether opacities are compensated.

@@ -112,7 +112,7 @@ def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tu
         width=cameras.width,
         height=cameras.height,
         near_plane=NEAR_PLANE,
-        eps2d=DILATION,
+        eps2d=DILATION / cameras.stride**2,
         sh_degree=sh_degree or None,
         packed=False,
         render_mode="RGB+D",

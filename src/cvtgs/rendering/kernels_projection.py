@@ -16,7 +16,7 @@ from cvtgs.rendering.compiled import (
     prange,
     serial,
 )
-from cvtgs.rendering.projection import DILATION, MIN_ALPHA, NEAR_PLANE
+from cvtgs.rendering.projection import MIN_ALPHA, NEAR_PLANE
 
 C2A, C2B = SH_C2
 C3A, C3B, C3C, C3D = SH_C3
@@ -80,9 +80,9 @@ def axes_of(rotation: Array, log_scales: Array, camera: Array, local: Array, out
 
 
 @serial
-def covariance_of(axes: Array) -> tuple[float, float, float, float]:
+def covariance_of(axes: Array, dilation: float) -> tuple[float, float, float, float]:
     """Return a, b, d of the dilated covariance ``(a b; b d)``, and the bare determinant over d."""
-    a, b, d = DILATION, 0.0, DILATION
+    a, b, d = dilation, 0.0, dilation
     for k in range(3):
         a += axes[3, k] * axes[3, k]
         b += axes[3, k] * axes[4, k]
@@ -96,10 +96,10 @@ def covariance_of(axes: Array) -> tuple[float, float, float, float]:
 
 
 @serial
-def survival_of(axes: Array) -> float:
+def survival_of(axes: Array, dilation: float) -> float:
     """Return the share of its opacity that an antialiased Gaussian keeps."""
-    a, _, d, bare = covariance_of(axes)
-    return math.sqrt(bare / (bare + DILATION * (a + d - DILATION) / d))
+    a, _, d, bare = covariance_of(axes, dilation)
+    return math.sqrt(bare / (bare + dilation * (a + d - dilation) / d))
 
 
 @serial
@@ -143,8 +143,9 @@ def sigmoid(logit: float) -> float:
 @serial
 def splat_of(axes: Array, local: Array, camera: Array, opacity: float, out: Array) -> bool:
     """Write all of a packed splat but its colour; return whether it touches the image."""
-    a, b, d, bare = covariance_of(axes)
-    schur = bare + DILATION * (a + d - DILATION) / d
+    dilation = camera[8, 2]
+    a, b, d, bare = covariance_of(axes, dilation)
+    schur = bare + dilation * (a + d - dilation) / d
     x = camera[4, 0] * local[0] / local[2] + camera[5, 0]
     y = camera[4, 1] * local[1] / local[2] + camera[5, 1]
     reach = 2 * math.log(opacity / MIN_ALPHA)
@@ -180,7 +181,7 @@ def project_all(
             continue
         axes_of(rotation, log_scales[i], camera, local, axes)
         if antialiased:
-            opacity *= survival_of(axes)
+            opacity *= survival_of(axes, camera[8, 2])
         if not (opacity >= MIN_ALPHA and splat_of(axes, local, camera, opacity, packed[i])):
             continue
         normalize_in_place(offset)
@@ -249,10 +250,12 @@ def color_gradient(
 
 
 @serial
-def covariance_gradient(grad: Array, axes: Array, antialiased: bool) -> tuple[float, float, float]:
+def covariance_gradient(
+    grad: Array, axes: Array, dilation: float, antialiased: bool
+) -> tuple[float, float, float]:
     """Return the gradient by a, b, d of the covariance."""
-    a, b, d, bare = covariance_of(axes)
-    schur = bare + DILATION * (a + d - DILATION) / d
+    a, b, d, bare = covariance_of(axes, dilation)
+    schur = bare + dilation * (a + d - dilation) / d
     shear, flat = -b / d, 1 / d
     of_schur = 0.5 * grad[2] / (schur * schur)
     of_a = of_schur
@@ -261,8 +264,8 @@ def covariance_gradient(grad: Array, axes: Array, antialiased: bool) -> tuple[fl
     if antialiased:
         # log survival = (log bare_det - log det) / 2; the packed splat holds log opacity.
         bare_det, det = bare * d, schur * d
-        of_a += 0.5 * grad[5] * ((d - DILATION) / bare_det - d / det)
-        of_d += 0.5 * grad[5] * ((a - DILATION) / bare_det - a / det)
+        of_a += 0.5 * grad[5] * ((d - dilation) / bare_det - d / det)
+        of_d += 0.5 * grad[5] * ((a - dilation) / bare_det - a / det)
         of_b += grad[5] * (b / det - b / bare_det)
     return of_a, of_b, of_d
 
@@ -370,7 +373,7 @@ def project_all_gradient(
         length = rotation_of(quats[i], rotation)
         axes_of(rotation, log_scales[i], camera, local, axes)
         opacity = sigmoid(logits[i])
-        of_a, of_b, of_d = covariance_gradient(grad, axes, antialiased)
+        of_a, of_b, of_d = covariance_gradient(grad, axes, camera[8, 2], antialiased)
         if abs(logits[i]) < LOGIT_LIMIT:
             of_logits[i] = grad[5] * (1 - opacity)
         of_local[0] = grad[0] * camera[4, 0] / local[2]

@@ -163,8 +163,9 @@ def _splats_by_tile(
 
 
 def _settings(camera: Pinhole, sh_degree: int, antialiased: bool) -> RasterSettings:
-    pairs = (camera.focal, camera.principal, *camera.slopes, camera.size)
-    rows = [*camera.rotation, camera.center, *((*pair, 0.0) for pair in pairs)]
+    pairs = (camera.focal, camera.principal, *camera.slopes)
+    last = (*camera.size, camera.dilation)
+    rows = [*camera.rotation, camera.center, *((*pair, 0.0) for pair in pairs), last]
     return RasterSettings(np.array(rows), camera.size, sh_degree, antialiased)
 
 

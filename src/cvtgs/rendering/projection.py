@@ -42,6 +42,7 @@ class Pinhole:
         focal: Focal lengths along x and y, pixels.
         principal: Principal point, pixels.
         size: Width and height, pixels.
+        dilation: Variance that every projected Gaussian gains, squared pixels.
     """
 
     rotation: tuple[tuple[float, float, float], ...]
@@ -49,6 +50,7 @@ class Pinhole:
     focal: tuple[float, float]
     principal: tuple[float, float]
     size: tuple[int, int]
+    dilation: float = DILATION
 
     @property
     def slopes(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -80,6 +82,7 @@ def to_pinholes(cameras: Cameras) -> list[Pinhole]:
             focal=(K[0][0], K[1][1]),
             principal=(K[0][2], K[1][2]),
             size=(cameras.width, cameras.height),
+            dilation=DILATION / cameras.stride**2,
         )
         for viewmat, center, K in zip(viewmats.tolist(), centers.tolist(), Ks.tolist(), strict=True)
     ]
@@ -142,7 +145,7 @@ def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
     rotation = scene.means.new_tensor(camera.rotation)
     local = offsets @ rotation.T
     axes = _image_axes(scene, rows, local, camera)
-    ellipses, survival = _ellipses(axes)
+    ellipses, survival = _ellipses(axes, camera.dilation)
     opacities = parameters.opacity_from_logit(scene.logit_opacities.index_select(0, rows))
     if scene.antialiased:
         opacities = opacities * survival
@@ -197,7 +200,7 @@ def _candidates(scene: GaussianScene, camera: Pinhole) -> Tensor:
     stretch = rotation.norm() * max(camera.focal) * (1 + steepest) ** 0.5 / z
     deviation = stretch * scene.log_scales.amax(dim=1).exp()
     # 3.33 standard deviations is where even an opacity of 1 falls to 1/255.
-    radius = 3.34 * deviation + 3.34 * DILATION**0.5
+    radius = 3.34 * deviation + 3.34 * camera.dilation**0.5
     quats = scene.quats.abs().amax(dim=1)
     # The squares of larger ones would overflow.
     keep: Tensor = deviation < torch.finfo(scene.dtype).max ** 0.5 / 4
@@ -224,7 +227,7 @@ def _image_axes(
     return jacobian * torch.exp(scene.log_scales.index_select(0, rows))[:, None, :]
 
 
-def _ellipses(axes: Float[Tensor, "m 2 3"]) -> tuple[Tensor, Tensor]:
+def _ellipses(axes: Float[Tensor, "m 2 3"], dilation: float) -> tuple[Tensor, Tensor]:
     """Return ellipses, and what share of its opacity an antialiased Gaussian keeps.
 
     With the covariance ``(a b; b d)``: steep is ``d / det``, shear ``-b / d``, flat ``1 / d``.
@@ -232,11 +235,11 @@ def _ellipses(axes: Float[Tensor, "m 2 3"]) -> tuple[Tensor, Tensor]:
     """
     across, down = axes.unbind(1)
     bare_a = (across * across).sum(dim=1)
-    d = (down * down).sum(dim=1) + DILATION
+    d = (down * down).sum(dim=1) + dilation
     b = (across * down).sum(dim=1)
     minors = torch.linalg.cross(across, down / d.sqrt()[:, None])
     bare = (minors * minors).sum(dim=1)
-    schur = bare + DILATION * (bare_a + d) / d
+    schur = bare + dilation * (bare_a + d) / d
     survival = (bare / schur).clamp_min(MIN_ALPHA**2 / 4).sqrt()
     return torch.stack([1 / schur, -b / d, 1 / d], dim=1), survival
 
