@@ -59,7 +59,7 @@ def test_what_cannot_be_drawn_does_not_move():
 
 def test_a_refinement_leaves_exact_ones_alone_and_moves_merged_ones():
     full = full_scene(500)
-    small = discolored(small_scene(full, 0.1), 0.5)
+    small = discolored(small_scene(full, 0.5), 0.5)
     exact = (small.means[:, None] == full.means).all(dim=2).any(dim=1)
     sh0 = torch.where(exact[:, None, None], small.sh0 - 0.5, small.sh0)
     small = small.with_tensors({"sh0": sh0}, {})

@@ -27,6 +27,9 @@ from cvtgs.scene import GaussianScene
 from cvtgs.train.cases import Case, MergedScene, TargetViews
 from cvtgs.train.config import LossConfig, TrainConfig
 
+BLACK_SHARE = 0.5
+"""Share of the images of whole scenes that are over black."""
+
 TILE = 32
 """Pixels of the side of a tile, which shows one cell."""
 
@@ -40,7 +43,7 @@ TILE_WIDTH = 7.0
 def scene_loss(
     net: MergeNet, case: Case, views: TargetViews, *, config: TrainConfig, rng: random.Random
 ) -> Float[Tensor, ""]:
-    """Compare random crops of images of the corrected scene, each over a random background.
+    """Compare random crops of images of the corrected scene, over black or a random background.
 
     Whole images are rendered: a camera that sees the crop only would project Gaussians beside it
     differently.
@@ -49,7 +52,7 @@ def scene_loss(
     corrected = case.correct_scene(residuals)
     losses = []
     for _ in range(config.views.per_step):
-        background = _random_color(rng, case)
+        background = _background(rng, case)
         view = views.select(rng.randrange(len(views.cameras)))
         last = max(0, view.cameras.width - config.views.crop)
         top, left = rng.randint(0, last), rng.randint(0, last)
@@ -152,6 +155,12 @@ def _residual_penalty(residuals: Residuals, config: LossConfig) -> Float[Tensor,
     if not config.residual_weight:
         return residuals.d_logit_opacities.new_zeros(())
     return config.residual_weight * residuals.cost()
+
+
+def _background(rng: random.Random, case: Case) -> Float[Tensor, "3"]:
+    """Return black, as most viewers have it, where faint haze shows most, or a random colour."""
+    color = _random_color(rng, case)
+    return color * 0.0 if rng.random() < BLACK_SHARE else color
 
 
 def _random_color(rng: random.Random, case: Case) -> Float[Tensor, "3"]:
