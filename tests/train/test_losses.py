@@ -66,12 +66,13 @@ def test_twice_the_error_costs_the_same_wherever_one_starts():
 
 
 def test_an_untrained_network_has_the_loss_of_the_reference():
-    """The same views over the same backgrounds, cut the same way, rendered here."""
+    """The same views over the same backgrounds, half of them black, cut the same way."""
     case, views, config = some_case(), some_views(size=40), config_of()
     found = scene_loss(small_net(), case, views, config=config, rng=random.Random(3))
     rng, losses = random.Random(3), []
     for _ in range(config.views.per_step):
         background = torch.tensor([rng.random() for _ in range(3)])
+        background *= rng.random() >= 0.5
         camera = views.cameras.select(torch.tensor([rng.randrange(len(views.cameras))]))
         y, x = rng.randint(0, 40 - 32), rng.randint(0, 40 - 32)
         before, full = (
@@ -93,7 +94,7 @@ def test_the_seed_decides_and_nothing_else(kind):
         return scene_loss(small_net(), case, views, config=config, rng=rng).item()
 
     assert loss(0) == loss(0)
-    assert len({loss(seed) for seed in range(4)}) == 4
+    assert len({loss(seed) for seed in range(4)}) >= 3  # two may see one image over black
 
 
 @pytest.mark.parametrize("kind", ["scene", "local"])
