@@ -10,6 +10,7 @@ import oracles
 from cvtgs import render
 from cvtgs.cells import Partition, merge_cells
 from cvtgs.config import SimplifyConfig
+from cvtgs.mergenet import PublishedMergeNet
 from cvtgs.mergenet.known import summarize
 from hard_cases import CASES, each_case
 from hard_scenes import DEVICES, PRESETS, dtypes, simplifier, valid_case
@@ -147,12 +148,17 @@ def check_that_what_the_network_sees_is_bounded(case):
 
 
 def check_that_corrected_cells_are_finite_and_near_the_reference(case, net):
-    """Log scales change by as much as the network promises at most, logits by 2."""
+    """Log scales change by as much as the network promises at most, logits by 2.
+
+    The network of CVT-GS as published promises no bounds.
+    """
     small = case.correct(net)
     several = case.part.counts > 1
     for name, values in small.tensors().items():
         assert bool(values[several].isfinite().all()), name
         assert torch.equal(values[~several], case.merged.tensors()[name][~several])
+    if isinstance(net, PublishedMergeNet):
+        return
     limit = net.architecture.largest_growth
     growth = (small.log_scales - case.merged.log_scales)[several].abs()
     change = (small.logit_opacities - case.merged.logit_opacities)[several].abs()

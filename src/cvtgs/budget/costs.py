@@ -12,6 +12,7 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.cvt.tessellate import MIN_SAMPLES
 from cvtgs.errors import ConfigError
+from cvtgs.grouping import finer_count
 from cvtgs.scene import GaussianScene
 
 VISIBILITY, NETWORK, MATCH, REFINE = "visibility", "network", "match", "refine"
@@ -20,7 +21,7 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     "check": ("in", "in_values"),
     "plan": ("once", "in"),
     "filter": ("in",),
-    "tessellate": ("once", "in", "search"),
+    "tessellate": ("once", "in", "search", "pairs"),
     "merge": ("once", "in", "in_values", "out", "out_values"),
     VISIBILITY: ("once", "view_pixels", "views_in"),
     MATCH: ("once", "view_pixels", "views_out", "view_values"),
@@ -84,10 +85,11 @@ class Work:
         Returns:
             Amounts by name.
         """
-        sample = config.cvt.samples_per_site * self.target
+        cells = finer_count(self.target, self.count, config.allocation)
+        sample = config.cvt.samples_per_site * cells
         sample = max(sample, MIN_SAMPLES) if sample else self.count
         sample = self.count if sample >= self.count // 2 else sample
-        searched = self.count + config.cvt.iterations * sample
+        searched = 0 if cells == self.count else self.count + config.cvt.iterations * sample
         visibility, refine = config.visibility, config.refine
         new_images = refine.new_images(refine.steps)
         checks = 1 + math.ceil(refine.steps / refine.check_every)
@@ -106,7 +108,8 @@ class Work:
             "images_in": (refine.heldout + new_images) * self.count,
             "look_pixels": renders * (refine.size / refine.stride) ** 2,
             "looks_out": renders * self.target,
-            "search": searched * math.log2(self.target + 2),
+            "search": searched * math.log2(cells + 2),
+            "pairs": float(cells if cells > self.target else 0),
         }
         return {name: amounts[name] for name in FEATURES.get(stage, OTHER_FEATURES)}
 
