@@ -14,7 +14,7 @@ from torch import Tensor
 import cvtgs
 from cvtgs.cvt import Tessellation
 from cvtgs.evaluation import Evaluation, EvaluationSettings
-from cvtgs.mergenet import MergeNet, load_checkpoint
+from cvtgs.mergenet import MergeNet, PublishedMergeNet, load_checkpoint
 from cvtgs.refinement import Refined
 from cvtgs.report import Level
 
@@ -80,7 +80,7 @@ def exchange(splats: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
     again = cvtgs.load(path)
     assert_type(again.extras, Mapping[str, Tensor])
     assert_type(again.sh_degree, int)
-    assert_type(load_checkpoint("standard").net, MergeNet)
+    assert_type(load_checkpoint("standard").net, MergeNet | PublishedMergeNet)
     return cvtgs.to_dict(again)
 
 

@@ -133,7 +133,7 @@ def test_lpips_is_measured_with_weights(file, tmp_path, capsys):
     weights = str(tmp_path / "weights.pth")
     ablation.main([str(file), "--rho", "0.05", "--means", "--lpips", weights])
     _, _, *rows = rows_of(capsys.readouterr().out)
-    assert len(rows) == 8
+    assert len(rows) == 9
     assert all(float(row[4]) > 0 for row in rows)
 
 
@@ -143,7 +143,7 @@ def test_another_judge_gets_every_small_scene(file, tmp_path, capsys):
     ablation.main([str(file), "--rho", "0.1", "0.05", "--means", "--scorer", command])
     _, _, *rows = rows_of(capsys.readouterr().out)
     found = [float(row[column]) for row in rows for column in (2, 6)]
-    assert found == [20.0 + number for number in range(16)]
+    assert found == [20.0 + number for number in range(18)]
 
 
 def test_means_are_over_scenes_and_unknown_lpips_stays_unknown():

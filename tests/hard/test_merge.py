@@ -10,10 +10,10 @@ import oracles
 from cvtgs import render
 from cvtgs.cells import Partition, merge_cells
 from cvtgs.config import SimplifyConfig
-from cvtgs.mergenet import PublishedMergeNet
+from cvtgs.mergenet import PublishedMergeNet, load_checkpoint
 from cvtgs.mergenet.known import summarize
 from hard_cases import CASES, each_case
-from hard_scenes import DEVICES, PRESETS, dtypes, simplifier, valid_case
+from hard_scenes import DEVICES, PRESETS, dtypes, valid_case
 from mergenet_cases import Case, case_of, features_of, lively_net
 from render_cases import around
 from scenes import assert_same_gaussians, assert_standard, covariances_of, moved, oracle_rows
@@ -134,7 +134,7 @@ def test_each_case_with_a_network(make, dtype, subtests):
             check_that_what_the_network_sees_is_bounded(case)
         for preset in PRESETS:
             with subtests.test("corrected cells are near", device=device, preset=preset):
-                net = deepcopy(simplifier(preset, device).checkpoint.net).to(dtype)
+                net = deepcopy(load_checkpoint(preset).net).to(device, dtype)
                 check_that_corrected_cells_are_finite_and_near_the_reference(case, net)
         with subtests.test("gradients are finite", device=device):
             check_that_gradients_are_finite(case, lively_net(dtype).to(device))

@@ -26,6 +26,7 @@ from hard_scenes import (
     simplifier,
     valid_case,
     valid_rows,
+    with_network,
 )
 from refine_cases import quick
 from render_cases import BACKENDS
@@ -148,7 +149,7 @@ def test_images_are_no_worse_than_mass_pruning(make, subtests):
         pytest.skip(CHANCE[make.__name__])
     scene = valid_case(make, 200, torch.float32)
     count = max(1, len(scene) // 5)
-    small = {preset: simplifier(preset).simplify(scene, count=count) for preset in PRESETS}
+    small = {preset: with_network(preset).simplify(scene, count=count) for preset in PRESETS}
     cameras = automatic_views(scene, 4, width=48, height=48)
     *found, pruned = scores(scene, small | {"pruned": keep_most_mass(scene, count)}, cameras)
     for preset, ours in zip(PRESETS, found, strict=True):

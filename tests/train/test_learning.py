@@ -63,7 +63,7 @@ def trained(request, tmp_path_factory) -> Trained:
 def test_a_scene_never_learned_from_gains(trained):
     start, *later = trained.history.validations
     assert start.gains == (Gain("exam", 0.06, 0.0),)
-    assert all(entry.mean_gain > 0.3 for entry in later)
+    assert all(entry.mean_gain > 0.2 for entry in later)
     assert trained.history.best().mean_gain > 0.4
 
 

@@ -1,6 +1,7 @@
 """Blocks in processes of this machine, which share its cores and its memory."""
 
 import os
+import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -83,10 +84,11 @@ class LocalWorkers:
         Raises:
             RunError: A process was ended from outside.
         """
-        futures = [self._pool.submit(function, item) for item in items]
+        futures = [self._pool.submit(_call, pickle.dumps((function, item))) for item in items]
         try:
             for future in futures:
-                yield future.result()
+                result: Result = pickle.loads(future.result())  # made by a process of this one
+                yield result
         except BrokenProcessPool as error:
             raise RunError(
                 "a process that worked on blocks was ended, most likely for lack of memory; run "
@@ -95,6 +97,12 @@ class LocalWorkers:
         finally:
             for future in futures:
                 future.cancel()
+
+
+def _call(work: bytes) -> bytes:
+    """Call a function; as bytes, since torch would hand tensors over by files in a folder."""
+    function, item = pickle.loads(work)  # made by the process that started this one
+    return pickle.dumps(function(item))
 
 
 def _begin(watched: Connection, threads: int) -> None:
