@@ -37,7 +37,7 @@ from cvtgs.outofcore.memory import (
 from cvtgs.outofcore.merge import correct, inflate, merge, simplify_block
 from cvtgs.outofcore.scan import CHUNK
 from cvtgs.outofcore.sort import sort_into_blocks
-from cvtgs.outofcore.workers import CheckedWorkers, Result, Workers, sequentially, with_progress
+from cvtgs.outofcore.workers import Result, Workers, begin, sequentially, with_progress
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport
 from cvtgs.simplifier import Simplifier
@@ -144,15 +144,9 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     job = replace(job, folder=job_folder(output, key))
     clock = StageClock(listener, torch.device("cpu"))
     with output_lock(output):
-        is_resumed = job.can_resume(key)
-        if not is_resumed:
-            job.start_over()
-        if isinstance(workers, CheckedWorkers):
-            with clock.stage("workers"):
-                workers.check(job)
-        if not is_resumed:
-            if simplifier.checkpoint is not None:
-                job.write_network(simplifier.checkpoint)
+        resumes = job.can_resume(key)
+        begin(job, workers, clock, simplifier.checkpoint, resumes=resumes)
+        if not resumes:
             with one_thread():
                 job.write_manifest(_scan_and_sort(job, key, workers, clock, room=cell_room(memory)))
         energies = _tessellate_and_merge(job, workers, clock) if job.goes_by_steps else ()

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Protocol, TypeVar, runtime_checkable
 
+from cvtgs.clock import StageClock
+from cvtgs.mergenet import Checkpoint
 from cvtgs.outofcore.job import Job
 
 Item = TypeVar("Item")
@@ -41,6 +43,19 @@ class CheckedWorkers(Workers, Protocol):
             How many workers there are.
         """
         ...
+
+
+def begin(
+    job: Job, workers: Workers, clock: StageClock, checkpoint: Checkpoint | None, *, resumes: bool
+) -> None:
+    """Make the folder of a job, unless it resumes, and ask workers whether they can do it."""
+    if not resumes:
+        job.start_over()
+    if isinstance(workers, CheckedWorkers):
+        with clock.stage("workers"):
+            workers.check(job)
+    if not resumes and checkpoint is not None:
+        job.write_network(checkpoint)
 
 
 def sequentially(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:

@@ -32,7 +32,7 @@ from cvtgs.outofcore.memory import memory_to_plan
 from cvtgs.outofcore.rows import analysis_of, read_rows
 from cvtgs.outofcore.run import rows_per_range
 from cvtgs.outofcore.sort import sort_into_blocks
-from cvtgs.outofcore.workers import CheckedWorkers, sequentially, with_progress
+from cvtgs.outofcore.workers import begin, sequentially, with_progress
 from cvtgs.pipeline import Reduced, level_facts, nests_in, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.scene import GaussianScene
@@ -254,15 +254,9 @@ def _run(
 ) -> tuple[list[StreamPart], int]:
     """Sort the file, and write the parts that are not there yet; return all of them."""
     job = spec.job
-    is_resumed = job.has_sorted_rows() and job.path("targets.json").exists()
-    if not is_resumed:
-        job.start_over()
-    if isinstance(workers, CheckedWorkers):
-        with clock.stage("workers"):
-            workers.check(job)
-    if not is_resumed:
-        if simplifier.checkpoint is not None:
-            job.write_network(simplifier.checkpoint)
+    resumes = job.has_sorted_rows() and job.path("targets.json").exists()
+    begin(job, workers, clock, simplifier.checkpoint, resumes=resumes)
+    if not resumes:
         with one_thread():
             found = sort_into_blocks(job, workers, clock, keep_all=True)
         _write_targets(spec, targets, found.rows, found.cells)
