@@ -201,8 +201,8 @@ def test_colours_count_more_where_cells_are_small():
     assert allocation_at(0.01, config).color == pytest.approx(10.0)
 
 
-def test_a_round_halves_the_groups_at_most():
-    """Ten pairs alike: with larger rounds or smaller ones, groups would grow unevenly."""
-    moments = points([place for pair in range(10) for place in (9.0 * pair, 9.0 * pair + 0.5)])
-    labels = merge_pairs(moments, all_others(20), 10, DEFAULT)
-    assert torch.bincount(labels).tolist() == [2] * 10
+def test_rounds_keep_groups_balanced():
+    """By cost alone, four near ones would become one before the two pairs on the right merge."""
+    moments = points([0.0, 0.1, 0.2, 0.3, 5.0, 5.5, 9.0, 9.5], size=0.1)
+    labels = merge_pairs(moments, all_others(8), 4, DEFAULT)
+    assert labels.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]

@@ -84,7 +84,9 @@ def test_an_untrained_network_has_the_loss_of_the_reference():
 
 
 @pytest.mark.parametrize("kind", ["scene", "local"])
-def test_the_seed_decides_and_nothing_else(kind):
+def test_the_seed_decides_and_nothing_else(kind, monkeypatch):
+    """Over colours: two seeds may choose the same image over black."""
+    monkeypatch.setattr("cvtgs.train.losses.BLACK_SHARE", 0.0)
     case, views, config = some_case(), some_views(), config_of()
 
     def loss(seed: int) -> float:
@@ -94,7 +96,7 @@ def test_the_seed_decides_and_nothing_else(kind):
         return scene_loss(small_net(), case, views, config=config, rng=rng).item()
 
     assert loss(0) == loss(0)
-    assert len({loss(seed) for seed in range(4)}) >= 3  # two may see one image over black
+    assert len({loss(seed) for seed in range(4)}) == 4
 
 
 @pytest.mark.parametrize("kind", ["scene", "local"])
