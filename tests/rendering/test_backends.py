@@ -102,6 +102,20 @@ def test_without_a_folder_for_compiled_code():
     assert lines == ["3"]
 
 
+def test_numba_leaves_the_threads_of_torch_as_they_are(monkeypatch):
+    pytest.importorskip("numba")
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "2")
+    lines = python(
+        "import torch\n"
+        "from cvtgs.rendering.compiled import use_threads_of_torch\n"
+        "for count in (1, 2, 3):\n"
+        "    torch.set_num_threads(count)\n"
+        "    use_threads_of_torch()\n"
+        "    print(torch.get_num_threads())\n"
+    )
+    assert lines == ["1", "2", "3"]
+
+
 def test_numba_is_installed_with_the_package_where_it_has_wheels():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     (found,) = [Requirement(n) for n in project["dependencies"] if n.startswith("numba")]

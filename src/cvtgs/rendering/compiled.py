@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from cvtgs.errors import MissingDependencyError
@@ -61,10 +62,16 @@ def _compiled(function: F, **settings: Any) -> F:
         return cast("F", numba.njit(**settings | {"cache": False})(function))
 
 
-def use_threads(count: int) -> None:
-    """Limit the threads of compiled functions that are called from this thread."""
-    most = vars(numba.config)["NUMBA_NUM_THREADS"]
+def use_threads_of_torch() -> None:
+    """Let compiled functions that are called from this thread use as many threads as torch.
+
+    Where both share an OpenMP library, numba sets the number for torch, too, when it starts its
+    threads: so it is set back.
+    """
+    count, most = torch.get_num_threads(), vars(numba.config)["NUMBA_NUM_THREADS"]
     numba.set_num_threads(max(1, min(count, most)))
+    if torch.get_num_threads() != count:
+        torch.set_num_threads(count)
 
 
 class GaussianArrays(NamedTuple):

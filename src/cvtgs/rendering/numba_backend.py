@@ -19,7 +19,7 @@ from cvtgs.rendering.compiled import (
     RasterSettings,
     SplatArrays,
     TileArrays,
-    use_threads,
+    use_threads_of_torch,
 )
 from cvtgs.rendering.kernels_blending import (
     composite_all,
@@ -63,7 +63,7 @@ def rasterize(
     Memory: ``11 n`` numbers for n Gaussians, ``12 p`` bytes for p intersections of splats and
     tiles, and the image. The backward pass needs ``10 p`` numbers at a time.
     """
-    use_threads(torch.get_num_threads())
+    use_threads_of_torch()
     tensors = [tensor.contiguous() for tensor in scene.tensors().values()]
     images = [
         partial(_Render.apply, _settings(camera, sh_degree, scene.antialiased), *tensors)
@@ -106,7 +106,7 @@ def blending_weights(scene: GaussianScene, camera: Cameras) -> TileWeights:
 
 
 def _arrays(scene: GaussianScene) -> GaussianArrays:
-    use_threads(torch.get_num_threads())
+    use_threads_of_torch()
     tensors = scene.tensors().values()
     return GaussianArrays(*(tensor.detach().contiguous().numpy() for tensor in tensors))
 
@@ -128,7 +128,7 @@ class _Render(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        use_threads(torch.get_num_threads())
+        use_threads_of_torch()
         image, *arrays = (tensor.detach().numpy() for tensor in ctx.saved_tensors)
         gaussians = GaussianArrays(*arrays)
         per_intersection = np.zeros((len(ctx.tiles.lists), 10), image.dtype)
