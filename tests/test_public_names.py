@@ -144,7 +144,6 @@ STAGES = {
         "normalized_weights",
         "align_axes",
         "side_cover",
-        "weighted_mean",
         "inflate_cells",
     },
     "evaluation": {

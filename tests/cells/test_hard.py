@@ -152,12 +152,14 @@ def test_masses_that_underflow_weigh_the_same(dtype):
 
 def test_weights_of_zero_become_equal_shares():
     weights = torch.tensor([0.0, 0.0, 1.0, 3.0, 5e-324, 5e-324], dtype=torch.float64)
-    shares = normalized_weights(weights, torch.tensor([0, 2, 4, 6]))
+    shares = normalized_weights(
+        weights, torch.tensor([0, 2, 4, 6]), torch.tensor([0, 0, 1, 1, 2, 2])
+    )
     assert shares.tolist() == pytest.approx([0.5, 0.5, 0.25, 0.75, 0.5, 0.5])
 
 
 def test_gradients():
     weights = torch.rand(5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     weights.requires_grad_()
-    offsets = torch.tensor([0, 2, 5])
-    assert torch.autograd.gradcheck(lambda w: normalized_weights(w, offsets), (weights,))
+    offsets, cells = torch.tensor([0, 2, 5]), torch.tensor([0, 0, 1, 1, 1])
+    assert torch.autograd.gradcheck(lambda w: normalized_weights(w, offsets, cells), (weights,))

@@ -21,7 +21,7 @@ from cvtgs.mergenet import (
     save_checkpoint,
 )
 from cvtgs.mergenet.checkpoint import LARGEST_FILE
-from cvtgs.mergenet.known import SUMMARY_FEATURES
+from cvtgs.mergenet.model import SUMMARY_FEATURES
 from mergenet_cases import fields_of, lively_net, some_case
 
 SMALL = Architecture(width=2, cell_width=3)

@@ -17,7 +17,6 @@ from cvtgs.cells.merge import (
     merge_cells,
     merged_depth,
     normalized_weights,
-    weighted_mean,
 )
 from cvtgs.math.segments import Partition
 
@@ -40,5 +39,4 @@ __all__ = [
     "normalized_weights",
     "reassign",
     "side_cover",
-    "weighted_mean",
 ]

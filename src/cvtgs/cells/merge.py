@@ -75,18 +75,19 @@ def merge_cells(
             "quats": quats,
             "log_scales": parameters.positive_log(scales),
             "logit_opacities": parameters.logit_from_optical_depth(depths),
-            "sh0": weighted_mean(scene.sh0.index_select(0, rows), weights, offsets),
         }
-        if scene.shN.shape[1]:
-            new["shN"] = weighted_mean(scene.shN.index_select(0, rows), weights, offsets)
+        bands = ("sh0", "shN") if scene.shN.shape[1] else ("sh0",)
+        for name in bands:
+            values = getattr(scene, name).index_select(0, rows).double()
+            new[name] = segment_sum(values, offsets, weights)
         for name, values in new.items():
             tensors[name][of_cells] = values.to(tensors[name].dtype)
         if extras:
             heaviest = rows[segment_argmax(members.opacities * members.areas, offsets)]
         for name, column in scene.extras.items():
             if column.is_floating_point():
-                values = weighted_mean(column[rows], weights, offsets).to(column.dtype)
-                extras[name][of_cells] = values
+                values = segment_sum(column[rows].double(), offsets, weights)
+                extras[name][of_cells] = values.to(column.dtype)
             else:
                 extras[name][of_cells] = column[heaviest]
         count: int = run.stop - run.start
@@ -111,6 +112,7 @@ class Members:
         depths: ``(n,)`` optical depths ``-log(1 - a)``.
         areas: ``(n,)`` mean projected areas.
         offsets: ``(m + 1,)`` where each cell starts, and the end of the last one.
+        cells: ``(n,)`` cell of every member.
     """
 
     means: Float[Tensor, "n 3"]
@@ -120,6 +122,7 @@ class Members:
     depths: Float[Tensor, "n"]
     areas: Float[Tensor, "n"]
     offsets: Int[Tensor, "m_plus_1"]
+    cells: Int[Tensor, "n"]
 
     def weights(self, area_power: float) -> Float[Tensor, "n"]:
         """Return what each member weighs in the means of its cell.
@@ -131,12 +134,11 @@ class Members:
         Returns:
             Weights; those of one cell sum to 1.
         """
-        if area_power == 0.0:
-            return normalized_weights(self.opacities, self.offsets)
-        ids = segment_ids(self.offsets, len(self.areas))
-        largest = segment_max(self.areas, self.offsets).index_select(0, ids)
-        shares = parameters.divide(self.areas, largest) ** area_power
-        return normalized_weights(self.opacities * shares, self.offsets)
+        weights = self.opacities
+        if area_power != 0.0:
+            largest = segment_max(self.areas, self.offsets).index_select(0, self.cells)
+            weights = weights * parameters.divide(self.areas, largest) ** area_power
+        return normalized_weights(weights, self.offsets, self.cells)
 
 
 def gather_members(scene: GaussianScene, part: Partition) -> Members:
@@ -161,54 +163,33 @@ def gather_members(scene: GaussianScene, part: Partition) -> Members:
         depths=parameters.optical_depth_from_logit(logits),
         areas=torch.exp(parameters.log_mean_projected_area(log_scales)),
         offsets=part.offsets,
+        cells=segment_ids(part.offsets, len(rows)),
     )
 
 
 def normalized_weights(
-    weights: Float[Tensor, "n"], offsets: Int[Tensor, "m_plus_1"]
+    weights: Float[Tensor, "n"], offsets: Int[Tensor, "m_plus_1"], cells: Int[Tensor, "n"]
 ) -> Float[Tensor, "n"]:
     """Scale weights so that those of each cell sum to 1.
 
     Args:
         weights: Weights, at least 0, members of one cell next to one another.
         offsets: Where each cell starts, and the end of the last one.
+        cells: Cell of every member.
 
     Returns:
         Weights in float64; equal ones in cells where all are 0 or denormal.
 
     Example:
-        >>> normalized_weights(torch.tensor([1.0, 3.0]), torch.tensor([0, 2])).tolist()
+        >>> weights, cells = torch.tensor([1.0, 3.0]), torch.tensor([0, 0])
+        >>> normalized_weights(weights, torch.tensor([0, 2]), cells).tolist()
         [0.25, 0.75]
     """
-    weights, ids = weights.double(), segment_ids(offsets, len(weights))
-    totals = segment_sum(weights, offsets).index_select(0, ids)
+    weights = weights.double()
+    totals = segment_sum(weights, offsets).index_select(0, cells)
     shares = weights / totals.clamp_min(torch.finfo(weights.dtype).tiny)
-    equal = offsets.diff().double().reciprocal().index_select(0, ids)
+    equal = offsets.diff().double().reciprocal().index_select(0, cells)
     return torch.where(totals < torch.finfo(weights.dtype).tiny, equal, shares)
-
-
-def weighted_mean(
-    values: Float[Tensor, "n *k"],
-    weights: Float[Tensor, "n"],
-    offsets: Int[Tensor, "m_plus_1"],
-) -> Float[Tensor, "m *k"]:
-    """Average the rows of every cell.
-
-    Args:
-        values: One row per member.
-        weights: Weights that sum to 1 in each cell.
-        offsets: Where each cell starts, and the end of the last one.
-
-    Returns:
-        One row per cell, float64.
-
-    Example:
-        >>> weighted_mean(
-        ...     torch.tensor([0.0, 4.0]), torch.tensor([0.25, 0.75]), torch.tensor([0, 2])
-        ... ).tolist()
-        [3.0]
-    """
-    return segment_sum(values.double(), offsets, weights.double())
 
 
 def mean_and_covariance(
@@ -227,20 +208,19 @@ def mean_and_covariance(
     Returns:
         Means and covariances of the cells, float64.
     """
-    offsets = members.offsets
-    ids = segment_ids(offsets, len(weights))
+    offsets, cells = members.offsets, members.cells
     first = members.means.index_select(0, offsets[:-1]).T.contiguous()
-    local = members.means.T - first.index_select(1, ids)
-    shift = weighted_mean(local.T, weights, offsets).T.contiguous()
+    local = members.means.T - first.index_select(1, cells)
+    shift = segment_sum(local.T, offsets, weights).T.contiguous()
     axes = parameters.quats_to_matrices(members.quats) * members.scales[:, None, :]
-    local = local - shift.index_select(1, ids)
+    local = local - shift.index_select(1, cells)
     x, y, z = local
     # Sums of products of columns; products of so many small matrices take ten times as long.
     products = torch.cat([x * local, y * local[1:], z * local[2:]])
     for axis in axes.permute(2, 1, 0):
         for row, part in enumerate(products.split([3, 2, 1])):
             part.addcmul_(axis[row], axis[row:])
-    xx, xy, xz, yy, yz, zz = weighted_mean(products.T, weights, offsets).unbind(1)
+    xx, xy, xz, yy, yz, zz = segment_sum(products.T, offsets, weights).unbind(1)
     matrices = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=1)
     return (first + shift).T, matrices.unflatten(1, (3, 3))
 

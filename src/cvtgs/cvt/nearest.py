@@ -71,7 +71,9 @@ def _in_threads(search: Callable[[slice], None], count: int) -> None:
 
     The threads are our own: an interrupt waits for them, where scipy's own would be left running.
     """
-    parts = [slice(start, start + CHUNK) for start in range(0, count, CHUNK)]
+    if count <= CHUNK:
+        return search(slice(0, count))
+    parts = (slice(start, start + CHUNK) for start in range(0, count, CHUNK))
     with ThreadPoolExecutor(thread_count()) as pool:
         for _ in pool.map(search, parts):
             pass

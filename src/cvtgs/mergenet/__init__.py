@@ -10,8 +10,14 @@ from cvtgs.mergenet.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from cvtgs.mergenet.known import KnownRange, summarize
-from cvtgs.mergenet.model import Architecture, CellNetwork, MergeNet, Residuals
+from cvtgs.mergenet.model import (
+    Architecture,
+    CellNetwork,
+    KnownRange,
+    MergeNet,
+    Residuals,
+    summarize,
+)
 from cvtgs.mergenet.published import (
     PublishedArchitecture,
     PublishedDescriptors,
