@@ -26,8 +26,8 @@ class RefineReport(Record):
         psnr_after: The same of the scene that came out; never less.
         gain: Their difference, dB.
         changed_count: Gaussians that are not what they were.
-        stopped: Why it ended: ``steps``, ``time``, ``patience`` (held-out views did not improve
-            any more), or ``perfect`` (there was nothing to gain).
+        stopped: Why it ended: ``steps``, ``time``, ``patience`` (held-out views stopped
+            improving), or ``perfect`` (there was nothing to gain).
         backend: What rendered.
         device: Where it ran.
         cost: What it cost, as the stage ``refine``.

@@ -87,8 +87,7 @@ class EffectPlan(pydantic.BaseModel):
     Attributes:
         sh: Colour depends on the direction of view: SH bands above the constant.
         mip: Images of the scene are taken with the compensation of Mip-Splatting.
-        unbounded: Part of the mass is far away: far positions are contracted, and huge, smooth
-            Gaussians such as those of a sky get fewer cells.
+        unbounded: Part of the mass is far away: far positions are contracted.
         haze: Faint Gaussians hold mass: they are sorted, and only the faintest left out.
         flat: Gaussians have two scales (2DGS), and none shall get a third.
         duplicates: Gaussians lie exactly on others: the nearest site is searched once for each

@@ -73,8 +73,8 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     "--cameras": {
         "metavar": "F",
         "type": Path,
-        "help": f"cameras to render from: {CAMERA_FILES} (default: those in the folder of REF or "
-        "IN if it is a model of INRIA's code, else automatic views)",
+        "help": f"cameras to render from: {CAMERA_FILES} (default: those "
+        "beside REF or IN or in its folder, if they show the scene, else automatic views)",
     },
     "--images": {
         "metavar": "DIR",

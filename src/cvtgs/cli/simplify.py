@@ -110,7 +110,8 @@ def add_simplify(add_parser: AddParser) -> None:
         type=Path,
         metavar="F",
         help="cameras to render from, for --refine and for presets that render: "
-        f"{CAMERA_FILES} (default: automatic views)",
+        f"{CAMERA_FILES} (default: those beside IN or in its folder, if they show the scene, "
+        "else automatic views)",
     )
     parser.add_argument(
         "--keep",

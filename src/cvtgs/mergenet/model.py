@@ -345,9 +345,9 @@ class KnownRange(nn.Module):
     def fit(self, cases: Iterable[Float[Tensor, "m f"]]) -> None:
         """Set the range from the cells of the training cases.
 
-        Each case has a say of its own, however few cells it has: the range of a feature goes
-        from the least to the greatest of what the cases hold without their tails. Cells of more
-        than ``MOST_MEMBERS`` members are never known.
+        Each case counts by itself, however few cells it has: the range of a feature goes from
+        the least to the greatest value of all cases without their tails. Cells of more than
+        ``MOST_MEMBERS`` members are never within it.
 
         Args:
             cases: Summaries of the cells of every case, at least one.

@@ -49,7 +49,7 @@ _BARE = 0.25
 
 _LEVEL = 0.7
 _BENEATH = 3.0
-"""What lies beneath a floor speaks this many times against it."""
+"""What lies beneath a floor counts this many times against it."""
 
 _LEAST_FLOOR = 0.25
 """The least share of all columns that end on a floor."""
@@ -143,9 +143,9 @@ class Floor(NamedTuple):
 def find_up(voxels: Voxels, far: Float[Tensor, "k 3"]) -> Float[Tensor, "3"]:
     """Return the direction that is up, as a unit vector.
 
-    Both senses of the axes, and of the normal of the largest plane, are compared by what speaks
-    for them: how usual they are in captures (-y most, then +y and +z); a floor that lies bare with
-    nothing beneath it; a large plane; the sky, if what is far away lies on one side. Where no
+    Both senses of the axes, and of the normal of the largest plane, are compared by how
+    usual they are in captures (-y most, then +y and +z); a bare floor with nothing beneath it; a
+    large plane; and the sky, if what is far away lies on one side. Where no
     floor lies bare, the sizes of Gaussians count too: captures seldom see a scene from below, and
     what no image has seen is left with larger Gaussians.
     """
