@@ -6,19 +6,18 @@ within the scene's, with the files of a training code:
 
 - INRIA: ``point_cloud/iteration_*/point_cloud.ply``
 - nerfstudio: ``splat.ply`` or ``step-*.ckpt``, with ``dataparser_transforms.json`` beside or above
-- gsplat: ``ply/point_cloud_*.ply`` or ``ckpts/ckpt_*_rank0.pt``, trained without
-  ``--normalize-world-space``
+- gsplat: ``ply/point_cloud_*.ply`` or ``ckpts/ckpt_*_rank0.pt``
+
+What each training did to the world of the cameras: ``benchmarks.worlds``.
 """
 
-import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -34,8 +33,6 @@ DEEPEST = 5
 
 DOWNSCALED = ("images_2", "images_4", "images_8", "images")
 """Folders of photographs, in the order in which one is taken where the published one is missing."""
-
-TRANSFORM = "dataparser_transforms.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,7 +166,7 @@ def find_captures(root: Path, datasets: Sequence[Dataset] = DATASETS) -> Found:
 
 
 def read_test_views(capture: Capture) -> TestViews:
-    """Read the held-out cameras of a scene, in the world of its model, and their photographs."""
+    """Read the held-out cameras of a scene and their photographs."""
     folder, dataset = capture.folder, capture.dataset
     if (folder / "transforms_train.json").is_file() and not (
         folder / "transforms_test.json"
@@ -180,35 +177,18 @@ def read_test_views(capture: Capture) -> TestViews:
         )
     images = _photograph_folder(folder, dataset.scenes[capture.name])
     try:
-        cameras = cvtgs.load_cameras(folder, split="test")
+        cameras = cvtgs.load_cameras(sparse_folder(folder) or folder, split="test")
         cameras = fit_cameras(cameras, images)
         photographs = load_photographs(images, cameras, background=dataset.background)
     except CvtgsError as error:
         raise SystemExit(f"{capture.name}: {error}") from None
-    return TestViews(_in_world_of(capture.model, cameras), photographs, images)
+    return TestViews(cameras, photographs, images)
 
 
-def check_model(capture: Capture, scene: cvtgs.GaussianScene, cameras: Cameras) -> None:
-    """Refuse a model that is not where its cameras look.
-
-    Half of the cameras must have a hundredth of the Gaussians that show in their images. A stricter
-    rule would refuse captures whose cameras stand on one side.
-    """
-    means = scene.means[scene.opacities > 0.1].double()
-    means = means[torch.isfinite(means).all(dim=1)]
-    means = means[:: max(1, len(means) // 4096)]
-    if not len(means):
-        raise SystemExit(f"{capture.model.path}: must hold Gaussians that show, found none.")
-    local = means @ cameras.viewmats[:, :3, :3].double().mT + cameras.viewmats[:, None, :3, 3]
-    x, y, z = (local @ cameras.Ks.double().mT).unbind(2)
-    inside = (z > 0) & (x > 0) & (x < cameras.width * z) & (y > 0) & (y < cameras.height * z)
-    looking = float((inside.double().mean(dim=1) > 0.01).double().mean())
-    if looking < 0.5:
-        raise SystemExit(
-            f"{capture.model.path}: must be a model of {capture.folder}, but its Gaussians are not "
-            f"where its cameras look; it is the model of another scene, or of a world that was "
-            f"normalized for the training."
-        )
+def sparse_folder(folder: Path) -> Path | None:
+    """Return where a scene has a model of COLMAP, which goes before other cameras."""
+    places = (folder / "sparse" / "0", folder / "sparse")
+    return next((place for place in places if place.is_dir()), None)
 
 
 def _folders(root: Path) -> Iterator[Path]:
@@ -263,27 +243,3 @@ def _photograph_folder(folder: Path, published: str) -> Path:
         if (folder / name).is_dir():
             return folder / name
     return folder
-
-
-def _in_world_of(model: Model, cameras: Cameras) -> Cameras:
-    """Move and scale cameras as nerfstudio did before it trained."""
-    if model.layout != "nerfstudio":
-        return cameras
-    places = [parent / TRANSFORM for parent in model.path.parents[:3]]
-    path = next((place for place in places if place.is_file()), None)
-    if path is None:
-        return cameras
-    told = json.loads(path.read_text(encoding="utf-8"))
-    transform = torch.tensor(told["transform"], dtype=torch.float64)
-    return moved_cameras(cameras, transform, float(told["scale"]))
-
-
-def moved_cameras(cameras: Cameras, transform: Float[Tensor, "3 4"], scale: float) -> Cameras:
-    """Return cameras of a world whose points ``x`` became ``scale (A x + b)``."""
-    turn, shift = transform[:, :3], transform[:, 3]
-    viewmats = cameras.viewmats.double().clone()
-    centers = (cameras.centers.double() @ turn.T + shift) * scale
-    rotations = viewmats[:, :3, :3] @ turn.T
-    viewmats[:, :3, :3] = rotations
-    viewmats[:, :3, 3] = -(rotations @ centers[:, :, None])[:, :, 0]
-    return replace(cameras, viewmats=viewmats.to(cameras.viewmats.dtype))

@@ -29,12 +29,12 @@ from benchmarks.compare_tables import Result, Table, joined, markdown, read_resu
 from benchmarks.datasets import (
     DATASETS,
     Capture,
-    check_model,
     find_captures,
     read_test_views,
 )
 from benchmarks.measuring import Cost, machine, write_file
 from benchmarks.quality import RATIOS, PhotographJudge, markdown_rows
+from benchmarks.worlds import place_cameras
 from cvtgs.errors import CvtgsError
 from cvtgs.evaluation.scorer import Metrics, chosen_metrics
 
@@ -147,11 +147,11 @@ def measure(
         return
     scene = cvtgs.load(capture.model.path)
     views = read_test_views(capture)
-    check_model(capture, scene, views.cameras)
-    judge = PhotographJudge(views.cameras, views.photographs, capture.dataset.background, metrics)
+    cameras = place_cameras(capture, scene, views.cameras)
+    judge = PhotographJudge(cameras, views.photographs, capture.dataset.background, metrics)
     print(
         f"{capture.name}: {len(scene):,} Gaussians of {capture.model.layout}'s layout, "
-        f"{len(views.cameras)} photographs of {views.cameras.width} x {views.cameras.height} in "
+        f"{len(cameras)} photographs of {cameras.width} x {cameras.height} in "
         f"{views.folder}",
         file=sys.stderr,
     )

@@ -1,112 +1,33 @@
 """The evaluation against photographs, on small generated datasets in every layout."""
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 import cvtgs
 from benchmarks import paper
-from benchmarks.datasets import (
-    DATASETS,
-    Capture,
-    check_model,
-    find_captures,
-    moved_cameras,
-    read_test_views,
+from benchmarks.datasets import DATASETS, find_captures, read_test_views
+from benchmarks.quality import Quality
+from dataset_files import (
+    HALF,
+    ball,
+    capture_of,
+    colmap_dataset,
+    gsplat_model,
+    inria_model,
+    nerf_dataset,
+    nerfstudio_model,
+    refusal,
+    score_of,
 )
-from benchmarks.quality import PhotographJudge, Quality
-from camera_files import NAMES, colmap_txt, transforms, write_json
-from cvtgs.cameras import Cameras
-from cvtgs.edit import Motion, move
-from cvtgs.evaluation.scorer import Metrics
-
-HALF = (32, 24)
-"""Pixels of the photographs, of cameras of twice the size."""
 
 
 @pytest.fixture(scope="module")
 def scene() -> cvtgs.GaussianScene:
-    """A ball of Gaussians about the point that the cameras look at."""
-    g = torch.Generator().manual_seed(0)
-    made = cvtgs.synthetic.scene("object", 600, sh_degree=0, seed=0)
-    return made.with_tensors(
-        {
-            "means": 0.5 * torch.randn(600, 3, generator=g),
-            "log_scales": torch.full((600, 3), math.log(0.08)),
-        },
-        {},
-    )
-
-
-def shoot(scene: cvtgs.GaussianScene, cameras: Cameras, folder: Path, *, alpha: bool = False):
-    """Write a photograph of every camera, by the last part of its name."""
-    cameras = cameras.resized(*HALF)
-    images = cvtgs.render(scene, cameras)
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, rgb, opacity in zip(cameras.names, images.rgb, images.alpha, strict=True):
-        colors = rgb / opacity.clamp_min(1e-3)[..., None] if alpha else rgb
-        pixels = torch.cat([colors, opacity[..., None]], dim=2) if alpha else colors
-        values = (pixels.clamp(0, 1) * 255).round().byte().numpy()
-        path = folder / Path(name).with_suffix(".png").name
-        Image.fromarray(values).save(path)
-
-
-def colmap_dataset(scene: cvtgs.GaussianScene, folder: Path, images: str = "images_4") -> Path:
-    colmap_txt(folder / "sparse" / "0", names=[Path(NAMES[row]).name for row in range(9, -1, -1)])
-    shoot(scene, cvtgs.load_cameras(folder), folder / images)
-    return folder
-
-
-def nerf_dataset(scene: cvtgs.GaussianScene, folder: Path) -> Path:
-    """Transparent pictures, and the split of NeRF-Synthetic."""
-    for split, rows in (("train", range(2, 10)), ("test", range(2))):
-        told = transforms(rows)
-        for row, frame in zip(rows, told["frames"], strict=True):
-            frame["file_path"] = f"./{split}/r_{row}"
-        write_json(folder / f"transforms_{split}.json", told)
-        cameras = cvtgs.load_cameras(folder / f"transforms_{split}.json")
-        shoot(scene, cameras, folder / split, alpha=True)
-    return folder
-
-
-def inria_model(scene: cvtgs.GaussianScene, folder: Path) -> Path:
-    for step in (7000, 30000):
-        path = folder / "point_cloud" / f"iteration_{step}" / "point_cloud.ply"
-        path.parent.mkdir(parents=True)
-        cvtgs.save(scene, path)
-    return path
-
-
-def gsplat_model(scene: cvtgs.GaussianScene, folder: Path) -> Path:
-    path = folder / "ply" / "point_cloud_29999.ply"
-    path.parent.mkdir(parents=True)
-    cvtgs.save(scene, path)
-    return path
-
-
-TURN = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-SHIFT, SCALE = torch.tensor([0.5, -0.25, 1.0]), 0.4
-
-
-def nerfstudio_model(scene: cvtgs.GaussianScene, folder: Path) -> Path:
-    """A scene that was turned, moved and then scaled, and the file that says so."""
-    moved = scene.with_tensors(
-        {
-            "means": (scene.means @ TURN.T + SHIFT) * SCALE,
-            "log_scales": scene.log_scales + math.log(SCALE),
-        },
-        {},
-    )
-    folder.mkdir(parents=True)
-    cvtgs.save(moved, folder / "splat.ply")
-    transform = torch.cat([TURN, SHIFT[:, None]], dim=1).tolist()
-    write_json(folder / "dataparser_transforms.json", {"transform": transform, "scale": SCALE})
-    return folder / "splat.ply"
+    return ball()
 
 
 @pytest.fixture
@@ -122,21 +43,6 @@ def root(tmp_path, scene) -> Path:
     gsplat_model(scene, root / "results" / "truck")
     inria_model(scene, root / "db" / "playroom" / "output")
     return root
-
-
-def capture_of(root: Path, name: str) -> Capture:
-    return next(one for one in find_captures(root).captures if one.name == name)
-
-
-def score_of(capture: Capture) -> float:
-    full = cvtgs.load(capture.model.path)
-    views = read_test_views(capture)
-    check_model(capture, full, views.cameras)
-    return (
-        PhotographJudge(views.cameras, views.photographs, capture.dataset.background, Metrics())
-        .score(full)
-        .psnr
-    )
 
 
 def test_every_layout_is_found_and_shows_what_was_photographed(root):
@@ -176,28 +82,6 @@ def test_pictures_of_nerf_are_over_white(root):
     assert photographs[:, 0, 0].tolist() == [[1.0] * 3] * 2
 
 
-def test_cameras_move_with_points():
-    """A point falls on the same pixel before and after both were moved."""
-    g = torch.Generator().manual_seed(0)
-    points = torch.randn(5, 3, generator=g)
-    cameras = Cameras(
-        viewmats=torch.tensor(
-            [[[0.6, 0, -0.8, 0.1], [0, 1, 0, 0.2], [0.8, 0, 0.6, 5], [0, 0, 0, 1.0]]]
-        ),
-        Ks=torch.tensor([[[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]]),
-        width=64,
-        height=48,
-    )
-    transform = torch.cat([TURN, SHIFT[:, None]], dim=1).double()
-    moved = moved_cameras(cameras, transform, SCALE)
-    places = []
-    for view, xyz in ((cameras, points), (moved, (points @ TURN.T + SHIFT) * SCALE)):
-        local = xyz @ view.viewmats[0, :3, :3].T + view.viewmats[0, :3, 3]
-        pixels = local @ view.Ks[0].T
-        places.append(pixels[:, :2] / pixels[:, 2:])
-    torch.testing.assert_close(*places, rtol=1e-4, atol=1e-3)
-
-
 def test_what_is_missing_is_one_sentence_each(root):
     for path in (root / "db" / "playroom" / "output", root / "tandt"):
         path.rename(path.with_name("gone"))
@@ -218,14 +102,6 @@ def test_what_is_missing_is_one_sentence_each(root):
     )
     assert f"chair: of NeRF-Synthetic, was not found in {root}." in notes
     assert all("\n" not in note and note.endswith(".") for note in notes)
-
-
-def refusal(capture: Capture) -> str:
-    with pytest.raises(SystemExit) as caught:
-        score_of(capture)
-    text = str(caught.value)
-    assert "\n" not in text
-    return text
 
 
 def test_a_dataset_without_a_test_split(root):
@@ -254,17 +130,6 @@ def test_photographs_of_another_shape(root):
     assert refusal(garden) == (
         f"garden: {garden.folder / 'images_4'}: photographs must have the shape of the cameras' "
         f"images, 64 x 48 or smaller, found 40 x 24."
-    )
-
-
-@pytest.mark.parametrize("shift", [(40.0, 0.0, 0.0), (0.0, 0.0, 9.0)])
-def test_the_model_of_another_scene(root, scene, shift):
-    garden = capture_of(root, "garden")
-    cvtgs.save(move(scene, Motion(shift=shift)), garden.model.path, overwrite=True)
-    assert refusal(garden) == (
-        f"{garden.model.path}: must be a model of {garden.folder}, but its Gaussians are not "
-        f"where its cameras look; it is the model of another scene, or of a world that was "
-        f"normalized for the training."
     )
 
 
