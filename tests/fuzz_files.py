@@ -178,7 +178,7 @@ def judged(read: Callable[[Path], object], path: Path) -> Verdict:
     except CvtgsError as error:
         text = str(error)
         own = (f"{path}: ", f"{path.parent}: ", f"{path.parent}{os.sep}")  # or one beside it
-        clear = text.startswith(own) and text.endswith(".") and "\n" not in text
+        clear = text.startswith(own) and text.endswith((".", "?")) and "\n" not in text
         result = "refused" if clear and len(text) < 1000 else f"unclear: {text!r}"
     except HangError:
         result = f"more than {CPU_SECONDS:g} s"

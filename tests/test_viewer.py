@@ -133,6 +133,9 @@ def test_compare_and_levels_write_a_page(
     assert main(["compare", str(full), str(small), "-o", str(folder), *views]) == 0
     assert (folder / "viewer.html").read_text() == "<html>[[500], [40]] True</html>"
     assert "viewer.html: 2 scenes in 3D" in capsys.readouterr().out
+    assert '<a href="viewer.html">' in (folder / "index.html").read_text()
+    assert main(["compare", str(full), str(small), "-o", f"{folder}2", *views[:-1]]) == 0
+    assert "viewer.html" not in (tmp_path / "compared2" / "index.html").read_text()
     folder = tmp_path / "levels"
     words = ["levels", str(full), "-o", str(folder), "--rho", "0.1,0.02", "--no-scores", *views]
     assert main([*words, "--preset", "draft"]) == 0

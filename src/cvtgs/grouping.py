@@ -55,6 +55,7 @@ class WeightedRows(NamedTuple):
         masses: ``(k,)`` what each weighs in the moments of its cell.
         apparent_masses: ``(k,)`` mass as images show it, by which merging costs.
         moments: Moments of each; None if they are not known yet.
+        neighbors: Gaussians that each may merge with; None if they are not known yet.
     """
 
     scene: GaussianScene
@@ -63,6 +64,7 @@ class WeightedRows(NamedTuple):
     masses: Float[Tensor, "k"]
     apparent_masses: Float[Tensor, "k"]
     moments: cells.Moments | None = None
+    neighbors: Int[Tensor, "k j"] | None = None
 
 
 class OrderedRows(NamedTuple):
@@ -96,6 +98,28 @@ def order_rows(
     """
     points = _weighted(scene, given, analysis, config)
     return OrderedRows(given, points._replace(moments=_moments(points, analysis)))
+
+
+def add_neighbors(
+    ordered: OrderedRows, target: int, config: AllocationConfig
+) -> OrderedRows | None:
+    """Find the neighbours of single Gaussians, if pairs of them are to merge.
+
+    Args:
+        ordered: What was computed of them before.
+        target: Number of cells.
+        config: How many neighbours each has.
+
+    Returns:
+        The same with neighbours, 48 bytes per Gaussian; None if they are there or of no use.
+    """
+    points, total = ordered.points, len(ordered.given)
+    if points.neighbors is not None or points.moments is None:
+        return None
+    if target >= total or finer_count(target, total, config) < total:
+        return None
+    near = cvt.nearest_neighbors(points.moments.means.T, config.neighbors)
+    return ordered._replace(points=points._replace(neighbors=near))
 
 
 def group_rows(
@@ -201,7 +225,10 @@ def _tessellate(
     )
     members = points.moments or _moments(points, analysis)
     costs = allocation_at(target / total, config.allocation)
-    return tessellation, allocate(members, tessellation.labels, count, target, costs)
+    near = points.neighbors if count == len(rows) else None
+    return tessellation, allocate(
+        members, tessellation.labels, count, target, costs, neighbors=near
+    )
 
 
 def finer_count(target: int, available: int, config: AllocationConfig) -> int:
@@ -226,6 +253,8 @@ def allocate(
     count: int,
     target: int,
     config: AllocationConfig,
+    *,
+    neighbors: Int[Tensor, "n k"] | None = None,
 ) -> Int[Tensor, "n"]:
     """Merge cells in pairs until the target is met, and move members to the cell that fits.
 
@@ -235,13 +264,17 @@ def allocate(
         count: Number of cells.
         target: Number of cells to leave.
         config: Costs.
+        neighbors: Neighbours of the members, where each is a cell of its own, in their order;
+            None finds those of the cells.
 
     Returns:
         The new cell of each member; none is empty.
     """
     if count > target:
-        groups = cells.group_moments(members, labels, count).on_host()  # many small steps
-        near = cvt.nearest_neighbors(groups.means.T, config.neighbors)
+        groups = members if neighbors is not None else cells.group_moments(members, labels, count)
+        groups, near = groups.on_host(), neighbors  # many small steps
+        if near is None:
+            near = cvt.nearest_neighbors(groups.means.T, config.neighbors)
         merged = cells.merge_pairs(groups, near, target, config).to(labels.device)
         labels = merged.index_select(0, labels)
     if config.reassign and target < len(labels):

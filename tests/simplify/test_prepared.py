@@ -59,6 +59,23 @@ def test_rows_are_ordered_once_and_again_where_the_filter_leaves_others(scene, m
     assert calls == [kept, kept, kept + 5]
 
 
+def test_neighbours_of_single_gaussians_are_found_once(scene, monkeypatch):
+    simplifier = Simplifier(preset="draft", device="cpu")
+    wanted = [simplifier.simplify(scene, rho) for rho in (0.5, 0.4, 0.3, 0.05)]
+    searched, search = [], cvtgs.cvt.nearest_neighbors
+    monkeypatch.setattr(
+        cvtgs.cvt,
+        "nearest_neighbors",
+        lambda sites, count: searched.append(len(sites)) or search(sites, count),
+    )
+    prepared, whole = simplifier.prepare(scene), []
+    for rho, small in zip((0.5, 0.4, 0.3, 0.05), wanted, strict=True):
+        searched.clear()
+        assert same_bits(prepared.run(rho).scene, small)
+        whole.append(searched.count(len(scene)))
+    assert whole == [1, 1, 0, 0]
+
+
 def test_protected_gaussians_may_differ_from_run_to_run(scene):
     simplifier = Simplifier(device="cpu")
     prepared = simplifier.prepare(scene)

@@ -15,7 +15,7 @@ from cvtgs.cli.options import (
     read_ratios,
     read_words,
 )
-from cvtgs.cli.view import check_page, write_page
+from cvtgs.cli.view import PAGE, check_page, write_page
 from cvtgs.cli.view_options import (
     add_view_options,
     background_color,
@@ -244,7 +244,11 @@ def compare(options: argparse.Namespace) -> None:
             listener=listener,
         )
         paths = cvtgs.evaluation.write_comparison(
-            comparison, options.output, overwrite=options.overwrite, listener=listener
+            comparison,
+            options.output,
+            overwrite=options.overwrite,
+            viewer=PAGE if options.viewer else "",
+            listener=listener,
         )
     if not options.quiet:
         _print_scores(comparison.evaluation, scenes.sizes)

@@ -106,6 +106,8 @@ def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m
     rows, _ = _by_tree(apart, apart, with_self)
     # Among coincident sites the site itself may be anywhere, even missing: then the last one goes.
     is_self = rows == torch.arange(len(sites))[:, None]
+    if bool(is_self[:, 0].all()):
+        return rows[:, 1:].to(sites.device)
     others = torch.sort(is_self.to(torch.uint8), dim=1, stable=True).indices[:, : with_self - 1]
     return rows.gather(1, others).to(sites.device)
 

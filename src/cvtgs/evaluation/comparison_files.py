@@ -61,6 +61,7 @@ def write_comparison(
     folder: str | os.PathLike[str],
     *,
     overwrite: bool = False,
+    viewer: str = "",
     listener: ProgressListener = silent,
 ) -> tuple[Path, ...]:
     """Write ``index.html``, ``sheet.png`` and ``errors.png``, each completely or not at all.
@@ -69,6 +70,7 @@ def write_comparison(
         comparison: Images and scores, at least one simplified scene.
         folder: Where to write; made if it is missing.
         overwrite: Whether existing files may be replaced.
+        viewer: Name of a page in the folder with the scenes in 3D, to link to; empty for none.
         listener: Called after each file.
 
     Returns:
@@ -94,7 +96,7 @@ def write_comparison(
     makers: dict[str, Callable[[], bytes]] = {
         SHEET: lambda: encode(contact_sheet(comparison), "png"),
         ERRORS: lambda: encode(error_sheet(comparison), "png"),
-        PAGE: lambda: comparison_page(comparison).encode(),
+        PAGE: lambda: comparison_page(comparison, viewer=viewer).encode(),
     }
     listener(ProgressEvent(stage=STAGE, done=0, total=len(makers)))
     paths = tuple(Path(folder) / name for name in makers)

@@ -28,9 +28,15 @@ _TRIES = ((84, 1.0), (72, 1.0), (55, 1.0), (55, 0.7), (45, 0.5), (35, 0.35), (30
 
 
 def comparison_page(
-    comparison: Comparison, *, summary: str = "", most_bytes: int = MOST_BYTES
+    comparison: Comparison,
+    *,
+    summary: str = "",
+    viewer: str = "",
+    most_bytes: int = MOST_BYTES,
 ) -> str:
     """Return the page, with a summary of :func:`render_template` above the images.
+
+    It links to a page with the scenes in 3D, if there is one beside it.
 
     It has a divider between the full and a simplified scene, a chooser of scene and view, counts,
     bytes and scores, and maps of the differences of colour and of alpha.
@@ -54,6 +60,7 @@ def comparison_page(
             alpha_gradient=CSS_ALPHA_GRADIENT,
             alpha_scale=f"{ALPHA_SCALE:g}",
             summary=summary,
+            viewer=viewer,
             data=_page_data(comparison, quality, factor),
         )
         if len(page) <= most_bytes:
