@@ -65,7 +65,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 }
 """What each preset changes of the defaults: ``standard`` nothing.
 
-``paper`` is CVT-GS (Li et al. 2026) as published, with a network that was trained here.
+``paper`` is CVT-GS (Li et al. 2026) as published, with a network that was trained here; the page
+on the design lists what the publication leaves open.
 """
 
 
