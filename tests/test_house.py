@@ -31,7 +31,7 @@ LEVELS = [
     {"pipeline", "refinement"},
     {"prepared"},
     {"simplifier", "info"},
-    {"budget", "levels", "notebooks", "oneshot", "outofcore", "tradeoff", "viewer"},
+    {"budget", "levels", "notebooks", "outofcore", "tradeoff", "viewer"},
     {"streams"},
     {"train"},
     {"cli"},

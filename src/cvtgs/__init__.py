@@ -48,14 +48,13 @@ if TYPE_CHECKING:
     from cvtgs.evaluation import evaluate
     from cvtgs.info import SceneInfo, describe
     from cvtgs.io import from_dict, load, load_cameras, save, to_dict
-    from cvtgs.oneshot import simplify
     from cvtgs.prepared import Prepared
     from cvtgs.progress import ProgressEvent, ProgressListener
     from cvtgs.refinement import refine
     from cvtgs.rendering import Rendering, render
     from cvtgs.report import Level, Simplified, SimplifyReport
     from cvtgs.scene import GaussianScene, concatenate
-    from cvtgs.simplifier import Simplifier
+    from cvtgs.simplifier import Simplifier, simplify
 
 __version__ = "0.1.0"
 
@@ -85,7 +84,7 @@ _HOME = {
     "Prepared": "cvtgs.prepared",
     "Simplified": "cvtgs.report",
     "Simplifier": "cvtgs.simplifier",
-    "simplify": "cvtgs.oneshot",
+    "simplify": "cvtgs.simplifier",
     "target_count": "cvtgs.counts",
 }
 _MODULES = (

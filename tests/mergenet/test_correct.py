@@ -1,10 +1,12 @@
 """Correcting all cells of a scene: turns and moves with it, leaves single members alone."""
 
+import json
 import math
 
 import pytest
 import torch
 
+import regenerate_golden as golden
 from cvtgs import GaussianScene
 from cvtgs.cells import Partition
 from cvtgs.mergenet import correct_cells
@@ -210,3 +212,24 @@ def test_cuda_gives_the_same_gaussians(dtype, tolerance):
     assert first.device.type == "cuda"
     assert same_bits(first.to("cpu"), second.to("cpu"))
     assert_close(first.to("cpu"), case.correct(lively_net(dtype)), tolerance)
+
+
+RENEW = "run `python tests/regenerate_golden.py`, look at the difference and commit it"
+
+
+@pytest.fixture(scope="module")
+def table() -> dict:
+    return json.loads(golden.TABLE.read_text(encoding="utf-8"))
+
+
+def test_the_table_is_of_the_shipped_checkpoints(table):
+    assert table["digests"] == golden.digests(), f"a shipped checkpoint has changed: {RENEW}"
+    assert list(table["figures"]) == golden.CASES, f"the cases have changed: {RENEW}"
+
+
+@pytest.mark.parametrize("case", golden.CASES)
+def test_golden_output(table, case):
+    found, wanted = golden.figures(case), table["figures"][case]
+    assert found.keys() == wanted.keys()
+    for name, value in wanted.items():
+        assert found[name] == pytest.approx(value, rel=1e-3, abs=1e-6), f"{name}: {RENEW}"

@@ -17,8 +17,7 @@ from cvtgs.evaluation import EvaluationSettings
 from cvtgs.io.ply import open_rows
 from cvtgs.math.frames import robust_frame
 from cvtgs.outofcore import block_count, read_bytes, simplify_file
-from cvtgs.outofcore.partition import partition_space
-from cvtgs.outofcore.scan import RowRange, add_totals, scan_range
+from cvtgs.outofcore.scan import RowRange, add_totals, partition_space, scan_range
 from cvtgs.views import automatic_views
 from scenes import random_scene, same_bits
 

@@ -1,4 +1,4 @@
-"""The learning rate scale of each Gaussian: 0 where it is right from everywhere."""
+"""The steps of a refinement: the learning rate scale of each Gaussian, and finite steps."""
 
 import math
 
@@ -7,10 +7,11 @@ import torch
 
 from cvtgs import GaussianScene
 from cvtgs.analysis import ambient_visibility
+from cvtgs.config import Rates
 from cvtgs.math.frames import robust_frame
 from cvtgs.refinement import refine
-from cvtgs.refinement.optimize import learning_rate_scales
-from refine_cases import discolored, full_scene, quick, small_scene
+from cvtgs.refinement.optimize import SceneOptimizer, learning_rate_scales
+from refine_cases import as_dtype, discolored, full_scene, quick, small_scene
 from scenes import random_scene, same_bits
 
 
@@ -68,3 +69,18 @@ def test_a_refinement_leaves_exact_ones_alone_and_moves_merged_ones():
     assert 0 < int((~free).sum()) < len(small)
     assert same_bits(scene.select(~free), small.select(~free))
     assert report.changed_count > 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [1e-44, 1e-30, 1e25, 3e38, 1e300])
+def test_gradients_of_any_size_give_finite_steps(dtype, size):
+    scene = as_dtype(random_scene(2, degree=0), dtype)
+    scale = torch.ones(2, dtype=dtype)
+    optimizer = SceneOptimizer(scene, Rates(sh0=0.25), learning_rate_scale=scale)
+    size = min(size, torch.finfo(dtype).max)
+    for sign in (1, -1, 1, 1):
+        optimizer.step(sign * size * optimizer.scene().sh0[0, 0, 0], factor=1.0)
+    moved = (optimizer.scene().sh0 - scene.sh0).detach()
+    assert bool(moved.isfinite().all())
+    assert float(moved.abs().amax()) <= 4 * 0.25
+    assert not moved[1].any()

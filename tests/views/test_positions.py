@@ -12,6 +12,7 @@ from cvtgs.refinement.images import generated_views
 from cvtgs.views import automatic_views, find_view_positions, mixed_views, random_views
 from cvtgs.views.layout import find_layout
 from cvtgs.views.mixed import NEAR
+from cvtgs.views.up import Voxels, find_up
 
 HALF = math.sqrt(0.5)
 CONVENTIONS = {
@@ -135,3 +136,13 @@ def test_views_do_not_cut_off_the_top():
     x, y, z = (cameras.Ks @ (cameras.viewmats @ tip)[:, :3, None])[:, :, 0].unbind(1)
     assert bool((z > 0).all())
     assert bool(((x / z > 0) & (x / z < 100) & (y / z > 0) & (y / z < 100)).all())
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_a_ground_across_x_gives_a_unit_vector(sense):
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(500, 3, generator=generator, dtype=torch.float64) - 0.5
+    points[:, 0] = 0.01 * points[:, 0]
+    normals = torch.tensor([[sense, 0.0, 0.0]], dtype=torch.float64).repeat(500, 1)
+    up = find_up(Voxels(points=points, normals=normals, log_sizes=points[:, 0]), points[:0])
+    assert up.tolist() == [1.0, 0.0, 0.0]

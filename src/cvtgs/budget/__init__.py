@@ -1,9 +1,8 @@
 """Settings from goals: a time budget, or a quality to reach."""
 
 from cvtgs.budget.calibrate import cost_model, shipped_model
-from cvtgs.budget.choose import Choice, choose_preset
 from cvtgs.budget.costs import CostModel, Work
-from cvtgs.budget.count import Found, Tried, find_count
+from cvtgs.budget.count import Choice, Found, Tried, choose_preset, find_count
 
 __all__ = [
     "Choice",

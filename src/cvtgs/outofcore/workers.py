@@ -1,11 +1,23 @@
 """Workers: what calls functions for ranges of a file and for blocks, here or elsewhere."""
 
+import os
+import pickle
+import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Protocol, TypeVar, runtime_checkable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Protocol, Self, TypeVar, runtime_checkable
 
 from cvtgs.clock import StageClock
+from cvtgs.devices import core_count
+from cvtgs.errors import RunError
 from cvtgs.mergenet import Checkpoint
 from cvtgs.outofcore.job import Job
+from cvtgs.outofcore.memory import LEAST_BYTES
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -68,3 +80,104 @@ def with_progress(results: Iterable[Result], advance: Callable[[int], None]) -> 
     for done, result in enumerate(results, start=1):
         yield result
         advance(done)
+
+
+def worker_count(memory: int, wanted: int | None = None) -> int:
+    """Choose how many processes work on blocks.
+
+    Args:
+        memory: Bytes for all of them together.
+        wanted: How many there should be; None for one on each core.
+
+    Returns:
+        At least 1, and no more than have 1 GB each, for torch and a block of some size.
+
+    Example:
+        >>> worker_count(4_000_000_000, 8)
+        4
+    """
+    return max(1, min(wanted or core_count(), memory // (2 * LEAST_BYTES)))
+
+
+class LocalWorkers:
+    """Calls functions in processes of this machine, as long as it is entered.
+
+    The processes end with this one, whatever ends it. A program that uses them must guard what it
+    does by ``if __name__ == "__main__":``, since they import it.
+
+    Args:
+        count: Number of processes.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+
+    def __enter__(self) -> Self:
+        context = get_context("spawn")  # a fork would copy locks that torch's threads hold
+        self._watched, self._alive = context.Pipe(duplex=False)
+        threads = max(1, core_count() // self._count)
+        self._pool = ProcessPoolExecutor(
+            self._count, context, initializer=_begin, initargs=(self._watched, threads)
+        )
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self._pool.shutdown()
+        self._alive.close()  # ends those that are still at work
+        self._pool.shutdown(cancel_futures=True)
+        self._watched.close()
+
+    def __call__(
+        self, function: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[Result]:
+        """Call a function for every item.
+
+        Args:
+            function: A function that can be pickled.
+            items: Its arguments.
+
+        Yields:
+            The results, in the order of the items.
+
+        Raises:
+            RunError: A process was ended from outside.
+        """
+        futures = [self._pool.submit(_call, pickle.dumps((function, item))) for item in items]
+        try:
+            for future in futures:
+                result: Result = pickle.loads(future.result())  # made by a process of this one
+                yield result
+        except BrokenProcessPool as error:
+            raise RunError(
+                "a process that worked on blocks was ended, most likely for lack of memory; run "
+                "the same command again, with less --memory or fewer --workers."
+            ) from error
+        finally:
+            for future in futures:
+                future.cancel()
+
+
+def _call(work: bytes) -> bytes:
+    """Call a function; as bytes, since torch would hand tensors over by files in a folder."""
+    function, item = pickle.loads(work)  # made by the process that started this one
+    return pickle.dumps(function(item))
+
+
+def _begin(watched: Connection, threads: int) -> None:
+    """Prepare a process: it leaves Ctrl-C to the first one, and ends when that one does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ["OMP_NUM_THREADS"] = str(threads)
+    threading.Thread(target=_end_with, args=(watched,), daemon=True).start()
+
+
+def _end_with(watched: Connection) -> None:
+    try:
+        watched.recv_bytes()
+    except (EOFError, OSError):
+        os._exit(1)

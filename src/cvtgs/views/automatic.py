@@ -1,24 +1,197 @@
-"""Automatic views: cameras for a scene of which nothing is layout."""
+"""Automatic views: candidates around a scene or inside of a room, and the best of them."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from cvtgs.cameras import Cameras
+from cvtgs.cameras import Cameras, look_at
 from cvtgs.devices import one_thread
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.scene import SceneLike
-from cvtgs.views.candidates import (
-    CandidateCameras,
-    found_candidates,
-    inside_candidates,
-    outside_candidates,
-)
 from cvtgs.views.layout import SceneLayout
-from cvtgs.views.positions import CameraPositions, as_positions
+from cvtgs.views.positions import REACH, CameraPositions, as_positions
 from cvtgs.views.scoring import score_cameras
+
+_ELEVATIONS = (20.0, 35.0, 12.0, 28.0)
+_OUTSIDE = (
+    # turn (share of a slot), further elevation (degrees), factor of the distance
+    (0.0, 0.0, 1.0),
+    (0.0, 12.0, 1.0),
+    (0.3, 4.0, 1.0),
+    (-0.3, 4.0, 1.0),
+    (0.0, 8.0, 0.75),
+    (0.0, 25.0, 1.0),
+    (0.3, 16.0, 0.75),
+    (-0.3, 16.0, 0.75),
+    (0.0, 20.0, 1.4),
+    (0.0, 45.0, 1.0),
+    (0.0, 15.0, 0.5),
+    (0.0, 50.0, 1.5),
+)
+_INSIDE = (
+    # turn (share of a slot), share of the distance to the wall behind, lift (share of the height)
+    (0.0, 0.65, 0.0),
+    (0.0, 0.75, 0.08),
+    (0.3, 0.65, 0.04),
+    (-0.3, 0.65, 0.04),
+    (0.0, 0.5, 0.0),
+    (0.0, 0.55, 0.12),
+    (0.3, 0.4, 0.04),
+    (-0.3, 0.4, 0.04),
+    (0.0, 0.8, -0.08),
+    (0.0, 0.25, 0.08),
+    (0.0, 0.0, 0.0),
+)
+OUTSIDE_FIELD = 45.0
+"""Field of view around a scene along the shorter side of the image, degrees."""
+
+INSIDE_FIELD = 62.0
+"""The same inside a room."""
+
+_PLACE_RADIUS = 0.95
+_OBJECT_RADIUS = 1.0
+_INSIDE_PITCH = -10.0
+_PATH_RADIUS = 0.15
+_WALL_QUANTILE = 0.8
+"""Of the surfaces in a direction, the nearest are furniture and the farthest stray."""
+
+_FARTHEST = 1.5
+_FOUND = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CandidateCameras:
+    """Cameras in rounds: the first choice of every view, then its alternates.
+
+    Attributes:
+        inside: Whether they are inside a room.
+        rounds: Cameras of one round; all rounds have one camera per view.
+        distances: From each camera to what it should show, scene units, one tensor per round.
+    """
+
+    inside: bool
+    rounds: tuple[Cameras, ...]
+    distances: tuple[Float[Tensor, "c"], ...]
+
+
+def outside_candidates(
+    layout: SceneLayout, count: int, *, size: tuple[int, int], turn: float
+) -> CandidateCameras:
+    """Return cameras around the scene at several heights that look at its middle."""
+    right, ahead = _level_axes(layout.up)
+    shown = layout.radius * (_OBJECT_RADIUS if layout.bounded else _PLACE_RADIUS)
+    distance = shown / math.sin(math.radians(0.5 * OUTSIDE_FIELD))
+    elevations = [_ELEVATIONS[slot % len(_ELEVATIONS)] for slot in range(count)]
+    rounds, distances = [], []
+    for shift, lift, factor in _OUTSIDE:
+        eyes = []
+        for slot, elevation in enumerate(elevations):
+            angle = 2 * math.pi * (slot + turn + shift) / count
+            rise = math.radians(min(elevation + lift, 80.0))
+            level = math.cos(angle) * right + math.sin(angle) * ahead
+            eyes.append(math.cos(rise) * level + math.sin(rise) * layout.up)
+        directions = torch.stack(eyes)
+        rounds.append(
+            _cameras(
+                layout.center + distance * factor * directions,
+                -directions,
+                layout.up,
+                size=size,
+                field=OUTSIDE_FIELD,
+            )
+        )
+        distances.append(torch.full((count,), distance * factor))
+    return CandidateCameras(inside=False, rounds=tuple(rounds), distances=tuple(distances))
+
+
+def inside_candidates(
+    layout: SceneLayout,
+    middle: Float[Tensor, "3"],
+    count: int,
+    *,
+    size: tuple[int, int],
+    turn: float,
+) -> CandidateCameras:
+    """Return cameras in a room, back from its middle, that look across."""
+    right, ahead = _level_axes(layout.up)
+    pitch = math.radians(_INSIDE_PITCH)
+    rounds, distances = [], []
+    for shift, back, lift in _INSIDE:
+        angles = [2 * math.pi * (slot + turn + shift) / count for slot in range(count)]
+        level = torch.stack([math.cos(angle) * right + math.sin(angle) * ahead for angle in angles])
+        steps = back * _distances_to_walls(layout, middle, -level)
+        eyes = middle - steps[:, None] * level + lift * layout.height * layout.up
+        directions = math.cos(pitch) * level + math.sin(pitch) * layout.up
+        rounds.append(_cameras(eyes, directions, layout.up, size=size, field=INSIDE_FIELD))
+        distances.append(steps + 0.5 * layout.frame.radius)
+    return CandidateCameras(inside=True, rounds=tuple(rounds), distances=tuple(distances))
+
+
+def found_candidates(
+    positions: CameraPositions, count: int, *, size: tuple[int, int], seed: int
+) -> CandidateCameras:
+    """Return cameras at positions that were found to be good, to take where others are not."""
+    layout = positions.layout
+    inside = layout.room is not None
+    reach = REACH if inside else (1.4, REACH[1])
+    eyes = torch.cat([positions.near(count, reach, seed + turn) for turn in range(_FOUND)])
+    directions = layout.center - eyes if layout.room is None else layout.room - eyes
+    cameras = _cameras(
+        eyes, directions, layout.up, size=size, field=INSIDE_FIELD if inside else OUTSIDE_FIELD
+    )
+    rows = torch.arange(len(eyes)).split(count)
+    distances = torch.linalg.vector_norm(directions, dim=1)
+    return CandidateCameras(
+        inside=inside,
+        rounds=tuple(cameras.select(part) for part in rows),
+        distances=tuple(distances[part] for part in rows),
+    )
+
+
+def _distances_to_walls(
+    layout: SceneLayout, start: Float[Tensor, "3"], directions: Float[Tensor, "c 3"]
+) -> Float[Tensor, "c"]:
+    """Return the distances to the walls behind the furniture, scene units."""
+    points = layout.frame.center + layout.frame.radius * layout.voxels.points - start
+    along = directions @ points.T
+    aside = (points.square().sum(dim=1) - along.square()).clamp_min(0).sqrt()
+    ahead = (along > 0) & (aside < _PATH_RADIUS * layout.frame.radius)
+    distances = [
+        row[there].quantile(_WALL_QUANTILE) if bool(there.any()) else row.new_zeros(())
+        for row, there in zip(along, ahead, strict=True)
+    ]
+    return torch.stack(distances).clamp_max(_FARTHEST * layout.frame.radius)
+
+
+def _level_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Return two level directions, fixed by ``up`` alone."""
+    least = torch.eye(3, dtype=up.dtype)[up.abs().argmin()]
+    right = torch.nn.functional.normalize(torch.linalg.cross(up, least), dim=0)
+    return right, torch.linalg.cross(right, up)
+
+
+def _cameras(
+    eyes: Float[Tensor, "c 3"],
+    directions: Float[Tensor, "c 3"],
+    up: Float[Tensor, "3"],
+    *,
+    size: tuple[int, int],
+    field: float,
+) -> Cameras:
+    width, height = size
+    focal = 0.5 * min(size) / math.tan(math.radians(0.5 * field))
+    intrinsics = [[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]]
+    return Cameras(
+        viewmats=look_at(eyes, eyes + directions, up),
+        Ks=torch.tensor(intrinsics, dtype=eyes.dtype).repeat(len(eyes), 1, 1),
+        width=width,
+        height=height,
+    )
+
 
 _GOLDEN = 0.6180339887498949
 

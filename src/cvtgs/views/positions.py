@@ -7,8 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cvtgs.scene import SceneLike, as_scene
-from cvtgs.views.layout import SceneLayout, find_layout
-from cvtgs.views.room import ENCLOSED, FREE, enclosure, size_growth
+from cvtgs.views.layout import ENCLOSED, FREE, SceneLayout, enclosure, find_layout, size_growth
 
 REACH = (0.2, 3.0)
 """Distances of the positions that are tried, in robust radii from the centre of the frame."""
