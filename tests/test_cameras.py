@@ -1,4 +1,4 @@
-"""Cameras: what cannot be a camera is refused; every so manyth pixel."""
+"""Cameras: what cannot be a camera is refused; every ``stride``-th pixel."""
 
 import pytest
 import torch

@@ -20,7 +20,7 @@ class Cameras:
         width: Pixels per row.
         height: Rows.
         names: Name of each camera, such as its photograph's file name; empty if they have none.
-        stride: Above 1, the images are every so manyth pixel of finer ones, in both directions;
+        stride: Above 1, the images are every ``stride``-th pixel of finer ones, in both directions;
             ``Ks``, width and height are those of the coarser grid (:meth:`every`).
 
     Raises:
@@ -143,7 +143,7 @@ class Cameras:
         )
 
     def every(self, stride: int, *, first: tuple[int, int] = (0, 0)) -> Self:
-        """Return cameras that see only every so manyth pixel, as sharp as in the whole image.
+        """Return cameras that see only every ``stride``-th pixel, as sharp as in the whole image.
 
         What they render is ``image[:, row::stride, column::stride]``: splats are as wide as in the
         whole image, while smaller images (:meth:`resized`) swell them.

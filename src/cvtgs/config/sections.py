@@ -49,7 +49,7 @@ class EffectsConfig(Section):
 
 
 class FilterConfig(Section):
-    """Which faint Gaussians are left out before the tessellation.
+    """Which Gaussians are left out before the tessellation: faint ones and flyaways.
 
     Attributes:
         min_opacity: Only Gaussians fainter than this may be left out.
@@ -173,10 +173,10 @@ class MergeConfig(Section):
             instead of their moments.
         align_axes: Whether axes of equal length turn to where the neighbours are
             (:func:`cvtgs.cells.align_axes`).
-        inflation: How much wider than its moments an opaque cell of many members becomes, along
-            every axis.
-        covered_inflation: How much more it becomes so along an axis on which other cells paint at
-            both its ends.
+        inflation: How much wider than its moments an opaque cell of many members becomes along
+            every axis, as a share of its standard deviation.
+        covered_inflation: The share by which it becomes wider still along an axis at both ends of
+            which other cells paint.
         network: Whether MergeNet corrects the merged Gaussians.
     """
 
@@ -221,12 +221,13 @@ class RefineConfig(Section):
         mse_weight: Weight of the logarithm of the mean squared error.
         image_weight: Weight of the logarithm of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) +
             0.2 gradient``.
-        size: Longer side of the images, pixels; at least 11 times ``stride``.
-        stride: A step and a check look at every so manyth pixel of an image in both directions,
-            as sharp as in the whole image: at 2, four times as many steps take the same time.
+        size: Longer side of the images, pixels; a side below 11 times ``stride`` becomes that.
+        stride: Distance in pixels, along rows and columns, of the pixels that a step and a check
+            look at, as sharp as in the whole image: at 2, four times as many steps take the same
+            time.
         batch: Views that are found together: a quarter automatic ones, half from anywhere around,
             a quarter from anywhere near, within the scene too.
-        first_images: So many first steps have a new image of the full scene each.
+        first_images: Steps at the start that have a new image of the full scene each.
         steps_per_image: Later steps for every new image; the others take one that was rendered
             before.
         images: Images that are kept at most, 8 bytes per pixel each.

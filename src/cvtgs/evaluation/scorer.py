@@ -69,7 +69,7 @@ class ViewImage:
         return rgb + (1 - alpha)[..., None] * background
 
     def every(self, stride: int, *, first: tuple[int, int]) -> Self:
-        """Return every so manyth pixel, from a first column and row on."""
+        """Return every ``stride``-th pixel, from a first column and row on."""
         column, row = first
         return replace(
             self,

@@ -73,7 +73,7 @@ def split_views(cameras: Cameras, *, config: RefineConfig, seed: int) -> RefineV
 
 
 def _thinned(views: Sequence[Cameras], stride: int) -> tuple[Cameras, ...]:
-    """Return every so manyth pixel of each view, from another first pixel on in each."""
+    """Return every ``stride``-th pixel of each view, from another first pixel on in each."""
     return tuple(
         view.every(stride, first=(row % stride, row // stride % stride))
         for row, view in enumerate(views)

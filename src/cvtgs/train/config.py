@@ -10,6 +10,7 @@ from cvtgs.errors import ConfigError
 
 Ratio = Annotated[float, pydantic.Field(gt=0.0, lt=1.0)]
 Count = Annotated[int, pydantic.Field(ge=1)]
+Side = Annotated[int, pydantic.Field(ge=11)]  # of a window of SSIM, pixels
 
 
 class DataConfig(Section):
@@ -50,7 +51,7 @@ class ViewsConfig(Section):
 
     Attributes:
         count: Images of each scene at each size.
-        sizes: Sides of the square images, pixels.
+        sizes: Sides of the square images, pixels; like those below at least 11, the window of SSIM.
         per_step: Images that one step renders.
         crop: Side of the random crop of each that is compared, pixels.
         validation_count: Images of each validation scene.
@@ -58,11 +59,11 @@ class ViewsConfig(Section):
     """
 
     count: Count = 16
-    sizes: tuple[Count, ...] = (256, 448)
+    sizes: tuple[Side, ...] = (256, 448)
     per_step: Count = 2
-    crop: Count = 256
+    crop: Side = 256
     validation_count: Count = 8
-    validation_size: Count = 400
+    validation_size: Side = 400
 
 
 class LossConfig(Section):
@@ -73,9 +74,10 @@ class LossConfig(Section):
     Logarithms give every scene, ratio and view the same weight, as a mean of PSNR does.
 
     Attributes:
-        mse_weight: Weight of the squared error.
-        image_weight: Weight of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) + 0.2 gradient``.
-        ssim_weight: Weight of the structural dissimilarity, ``1 - SSIM``.
+        mse_weight: Weight of the logarithm of the mean squared error.
+        image_weight: Weight of the logarithm of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) +
+            0.2 gradient``.
+        ssim_weight: Weight of the logarithm of the structural dissimilarity, ``1 - SSIM``.
         residual_weight: Weight of the size of the residuals.
     """
 
@@ -97,9 +99,8 @@ class TrainConfig(Section):
         steps: Training steps.
         learning_rate: Largest learning rate of AdamW; it falls to zero along a cosine.
         width: Units of the layers for members and neighbours.
-        cell_width: Units of the layers for cells; ``largest_growth`` does not concern the
-            published network.
-        largest_growth: Largest change of a log scale.
+        cell_width: Units of the layers for cells.
+        largest_growth: Largest change of a log scale; the published network has no limit.
         validate_every: Steps between validations.
         patience: Validations without a new best before training stops.
         averaged_steps: The network that is kept is a running mean of the weights over about this
