@@ -3,7 +3,8 @@
 ``pretended_cuda()`` lets code that runs inside believe that there is a GPU ``cuda:0``. A tensor
 there wraps one on the CPU. Operations that mix devices, ``numpy()`` and generators of the CPU raise
 what CUDA raises; whatever makes the host wait for the device, and every copy between both, is
-counted, with the line of the library that caused it. Tensors above a limit do not fit.
+counted, with the line of the library that caused it. Tensors above a limit do not fit. Sums that
+CUDA adds in any order are refused too, but in gradients, which torch makes of such sums.
 """
 
 import sys
@@ -40,6 +41,9 @@ WAITS = {
 """Operations after which the host needs a value, or a size that depends on values."""
 
 INDEXING = {"aten::index", "aten::index_put_", "aten::index_put", "aten::_index_put_impl_"}
+
+ANY_ORDER = {"cumsum", "cumprod", "logcumsumexp", "index_add", "scatter_add", "histc"}
+"""Operations that add floating-point numbers in any order on CUDA; ``check_order`` knows others."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,6 +122,7 @@ class Device(TorchDispatchMode):
             return args[0]
         if wrapped:
             self.check(name, args, leaves)
+            check_order(name, args, kwargs)
             is_mask = name in INDEXING and any(
                 i is not None and i.dtype == torch.bool for i in args[1]
             )
@@ -161,6 +166,24 @@ class Device(TorchDispatchMode):
                 f"{name}: Expected all tensors to be on the same device, but found at least two "
                 f"devices, cuda:0 and cpu!"
             )
+
+
+def check_order(name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+    """Refuse sums that CUDA adds in any order, so that two runs would give different bits."""
+    if torch._C._current_graph_task_id() >= 0:  # a gradient
+        return
+    kind = name.removeprefix("aten::").removesuffix("_")
+    floats = isinstance(args[0], Tensor) and args[0].is_floating_point()
+    if name in INDEXING:  # self, indices, values, accumulate
+        adds = floats and len(args) > 3 and args[3]
+    elif kind == "bincount":
+        adds = kwargs.get("weights", args[1] if len(args) > 1 else None) is not None
+    elif kind == "scatter_reduce":  # self, dim, index, source, kind of reduction
+        adds = floats and args[4] not in ("amin", "amax")
+    else:
+        adds = floats and kind in ANY_ORDER
+    if adds:
+        raise RuntimeError(f"{kind}: CUDA adds in any order")
 
 
 class Constructors(TorchFunctionMode):
@@ -226,6 +249,7 @@ def pretended_cuda(*, largest: int | None = None) -> Iterator[Traffic]:
         "current_device": lambda: 0,
         "synchronize": lambda device=None: None,
         "get_device_properties": lambda device: SimpleNamespace(total_memory=64 << 30),
+        "mem_get_info": lambda device=None: (32 << 30, 64 << 30),
     }
     device = Device(traffic, largest)
     with patch.multiple(torch.cuda, **answers), device, Constructors(traffic):

@@ -9,6 +9,7 @@ from torch import Tensor
 from cvtgs.analysis import SceneAnalysis, perspective_falloff
 from cvtgs.config import FilterConfig
 from cvtgs.math.parameters import divide
+from cvtgs.math.segments import running_sums, true_rows
 from cvtgs.scene import GaussianScene
 
 FLYAWAY_RADII = 100.0
@@ -63,9 +64,9 @@ def filter_rows(
         seen = masses * perspective_falloff(distances)
         fewer = keep & ~flyaway_rows(distances, seen, max_share=config.max_flyaway_share)
         keep = fewer if int(fewer.sum()) >= target else keep
-    mass_share = divide(masses[~keep].sum(), masses.sum())
-    rows = keep.nonzero()[:, 0]
-    return FilteredRows(rows, len(keep) - len(rows), float(mass_share))
+    mass_share = divide(torch.where(keep, 0.0, masses).sum(), masses.sum())
+    count, share = torch.stack([keep.sum().double(), mass_share.double()]).tolist()
+    return FilteredRows(true_rows(keep, int(count)), len(keep) - int(count), share)
 
 
 def visible_rows(
@@ -105,7 +106,7 @@ def visible_rows(
     faint = faint[torch.sort(opacities[faint], stable=True).indices]
     dropped = faint
     if max_mass_share < 1:
-        lost = masses[faint].double().cumsum(0)
+        lost = running_sums(masses[faint].double())
         dropped = faint[lost <= max_mass_share * masses.double().sum()]
     missing = at_least - (len(opacities) - len(dropped))
     if missing > 0:
@@ -139,7 +140,7 @@ def flyaway_rows(
     """
     far = (distances > FLYAWAY_RADII).nonzero()[:, 0]
     far = far[torch.sort(masses[far], stable=True).indices]
-    lost = masses[far].double().cumsum(0)
+    lost = running_sums(masses[far].double())
     found = torch.zeros(len(distances), dtype=torch.bool, device=distances.device)
     found[far[lost <= max_share * masses.double().sum()]] = True
     return found

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -340,7 +341,7 @@ def _grouping(
     """Return the rows of every cell, with its weight; the labels of the points are let go."""
     local = cells.Partition.from_labels(labels, len(weights))
     return Grouping(
-        partition=cells.Partition(order=rows.index_select(0, local.order), offsets=local.offsets),
+        partition=replace(local, order=rows.index_select(0, local.order)),
         weights=weights,
         refilled=tessellation.refilled,
         energies=tessellation.energies,

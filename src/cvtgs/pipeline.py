@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -138,13 +137,11 @@ def reduce_scene(
                 on_cells=advance,
             )
     small = restore_columns(standardized(small), scene, analysis.plan)
-    singles, largest = (merged.partition.counts == 1).sum(), grouping.partition.counts.amax()
-    single_count, largest_count = torch.stack([singles, largest]).tolist()
     statistics = CellStatistics(
         filtered_count=left_out,
         filtered_mass_share=left_out_mass_share,
-        single_member_cells=single_count,
-        largest_cell=largest_count,
+        single_member_cells=merged.partition.count_singles(),
+        largest_cell=int(grouping.partition.counts.amax()),
         refilled_cells=grouping.refilled,
         energies=grouping.energies,
         energy=grouping.energy,

@@ -1,5 +1,6 @@
 """Partition: members of every cell as runs of row numbers."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 
 from cvtgs.cells import Partition
 from cvtgs.errors import InvalidArgumentError
+from pretended_device import pretended_cuda
 
 
 def lists_of(partition: Partition) -> list[list[int]]:
@@ -30,12 +32,34 @@ def test_known_labels():
 
 def test_select_keeps_order():
     partition = Partition.from_labels(torch.tensor([2, 0, 2, 1, 0]), 3)
-    kept = partition.select(torch.tensor([True, False, True]))
-    assert lists_of(kept) == [[1, 4], [0, 2]]
-    none = partition.select(torch.tensor([False, False, False]))
+    for total in (None, 4):
+        assert lists_of(partition.select(torch.tensor([0, 2]), total)) == [[1, 4], [0, 2]]
+    none = partition.select(torch.tensor([], dtype=torch.int64))
     assert len(none) == 0
     assert lists_of(none) == []
     assert list(none.chunks(5)) == []
+
+
+def test_cells_of_several_members():
+    partition = partition_of([2, 1, 3, 1])
+    for known in (partition, replace(partition, singles=None)):
+        assert known.count_singles() == 2
+        assert known.several().tolist() == [0, 2]
+        assert lists_of(known.select_several(known.several())) == lists_of(partition)[::2]
+
+
+def test_a_device_is_not_waited_for_where_sizes_are_known():
+    partition = partition_of([2, 1, 3, 1])
+    first = partition.order[partition.offsets[2]]
+    rows = torch.tensor([-1, -1, int(first), -1])
+    wanted = lists_of(partition)
+    with pretended_cuda() as traffic:
+        there = replace(partition.to(torch.device("cuda")), singles=partition.singles)
+        cells = there.several()
+        several, shown = there.select_several(cells), there.keep_only(rows.to("cuda"), total=5)
+        assert not traffic.waits
+        assert lists_of(several) == wanted[::2]
+        assert lists_of(shown) == [*wanted[:2], wanted[2][:1], wanted[3]]
 
 
 @pytest.mark.parametrize("dtype", [torch.int32, torch.int64])

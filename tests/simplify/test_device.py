@@ -6,17 +6,18 @@ import torch
 from cvtgs import Simplifier
 from cvtgs.cvt import nearest_neighbors, nearest_scipy, nearest_several
 from cvtgs.errors import OutOfMemoryError
+from cvtgs.math.frames import morton_order
+from cvtgs.math.segments import running_sums
 from pretended_device import CUDA, DeviceTensor, pretended_cuda
 from scenes import random_scene, same_bits
 
 PRESETS = ["draft", "fast", "standard", "paper"]
-WAITS, COPIES = 23, 11
+WAITS, COPIES = 14, 9
 """Most waits of the host, and copies, in one simplification.
 
-Of the copies 1 is the network, 4 are the tessellation (points and weights to the host, labels and
-sites back), 4 the allocation and 2 the neighbours of merged Gaussians; a scene that is not on the
-device is 6 more. Neither grows with the scene, but for what is computed in chunks, which are large
-on a device.
+Of the copies 1 is the network, 2 are the tessellation (points to the host, labels back), 4 the
+allocation and 2 the neighbours of merged Gaussians; a scene that is not on the device is 6 more.
+Neither grows with the scene, but for what is computed in chunks, which are large on a device.
 """
 
 
@@ -132,6 +133,25 @@ def test_nearest_sites_of_points_on_a_device():
             assert torch.equal(one.cpu(), same)
 
 
+def test_ties_on_a_curve_of_a_device():
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randint(0, 3, (400, 3), generator=generator).double()  # 27 places
+    masses = torch.randint(0, 5, (400,), generator=generator).float()
+    wanted = morton_order(points, ties=masses)
+    with pretended_cuda() as traffic:
+        found = morton_order(points.to("cuda"), ties=masses.to("cuda"))
+        assert not traffic.waits
+        assert torch.equal(found.cpu(), wanted)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 1000])
+def test_running_sums_on_a_device(count):
+    values = torch.rand(count, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    with pretended_cuda():
+        found = running_sums(values.to("cuda")).cpu()
+    torch.testing.assert_close(found, values.cumsum(0))
+
+
 def test_neighbours_on_a_device():
     sites = torch.randn(100, 3, generator=torch.Generator().manual_seed(0)).repeat(2, 1)
     wanted = nearest_neighbors(sites, 5), *nearest_several(sites, sites[:50], 4)
@@ -159,6 +179,20 @@ def test_the_pretended_device_refuses_and_counts():
             there.numpy()
         with pytest.raises(RuntimeError, match="generator"):
             torch.rand(2, device="cuda", generator=torch.Generator())
+        for add in (
+            lambda: there.cumsum(1),
+            lambda: torch.bincount(there[0].long(), there[0]),
+            lambda: there.index_add(0, there[:, 0].long(), there),
+            lambda: there.scatter_reduce(0, there.long(), there, "sum"),
+            lambda: there.index_put_((there[:, 0].long(),), there, accumulate=True),
+        ):
+            with pytest.raises(RuntimeError, match="in any order"):
+                add()
+        leaf = there.clone().requires_grad_()
+        leaf[torch.zeros(2, dtype=torch.int64, device="cuda")].sum().backward()
+        assert leaf.grad.tolist() == [[2, 2, 2], [0, 0, 0]]
+        assert there.long().cumsum(1).tolist() == [[0, 1, 3], [3, 7, 12]]
+        traffic.waits.clear()
         assert (traffic.waits.total(), traffic.copies.total()) == (0, 1)
         assert float(there.sum()) == 15
         assert there[there > 2].tolist() == [3, 4, 5]

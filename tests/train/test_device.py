@@ -1,16 +1,42 @@
 """Training on a pretended CUDA device: the CPU's gains, and resumed bit for bit."""
 
 import pytest
+import torch
 
+from cvtgs import SimplifyConfig
 from cvtgs.progress import ProgressEvent
 from cvtgs.train import History
-from pretended_device import pretended_cuda
-from train_cases import bits_of_state, run, tiny_config, tiny_data, write_scenes
+from cvtgs.train.cases import Case, DeviceCopies, make_case
+from pretended_device import DeviceTensor, pretended_cuda
+from train_cases import bits_of_state, run, small_scene, tiny_config, tiny_data, write_scenes
 
 
 @pytest.fixture
 def _quick_curves(monkeypatch) -> None:
     monkeypatch.setattr(History, "curves", lambda history: b"an image")
+
+
+@pytest.fixture
+def case() -> Case:
+    made = make_case("made", small_scene(300), 0.1, SimplifyConfig())
+    assert made is not None
+    return made
+
+
+def test_cases_stay_on_a_device(case):
+    with pretended_cuda() as traffic:
+        copies = DeviceCopies(torch.device("cuda"))
+        first = copies.get(case)
+        assert isinstance(first.reference.scene.means, DeviceTensor)
+        once = traffic.copies.total()
+        assert copies.get(case) is first
+        assert traffic.copies.total() == once
+        size = sum(tensor.nbytes for tensor in case.reference.scene.tensors().values())
+        tight = DeviceCopies(torch.device("cuda"), room=2 * size)  # each is larger than its scene
+        kept = tight.get(case)
+        tight.get(case.select(torch.arange(5)))
+        assert tight.get(case) is not kept
+    assert DeviceCopies(torch.device("cpu")).get(case) is case
 
 
 class PowerCutError(Exception):

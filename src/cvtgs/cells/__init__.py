@@ -18,7 +18,7 @@ from cvtgs.cells.merge import (
     merged_depth,
     normalized_weights,
 )
-from cvtgs.math.segments import Partition
+from cvtgs.cells.partition import Partition
 
 __all__ = [
     "Descriptors",

@@ -12,8 +12,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cells.inflate import project_on_axes, side_cover
+from cvtgs.cells.partition import Partition
 from cvtgs.math import parameters
-from cvtgs.math.segments import Partition, gather_columns, segment_ids, segment_max, segment_sum
+from cvtgs.math.segments import gather_columns, segment_ids, segment_max, segment_sum
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 

@@ -4,9 +4,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.cells.partition import Partition
 from cvtgs.devices import chunk_length
 from cvtgs.math import parameters
-from cvtgs.math.segments import Partition, gather_columns
+from cvtgs.math.segments import gather_columns
 from cvtgs.scene import GaussianScene
 
 EQUAL_SHARE = 1e-2
@@ -141,7 +142,7 @@ def inflate_cells(
     opacities = parameters.opacity_from_logit(merged.logit_opacities)[: len(counts)]
     strength = opacities.double().square() * crowding
     chunk = chunk_length(CHUNK, counts.device)
-    for part in (counts > 1).nonzero()[:, 0].split(chunk):
+    for part in partition.several().split(chunk):
         cover = side_cover(merged, part, neighbors[part]).amin(dim=2)
         growth = everywhere + covered * (cover / FULL_COVER).clamp_max(1.0)
         factors = 1 + strength[part, None] * growth

@@ -1,23 +1,24 @@
 """Merge the members of every cell into one Gaussian, by moments or by a representative."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.cells.partition import Partition
 from cvtgs.config import MergeConfig
 from cvtgs.devices import chunk_length, in_threads
 from cvtgs.math import parameters
 from cvtgs.math.segments import (
-    Partition,
     gather_columns,
     segment_argmax,
     segment_ids,
     segment_max,
     segment_sum,
+    true_rows,
 )
 from cvtgs.scene import GaussianScene
 
@@ -57,7 +58,7 @@ def merge_cells(
     """
     counts = partition.counts
     merged = scene.select(partition.order[partition.offsets[:-1]])
-    cells = (counts > 1).nonzero()[:, 0]
+    cells = partition.several()
     done = len(counts) - len(cells)
     tensors, extras = merged.tensors(), dict(merged.extras)
     chunk = chunk_length(CHUNK_MEMBERS, scene.means.device)
@@ -93,7 +94,7 @@ def merge_cells(
         count: int = run.stop - run.start
         return count
 
-    chunks = partition.select(cells).chunks(chunk)
+    chunks = partition.select_several(cells).chunks(chunk)
     for count in in_threads(merge_chunk, chunks, scene.means.device):
         done += count
         on_cells(done)
@@ -293,10 +294,12 @@ def keep_representatives(
     cell_masses = segment_sum(masses, offsets)
     merged_areas = torch.exp(parameters.log_mean_projected_area(merged.log_scales.double()))
     is_kept = masses[best] ** 2 * merged_areas > cell_masses**2 * member_areas[best]
-    is_kept &= offsets.diff() > 1
-    representatives, cells = order[best], is_kept.nonzero()[:, 0]
-    if len(cells) == 0:
+    counts = partition.counts
+    is_kept &= counts > 1
+    number, members = torch.stack([is_kept.sum(), (counts * is_kept).sum()]).tolist()
+    if number == 0:
         return merged, partition
+    representatives, cells = order[best], true_rows(is_kept, number)
     kept = scene.select(representatives[cells])
     tensors = {
         name: values.index_copy(0, cells, getattr(kept, name))
@@ -306,5 +309,8 @@ def keep_representatives(
         name: values.index_copy(0, cells, kept.extras[name])
         for name, values in merged.extras.items()
     }
-    shown = partition.keep_only(torch.where(is_kept, representatives, -1))
+    kept_rows = torch.where(is_kept, representatives, -1)
+    shown = partition.keep_only(kept_rows, len(order) - members + number)
+    if partition.singles is not None:
+        shown = replace(shown, singles=partition.singles + number)
     return merged.with_tensors(tensors, extras), shown

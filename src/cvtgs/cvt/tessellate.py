@@ -22,7 +22,7 @@ class Tessellation:
 
     Attributes:
         labels: ``(n,)`` cell of every point, 0 to m - 1; every cell has a point.
-        sites: ``(m, d)`` sites that the labels belong to.
+        sites: ``(m, d)`` sites that the labels belong to, on the CPU.
         energies: ``sum w |x - site|^2`` before every move of Lloyd.
         energy: The same for the final labels, over all points.
         refilled: Cells that were empty and took a point from another cell.
@@ -80,14 +80,14 @@ def tessellate(
         own = torch.arange(count, device=home)
         return Tessellation(
             labels=own,
-            sites=points.double(),
+            sites=points.double().cpu(),
             energies=(0.0,),
             energy=0.0,
             refilled=0,
             backend=SEARCH,
         )
     nearest = choose_search(has_duplicates=has_duplicates)
-    points, weights = points.cpu(), weights.cpu()  # where the tree is
+    points, weights = to_host(points, weights)  # where the tree is
     seeds = choose_seeds(weights, count, config=config, seed=seed)
     sample, sample_weights = sample_points(points, weights, config.samples_per_site * count)
     settled = lloyd(
@@ -104,12 +104,22 @@ def tessellate(
     labels, squared, refilled = fill_empty_cells(labels, weights, squared, count)
     return Tessellation(
         labels=labels.to(home),
-        sites=sites.to(home),
+        sites=sites,
         energies=settled.energies,
         energy=float((weights * squared).sum()),
         refilled=refilled,
         backend=SEARCH,
     )
+
+
+def to_host(
+    points: Float[Tensor, "n d"], weights: Float[Tensor, "n"]
+) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n"]]:
+    """Return points and weights on the CPU; from a device they go there in one piece."""
+    if points.device.type == "cpu":
+        return points, weights
+    table = torch.cat([points.double(), weights.double()[:, None]], dim=1).cpu()
+    return table[:, :-1].to(points.dtype), table[:, -1].to(weights.dtype)
 
 
 def choose_search(*, has_duplicates: bool) -> NearestSite:

@@ -1,15 +1,12 @@
-"""Consecutive runs of rows (CSR segments): partitions, gathering, deterministic reductions."""
+"""Consecutive runs of rows (CSR segments): gathering, deterministic reductions."""
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, Self
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-
-from cvtgs.errors import InvalidArgumentError
 
 
 def sort_by_label(
@@ -34,6 +31,13 @@ def sort_by_label(
     return order, torch.searchsorted(ascending, starts)
 
 
+def true_rows(mask: Bool[Tensor, "n"], count: int | None = None) -> Int[Tensor, "k"]:
+    """Return the rows where a mask is true; a device is not waited for if it is known how many."""
+    if count is None or mask.device.type == "cpu":
+        return mask.nonzero()[:, 0]
+    return torch.sort(~mask, stable=True).indices[:count]
+
+
 def gather_columns(
     rows: Int[Tensor, "r"], *tables: Float[Tensor, "n c"]
 ) -> tuple[Float[Tensor, "r c"], ...]:
@@ -55,6 +59,31 @@ def gather_columns(
     for table in tables:
         found.append(table.T.gather(1, rows.expand(table.shape[1], -1)).T)
     return tuple(found)
+
+
+def running_sums(values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Return sums of all values up to each; every run on a device gives the same bits.
+
+    CUDA's own running sums of floating-point numbers add in any order. There, values are added
+    to those 1, 2, 4, ... places further on (Hillis and Steele 1986).
+
+    Args:
+        values: Numbers.
+
+    Returns:
+        As many sums; the last one is that of all.
+
+    Example:
+        >>> running_sums(torch.tensor([1.0, 2.0, 4.0])).tolist()
+        [1.0, 3.0, 7.0]
+    """
+    if values.device.type == "cpu":
+        return values.cumsum(0)
+    step = 1
+    while step < len(values):
+        values = torch.cat([values[:step], values[step:] + values[:-step]])
+        step *= 2
+    return values
 
 
 def label_sums(
@@ -236,158 +265,3 @@ class _SumOfRuns(torch.autograd.Function):
         offsets, weights = ctx.saved_tensors
         spread = grad.index_select(0, segment_ids(offsets, ctx.total))
         return spread if weights is None else spread * weights[:, None], None, None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Partition:
-    """Members of every cell in compressed (CSR) form.
-
-    Attributes:
-        order: ``(n,)`` row numbers, those of one cell next to one another.
-        offsets: ``(m + 1,)`` where each cell starts in ``order``, and the end of the last one.
-    """
-
-    order: Int[Tensor, "n"]
-    offsets: Int[Tensor, "m_plus_1"]
-
-    @classmethod
-    def from_labels(cls, labels: Int[Tensor, "n"], count: int) -> Self:
-        """Build the partition of labelled rows.
-
-        Args:
-            labels: Cell of every row, 0 to ``count - 1``.
-            count: Number of cells.
-
-        Returns:
-            The partition; the members of a cell keep their order.
-
-        Raises:
-            InvalidArgumentError: A label is out of range, or a cell has no member.
-
-        Example:
-            >>> Partition.from_labels(torch.tensor([1, 0, 1]), 2).order.tolist()
-            [1, 0, 2]
-        """
-        order, offsets = sort_by_label(labels, count)
-        ends, empty = labels.aminmax() if len(labels) else (), offsets.diff() == 0
-        *found, missing = torch.stack([*ends, empty.sum()]).tolist()  # a device is asked only once
-        if found and (found[0] < 0 or found[1] >= count):
-            raise InvalidArgumentError(
-                f"labels must be between 0 and {count - 1}, found {found[0]} to {found[1]}."
-            )
-        if missing:
-            first = int(empty.nonzero()[0])
-            raise InvalidArgumentError(
-                f"every cell needs a member; {missing} have none, the first is {first}."
-            )
-        return cls(order=order, offsets=offsets)
-
-    def __len__(self) -> int:
-        """Return the number of cells."""
-        return len(self.offsets) - 1
-
-    @property
-    def counts(self) -> Int[Tensor, "m"]:
-        """Members of every cell."""
-        return self.offsets.diff()
-
-    def labels(self, count: int) -> Int[Tensor, "n"]:
-        """Return the cell of every row, the inverse of :meth:`from_labels`.
-
-        Args:
-            count: Number of rows.
-
-        Returns:
-            Cells, int32; -1 for rows that belong to none.
-
-        Example:
-            >>> Partition.from_labels(torch.tensor([1, 0, 1]), 2).labels(4).tolist()
-            [1, 0, 1, -1]
-        """
-        cells = torch.arange(len(self), dtype=torch.int32, device=self.order.device)
-        found = cells.new_full((count,), -1)
-        found[self.order] = torch.repeat_interleave(cells, self.counts)
-        return found
-
-    def select(self, cells: Int[Tensor, "k"] | Bool[Tensor, "m"]) -> Self:
-        """Keep some cells.
-
-        Args:
-            cells: The cells to keep, ascending, or a mask of them.
-
-        Returns:
-            Their partition, in the same order.
-        """
-        counts = self.counts
-        if cells.dtype == torch.bool:
-            cells = cells.nonzero()[:, 0]
-        is_kept = torch.zeros_like(counts, dtype=torch.bool).index_fill(0, cells, value=True)
-        members = torch.repeat_interleave(is_kept, counts, output_size=len(self.order))
-        offsets = torch.nn.functional.pad(counts[cells].cumsum(0), (1, 0))
-        return type(self)(order=self.order[members], offsets=offsets)
-
-    def keep_only(self, rows: Int[Tensor, "m"]) -> Self:
-        """Keep one member of some cells.
-
-        Args:
-            rows: The row number of the member to keep; -1 keeps all members of a cell.
-
-        Returns:
-            The partition of the same cells.
-
-        Example:
-            >>> whole = Partition.from_labels(torch.tensor([1, 0, 1]), 2)
-            >>> whole.keep_only(torch.tensor([-1, 2])).order.tolist()
-            [1, 2]
-        """
-        counts = self.counts
-        kept = torch.repeat_interleave(rows, counts, output_size=len(self.order))
-        offsets = torch.nn.functional.pad(torch.where(rows < 0, counts, 1).cumsum(0), (1, 0))
-        return type(self)(order=self.order[(kept < 0) | (kept == self.order)], offsets=offsets)
-
-    def cut(self, run: slice) -> Self:
-        """Keep some consecutive cells.
-
-        Args:
-            run: From which cell to which, at least one.
-
-        Returns:
-            Their partition; its order is a view.
-        """
-        if run.start == 0 and run.stop >= len(self):
-            return self
-        ends = self.offsets[run.start : run.stop + 1]
-        return type(self)(order=self.order[int(ends[0]) : int(ends[-1])], offsets=ends - ends[0])
-
-    def to(self, device: torch.device) -> Self:
-        """Move the partition to a device.
-
-        Args:
-            device: Where to.
-
-        Returns:
-            The partition there.
-        """
-        return type(self)(order=self.order.to(device), offsets=self.offsets.to(device))
-
-    def chunks(self, max_members: int, *, cell_cost: int = 0) -> Iterator[tuple[slice, Self]]:
-        """Cut the partition into runs of cells, to bound memory.
-
-        Args:
-            max_members: Members of one run at most; a larger cell is a run of its own.
-            cell_cost: A cell counts as this many members more than it has.
-
-        Yields:
-            The cells of the run, and their partition.
-        """
-        if len(self) and len(self.order) + cell_cost * len(self) <= max_members:
-            yield slice(0, len(self)), self
-            return
-        first, costs = 0, self.offsets.cpu()
-        if cell_cost:
-            costs = costs + cell_cost * torch.arange(len(costs))
-        while first < len(self):
-            fitting = torch.searchsorted(costs, costs[first] + max_members, right=True)
-            last = max(first + 1, int(fitting) - 1)
-            yield slice(first, last), self.cut(slice(first, last))
-            first = last

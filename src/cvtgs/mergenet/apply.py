@@ -68,8 +68,8 @@ def correct_cells(
     """
     counts = partition.counts
     sizes = counts if sizes is None else sizes
-    cells = (counts > 1).nonzero()[:, 0]
-    several = partition.select(cells)
+    cells = partition.several()
+    several = partition.select_several(cells)
     done = len(counts) - len(cells)
     originals = merged.tensors()
     tensors = {name: values.clone() for name, values in originals.items() if values.numel()}

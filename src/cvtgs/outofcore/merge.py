@@ -144,7 +144,7 @@ def correct(job: Job, block: int) -> None:
     report = BlockReport(
         input_count=len(scene),
         mass_out=float(small.masses.sum()),
-        single_member_cells=int((shown.counts == 1).sum()),
+        single_member_cells=shown.count_singles(),
         largest_cell=int(partition.counts.amax()),
         backend=cvt.SEARCH,
     )

@@ -1,6 +1,8 @@
 """Project Gaussians onto an image, in differentiable torch operations, by the rules of 3DGS."""
 
 from dataclasses import dataclass
+from itertools import chain
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -69,10 +71,31 @@ class Pinhole:
         return (x_low, x_high), (y_low, y_high)
 
 
+class CameraTensors(NamedTuple):
+    """Numbers of a camera beside the Gaussians that it sees; bounds are those of ``slopes``."""
+
+    rotation: Float[Tensor, "3 3"]
+    center: Float[Tensor, "3"]
+    focal: Float[Tensor, "2"]
+    principal: Float[Tensor, "2"]
+    low: Float[Tensor, "2"]
+    high: Float[Tensor, "2"]
+
+    @classmethod
+    def of(cls, camera: Pinhole, like: Tensor) -> "CameraTensors":
+        """Return the numbers in the dtype of a tensor, the centre in float64; one copy for all."""
+        low, high = zip(*camera.slopes, strict=True)
+        numbers = *camera.center, *chain(*camera.rotation), *camera.focal, *camera.principal
+        table = torch.tensor([*numbers, *low, *high], dtype=torch.float64, device=like.device)
+        rotation, *pairs = table[3:].to(like.dtype).split([9, 2, 2, 2, 2])
+        return cls(rotation.view(3, 3), table[:3], *pairs)
+
+
 def to_pinholes(cameras: Cameras) -> list[Pinhole]:
     """Return plain numbers of each camera, after checks."""
-    viewmats = cameras.viewmats.detach().double().cpu()
-    Ks = cameras.Ks.detach().double().cpu()  # noqa: N806 (the name that gsplat gives it)
+    both = cameras.viewmats.flatten(1).double(), cameras.Ks.flatten(1).double()
+    table = torch.cat(both, dim=1).detach().cpu()
+    viewmats, Ks = table[:, :16].view(-1, 4, 4), table[:, 16:].view(-1, 3, 3)  # noqa: N806 (as gsplat)
     _check(viewmats, Ks)
     centers = -torch.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[:, :, 0]
     return [
@@ -140,17 +163,17 @@ def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
     Memory with gradients: about ``(150 + 6 k) n`` numbers for n Gaussians in view with k rest
     coefficients.
     """
-    rows = _candidates(scene, camera)
-    offsets = _offsets(scene.means.index_select(0, rows), camera)
-    rotation = scene.means.new_tensor(camera.rotation)
-    local = offsets @ rotation.T
-    axes = _image_axes(scene, rows, local, camera)
+    beside = CameraTensors.of(camera, scene.means)
+    rows = _candidates(scene, camera, beside)
+    offsets = _offsets(scene.means.index_select(0, rows), beside)
+    local = offsets @ beside.rotation.T
+    axes = _image_axes(scene, rows, local, beside)
     ellipses, survival = _ellipses(axes, camera.dilation)
     opacities = parameters.opacity_from_logit(scene.logit_opacities.index_select(0, rows))
     if scene.antialiased:
         opacities = opacities * survival
     slopes = local[:, :2] / local[:, 2:]
-    centers = slopes * slopes.new_tensor(camera.focal) + slopes.new_tensor(camera.principal)
+    centers = slopes * beside.focal + beside.principal
     order = _front_to_back(centers, ellipses, opacities, local[:, 2], camera)
     return Splats(
         rows=rows[order],
@@ -185,17 +208,16 @@ def half_sizes(
     return (reach / steep + reach * shear * shear / flat).sqrt(), (reach / flat).sqrt()
 
 
-def _offsets(means: Float[Tensor, "n 3"], camera: Pinhole) -> Float[Tensor, "n 3"]:
+def _offsets(means: Float[Tensor, "n 3"], beside: CameraTensors) -> Float[Tensor, "n 3"]:
     """Return ways from the camera; far from the origin float32 holds them, but not the camera."""
-    center = torch.tensor(camera.center, dtype=torch.float64, device=means.device)
-    return (means.double() - center).to(means.dtype)
+    return (means.double() - beside.center).to(means.dtype)
 
 
 @torch.no_grad()
-def _candidates(scene: GaussianScene, camera: Pinhole) -> Tensor:
+def _candidates(scene: GaussianScene, camera: Pinhole, beside: CameraTensors) -> Tensor:
     """Return the rows whose bounding ball touches the image, without faint and invalid ones."""
-    rotation = scene.means.new_tensor(camera.rotation)
-    x, y, z = (_offsets(scene.means, camera) @ rotation.T).unbind(1)
+    rotation = beside.rotation
+    x, y, z = (_offsets(scene.means, beside) @ rotation.T).unbind(1)
     steepest = sum(max(abs(low), abs(high)) ** 2 for low, high in camera.slopes)
     stretch = rotation.norm() * max(camera.focal) * (1 + steepest) ** 0.5 / z
     deviation = stretch * scene.log_scales.amax(dim=1).exp()
@@ -215,14 +237,13 @@ def _candidates(scene: GaussianScene, camera: Pinhole) -> Tensor:
 
 
 def _image_axes(
-    scene: GaussianScene, rows: Tensor, local: Tensor, camera: Pinhole
+    scene: GaussianScene, rows: Tensor, local: Tensor, beside: CameraTensors
 ) -> Float[Tensor, "m 2 3"]:
     """Return ``M = J W R S``: the own axes of each Gaussian, to first order in the image."""
     quats = parameters.normalize_quats(scene.quats.index_select(0, rows))
-    turned = scene.means.new_tensor(camera.rotation) @ parameters.quats_to_matrices(quats)
-    low, high = scene.means.new_tensor(camera.slopes).unbind(1)
-    slopes = torch.minimum(torch.maximum(local[:, :2] / local[:, 2:], low), high)
-    stretch = scene.means.new_tensor(camera.focal) / local[:, 2:]
+    turned = beside.rotation @ parameters.quats_to_matrices(quats)
+    slopes = torch.minimum(torch.maximum(local[:, :2] / local[:, 2:], beside.low), beside.high)
+    stretch = beside.focal / local[:, 2:]
     jacobian = stretch[:, :, None] * (turned[:, :2] - slopes[:, :, None] * turned[:, 2:])
     return jacobian * torch.exp(scene.log_scales.index_select(0, rows))[:, None, :]
 

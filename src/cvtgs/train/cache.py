@@ -152,7 +152,7 @@ def _entry_count(tensors: Mapping[str, Tensor]) -> int:
 
 def _case(name: str, scene: GaussianScene, light: Tensor, tensors: Mapping[str, Tensor]) -> Case:
     partition = Partition(order=tensors["order"].long(), offsets=tensors["offsets"])
-    several = partition.counts > 1
+    cells = partition.several()
     return Case(
         scene_name=name,
         ratio=float(tensors["ratio"]),
@@ -163,8 +163,8 @@ def _case(name: str, scene: GaussianScene, light: Tensor, tensors: Mapping[str, 
             neighbors=tensors["neighbors"].long(),
             visibility=light,
         ),
-        cells=several.nonzero()[:, 0],
-        part=partition.select(several),
+        cells=cells,
+        part=partition.select_several(cells),
         descriptors=Descriptors(**under_prefix("seen/", tensors)),
     )
 

@@ -1,7 +1,8 @@
 """Training cases: scenes at a ratio, and images of full scenes as targets."""
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections import OrderedDict
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -28,6 +29,9 @@ from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import check_rows
 from cvtgs.views import mixed_views
+
+DEVICE_BYTES = 10**9
+"""Memory for copies on a device that does not say how much it has."""
 
 
 class MergedScene(NamedTuple):
@@ -96,10 +100,8 @@ class Case:
 
     def select(self, rows: Int[Tensor, "s"]) -> "Case":
         """Return the case of some of the cells."""
-        chosen = torch.zeros(len(self.cells), dtype=torch.bool, device=self.cells.device)
-        chosen[rows] = True
-        part = self.part.select(chosen)
-        return describe_case(self.scene_name, self.ratio, self.reference, self.cells[chosen], part)
+        part, cells = self.part.select(rows), self.cells[rows]
+        return describe_case(self.scene_name, self.ratio, self.reference, cells, part)
 
     def correct_cells(self, residuals: Residuals) -> dict[str, Tensor]:
         """Return the tensors of the corrected cells, differentiably."""
@@ -188,11 +190,11 @@ def make_case(
     if target >= len(scene):
         return None
     reference = merge_scene(scene, target, config)
-    several = reference.partition.counts > 1
-    cells = several.nonzero()[:, 0]
+    cells = reference.partition.several()
     if not len(cells):
         return None
-    return describe_case(scene_name, ratio, reference, cells, reference.partition.select(several))
+    part = reference.partition.select_several(cells)
+    return describe_case(scene_name, ratio, reference, cells, part)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -215,7 +217,7 @@ class TargetViews:
 
     def select(self, row: int) -> "TargetViews":
         """Return one of the images."""
-        rows = torch.tensor([row], device=self.cameras.Ks.device)
+        rows = torch.full((1,), row, device=self.cameras.Ks.device)  # without a copy
         return TargetViews(
             cameras=self.cameras.select(rows),
             rgb=self.rgb[row : row + 1],
@@ -227,6 +229,50 @@ class TargetViews:
         return TargetViews(
             cameras=self.cameras.to(device), rgb=self.rgb.to(device), alpha=self.alpha.to(device)
         )
+
+
+Item = TypeVar("Item", Case, TargetViews)
+
+
+class DeviceCopies:
+    """Copies of cases and images on a device; those that were asked for last stay there.
+
+    Args:
+        device: Where to.
+        room: Bytes that the copies may take together; None is half of what is free on CUDA, and
+            1 GB elsewhere.
+    """
+
+    def __init__(self, device: torch.device, room: int | None = None) -> None:
+        self.device, self._room = device, room or DEVICE_BYTES
+        if room is None and device.type == "cuda":
+            self._room = torch.cuda.mem_get_info(device)[0] // 2
+        # The originals are kept beside the copies, so that their numbers stay theirs.
+        self._copies: OrderedDict[int, tuple[Any, Any]] = OrderedDict()
+        self._taken = 0
+
+    def get(self, item: Item) -> Item:
+        """Return a copy on the device; the item itself if it is there."""
+        if self.device.type == "cpu":
+            return item
+        if id(item) not in self._copies:
+            self._taken += _byte_count(item)
+            while self._copies and self._taken > self._room:
+                self._taken -= _byte_count(self._copies.popitem(last=False)[1][0])
+            self._copies[id(item)] = item, item.to(self.device)
+        self._copies.move_to_end(id(item))
+        copied: Item = self._copies[id(item)][1]
+        return copied
+
+
+def _byte_count(value: Any) -> int:
+    """Return the bytes of all tensors in a value."""
+    if isinstance(value, Tensor):
+        return value.nbytes
+    if is_dataclass(value):
+        return sum(_byte_count(getattr(value, field.name)) for field in fields(value))
+    parts = value.values() if isinstance(value, dict) else value
+    return sum(map(_byte_count, parts)) if isinstance(value, (tuple, dict)) else 0
 
 
 def render_views(scene: GaussianScene, count: int, *, size: int, seed: int) -> TargetViews:

@@ -26,7 +26,7 @@ from cvtgs.mergenet import (
 )
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.train.cache import TrainingScene, prepare_scene
-from cvtgs.train.cases import Case, TargetViews
+from cvtgs.train.cases import Case, DeviceCopies, TargetViews
 from cvtgs.train.config import TrainConfig
 from cvtgs.train.losses import local_loss, published_loss, scene_loss, validation_psnr
 from cvtgs.train.sources import Source, find_sources
@@ -141,16 +141,17 @@ def train(
     cases, validation_scenes = _prepare_scenes(sources, config, files.cache, listener)
     if config.kind != "published":
         state.learn_range(summarize(case.descriptors) for case, _ in cases)
+    copies = DeviceCopies(device)
     if not state.history.validations:
-        _validate(state, validation_scenes, math.nan, config, files, device)
+        _validate(state, validation_scenes, math.nan, config, files, copies)
         on_validation(state.history)
     losses: list[float] = []
     while state.step < config.steps and state.history.since_best() < config.patience:
-        losses.append(_step(state, cases, config, files, device))
+        losses.append(_step(state, cases, config, files, copies))
         listener(ProgressEvent(stage="train", done=state.step, total=config.steps))
         if state.step % config.validate_every == 0 or state.step == config.steps:
             loss = sum(losses) / len(losses)
-            _validate(state, validation_scenes, loss, config, files, device)
+            _validate(state, validation_scenes, loss, config, files, copies)
             on_validation(state.history)
             losses = []
     return state.history
@@ -216,13 +217,13 @@ def _step(
     cases: Sequence[tuple[Case, tuple[TargetViews, ...]]],
     config: TrainConfig,
     files: TrainFiles,
-    device: torch.device,
+    copies: DeviceCopies,
 ) -> float:
     rng = random.Random(f"{config.seed}/{state.step}")
     case, views = rng.choice(cases)
     for group in state.optimizer.param_groups:
         group["lr"] = _learning_rate(config, state.step)
-    loss = _loss(state.net, case.to(device), views, config, rng)
+    loss = _loss(state.net, case, views, config, rng, copies)
     state.optimizer.zero_grad()
     loss.backward()
     length = torch.nn.utils.clip_grad_norm_(state.net.parameters(), LARGEST_GRADIENT)
@@ -245,13 +246,15 @@ def _loss(
     views: Sequence[TargetViews],
     config: TrainConfig,
     rng: random.Random,
+    copies: DeviceCopies,
 ) -> Tensor:
+    case = copies.get(case)
     if isinstance(net, PublishedMergeNet):
         return published_loss(net, case, config=config, rng=rng)
-    some_views = rng.choice(views).to(case.cells.device)
+    some_views = rng.choice(views)
     if config.kind == "local":
         return local_loss(net, case, config=config, rng=rng)
-    return scene_loss(net, case, some_views, config=config, rng=rng)
+    return scene_loss(net, case, copies.get(some_views), config=config, rng=rng)
 
 
 def _learning_rate(config: TrainConfig, step: int) -> float:
@@ -265,13 +268,13 @@ def _validate(
     loss: float,
     config: TrainConfig,
     files: TrainFiles,
-    device: torch.device,
+    copies: DeviceCopies,
 ) -> None:
     gains = []
     for scene in validation_scenes:
-        views = scene.views[0].to(device)
+        views = copies.get(scene.views[0])
         for case in scene.cases:
-            before, after = validation_psnr(state.mean_net, case.to(device), views)
+            before, after = validation_psnr(state.mean_net, copies.get(case), views)
             gains.append(Gain(scene=scene.name, ratio=case.ratio, decibels=after - before))
     history = state.history
     history.validations.append(Validation(step=state.step, loss=loss, gains=tuple(gains)))

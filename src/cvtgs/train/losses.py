@@ -68,7 +68,8 @@ def local_loss(
 ) -> Float[Tensor, ""]:
     """Compare images of single cells in a grid: members against the corrected Gaussian."""
     number = min(config.cells, len(case.cells))
-    rows = torch.tensor(sorted(rng.sample(range(len(case.cells)), number)))
+    drawn = sorted(rng.sample(range(len(case.cells)), number))
+    rows = torch.tensor(drawn, device=case.cells.device)
     chosen = case.select(rows)
     residuals: Residuals = net(chosen.descriptors)
     corrected = chosen.correct_cells(residuals)
@@ -243,12 +244,13 @@ class _Placement:
             dim=1,
         )
         zooms = torch.exp(math.log(2.0) * (draws[:, 2] - 0.5)) / TILE_WIDTH
-        like = merged.means
+        drawn = [parameters.normalize_quats(quats), zooms[:, None], positions]
+        turns, sizes, places = torch.cat(drawn, dim=1).to(merged.means).split([4, 1, 3], dim=1)
         return cls(
             centers=merged.means,
-            quats=parameters.normalize_quats(quats).to(like),
-            zooms=zooms.to(like) / merged.scales.amax(dim=1),
-            positions=positions.to(like),
+            quats=turns,
+            zooms=sizes[:, 0] / merged.scales.amax(dim=1),
+            positions=places,
         )
 
     def apply(

@@ -1,0 +1,184 @@
+"""Partition: the members of every cell, as consecutive runs of rows."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.math.segments import sort_by_label, true_rows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Partition:
+    """Members of every cell in compressed (CSR) form.
+
+    Attributes:
+        order: ``(n,)`` row numbers, those of one cell next to one another.
+        offsets: ``(m + 1,)`` where each cell starts in ``order``, and the end of the last one.
+        singles: Cells of one member, if the host knows; what it knows it need not wait for.
+    """
+
+    order: Int[Tensor, "n"]
+    offsets: Int[Tensor, "m_plus_1"]
+    singles: int | None = None
+
+    @classmethod
+    def from_labels(cls, labels: Int[Tensor, "n"], count: int) -> Self:
+        """Build the partition of labelled rows.
+
+        Args:
+            labels: Cell of every row, 0 to ``count - 1``.
+            count: Number of cells.
+
+        Returns:
+            The partition; the members of a cell keep their order.
+
+        Raises:
+            InvalidArgumentError: A label is out of range, or a cell has no member.
+
+        Example:
+            >>> Partition.from_labels(torch.tensor([1, 0, 1]), 2).order.tolist()
+            [1, 0, 2]
+        """
+        order, offsets = sort_by_label(labels, count)
+        ends, counts = labels.aminmax() if len(labels) else (), offsets.diff()
+        sums = (counts == 0).sum(), (counts == 1).sum()
+        *found, missing, singles = torch.stack([*ends, *sums]).tolist()  # asked only once
+        if found and (found[0] < 0 or found[1] >= count):
+            raise InvalidArgumentError(
+                f"labels must be between 0 and {count - 1}, found {found[0]} to {found[1]}."
+            )
+        if missing:
+            first = int((counts == 0).nonzero()[0])
+            raise InvalidArgumentError(
+                f"every cell needs a member; {missing} have none, the first is {first}."
+            )
+        return cls(order=order, offsets=offsets, singles=singles)
+
+    def __len__(self) -> int:
+        """Return the number of cells."""
+        return len(self.offsets) - 1
+
+    @property
+    def counts(self) -> Int[Tensor, "m"]:
+        """Members of every cell."""
+        return self.offsets.diff()
+
+    def count_singles(self) -> int:
+        """Return how many cells have one member."""
+        return int((self.counts == 1).sum()) if self.singles is None else self.singles
+
+    def labels(self, count: int) -> Int[Tensor, "n"]:
+        """Return the cell of every row, the inverse of :meth:`from_labels`.
+
+        Args:
+            count: Number of rows.
+
+        Returns:
+            Cells, int32; -1 for rows that belong to none.
+
+        Example:
+            >>> Partition.from_labels(torch.tensor([1, 0, 1]), 2).labels(4).tolist()
+            [1, 0, 1, -1]
+        """
+        cells = torch.arange(len(self), dtype=torch.int32, device=self.order.device)
+        found = cells.new_full((count,), -1)
+        found[self.order] = torch.repeat_interleave(cells, self.counts)
+        return found
+
+    def several(self) -> Int[Tensor, "k"]:
+        """Return the cells of several members, ascending."""
+        known = None if self.singles is None else len(self) - self.singles
+        return true_rows(self.counts > 1, known)
+
+    def select(self, cells: Int[Tensor, "k"], total: int | None = None) -> Self:
+        """Keep some cells.
+
+        Args:
+            cells: The cells to keep, ascending.
+            total: How many members they have, if that is known.
+
+        Returns:
+            Their partition, in the same order.
+        """
+        counts = self.counts
+        is_kept = torch.zeros_like(counts, dtype=torch.bool).index_fill(0, cells, value=True)
+        members = torch.repeat_interleave(is_kept, counts, output_size=len(self.order))
+        offsets = torch.nn.functional.pad(counts[cells].cumsum(0), (1, 0))
+        return type(self)(order=self.order[true_rows(members, total)], offsets=offsets)
+
+    def select_several(self, cells: Int[Tensor, "k"]) -> Self:
+        """Keep what :meth:`several` returned: all others have one member each."""
+        return self.select(cells, len(self.order) - (len(self) - len(cells)))
+
+    def keep_only(self, rows: Int[Tensor, "m"], total: int | None = None) -> Self:
+        """Keep one member of some cells.
+
+        Args:
+            rows: The row number of the member to keep; -1 keeps all members of a cell.
+            total: How many members are kept in all, if that is known.
+
+        Returns:
+            The partition of the same cells.
+
+        Example:
+            >>> whole = Partition.from_labels(torch.tensor([1, 0, 1]), 2)
+            >>> whole.keep_only(torch.tensor([-1, 2])).order.tolist()
+            [1, 2]
+        """
+        counts = self.counts
+        kept = torch.repeat_interleave(rows, counts, output_size=len(self.order))
+        offsets = torch.nn.functional.pad(torch.where(rows < 0, counts, 1).cumsum(0), (1, 0))
+        members = true_rows((kept < 0) | (kept == self.order), total)
+        return type(self)(order=self.order[members], offsets=offsets)
+
+    def cut(self, run: slice) -> Self:
+        """Keep some consecutive cells.
+
+        Args:
+            run: From which cell to which, at least one.
+
+        Returns:
+            Their partition; its order is a view.
+        """
+        if run.start == 0 and run.stop >= len(self):
+            return self
+        ends = self.offsets[run.start : run.stop + 1]
+        return type(self)(order=self.order[int(ends[0]) : int(ends[-1])], offsets=ends - ends[0])
+
+    def to(self, device: torch.device) -> Self:
+        """Move the partition to a device.
+
+        Args:
+            device: Where to.
+
+        Returns:
+            The partition there.
+        """
+        return type(self)(order=self.order.to(device), offsets=self.offsets.to(device))
+
+    def chunks(self, max_members: int, *, cell_cost: int = 0) -> Iterator[tuple[slice, Self]]:
+        """Cut the partition into runs of cells, to bound memory.
+
+        Args:
+            max_members: Members of one run at most; a larger cell is a run of its own.
+            cell_cost: A cell counts as this many members more than it has.
+
+        Yields:
+            The cells of the run, and their partition.
+        """
+        if len(self) and len(self.order) + cell_cost * len(self) <= max_members:
+            yield slice(0, len(self)), self
+            return
+        first, costs = 0, self.offsets.cpu()
+        if cell_cost:
+            costs = costs + cell_cost * torch.arange(len(costs))
+        while first < len(self):
+            fitting = torch.searchsorted(costs, costs[first] + max_members, right=True)
+            last = max(first + 1, int(fitting) - 1)
+            yield slice(first, last), self.cut(slice(first, last))
+            first = last
