@@ -45,7 +45,7 @@ def checked_box(low: Sequence[float], high: Sequence[float], name: str) -> Box:
         return Box.model_validate({"min": tuple(low), "max": tuple(high)})
     except pydantic.ValidationError as error:
         raise InvalidArgumentError(
-            f"{name} must have finite numbers, none of the first three above those that follow, "
+            f"{name} must be six finite numbers, the least x, y, z and then the largest, "
             f"found {', '.join(f'{number:g}' for number in (*low, *high))}."
         ) from error
 

@@ -262,7 +262,7 @@ def test_what_cannot_be_chosen_by(model):
     for seconds in (0.0, -1.0, math.inf, math.nan):
         with pytest.raises(InvalidArgumentError, match="the time must be above 0 and finite"):
             choose_preset(work, seconds, model=model)
-    with pytest.raises(InvalidArgumentError, match="a size knows its target"):
+    with pytest.raises(InvalidArgumentError, match="a Work has its target"):
         choose_preset(work, 1.0, rho=0.1, model=model)
     with pytest.raises(ConfigError, match="whose cost was measured; found 'paper'"):
         model.seconds("paper", work)

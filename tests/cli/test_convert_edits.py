@@ -73,7 +73,7 @@ def test_edits_are_in_the_axes_of_a_ply(tmp_path: Path, scene: GaussianScene) ->
     ("words", "said"),
     [
         (["--crop-box", "1,2,3"], "--crop-box must be six numbers x,y,z,X,Y,Z, the least and the"),
-        (["--crop-box", "1,0,0,0,1,1"], "--crop-box must have finite numbers, none of the first"),
+        (["--crop-box", "1,0,0,0,1,1"], "--crop-box must be six finite numbers, the least"),
         (["--crop-sphere", "0,0,0,-1"], "a radius of at least 0"),
         (["--crop-sphere", "0,0,0,0"], "at least one Gaussian must be left to be written, found n"),
         (["--min-opacity", "2"], "--min-opacity must be from 0 to 1, found 2.0."),

@@ -231,7 +231,7 @@ def test_extra_columns_and_other_formats(tmp_path):
     ("settings", "problem"),
     [
         ({"refine": {"seconds": 3.0}}, "number of steps .* found 3 s"),
-        ({"visibility": {"views": 8}}, "not to weigh Gaussians; found 8 views"),
+        ({"visibility": {"views": 8}}, "not for weights; found 8 views"),
     ],
 )
 def test_images_that_blocks_cannot_use_are_refused(source, tmp_path, settings, problem):

@@ -298,7 +298,7 @@ def choose_preset(
     with, is never chosen. A preset fits only if 1.3 times its predicted seconds do.
 
     Args:
-        work: The scene, or its size; a size knows its target, and takes no ratio and no count.
+        work: The scene, or its size, which has its target and takes no ratio and no count.
         seconds: Wall-clock seconds from the scene in memory to the small scene in memory.
         rho: Ratio of Gaussians to keep, in (0, 1].
         count: Number of Gaussians to keep, instead of ``rho``.
@@ -326,7 +326,7 @@ def choose_preset(
     if isinstance(work, GaussianScene):
         work = Work.of(work, target_count(len(work), rho, count=count))
     elif rho is not None or count is not None:
-        raise InvalidArgumentError("a size knows its target: give neither rho nor count with it.")
+        raise InvalidArgumentError("rho and count go with a scene; a Work has its target.")
     known = cost_model() if model is None else model
     costs = {
         name: known.seconds(

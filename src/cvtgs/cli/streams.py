@@ -88,7 +88,7 @@ def read_transform(options: argparse.Namespace) -> tuple[float, ...] | None:
     if options.place is None and options.transform is None:
         return None
     if options.stream != "3dtiles" or None not in (options.place, options.transform):
-        raise InvalidArgumentError("--place or --transform, not both, goes with --stream 3dtiles.")
+        raise InvalidArgumentError("one of --place and --transform goes with --stream 3dtiles.")
     if options.transform is not None:
         numbers = _numbers(options.transform, "--transform", (16,))
         return check_transform(numbers)

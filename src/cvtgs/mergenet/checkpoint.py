@@ -133,8 +133,8 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
     digest = _digest(tensors, metadata["info"])
     if metadata.get("sha256") != digest:
         raise CheckpointError(
-            f"{name}: the checkpoint is damaged: its content has the hash {digest[:12]}..., "
-            f"it says {str(metadata.get('sha256'))[:12]}..."
+            f"{name}: the checkpoint is damaged: its content must have the hash "
+            f"{str(metadata.get('sha256'))[:12]}..., found {digest[:12]}..."
         )
     return Checkpoint(
         net=_build_net(info, tensors, name), info=info, name=printable(name), digest=digest

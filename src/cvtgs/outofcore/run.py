@@ -182,8 +182,8 @@ def check_config(config: SimplifyConfig, *, with_images: bool = True) -> None:
         )
     if config.uses_renders and not (config.match.enabled or config.refine.enabled):
         raise ConfigError(
-            "blocks take images of the scene to match or refine what was merged, not to weigh "
-            f"Gaussians; found {config.visibility.views} views and neither."
+            "blocks use images for matching and refinement only, not for weights; found "
+            f"{config.visibility.views} views without either: set visibility.views=0."
         )
     if config.refine.seconds:
         raise ConfigError(
