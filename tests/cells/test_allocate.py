@@ -151,6 +151,15 @@ def test_members_move_to_the_group_that_explains_them():
     assert found.tolist() == [0, 0, 1, 1, 1]
 
 
+def test_colour_counts_twice_its_weight_against_squared_distances():
+    """At 2 and 1 standard deviations: group 0 where ``4 + 6 v^2 < 1 + 6 (1 - v)^2``, v < 1/4."""
+    groups = points([0.0, 0.03], colors=[0.0, 1.0])
+    members = points([0.0, 0.03, 0.02, 0.02], colors=[0.0, 1.0, 0.24, 0.26])
+    config = AllocationConfig(color=1.0)
+    found = reassign(members, torch.tensor([0, 1, 1, 0]), groups, torch.tensor([[1], [0]]), config)
+    assert found.tolist() == [0, 1, 0, 1]
+
+
 def test_no_group_becomes_empty():
     members = points([0.0, 0.01, 0.02], size=0.1)
     labels = torch.tensor([0, 1, 2])

@@ -1,4 +1,4 @@
-"""A few hundred damaged files; ``nox -s fuzz`` reads a hundred thousand."""
+"""Damaged files and faults, a few of each; ``nox -s fuzz`` and ``nox -s faults`` do far more."""
 
 import gzip
 import io
@@ -169,3 +169,21 @@ def test_what_is_packed_is_damaged_inside(kind):
         with zipfile.ZipFile(io.BytesIO(damaged)) as archive:
             assert archive.testzip() is None
     assert seeds
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="forks and limits as Linux does")
+def test_every_fault_leaves_whole_files_or_none():
+    """By another process: forks of one that runs tests would inherit its threads."""
+    words = ["--kills", "6", "--pairs", "2", "--limits", "1", "--count", "2000"]
+    words += ["--commands", "plain", "blocks", "convert", "--seed", "7"]
+    path = os.pathsep.join([str(HERE), *filter(None, sys.path)])
+    done = subprocess.run(
+        [sys.executable, str(HERE / "faults.py"), *words],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert sum(int(part.split()[0]) for part in done.stdout.split(", ")) == 6 + 2 + 2

@@ -17,8 +17,6 @@ from cvtgs.io.sog.read import read_sog
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
 
-LOD_META = "lod-meta.json"
-
 _Size = Annotated[Whole, Field(ge=0, description="a whole number of at least 0")]
 _Object = Annotated[dict[str, Any], Field(description="a JSON object")]
 
