@@ -23,7 +23,6 @@ from torch import Tensor
 
 import cvtgs
 from cvtgs.cameras import Cameras
-from cvtgs.errors import CvtgsError
 from cvtgs.evaluation import fit_cameras, load_photographs
 from cvtgs.evaluation.scorer import Color
 
@@ -168,20 +167,10 @@ def find_captures(root: Path, datasets: Sequence[Dataset] = DATASETS) -> Found:
 def read_test_views(capture: Capture) -> TestViews:
     """Read the held-out cameras of a scene and their photographs."""
     folder, dataset = capture.folder, capture.dataset
-    if (folder / "transforms_train.json").is_file() and not (
-        folder / "transforms_test.json"
-    ).is_file():
-        raise SystemExit(
-            f"{folder}: must hold the test split, transforms_test.json; "
-            f"found that of training only."
-        )
     images = _photograph_folder(folder, dataset.scenes[capture.name])
-    try:
-        cameras = cvtgs.load_cameras(sparse_folder(folder) or folder, split="test")
-        cameras = fit_cameras(cameras, images)
-        photographs = load_photographs(images, cameras, background=dataset.background)
-    except CvtgsError as error:
-        raise SystemExit(f"{capture.name}: {error}") from None
+    cameras = cvtgs.load_cameras(sparse_folder(folder) or folder, split="test")
+    cameras = fit_cameras(cameras, images)
+    photographs = load_photographs(images, cameras, background=dataset.background)
     return TestViews(cameras, photographs, images)
 
 

@@ -13,6 +13,7 @@ from benchmarks.quality import PhotographJudge
 from benchmarks.worlds import place_cameras
 from camera_files import NAMES, colmap_txt, transforms, write_json
 from cvtgs.cameras import Cameras
+from cvtgs.errors import CvtgsError
 from cvtgs.evaluation.scorer import Metrics
 
 HALF = (32, 24)
@@ -111,7 +112,7 @@ def score_of(capture: Capture) -> float:
 
 
 def refusal(capture: Capture) -> str:
-    with pytest.raises(SystemExit) as caught:
+    with pytest.raises((SystemExit, CvtgsError)) as caught:
         score_of(capture)
     text = str(caught.value)
     assert "\n" not in text

@@ -108,8 +108,8 @@ def test_a_dataset_without_a_test_split(root):
     lego = capture_of(root, "lego")
     (lego.folder / "transforms_test.json").unlink()
     assert refusal(lego) == (
-        f"{lego.folder}: must hold the test split, transforms_test.json; "
-        f"found that of training only."
+        f"{lego.folder}: must hold transforms_test.json for the split 'test', found "
+        f"transforms_train.json only; choose the other split, or none for all cameras."
     )
 
 
@@ -118,7 +118,7 @@ def test_photographs_without_a_camera_and_cameras_without_a_photograph(root):
     photograph = garden.folder / "images_4" / "frame_08.png"
     photograph.rename(photograph.with_name("another.png"))
     assert refusal(garden) == (
-        f"garden: {garden.folder / 'images_4'}: must hold a photograph of every camera; "
+        f"{garden.folder / 'images_4'}: must hold a photograph of every camera; "
         f"1 of 2 cameras have none, the first is 'frame_08.jpg'."
     )
 
@@ -128,7 +128,7 @@ def test_photographs_of_another_shape(root):
     for path in (garden.folder / "images_4").iterdir():
         Image.fromarray(np.zeros((24, 40, 3), np.uint8)).save(path)
     assert refusal(garden) == (
-        f"garden: {garden.folder / 'images_4'}: photographs must have the shape of the cameras' "
+        f"{garden.folder / 'images_4'}: photographs must have the shape of the cameras' "
         f"images, 64 x 48 or smaller, found 40 x 24."
     )
 

@@ -137,7 +137,8 @@ def test_splits_of_transforms(tmp_path) -> None:
     )
     path.rename(tmp_path / "transforms_train.json")
     assert camera_refusal(tmp_path, InputNotFoundError, split="test") == (
-        f"{tmp_path / 'transforms_test.json'}: the file to read must exist, found none."
+        f"{tmp_path}: must hold transforms_test.json for the split 'test', found "
+        f"transforms_train.json only; choose the other split, or none for all cameras."
     )
 
 
