@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 import cvtgs
+from benchmarks.device_search import search_table
 from benchmarks.measuring import machine, renew_tables
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.devices import device_name
@@ -55,6 +56,7 @@ def main() -> None:
             *refining_table(device, options.counts[0], rho=options.rho),
             *renderer_table(device, options.counts[0], size=options.size, runs=options.runs),
             *training_table(device, steps=options.steps),
+            *search_table(device, options.counts, axes=6, share=2 * options.rho),
         ]
     )
     print(text)

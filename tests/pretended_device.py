@@ -248,6 +248,7 @@ def pretended_cuda(*, largest: int | None = None) -> Iterator[Traffic]:
         "device_count": lambda: 1,
         "current_device": lambda: 0,
         "synchronize": lambda device=None: None,
+        "get_device_name": lambda device=None: "a pretended device",
         "get_device_properties": lambda device: SimpleNamespace(total_memory=64 << 30),
         "mem_get_info": lambda device=None: (32 << 30, 64 << 30),
     }

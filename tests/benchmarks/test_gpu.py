@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from benchmarks import gpu, numerics
+from benchmarks.device_search import nearest_by_boxes, sample
+from cvtgs.cvt import nearest_scipy
 from hard_cases import CASES
 from pretended_device import pretended_cuda
 
@@ -44,11 +46,42 @@ def quick_high() -> dict[str, object]:
 
 
 @pytest.mark.slow
-def test_stages_on_the_pretended_device():
+def test_the_page_of_the_pretended_device(tmp_path, monkeypatch):
+    page = page_at(tmp_path)
+    monkeypatch.setattr(gpu, "HIGH", quick_high())
+    monkeypatch.setattr(gpu, "CASE_COUNT", 400)
+    monkeypatch.setattr(sys, "argv", ["gpu", "--page", str(page), *TINY])
     with pretended_cuda():
-        lines = gpu.stage_table(torch.device("cuda"), [300], rho=0.1, runs=1)
-    assert any(line.startswith("| 300 | network | ") for line in lines)
-    assert "300: runs give the same bits; 0 of 30 Gaussians differ" in lines[-2]
+        gpu.main()
+    text = page.read_text(encoding="utf-8")
+    assert "a pretended device; CPU: " in text
+    assert "300: runs give the same bits; 0 of 30 Gaussians differ" in text
+    for start in ("300 | network", "300, 60", "torch", "scene", "local"):
+        assert f"\n| {start} | " in text
+
+
+@pytest.mark.parametrize("axes", [1, 3, 6])
+@pytest.mark.parametrize("count", [1, 5, 9, 100, 1000])
+def test_the_search_for_devices_finds_the_nearest(count, axes):
+    generator = torch.Generator().manual_seed(count)
+    sites, points = (torch.randn(n, axes, generator=generator) for n in (count, 300))
+    points = torch.cat([2 * points, sites[:50]])  # many lie outside, some are sites
+    labels, squared = nearest_scipy(points, sites)
+    found = nearest_by_boxes(points, sites)
+    assert torch.equal(found.labels, labels)
+    torch.testing.assert_close(found.squared, squared)
+
+
+def test_the_search_for_devices_compares_with_few():
+    points = sample(8000, 6, torch.device("cpu"))
+    assert nearest_by_boxes(points, points[::10]).compared < 200 * len(points)  # of 800
+
+
+def test_the_search_for_devices_names_the_first_of_equal_sites():
+    sites = torch.tensor([[1.0, 0.0], [0.0, 1.0]]).repeat(20, 1)
+    with pretended_cuda():
+        found = nearest_by_boxes(sites.to("cuda"), sites.to("cuda"))
+        assert found.labels.tolist() == [0, 1] * 20
 
 
 pytestmark = pytest.mark.slow

@@ -33,8 +33,9 @@ def test_known_labels():
 def test_select_keeps_order():
     partition = Partition.from_labels(torch.tensor([2, 0, 2, 1, 0]), 3)
     for total in (None, 4):
-        assert lists_of(partition.select(torch.tensor([0, 2]), total)) == [[1, 4], [0, 2]]
-    none = partition.select(torch.tensor([], dtype=torch.int64))
+        for cells in (torch.tensor([0, 2]), torch.tensor([True, False, True])):
+            assert lists_of(partition.select(cells, total)) == [[1, 4], [0, 2]]
+    none = partition.select(torch.tensor([False, False, False]))
     assert len(none) == 0
     assert lists_of(none) == []
     assert list(none.chunks(5)) == []

@@ -20,6 +20,11 @@ def test_argmax_names_the_first_of_equals():
     assert segments.segment_argmax(values, torch.tensor([0, 3, 5])).tolist() == [1, 3]
 
 
+def test_argmin_of_labels_names_the_first_of_equals():
+    values, labels = torch.tensor([3.0, 1.0, 5.0, 1.0]), torch.tensor([0, 2, 2, 2])
+    assert segments.label_argmin(values, labels, 4).tolist() == [0, 4, 1, 4]
+
+
 def test_sort_by_label_is_stable_and_knows_empty_labels():
     order, offsets = segments.sort_by_label(torch.tensor([2, 0, 2, 0, 2]), 4)
     assert order.tolist() == [1, 3, 0, 2, 4]

@@ -1,5 +1,7 @@
 """Training on a pretended CUDA device: the CPU's gains, and resumed bit for bit."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 
@@ -9,6 +11,8 @@ from cvtgs.train import History
 from cvtgs.train.cases import Case, DeviceCopies, make_case
 from pretended_device import DeviceTensor, pretended_cuda
 from train_cases import bits_of_state, run, small_scene, tiny_config, tiny_data, write_scenes
+
+SCENE_COPIES = 8
 
 
 @pytest.fixture
@@ -46,6 +50,28 @@ class PowerCutError(Exception):
 def stop_after_three(event: ProgressEvent) -> None:
     if event.stage == "train" and event.done == 3:
         raise PowerCutError
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_quick_curves")
+@pytest.mark.parametrize(
+    ("kind", "copies"), [("scene", SCENE_COPIES), ("local", 10), ("published", 11)]
+)
+def test_copies_of_a_step(kind, copies, tmp_path):
+    """An image is 2 copies, its loss and background 2; where cells lie is 3, which they are 1."""
+    scenes = write_scenes(tmp_path / "scenes", ["exam", "lesson"], 300)
+    changes = {"preset": "paper"} if kind == "published" else {}
+    config = tiny_config(tiny_data(scenes), kind=kind, steps=6, validate_every=6, **changes)
+    with pretended_cuda() as traffic:
+        seen: list[int] = []
+
+        def listen(event: ProgressEvent) -> None:
+            if event.stage == "train":
+                seen.append(traffic.copies.total())
+
+        run(config, tmp_path / "net.safetensors", device="cuda", listener=listen)
+    steps = [after - before for before, after in pairwise(seen)]
+    assert steps[-1] == min(steps) <= copies, traffic.copies
 
 
 @pytest.mark.slow

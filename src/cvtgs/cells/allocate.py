@@ -14,7 +14,7 @@ from cvtgs.config import AllocationConfig
 from cvtgs.devices import chunk_length, in_threads
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.parameters import normalize_quats, quats_to_matrices
-from cvtgs.math.segments import label_sums
+from cvtgs.math.segments import label_argmin, label_sums, smallest_rows
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
@@ -232,7 +232,7 @@ def _cheapest_disjoint(
     A pair that is the cheapest one of both its groups is taken, again and again: the same as to
     go through all pairs in order (Preis 1999), in few steps over all of them.
     """
-    order = _cheapest(costs, 6 * wanted)
+    order = smallest_rows(costs, 6 * wanted)
     first, second = first[order], second[order]
     ranks = torch.arange(len(order), device=order.device)
     taken = []
@@ -248,15 +248,6 @@ def _cheapest_disjoint(
         ranks = ranks[~(used[first[ranks]] | used[second[ranks]])]
     rows = torch.sort(torch.cat(taken)).values[:wanted]
     return first[rows], second[rows]
-
-
-def _cheapest(costs: Float[Tensor, "p"], count: int) -> Int[Tensor, "k"]:
-    """Return the cheapest, in ascending order, ties as they come; only those are sorted."""
-    if 2 * count >= len(costs) or costs.device.type != "cpu":
-        return torch.sort(costs, stable=True).indices[:count]
-    most = torch.kthvalue(costs, count).values
-    candidates = (~(costs > most)).nonzero()[:, 0]
-    return candidates[torch.sort(costs[candidates], stable=True).indices[:count]]
 
 
 def reassign(
@@ -318,11 +309,7 @@ def reassign(
 
     for _ in in_threads(search, range(0, len(labels), chunk), labels.device):
         pass
-    lowest = own_costs.new_full((count,), torch.inf).scatter_reduce(0, labels, own_costs, "amin")
-    rows = torch.arange(len(labels), device=labels.device)
-    rows = torch.where(own_costs == lowest.index_select(0, labels), rows, len(labels))
-    anchors = torch.full((count,), len(labels), device=labels.device)
-    anchors = anchors.scatter_reduce(0, labels, rows, "amin")
+    anchors = label_argmin(own_costs, labels, count)
     if must_stay is not None:
         anchors = torch.where(must_stay, anchors, len(labels))
     found[anchors] = own

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError
@@ -95,17 +95,19 @@ class Partition:
         known = None if self.singles is None else len(self) - self.singles
         return true_rows(self.counts > 1, known)
 
-    def select(self, cells: Int[Tensor, "k"], total: int | None = None) -> Self:
+    def select(self, cells: Int[Tensor, "k"] | Bool[Tensor, "m"], total: int | None = None) -> Self:
         """Keep some cells.
 
         Args:
-            cells: The cells to keep, ascending.
+            cells: The cells to keep, ascending, or a mask of them.
             total: How many members they have, if that is known.
 
         Returns:
             Their partition, in the same order.
         """
         counts = self.counts
+        if cells.dtype == torch.bool:
+            cells = cells.nonzero()[:, 0]
         is_kept = torch.zeros_like(counts, dtype=torch.bool).index_fill(0, cells, value=True)
         members = torch.repeat_interleave(is_kept, counts, output_size=len(self.order))
         offsets = torch.nn.functional.pad(counts[cells].cumsum(0), (1, 0))

@@ -10,7 +10,7 @@ from torch import Tensor
 from cvtgs.config import TessellationConfig
 from cvtgs.cvt.nearest import SEARCH, NearestSite, nearest_scipy, search_once_per_position
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.math.segments import label_sums, segment_argmax, sort_by_label
+from cvtgs.math.segments import label_argmin, label_sums, smallest_rows
 
 MIN_SAMPLES = 1 << 15
 """Lloyd never looks at fewer points than this to save time; so few cost next to nothing."""
@@ -179,14 +179,11 @@ def fill_empty_cells(
     if len(empty) == 0:
         return labels, squared, 0
     cost = weights * squared
-    order, offsets = sort_by_label(labels, count)
-    filled = torch.cat([offsets[:1], offsets[1:][members > 0]])
-    cheapest = order[segment_argmax(-cost[order], filled)]
+    cheapest = label_argmin(cost, labels, count)[members > 0]
     movable = torch.ones(len(labels), dtype=torch.bool, device=labels.device)
     movable[cheapest] = False
     candidates = movable.nonzero()[:, 0]
-    dearest = torch.sort(cost[candidates], stable=True, descending=True).indices[: len(empty)]
-    moved = candidates[dearest]
+    moved = candidates[smallest_rows(-cost[candidates], len(empty))]
     labels, squared = labels.clone(), squared.clone()
     labels[moved], squared[moved] = empty, 0.0
     return labels, squared, len(empty)

@@ -38,6 +38,15 @@ def true_rows(mask: Bool[Tensor, "n"], count: int | None = None) -> Int[Tensor, 
     return torch.sort(~mask, stable=True).indices[:count]
 
 
+def smallest_rows(values: Float[Tensor, "n"], count: int) -> Int[Tensor, "k"]:
+    """Return rows of the smallest values, ascending, ties as they come; only those are sorted."""
+    if 2 * count >= len(values) or values.device.type != "cpu":
+        return torch.sort(values, stable=True).indices[:count]
+    most = torch.kthvalue(values, count).values
+    candidates = (~(values > most)).nonzero()[:, 0]
+    return candidates[torch.sort(values[candidates], stable=True).indices[:count]]
+
+
 def gather_columns(
     rows: Int[Tensor, "r"], *tables: Float[Tensor, "n c"]
 ) -> tuple[Float[Tensor, "r c"], ...]:
@@ -110,6 +119,31 @@ def label_sums(
         return sums
     order, offsets = sort_by_label(labels, count)
     return torch.stack([segment_sum(column.double()[order], offsets) for column in columns], dim=1)
+
+
+def label_argmin(
+    values: Float[Tensor, "n"], labels: Int[Tensor, "n"], count: int
+) -> Int[Tensor, "m"]:
+    """Find the first row with the smallest value of each label.
+
+    Args:
+        values: One number per row, none of them NaN.
+        labels: Label of every row, 0 to ``count - 1``.
+        count: Number of labels, m.
+
+    Returns:
+        Row numbers; n for a label without rows.
+
+    Example:
+        >>> values, labels = torch.tensor([2.0, 1.0, 1.0]), torch.tensor([1, 1, 1])
+        >>> label_argmin(values, labels, 2).tolist()
+        [3, 1]
+    """
+    least = values.new_full((count,), torch.inf).scatter_reduce(0, labels, values, "amin")
+    rows = torch.arange(len(labels), device=labels.device)
+    rows = torch.where(values == least.index_select(0, labels), rows, len(labels))
+    none = torch.full((count,), len(labels), device=labels.device)
+    return none.scatter_reduce(0, labels, rows, "amin")
 
 
 def segment_sum(
