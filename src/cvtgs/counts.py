@@ -1,4 +1,4 @@
-"""How many Gaussians are left."""
+"""How many Gaussians to keep: ratios and counts as written, and shares of a count."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""Losses between rendered images and the images that they should be."""
+"""Losses between rendered images and their targets."""
 
 import math
 

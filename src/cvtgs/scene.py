@@ -1,4 +1,4 @@
-"""GaussianScene: the only thing that travels between the stages."""
+"""GaussianScene: the Gaussians of a scene, as files and optimisers store them."""
 
 import os
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Other people's texts in messages: names in files, comments, paths, whatever they contain."""
+"""Texts from files and users in messages: names, comments and paths, printable and short."""
 
 import json
 import re

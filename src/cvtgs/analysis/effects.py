@@ -227,7 +227,7 @@ def _plan_bands(scene: GaussianScene, choice: str | int) -> BandsEffect:
 
 
 def _by_share(share: float, choice: str, least: float, meaning: str) -> Effect:
-    """Decide on what needs a share above ``least``, or any share if it is forced on."""
+    """Decide on an effect: on above a share of ``least``, or of 0 if it is forced on."""
     return Effect(
         active=share > (least if choice == "auto" else 0.0) and choice != "off",
         figure=share,

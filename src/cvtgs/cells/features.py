@@ -1,4 +1,4 @@
-"""Descriptors: what MergeNet gets to see of a cell, nothing of which says where or how large it is.
+"""Descriptors: what MergeNet sees of a cell, relative to its position, rotation, size and colour.
 
 The values of one feature are one run of memory: sums of products over three components are then
 as fast as memory, and many times as fast as products of small matrices.

@@ -20,7 +20,7 @@ TIE = "\N{NO-BREAK SPACE}"
 
 
 def say(text: str, *, file: TextIO | None = None, end: str = "\n", flush: bool = False) -> None:
-    """Print a text, with what a terminal would obey or cannot show as escapes."""
+    """Print a text; control characters, and what the terminal cannot show, become escapes."""
     file = sys.stdout if file is None else file
     if file is None:  # closed by who started the process
         return
@@ -39,7 +39,7 @@ def flush_output() -> None:
 
 @contextmanager
 def _console_errors(file: TextIO) -> Iterator[None]:
-    """Turn the error of a full disk or a closed pipe into a sentence; stderr is not missed."""
+    """Raise a full disk or a closed pipe as an error of cvtgs; ignore it on stderr."""
     try:
         yield
     except OSError as error:

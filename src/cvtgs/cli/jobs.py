@@ -116,7 +116,7 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
 
 
 def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> None:
-    """Do the work for every scene, and say what came of it and where it is."""
+    """Do the work for every scene, and print the results and where they are."""
     first = jobs[0]
     if not first.is_one_of_many:
         _run_one(first, work)

@@ -185,7 +185,7 @@ class TrainState:
         self.averaged_steps = config.averaged_steps
 
     def learn_range(self, cases: Iterable[Tensor]) -> None:
-        """Tell both networks the range of the summaries of all cases."""
+        """Set the known range of both networks from the summaries of all cases."""
         if isinstance(self.net, MergeNet) and isinstance(self.mean_net, MergeNet):
             self.net.known.fit(cases)
             self.mean_net.known.load_state_dict(self.net.known.state_dict())
@@ -233,7 +233,7 @@ class TrainState:
             raise CheckpointError(f"{path}: the state of the training is damaged.") from error
 
     def _check_origin(self, path: Path, version: str, scenes: list[dict[str, Any]]) -> None:
-        """Refuse what would make the checkpoint say what is only true of its last steps."""
+        """Refuse a state of another version or of other scenes, which the checkpoint would not name."""
         if version != cvtgs.__version__:
             raise CheckpointError(
                 f"{path}: the state was made by cvtgs {version}, this is {cvtgs.__version__}; "
