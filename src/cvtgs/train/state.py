@@ -233,7 +233,7 @@ class TrainState:
             raise CheckpointError(f"{path}: the state of the training is damaged.") from error
 
     def _check_origin(self, path: Path, version: str, scenes: list[dict[str, Any]]) -> None:
-        """Refuse a state of another version or of other scenes, which the checkpoint would not name."""
+        """Refuse a state of another version or other scenes: the checkpoint names one of each."""
         if version != cvtgs.__version__:
             raise CheckpointError(
                 f"{path}: the state was made by cvtgs {version}, this is {cvtgs.__version__}; "
