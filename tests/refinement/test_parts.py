@@ -12,6 +12,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.config import Rates
 from cvtgs.evaluation import scorer as scorer_module
 from cvtgs.evaluation.scorer import BLACK, WHITE, Metrics, Scorer, ViewImage, render_view
+from cvtgs.math import parameters
 from cvtgs.refinement import RefineConfig
 from cvtgs.refinement import limits as limits_module
 from cvtgs.refinement.images import ImageBuffer, RefineViews, generated_views, split_views
@@ -266,9 +267,29 @@ def test_a_step_has_the_length_of_the_rate_times_the_scale_of_the_gaussian():
     moved = scene.sh0.clone()
     moved[:, 0, 0] -= 0.125 * scale
     torch.testing.assert_close(found.sh0, moved)
-    unit = scene.scales[1].mean().item()
-    assert (found.means - scene.means)[1, 2].item() == pytest.approx(0.25 * unit, rel=1e-4)
+    axes = scene.scales[1].clamp_min(0.1 * float(scene.scales[1].mean()))
+    along = parameters.rotation_matrices(scene.quats)[1].T @ (found.means - scene.means)[1]
+    torch.testing.assert_close(along.abs(), 0.25 * axes, rtol=1e-4, atol=1e-6)
+    assert float((found.means - scene.means)[1, 2]) > 0
     torch.testing.assert_close(found.log_scales, scene.log_scales)
+
+
+def test_a_disc_tilts_less_than_it_turns_and_moves_less_across_than_along():
+    """Axes of 1, 1 and 0.2: a tilt by 0.01 of a turn's unit is 0.2 / (1 - 0.04) of it."""
+    scene = random_scene(1, degree=0)
+    scene = scene.with_tensors({"log_scales": torch.tensor([[1.0, 1.0, 0.2]]).log()}, {})
+    rates = Rates(means=0.02, quats=0.01)
+    optimizer = SceneOptimizer(scene, rates, learning_rate_scale=torch.ones(1))
+    now = optimizer.scene()
+    slopes = torch.tensor([1.0, 2, 3]), torch.tensor([1.0, -2, 3, 5])
+    optimizer.step((now.means @ slopes[0] + now.quats @ slopes[1]).sum(), factor=1.0)
+    found = optimizer.scene()
+    start = parameters.normalize_quats(scene.quats)
+    back = start * torch.tensor([1.0, -1, -1, -1])
+    turned = parameters.multiply_quats(back, found.quats)[0, 1:].abs()
+    torch.testing.assert_close(turned, 0.01 * torch.tensor([0.2 / 0.96, 0.2 / 0.96, 1]))
+    moved = parameters.rotation_matrices(scene.quats)[0].T @ (found.means - scene.means)[0]
+    torch.testing.assert_close(moved.abs(), 0.02 * torch.tensor([1.0, 1, 0.2]))
 
 
 def test_rows_without_a_gradient_keep_their_bits_and_their_momentum():

@@ -18,11 +18,11 @@ WILD = Rates(means=50, quats=5, log_scales=5, logit_opacities=50, sh0=50, shN=50
 
 def test_wrong_colours_are_mended():
     full = full_scene()
-    refined = refine(discolored(full), full, steps=60, config=quick())
+    refined = refine(discolored(full), full, steps=40, config=quick())
     report = refined.report
     assert report.gain > 1
     assert report.psnr_after == pytest.approx(report.psnr_before + report.gain)
-    assert (report.steps, report.stopped, report.heldout) == (60, "steps", 4)
+    assert (report.steps, report.stopped, report.heldout) == (40, "steps", 4)
     assert 0 < report.changed_count <= 500
     before, after = (
         (scene.sh0 - full.sh0).abs().mean() for scene in (discolored(full), refined[0])

@@ -7,11 +7,13 @@ import torch
 from torch import Tensor
 
 import cvtgs
+from cvtgs.cameras import Cameras, look_at
 from cvtgs.math import parameters
 from cvtgs.refinement.images import generated_views
 from cvtgs.views import automatic_views, find_view_positions, mixed_views, random_views
 from cvtgs.views.layout import find_layout
 from cvtgs.views.mixed import NEAR
+from cvtgs.views.scoring import splat_sizes
 from cvtgs.views.up import Voxels, find_up
 
 HALF = math.sqrt(0.5)
@@ -116,6 +118,35 @@ def test_a_wall_that_was_seen_from_one_side_is_looked_at_from_there():
     scene = blobs(means, math.log(0.02) + 5.0 * means[:, 2])
     eyes = random_views(scene, 48, size=32, seed=0).centers
     assert float((eyes[:, 2] < 0).double().mean()) > 0.9
+
+
+def test_splats_are_as_large_as_they_are_in_the_image():
+    """Near ones are 0.1 wide at a distance of 2, far ones 0.1 at 4 and hardly seen: 50 / 2 * 0.1."""
+    means = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [0, 0, 2]])
+    layout = find_layout(blobs(means, torch.tensor([0.1, 0.1, 0.1]).log()))
+    cameras = Cameras(
+        viewmats=look_at(
+            torch.tensor([[0.0, 0, -2]]).double(), torch.zeros(1, 3).double(), DOWN.double()
+        ),
+        Ks=torch.tensor([[[50.0, 0, 50], [0, 50, 50], [0, 0, 1]]]).double(),
+        width=100,
+        height=100,
+    )
+    assert splat_sizes(layout, cameras).tolist() == pytest.approx([0.5 * 0.1 / 2], rel=1e-5)
+
+
+def test_where_splats_are_large_hardly_any_view_is():
+    """Half of a ball is of large and of tiny Gaussians, as large in the mean as those elsewhere."""
+    means = sphere(4000)
+    large = torch.rand(4000, generator=torch.Generator().manual_seed(1)) < 0.5
+    factors = torch.where(large, 6.0, 1 / 6).where(means[:, 0] > 0, 1.0)
+    positions = find_view_positions(blobs(means, (0.05 * factors).log()))
+
+    def share(cameras):
+        return float((cameras.centers[:, 0] > 0).double().mean())
+
+    assert share(random_views(positions, 64, size=32, seed=0)) > 0.5
+    assert share(mixed_views(positions, 32, size=32)) < 0.2
 
 
 def test_same_scene_same_positions():

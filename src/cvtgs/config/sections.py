@@ -193,8 +193,8 @@ class Rates(Section):
     """The first steps of every parameter where all images agree; 0 leaves it as it is.
 
     Attributes:
-        means: Positions, in mean standard deviations of each Gaussian.
-        quats: Unit quaternions.
+        means: Positions along the axes of each Gaussian, in their standard deviations.
+        quats: Rotations about these axes, half radians; less where the other two axes differ.
         log_scales: Logarithms of the standard deviations.
         logit_opacities: Opacity logits.
         sh0: Constant colours.

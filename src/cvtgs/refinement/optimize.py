@@ -23,6 +23,9 @@ from cvtgs.validity import standardized, valid_rows, with_finite_opacities
 
 STAGE = "refine"
 
+THINNEST = 0.1
+"""Axes thinner than this share of the mean count as so thick: in images they are, too."""
+
 _BETAS = (0.6, 0.99)
 _LEAST_ROOT = 1e-15
 
@@ -123,6 +126,7 @@ class SceneOptimizer:
         start = with_finite_opacities(scene).tensors()
         self._start = start | {"quats": parameters.normalize_quats(start["quats"])}
         self._units = _units(scene, learning_rate_scale)
+        self._frames = parameters.rotation_matrices(self._start["quats"])
         self._changes = {
             name: torch.zeros_like(tensor, requires_grad=True)
             for name, tensor in self._start.items()
@@ -142,10 +146,11 @@ class SceneOptimizer:
 
     def scene(self) -> GaussianScene:
         """Return the scene, differentiable in the changes."""
-        tensors = {
-            name: start + self._changes[name] * self._units[name]
-            for name, start in self._start.items()
-        }
+        shifts = {name: change * self._units[name] for name, change in self._changes.items()}
+        means = (self._frames @ shifts["means"][:, :, None])[:, :, 0]
+        turns = parameters.multiply_quats(self._start["quats"], shifts["quats"])
+        shifts |= {"means": means, "quats": turns}
+        tensors = {name: start + shifts[name] for name, start in self._start.items()}
         return self._scene.with_tensors(tensors, self._scene.extras)
 
     def step(self, loss: Tensor, *, factor: float) -> None:
@@ -183,10 +188,23 @@ class SceneOptimizer:
 
 
 def _units(scene: GaussianScene, scale: Float[Tensor, "n"]) -> dict[str, Tensor]:
-    """Return the length of one unit of change; positions use the mean standard deviation."""
-    widths = torch.where(scale > 0, torch.exp(scene.log_scales).mean(dim=1), 0.0)
+    """Return the length of one unit of change.
+
+    Positions and rotations change in the frame of each Gaussian, where a unit changes its density
+    equally along each axis, as in the metric of Fisher: a position by the standard deviation, a
+    rotation of two axes by ``ab / |a^2 - b^2|``, at most 1. A needle moves as far along itself as
+    a ball, and much less across.
+    """
+    axes = torch.where((scale > 0)[:, None], torch.exp(scene.log_scales), 0.0)
+    axes = torch.maximum(axes, THINNEST * axes.mean(dim=1, keepdim=True))
+    first, second = axes[:, [1, 2, 0]], axes[:, [2, 0, 1]]
+    squares = (first.square() - second.square()).abs()
+    turns = (first * second / squares.clamp_min(1e-30)).clamp_max(1.0)
     units = {name: _like(scale, tensor) for name, tensor in scene.tensors().items()}
-    return units | {"means": (scale * widths)[:, None]}
+    return units | {
+        "means": scale[:, None] * axes,
+        "quats": scale[:, None] * torch.nn.functional.pad(turns, (1, 0)),
+    }
 
 
 def _rows_to_move(gradients: tuple[Tensor, ...]) -> Tensor:

@@ -10,6 +10,13 @@ from cvtgs.cameras import Cameras, look_at
 from cvtgs.scene import SceneLike
 from cvtgs.views.automatic import automatic_views
 from cvtgs.views.positions import CameraPositions, as_positions
+from cvtgs.views.scoring import splat_sizes
+
+TRIED = 3
+"""Views that are tried for each that is returned."""
+
+BLURRED = 2.0
+"""Views are blurred whose splats are so many times as large as in the sharpest quarter of them."""
 
 NEAR = (0.2, 1.4)
 """Distances of near views, robust radii: some are within the scene."""
@@ -89,7 +96,8 @@ def mixed_views(
     """Return automatic and random views together.
 
     A quarter are automatic views, a quarter random views from near, within the scene too, and
-    half random views from around it.
+    half random views from around it. Of each kind three times as many are tried, and those that
+    show large splats come last: where no image was taken, a scene is a fog from which nobody looks.
 
     Args:
         scene: A scene with at least one valid Gaussian, or what :func:`find_view_positions` found
@@ -112,14 +120,26 @@ def mixed_views(
     """
     positions = as_positions(scene)
     usual, near = max(1, count // 4), count // 4
-    groups = [
-        automatic_views(positions, usual, width=size, height=size, seed=seed),
-        random_views(positions, near, size=size, seed=seed + 1, reach=NEAR),
-        random_views(positions, max(0, count - usual - near), size=size, seed=seed),
+    far = max(0, count - usual - near)
+    tried = [
+        (automatic_views(positions, TRIED * usual, width=size, height=size, seed=seed), usual),
+        (random_views(positions, TRIED * near, size=size, seed=seed + 1, reach=NEAR), near),
+        (random_views(positions, TRIED * far, size=size, seed=seed), far),
     ]
+    groups = [_sharp_ones(positions, cameras, wanted) for cameras, wanted in tried]
     return Cameras(
         viewmats=torch.cat([group.viewmats for group in groups]),
         Ks=torch.cat([group.Ks for group in groups]),
         width=size,
         height=size,
     )
+
+
+def _sharp_ones(positions: CameraPositions, cameras: Cameras, count: int) -> Cameras:
+    """Return the first views that are not blurred; the least blurred others if those are too few."""
+    if count == 0:
+        return cameras
+    sizes = splat_sizes(positions.layout, cameras)
+    least = BLURRED * sizes.quantile(0.25)
+    kept = sizes.clamp_min(least).sort(stable=True).indices[:count].sort().values
+    return cameras.select(kept)

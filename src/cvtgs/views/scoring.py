@@ -8,7 +8,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.math import parameters
-from cvtgs.rendering import render
+from cvtgs.rendering import observe, render
 from cvtgs.views.layout import SceneLayout
 from cvtgs.views.up import VOXEL_SIZE
 
@@ -71,6 +71,28 @@ def score_cameras(
         penalties=penalties,
         visible=_visible_voxels(layout, small, images.alpha, depth=depth),
     )
+
+
+def splat_sizes(layout: SceneLayout, cameras: Cameras) -> Float[Tensor, "c"]:
+    """Return the median size of what each camera shows, as a share of the image, float64.
+
+    Half of the image is painted by Gaussians of smaller projected standard deviations.
+    """
+    sample, side = layout.sample, max(cameras.width, cameras.height)
+    factor = PIXELS / side
+    small = cameras.resized(
+        max(8, round(factor * cameras.width)), max(8, round(factor * cameras.height))
+    )
+    widths = sample.log_scales.double().sort(dim=1).values[:, 1:].mean(dim=1).exp()
+    found = []
+    for camera in small.singles():
+        painted = observe(sample, camera).contributions.double()
+        ahead = sample.means.double() @ camera.viewmats[0, 2, :3] + camera.viewmats[0, 2, 3]
+        sizes, order = (widths / ahead.clamp_min(1e-9)).sort()
+        shares = painted[order].cumsum(dim=0)
+        middle = torch.searchsorted(shares, 0.5 * shares[-1])
+        found.append(sizes[middle] * camera.Ks[0, 0, 0] / PIXELS)
+    return torch.stack(found)
 
 
 def _inside_gaussians(layout: SceneLayout, cameras: Cameras) -> Bool[Tensor, "c"]:
