@@ -1,6 +1,6 @@
 """What presets and settings gain over ``standard`` in views from all around, by their height.
 
-``python -m benchmarks.heights FILES --rho 0.1 high max "standard refine.steps=100"`` scores each
+``python -m benchmarks.heights FILES --rho 0.1 high "standard refine.steps=100"`` scores each
 variant (a preset, and settings after it) in twelve random directions at nine heights, from below
 and from inside the ground too, by cvtgs' own renderer, and prints Markdown. Few views mislead
 where some of them stand inside solid ground: there, PSNR changes by tens of decibels.

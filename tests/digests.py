@@ -98,7 +98,7 @@ CASES = {
     **{
         f"{kind} {name}": partial(refined, kind, name)
         for kind in ("object", "landscape")
-        for name in ("matched", "high", "max")
+        for name in ("matched", "high")
     },
     **{f"{kind} protected": partial(protected, kind) for kind in KINDS},
     **{f"{kind} levels": partial(levels, kind) for kind in KINDS},

@@ -12,7 +12,7 @@ import torch
 import digests
 
 RECORDED = json.loads(digests.FILE.read_text(encoding="utf-8"))
-DEAR = ("large", "matched", "high", "max", "block")
+DEAR = ("large", "matched", "high", "block")
 CASES = [
     pytest.param(name, marks=[pytest.mark.slow] * any(word in name for word in DEAR))
     for name in digests.CASES

@@ -206,7 +206,7 @@ def simplify(
         rho: Ratio of Gaussians to keep, in (0, 1].
         count: Number of Gaussians to keep, instead of ``rho``.
         max_count: Number to keep if there are more; a smaller scene stays as it is.
-        preset: Name of the preset, from ``draft``, the fastest, to ``max``, the best.
+        preset: Name of the preset, from ``draft``, the fastest, to ``high``, the best.
         device: Where to compute, as for :class:`cvtgs.Simplifier`.
 
     Returns:

@@ -114,7 +114,7 @@ def test_invalid_rows_are_dropped_and_counted(tmp_path, capsys):
         ),
         (
             ["--rho", "0.1", "--preset", "best"],
-            "preset must be one of draft, fast, standard, matched, high, max, paper; found 'best'.",
+            "preset must be one of draft, fast, standard, matched, high, paper; found 'best'.",
         ),
         (
             ["--rho", "0.1", "--set", "cvt.iterations"],

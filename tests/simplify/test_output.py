@@ -132,7 +132,7 @@ def test_config_may_be_an_object_or_a_name():
 def test_an_unknown_preset_is_an_error():
     with pytest.raises(CvtgsError) as caught:
         Simplifier(config="best")
-    presets = "draft, fast, standard, matched, high, max, paper"
+    presets = "draft, fast, standard, matched, high, paper"
     assert str(caught.value).startswith(f"preset must be one of {presets}")
     assert str(caught.value).endswith("; found 'best'.")
 

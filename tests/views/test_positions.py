@@ -121,7 +121,7 @@ def test_a_wall_that_was_seen_from_one_side_is_looked_at_from_there():
 
 
 def test_splats_are_as_large_as_they_are_in_the_image():
-    """Near ones are 0.1 wide at a distance of 2, far ones 0.1 at 4 and hardly seen: 50 / 2 * 0.1."""
+    """Near ones are 0.1 wide at a distance of 2, and hide the far one."""
     means = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [0, 0, 2]])
     layout = find_layout(blobs(means, torch.tensor([0.1, 0.1, 0.1]).log()))
     cameras = Cameras(

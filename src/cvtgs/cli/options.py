@@ -25,7 +25,7 @@ READABLE = (
     ".ply, .spz, .splat, .ksplat, .sog, .glb, .gltf, .ckpt, .pt or the folder of a trained model"
 )
 WRITABLE = ".ply, .compressed.ply, .spz, .splat, .sog, .glb, .gltf, .spz.glb or .usda"
-PRESET_NAMES = "draft, fast, standard, matched, high, max (from the fastest to the best) or paper"
+PRESET_NAMES = "draft, fast, standard, matched, high (from the fastest to the best) or paper"
 CAMERA_FILES = "transforms.json, a COLMAP model, cameras.json, or a folder of these"
 # By name, or by both spellings. The help of a value is a noun phrase, that of a flag begins with
 # a verb.

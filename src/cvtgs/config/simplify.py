@@ -28,16 +28,27 @@ def unknown_preset(name: object) -> ConfigError:
     return ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {shown(name)}{end}")
 
 
+MATCHED: Mapping[str, Any] = {
+    "visibility": {"views": 24, "size": 256},
+    "match": {"opacity_rounds": 1, "color_iterations": 6},
+}
+
+THINNED: Mapping[str, Any] = {
+    "steps": 250,
+    "half_after": 60,
+    "size": 400,
+    "stride": 2,
+    "first_images": 32,
+    "steps_per_image": 8,
+    "check_every": 50,
+}
+
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "draft": {"cvt": {"iterations": 0}, "merge": {"network": False}},
     "fast": {"merge": {"network": False}},
     "standard": {},
-    "matched": {
-        "visibility": {"views": 24, "size": 256},
-        "match": {"opacity_rounds": 1, "color_iterations": 6},
-    },
-    "high": {"visibility": {"views": 64}, "refine": {"steps": 200, "half_after": 60, "size": 400}},
-    "max": {"visibility": {"views": 64}, "refine": {"steps": 600, "size": 400}},
+    "matched": MATCHED,
+    "high": {**MATCHED, "refine": THINNED},
     "paper": {
         "effects": {"unbounded": "off", "duplicates": "off"},
         "filter": {"max_mass_share": 1.0, "max_flyaway_share": 0.0},

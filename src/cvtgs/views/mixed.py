@@ -136,7 +136,7 @@ def mixed_views(
 
 
 def _sharp_ones(positions: CameraPositions, cameras: Cameras, count: int) -> Cameras:
-    """Return the first views that are not blurred; the least blurred others if those are too few."""
+    """Return the first views that are not blurred, and the least blurred others if need be."""
     if count == 0:
         return cameras
     sizes = splat_sizes(positions.layout, cameras)
