@@ -2,10 +2,11 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from cvtgs import load, save
+from cvtgs import load, save, synthetic
 from cvtgs.cli.main import main
 from scenes import random_scene
 
@@ -24,12 +25,18 @@ def test_a_stream(
     assert main([*words, "--stream", kind, "--chunk", "300", "--rho", "1,0.1,0.01"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("a.ply in ")
+    assert "chunks, the finest level first:" in lines[0]
     assert lines[2].split()[0] == "2,000"
     if kind == "sog":
         counts = [len(load(tmp_path / "out", lod=lod)) for lod in range(3)]
         assert counts == [2000, 200, 20]
     else:
         assert len(load(tmp_path / "out" / "0_0.glb")) == 20
+
+
+def test_a_small_stream_is_one_chunk(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*words, "--stream", "3dtiles", "--rho", "0.1,0.01"]) == 0
+    assert capsys.readouterr().out.startswith("a.ply in one chunk, the finest level first:")
 
 
 @pytest.mark.parametrize(
@@ -75,3 +82,31 @@ def test_blocks(
     assert (finest.split()[0], coarsest.split()[0]) == ("2,000", "200")
     document = json.loads((tmp_path / "out" / "tileset.json").read_text())
     assert document["root"]["transform"][12:15] == pytest.approx((4276e3, 639e3, 4672e3), abs=2e3)
+
+
+def first_bytes(folder: Path) -> int:
+    """Bytes that a viewer must fetch before it can show all of the scene, at its coarsest."""
+
+    def files_of(node: dict[str, Any]) -> set[str]:
+        if "content" in node:
+            return {node["content"]["uri"]}
+        if "lods" in node:
+            place = node["lods"][max(node["lods"], key=int)]
+            return {str(Path(index["filenames"][place["file"]]).parent)}
+        return set[str]().union(*map(files_of, node["children"]))
+
+    path = next(folder.glob("*.json"))
+    index = json.loads(path.read_text())
+    places = [folder / name for name in files_of(index.get("tree") or index["root"])]
+    files = [file for place in places for file in ([place] if place.is_file() else place.iterdir())]
+    return sum(file.stat().st_size for file in [path, *files])
+
+
+@pytest.mark.parametrize("kind", ["sog", "3dtiles"])
+def test_the_first_image_takes_a_twentieth_of_the_bytes(tmp_path: Path, kind: str) -> None:
+    source, out = tmp_path / "a.ply", tmp_path / "out"
+    save(synthetic.scene("courtyard", 20_000, sh_degree=1, seed=1), source)
+    words = ["levels", str(source), "-o", str(out), "--preset", "draft", "--quiet"]
+    assert main([*words, "--stream", kind, "--chunk", "2000"]) == 0
+    total = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
+    assert 0 < first_bytes(out) <= 0.05 * total

@@ -264,7 +264,7 @@ def test_bad_amounts_of_memory(text):
 def test_less_memory_makes_more_blocks(source):
     rows = open_rows(source)
     assert block_count(rows, 10**10) == 1
-    assert block_count(rows, 450_100_000) > block_count(rows, 450_500_000) > 1
+    assert block_count(rows, 350_100_000) > block_count(rows, 350_500_000) > 1
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,9 +10,17 @@ import psutil
 import pytest
 
 import cvtgs
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.ply import open_rows
-from cvtgs.outofcore import available_memory, block_count, needed_memory
-from cvtgs.outofcore.memory import BASE_BYTES, control_group_rooms
+from cvtgs.outofcore import available_memory, block_count, needed_memory, read_bytes
+from cvtgs.outofcore.memory import (
+    BASE_BYTES,
+    LEAST_BYTES,
+    ROOMY_BYTES,
+    SMALL_BASE_BYTES,
+    control_group_rooms,
+    sample_rows,
+)
 
 
 def machine(root: Path, groups: str, files: dict[str, str]) -> Path:
@@ -110,9 +119,41 @@ def test_little_memory_gives_blocks_and_no_division_by_zero(tmp_path: Path) -> N
     path = tmp_path / "a.ply"
     cvtgs.save(cvtgs.synthetic.scene("object", 200, sh_degree=0), path)
     rows = open_rows(path)
-    assert block_count(rows, needed_memory(rows, rows.count)) == 1
-    assert block_count(rows, needed_memory(rows, rows.count) - 1) > 1
-    assert block_count(rows, 0) == block_count(rows, BASE_BYTES) == 2
+    large = replace(rows, count=1_000_000)
+    assert block_count(large, needed_memory(large, large.count)) == 1
+    assert block_count(large, needed_memory(large, large.count) - 1) > 1
+    own = needed_memory(rows, rows.count) - BASE_BYTES
+    assert block_count(rows, SMALL_BASE_BYTES + own) == 1
+    assert block_count(rows, SMALL_BASE_BYTES + own - 1) > 1
+    assert block_count(rows, 0) == block_count(rows, SMALL_BASE_BYTES) == 2
+    assert len({block_count(large, LEAST_BYTES + k * 20_000_000) for k in range(6)}) == 1
+    assert sample_rows(LEAST_BYTES) < sample_rows(ROOMY_BYTES) == sample_rows(1 << 40)
+
+
+def test_the_least_memory_is_read() -> None:
+    assert read_bytes("400MB") == LEAST_BYTES
+    with pytest.raises(InvalidArgumentError, match=r"at least 400 MB: .*; found '399MB'"):
+        read_bytes("399MB")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="kilobytes of Linux")
+def test_blocks_stay_within_the_least_memory(tmp_path: Path) -> None:
+    """Beside what torch, scipy and the network take: 280 MB here, more in builds for GPUs."""
+    path = tmp_path / "a.ply"
+    cvtgs.save(cvtgs.synthetic.scene("object", 262_144, sh_degree=3), path)
+    program = (
+        "import resource, sys, scipy.spatial, cvtgs\n"
+        "from cvtgs.outofcore import simplify_file\n"
+        "simplifier = cvtgs.Simplifier(device='cpu')\n"
+        "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024\n"
+        "before = peak()\n"
+        "simplify_file(*sys.argv[1:], 0.01, memory=400_000_000, simplifier=simplifier)\n"
+        "print(peak() - before)\n"
+    )
+    words = [sys.executable, "-c", program, str(path), str(tmp_path / "small.ply")]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert int(done.stdout) < LEAST_BYTES - 280_000_000
 
 
 @pytest.mark.slow

@@ -202,7 +202,8 @@ def _print_levels(
 ) -> None:
     if options.quiet:
         return
-    say(f"{options.input.name} in {chunks:,} chunks{more}, the finest level first:")
+    number = "one chunk" if chunks == 1 else f"{chunks:,} chunks"
+    say(f"{options.input.name} in {number}{more}, the finest level first:")
     say(f"  {'Gaussians':>12}  {'size':>9}  {'files':>6}" + f"  {'error':>9}" * bool(errors))
     for one, error in zip_longest(levels, errors):
         last = "" if error is None else f"  {error:>9.3g}"

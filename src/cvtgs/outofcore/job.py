@@ -23,7 +23,7 @@ from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import Checkpoint, load_checkpoint, save_checkpoint
 from cvtgs.outofcore.attempts import SortedFile
-from cvtgs.outofcore.scan import RowRange, SceneScan, read_scan, write_scan
+from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, write_scan
 
 SENT_BYTES = "sent_bytes"
 """What the file of labels of a block says of the size of the file of its sent rows."""
@@ -63,8 +63,9 @@ class Job:
         boxes: Protected regions.
         config: Every choice.
         has_network: Whether the folder holds a checkpoint.
-        axes: Where x, y and z of the file to write are to point.
         range_rows: Rows of the file that one process reads in one call.
+        sample_rows: Gaussians that stand for all where the blocks are laid out.
+        axes: Where x, y and z of the file to write are to point.
     """
 
     folder: str
@@ -75,6 +76,7 @@ class Job:
     config: SimplifyConfig
     has_network: bool
     range_rows: int
+    sample_rows: int = SAMPLE_ROWS
     axes: str = SCENE_AXES
 
     def path(self, name: str) -> Path:
@@ -221,6 +223,7 @@ class Job:
             "target": self.target,
             "blocks": self.blocks,
             "ranges": self.range_rows,
+            "sample": self.sample_rows,
             "axes": [self.source.axes, self.axes],
             "sh_degree": self.source.sh_degree,
             "boxes": [box.model_dump() for box in self.boxes],

@@ -8,12 +8,19 @@ from typing import NamedTuple
 
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.ply import PlyRows
+from cvtgs.outofcore.scan import SAMPLE_ROWS
 
 BASE_BYTES = 450_000_000
 """Interpreter, torch and scipy (280 MB), network, sample, grid of depths, and a chunk of rows."""
 
-LEAST_BYTES = 500_000_000
-"""The same and a small block: no run in blocks takes less."""
+SMALL_BASE_BYTES = 350_000_000
+"""The same with a sample of a quarter, for those who have less than ``ROOMY_BYTES``."""
+
+ROOMY_BYTES = 500_000_000
+"""With less than this, the sample is small."""
+
+LEAST_BYTES = 400_000_000
+"""The small base and a small block: no run in blocks takes less."""
 
 IMAGE_BYTES = 400_000_000
 """Set aside for images of the scene and what they are made of."""
@@ -141,6 +148,18 @@ def _room(folder: Path, names: _GroupFiles) -> int | None:
     return limit - max(0, used)
 
 
+def base_bytes(memory: int | None) -> int:
+    """Return what a run takes beside its blocks, which have as much with little memory."""
+    if memory is None or memory >= ROOMY_BYTES:
+        return BASE_BYTES
+    return max(SMALL_BASE_BYTES, memory - (LEAST_BYTES - SMALL_BASE_BYTES))
+
+
+def sample_rows(memory: int) -> int:
+    """Return how many Gaussians stand for all where blocks are laid out."""
+    return SAMPLE_ROWS if memory >= ROOMY_BYTES else SAMPLE_ROWS // 4
+
+
 def needed_memory(source: PlyRows, rows: int) -> int:
     """Estimate what it takes to simplify some rows at once.
 
@@ -158,7 +177,8 @@ def needed_memory(source: PlyRows, rows: int) -> int:
 
 def cell_room(memory: int | None) -> int:
     """Return how many cells of the tessellation may merge together."""
-    return CELL_ROOM if memory is None else max(0, memory - BASE_BYTES) // CELL_BYTES
+    room = CELL_ROOM * CELL_BYTES if memory is None else memory - base_bytes(memory)
+    return max(0, room) // CELL_BYTES
 
 
 def block_count(source: PlyRows, memory: int) -> int:
@@ -173,7 +193,9 @@ def block_count(source: PlyRows, memory: int) -> int:
     Returns:
         1 if the whole file fits.
     """
-    if needed_memory(source, source.count) <= memory:
+    base = min(BASE_BYTES, base_bytes(memory))
+    wanted = needed_memory(source, source.count) - BASE_BYTES
+    if base + wanted <= memory:
         return 1
-    room = (memory if memory > BASE_BYTES else LEAST_BYTES) - BASE_BYTES
-    return max(2, math.ceil(2 * (needed_memory(source, source.count) - BASE_BYTES) / room))
+    room = (memory if memory > base else LEAST_BYTES) - base
+    return max(2, math.ceil(2 * wanted / room))

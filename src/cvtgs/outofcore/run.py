@@ -33,6 +33,7 @@ from cvtgs.outofcore.memory import (
     block_count,
     cell_room,
     memory_to_plan,
+    sample_rows,
 )
 from cvtgs.outofcore.merge import correct, inflate, merge, simplify_block
 from cvtgs.outofcore.scan import CHUNK
@@ -138,6 +139,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         config=simplifier.config,
         has_network=simplifier.checkpoint is not None,
         range_rows=range_rows or rows_per_range(rows.count),
+        sample_rows=sample_rows(room),
         axes=checked_axes(output_axes or SCENE_AXES) if is_plain_ply(output) else SCENE_AXES,
     )
     key = job.key(simplifier.checkpoint)

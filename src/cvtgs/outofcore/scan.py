@@ -22,7 +22,7 @@ from cvtgs.devices import one_thread
 from cvtgs.io.ply import PlyRows
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.math.frames import RobustFrame
-from cvtgs.scene import GaussianScene, concatenate
+from cvtgs.scene import GaussianScene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -113,8 +113,11 @@ def _weighted_quantile(coordinates: Tensor, weights: Tensor, share: float) -> fl
 SAMPLE_ROWS = 1 << 18
 """Gaussians that stand for all where frame, effect plan and partition are found."""
 
-CHUNK = 1 << 17
+CHUNK = 1 << 15
 """Rows that are read together."""
+
+MAPPED_ROWS = 1 << 15
+"""Rows of the file that are mapped together where a sample is taken of them."""
 
 
 class RowRange(NamedTuple):
@@ -202,15 +205,15 @@ class SceneScan:
     kept_count: int
 
 
-def read_sample(source: PlyRows) -> GaussianScene:
-    """Read Gaussians at equal steps over the file; return the valid ones."""
-    step = max(1, source.count // SAMPLE_ROWS)
-    parts = []
-    for start in range(0, source.count, CHUNK * step):
-        stop = min(start + CHUNK * step, source.count)
-        parts.append(source.scene(source.read(start, stop, step)))
-    sample = concatenate(parts)
-    return sample.select(validity.valid_rows(sample))
+def read_sample(source: PlyRows, count: int = SAMPLE_ROWS) -> GaussianScene:
+    """Read some ``count`` Gaussians at equal steps over the file; return the valid ones."""
+    step = max(1, source.count // count)
+    rows = step * max(1, MAPPED_ROWS // step)
+    starts = range(0, source.count, rows)
+    parts = (source.read(start, min(start + rows, source.count), step) for start in starts)
+    sample = source.assemble(parts, -(-source.count // step))
+    valid = validity.valid_rows(sample)
+    return sample if bool(valid.all()) else sample.select(valid)
 
 
 @one_thread()

@@ -14,7 +14,14 @@ from cvtgs.math.frames import robust_frame
 from cvtgs.outofcore.attempts import SortedFile
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.rows import sort_range
-from cvtgs.outofcore.scan import RowRange, add_totals, read_sample, scan_range, scan_scene
+from cvtgs.outofcore.scan import (
+    RowRange,
+    SceneScan,
+    add_totals,
+    read_sample,
+    scan_range,
+    scan_scene,
+)
 from cvtgs.outofcore.workers import Workers, with_progress
 
 
@@ -54,30 +61,7 @@ def sort_into_blocks(
     """
     ranges = job.ranges()
     with clock.stage("scan", len(ranges)) as advance:
-        sample = read_sample(job.source)
-        if len(sample) == 0:
-            raise InvalidSceneError(f"{job.source.path}: found no valid Gaussian.")
-        validity.warn_of_lost_digits(sample)
-        frame = robust_frame(sample.means)
-        scan_rows = partial(scan_range, job.source, frame, job.boxes)
-        totals = add_totals(with_progress(workers(scan_rows, ranges), advance))
-        valid, kept = totals.valid_count, totals.kept_count
-        check_room(kept, target=job.target, total=valid)
-        if kept == valid:
-            raise InvalidArgumentError(
-                f"all {kept} valid Gaussians are to be kept as they are; none is left."
-            )
-        rest = min(job.target, valid) - kept
-        scan = scan_scene(
-            sample,
-            totals,
-            boxes=job.boxes,
-            target=max(1, rest),
-            cells=finer_count(max(1, rest), valid - kept, job.config.allocation),
-            blocks=job.blocks,
-            config=job.config,
-            frame=frame,
-        )
+        rest, scan = _scan(job, workers, ranges, advance)
     unfiltered = replace(scan, min_opacity=0.0, max_flyaway_mass=-1.0)
     with clock.stage("sort", len(ranges)) as advance:
         job.write_scan(unfiltered if keep_all else scan)
@@ -86,6 +70,40 @@ def sort_into_blocks(
             job.write_scan(unfiltered)
             found = _sort(job, rest, workers, ranges, advance)
     return found
+
+
+def _scan(
+    job: Job, workers: Workers, ranges: Sequence[RowRange], advance: Callable[[int], None]
+) -> tuple[int, SceneScan]:
+    """Return how many Gaussians all blocks are to keep, and what they need of the scene.
+
+    The sample is let go of at the end.
+    """
+    sample = read_sample(job.source, job.sample_rows)
+    if len(sample) == 0:
+        raise InvalidSceneError(f"{job.source.path}: found no valid Gaussian.")
+    validity.warn_of_lost_digits(sample)
+    frame = robust_frame(sample.means)
+    scan_rows = partial(scan_range, job.source, frame, job.boxes)
+    totals = add_totals(with_progress(workers(scan_rows, ranges), advance))
+    valid, kept = totals.valid_count, totals.kept_count
+    check_room(kept, target=job.target, total=valid)
+    if kept == valid:
+        raise InvalidArgumentError(
+            f"all {kept} valid Gaussians are to be kept as they are; none is left."
+        )
+    rest = min(job.target, valid) - kept
+    scan = scan_scene(
+        sample,
+        totals,
+        boxes=job.boxes,
+        target=max(1, rest),
+        cells=finer_count(max(1, rest), valid - kept, job.config.allocation),
+        blocks=job.blocks,
+        config=job.config,
+        frame=frame,
+    )
+    return rest, scan
 
 
 def _sort(

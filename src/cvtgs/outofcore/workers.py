@@ -17,7 +17,7 @@ from cvtgs.devices import core_count
 from cvtgs.errors import RunError
 from cvtgs.mergenet import Checkpoint
 from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.memory import LEAST_BYTES
+from cvtgs.outofcore.memory import ROOMY_BYTES
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -96,7 +96,7 @@ def worker_count(memory: int, wanted: int | None = None) -> int:
         >>> worker_count(4_000_000_000, 8)
         4
     """
-    return max(1, min(wanted or core_count(), memory // (2 * LEAST_BYTES)))
+    return max(1, min(wanted or core_count(), memory // (2 * ROOMY_BYTES)))
 
 
 class LocalWorkers:

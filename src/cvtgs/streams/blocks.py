@@ -28,7 +28,7 @@ from cvtgs.io.ply import open_rows
 from cvtgs.mergenet import MergeNet, PublishedMergeNet
 from cvtgs.outofcore import Workers, available_memory, block_count, check_config
 from cvtgs.outofcore.job import Job, job_folder
-from cvtgs.outofcore.memory import memory_to_plan
+from cvtgs.outofcore.memory import memory_to_plan, sample_rows
 from cvtgs.outofcore.rows import analysis_of, read_rows
 from cvtgs.outofcore.run import rows_per_range
 from cvtgs.outofcore.sort import sort_into_blocks
@@ -208,7 +208,8 @@ def stream_file(  # noqa: PLR0913 (options by name)
             f"{rows.count:,} Gaussians."
         )
     merged = [target for target in targets if target < rows.count] or targets
-    wanted = blocks or block_count(rows, memory or memory_to_plan(available_memory()))
+    room = memory or memory_to_plan(available_memory())
+    wanted = blocks or block_count(rows, room)
     job = Job(
         folder="",
         source=rows,
@@ -218,6 +219,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
         config=simplifier.config,
         has_network=simplifier.checkpoint is not None,
         range_rows=rows_per_range(rows.count),
+        sample_rows=sample_rows(room),
     )
     form = SogFormat() if kind == "sog" else TilesFormat(transform=transform)
     spec = StreamJob(
