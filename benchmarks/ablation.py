@@ -39,7 +39,7 @@ from benchmarks.quality import (
 )
 from cvtgs import cells
 from cvtgs.mergenet import MergeNet, PublishedMergeNet, correct_cells, load_checkpoint
-from cvtgs.pipeline import merge_cells
+from cvtgs.pipeline import merge_and_inflate
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.train.cases import MergedScene, merge_scene
 from cvtgs.validity import standardized
@@ -236,7 +236,7 @@ def regroup(
     With the partition of the reference itself this gives what ``Simplifier`` gives.
     """
     scene = reference.scene
-    merged = merge_cells(
+    merged = merge_and_inflate(
         scene,
         partition,
         config.merge,

@@ -46,6 +46,8 @@ def test_printable(text: str, encoding: str, wanted: str | None) -> None:
 def test_shown() -> None:
     assert shown("a\x1b") == r"'a\x1b'"
     assert len(shown("x" * 1000)) == 60
+    assert len(shown("x" * 1000, 80)) == 80
+    assert shown(10**5000) == "a number of thousands of digits"
     nested: list[object] = []
     for _ in range(100_000):
         nested = [nested]

@@ -116,7 +116,7 @@ def reduce_scene(
             fine, cells_of = finest.merged.scene, finest.grouping
             grouping = group_cells(fine, cells_of, analysis, target, config, on_iteration=advance)
     with clock.stage("merge", target) as advance:
-        merged = merge_cells(
+        merged = merge_and_inflate(
             used,
             grouping.partition,
             config.merge,
@@ -158,7 +158,7 @@ def order_gaussians(
     return order_rows(scene, filtered.rows, analysis, config)
 
 
-def merge_cells(
+def merge_and_inflate(
     scene: GaussianScene,
     partition: cells.Partition,
     config: MergeConfig,

@@ -15,6 +15,11 @@ MOST_LETTERS = 60
 """Of a value in an error text."""
 
 
+def shortened(text: str, length: int) -> str:
+    """Cut a text that is too long."""
+    return text if len(text) <= length else f"{text[: length - 3]}..."
+
+
 def printable(text: str, encoding: str = "utf-8") -> str:
     r"""Return a text with what a terminal obeys, or cannot encode, as ``\u001b`` (also in JSON)."""
     text = _UNSAFE.sub(lambda match: _escaped(match[0]), text)
@@ -37,13 +42,14 @@ def _escaped(letter: str) -> str:
     return f"\\u{ord(letter):04x}" if ord(letter) < 1 << 16 else json.dumps(letter)[1:-1]
 
 
-def shown(value: Any) -> str:
-    """Return a value as Python writes it, cut after 60 characters."""
+def shown(value: Any, length: int = MOST_LETTERS) -> str:
+    """Return a value as Python writes it, cut after some characters."""
     try:
-        text = repr(value)
+        return shortened(repr(value), length)
     except RecursionError:  # lists in lists in lists
         return f"a deeply nested {type(value).__name__}"
-    return text if len(text) <= MOST_LETTERS else f"{text[: MOST_LETTERS - 3]}..."
+    except ValueError:  # Python writes no number of thousands of digits
+        return "a number of thousands of digits"
 
 
 def suggestion(word: str, choices: Iterable[str], *, likeness: float = 0.6) -> str:

@@ -48,10 +48,10 @@ def test_empty_bands_are_neither_merged_nor_predicted(above, preset, monkeypatch
     scene = with_zero_bands(random_scene(400, degree=3), above)
     bare = scene.with_tensors({"shN": scene.shN[:, : REST_COUNTS[above]]}, {})
     seen = []
-    original = pipeline.merge_cells
+    original = pipeline.merge_and_inflate
     monkeypatch.setattr(
         pipeline,
-        "merge_cells",
+        "merge_and_inflate",
         lambda valid, *a, **k: seen.append(valid) or original(valid, *a, **k),
     )
     small, report = run_with(scene, preset=preset)

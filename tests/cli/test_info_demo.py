@@ -93,7 +93,7 @@ def test_demo_writes_three_scenes_and_a_page_and_says_what_is_next(tmp_path, cap
 def test_demo_names_the_folder_it_cannot_make(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert main(["demo", "-o", str(tmp_path / "file" / "demo"), "--count", "10"]) == 1
-    assert "cannot be made" in capsys.readouterr().err
+    assert "must become a folder" in capsys.readouterr().err
 
 
 def test_size_text():

@@ -93,7 +93,7 @@ def test_a_scene_that_fails_does_not_stop_the_others(
             "the same name in ., found a.ply and a.spz.",
         ),
         (["nothing*", "-o", "out"], "nothing*: the pattern must match a file, found none."),
-        (["a.ply", "-o", "a.ply"], "a.ply: cannot be made: "),
+        (["a.ply", "-o", "a.ply"], "a.ply: must become a folder, found: "),
         (["a.ply", "c.spz", "-o", "out", "--suffix", "xyz"], "the file name must end in "),
     ],
 )

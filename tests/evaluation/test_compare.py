@@ -291,7 +291,7 @@ def test_files_are_replaced_only_when_asked(comparison, tmp_path):
     write_comparison(comparison, folder, overwrite=True)
     assert paths[-1].read_bytes() == first
     (tmp_path / "file").write_text("")
-    with pytest.raises(cvtgs.errors.OutputError, match="cannot be made"):
+    with pytest.raises(cvtgs.errors.OutputError, match="must become a folder"):
         write_comparison(comparison, tmp_path / "file" / "page")
 
 

@@ -205,7 +205,7 @@ def test_scenes_too_small_for_their_ratios_are_an_error(scenes, cache, tmp_path,
 
 def test_a_cache_that_is_a_file_is_an_error(scenes, tmp_path):
     (tmp_path / "cache").write_text("precious")
-    with pytest.raises(OutputError, match="the cache must be a folder"):
+    with pytest.raises(OutputError, match="must become a folder"):
         run(config_of(scenes), tmp_path / "net.safetensors", tmp_path / "cache")
     assert (tmp_path / "cache").read_text() == "precious"
 

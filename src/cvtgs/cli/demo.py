@@ -51,7 +51,7 @@ def add_demo(add_parser: AddParser) -> None:
 
 def demo(options: argparse.Namespace) -> None:
     """Run ``cvtgs demo``."""
-    from cvtgs.evaluation.comparison_files import make_folder
+    from cvtgs.io.atomic import make_folder
 
     make_folder(options.output)
     with progress_bars(quiet=options.quiet) as listener:

@@ -61,7 +61,7 @@ def say_wrapped(text: str, *, file: TextIO | None = None, indent: int = 0) -> No
         say(line.replace(TIE, " "), file=file)
 
 
-def shortened(text: str, width: int) -> str:
+def without_middle(text: str, width: int) -> str:
     """Return a text, without its middle if it is longer than the width."""
     text = printable(text)
     if len(text) <= width:

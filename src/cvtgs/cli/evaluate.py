@@ -60,8 +60,8 @@ def render(options: argparse.Namespace) -> None:
     import torch
 
     from cvtgs.devices import chosen_device
-    from cvtgs.evaluation.comparison_files import make_folder
     from cvtgs.evaluation.images import as_bytes, encode
+    from cvtgs.io.atomic import make_folder
 
     check_view_options(options)
     scene = cvtgs.io.load(options.input, trust_sizes=options.trust_sizes).to(

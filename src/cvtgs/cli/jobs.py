@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import cvtgs
-from cvtgs.cli.display import WIDTH, file_size, say, say_wrapped, shortened, size_text
+from cvtgs.cli.display import WIDTH, file_size, say, say_wrapped, size_text, without_middle
 from cvtgs.cli.options import READABLE, WRITABLE, CommandParser
 from cvtgs.errors import CvtgsError, InputNotFoundError, InvalidArgumentError, OutputError, RunError
 from cvtgs.text import printable
@@ -139,7 +139,7 @@ def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> N
             sizes = f"{size_text(bytes_in)} -> {size_text(bytes_out)}"
             facts = ", ".join(filter(None, (outcome.counts, sizes, outcome.seconds)))
             room = max(8, WIDTH - len(place) - len(facts) - 2)
-            say(f"{place}{shortened(target.name, room)}: {facts}", flush=True)
+            say(f"{place}{without_middle(target.name, room)}: {facts}", flush=True)
             for note in outcome.notes:
                 say_wrapped(note, indent=len(place))
     done = len(jobs) - failed
@@ -183,7 +183,7 @@ def _bytes_of(path: Path) -> int:
 
 def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
     """Return a job for every scene to read; no two write the same file."""
-    from cvtgs.evaluation.comparison_files import make_folder
+    from cvtgs.io.atomic import make_folder
 
     sources = [Path(path) for pattern in options.paths for path in _expanded(pattern)]
     targets: dict[Path, Path] = {}

@@ -7,6 +7,7 @@ from typing import Any
 import pydantic
 
 from cvtgs.errors import ConfigError
+from cvtgs.text import shortened, shown
 
 MOST_PROBLEMS = 4
 """A sentence about some settings names no more problems."""
@@ -65,7 +66,9 @@ def explain(error: pydantic.ValidationError) -> str:
         if problem["type"] == "extra_forbidden":
             problems.append(f"{key}: is not a known setting")
         else:
-            problems.append(f"{key}: {problem['msg'].lower()}, found {shown(problem['input'])}")
+            problems.append(
+                f"{key}: {problem['msg'].lower()}, found {shown(problem['input'], 120)}"
+            )
     if count > MOST_PROBLEMS:
         problems.append(f"and {count - MOST_PROBLEMS:,} more")
     return "; ".join(problems) + "."
@@ -74,16 +77,3 @@ def explain(error: pydantic.ValidationError) -> str:
 def named(key: str) -> str:
     """Return a key as texts show it: short, in one line."""
     return shortened(key, 80) if key.isprintable() else shortened(repr(key), 80)
-
-
-def shown(value: object) -> str:
-    """Return a value as texts show it: as Python would, but short."""
-    try:
-        return shortened(repr(value), 120)
-    except ValueError:  # Python writes no number of thousands of digits
-        return "a number of thousands of digits"
-
-
-def shortened(text: str, length: int) -> str:
-    """Cut a text that is too long."""
-    return text if len(text) <= length else f"{text[: length - 3]}..."

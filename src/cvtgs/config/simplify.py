@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import pydantic
 
-from cvtgs.config.base import Section, explain, named, read_toml, shown
+from cvtgs.config.base import Section, explain, named, read_toml
 from cvtgs.config.sections import (
     AllocationConfig,
     EffectsConfig,
@@ -18,14 +18,14 @@ from cvtgs.config.sections import (
     VisibilityConfig,
 )
 from cvtgs.errors import ConfigError
-from cvtgs.text import suggestion
+from cvtgs.text import shown, suggestion
 
 
 def unknown_preset(name: object) -> ConfigError:
     """Return the error about a preset that is none."""
     near = suggestion(name, PRESETS) if isinstance(name, str) else ""
     end = near or "."
-    return ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {shown(name)}{end}")
+    return ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {shown(name, 120)}{end}")
 
 
 MATCHED: Mapping[str, Any] = {

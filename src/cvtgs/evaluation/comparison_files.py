@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-from cvtgs.errors import OutputError
 from cvtgs.evaluation.compare import Comparison, Images
 from cvtgs.evaluation.images import (
     ALPHA_SCALE,
@@ -24,6 +23,7 @@ from cvtgs.evaluation.images import (
 from cvtgs.evaluation.page import comparison_page
 from cvtgs.evaluation.report import SceneScores
 from cvtgs.io import atomic_output, check_output
+from cvtgs.io.atomic import make_folder
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 
 if TYPE_CHECKING:
@@ -45,15 +45,6 @@ def check_comparison_files(folder: str | os.PathLike[str], *, overwrite: bool = 
     make_folder(folder)
     for name in (PAGE, SHEET, ERRORS):
         check_output(Path(folder) / name, overwrite)
-
-
-def make_folder(folder: str | os.PathLike[str]) -> None:
-    """Make a folder to write to, with its parents, unless it is there."""
-    try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise OutputError(f"{os.fspath(folder)}: cannot be made: {reason}.") from error
 
 
 def write_comparison(

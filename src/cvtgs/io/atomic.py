@@ -144,6 +144,15 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
             temporary.unlink(missing_ok=True)
 
 
+def make_folder(folder: str | os.PathLike[str], *, parents: bool = True) -> None:
+    """Make a folder to write to, unless it is there."""
+    try:
+        Path(folder).mkdir(parents=parents, exist_ok=True)
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise OutputError(f"{os.fspath(folder)}: must become a folder, found: {reason}.") from error
+
+
 def windows_fault(path: PureWindowsPath) -> str | None:
     """Return what Windows would not write to under this name, or under another one."""
     name = path.name

@@ -22,6 +22,7 @@ from cvtgs.counts import shared_out, target_count
 from cvtgs.devices import one_thread
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
 from cvtgs.io import atomic_output, change_axes
+from cvtgs.io.atomic import make_folder
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
@@ -43,7 +44,6 @@ from cvtgs.streams.files import (
     StreamPart,
     check_stream,
     join_levels,
-    make_folder,
     publish,
     write_index,
 )
@@ -262,7 +262,7 @@ def _run(
         with one_thread():
             found = sort_into_blocks(job, workers, clock, keep_all=True)
         _write_targets(spec, targets, found.rows, found.cells)
-    make_folder(spec.folder)
+    make_folder(spec.folder, parents=False)
     blocks = [block for block, counts in enumerate(spec.targets()) if counts[0]]
     unfinished = [block for block in blocks if spec.finished(block) is None]
     with clock.stage("blocks", len(unfinished)) as advance:

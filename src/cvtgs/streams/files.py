@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 from cvtgs.config.base import Record
 from cvtgs.errors import OutputError, OutputExistsError
 from cvtgs.io import atomic_output, check_output
+from cvtgs.io.atomic import make_folder
 from cvtgs.progress import ProgressListener
 from cvtgs.streams.plan import Corner, StreamPlan
 
@@ -197,20 +198,11 @@ def _hidden_folder(place: Path) -> Iterator[Path]:
     if target.is_dir() and not os.access(target.parent, os.W_OK | os.X_OK):
         hidden = target / ".stream"
     shutil.rmtree(hidden, ignore_errors=True)
-    make_folder(hidden)
+    make_folder(hidden, parents=False)
     try:
         yield hidden
     finally:
         shutil.rmtree(hidden, ignore_errors=True)
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder if it is missing."""
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise OutputError(f"{folder}: must become a folder, found: {reason}.") from error
 
 
 def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:

@@ -11,6 +11,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from cvtgs.io import atomic_output, load, save
+from cvtgs.io.atomic import make_folder
 from cvtgs.io.sog import encode_sog
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.scene import GaussianScene, concatenate
@@ -19,7 +20,6 @@ from cvtgs.streams.files import (
     StreamPart,
     join_levels,
     join_trees,
-    make_folder,
     write_stream,
 )
 from cvtgs.streams.plan import Corner, StreamNode, StreamPlan
@@ -152,7 +152,7 @@ def write_sog_stream(
 
 def _write_sog(scene: GaussianScene, folder: Path) -> int:
     """Write an unbundled SOG; return its bytes."""
-    make_folder(folder)
+    make_folder(folder, parents=False)
     total = 0
     for name, content in encode_sog(scene).files():
         with atomic_output(folder / name, overwrite=True) as file:

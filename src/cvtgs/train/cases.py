@@ -24,7 +24,7 @@ from cvtgs.mergenet import (
     compose_published,
     describe_published,
 )
-from cvtgs.pipeline import merge_cells
+from cvtgs.pipeline import merge_and_inflate
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import check_rows
@@ -57,7 +57,7 @@ def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> Me
     valid = drop_unused_bands(valid, analysis.plan)
     rows = filter_rows(valid, analysis, target, config.filter).rows
     grouping = group_rows(valid, rows, analysis, target, config)
-    merged = merge_cells(
+    merged = merge_and_inflate(
         valid,
         grouping.partition,
         config.merge,

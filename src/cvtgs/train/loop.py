@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 import cvtgs
-from cvtgs.errors import ConfigError, MissingDependencyError, OutputError, TrainingError
+from cvtgs.errors import ConfigError, MissingDependencyError, TrainingError
 from cvtgs.io import atomic_output
+from cvtgs.io.atomic import make_folder
 from cvtgs.mergenet import (
     Architecture,
     CheckpointInfo,
@@ -137,7 +138,7 @@ def train(
     state = TrainState(_first_net(config).to(device), config, origins)
     if resume and files.state.is_file():
         state.load(files.state, config)
-    _make_folder(files.cache)
+    make_folder(files.cache)
     cases, validation_scenes = _prepare_scenes(sources, config, files.cache, listener)
     if config.kind != "published":
         state.learn_range(summarize(case.descriptors) for case, _ in cases)
@@ -180,14 +181,6 @@ def _shape(config: TrainConfig) -> Architecture | PublishedArchitecture:
     return Architecture(
         width=config.width, cell_width=config.cell_width, largest_growth=config.largest_growth
     )
-
-
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise OutputError(f"{path}: the cache must be a folder, found: {reason}.") from error
 
 
 def _prepare_scenes(
