@@ -3,6 +3,7 @@
 import ast
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -313,6 +314,12 @@ def test_tables_agree_with_what_type_checkers_see():
 def test_names_live_where_the_table_says():
     for name, home in cvtgs._HOME.items():
         assert getattr(cvtgs, name) is getattr(import_module(home), name)
+
+
+def test_the_front_page_of_the_reference_lists_every_name():
+    page = (Path(__file__).parents[1] / "docs" / "api" / "index.md").read_text(encoding="utf-8")
+    names = [name for name in cvtgs.__all__ if not isinstance(getattr(cvtgs, name), ModuleType)]
+    assert [name for name in names if f"`cvtgs.{name} <" not in page] == []
 
 
 def test_names_of_the_stages():
