@@ -40,8 +40,8 @@ from cvtgs.validity import (
 class Prepared:
     """A scene to be made smaller again and again; what does not depend on the count is kept.
 
-    From the second run on, 152 more bytes per Gaussian are kept; from the second one to more than
-    an eighth of the Gaussians on, 200.
+    From the second run on, 152 more bytes per Gaussian are kept, and another 48 from the second
+    run on that leaves more than an eighth of the Gaussians.
 
     ``Simplifier.prepare`` makes these. Every run gives the bits of ``Simplifier.run``;
     the report of the first one has the stages that are shared.
@@ -66,6 +66,7 @@ class Prepared:
         listener: ProgressListener = silent,
     ) -> None:
         self._scene, self._config, self._checkpoint = scene, config, checkpoint
+        self._total = len(scene)
         self._refines = config.refine.enabled
         self._cameras, self._listener = cameras, listener
         self._device = chosen_device(device or "auto", scene.device)
@@ -101,7 +102,7 @@ class Prepared:
         Returns:
             The scene and the report.
         """
-        total = len(self._scene)
+        total = self._total
         target = target_count(total, rho, count=count, max_count=max_count)
         if keep is not None:
             check_mask(keep, total)
@@ -154,13 +155,13 @@ class Prepared:
         Returns:
             One level per ratio, in the order of the ratios.
         """
-        targets = [target_count(len(self._scene), rho) for rho in rhos]
+        targets = [target_count(self._total, rho) for rho in rhos]
         if not targets:
             raise InvalidArgumentError("levels need at least one ratio, found none.")
         found = within_memory(
             partial(self._run_levels, targets),
             self._device,
-            work=f"simplifying {len(self._scene):,} Gaussians",
+            work=f"simplifying {self._total:,} Gaussians",
             may_leave=self._may_leave,
         )
         return tuple(found[target] for target in targets)
@@ -222,7 +223,7 @@ class Prepared:
 
     def _keep_all(self, valid: GaussianScene, target: int) -> Reduced:
         """Return all valid Gaussians: as they are if none was to go, else as standard ones."""
-        is_whole = target == len(self._scene)
+        is_whole = target == self._total
         return Reduced(with_finite_opacities(valid) if is_whole else standardized(valid))
 
     def _match(self, reduced: Reduced, analysis: SceneAnalysis, clock: StageClock) -> Reduced:
@@ -261,7 +262,7 @@ class Prepared:
         kept_count: int = 0,
     ) -> Simplified:
         """Report, restore what was not computed with, and refine if the configuration says so."""
-        scene, total = self._scene, len(self._scene)
+        scene, total = self._scene, self._total
         masses = [(analysis.areas * analysis.opacities).sum(), reduced.scene.masses.sum()]
         mass_in, mass_out = torch.stack(masses).tolist()
         views = "none"

@@ -209,7 +209,8 @@ def plan_haze(share: float, config: SimplifyConfig) -> Effect:
 
 
 def _plan_bands(scene: GaussianScene, choice: str | int) -> BandsEffect:
-    losses, degree = band_losses(scene, enough=BAND_LOSS), scene.sh_degree
+    losses = band_losses(scene, enough=BAND_LOSS)
+    degree = len(losses)
     if isinstance(choice, int):
         degree = min(degree, choice)
     else:
