@@ -83,8 +83,10 @@ def test_rows_are_taken_as_of_a_tensor():
     for small, rows in taken:
         assert small.extras["label"].tolist() == rows
         assert torch.equal(small.means, scene.means[torch.tensor(rows, dtype=torch.int64)])
-    with pytest.raises(InvalidArgumentError, match=r"found 5; write scene\[5:6\] for a single"):
-        scene[5]
+    with pytest.raises(InvalidArgumentError, match=r"found -2; write scene\[\[-2\]\] for a single"):
+        scene[-2]
+    with pytest.raises(InvalidArgumentError, match=r"or row numbers, found 'label'\.$"):
+        scene["label"]
     with pytest.raises(InvalidArgumentError, match="for each of 9 Gaussians, found 8"):
         scene[mask[:8]]
 

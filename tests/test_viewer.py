@@ -162,7 +162,7 @@ def test_command_writes_a_page(
     tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save(scene, tmp_path / "a.ply")
-    words = ["view", str(tmp_path / "a.ply"), "--page", str(tmp_path / "a.html"), "--rho", "0.02"]
+    words = ["view", str(tmp_path / "a.ply"), "--page", str(tmp_path / "a.html"), "--rho", "2%"]
     assert main([*words, "--preset", "draft", "--device", "cpu"]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'a.html'}: 2 scenes; open it in a browser.\n"
     assert (tmp_path / "a.html").read_text() == "<html>[[500], [10]] True</html>"

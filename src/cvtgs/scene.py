@@ -212,16 +212,16 @@ class GaussianScene:
 
         Raises:
             InvalidArgumentError: A mask does not have an entry for every Gaussian, or rows is a
-                single number.
+                single number or a text.
         """
         if isinstance(rows, slice):
             these = range(len(self))[rows]
             stop = these.start + len(these) * these.step
             rows = torch.arange(these.start, stop, these.step)
-        if isinstance(rows, int) or getattr(rows, "ndim", 1) != 1:
+        if isinstance(rows, int | str) or getattr(rows, "ndim", 1) != 1:
+            hint = f"; write scene[[{rows}]] for a single Gaussian" if type(rows) is int else ""
             raise InvalidArgumentError(
-                f"rows of a scene must be a slice, a mask or row numbers, found {rows!r}; "
-                f"write scene[5:6] for a single Gaussian."
+                f"rows of a scene must be a slice, a mask or row numbers, found {rows!r}{hint}."
             )
         picked = torch.as_tensor(rows, device=self.device)
         if picked.dtype == torch.bool and len(picked) != len(self):

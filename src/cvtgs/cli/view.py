@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.display import say
-from cvtgs.cli.options import PRESET_NAMES, AddParser, add_options
+from cvtgs.cli.options import PRESET_NAMES, AddParser, add_options, ratio
 from cvtgs.errors import InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def add_view(add_parser: AddParser) -> None:
         help=f"preset to start with: {PRESET_NAMES} (default draft, for a quick slider)",
     )
     parser.add_argument(
-        "--rho", type=float, metavar="R", default=0.1, help="ratio to start with (default 0.1)"
+        "--rho", type=ratio, metavar="R", default=0.1, help="ratio to start with (default 0.1)"
     )
     parser.add_argument(
         "--page",
