@@ -219,7 +219,7 @@ class GaussianScene:
             stop = these.start + len(these) * these.step
             rows = torch.arange(these.start, stop, these.step)
         if isinstance(rows, int | str) or getattr(rows, "ndim", 1) != 1:
-            hint = f"; write scene[[{rows}]] for a single Gaussian" if type(rows) is int else ""
+            hint = f"; write scene[[{rows}]] for a single Gaussian" if isinstance(rows, int) else ""
             raise InvalidArgumentError(
                 f"rows of a scene must be a slice, a mask or row numbers, found {rows!r}{hint}."
             )

@@ -193,6 +193,22 @@ def test_what_is_there_is_not_replaced_unasked(plan: StreamPlan, tmp_path: Path)
         write_tiles(plan, tmp_path, overwrite=True)
 
 
+@pytest.mark.parametrize("kind", ["sog", "3dtiles"])
+def test_a_stream_takes_the_files_of_the_one_before(
+    levels: tuple[Level, ...], tmp_path: Path, kind: str
+) -> None:
+    write = write_sog_stream if kind == "sog" else write_tiles
+    few, many = plan_stream(levels[2:]), plan_stream(levels, chunk_gaussians=500)
+    more = {"file_gaussians": 500} if kind == "sog" else {"tile_gaussians": 500}
+    write(few, tmp_path / "few")
+    write(many, tmp_path / "out", **more)
+    (tmp_path / "out" / "own.html").touch()
+    (tmp_path / "out" / "9_9_9").mkdir()
+    write(few, tmp_path / "out", overwrite=True)
+    names = [{path.name for path in (tmp_path / name).iterdir()} for name in ("out", "few")]
+    assert names[0] == names[1] | {"own.html", "9_9_9"}
+
+
 def test_wrong_levels(levels: tuple[Level, ...]) -> None:
     for wrong in ([], [levels[0], levels[0]]):
         with pytest.raises(InvalidArgumentError, match="needs levels of different sizes"):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,6 +20,10 @@ __all__ = ["INDEX_NAMES", "StreamLevel", "check_stream"]
 
 INDEX_NAMES = {"sog": "lod-meta.json", "3dtiles": "tileset.json"}
 """The file that a viewer opens, by the kind of the stream."""
+
+
+_OWN_NAME = re.compile(r'"(\d+_\d+\.glb|\d+_\d+_\d+(?=/meta\.json")|environment(?=/meta\.json"))')
+"""In an index, what a stream of ours consists of."""
 
 
 class StreamLevel(NamedTuple):
@@ -224,13 +229,32 @@ def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
         raise _refused(place, error) from error
     found = [path.name for path in hidden.iterdir()]
     names = [name for name in found if name != index and not name.startswith(".")]
+    old = _names_of(place / index) - {*names}
     try:
         for name in [*names, index]:
             if (place / name).is_dir():
-                shutil.rmtree(place / name)
+                _remove(place / name)
             (hidden / name).replace(place / name)
+        for name in old:  # of the stream before, which had more of them
+            _remove(place / name)
     except OSError as error:
         raise _refused(place, error) from error
+
+
+def _names_of(index: Path) -> set[str]:
+    """Return the files and folders of ours that an index names."""
+    try:
+        text = index.read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return set()
+    return set(_OWN_NAME.findall(text))
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _refused(place: Path, error: OSError) -> OutputError:
