@@ -2,10 +2,12 @@
 
 ``python -m benchmarks.large levels`` compares levels with runs of their own, in time and PSNR;
 ``seams`` compares blocks with one piece; ``blocks`` simplifies a large generated file in a process
-of its own and prints its user CPU seconds and peak memory. Tables are Markdown.
+of its own and prints its user CPU seconds and peak memory, and with ``--workers 1 2`` how much
+faster two workers are, and whether they write the same bytes. Tables are Markdown.
 """
 
 import argparse
+import hashlib
 import itertools
 import json
 import os
@@ -35,7 +37,13 @@ def main() -> None:
     parser.add_argument("--kinds", default=",".join(KINDS), help="kinds of generated scenes")
     parser.add_argument("--blocks", default="4,16", help="numbers of blocks to compare")
     parser.add_argument("--memory", default="4GB")
-    parser.add_argument("--workers", default="1", help="processes; their user CPU is not counted")
+    parser.add_argument(
+        "--workers",
+        type=int,
+        nargs="+",
+        default=[1],
+        help="processes, one row each; their user CPU is not counted",
+    )
     parser.add_argument("--rho", type=float, default=0.01)
     parser.add_argument("--folder", type=Path, help="where large files are written")
     options = parser.parse_intermixed_args()
@@ -105,21 +113,27 @@ def seams(options: argparse.Namespace) -> None:
 
 
 def blocks(options: argparse.Namespace) -> None:
-    """Whole processes on large files."""
-    print("| file | memory | user CPU s | wall s | peak MB | Gaussians | blocks |")
-    print("|---|---|---|---|---|---|---|")
+    """Whole processes on large files, and each number of workers against the first."""
+    print(
+        "| file | memory | workers | user CPU s | wall s | ratio | peak MB | Gaussians | blocks |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-        for file in options.files:
-            output, report = Path(folder) / "small.ply", Path(folder) / "report.json"
+        output, report = Path(folder) / "small.ply", Path(folder) / "report.json"
+        for file, workers in itertools.product(options.files, options.workers):
             cost = run_python(
                 "-m", "cvtgs", "simplify", str(file), str(output), "--rho", str(options.rho),
-                "--memory", options.memory, "--workers", options.workers,
+                "--memory", options.memory, "--workers", str(workers),
                 "--report", str(report), "--overwrite", "--quiet",
             )  # fmt: skip
-            said = json.loads(report.read_text())
+            said, digest = json.loads(report.read_text()), hashlib.sha256(output.read_bytes())
+            if workers == options.workers[0]:
+                wall, first = cost.wall_seconds, digest.digest()
+            same = "same" if digest.digest() == first else "OTHER"
             print(
-                f"| {file.stem}, {file.stat().st_size / 1e9:.2f} GB | {options.memory} "
+                f"| {file.stem}, {file.stat().st_size / 1e9:.2f} GB | {options.memory} | {workers} "
                 f"| {cost.user_seconds:.1f} | {cost.wall_seconds:.1f} "
+                f"| {wall / cost.wall_seconds:.2f}, {same} bytes "
                 f"| {cost.peak_bytes / 1e6:.0f} | {said['output_count']:,} | {said['blocks']} |",
                 flush=True,
             )

@@ -55,7 +55,7 @@ def test_a_device_is_not_waited_for_where_sizes_are_known():
     rows = torch.tensor([-1, -1, int(first), -1])
     wanted = lists_of(partition)
     with pretended_cuda() as traffic:
-        there = replace(partition.to(torch.device("cuda")), singles=partition.singles)
+        there = partition.to(torch.device("cuda"))
         cells = there.several()
         several, shown = there.select_several(cells), there.keep_only(rows.to("cuda"), total=5)
         assert not traffic.waits

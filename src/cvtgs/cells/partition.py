@@ -161,7 +161,8 @@ class Partition:
         Returns:
             The partition there.
         """
-        return type(self)(order=self.order.to(device), offsets=self.offsets.to(device))
+        order, offsets = self.order.to(device), self.offsets.to(device)
+        return type(self)(order=order, offsets=offsets, singles=self.singles)
 
     def chunks(self, max_members: int, *, cell_cost: int = 0) -> Iterator[tuple[slice, Self]]:
         """Cut the partition into runs of cells, to bound memory.
