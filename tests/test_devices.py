@@ -161,10 +161,19 @@ def test_one_thread_computes_where_it_is():
 
 
 def test_stages_give_the_same_bits_in_two_threads(two_threads, monkeypatch):
-    for name in ("cells.allocate.CHUNK", "cells.merge.CHUNK_MEMBERS"):
+    for name in ("cells.allocate.CHUNK", "cells.inflate.CHUNK", "cells.merge.CHUNK_MEMBERS"):
         monkeypatch.setattr(f"cvtgs.{name}", 100)
+    handed_over = set()
+
+    def recorded(function, items, device):
+        handed_over.add(function.__name__)
+        return in_threads(function, items, device)
+
+    for module in ("allocate", "inflate", "merge"):
+        monkeypatch.setattr(f"cvtgs.cells.{module}.in_threads", recorded)
     monkeypatch.setattr("cvtgs.mergenet.apply.CHUNK_MEMBERS", 100)
     scene = cvtgs.synthetic.scene("object", 2000, sh_degree=1, seed=0)
     two = cvtgs.Simplifier(device="cpu").simplify(scene, 0.1)
     with one_thread():
         assert same_bits(two, cvtgs.Simplifier(device="cpu").simplify(scene, 0.1))
+    assert handed_over == {"costs_of", "search", "merge_chunk", "inflate"}

@@ -197,8 +197,9 @@ def _pair_costs(
     """Return what it costs to merge each pair."""
     volumes = _log_volume(groups.covariances)
     chunk = chunk_length(CHUNK, first.device)
-    costs = []
-    for i, j in zip(first.split(chunk), second.split(chunk), strict=True):
+
+    def costs_of(pairs: tuple[Tensor, Tensor]) -> Tensor:
+        i, j = pairs
         a, b = groups.take(i), groups.take(j)
         total = a.weights + b.weights
         share, other = a.weights / total, b.weights / total
@@ -210,8 +211,11 @@ def _pair_costs(
         ])  # fmt: skip
         cost = 0.5 * (_log_volume(merged) - share * volumes[i] - other * volumes[j])
         cost += config.color * product * (a.colors - b.colors).square().sum(0)
-        costs.append(cost * (a.masses + b.masses) ** config.mass_power)
-    return torch.cat(costs)
+        costs: Tensor = cost * (a.masses + b.masses) ** config.mass_power
+        return costs
+
+    parts = list(zip(first.split(chunk), second.split(chunk), strict=True))
+    return torch.cat([*in_threads(costs_of, parts, first.device)])
 
 
 def _log_volume(covariances: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:

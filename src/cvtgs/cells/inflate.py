@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cells.partition import Partition
-from cvtgs.devices import chunk_length
+from cvtgs.devices import chunk_length, in_threads
 from cvtgs.math import parameters
 from cvtgs.math.segments import gather_columns
 from cvtgs.scene import GaussianScene
@@ -142,11 +142,15 @@ def inflate_cells(
     opacities = parameters.opacity_from_logit(merged.logit_opacities)[: len(counts)]
     strength = opacities.double().square() * crowding
     chunk = chunk_length(CHUNK, counts.device)
-    for part in partition.several().split(chunk):
+
+    def inflate(part: Tensor) -> None:
         cover = side_cover(merged, part, neighbors[part]).amin(dim=2)
         growth = everywhere + covered * (cover / FULL_COVER).clamp_max(1.0)
         factors = 1 + strength[part, None] * growth
         log_scales[part] += parameters.positive_log(factors).to(log_scales.dtype)
+
+    for _ in in_threads(inflate, partition.several().split(chunk), counts.device):
+        pass
     return merged.with_tensors({"log_scales": log_scales}, merged.extras)
 
 
