@@ -99,6 +99,16 @@ def test_images_to_match_stand_for_many(model):
     assert "match" not in model.stage_seconds("matched", work, config=unmatched)
 
 
+def test_pairs_of_pixels_and_gaussians_grow_as_the_roots_of_both():
+    matched = cvtgs.SimplifyConfig.from_preset("matched")
+    few, many = (
+        Work(count=10**6, target=count).features("match", matched)["view_pairs"]
+        for count in (1000, 100_000)
+    )
+    assert few == pytest.approx(24 * 256 * math.sqrt(1000))
+    assert many == pytest.approx(10 * few)
+
+
 def test_settings_count(model):
     """Stages that are left out cost nothing, those asked for cost what they cost elsewhere."""
     work = Work(count=100_000, target=1000)

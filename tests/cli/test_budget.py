@@ -15,7 +15,7 @@ from cvtgs.cli.time_budget import STARTED, choose_preset, read_seconds
 from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.progress import silent
 
-RATES = dict(zip(CANDIDATES, (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1.0), strict=True))
+RATES = dict(zip(CANDIDATES, (1e-6, 1e-5, 1e-4, 1e-3, 1e-2), strict=True))
 MODEL = CostModel(
     rates={name: {"check": {"in": rate, "in_values": 0.0}} for name, rate in RATES.items()}
 )

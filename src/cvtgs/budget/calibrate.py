@@ -49,8 +49,8 @@ CANDIDATES = tuple(name for name in PRESETS if name != "paper")
 """Presets to choose from; ``paper`` is there to compare with."""
 
 SHORT = (
-    {"views": 3, "steps": 4, "batch": 4, "heldout": 2, "size": 128},
-    {"views": 5, "steps": 5, "batch": 5, "heldout": 2, "size": 176},
+    {"views": 3, "steps": 4, "batch": 4, "heldout": 2, "size": 256},
+    {"views": 5, "steps": 5, "batch": 5, "heldout": 2, "size": 352},
 )
 """Images and refinements are cut to this, in turn: their cost grows with number and pixels."""
 
@@ -60,7 +60,7 @@ SHORTEST = {"views": 1, "steps": 1, "batch": 4, "heldout": 1, "size": 32}
 RENDERERS = ("gsplat", "numba")
 """Packages that render faster than torch; importing one to ask takes longer than many a run."""
 
-VERSION: Literal[2] = 2
+VERSION: Literal[3] = 3
 """Of the file; raised when features change, so that older files are measured again."""
 
 SHIPPED_RATES = "rates.json"
@@ -96,7 +96,7 @@ TRIALS = (
 class CachedModel(Record, allow_inf_nan=False):
     """The content of the file."""
 
-    version: Literal[2]
+    version: Literal[3]
     key: dict[str, str]
     made: float
     model: CostModel

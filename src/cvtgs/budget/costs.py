@@ -24,7 +24,7 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     "tessellate": ("once", "in", "search", "pairs"),
     "merge": ("once", "in", "in_values", "out", "out_values"),
     VISIBILITY: ("once", "view_pixels", "views_in"),
-    MATCH: ("once", "view_pixels", "views_out", "view_values"),
+    MATCH: ("once", "view_pixels", "view_pairs", "view_values"),
     REFINE: ("images_in", "look_pixels", "looks_out"),
     NETWORK: ("once", "in", "in_values", "out", "out_values"),
 }
@@ -36,7 +36,7 @@ OTHER_FEATURES = ("once", "in", "out")
 SHARE_OF_A_STEP = 0.2
 """An image without gradients costs this share of a step."""
 
-STEPS_OF_A_BATCH = 2.0
+STEPS_OF_A_BATCH = 8.0
 """To find views, however many at once, costs as much as so many steps."""
 
 LEAST_SECONDS = 2e-3
@@ -103,7 +103,8 @@ class Work:
             "out_values": float(self.target * self.colors),
             "view_pixels": float(visibility.views * visibility.size**2),
             "views_in": float(visibility.views * self.count),
-            "views_out": float(visibility.views * self.target),
+            # Pairs of a pixel and a Gaussian: more Gaussians are smaller, and hide one another.
+            "view_pairs": visibility.views * visibility.size * math.sqrt(self.target),
             "view_values": float(visibility.views * self.target * self.colors),
             "images_in": (refine.heldout + new_images) * self.count,
             "look_pixels": renders * (refine.size / refine.stride) ** 2,
