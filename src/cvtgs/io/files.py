@@ -94,7 +94,7 @@ def scene_size(path: str | os.PathLike[str]) -> int:
         path: A file, or a folder that :func:`scene_file` finds a scene in.
 
     Returns:
-        Bytes of its file; of an unbundled or a streamed SOG, those of its images too.
+        Bytes of its file; of an unbundled or a streamed SOG, those of its other files too.
 
     Example:
         >>> import tempfile
@@ -103,8 +103,9 @@ def scene_size(path: str | os.PathLike[str]) -> int:
         0
     """
     file = scene_file(path)
-    patterns = {"meta.json": "*.webp", "lod-meta.json": "**/*.webp"}
-    parts = file.parent.glob(patterns[file.name]) if file.name in patterns else ()
+    streamed = ("**/*.webp", "**/*.sog", "**/meta.json")
+    patterns = {"meta.json": ("*.webp",), "lod-meta.json": streamed}.get(file.name, ())
+    parts = [part for pattern in patterns for part in file.parent.glob(pattern)]
     return sum(part.stat().st_size for part in (file, *parts))
 
 
