@@ -50,7 +50,9 @@ def psnr_of(scene, small):
     ]
 
 
-def test_matched_blocks_are_nearly_as_good_as_one_piece(scene, source, tmp_path):
+def test_matched_blocks_are_nearly_as_good_as_one_piece(scene, source, tmp_path, monkeypatch):
+    """One piece by views chosen as those of blocks are, blurred ones too: else it is 2 dB ahead."""
+    monkeypatch.setattr("cvtgs.views.mixed.TRIED", 1)
     report = in_blocks(source, tmp_path / "matched.ply", MATCHED)
     small = {
         "one": simplifier_of(MATCHED).simplify(scene, count=COUNT),
@@ -75,7 +77,7 @@ def test_the_order_of_blocks_does_not_matter(source, tmp_path, settings):
 
 
 def test_images_need_some_memory(source, tmp_path):
-    with pytest.raises(InvalidArgumentError, match="at least 900 MB for images"):
+    with pytest.raises(InvalidArgumentError, match="at least 800 MB for images"):
         in_blocks(source, tmp_path / "no.ply", MATCHED, blocks=None, memory=600_000_000)
 
 

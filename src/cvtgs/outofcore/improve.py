@@ -55,7 +55,9 @@ def improve(job: Job, block: int) -> None:
     small, changes = drawn.small, dict[str, Any]()
     if config.match.enabled and config.uses_renders:
         choices = config.visibility
-        views = mixed_views(drawn.positions, choices.views, size=choices.size, seed=config.seed)
+        views = mixed_views(
+            drawn.positions, choices.views, size=choices.size, seed=config.seed, sharp=False
+        )
         observed = observe(drawn.full, views)
         targets = cell_contributions(observed.contributions[drawn.fixed :], found.partition)
         small, changes["matching"] = match_views(
@@ -71,7 +73,9 @@ def improve(job: Job, block: int) -> None:
         small, changes["refinement"] = refine(
             small,
             drawn.full,
-            cameras=mixed_views(drawn.positions, max(2, number), size=size, seed=config.seed),
+            cameras=mixed_views(
+                drawn.positions, max(2, number), size=size, seed=config.seed, sharp=False
+            ),
             config=config.refine,
             seed=config.seed,
             device="cpu",

@@ -91,7 +91,7 @@ def _targets(
 
 
 def mixed_views(
-    scene: SceneLike | CameraPositions, count: int, *, size: int, seed: int = 0
+    scene: SceneLike | CameraPositions, count: int, *, size: int, seed: int = 0, sharp: bool = True
 ) -> Cameras:
     """Return automatic and random views together.
 
@@ -105,6 +105,7 @@ def mixed_views(
         count: Number of views, at least 1.
         size: Side of the square images, pixels.
         seed: Of the random numbers.
+        sharp: Whether views of large splats come last; not where parts of a scene were merged.
 
     Returns:
         The cameras, in this order.
@@ -120,11 +121,12 @@ def mixed_views(
     """
     positions = as_positions(scene)
     usual, near = max(1, count // 4), count // 4
+    times = TRIED if sharp else 1
     far = max(0, count - usual - near)
     tried = [
-        (automatic_views(positions, TRIED * usual, width=size, height=size, seed=seed), usual),
-        (random_views(positions, TRIED * near, size=size, seed=seed + 1, reach=NEAR), near),
-        (random_views(positions, TRIED * far, size=size, seed=seed), far),
+        (automatic_views(positions, times * usual, width=size, height=size, seed=seed), usual),
+        (random_views(positions, times * near, size=size, seed=seed + 1, reach=NEAR), near),
+        (random_views(positions, times * far, size=size, seed=seed), far),
     ]
     groups = [_sharp_ones(positions, cameras, wanted) for cameras, wanted in tried]
     return Cameras(
@@ -137,7 +139,7 @@ def mixed_views(
 
 def _sharp_ones(positions: CameraPositions, cameras: Cameras, count: int) -> Cameras:
     """Return the first views that are not blurred, and the least blurred others if need be."""
-    if count == 0:
+    if len(cameras) == count:
         return cameras
     sizes = splat_sizes(positions.layout, cameras)
     least = BLURRED * sizes.quantile(0.25)
