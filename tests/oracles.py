@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import spence
 
 Array = NDArray[np.float64]
 
@@ -138,13 +140,16 @@ def merge(cell: Sequence[Gaussian], *, area_power: float, opacity: str) -> Gauss
         offset = g.mean - mean
         matrix += share * (g.covariance + np.outer(offset, offset))
         sh += share * g.sh
+    limit = -math.log(OPACITY_MARGIN)
     if opacity == "union":
         through = math.prod(1.0 - g.opacity for g in cell)
         depth = -math.log(max(through, 1e-300))
     else:
         merged_area = thomsen_area(np.sqrt(np.maximum(np.linalg.eigvalsh(matrix), 0.0)))
-        depth = math.fsum(g.depth * g.area for g in cell) / merged_area
-    limit = -math.log(OPACITY_MARGIN)
+        total = math.fsum(spence(math.exp(-g.depth)) * g.area for g in cell) / merged_area
+        limit = -math.log(0.01)
+        is_opaque = total >= spence(math.exp(-limit))
+        depth = limit if is_opaque else brentq(lambda x: spence(math.exp(-x)) - total, 0, limit)
     return Gaussian(mean=np.asarray(mean), covariance=matrix, depth=min(depth, limit), sh=sh)
 
 

@@ -1,5 +1,6 @@
 """Merge the members of every cell into one Gaussian, by moments or by a representative."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -11,7 +12,7 @@ from torch import Tensor
 from cvtgs.cells.partition import Partition
 from cvtgs.config import MergeConfig
 from cvtgs.devices import chunk_length, in_threads
-from cvtgs.math import parameters
+from cvtgs.math import depths, parameters
 from cvtgs.math.segments import (
     gather_columns,
     segment_argmax,
@@ -24,6 +25,9 @@ from cvtgs.scene import GaussianScene
 
 CHUNK_MEMBERS = 1 << 15
 """Members gathered at one time; a chunk takes about ``(60 + 6 k) * 8`` bytes for each."""
+
+OPAQUE = -math.log(0.01)
+"""The optical depth of an opacity of 0.99, the most that rasterizers paint at a pixel."""
 
 
 def merge_cells(
@@ -70,12 +74,14 @@ def merge_cells(
         weights = members.weights(config.area_power)
         means, matrices = mean_and_covariance(members, weights)
         scales, quats = parameters.decompose_covariances(matrices)
-        depths = merged_depth(members, parameters.mean_projected_area(scales), rule=config.opacity)
+        areas = parameters.mean_projected_area(scales)
         new = {
             "means": means,
             "quats": quats,
             "log_scales": parameters.positive_log(scales),
-            "logit_opacities": parameters.logit_from_optical_depth(depths),
+            "logit_opacities": parameters.logit_from_optical_depth(
+                merged_depth(members, areas, rule=config.opacity)
+            ),
         }
         bands = ("sh0", "shN") if scene.shN.shape[1] else ("sh0",)
         for name in bands:
@@ -238,15 +244,17 @@ def merged_depth(
         members: Members of the cells.
         areas: Mean projected areas of the merged Gaussians.
         rule: ``union``: all members lie behind one another, depths add up (CVT-GS:
-            ``1 - prod(1 - a)``). ``saturating``: depth times area adds up, so that mass is
-            conserved as long as the cell is not opaque.
+            ``1 - prod(1 - a)``). ``saturating``: what each sums to over an image adds up
+            (:func:`cvtgs.math.depths.integrated_depth`), until the cell is opaque.
 
     Returns:
         Optical depths; the opacity is ``1 - exp(-depth)``.
     """
     if rule == "union":
         return segment_sum(members.depths, members.offsets)
-    return parameters.divide(segment_sum(members.depths * members.areas, members.offsets), areas)
+    images = depths.integrated_depth(members.depths) * members.areas
+    totals = segment_sum(images, members.offsets)
+    return depths.depth_from_integrated(parameters.divide(totals, areas)).clamp_max(OPAQUE)
 
 
 def keep_representatives(

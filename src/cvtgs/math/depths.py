@@ -1,0 +1,62 @@
+"""Optical depth of a Gaussian summed over its image, from the depth at its centre and back."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from cvtgs.math import parameters
+
+FULL_DEPTH = math.pi**2 / 6
+"""The optical depth of an opaque Gaussian summed over an image, as a multiple of its area."""
+
+
+def integrated_depth(depths: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Return the optical depth of Gaussians summed over an image, as a multiple of their area.
+
+    A Gaussian lets ``1 - a g(x)`` of the light through, g being 1 at its centre. The integral of
+    ``-log(1 - a g(x))`` over its projected area ``2 pi sigma_1 sigma_2`` is the dilogarithm
+    ``Li2(a)``: it grows like a, and ends at ``pi^2 / 6``, however deep the centre is.
+
+    Args:
+        depths: Optical depths at the centre, ``-log(1 - a)``, above 0.
+
+    Returns:
+        ``Li2(1 - exp(-depth))``, in (0, 1.645).
+
+    Example:
+        >>> round(integrated_depth(torch.tensor([0.6931472])).item(), 4)
+        0.5822
+    """
+    others = -parameters.positive_log(parameters.opacity_from_optical_depth(depths))  # -log(a)
+    small = torch.minimum(depths, others)
+    square = small.square()
+    series = 1 / 3600 - square * (1 / 211680 - square / 10886400)
+    values = small - square / 4 + small * square * (1 / 36 - square * series)
+    return torch.where(depths <= others, values, FULL_DEPTH - depths * others - values)
+
+
+def depth_from_integrated(values: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Return the optical depth at the centre (inverse of :func:`integrated_depth`).
+
+    Args:
+        values: Integrated depths, at least 0; more than a Gaussian can have counts as the most.
+
+    Returns:
+        Optical depths in [0, 13.8].
+
+    Example:
+        >>> round(depth_from_integrated(torch.tensor([0.5822405])).item(), 4)
+        0.6931
+    """
+    tiny = torch.finfo(values.dtype).tiny
+    values = values.clamp_max(FULL_DEPTH)
+    depths = torch.maximum(values, -parameters.positive_log(1 - values / FULL_DEPTH)).clamp(
+        tiny, parameters.LOGIT_LIMIT
+    )
+    for _ in range(6):  # Newton, from below
+        slopes = depths / torch.expm1(depths)
+        depths = depths + (values - integrated_depth(depths)) / slopes
+        depths = depths.clamp(tiny, parameters.LOGIT_LIMIT)
+    return depths
