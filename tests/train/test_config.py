@@ -70,7 +70,7 @@ def test_there_are_recipes():
         "standard",
         "standard-low",
         "standard-pairs",
-        "standard-balanced",
+        "standard-depth",
         "paper",
         "paper-gated",
         "paper-gated-local",
