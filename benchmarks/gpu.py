@@ -36,6 +36,9 @@ HIGH: dict[str, Any] = {"preset": "high"}
 CASE_COUNT = 20_000
 """Gaussians of the scene to train on."""
 
+TRAININGS = ("scene", "local")
+"""Kinds of training to time."""
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
@@ -146,7 +149,7 @@ def training_table(device: torch.device, *, steps: int) -> list[str]:
     """Steps a second of both trainings, without the first fifth, on the device and on the CPU."""
     lines = ["| training | device steps/s | CPU steps/s |", "|---|---|---|"]
     data = DataConfig(generated=1, generated_validation=1, generated_counts=(CASE_COUNT,))
-    for kind in ("scene", "local"):
+    for kind in TRAININGS:
         rates = []
         for where in (device, torch.device("cpu")):
             config = TrainConfig(
