@@ -1,7 +1,6 @@
 """Merged cells against the scalar oracle, and what a merge conserves."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -17,7 +16,6 @@ from cvtgs.cells import (
 )
 from cvtgs.config import MergeConfig
 from cvtgs.math import depths, parameters
-from cvtgs.scene import ANTIALIASED_TAG
 from scenes import assert_same_gaussians, covariances_of, moved, oracle_rows, random_scene
 
 RULES = {
@@ -120,20 +118,6 @@ def test_saturating_conserves_what_depth_sums_to_over_an_image(shift: float):
     torch.testing.assert_close(found[clear], wanted[clear], rtol=1e-4, atol=0)
     opaque = (wanted >= depths.FULL_DEPTH * areas) & (cells.offsets.diff() > 1)
     torch.testing.assert_close(small.opacities[opaque], torch.full_like(areas[opaque], 0.99))
-
-
-def test_antialiased_scenes_conserve_depth_at_the_centre_times_area():
-    scene, cells = random_scene(400, dtype=torch.float64), random_cells(400, 150)
-    scene = replace(scene, comments=(ANTIALIASED_TAG,))
-    small, members = merged(scene, cells, RULES["standard"]), gather_members(scene, cells)
-    wanted = [
-        part.sum() for part in (members.depths * members.areas).split(cells.offsets.diff().tolist())
-    ]
-    areas = parameters.mean_projected_area(small.scales)
-    found = -torch.log1p(-small.opacities) * areas
-    clear = (small.opacities < 0.999) & (cells.offsets.diff() > 1)
-    assert int(clear.sum()) > 50
-    torch.testing.assert_close(found[clear], torch.stack(wanted)[clear], rtol=1e-8, atol=0)
 
 
 def test_saturating_never_gains_mass_and_never_exceeds_one():

@@ -80,7 +80,7 @@ def merge_cells(
             "quats": quats,
             "log_scales": parameters.positive_log(scales),
             "logit_opacities": parameters.logit_from_optical_depth(
-                merged_depth(members, areas, rule=config.opacity, antialiased=scene.antialiased)
+                merged_depth(members, areas, rule=config.opacity)
             ),
         }
         bands = ("sh0", "shN") if scene.shN.shape[1] else ("sh0",)
@@ -237,7 +237,6 @@ def merged_depth(
     areas: Float[Tensor, "m"],
     *,
     rule: Literal["saturating", "union"],
-    antialiased: bool = False,
 ) -> Float[Tensor, "m"]:
     """Return the optical depth of the Gaussian that stands for a cell.
 
@@ -247,18 +246,12 @@ def merged_depth(
         rule: ``union``: all members lie behind one another, depths add up (CVT-GS:
             ``1 - prod(1 - a)``). ``saturating``: what each sums to over an image adds up
             (:func:`cvtgs.math.depths.integrated_depth`), until the cell is opaque.
-        antialiased: Whether images of the scene are compensated for dilation. Where they are not,
-            small members show more than their mass; where they are, ``saturating`` adds up depths
-            at the centre times areas, which is less.
 
     Returns:
         Optical depths; the opacity is ``1 - exp(-depth)``.
     """
     if rule == "union":
         return segment_sum(members.depths, members.offsets)
-    if antialiased:
-        totals = segment_sum(members.depths * members.areas, members.offsets)
-        return parameters.divide(totals, areas)
     images = depths.integrated_depth(members.depths) * members.areas
     totals = segment_sum(images, members.offsets)
     return depths.depth_from_integrated(parameters.divide(totals, areas)).clamp_max(OPAQUE)
