@@ -165,7 +165,7 @@ def test_one_image_keeps_its_camera():
 def test_views_are_mixed_ones():
     scene = small_scene()
     views = render_views(scene, 5, size=32, seed=2)
-    mixed = mixed_views(scene, 5, size=32, seed=2)
+    mixed = mixed_views(scene, 5, size=32, seed=2, sharp=False)
     assert torch.equal(views.cameras.viewmats, mixed.viewmats)
     assert torch.equal(views.cameras.Ks, mixed.Ks)
     assert views.rgb.shape == (5, 32, 32, 3)
@@ -177,9 +177,9 @@ def test_views_are_mixed_ones():
 
 def test_one_view_is_an_automatic_one():
     scene = small_scene()
-    usual = automatic_views(scene, 3, width=32, height=32, seed=0)  # of which a sharp one is taken
-    (view,) = render_views(scene, 1, size=32, seed=0).cameras.viewmats
-    assert any(torch.equal(view, other) for other in usual.viewmats)
+    usual = automatic_views(scene, 1, width=32, height=32, seed=0)
+    views = render_views(scene, 1, size=32, seed=0)
+    assert torch.equal(views.cameras.viewmats, usual.viewmats)
 
 
 def test_the_seed_decides_the_views():

@@ -276,8 +276,11 @@ def _byte_count(value: Any) -> int:
 
 
 def render_views(scene: GaussianScene, count: int, *, size: int, seed: int) -> TargetViews:
-    """Render a full scene from automatic cameras and from random positions, near ones too."""
-    cameras = mixed_views(scene, count, size=size, seed=seed)
+    """Render a full scene from automatic cameras and from random positions, near ones too.
+
+    Blurred views are learned from as well: the shipped networks were.
+    """
+    cameras = mixed_views(scene, count, size=size, seed=seed, sharp=False)
     with torch.no_grad():
         images = render(scene, cameras)
     return TargetViews(

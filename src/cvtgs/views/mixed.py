@@ -105,7 +105,8 @@ def mixed_views(
         count: Number of views, at least 1.
         size: Side of the square images, pixels.
         seed: Of the random numbers.
-        sharp: Whether views of large splats come last; not where parts of a scene were merged.
+        sharp: Whether views of large splats come last; not where parts of a scene were merged,
+            nor in trainings.
 
     Returns:
         The cameras, in this order.
