@@ -167,18 +167,22 @@ def in_threads(
         items: The chunks.
         device: Where it computes: others than CPUs get one chunk after the other.
 
-    Yields:
-        The results, in the order of the items.
+    Returns:
+        The results, in the order of the items, each computed when it is asked for or before.
 
     Example:
         >>> list(in_threads(abs, [-1, 2, -3], torch.device("cpu")))
         [1, 2, 3]
     """
-    threads = min(torch.get_num_threads(), thread_count())
-    if device.type != "cpu" or threads == 1:
-        yield from map(function, items)
-        return
+    threads = torch.get_num_threads()
+    if device.type != "cpu" or threads == 1 or thread_count() == 1:
+        return map(function, items)
+    return _in_pool(function, items, min(threads, thread_count()))
 
+
+def _in_pool(
+    function: Callable[[Item], Result], items: Iterable[Item], threads: int
+) -> Iterator[Result]:
     before, has_gradients = torch.get_num_threads(), torch.is_grad_enabled()
 
     def start() -> None:

@@ -224,12 +224,17 @@ def _tessellate(
         has_duplicates=has_duplicates,
         on_iteration=on_iteration,
     )
-    members = points.moments or _moments(points, analysis)
-    costs = allocation_at(target / total, config.allocation)
-    near = points.neighbors if count == len(rows) else None
-    return tessellation, allocate(
-        members, tessellation.labels, count, target, costs, neighbors=near
-    )
+    labels, allocation = tessellation.labels, config.allocation
+    if count > target or (allocation.reassign and count < len(rows)):
+        labels = allocate(
+            points.moments or _moments(points, analysis),
+            labels,
+            count,
+            target,
+            allocation_at(target / total, allocation),
+            neighbors=points.neighbors if count == len(rows) else None,
+        )
+    return tessellation, labels
 
 
 def finer_count(target: int, available: int, config: AllocationConfig) -> int:
@@ -261,28 +266,27 @@ def allocate(
 
     Args:
         members: Moments of what is grouped.
-        labels: Cell of each; none is empty.
+        labels: Cell of each; none is empty. As many cells as members are numbered as they are.
         count: Number of cells.
         target: Number of cells to leave.
         config: Costs.
-        neighbors: Neighbours of the members, where each is a cell of its own, in their order;
-            None finds those of the cells.
+        neighbors: Neighbours of the cells; None finds them.
 
     Returns:
         The new cell of each member; none is empty.
     """
+    groups = members if count == len(labels) else cells.group_moments(members, labels, count)
     if count > target:
-        groups = members if neighbors is not None else cells.group_moments(members, labels, count)
-        groups, near = groups.on_host(), neighbors  # many small steps
-        if near is None:
-            near = cvt.nearest_neighbors(groups.means.T, config.neighbors)
-        merged = cells.merge_pairs(groups, near, target, config).to(labels.device)
-        labels = merged.index_select(0, labels)
-    if config.reassign and target < len(labels):
-        groups = cells.group_moments(members, labels, target)
-        near = cvt.nearest_neighbors(groups.means.T, REASSIGN)
-        labels = cells.reassign(members, labels, groups, near, config)
-    return labels
+        groups = groups.to(torch.device("cpu"))  # many small steps
+        if neighbors is None:
+            neighbors = cvt.nearest_neighbors(groups.means.T, config.neighbors)
+        merged = cells.merge_pairs(groups, neighbors, target, config)
+        labels = merged.to(labels.device).index_select(0, labels)
+        groups = cells.group_moments(groups, merged, target).to(labels.device)
+    if not config.reassign or target == len(labels):
+        return labels
+    near = cvt.nearest_neighbors(groups.means.T, REASSIGN)
+    return cells.reassign(members, labels, groups, near, config)
 
 
 def group_cells(

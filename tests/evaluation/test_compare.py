@@ -143,6 +143,17 @@ def test_evaluate_refuses_what_makes_no_sense(scene, cameras):
         evaluate(scene, {"a": scene}, cameras, settings=EvaluationSettings(lpips="x"))
 
 
+def test_cameras_of_another_scene_are_refused(scene, cameras):
+    away = cameras.viewmats.clone()
+    away[:, 0, 3] += 1e4  # the scene lies far to the right of every image
+    elsewhere = replace(cameras, viewmats=away)
+    for score in (evaluate, compare):
+        with pytest.raises(ValueError, match=r"must see full, found nothing of it in any of 3"):
+            score(scene, {"a": scene}, elsewhere, settings=OFF)
+    mixed = replace(cameras, viewmats=torch.cat([away[:2], cameras.viewmats[2:]]))
+    assert evaluate(scene, {"a": scene}, mixed, settings=OFF).scenes
+
+
 def test_the_background_shows_through(scene, small, cameras):
     settings = EvaluationSettings(lpips="off", background=(1.0, 1.0, 1.0))
     white = compare(scene, small, cameras, settings=settings)

@@ -19,7 +19,7 @@ from PIL import Image
 import cvtgs
 from cvtgs.cli.main import build_parser, main
 from cvtgs.errors import FileFormatError
-from cvtgs.io.sizes import FREE_BYTES, MOST_EXPANSION
+from cvtgs.io.files import FREE_BYTES, MOST_EXPANSION
 from format_cases import DATA, refusal
 from scenes import random_scene
 

@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 
 from cvtgs import load, save
 from cvtgs.errors import FileFormatError, InputNotFoundError
-from cvtgs.io.sog.codebook import codebook, palette, palette_size
 from cvtgs.io.sog.container import encode_webp
-from cvtgs.io.sog.write import write_sog
+from cvtgs.io.sog.write import codebook, palette, palette_size, write_sog
 from format_cases import (
     DATA,
     assert_as_oracle,

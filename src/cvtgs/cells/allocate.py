@@ -58,11 +58,11 @@ class Moments(NamedTuple):
             self.colors.index_select(1, rows),
         )
 
-    def on_host(self) -> "Moments":
-        """Return them on the CPU; they go there in one piece."""
-        if self.weights.device.type == "cpu":
+    def to(self, device: torch.device) -> "Moments":
+        """Return them on a device; they go there in one piece."""
+        if self.weights.device == device:
             return self
-        table = torch.cat([self.weights[None], self.masses[None], *self[2:]]).cpu()
+        table = torch.cat([self.weights[None], self.masses[None], *self[2:]]).to(device)
         weights, masses, *others = table.split([1, 1, 3, 6, 3])
         return Moments(weights[0], masses[0], *others)
 

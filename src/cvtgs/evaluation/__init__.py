@@ -2,9 +2,9 @@
 
 from cvtgs.evaluation.compare import Comparison, SceneImages, compare, evaluate
 from cvtgs.evaluation.comparison_files import write_comparison
+from cvtgs.evaluation.images import fit_cameras, load_photographs
 from cvtgs.evaluation.lpips import LPIPS_VARIABLE, LpipsWeights, load_lpips, lpips
 from cvtgs.evaluation.metrics import alpha_bias, alpha_error, psnr, ssim
-from cvtgs.evaluation.photographs import fit_cameras, load_photographs
 from cvtgs.evaluation.report import Evaluation, SceneScores, Score
 from cvtgs.evaluation.scorer import EvaluationSettings
 

@@ -26,6 +26,9 @@ from cvtgs.scene import GaussianScene, SceneLike, as_scene
 STAGE = "evaluate"
 """The stage of the progress events; a step is an image."""
 
+LEAST_COVER = 1e-4
+"""Cameras see nothing of a scene that covers less of every image (7 x 7 of 800 x 600 pixels)."""
+
 Images = UInt8[np.ndarray, "c h w 3"]
 Alphas = UInt8[np.ndarray, "c h w"]
 
@@ -110,8 +113,8 @@ def evaluate(
         The scores, per view and on average.
 
     Raises:
-        InvalidArgumentError: There is no camera, two scenes share a name, or the photographs
-            have another shape than the images.
+        InvalidArgumentError: There is no camera, or none sees anything of the full scene; two
+            scenes share a name, or the photographs have another shape than the images.
         DeviceError: The backend does not work on a scene's device.
         MissingDependencyError: The backend's package or the chosen LPIPS is missing.
 
@@ -162,8 +165,7 @@ def compare(  # noqa: PLR0913 (options by name)
         The images and the scores.
 
     Raises:
-        InvalidArgumentError: There is no camera, two scenes share a name, ``most_images`` is
-            below 1, or the photographs have another shape than the images.
+        InvalidArgumentError: As for :func:`evaluate`, or ``most_images`` is below 1.
         DeviceError: The backend does not work on a scene's device.
         MissingDependencyError: The backend's package or the chosen LPIPS is missing.
 
@@ -239,6 +241,7 @@ def _score_images(
     against_full: dict[str, list[ImageScores]] = {name: [] for name in scenes}
     against_photographs: dict[str, list[ImageScores]] = {name: [] for name in scenes}
     total, done, backend = len(cameras) * len(scenes), 0, ""
+    most_cover = 0.0
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
     for view in range(len(cameras)):
         camera = cameras.select(torch.tensor([view]))
@@ -251,6 +254,7 @@ def _score_images(
             keep(name, view, image)
             if truth is None:
                 truth = image
+                most_cover = max(most_cover, float(image.alpha.mean()))
             else:
                 alphas = (image.alpha, truth.alpha.to(image.alpha))
                 against_full[name].append(metrics.compare(color, truth.color, alphas=alphas))
@@ -259,6 +263,11 @@ def _score_images(
                 against_photographs[name].append(found)
             done += 1
             listener(ProgressEvent(stage=STAGE, done=done, total=total))
+    if most_cover < LEAST_COVER:
+        raise InvalidArgumentError(
+            f"the cameras must see {reference_name}, found nothing of it in any of {len(cameras)} "
+            f"views; give cameras of this scene, in its axes and units."
+        )
     del against_full[reference_name]
     return Evaluation(
         reference=reference_name,

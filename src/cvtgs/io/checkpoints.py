@@ -14,8 +14,7 @@ from torch import Tensor
 
 from cvtgs.errors import CvtgsError, FileFormatError, InvalidSceneError, is_out_of_memory
 from cvtgs.io.dicts import check_tensors, from_dict
-from cvtgs.io.files import open_input
-from cvtgs.io.sizes import check_stored
+from cvtgs.io.files import check_stored, open_input
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown

@@ -1,20 +1,39 @@
-"""Find and open the files of scenes and cameras; every failure is one clear sentence."""
+"""Files of other programs: found and opened, no larger than they can be, JSON validated.
 
+Every failure is one clear sentence.
+"""
+
+import json
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Annotated, Any, BinaryIO, TypeVar, get_args
+
+import pydantic
+from pydantic import AllowInfNan, BeforeValidator, Field, Strict
+from torch import Tensor
 
 from cvtgs.errors import CvtgsError, FileFormatError, InputError, InputNotFoundError
+from cvtgs.text import shown
 
 _POINTER = b"version https://git-lfs."
 """How the few lines start that a clone without Git LFS has in place of a large file."""
 
 _ITERATION = re.compile(r"iteration_(\d{1,18})")
 _STEP = re.compile(r"step-(\d{1,18})\.ckpt")
+
+
+FREE_BYTES = 1 << 26
+"""A scene of at most this many bytes in memory is read from a file of any size."""
+MOST_EXPANSION = 64
+"""Beyond that, a scene may have this many times the bytes of its file; real ones have 4 to 13."""
+_FLOATS = 14
+"""Numbers of a Gaussian without view-dependent colour."""
+_MOST_WHOLE = 1 << 53
+"""Whole numbers up to here are the same in every JSON parser."""
 
 
 @contextmanager
@@ -126,3 +145,98 @@ def _numbered(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
     matches = [(pattern.fullmatch(part.name), part) for part in folder.iterdir()]
     numbers = [(int(match[1]), part) for match, part in matches if match]
     return [part for _, part in sorted(numbers, reverse=True)]
+
+
+def check_expansion(path: Path | str, *, count: int, rest: int, stored: int) -> None:
+    """Refuse a file that claims far more Gaussians, of ``rest`` SH coefficients, than it can hold.
+
+    Every reader of a compressed format calls this before it unpacks anything, unless sizes are
+    trusted.
+    """
+    wanted = 4 * count * (_FLOATS + 3 * rest)
+    if wanted > FREE_BYTES + MOST_EXPANSION * stored:
+        raise FileFormatError(
+            f"{path}: a scene must have at most {FREE_BYTES >> 20} MiB and {MOST_EXPANSION} times "
+            f"the bytes of its file, found {count:,} Gaussians that take {wanted:,} bytes in a "
+            f"file of {stored:,}; if you trust the file, pass trust_sizes=True (--trust-sizes)."
+        )
+
+
+def check_stored(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Refuse tensors of a checkpoint that repeat numbers instead of storing each."""
+    for name, tensor in tensors.items():
+        wanted, stored = tensor.numel() * tensor.element_size(), tensor.untyped_storage().nbytes()
+        if wanted > stored:
+            raise FileFormatError(
+                f"{path}: {name!r} must store each of its {wanted:,} bytes, found {stored:,}; if "
+                f"you trust the file, pass trust_sizes=True (--trust-sizes)."
+            )
+
+
+class Document(pydantic.BaseModel):
+    """A JSON object of which some keys are read; descriptions of fields say what they must be."""
+
+    model_config = pydantic.ConfigDict(frozen=True)
+
+
+def _without_point(value: Any) -> Any:
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+Number = Annotated[float, Strict(), AllowInfNan(False), Field(description="a finite number")]
+Whole = Annotated[
+    int,
+    Strict(),
+    BeforeValidator(_without_point),  # 800.0
+    Field(ge=-_MOST_WHOLE, le=_MOST_WHOLE, description="a whole number"),
+]
+Text = Annotated[str, Strict(), Field(description="a text")]
+Items = Annotated[list[Any], Field(description="a list")]
+Vector = Annotated[tuple[Number, Number, Number], Field(description="3 finite numbers")]
+AnyDocument = TypeVar("AnyDocument", bound=Document)
+
+
+def validated(model: type[AnyDocument], value: Any, where: str) -> AnyDocument:
+    """Check a value of a document against a model; errors name the place, the key and the value."""
+    try:
+        return model.model_validate(value)
+    except pydantic.ValidationError as error:
+        text = _sentence(model, value, error.errors(include_url=False)[0]["loc"], where)
+        raise FileFormatError(text) from error
+
+
+def _sentence(model: type[Document], value: Any, keys: Sequence[int | str], where: str) -> str:
+    if not isinstance(value, dict):
+        return f"{where}: must be a JSON object, found {shown(value)}."
+    key = str(keys[0])
+    annotation = model.model_fields[key].annotation
+    for part in (annotation, *get_args(annotation)):
+        if isinstance(part, type) and issubclass(part, Document):
+            return _sentence(part, value.get(key), keys[1:], f"{where}: {key!r}")
+    schema = model.model_json_schema()["properties"][key]
+    required = schema.get("description") or schema["anyOf"][0]["description"]  # X, X | None
+    found = shown(value[key]) if key in value else "none"
+    return f"{where}: {key!r} must be {required}, found {found}."
+
+
+def read_json(path: Path) -> Any:
+    """Read and parse a JSON file."""
+    with open_input(path) as file:
+        return parse_json(file.read(), path)
+
+
+def parse_json(data: bytes, path: str | Path) -> Any:
+    """Parse JSON that is read already."""
+    try:
+        return json.loads(data.decode("utf-8-sig"))
+    except json.JSONDecodeError as error:
+        raise FileFormatError(
+            f"{path}: must be JSON, found an error in line {error.lineno}, column {error.colno}: "
+            f"{error.msg.lower()}."
+        ) from error
+    except UnicodeDecodeError as error:
+        raise FileFormatError(
+            f"{path}: must be JSON in UTF-8, found another byte at {error.start:,}."
+        ) from error
+    except (RecursionError, ValueError) as error:  # nested without end; numbers without end
+        raise FileFormatError(f"{path}: must be plain JSON, found: {error}.") from error

@@ -173,7 +173,7 @@ def save_checkpoint(net: MergeNet | PublishedMergeNet, info: CheckpointInfo) -> 
 
 
 def _shipped_path(name: str) -> Path:
-    return Path(str(resources.files("cvtgs.mergenet.data").joinpath(f"{name}.safetensors")))
+    return Path(str(resources.files("cvtgs.mergenet").joinpath("data", f"{name}.safetensors")))
 
 
 def _read(path: Path, name: str) -> bytes:

@@ -107,7 +107,7 @@ def _file_views(path: Path, split: Split | None) -> list[View]:
             f"({', '.join(_COLMAP_FILES)}), found neither."
         )
     from cvtgs.io.cameras.transforms import inria_views, transforms_views  # noqa: PLC0415
-    from cvtgs.io.documents import read_json  # noqa: PLC0415
+    from cvtgs.io.files import read_json  # noqa: PLC0415
 
     content = read_json(path)
     if isinstance(content, list):

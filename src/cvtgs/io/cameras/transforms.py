@@ -19,8 +19,17 @@ from cvtgs.io.cameras.views import (
     hold_out,
     viewmat_of_pose,
 )
-from cvtgs.io.documents import Document, Items, Number, Text, Vector, Whole, validated
-from cvtgs.io.files import is_file, open_input
+from cvtgs.io.files import (
+    Document,
+    Items,
+    Number,
+    Text,
+    Vector,
+    Whole,
+    is_file,
+    open_input,
+    validated,
+)
 from cvtgs.text import shown
 
 _PinholeModel = Literal[

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from cvtgs.errors import FileFormatError
-from cvtgs.io.documents import (
+from cvtgs.io.files import (
     AnyDocument,
     Document,
     Text,
     Whole,
+    open_input,
     parse_json,
     validated,
 )
-from cvtgs.io.files import open_input
 from cvtgs.text import shown
 
 SPLATS = "KHR_gaussian_splatting"

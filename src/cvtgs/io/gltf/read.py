@@ -15,7 +15,7 @@ from cvtgs.edit import Motion, merge, move
 from cvtgs.errors import DroppedDataWarning
 from cvtgs.io.arrays import Arrays, scene_of, unit_quats
 from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
-from cvtgs.io.documents import Document, Items, Number, Whole, validated
+from cvtgs.io.files import Document, Items, Number, Whole, check_expansion, validated
 from cvtgs.io.gltf.document import (
     AXES,
     COLOR_SPACE,
@@ -33,7 +33,6 @@ from cvtgs.io.gltf.document import (
     coefficient,
     open_gltf,
 )
-from cvtgs.io.sizes import check_expansion
 from cvtgs.io.spz import decode_spz
 from cvtgs.math.parameters import logit_from_opacity, matrices_to_quats
 from cvtgs.math.spherical_harmonics import REST_COUNTS

@@ -11,8 +11,16 @@ from pydantic import AfterValidator, Field
 
 from cvtgs.errors import FileFormatError
 from cvtgs.io.arrays import Arrays, logits_of_bytes, restore_largest, scene_of
-from cvtgs.io.documents import Document, Number, Text, Vector, Whole, parse_json, validated
-from cvtgs.io.sizes import check_expansion
+from cvtgs.io.files import (
+    Document,
+    Number,
+    Text,
+    Vector,
+    Whole,
+    check_expansion,
+    parse_json,
+    validated,
+)
 from cvtgs.io.sog.container import (
     META,
     MOST_META_BYTES,

@@ -10,8 +10,7 @@ from pydantic import Field
 
 from cvtgs.edit import merge
 from cvtgs.errors import FileFormatError, InvalidArgumentError
-from cvtgs.io.documents import Document, Text, Whole, parse_json, validated
-from cvtgs.io.files import open_input
+from cvtgs.io.files import Document, Text, Whole, open_input, parse_json, validated
 from cvtgs.io.sog.container import META
 from cvtgs.io.sog.read import read_sog
 from cvtgs.scene import GaussianScene

@@ -12,8 +12,7 @@ from jaxtyping import Float, UInt8
 from cvtgs.errors import DroppedDataWarning, FileFormatError
 from cvtgs.io.arrays import HALF_RANGE, Arrays, logits_of_bytes, restore_largest, scene_of
 from cvtgs.io.axes import AXES, SCENE_AXES, change_axes, checked_axes
-from cvtgs.io.files import open_input
-from cvtgs.io.sizes import check_expansion
+from cvtgs.io.files import check_expansion, open_input
 from cvtgs.io.spz.layout import (
     AXES_EXTENSION,
     COLOR_SCALE,
