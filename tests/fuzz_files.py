@@ -18,6 +18,7 @@ import resource
 import signal
 import sys
 import tempfile
+import time
 import warnings
 import zipfile
 import zlib
@@ -253,6 +254,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=100_000, help="inputs of all kinds together")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="after which to end")
     parser.add_argument("--kinds", nargs="*", choices=[*READERS], help="kinds of files (all)")
     parser.add_argument("--grow", type=int, default=0, help="new ends per kind to keep with tests")
     options = parser.parse_args()
@@ -271,7 +273,10 @@ def main() -> None:
                     sys.exit(f"{kind} {number} cannot be read before it is damaged.")
             pool += [path.read_bytes() for path in corpus(kind)]
         limit()
+        begun = time.monotonic()
         for number in range(options.count):
+            if time.monotonic() - begun > options.seconds:
+                break
             kind = kinds[number % len(kinds)]
             path, read = paths[kind], READERS[kind].read
             data = mutant(chosen(pools[kind], whole[kind], dice), dice)

@@ -169,6 +169,31 @@ def test_standard_streams(
     assert capsysbinary.readouterr().out[:3] == b"ply"
 
 
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (
+            b"what?",
+            "standard input: the first bytes must be those of a .ply, .spz, .sog, .glb or .pt, "
+            "found b'what'; write a scene of another format to a file, whose name says which it "
+            "is.",
+        ),
+        (b"ply\nx", "standard input: the PLY header must end with a line 'end_header'"),
+    ],
+)
+def test_standard_input_that_is_no_scene(
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    content: bytes,
+    said: str,
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
+    assert main(["convert", "-", str(tmp_path / "a.ply")]) == 1
+    assert capsys.readouterr().err.startswith(f"cvtgs: error: {said}")
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.slow
 def test_a_pipe_of_two_commands(scenes: Path) -> None:
     program = f"{sys.executable} -m cvtgs"

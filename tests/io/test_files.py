@@ -261,8 +261,8 @@ def test_a_format_may_be_named_whatever_the_file_is_called(tmp_path: Path) -> No
     [
         (b"", FileFormatError, "the first bytes must be those of a .ply, .spz, .sog, .glb or .pt"),
         (b"what?", FileFormatError, "found b'what'; give format= for another one"),
-        (b"ply\nnonsense", FileFormatError, "stream.ply: "),
-        (b"PK\x03\x04nonsense", FileFormatError, "stream.sog: "),
+        (b"ply\nnonsense", FileFormatError, "the BytesIO: the PLY header must end"),
+        (b"PK\x03\x04nonsense", FileFormatError, "the BytesIO: a .sog file must be a zip"),
     ],
 )
 def test_what_cannot_be_read(content: bytes, error: type[Exception], text: str) -> None:

@@ -4,7 +4,6 @@ import base64
 import json
 import math
 import struct
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,41 +11,15 @@ import pytest
 import torch
 
 from cvtgs import GaussianScene, load, save
-from cvtgs.errors import DroppedDataWarning, FileFormatError, InvalidSceneError
+from cvtgs.errors import DroppedDataWarning
 from cvtgs.io import change_axes, losses
 from cvtgs.math.parameters import build_covariances, normalize_quats
 from format_cases import DATA, assert_as_oracle, assert_within, refusal, storable_scene
 from format_oracles import read_glb, read_spz
+from gltf_cases import NAME, accessor, changed, parts, primitive
 from scenes import moved, same_bits
 
-NAME = "KHR_gaussian_splatting"
 BOUNDS = {"means": 0.0, "log_scales": 1e-6, "opacities": 2e-7, "sh0": 0.0, "shN": 0.0}
-Change = Callable[[dict[str, Any]], None]
-
-
-def parts(content: bytes) -> tuple[dict[str, Any], bytes]:
-    """Split a ``.glb`` into its document and its binary chunk."""
-    size = struct.unpack_from("<I", content, 12)[0]
-    return json.loads(content[20 : 20 + size]), content[28 + size :]
-
-
-def joined(document: dict[str, Any], binary: bytes) -> bytes:
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A)
-    return head + text + struct.pack("<II", len(binary), 0x004E4942) + binary
-
-
-def changed(path: Path, change: Change) -> Path:
-    """Change the document of a ``.glb``."""
-    document, binary = parts(path.read_bytes())
-    change(document)
-    path.write_bytes(joined(document, binary))
-    return path
-
-
-def primitive(document: dict[str, Any]) -> dict[str, Any]:
-    return document["meshes"][0]["primitives"][0]
 
 
 def covariances(scene: GaussianScene) -> torch.Tensor:
@@ -199,6 +172,33 @@ def test_integers_are_normalised(small: Path) -> None:
     torch.testing.assert_close(scene.opacities, wanted, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("normalized", [False, True])
+def test_quantized_positions_are_placed_by_their_node(small: Path, normalized: bool) -> None:
+    """Shorts, as KHR_mesh_quantization has them; sizes as unsigned bytes."""
+    added = b"".join(struct.pack("<3hxx3Bx", row, -2 * row, 300, 1, 2, 4) for row in range(5))
+
+    def quantize(document: dict[str, Any]) -> None:
+        document["extensionsUsed"].append("KHR_mesh_quantization")
+        uri = "data:application/octet-stream;base64," + base64.b64encode(added).decode()
+        document["buffers"].append({"byteLength": len(added), "uri": uri})
+        view = {"buffer": 1, "byteLength": len(added), "byteStride": 12}
+        document["bufferViews"].append(view)
+        number = len(document["bufferViews"]) - 1
+        common = {"bufferView": number, "count": 5, "type": "VEC3"}
+        accessor(document, "POSITION").clear()
+        accessor(document, "POSITION").update(common, componentType=5122, normalized=normalized)
+        sizes = accessor(document, f"{NAME}:SCALE")
+        sizes.clear()
+        sizes.update(common, componentType=5121, byteOffset=8)
+        document["nodes"][0]["scale"] = [2.0, 2.0, 2.0]
+
+    scene = load(changed(small, quantize), axes="rdf")
+    unit = 2 / 32767 if normalized else 2
+    wanted = [[unit * row, -2.0 * unit * row, 300.0 * unit] for row in range(5)]
+    torch.testing.assert_close(scene.means, torch.tensor(wanted))
+    torch.testing.assert_close(scene.scales, torch.tensor([[2.0, 4.0, 8.0]] * 5))
+
+
 def test_buffers_beside_the_file(small: Path, tmp_path: Path) -> None:
     document, binary = parts(small.read_bytes())
     (tmp_path / "in").mkdir()
@@ -222,146 +222,6 @@ def test_buffers_beside_the_file(small: Path, tmp_path: Path) -> None:
         assert "buffers[0] must " in str(refusal(path))
 
 
-def accessor(document: dict[str, Any], name: str) -> dict[str, Any]:
-    return document["accessors"][primitive(document)["attributes"][name]]
-
-
-def without(document: dict[str, Any], name: str) -> None:
-    del primitive(document)["attributes"][f"{NAME}:{name}"]
-
-
-DAMAGE: dict[str, tuple[Change, str]] = {
-    "elements": (
-        lambda d: accessor(d, "POSITION").update(count=6),
-        "accessors[0] (POSITION) must have one element at least and end in its buffer view of 60 "
-        "bytes, found 6 elements that end at byte 72.",
-    ),
-    "no elements": (
-        lambda d: accessor(d, "POSITION").update(count=0),
-        "accessors[0] (POSITION) must have one element at least and end in its buffer view of 60 "
-        "bytes, found 0 elements that end at byte 0.",
-    ),
-    "fewer elements": (
-        lambda d: accessor(d, f"{NAME}:SCALE").update(count=4),
-        f"all attributes must have the 5 elements of POSITION, found 4 in {NAME}:SCALE.",
-    ),
-    "view": (
-        lambda d: d["bufferViews"][0].update(byteLength=10**9),
-        "bufferViews[0] must end in buffer 0 of 480 bytes, found byte 1,000,000,000.",
-    ),
-    "buffer": (
-        lambda d: d["buffers"][0].update(byteLength=10**9),
-        "buffers[0] must have 1,000,000,000 bytes, found 480.",
-    ),
-    "type": (
-        lambda d: accessor(d, "POSITION").update(type="VEC4"),
-        "accessors[0] (POSITION) must be VEC3 of bytes, shorts or floats, found 'VEC4' of "
-        "component type 5126.",
-    ),
-    "component": (
-        lambda d: accessor(d, f"{NAME}:OPACITY").update(componentType=5125),
-        f"accessors[4] ({NAME}:OPACITY) must be SCALAR of bytes, shorts or floats, found 'SCALAR' "
-        f"of component type 5125.",
-    ),
-    "count": (
-        lambda d: accessor(d, "POSITION").update(count="five"),
-        "accessors[0]: 'count' must be a whole number of at least 0, found 'five'.",
-    ),
-    "sparse": (
-        lambda d: accessor(d, "POSITION").update(sparse={}),
-        "accessors[0] (POSITION) must lie in a buffer view, found a sparse one.",
-    ),
-    "reference": (
-        lambda d: primitive(d)["attributes"].update(POSITION=99),
-        "accessors has 9 entries, found a reference to 99.",
-    ),
-    "opacity": (
-        lambda d: without(d, "OPACITY"),
-        f"Gaussians must have an accessor for {NAME}:OPACITY, found none.",
-    ),
-    "coefficient": (
-        lambda d: without(d, "SH_DEGREE_1_COEF_2"),
-        f"Gaussians must have all SH coefficients up to degree 1, found no "
-        f"{NAME}:SH_DEGREE_1_COEF_2.",
-    ),
-    "kernel": (
-        lambda d: primitive(d)["extensions"][NAME].update(kernel="ellipse2d"),
-        "Gaussians must be points (mode 0) of the kernel 'ellipse', found mode 0 and 'ellipse2d'.",
-    ),
-    "mesh": (
-        lambda d: primitive(d).update(extensions={}),
-        f"must have a mesh primitive with {NAME}, found none.",
-    ),
-    "required": (
-        lambda d: d.update(extensionsRequired=["EXT_meshopt_compression"]),
-        f"must require no other extensions than {NAME}, {NAME}_compression_spz_2, "
-        f"KHR_mesh_quantization, found 'EXT_meshopt_compression'.",
-    ),
-    "circle": (
-        lambda d: d.update(nodes=[{"children": [0]}]),
-        "each node must hang in one place, found 0 again.",
-    ),
-    "skewed": (
-        lambda d: d.update(nodes=[{"mesh": 0, "scale": [1, 2, 1]}]),
-        "nodes must turn, shift and evenly scale Gaussians, found one that stretches, skews or "
-        "mirrors them.",
-    ),
-    "stride": (
-        lambda d: d["bufferViews"][0].update(byteStride=4),
-        "bufferViews[0] must have a stride of 12 to 252 bytes, found 4.",
-    ),
-}
-
-
-@pytest.mark.filterwarnings("ignore:left out 1 mesh", "ignore:.*left out 1 mesh")
-@pytest.mark.parametrize("name", DAMAGE)
-def test_damage(small: Path, name: str) -> None:
-    change, said = DAMAGE[name]
-    assert refusal(changed(small, change)) == f"{small}: {said}"
-
-
-def test_damaged_containers(small: Path) -> None:
-    content = small.read_bytes()
-    small.write_bytes(content[:-9])
-    assert refusal(small) == (
-        f"{small}: must be version 2 of glTF and have the {len(content):,} bytes that its header "
-        f"promises, found version 2 and {len(content) - 9:,} bytes."
-    )
-    small.write_bytes(content[:16] + bytes(4) + content[20:])
-    assert refusal(small) == f"{small}: a .glb must have a chunk of JSON, found none."
-    small.write_bytes(content[:12] + b"\xff\xff\xff\x00" + content[16:])
-    assert "a chunk must end in the" in str(refusal(small))
-    small.write_bytes(b"ply" + content)
-    assert refusal(small) == f"{small}: a .glb must start with b'glTF', found b'plyg'."
-    small.write_bytes(content[:8])
-    assert "must start with 12 bytes of header, found 8." in str(refusal(small))
-    spz = joined({"meshes": [{"primitives": []}]}, b"")
-    small.write_bytes(spz)
-    assert refusal(small) == f"{small}: must have a mesh primitive with {NAME}, found none."
-
-
-def test_negative_scales(small: Path) -> None:
-    document, binary = parts(small.read_bytes())
-    start = document["bufferViews"][accessor(document, f"{NAME}:SCALE")["bufferView"]]["byteOffset"]
-    value = struct.pack("<f", -0.5)
-    small.write_bytes(joined(document, binary[: start + 12] + value + binary[start + 16 :]))
-    assert refusal(small) == (
-        f"{small}: {NAME}:SCALE must not be negative, found -0.5 in element 1."
-    )
-
-
-def test_nodes_that_repeat_a_mesh(tmp_path: Path) -> None:
-    def repeat(document: dict[str, Any]) -> None:
-        document["nodes"] = [{"mesh": 0}] * 1500
-        document["scenes"] = [{"nodes": list(range(1500))}]
-
-    path = tmp_path / "a.glb"
-    save(storable_scene(3000, degree=0), path)
-    size = changed(path, repeat).stat().st_size
-    with pytest.raises(FileFormatError, match=f"in a file of {size:,}; if you trust the file"):
-        load(path)
-
-
 def test_linear_colours_are_warned_about(small: Path) -> None:
     def linear(document: dict[str, Any]) -> None:
         primitive(document)["extensions"][NAME]["colorSpace"] = "lin_rec709_display"
@@ -369,21 +229,3 @@ def test_linear_colours_are_warned_about(small: Path) -> None:
     with pytest.warns(DroppedDataWarning, match="space 'lin_rec709_display' for those of") as said:
         load(changed(small, linear))
     assert said[0].filename == __file__
-
-
-def test_spz_inside_may_not_lie(tmp_path: Path) -> None:
-    path = tmp_path / "a.spz.glb"
-    save(storable_scene(9), path)
-    document, binary = parts(path.read_bytes())
-    path.write_bytes(joined(document, bytes(4) + binary[4:]))
-    assert refusal(path) == (
-        f"{path}: bufferViews[0]: an .spz file must start with gzip's or its own magic number, "
-        f"found b'\\x00\\x00\\x00\\x00'."
-    )
-
-
-def test_more_than_a_glb_can_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cvtgs.io.gltf.write._MOST_BYTES", 1000)
-    with pytest.raises(InvalidSceneError, match="must have less than 4 GiB, found a scene that"):
-        save(storable_scene(9), tmp_path / "a.glb")
-    assert list(tmp_path.iterdir()) == []

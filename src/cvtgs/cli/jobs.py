@@ -21,6 +21,8 @@ from cvtgs.text import printable
 STREAM = "-"
 """What stands for standard input or output."""
 
+_OTHER_FORMATS = "write a scene of another format to a file, whose name says which it is"
+
 
 class Outcome(NamedTuple):
     """What a command did to one scene.
@@ -108,8 +110,10 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
                 raise OutputError("the OUT - must be a pipe or a file, found a terminal.")
             folder = stack.enter_context(TemporaryDirectory(prefix="cvtgs-"))
             target = f"{folder}/standard-output{options.suffix or '.ply'}"
-        piped = source == STREAM
-        path = stack.enter_context(file_of(sys.stdin.buffer)) if piped else Path(source)
+        path = Path(source)
+        if source == STREAM:
+            copy = file_of(sys.stdin.buffer, name="standard input", advice=_OTHER_FORMATS)
+            path = stack.enter_context(copy)
         own = {"input": path, "output": Path(target)}
         job = argparse.Namespace(**{**vars(options), **own})
         yield [SceneJob(options=job, to_stream=to_stream)]

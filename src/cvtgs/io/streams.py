@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import SpooledTemporaryFile, TemporaryDirectory
 from typing import BinaryIO, Protocol, cast
 
-from cvtgs.errors import FileFormatError, InputError, OutputError
+from cvtgs.errors import CvtgsError, FileFormatError, InputError, OutputError
 
 MEMORY_BYTES = 1 << 26
 """A file is built in memory up to this size, and on the disk beyond it."""
@@ -35,8 +35,19 @@ class ByteSink(Protocol):
 
 
 @contextmanager
-def file_of(stream: ByteSource, format: str | None = None) -> Iterator[Path]:
-    """Copy what is left of a stream to a file, which is there while the context is."""
+def file_of(
+    stream: ByteSource,
+    format: str | None = None,
+    *,
+    name: str | None = None,
+    advice: str = "give format= for another one, such as '.splat'",
+) -> Iterator[Path]:
+    """Copy what is left of a stream to a file, which is there while the context is.
+
+    Errors of the context that name the file name the stream instead: by ``name``, or by its own.
+    ``advice`` says what to do where the first bytes tell no format.
+    """
+    name = name or name_of(stream)
     with TemporaryDirectory(prefix="cvtgs-") as folder:
         path = Path(folder) / "stream"
         with _opened(path) as file:
@@ -44,24 +55,28 @@ def file_of(stream: ByteSource, format: str | None = None) -> Iterator[Path]:
                 first = stream.read(1 << 16)
                 if not isinstance(first, bytes):
                     raise InputError(
-                        f"{name_of(stream)}: must be open in binary mode, found text; open it "
-                        f"with 'rb'."
+                        f"{name}: must be open in binary mode, found text; open it with 'rb'."
                     )
                 file.write(first)
                 shutil.copyfileobj(stream, file)
             except OSError as error:
                 if isinstance(error, InputError):
                     raise
-                raise InputError(
-                    f"{name_of(stream)}: must be readable to its end, found: {error}."
-                ) from error
+                raise InputError(f"{name}: must be readable to its end, found: {error}.") from error
         suffix = format or format_of(path)
         if suffix is None:
             raise FileFormatError(
-                f"{name_of(stream)}: the first bytes must be those of a .ply, .spz, .sog, .glb or "
-                f".pt, found {first[:4]!r}; give format= for another one, such as '.splat'."
+                f"{name}: the first bytes must be those of a .ply, .spz, .sog, .glb or .pt, found "
+                f"{first[:4]!r}; {advice}."
             )
-        yield path.rename(path.with_suffix(suffix))
+        path = path.rename(path.with_suffix(suffix))
+        try:
+            yield path
+        except CvtgsError as error:
+            text = str(error)
+            if str(path) not in text:
+                raise
+            raise type(error)(text.replace(str(path), name)) from error
 
 
 @contextmanager

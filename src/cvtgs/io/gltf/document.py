@@ -25,6 +25,7 @@ from cvtgs.text import shown
 
 SPLATS = "KHR_gaussian_splatting"
 SPZ = "KHR_gaussian_splatting_compression_spz_2"
+QUANTIZATION = "KHR_mesh_quantization"
 KERNEL = "ellipse"
 COLOR_SPACE = "srgb_rec709_display"
 AXES = "luf"
@@ -46,6 +47,21 @@ _COMPONENTS: dict[int, np.dtype[Any]] = {
     FLOAT: np.dtype("<f4"),
 }
 _LARGEST = {BYTE: 127, UNSIGNED_BYTE: 255, SHORT: 32767, UNSIGNED_SHORT: 65535}
+_INTEGERS = frozenset((kind, scaled) for kind in _LARGEST for scaled in (False, True))
+_ENCODINGS = {
+    ROTATION: (
+        frozenset({(BYTE, True), (SHORT, True)}),
+        "floats, or of signed bytes or shorts that are normalized",
+    ),
+    SCALE: (_INTEGERS, "floats, bytes or shorts"),
+    OPACITY: (
+        frozenset({(UNSIGNED_BYTE, True), (UNSIGNED_SHORT, True)}),
+        "floats, or of unsigned bytes or shorts that are normalized",
+    ),
+    POSITION: (_INTEGERS, f"floats, or with {QUANTIZATION} of bytes or shorts"),
+}
+"""Integers that attributes may be, component type and whether normalized, and their names; all may
+be floats, and others are nothing else."""
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _MOST_STRIDE = 252
 _LONGEST_NAME = 255
@@ -65,7 +81,8 @@ class GltfRoot(Document):
     """The root of a glTF document."""
 
     asset: Entry
-    extensionsRequired: Entries  # noqa: N815 (the names of glTF, here and below)
+    extensionsUsed: Entries  # noqa: N815 (the names of glTF, here and below)
+    extensionsRequired: Entries  # noqa: N815
     scene: Size | None = None
     scenes: Entries
     nodes: Entries
@@ -140,11 +157,17 @@ class GltfFile:
         """Return the numbers of an accessor as float32, one row per element."""
         accessor = self.entry(_Accessor, "accessors", index)
         where = f"accessors[{index}] ({name})"
-        dtype = _COMPONENTS.get(accessor.componentType)
-        if accessor.type != kind or dtype is None:
+        component = accessor.componentType
+        integers, encodings = _ENCODINGS.get(name, (frozenset(), "floats"))
+        if name == POSITION and QUANTIZATION not in self.root.extensionsUsed:
+            integers = frozenset()
+        dtype = _COMPONENTS.get(component)
+        fits = component == FLOAT or (component, accessor.normalized) in integers
+        if accessor.type != kind or dtype is None or not fits:
+            scaled = ", normalized" if accessor.normalized else ", not normalized"
             raise self.error(
-                f"{where} must be {kind} of bytes, shorts or floats, found "
-                f"{shown(accessor.type)} of component type {accessor.componentType}"
+                f"{where} must be {kind} of {encodings}, found {shown(accessor.type)} of component "
+                f"type {component}{scaled if component in _LARGEST else ''}"
             )
         if accessor.sparse is not None or accessor.bufferView is None:
             found = "a sparse one" if accessor.sparse is not None else "none"
@@ -172,8 +195,8 @@ class GltfFile:
             (stride, dtype.itemsize),
         )
         numbers = rows.astype(np.float32)
-        if accessor.normalized and accessor.componentType in _LARGEST:
-            numbers /= np.float32(_LARGEST[accessor.componentType])
+        if accessor.normalized and component in _LARGEST:
+            numbers /= np.float32(_LARGEST[component])
             np.maximum(numbers, -1, out=numbers)
         return numbers
 

@@ -22,6 +22,7 @@ from cvtgs.io.gltf.document import (
     KERNEL,
     OPACITY,
     POSITION,
+    QUANTIZATION,
     ROTATION,
     SCALE,
     SPLATS,
@@ -39,7 +40,7 @@ from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
 from cvtgs.text import printable, shown
 
-_KNOWN = (SPLATS, SPZ, "KHR_mesh_quantization")
+_KNOWN = (SPLATS, SPZ, QUANTIZATION)
 _POINTS = 0
 _EVENNESS = 1e-4
 """How far a node may be from an even scale, relative to it."""
