@@ -72,55 +72,12 @@ class OrderedRows(NamedTuple):
     """What grouping computes of Gaussians whatever the number of cells.
 
     Attributes:
-        given: ``(k,)`` the rows as the filter left them.
+        filtered: ``(k,)`` the rows as the filter left them.
         points: The same along the Morton curve, with their moments.
     """
 
-    given: Int[Tensor, "k"]
+    filtered: Int[Tensor, "k"]
     points: WeightedRows
-
-
-def order_rows(
-    scene: GaussianScene,
-    given: Int[Tensor, "k"],
-    analysis: SceneAnalysis,
-    config: SimplifyConfig,
-) -> OrderedRows:
-    """Compute what does not depend on the number of cells, to group the same Gaussians again.
-
-    Args:
-        scene: The Gaussians.
-        given: Which of them, after the filter.
-        analysis: Frame, apparent areas and effect plan.
-        config: Weights.
-
-    Returns:
-        What :func:`group_rows` takes; 152 bytes per Gaussian.
-    """
-    points = _weighted(scene, given, analysis, config)
-    return OrderedRows(given, points._replace(moments=_moments(points, analysis)))
-
-
-def add_neighbors(
-    ordered: OrderedRows, target: int, config: AllocationConfig
-) -> OrderedRows | None:
-    """Find the neighbours of single Gaussians, if pairs of them are to merge.
-
-    Args:
-        ordered: What was computed of them before.
-        target: Number of cells.
-        config: How many neighbours each has.
-
-    Returns:
-        The same with neighbours, 48 bytes per Gaussian; None if they are there or of no use.
-    """
-    points, total = ordered.points, len(ordered.given)
-    if points.neighbors is not None or points.moments is None:
-        return None
-    if target >= total or finer_count(target, total, config) < total:
-        return None
-    near = cvt.nearest_neighbors(points.moments.means.T, config.neighbors)
-    return ordered._replace(points=points._replace(neighbors=near))
 
 
 def group_rows(
@@ -133,21 +90,22 @@ def group_rows(
     ordered: OrderedRows | None = None,
     on_iteration: Callable[[int], None] = lambda done: None,
 ) -> Grouping:
-    """Group Gaussians into the cells of a weighted centroidal Voronoi tessellation.
+    """Group Gaussians into cells: tessellate, merge cheap pairs of cells, move what fits others.
 
     Args:
         scene: The Gaussians.
         rows: Which of them, after the filter.
         analysis: Frame, apparent areas and effect plan.
         target: Number of cells, at most k.
-        config: Weights, space, seeding and iterations (``config.cvt``), and the seed.
+        config: The tessellation (``config.cvt``), what follows it (``config.allocation``), and
+            the seed.
         ordered: What was computed of the same rows before; ignored if the rows are others.
         on_iteration: Called with the number of finished Lloyd iterations.
 
     Returns:
         The cells.
     """
-    if ordered is not None and torch.equal(ordered.given, rows):
+    if ordered is not None and torch.equal(ordered.filtered, rows):
         points = ordered.points
     else:
         points = _weighted(scene, rows, analysis, config)
@@ -190,6 +148,7 @@ def _weighted(
 
 
 def _moments(points: WeightedRows, analysis: SceneAnalysis) -> cells.Moments:
+    """Compute the moments of each, in robust radii."""
     return cells.gaussian_moments(
         points.scene,
         points.rows,
@@ -282,11 +241,11 @@ def allocate(
             neighbors = cvt.nearest_neighbors(groups.means.T, config.neighbors)
         merged = cells.merge_pairs(groups, neighbors, target, config)
         labels = merged.to(labels.device).index_select(0, labels)
-        groups = cells.group_moments(groups, merged, target).to(labels.device)
+        groups = cells.group_moments(groups, merged, target)
     if not config.reassign or target == len(labels):
         return labels
-    near = cvt.nearest_neighbors(groups.means.T, REASSIGN)
-    return cells.reassign(members, labels, groups, near, config)
+    near = cvt.nearest_neighbors(groups.means.T, REASSIGN).to(labels.device)
+    return cells.reassign(members, labels, groups.to(labels.device), near, config)
 
 
 def group_cells(
@@ -342,7 +301,7 @@ def group_cells(
 def _grouping(
     tessellation: cvt.Tessellation, rows: Tensor, labels: Tensor, weights: Tensor
 ) -> Grouping:
-    """Return the rows of every cell, with its weight; the labels of the points are let go."""
+    """Return the cells of labelled rows, with their weights."""
     local = cells.Partition.from_labels(labels, len(weights))
     return Grouping(
         partition=replace(local, order=rows.index_select(0, local.order)),
@@ -384,3 +343,44 @@ def embed_rows(
         contraction=analysis.plan.unbounded.strength,
         color=config.cvt.color * (target / COLOR_CELLS) ** config.cvt.color_power,
     )
+
+
+def order_rows(
+    scene: GaussianScene,
+    rows: Int[Tensor, "k"],
+    analysis: SceneAnalysis,
+    config: SimplifyConfig,
+) -> OrderedRows:
+    """Compute what does not depend on the number of cells, to group the same Gaussians again.
+
+    Args:
+        scene: The Gaussians.
+        rows: Which of them, after the filter.
+        analysis: Frame, apparent areas and effect plan.
+        config: Weights.
+
+    Returns:
+        What :func:`group_rows` takes; 152 bytes per Gaussian.
+    """
+    points = _weighted(scene, rows, analysis, config)
+    return OrderedRows(rows, points._replace(moments=_moments(points, analysis)))
+
+
+def add_neighbors(ordered: OrderedRows, target: int, config: AllocationConfig) -> OrderedRows:
+    """Find the neighbours of single Gaussians, if pairs of them are to merge.
+
+    Args:
+        ordered: What was computed of them before.
+        target: Number of cells.
+        config: How many neighbours each has.
+
+    Returns:
+        The same with neighbours, 48 bytes per Gaussian; itself if they are there or of no use.
+    """
+    points, total = ordered.points, len(ordered.filtered)
+    if points.neighbors is not None or points.moments is None:
+        return ordered
+    if target >= total or finer_count(target, total, config) < total:
+        return ordered
+    near = cvt.nearest_neighbors(points.moments.means.T, config.neighbors)
+    return ordered._replace(points=points._replace(neighbors=near))

@@ -93,7 +93,7 @@ def reduce_scene(
         ordered: What :func:`order_gaussians` computed of the scene; None computes it.
 
     Returns:
-        The small scene, with its cells.
+        The small scene, with its cells; all Gaussians, with finite opacities, if none has to go.
     """
     if target >= len(scene.means):
         return Reduced(with_finite_opacities(scene))
@@ -153,7 +153,10 @@ def reduce_scene(
 def order_gaussians(
     scene: GaussianScene, analysis: SceneAnalysis, config: SimplifyConfig
 ) -> OrderedRows:
-    """Compute what grouping needs of a scene whatever its target, for :func:`reduce_scene`."""
+    """Compute what grouping needs of a scene whatever its target, for :func:`reduce_scene`.
+
+    It holds where the filter leaves the target enough rows; else the filter brings some back.
+    """
     filtered = filter_rows(scene, analysis, 1, config.filter)
     return order_rows(scene, filtered.rows, analysis, config)
 

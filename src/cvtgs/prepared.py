@@ -70,16 +70,18 @@ class Prepared:
         self._refines = config.refine.enabled
         self._cameras, self._listener = cameras, listener
         self._device = chosen_device(device or "auto", scene.device)
-        self._may_leave, self._moved, self._note = device is None, "", ""
+        self._may_leave = device is None
+        self._device_note = ""  # of the present run
+        self._move_note = ""  # of all runs since the device was left
         self._forget()
 
-    def _place(self, device: torch.device, note: str) -> None:
-        """Choose where the next attempt computes; after a failed one, let go of its tensors."""
+    def _begin(self, device: torch.device, note: str) -> None:
+        """Begin an attempt on a device; after a failed one, let go of its tensors."""
         if note:
             self._forget()
         if device != self._device:
-            self._device, self._moved = device, note
-        self._note = note or self._moved
+            self._device, self._move_note = device, note
+        self._device_note = note or self._move_note
 
     def _forget(self) -> None:
         """Let go of all that is on the device."""
@@ -116,23 +118,18 @@ class Prepared:
     def _run(
         self, target: int, keep: Bool[Tensor, "n"] | None, device: torch.device, note: str
     ) -> Simplified:
-        self._place(device, note)
+        self._begin(device, note)
         clock = StageClock(self._listener, device)
         checked, analysis = self._analyze(target, clock)
         valid = checked.scene
-        reduce = partial(reduce_scene, config=self._config, net=self._net, clock=clock)
         if keep is None or not bool(keep.any()):
             if self._has_run and self._ordered is None and target < len(valid):
                 with clock.stage("order"):
                     self._ordered = order_gaussians(valid, analysis, self._config)
             if self._ordered is not None:
-                more = add_neighbors(self._ordered, target, self._config.allocation)
-                self._ordered = more or self._ordered
+                self._ordered = add_neighbors(self._ordered, target, self._config.allocation)
             self._has_run = True
-            if target >= len(valid):
-                reduced = self._keep_all(valid, target)
-            else:
-                reduced = reduce(valid, analysis, target, ordered=self._ordered)
+            reduced = self._reduce(valid, analysis, target, clock, ordered=self._ordered)
             reduced = self._match(reduced, analysis, clock)
             return self._result(reduced, checked, analysis, target, clock)
         keep = keep.to(valid.device)
@@ -141,10 +138,9 @@ class Prepared:
         first, rest = kept.nonzero()[:, 0], (~kept).nonzero()[:, 0]
         protected = with_finite_opacities(valid.select(first))
         part, room = analysis.select(rest), target - len(protected)
-        if target >= len(valid):
-            others = Reduced(with_finite_opacities(valid.select(rest)))
-        else:
-            others = reduce(valid.select(rest), part, room)
+        others = reduce_scene(
+            valid.select(rest), part, room, self._config, net=self._net, clock=clock
+        )
         reduced = others._replace(scene=concatenate([protected, others.scene]))
         reduced = self._match(reduced, part, clock)
         return self._result(reduced, checked, analysis, target, clock, kept_count=len(protected))
@@ -169,25 +165,15 @@ class Prepared:
     def _run_levels(
         self, targets: Sequence[int], device: torch.device, note: str
     ) -> dict[int, Level]:
-        self._place(device, note)
+        self._begin(device, note)
         found: dict[int, Level] = {}
         finest: Reduced | None = None
         for target in sorted(set(targets), reverse=True):
             clock = StageClock(self._listener, device)
             checked, analysis = self._analyze(target, clock)
             valid, nested = checked.scene, nests_in(target, finest)
-            if target >= len(valid):
-                reduced = self._keep_all(valid, target)
-            else:
-                reduced = reduce_scene(
-                    valid,
-                    analysis,
-                    target,
-                    self._config,
-                    net=self._net,
-                    clock=clock,
-                    finest=finest if nested else None,
-                )
+            start = finest if nested else None
+            reduced = self._reduce(valid, analysis, target, clock, finest=start)
             if reduced.grouping is not None:
                 finest = finest or reduced
             error, assignment = level_facts(valid, analysis, reduced)
@@ -221,10 +207,33 @@ class Prepared:
             self._analysis = analysis
         return checked, analysis
 
-    def _keep_all(self, valid: GaussianScene, target: int) -> Reduced:
-        """Return all valid Gaussians: as they are if none was to go, else as standard ones."""
-        is_whole = target == self._total
-        return Reduced(with_finite_opacities(valid) if is_whole else standardized(valid))
+    def _reduce(
+        self,
+        valid: GaussianScene,
+        analysis: SceneAnalysis,
+        target: int,
+        clock: StageClock,
+        *,
+        finest: Reduced | None = None,
+        ordered: OrderedRows | None = None,
+    ) -> Reduced:
+        """Reduce all valid Gaussians; if none has to go, they stay as they are.
+
+        Where invalid rows alone make up the difference, they come out as standard Gaussians.
+        """
+        if target >= len(valid):
+            is_whole = target == self._total
+            return Reduced(with_finite_opacities(valid) if is_whole else standardized(valid))
+        return reduce_scene(
+            valid,
+            analysis,
+            target,
+            self._config,
+            net=self._net,
+            clock=clock,
+            finest=finest,
+            ordered=ordered,
+        )
 
     def _match(self, reduced: Reduced, analysis: SceneAnalysis, clock: StageClock) -> Reduced:
         """Match the small scene to the images of the analysis, if the configuration says so."""
@@ -281,7 +290,7 @@ class Prepared:
             mass_out=mass_out,
             checkpoint="none" if self._checkpoint is None else self._checkpoint.name,
             device=str(self._device),
-            device_note=self._note,
+            device_note=self._device_note,
             views=views,
             plan=analysis.plan,
             matching=reduced.matching,

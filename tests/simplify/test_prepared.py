@@ -44,11 +44,10 @@ def test_rows_are_ordered_once_and_again_where_the_filter_leaves_others(scene, m
     config = SimplifyConfig(filter={"min_opacity": 0.99, "max_mass_share": 1.0})
     simplifier = Simplifier(config=config, ckpt=None, device="cpu")
     prepared, calls = simplifier.prepare(scene), []
-    measure = cvtgs.cells.gaussian_moments
+    order = cvtgs.grouping.curve_order
     monkeypatch.setattr(
-        cvtgs.cells,
-        "gaussian_moments",
-        lambda *args, **more: calls.append(len(args[1])) or measure(*args, **more),
+        "cvtgs.grouping.curve_order",
+        lambda *args, **more: calls.append(len(args[1])) or order(*args, **more),
     )
     kept = int((scene.opacities >= 0.99).sum())
     for count in (30, 20, 10, kept + 5):
