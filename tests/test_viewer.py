@@ -74,6 +74,17 @@ def test_a_moved_slider_shows_what_the_simplifier_makes(page: Any, scene: Gaussi
     assert same_bits(page.viewer.scenes["simplified"].scene, wanted)
 
 
+def test_what_sizes_share_is_computed_before_the_slider_moves(
+    scene: GaussianScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warm: list[str] = []
+    monkeypatch.setattr(SceneViewer, "warm_up", lambda _, preset: warm.append(preset))
+    viewer = SceneViewer(scene, device="cpu")
+    server = ViewerServer(viewer, preset="draft", rho=0.1)
+    until(lambda: warm == ["draft"])
+    server.close()
+
+
 def test_presets_and_flipping(page: Any) -> None:
     control(page, "preset").value = "fast"
     until(lambda: control(page, FACTS).content.endswith("with fast"))

@@ -174,8 +174,12 @@ def _tessellate(
     """
     scene, rows = points.scene, points.rows
     count = finer_count(target, len(rows), config.allocation)
+    if count == len(rows):  # each is a cell of its own, in any space
+        space = scene.means.index_select(0, rows)
+    else:
+        space = embed_rows(scene, rows, analysis, target, config)
     tessellation = cvt.tessellate(
-        embed_rows(scene, rows, analysis, target, config),
+        space,
         points.weights,
         count,
         config=config.cvt,

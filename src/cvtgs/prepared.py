@@ -41,7 +41,7 @@ class Prepared:
     """A scene to be made smaller again and again; what does not depend on the count is kept.
 
     From the second run on, 152 more bytes per Gaussian are kept, and another 48 from the second
-    run on that leaves more than an eighth of the Gaussians.
+    run on that leaves more than an eighth of the Gaussians; or from ``warm_up`` on.
 
     ``Simplifier.prepare`` makes these. Every run gives the bits of ``Simplifier.run``;
     the report of the first one has the stages that are shared.
@@ -123,11 +123,7 @@ class Prepared:
         checked, analysis = self._analyze(target, clock)
         valid = checked.scene
         if keep is None or not bool(keep.any()):
-            if self._has_run and self._ordered is None and target < len(valid):
-                with clock.stage("order"):
-                    self._ordered = order_gaussians(valid, analysis, self._config)
-            if self._ordered is not None:
-                self._ordered = add_neighbors(self._ordered, target, self._config.allocation)
+            self._order(valid, analysis, target, clock)
             self._has_run = True
             reduced = self._reduce(valid, analysis, target, clock, ordered=self._ordered)
             reduced = self._match(reduced, analysis, clock)
@@ -144,6 +140,26 @@ class Prepared:
         reduced = others._replace(scene=concatenate([protected, others.scene]))
         reduced = self._match(reduced, part, clock)
         return self._result(reduced, checked, analysis, target, clock, kept_count=len(protected))
+
+    def warm_up(self, rho: float) -> None:
+        """Compute now what the second run computes for all later ones.
+
+        Args:
+            rho: The largest ratio to expect.
+        """
+        within_memory(
+            partial(self._warm_up, target_count(self._total, rho)),
+            self._device,
+            work=f"simplifying {self._total:,} Gaussians",
+            may_leave=self._may_leave,
+        )
+
+    def _warm_up(self, target: int, device: torch.device, note: str) -> None:
+        self._begin(device, note)
+        clock = StageClock(silent, device)
+        checked, analysis = self._analyze(target, clock)
+        self._has_run = True
+        self._order(checked.scene, analysis, target, clock)
 
     def levels(self, rhos: Sequence[float]) -> tuple[Level, ...]:
         """Make the scene smaller in several sizes; see ``Simplifier.levels``.
@@ -206,6 +222,16 @@ class Prepared:
                     )
             self._analysis = analysis
         return checked, analysis
+
+    def _order(
+        self, valid: GaussianScene, analysis: SceneAnalysis, target: int, clock: StageClock
+    ) -> None:
+        """Keep what grouping computes of all Gaussians, from the second run on."""
+        if self._has_run and self._ordered is None and target < len(valid):
+            with clock.stage("order"):
+                self._ordered = order_gaussians(valid, analysis, self._config)
+        if self._ordered is not None:
+            self._ordered = add_neighbors(self._ordered, target, self._config.allocation)
 
     def _reduce(
         self,

@@ -125,6 +125,15 @@ def test_disjoint_pairs_are_those_of_a_loop_over_all_pairs():
     assert found == wanted
 
 
+def test_each_pair_is_there_once_in_ascending_order():
+    pairs_of = merge_pairs.__globals__["_distinct_pairs"]
+    first, second = torch.tensor([4, 2, 9, 2, 3, 0]), torch.tensor([2, 4, 0, 9, 3, 9])
+    found = pairs_of(first, second)
+    assert [ends.tolist() for ends in found] == [[0, 2, 2], [9, 4, 9]]
+    none = torch.empty(0, dtype=torch.int64)
+    assert [len(ends) for ends in pairs_of(none, none)] == [0, 0]
+
+
 @pytest.mark.parametrize("count", [1, 30, 49, 60, 200])
 def test_only_the_cheapest_are_sorted(count: int) -> None:
     """Ties at the threshold come in the order of the pairs, as a sort of all gives them."""

@@ -25,6 +25,25 @@ def test_argmin_of_labels_names_the_first_of_equals():
     assert segments.label_argmin(values, labels, 4).tolist() == [0, 4, 1, 4]
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_ascending_rows_as_a_stable_sort_gives_them(dtype):
+    inf, nan = float("inf"), float("nan")
+    values = torch.tensor([0.5, -0.0, inf, 0.0, -2.0, nan, -inf, 0.5, -1.0, -nan], dtype=dtype)
+    assert segments.ascending_rows(values).tolist() == [6, 4, 8, 1, 3, 0, 7, 2, 5, 9]
+    many = torch.randint(-50, 50, (5000,), generator=torch.Generator().manual_seed(0)).to(dtype)
+    wanted = sorted(range(5000), key=lambda row: float(many[row]))
+    assert segments.ascending_rows(many / 7).tolist() == wanted
+    assert segments.ascending_rows(many[:0]).tolist() == []
+
+
+def test_float64_is_sorted_by_its_bits(monkeypatch):
+    """Torch sorts whole numbers four times as fast."""
+    sort, sorted_dtypes = torch.sort, []
+    monkeypatch.setattr(torch, "sort", lambda x, **_: sorted_dtypes.append(x.dtype) or sort(x, **_))
+    segments.ascending_rows(torch.tensor([2.0, 1.0], dtype=torch.float64))
+    assert sorted_dtypes == [torch.int64]
+
+
 def test_sort_by_label_is_stable_and_knows_empty_labels():
     order, offsets = segments.sort_by_label(torch.tensor([2, 0, 2, 0, 2]), 4)
     assert order.tolist() == [1, 3, 0, 2, 4]

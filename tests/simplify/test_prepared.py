@@ -75,6 +75,22 @@ def test_neighbours_of_single_gaussians_are_found_once(scene, monkeypatch):
     assert whole == [1, 1, 0, 0]
 
 
+def test_a_warm_scene_has_what_runs_share(scene, monkeypatch):
+    simplifier = Simplifier(preset="draft", device="cpu")
+    prepared, wanted = simplifier.prepare(scene), simplifier.simplify(scene, 0.5)
+    prepared.warm_up(0.5)
+    searched, search = [], cvtgs.cvt.nearest_neighbors
+    monkeypatch.setattr(
+        cvtgs.cvt,
+        "nearest_neighbors",
+        lambda sites, count: searched.append(len(sites)) or search(sites, count),
+    )
+    small, report = prepared.run(0.5)
+    assert same_bits(small, wanted)
+    assert {stage.stage for stage in report.stages} == {"filter", "tessellate", "merge"}
+    assert len(scene) not in searched
+
+
 def test_protected_gaussians_may_differ_from_run_to_run(scene):
     simplifier = Simplifier(device="cpu")
     prepared = simplifier.prepare(scene)

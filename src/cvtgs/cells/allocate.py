@@ -186,9 +186,9 @@ def merge_pairs(
 def _distinct_pairs(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     """Return each unordered pair of different groups once, in ascending order."""
     low, high = torch.minimum(first, second), torch.maximum(first, second)
-    size = int(high.amax()) + 1 if len(high) else 1
-    keys = torch.unique((low * size + high)[low < high])
-    return keys // size, keys % size
+    bits = int(high.amax()).bit_length() if len(high) else 1
+    keys = torch.unique(((low << bits) | high)[low < high])
+    return keys >> bits, keys & ((1 << bits) - 1)
 
 
 def _pair_costs(
@@ -209,7 +209,8 @@ def _pair_costs(
             share * a.covariances[k] + other * b.covariances[k] + product * shifts[r] * shifts[c]
             for k, (r, c) in enumerate(UPPER)
         ])  # fmt: skip
-        cost = 0.5 * (_log_volume(merged) - share * volumes[i] - other * volumes[j])
+        own, others = volumes.index_select(0, i), volumes.index_select(0, j)
+        cost = 0.5 * (_log_volume(merged) - share * own - other * others)
         cost += config.color * product * (a.colors - b.colors).square().sum(0)
         costs: Tensor = cost * (a.masses + b.masses) ** config.mass_power
         return costs
@@ -237,21 +238,25 @@ def _cheapest_disjoint(
     go through all pairs in order (Preis 1999), in few steps over all of them.
     """
     order = smallest_rows(costs, 6 * wanted)
-    first, second = first[order], second[order]
-    ranks = torch.arange(len(order), device=order.device)
-    taken = []
+    ends = first.index_select(0, order), second.index_select(0, order)
+    ranks = torch.arange(len(order), device=order.device)  # of the pairs that are left
+    left, taken = ends, []
     while len(ranks):
         best = torch.full((total,), len(order), device=order.device)
-        for ends in (first, second):
-            best.scatter_reduce_(0, ends[ranks], ranks, "amin")
-        chosen = ranks[(best[first[ranks]] == ranks) & (best[second[ranks]] == ranks)]
-        taken.append(chosen)
-        used = torch.zeros(total, dtype=torch.bool, device=order.device)
-        used[first[chosen]] = True
-        used[second[chosen]] = True
-        ranks = ranks[~(used[first[ranks]] | used[second[ranks]])]
+        for groups in left:
+            best.scatter_reduce_(0, groups, ranks, "amin")
+        cheapest = [best.index_select(0, groups) == ranks for groups in left]
+        chosen = (cheapest[0] & cheapest[1]).nonzero()[:, 0]
+        taken.append(ranks.index_select(0, chosen))
+        free = torch.ones(total, dtype=torch.bool, device=order.device)
+        for groups in left:
+            free[groups.index_select(0, chosen)] = False
+        stays = free.index_select(0, left[0]) & free.index_select(0, left[1])
+        rows = stays.nonzero()[:, 0]
+        left = left[0].index_select(0, rows), left[1].index_select(0, rows)
+        ranks = ranks.index_select(0, rows)
     rows = torch.sort(torch.cat(taken)).values[:wanted]
-    return first[rows], second[rows]
+    return ends[0].index_select(0, rows), ends[1].index_select(0, rows)
 
 
 def reassign(

@@ -301,13 +301,14 @@ def keep_representatives(
     best = segment_argmax(opacities * masses, offsets)
     cell_masses = segment_sum(masses, offsets)
     merged_areas = torch.exp(parameters.log_mean_projected_area(merged.log_scales.double()))
-    is_kept = masses[best] ** 2 * merged_areas > cell_masses**2 * member_areas[best]
+    best_masses, best_areas = masses.index_select(0, best), member_areas.index_select(0, best)
+    is_kept = best_masses**2 * merged_areas > cell_masses**2 * best_areas
     counts = partition.counts
     is_kept &= counts > 1
     number, members = torch.stack([is_kept.sum(), (counts * is_kept).sum()]).tolist()
     if number == 0:
         return merged, partition
-    representatives, cells = order[best], true_rows(is_kept, number)
+    representatives, cells = order.index_select(0, best), true_rows(is_kept, number)
     kept = scene.select(representatives[cells])
     tensors = {
         name: values.index_copy(0, cells, getattr(kept, name))

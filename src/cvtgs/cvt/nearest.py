@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.devices import thread_count
+from cvtgs.math.segments import ascending_rows
 
 SEARCH = "scipy"
 """What searches, for reports."""
@@ -163,9 +164,10 @@ def runs_of_equal(
     keys = sites.new_zeros(len(sites), dtype=torch.float64)
     for axis, column in enumerate(sites.unbind(1)):
         keys += column.double() * math.sqrt(1 + axis)  # no common measure: sums rarely coincide
-    order = torch.sort(keys, stable=True).indices
+    order = ascending_rows(keys)
     repeated = torch.zeros(len(sites), dtype=torch.bool, device=sites.device)
-    candidates = (keys[order[1:]] == keys[order[:-1]]).nonzero()[:, 0]
+    ascending = keys.index_select(0, order)
+    candidates = (ascending[1:] == ascending[:-1]).nonzero()[:, 0]
     repeated[candidates + 1] = (sites[order[candidates + 1]] == sites[order[candidates]]).all(dim=1)
     if not bool(repeated.any()):
         return None

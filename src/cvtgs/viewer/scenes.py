@@ -22,6 +22,9 @@ __all__ = ["SceneViewer", "ShownScene"]
 
 FULL, SIMPLIFIED = "full scene", "simplified"
 
+WARM_RATIO = 0.5
+"""Ratio to be ready for: from an eighth on, single Gaussians are paired with their neighbours."""
+
 SCORE_SIDE = 480
 """Longer side of the images that a view is scored on, pixels."""
 
@@ -95,6 +98,15 @@ class SceneViewer:
         facts = f"{_counted(small, self._scene)}, {report.seconds:.2f} s with {preset}"
         self.scenes[SIMPLIFIED] = ShownScene(small, facts)
         return self.scenes[SIMPLIFIED]
+
+    def warm_up(self, preset: str) -> None:
+        """Compute what all sizes share, so that the first move of the slider is as quick as others.
+
+        Args:
+            preset: Name of a preset; nothing is done if the scene was not simplified by it.
+        """
+        if preset in self._prepared:
+            self._prepared[preset].warm_up(WARM_RATIO)
 
     def score(self, name: str, cameras: Cameras) -> float:
         """Return the mean PSNR of a scene against the full one, dB.

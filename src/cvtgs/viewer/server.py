@@ -3,6 +3,7 @@
 import math
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from cvtgs.config import PRESETS
@@ -120,7 +121,11 @@ class ViewerServer:
             self._wanted.clear()
             if not self._closed:
                 self._try(self._simplify)
+                is_first = not self._first.is_set()
                 self._first.set()
+                if is_first and not (self._wanted.is_set() or self._closed):
+                    with suppress(CvtgsError):  # the next run says it
+                        self._viewer.warm_up(self._preset.value)
 
     def _simplify(self) -> str:
         rho = min(1.0, 10.0**self._slider.value)
