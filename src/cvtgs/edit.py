@@ -51,7 +51,7 @@ class Sphere:
         numbers = (*self.center, self.radius)
         if len(numbers) != 4 or not all(map(math.isfinite, numbers)) or self.radius < 0:
             raise InvalidArgumentError(
-                f"a sphere needs a center of 3 finite numbers and a radius of at least 0, "
+                f"a sphere needs a centre of 3 finite numbers and a radius of at least 0, "
                 f"found {self.center} and {self.radius}."
             )
 

@@ -1,6 +1,7 @@
 """The command line as a whole: help, usage, errors, exit codes, interruption, completion."""
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -12,6 +13,8 @@ import pytest
 
 import cvtgs
 from cvtgs.cli.main import build_parser, main
+from cvtgs.cli.options import READABLE, WRITABLE
+from cvtgs.io.formats import READABLE_SUFFIXES, WRITABLE_SUFFIXES
 
 
 def run_cvtgs(*arguments: str | Path, **options) -> subprocess.CompletedProcess[str]:
@@ -26,6 +29,12 @@ def test_help_names_every_command(capsys):
     printed = capsys.readouterr().out
     for command in ("simplify", "info", "demo", "doctor"):
         assert command in printed
+
+
+def test_help_names_every_format():
+    written, read = (set(re.findall(r"[\w-]*(?:\.\w+)+", text)) for text in (WRITABLE, READABLE))
+    assert written == set(WRITABLE_SUFFIXES)
+    assert read == {*READABLE_SUFFIXES, "meta.json", "lod-meta.json"}
 
 
 def test_version(capsys):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _NUMBERS = {
     "--crop-box": "six numbers x,y,z,X,Y,Z, the least and the largest coordinates",
-    "--crop-sphere": "four numbers x,y,z,r, the center and the radius",
+    "--crop-sphere": "four numbers x,y,z,r, the centre and the radius",
     "--rotate": "three numbers x,y,z, degrees about each axis",
     "--translate": "three numbers x,y,z",
 }
@@ -47,7 +47,7 @@ def add_edit_options(parser: argparse.ArgumentParser) -> None:
         metavar="X,Y,Z,R",
         action="append",
         default=[],
-        help="sphere to keep, by its center and its radius",
+        help="sphere to keep, by its centre and its radius",
     )
     group.add_argument(
         "--min-opacity", metavar="A", type=float, help="least opacity to keep, 0 to 1"

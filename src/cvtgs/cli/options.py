@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from cvtgs.scene import GaussianScene
 
 READABLE = (
-    ".ply, .spz, .splat, .ksplat, .sog, .glb, .gltf, .ckpt, .pt or the folder of a trained model"
+    ".ply, .compressed.ply, .spz, .splat, .ksplat, .sog, meta.json or lod-meta.json of one, .glb, "
+    ".gltf, .ckpt, .pt or the folder of a trained model"
 )
 WRITABLE = ".ply, .compressed.ply, .spz, .splat, .sog, .glb, .gltf, .spz.glb or .usda"
 PRESET_NAMES = "draft, fast, standard, matched, high (from the fastest to the best) or paper"
@@ -91,7 +92,7 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     "--background": {
         "metavar": "COLOR",
         "default": "black",
-        "help": "background color: black (default), gray, white, or red,green,blue from 0 to 1",
+        "help": "background colour: black (default), gray, white, or red,green,blue from 0 to 1",
     },
     "--backend": {
         "default": "auto",

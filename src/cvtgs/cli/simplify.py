@@ -88,7 +88,7 @@ def add_simplify(add_parser: AddParser) -> None:
     parser.add_argument(
         "--shipped-rates",
         action="store_true",
-        help="choose for --time-budget by seconds of another machine, which come with cvtgs, "
+        help="choose for --time-budget by how long another machine took, which comes with cvtgs, "
         "instead of measuring this one",
     )
     parser.add_argument(

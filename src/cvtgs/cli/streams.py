@@ -40,8 +40,9 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
         "--environment",
         type=float,
         metavar="RADII",
-        help="what lies farther from the middle than so many robust radii (which hold 70 %% of the "
-        "Gaussians) becomes the environment of a streamed SOG, for all levels; 10 is a sky",
+        help="distance from the middle beyond which Gaussians are the environment of a streamed "
+        "SOG, which all levels share; in robust radii, of which one holds 70 %% of the Gaussians, "
+        "for example 10 for a sky",
     )
     parser.add_argument(
         "--place",

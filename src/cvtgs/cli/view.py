@@ -26,7 +26,7 @@ def add_view(add_parser: AddParser) -> None:
         help="choose the size of a scene in the browser",
         description="Serve a page that shows IN and, as a slider of rho is moved, IN simplified "
         "(needs the extra view). It flips between scenes, scores the present view and saves. "
-        "Colors are those of SH degree 0.",
+        "Colours are those of SH degree 0.",
     )
     parser.set_defaults(run=view)
     add_options(parser, "input")
