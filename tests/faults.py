@@ -29,7 +29,9 @@ import cvtgs.outofcore.memory
 from cvtgs.cli.main import run_process
 from fault_commands import CLUSTER, COMMANDS, TRAINING, Command
 
-SIGNALS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}
+SIGNALS = {"SIGINT": 130, "SIGTERM": 143, "SIGKILL": -9}
+"""Status after each signal, by name: Windows lacks one."""
+
 BUSY = ("one run at a time may work on it", "must not exist yet", "must be")
 MOST_SECONDS = 300.0
 
@@ -152,18 +154,18 @@ def references(home: Path, names: list[str]) -> Iterator[tuple[str, float, dict[
         yield name, seconds, wanted
 
 
-def kill(command: Command, folder: Path, seconds: float, number: signal.Signals) -> int:
+def kill(command: Command, folder: Path, seconds: float, name: str) -> int:
     """Start a command, send a signal after some seconds, and return its status."""
     process = started(command, folder)
     time.sleep(seconds)
     with suppress(ProcessLookupError):  # it has ended
-        os.kill(process, number)
+        os.kill(process, signal.Signals[name])
     code, text = ended(process, folder)
-    if code not in (0, SIGNALS[number]) and not (code == 130 and not text):
-        raise FaultError(f"status {code} after signal {number}: {text}")
+    if code not in (0, SIGNALS[name]) and not (code == 130 and not text):
+        raise FaultError(f"status {code} after {name}: {text}")
     sentences = [line for line in text.splitlines() if not line.startswith("cvtgs: warning: ")]
     if len(sentences) > 1:
-        raise FaultError(f"more than a sentence after signal {number}: {text}")
+        raise FaultError(f"more than a sentence after {name}: {text}")
     return code
 
 

@@ -14,7 +14,6 @@ import io
 import os
 import random
 import re
-import resource
 import signal
 import sys
 import tempfile
@@ -168,7 +167,7 @@ def judged(read: Callable[[Path], object], path: Path) -> Verdict:
     """Read a file, and judge how it ended."""
     text = "read"
     before = sorted(path.parent.iterdir())
-    signal.setitimer(signal.ITIMER_PROF, CPU_SECONDS)
+    set_timer(CPU_SECONDS)
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -186,7 +185,7 @@ def judged(read: Callable[[Path], object], path: Path) -> Verdict:
     except Exception as error:  # whatever is not ours is what is looked for
         result = f"{type(error).__name__}: {error}"
     finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
+        set_timer(0)
     if any(w.category is not DroppedDataWarning for w in caught) or len(caught) > 1:
         result = f"warnings: {[str(w.message) for w in caught]}"
     if sorted(path.parent.iterdir()) != before:
@@ -194,8 +193,15 @@ def judged(read: Callable[[Path], object], path: Path) -> Verdict:
     return Verdict(result, re.sub(r"'[^']*'|\d+", "#", text.replace(str(path), "")))
 
 
+def set_timer(seconds: float) -> None:
+    """Ask for a signal after some seconds of processor time; Windows has none."""
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_PROF, seconds)
+
+
 def limit() -> None:
     """Let nothing take much memory or time."""
+    import resource  # noqa: PLC0415 (not on Windows)
 
     def stop(number: int, frame: object) -> None:
         raise HangError

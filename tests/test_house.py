@@ -160,6 +160,58 @@ def test_packages_are_imported_only_where_they_belong():
     assert {name: strangers for name, strangers in found.items() if strangers} == {}
 
 
+POSIX_MODULES = {"fcntl", "grp", "pty", "pwd", "resource", "termios", "tty"}
+POSIX_NAMES = {
+    "os.fork",
+    "os.geteuid",
+    "os.getuid",
+    "os.killpg",
+    "os.mkfifo",
+    "os.sched_getaffinity",
+}
+POSIX_NAMES |= {"signal.SIGALRM", "signal.SIGKILL", "signal.SIGPROF", "signal.setitimer"}
+
+
+def run_at_import(node: ast.AST) -> Iterator[ast.AST]:
+    """Return what runs when a file is imported: no bodies of functions, but their decorators.
+
+    What follows an ``if`` may be meant for some systems only.
+    """
+    for child in ast.iter_child_nodes(node):
+        yield child
+        if isinstance(child, ast.FunctionDef):
+            for part in (*child.decorator_list, *child.args.defaults):
+                yield part
+                yield from run_at_import(part)
+        elif not isinstance(child, ast.Lambda | ast.If):
+            yield from run_at_import(child)
+
+
+def missing_on_windows(text: str) -> list[str]:
+    found = []
+    for node in run_at_import(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names if alias.name in POSIX_MODULES]
+        elif isinstance(node, ast.Attribute) and ast.unparse(node) in POSIX_NAMES:
+            found.append(ast.unparse(node))
+    return found
+
+
+def test_every_file_can_be_imported_on_windows():
+    """Of tests also: one that cannot ends the collection of all."""
+    text = """
+import os, resource
+@mark.parametrize("sign", [signal.SIGKILL])
+def test(sign, kill=os.fork):
+    import fcntl
+    signal.setitimer(0)
+"""
+    assert missing_on_windows(text) == ["resource", "signal.SIGKILL", "os.fork"]
+    paths = [*FILES, *sorted((ROOT / "tests").rglob("*.py"))]
+    found = {path: missing_on_windows(path.read_text(encoding="utf-8")) for path in paths}
+    assert {path.relative_to(ROOT): names for path, names in found.items() if names} == {}
+
+
 def test_files_are_short():
     paths = [*FILES, *sorted((ROOT / "tests").rglob("*.py"))]
     lines = {path: path.read_text(encoding="utf-8").count("\n") for path in paths}

@@ -219,6 +219,7 @@ def test_what_is_not_there(tmp_path) -> None:
     )
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and permissions are those of POSIX")
 def test_what_cannot_be_read(tmp_path) -> None:
     os.mkfifo(tmp_path / "pipe.json")
     assert camera_refusal(tmp_path / "pipe.json", InputError) == (
