@@ -175,7 +175,7 @@ POSIX_NAMES |= {"signal.SIGALRM", "signal.SIGKILL", "signal.SIGPROF", "signal.se
 def run_at_import(node: ast.AST) -> Iterator[ast.AST]:
     """Return what runs when a file is imported: no bodies of functions, but their decorators.
 
-    What follows an ``if`` may be meant for some systems only.
+    What follows an ``if`` or a ``try`` may be meant for some systems only.
     """
     for child in ast.iter_child_nodes(node):
         yield child
@@ -183,7 +183,7 @@ def run_at_import(node: ast.AST) -> Iterator[ast.AST]:
             for part in (*child.decorator_list, *child.args.defaults):
                 yield part
                 yield from run_at_import(part)
-        elif not isinstance(child, ast.Lambda | ast.If):
+        elif not isinstance(child, ast.Lambda | ast.If | ast.Try):
             yield from run_at_import(child)
 
 
