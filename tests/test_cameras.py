@@ -45,3 +45,14 @@ def test_every_second_pixel_by_hand():
     slope = (3.5 - 4) / 10
     assert 5 * slope + 1.75 == 1.5
     assert found.every(2).stride == 4
+
+
+def test_interleaved_pixels_are_those_of_each_camera_from_its_own_first_one():
+    Ks = torch.tensor([[[10.0, 0, 4], [0, 12, 3], [0, 0, 1]]])  # noqa: N806
+    one = Cameras(viewmats=torch.eye(4)[None], Ks=Ks, width=8, height=5)
+    five = one.select(torch.zeros(5, dtype=torch.int64))
+    found = five.interleaved(2)
+    assert (found.width, found.height, found.stride) == (4, 2, 2)
+    for camera, first in zip(found.Ks, [(0, 0), (1, 0), (0, 1), (1, 1), (0, 0)], strict=True):
+        assert torch.equal(camera, one.every(2, first=first).Ks[0])
+    assert five.interleaved(1) is five

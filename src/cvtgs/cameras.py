@@ -167,6 +167,25 @@ class Cameras:
             stride=self.stride * stride,
         )
 
+    def interleaved(self, stride: int) -> Self:
+        """Return cameras that see only every ``stride``-th pixel, each from another first one on.
+
+        Args:
+            stride: Pixels from one to the next, along rows and columns; 1 leaves all as it is.
+
+        Returns:
+            Cameras of smaller images, of one size: see :meth:`every`.
+        """
+        if stride == 1:
+            return self
+        rows = torch.arange(len(self), device=self.Ks.device)
+        firsts = torch.stack([rows % stride, rows // stride % stride], dim=1).to(self.Ks)
+        Ks = self.Ks.clone()  # noqa: N806 (the name that gsplat gives it)
+        Ks[:, :2] /= stride
+        Ks[:, :2, 2] += 0.5 - (firsts + 0.5) / stride
+        width, height = max(1, self.width // stride), max(1, self.height // stride)
+        return replace(self, Ks=Ks, width=width, height=height, stride=self.stride * stride)
+
     def spread(self, count: int) -> Self:
         """Return cameras spread evenly over their order.
 

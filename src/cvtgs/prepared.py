@@ -347,6 +347,7 @@ class Prepared:
             seed=self._config.seed,
             device=self._device,
             frozen=kept,
+            observed=analysis.observed if self._config.shares_images else None,
             listener=self._listener,
         )
         restored = restore_columns(refined.scene, self._scene, plan)

@@ -105,7 +105,7 @@ def test_pairs_of_pixels_and_gaussians_grow_as_the_roots_of_both():
         Work(count=10**6, target=count).features("match", matched)["view_pairs"]
         for count in (1000, 100_000)
     )
-    assert few == pytest.approx(24 * 256 * math.sqrt(1000))
+    assert few == pytest.approx(24 * 200 * math.sqrt(1000))
     assert many == pytest.approx(10 * few)
 
 
@@ -128,7 +128,7 @@ def test_settings_count(model):
     refine = cvtgs.SimplifyConfig.from_preset("high").refine.model_dump(exclude={"rates"})
     added = stages("standard", **{f"refine_{name}": str(text) for name, text in refine.items()})
     assert set(added) - set(model.stage_seconds("standard", work)) == {"refine"}
-    assert added["refine"] == pytest.approx(high["refine"], rel=0.01)
+    assert 1.0 < added["refine"] / high["refine"] < 1.1  # it finds and renders all its images
     assert stages("draft", refine_seconds="7")["refine"] == 7.0
 
 

@@ -12,7 +12,11 @@ from cvtgs.views import automatic_views, mixed_views, random_views
 from render_cases import backends
 from scenes import random_scene, same_bits
 
-SMALL = {"visibility": {"views": 10, "size": 48}}
+SMALL = {
+    "visibility": {"views": 10, "size": 48, "stride": 1},
+    "match": {"color_iterations": 6},
+    "refine": {"steps": 0},
+}
 
 
 def preset(**changes) -> SimplifyConfig:
@@ -129,6 +133,20 @@ def test_count_report_and_determinism(scene):
     assert report.matching.psnr_after > report.matching.psnr_before
     assert same_bits(small, simplifier.simplify(scene, 0.1))
     assert float(small.opacities.amax()) <= 1 - 1e-6
+
+
+def test_steps_learn_from_the_images_that_were_matched_to(scene, monkeypatch):
+    """The full scene is rendered once, however many steps follow; a larger image is another."""
+    steps = {"size": 48, "stride": 2, "steps": 12, "steps_per_image": 20, "check_every": 4}
+    config = preset(visibility={"views": 16, "size": 48, "stride": 2}, refine=steps)
+    small, report = Simplifier(config=config, device="cpu").run(scene, 0.1)
+    assert [cost.stage for cost in report.stages][-2:] == ["match", "refine"]
+    refined = report.refinement
+    assert (refined.images, refined.heldout, refined.steps) == (0, 2, 12)
+    assert refined.gain > 0
+    assert same_bits(small, Simplifier(config=config, device="cpu").simplify(scene, 0.1))
+    other = preset(visibility={"views": 16, "size": 64}, refine=steps)
+    assert Simplifier(config=other, device="cpu").run(scene, 0.1).report.refinement.images == 1
 
 
 def test_protected_gaussians_stay_bit_for_bit(scene):

@@ -12,9 +12,15 @@ from cvtgs.outofcore import LocalWorkers, simplify_file
 from cvtgs.views import automatic_views
 
 COUNT = 200
-MATCHED = {"preset": "matched", "visibility": {"views": 12, "size": 64}}
+MATCHED = {
+    "preset": "matched",
+    "visibility": {"views": 12, "size": 64, "stride": 1},
+    "match": {"color_iterations": 6},
+    "refine": {"steps": 0},
+}
 REFINED = {
     "preset": "high",
+    "visibility": {"size": 48},
     "refine": {"steps": 12, "size": 48, "images": 12, "heldout": 2, "check_every": 6},
 }
 

@@ -15,10 +15,17 @@ from cvtgs.evaluation.scorer import BLACK, WHITE, Metrics, Scorer, ViewImage, re
 from cvtgs.math import parameters
 from cvtgs.refinement import RefineConfig
 from cvtgs.refinement import limits as limits_module
-from cvtgs.refinement.images import ImageBuffer, RefineViews, generated_views, split_views
+from cvtgs.refinement.images import (
+    ImageBuffer,
+    RefineViews,
+    generated_views,
+    shared_views,
+    split_views,
+)
 from cvtgs.refinement.limits import Limits
 from cvtgs.refinement.optimize import SceneOptimizer, heldout_psnr, psnr_cap
 from cvtgs.refinement.refine import changed_count
+from cvtgs.rendering import observe
 from refine_cases import full_scene, quick, ring
 from scenes import random_scene, same_bits
 
@@ -239,6 +246,37 @@ def test_how_many_images_some_steps_take():
         taken.append(images.rendered)
         assert taken[-1] == config.new_images(steps)
     assert taken == [1, 2, 3, 3, 3, 4, 4, 4, 5]
+
+
+def test_images_that_are_there_come_first_and_every_eighth_of_them_is_held_out():
+    full, cameras = full_scene(50), ring(24)
+    config = quick(stride=2, first_images=2, steps_per_image=50)
+    observed = observe(full, cameras.select(torch.arange(16)).interleaved(2))
+    views = shared_views(observed, full, cameras, config=config, seed=0)
+    assert (len(views.heldout), len(views.heldout_images), len(views.images)) == (0, 2, 14)
+    images = ImageBuffer(full, views, config=config, seed=0)
+    drawn = [images.draw() for _ in range(50)]
+    assert [config.new_images(steps, given=14) for steps in (14, 49, 50, 100)] == [0, 0, 1, 2]
+    assert images.rendered == 1
+    given = {tuple(camera.viewmats.flatten().tolist()) for camera in observed.cameras.singles()}
+    known = [tuple(image.camera.viewmats.flatten().tolist()) in given for image in drawn]
+    assert known == [True] * 49 + [False]
+    assert {image.camera.stride for image in drawn} == {2}
+    held = {tuple(image.camera.viewmats.flatten().tolist()) for image in views.heldout_images}
+    assert not held & {tuple(image.camera.viewmats.flatten().tolist()) for image in drawn}
+    exact = render_view(full, drawn[0].camera)
+    torch.testing.assert_close(drawn[0].rgb.float(), exact.rgb, rtol=1e-3, atol=1e-3)
+
+
+def test_no_view_is_looked_for_before_one_is_due(monkeypatch):
+    full = full_scene(50)
+    observed = observe(full, ring(8))
+    monkeypatch.setattr("cvtgs.refinement.images.find_view_positions", None)
+    views = shared_views(observed, full, None, config=quick(steps_per_image=9), seed=0)
+    images = ImageBuffer(full, views, config=quick(steps_per_image=9), seed=0)
+    assert [images.draw().camera.stride for _ in range(8)] == [1] * 8
+    with pytest.raises(TypeError):
+        images.draw()
 
 
 def test_images_that_are_never_used_again_are_not_kept():

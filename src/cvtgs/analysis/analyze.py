@@ -14,6 +14,7 @@ from cvtgs.analysis.effects import EffectPlan, haze_share, plan_effects, plan_ha
 from cvtgs.analysis.visibility import ambient_visibility, perspective_falloff
 from cvtgs.cameras import Cameras
 from cvtgs.config import EffectsConfig, SimplifyConfig, TessellationConfig
+from cvtgs.losses import SSIM_WINDOW
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import divide
 from cvtgs.rendering import ObservedViews, contributions, observe
@@ -156,10 +157,12 @@ def measure_visibility(
     """
     choices = config.visibility
     if cameras is None:
-        views = mixed_views(scene, choices.views, size=choices.size, seed=config.seed)
+        side = max(choices.size, SSIM_WINDOW * choices.stride)
+        views = mixed_views(scene, choices.views, size=side, seed=config.seed)
     else:
-        longer = max(cameras.width, cameras.height)
-        views = cameras.spread(choices.views).fitted(min(choices.size, longer))
+        longer, least = max(cameras.width, cameras.height), SSIM_WINDOW * choices.stride
+        views = cameras.spread(choices.views).fitted(min(choices.size, longer), least=least)
+    views = views.interleaved(choices.stride)
     used, observed = drop_unused_bands(scene, analysis.plan), None
     if config.match.enabled:
         observed = observe(used, views)

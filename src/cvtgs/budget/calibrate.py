@@ -320,6 +320,11 @@ def _shortened(preset: str, short: Mapping[str, int]) -> SimplifyConfig:
     if config.refine.enabled:
         update = {name: short[name] for name in short if name != "views"} | {"seconds": 0}
         update["half_after"] = RefineConfig().half_after  # it costs nothing
+        if config.shares_images:
+            seen = config.visibility.model_copy(
+                update={"views": short["views"], "size": short["size"]}
+            )
+            changes["visibility"] = seen
         changes["refine"] = config.refine.model_copy(update=update)
     return config.model_copy(update=changes)
 

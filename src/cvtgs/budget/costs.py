@@ -91,22 +91,27 @@ class Work:
         sample = self.count if sample >= self.count // 2 else sample
         searched = 0 if cells == self.count else self.count + config.cvt.iterations * sample
         visibility, refine = config.visibility, config.refine
-        new_images = refine.new_images(refine.steps)
+        shared = visibility.views if config.shares_images else 0
+        heldout = refine.heldout_of(shared) if shared else refine.heldout
+        learned = shared - heldout if shared else 0
+        new_images = refine.new_images(refine.steps, given=learned)
+        batches = math.ceil(new_images / refine.batch) + (not shared)
         checks = 1 + math.ceil(refine.steps / refine.check_every)
-        renders = refine.steps + SHARE_OF_A_STEP * refine.heldout * checks
-        renders += STEPS_OF_A_BATCH * (1 + math.ceil(new_images / refine.batch))
+        renders = refine.steps + SHARE_OF_A_STEP * heldout * checks
+        renders += STEPS_OF_A_BATCH * batches
+        side = visibility.size / visibility.stride
         amounts = {
             "once": 1.0,
             "in": float(self.count),
             "in_values": float(self.count * self.colors),
             "out": float(self.target),
             "out_values": float(self.target * self.colors),
-            "view_pixels": float(visibility.views * visibility.size**2),
+            "view_pixels": float(visibility.views * side**2),
             "views_in": float(visibility.views * self.count),
             # Pairs of a pixel and a Gaussian: more Gaussians are smaller, and hide one another.
-            "view_pairs": visibility.views * visibility.size * math.sqrt(self.target),
+            "view_pairs": visibility.views * side * math.sqrt(self.target),
             "view_values": float(visibility.views * self.target * self.colors),
-            "images_in": (refine.heldout + new_images) * self.count,
+            "images_in": float((0 if shared else heldout) + new_images) * self.count,
             "look_pixels": renders * (refine.size / refine.stride) ** 2,
             "looks_out": renders * self.target,
             "search": searched * math.log2(cells + 2),

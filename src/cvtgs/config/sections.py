@@ -127,12 +127,15 @@ class VisibilityConfig(Section):
         views: Images, from :func:`cvtgs.views.mixed_views`. 0 takes none: what a Gaussian
             paints is then told by its size, opacity and place alone.
         size: Side of the images, pixels.
+        stride: Distance in pixels, along rows and columns, of the pixels that are rendered, as
+            sharp as in the whole image.
         mass_share: Share of the weight that still comes from size, opacity and place, for all
             that no image shows.
     """
 
     views: int = pydantic.Field(default=0, ge=0)
     size: int = pydantic.Field(default=128, ge=16)
+    stride: Count = 1
     mass_share: Share = 0.7
 
 
@@ -257,17 +260,30 @@ class RefineConfig(Section):
     check_every: Count = 25
     patience: Count = 8
 
-    def new_images(self, steps: int) -> int:
+    def new_images(self, steps: int, *, given: int = 0) -> int:
         """Return how many images of the full scene so many steps take, where there are enough.
 
         Args:
             steps: Number of steps.
+            given: Images to learn from that are there before.
 
         Returns:
-            Number of images.
+            Number of images to render.
         """
-        later = max(0, steps - self.first_images)
-        return min(steps, self.first_images) + later // self.steps_per_image
+        first = max(0, self.first_images - given)
+        later = max(0, steps - first)
+        return min(steps, first) + later // self.steps_per_image
+
+    def heldout_of(self, count: int) -> int:
+        """Return how many of so many views are held out: every eighth, one at least.
+
+        Args:
+            count: Number of views.
+
+        Returns:
+            Number of those that decide what is kept.
+        """
+        return max(1, min(self.heldout, count // 8))
 
     @property
     def enabled(self) -> bool:

@@ -29,8 +29,16 @@ def unknown_preset(name: object) -> ConfigError:
 
 
 MATCHED: Mapping[str, Any] = {
-    "visibility": {"views": 24, "size": 256},
-    "match": {"opacity_rounds": 1, "color_iterations": 6},
+    "visibility": {"views": 24, "size": 400, "stride": 2},
+    "match": {"opacity_rounds": 1},
+    "refine": {
+        "steps": 50,
+        "half_after": 40,
+        "size": 400,
+        "stride": 2,
+        "steps_per_image": 100,
+        "check_every": 25,
+    },
 }
 
 THINNED: Mapping[str, Any] = {
@@ -116,6 +124,13 @@ class SimplifyConfig(Section):
     def uses_renders(self) -> bool:
         """Whether images of the scene tell what is seen."""
         return self.visibility.views > 0 and self.effects.visibility != "off"
+
+    @property
+    def shares_images(self) -> bool:
+        """Whether a refinement learns from the images to which opacities are matched."""
+        ours, theirs = self.visibility, self.refine
+        is_same = (ours.size, ours.stride) == (theirs.size, theirs.stride)
+        return self.uses_renders and self.match.enabled and theirs.enabled and is_same
 
     @classmethod
     def from_preset(cls, name: str) -> Self:

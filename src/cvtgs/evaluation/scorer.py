@@ -186,6 +186,7 @@ class Scorer:
         cameras: Iterable[Cameras],
         *,
         metrics: Metrics,
+        images: Iterable[ViewImage] = (),
         backgrounds: Sequence[Color] = (BLACK,),
         progress: Callable[[int], None] = lambda done: None,
     ) -> None:
@@ -195,6 +196,7 @@ class Scorer:
         for camera in cameras:
             progress(len(self._truths))
             self._truths.append((camera, self._render(full, camera)))
+        self._truths += [(image.camera, self._composite(image)) for image in images]
         progress(len(self._truths))
 
     def __len__(self) -> int:
@@ -213,7 +215,9 @@ class Scorer:
         return scores
 
     def _render(self, scene: GaussianScene, camera: Cameras) -> "_OverBackgrounds":
-        image = render_view(scene, camera)
+        return self._composite(render_view(scene, camera))
+
+    def _composite(self, image: ViewImage) -> "_OverBackgrounds":
         colors = [image.over(background).clamp(0, 1) for background in self._backgrounds]
         return _OverBackgrounds(colors, image.alpha)
 

@@ -29,6 +29,10 @@ NEAR = 0.5
 """Cameras stand among what lies within this share of the diagonal of a block around it."""
 
 
+LATER_SEED = 307
+"""Added to the seed: views to learn from are others than those for matching."""
+
+
 class Drawn(NamedTuple):
     """What is drawn while a block is improved.
 
@@ -52,13 +56,13 @@ def improve(job: Job, block: int) -> None:
         return
     own, found, config = load(job.small_path(block)), read_cells(job, block), job.config
     drawn = _draw(job, block, own, found)
-    small, changes = drawn.small, dict[str, Any]()
+    small, changes, observed = drawn.small, dict[str, Any](), None
     if config.match.enabled and config.uses_renders:
         choices = config.visibility
         views = mixed_views(
             drawn.positions, choices.views, size=choices.size, seed=config.seed, sharp=False
         )
-        observed = observe(drawn.full, views)
+        observed = observe(drawn.full, views.interleaved(choices.stride))
         targets = cell_contributions(observed.contributions[drawn.fixed :], found.partition)
         small, changes["matching"] = match_views(
             small,
@@ -69,17 +73,17 @@ def improve(job: Job, block: int) -> None:
         )
     if config.refine.enabled:
         number = min(config.refine.images, config.refine.steps) + config.refine.heldout
-        size = config.refine.size
+        size, seed = config.refine.size, config.seed + LATER_SEED
+        cameras = mixed_views(drawn.positions, max(2, number), size=size, seed=seed, sharp=False)
         small, changes["refinement"] = refine(
             small,
             drawn.full,
-            cameras=mixed_views(
-                drawn.positions, max(2, number), size=size, seed=config.seed, sharp=False
-            ),
+            cameras=cameras,
             config=config.refine,
             seed=config.seed,
             device="cpu",
             frozen=drawn.fixed,
+            observed=observed if config.shares_images else None,
         )
     rows = torch.arange(drawn.fixed, len(small))
     improved = own.with_tensors(small.select(rows).tensors(), own.extras)

@@ -13,6 +13,7 @@ from cvtgs.config import RefineConfig
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation.scorer import ViewImage, render_view
 from cvtgs.losses import SSIM_WINDOW
+from cvtgs.rendering import ObservedViews
 from cvtgs.scene import GaussianScene
 from cvtgs.views import find_view_positions, mixed_views
 
@@ -30,11 +31,15 @@ class RefineViews:
         heldout: Single cameras of one size, which decide what is kept.
         training: Single cameras to learn from.
         endless: Whether there are always more of them.
+        heldout_images: Images that decide, too.
+        images: Images to learn from that are there before the first step.
     """
 
     heldout: tuple[Cameras, ...]
     training: Iterator[Cameras]
     endless: bool
+    heldout_images: tuple[ViewImage, ...] = ()
+    images: tuple[ViewImage, ...] = ()
 
 
 def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> RefineViews:
@@ -64,12 +69,60 @@ def split_views(cameras: Cameras, *, config: RefineConfig, seed: int) -> RefineV
         )
     side = min(config.size, max(cameras.width, cameras.height))
     views = cameras.fitted(side, least=SSIM_WINDOW * config.stride).singles()
-    number = max(1, min(config.heldout, len(views) // 8))
-    held = {(2 * k + 1) * len(views) // (2 * number) for k in range(number)}
+    held = _heldout_rows(len(views), config)
     others = [view for row, view in enumerate(views) if row not in held]
     random.Random(seed).shuffle(others)
-    heldout = _thinned([views[row] for row in sorted(held)], config.stride)
+    heldout = _thinned([views[row] for row in held], config.stride)
     return RefineViews(heldout=heldout, training=iter(others), endless=False)
+
+
+def shared_views(
+    observed: ObservedViews,
+    full: GaussianScene,
+    cameras: Cameras | None,
+    *,
+    config: RefineConfig,
+    seed: int,
+) -> RefineViews:
+    """Divide images that were rendered before like :func:`split_views`; later views are others."""
+    images = [
+        ViewImage(camera=camera, rgb=rgb[None], alpha=alpha[None], backend=observed.backend)
+        for camera, rgb, alpha in zip(
+            observed.cameras.singles(), observed.rgb, observed.alpha, strict=True
+        )
+    ]
+    held = _heldout_rows(len(images), config)
+    return RefineViews(
+        heldout=(),
+        training=_further(observed.cameras, full, cameras, config=config, seed=seed),
+        endless=cameras is None,
+        heldout_images=tuple(images[row] for row in held),
+        images=tuple(image.half() for row, image in enumerate(images) if row not in held),
+    )
+
+
+def _further(
+    used: Cameras,
+    full: GaussianScene,
+    cameras: Cameras | None,
+    *,
+    config: RefineConfig,
+    seed: int,
+) -> Iterator[Cameras]:
+    """Yield other views to learn from; none is looked for until the first is asked for."""
+    if cameras is None:
+        yield from generated_views(full, config=config, seed=seed).training
+        return
+    taken = {tuple(viewmat.flatten().tolist()) for viewmat in used.viewmats}
+    for view in split_views(cameras, config=config, seed=seed).training:
+        if tuple(view.viewmats[0].flatten().tolist()) not in taken:
+            yield view
+
+
+def _heldout_rows(count: int, config: RefineConfig) -> tuple[int, ...]:
+    """Return which of some views are held out, spread evenly."""
+    number = config.heldout_of(count)
+    return tuple((2 * k + 1) * count // (2 * number) for k in range(number))
 
 
 def _thinned(views: Sequence[Cameras], stride: int) -> tuple[Cameras, ...]:
@@ -97,23 +150,24 @@ class ImageBuffer:
         self._full = full
         self._cameras = views.training
         self._config = config
-        self._capacity = 1 if always_new else config.images
+        self._capacity = max(1 if always_new else config.images, len(views.images))
+        self._first = max(config.first_images, len(views.images))
         self._rng = random.Random(seed)
-        self._kept: list[ViewImage] = []
-        self._drawn = 0
+        self._kept: list[ViewImage] = list(views.images)
+        self._drawn = len(self._kept)
         self.rendered = 0
 
     def draw(self) -> ViewImage:
         """Return an image to learn from, in half precision."""
-        stride = self._config.stride
-        if stride == 1:
-            return self._next()
+        image, stride = self._next(), self._config.stride
+        if image.camera.stride == stride:
+            return image
         first = (self._rng.randrange(stride), self._rng.randrange(stride))
-        return self._next().every(stride, first=first)
+        return image.every(stride, first=first)
 
     def _next(self) -> ViewImage:
         self._drawn += 1
-        later = self._drawn - self._config.first_images
+        later = self._drawn - self._first
         is_due = later <= 0 or later % self._config.steps_per_image == 0
         camera = next(self._cameras, None) if is_due else None
         if camera is None:

@@ -11,9 +11,10 @@ from cvtgs.devices import chosen_device
 from cvtgs.errors import InvalidSceneError
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.refinement.images import ImageBuffer, generated_views, split_views
+from cvtgs.refinement.images import ImageBuffer, generated_views, shared_views, split_views
 from cvtgs.refinement.limits import Limits, check_limits
 from cvtgs.refinement.optimize import STAGE, learning_rate_scales, optimize
+from cvtgs.rendering import ObservedViews
 from cvtgs.rendering.backends import choose_backend
 from cvtgs.report import RefineReport, SimplifyReport
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
@@ -46,6 +47,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     seed: int = 0,
     device: str | torch.device = "auto",
     frozen: int = 0,
+    observed: ObservedViews | None = None,
     listener: ProgressListener = silent,
 ) -> Refined:
     """Fine-tune a simplified scene until images of it look more like those of the full one.
@@ -75,6 +77,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         device: Where to compute: ``auto`` stays where the small scene is, but takes CUDA for
             scenes on the CPU if there is one. The result is where the small scene was.
         frozen: So many of the first Gaussians stay as they are, bit for bit.
+        observed: Images of the full scene that were rendered before, of the size and stride of
+            the configuration. They are the first ones, and every eighth of them is held out.
         listener: Called after every step, with the gain so far as its note.
 
     Returns:
@@ -103,12 +107,20 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         steps = DEFAULT_STEPS
     limits, clock = Limits(seconds, steps=steps), StageClock(listener, place)
     with clock.stage(STAGE, limits.total):
-        if cameras is None:
+        if observed is not None:
+            views = shared_views(observed, theirs, cameras, config=config, seed=seed)
+        elif cameras is None:
             views = generated_views(theirs, config=config, seed=seed)
         else:
             views = split_views(cameras, config=config, seed=seed)
         metrics = Metrics(ssim=False, most_psnr=MOST_PSNR)
-        scorer = Scorer(theirs, views.heldout, metrics=metrics, backgrounds=(BLACK, WHITE))
+        scorer = Scorer(
+            theirs,
+            views.heldout,
+            metrics=metrics,
+            images=views.heldout_images,
+            backgrounds=(BLACK, WHITE),
+        )
         images = ImageBuffer(theirs, views, config=config, seed=seed)
         scales = learning_rate_scales(ours, theirs)
         scales[:frozen] = 0.0
@@ -124,7 +136,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     report = RefineReport(
         steps=limits.steps,
         images=images.rendered,
-        heldout=len(views.heldout),
+        heldout=len(scorer),
         psnr_before=found.before,
         psnr_after=found.after,
         gain=found.after - found.before,
