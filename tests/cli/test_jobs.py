@@ -50,6 +50,22 @@ def test_many_scenes_get_a_line_each(
     assert printed.err == ""
 
 
+def test_a_folder_stands_for_the_scenes_in_it(
+    scenes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (scenes / "notes.txt").write_text("not a scene")
+    (scenes / "model").mkdir()  # of a trained model: one scene
+    cvtgs.save(cvtgs.load("a.ply"), "model/point_cloud.ply")
+    (scenes / "model" / "other.ply").write_text("not read")
+    assert main(["convert", ".", "model", "-o", "out", "--suffix", ".splat", "--quiet"]) == 0
+    assert {path.name for path in Path("out").iterdir()} == {
+        *("a.splat", "b.splat", "c.splat", "model.splat")
+    }
+    (scenes / "none").mkdir()
+    assert main(["convert", "none", "-o", "out"]) == 1
+    assert "none: must be a file or the folder of a trained model" in capsys.readouterr().err
+
+
 def test_one_suffix_for_all(scenes: Path) -> None:
     assert main(["convert", *NAMES, "-o", "deep/out", "--suffix", "splat", "--quiet"]) == 0
     names = {path.name for path in Path("deep/out").iterdir()}

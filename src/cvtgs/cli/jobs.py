@@ -15,7 +15,14 @@ from typing import NamedTuple
 import cvtgs
 from cvtgs.cli.display import WIDTH, file_size, say, say_wrapped, size_text, without_middle
 from cvtgs.cli.options import READABLE, WRITABLE, CommandParser
-from cvtgs.errors import CvtgsError, InputNotFoundError, InvalidArgumentError, OutputError, RunError
+from cvtgs.errors import (
+    CvtgsError,
+    InputError,
+    InputNotFoundError,
+    InvalidArgumentError,
+    OutputError,
+    RunError,
+)
 from cvtgs.text import printable
 
 STREAM = "-"
@@ -65,7 +72,7 @@ def add_paths(parser: CommandParser, *, options: str) -> None:
         metavar="IN OUT",
         help=f"scene to read ({READABLE}) and scene to write ({WRITABLE}); - is standard input or "
         "output. With -o, any number of scenes to read; patterns such as 'scans/*.ply' are "
-        "expanded",
+        "expanded, and a folder stands for the scenes in it",
     )
     parser.add_argument(
         "-o",
@@ -210,13 +217,29 @@ def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
 
 
 def _expanded(pattern: str) -> list[str]:
-    """Return the files that a pattern stands for, where the shell has not expanded it."""
+    """Return the files of a pattern that the shell has not expanded, or of a folder of scenes."""
+    if os.path.isdir(pattern):  # noqa: PTH112 (any path)
+        return _in_folder(pattern)
     if os.path.lexists(pattern) or not glob.has_magic(pattern):
         return [pattern]
     found = sorted(glob.glob(pattern, recursive=True))  # noqa: PTH207 (any path, any pattern)
     if not found:
         raise InputNotFoundError(f"{pattern}: the pattern must match a file, found none.")
     return found
+
+
+def _in_folder(folder: str) -> list[str]:
+    """Return the scenes in a folder, or the folder itself if it holds a single one."""
+    from cvtgs.io.formats import READABLE_SUFFIXES
+
+    try:
+        cvtgs.io.scene_file(folder)
+    except InputError:
+        found = sorted(glob.glob(f"{glob.escape(folder)}/*"))  # noqa: PTH207 (as text)
+        scenes = [path for path in found if path.lower().endswith(READABLE_SUFFIXES)]
+        if scenes:
+            return scenes
+    return [folder]
 
 
 def _output_name(source: Path, suffix: str | None) -> str:
