@@ -50,7 +50,7 @@ OWNERS = {
     "numba": "rendering/compiled.py",
     "gsplat": "rendering/gsplat_backend.py",
     "PIL": ("evaluation/comparison_files.py", "evaluation/images.py", "io/sog/container.py"),
-    "jinja2": "evaluation/page.py",
+    "jinja2": "evaluation/comparison_files.py",
     "zstandard": ("io/spz/read.py", "io/spz/write.py"),
     "safetensors": "io/tensors.py",
     "matplotlib": "plots.py",

@@ -24,7 +24,13 @@ from cvtgs.evaluation import (
     ssim,
     write_comparison,
 )
-from cvtgs.evaluation.comparison_files import bytes_text, contact_sheet, error_sheet
+from cvtgs.evaluation.comparison_files import (
+    bytes_text,
+    comparison_page,
+    contact_sheet,
+    error_sheet,
+    render_template,
+)
 from cvtgs.evaluation.images import (
     ALPHA_SCALE,
     ERROR_SCALE,
@@ -34,7 +40,6 @@ from cvtgs.evaluation.images import (
     error_map,
     read_image,
 )
-from cvtgs.evaluation.page import comparison_page, render_template
 from cvtgs.evaluation.scorer import Metrics
 from cvtgs.rendering import render
 from cvtgs.views import automatic_views

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cvtgs.errors import MissingDependencyError
-from cvtgs.evaluation.comparison_files import PAGE, bytes_text
-from cvtgs.evaluation.page import comparison_page, render_template
+from cvtgs.evaluation.comparison_files import PAGE, bytes_text, comparison_page, render_template
 from cvtgs.io import atomic_output, check_output
 from cvtgs.io.atomic import make_folder
 from cvtgs.plots import Panel, Series, line_chart
