@@ -47,6 +47,7 @@ WORDS = (
     b"property list uint int a", b"element vertex 1000000000", b"end_header\n", b"comment ",
     b"double", b"int64", b"[[]]", b"{}",
     b"=", b"[a]\n", b'"""', "\u00fc\u2028".encode(), b"format ascii 1.0\n", b"e", b"-",
+    b"[" * 2000,
 )  # fmt: skip
 
 

@@ -15,8 +15,11 @@ import torch
 import cvtgs
 from camera_files import colmap_bin, colmap_txt, inria, transforms
 from cvtgs import SimplifyConfig
+from cvtgs.boxes import read_boxes
 from cvtgs.io.sog import encode_sog
+from cvtgs.levels import read_index
 from cvtgs.mergenet import Architecture, CheckpointInfo, load_checkpoint, save_checkpoint
+from cvtgs.train import TrainConfig
 from mergenet_cases import lively_net
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
 from scenes import random_scene
@@ -145,6 +148,26 @@ def seeds_of_streams() -> list[bytes]:
     return [json.dumps(found).encode() for found in (document | {"tree": tree}, whole)]
 
 
+def seeds_of_boxes() -> list[bytes]:
+    """A box, and a list of two."""
+    boxes = [{"min": [0, -1.5, 2], "max": [1, 1e3, 2]}, {"min": [0, 0, 0], "max": [1, 2, 3]}]
+    return [json.dumps(found).encode() for found in (boxes[0], boxes)]
+
+
+def seeds_of_trainings() -> list[bytes]:
+    """The recipes, which have most settings."""
+    return [path.read_bytes() for path in sorted((HERE.parent / "recipes").glob("*.toml"))]
+
+
+def seeds_of_levels() -> list[bytes]:
+    """The index of two levels."""
+    scene = random_scene(20, degree=0)
+    made = cvtgs.Simplifier(preset="draft", device="cpu").levels(scene, [0.5, 0.1])
+    with tempfile.TemporaryDirectory() as folder:
+        cvtgs.levels.write_levels(made, folder, rhos=[0.5, 0.1], source="a.ply")
+        return [(Path(folder) / cvtgs.levels.INDEX_NAME).read_bytes()]
+
+
 def colmap_files(write: Callable[[Path], object]) -> Files:
     """Return the files of a COLMAP model."""
     with tempfile.TemporaryDirectory() as folder:
@@ -182,6 +205,9 @@ READERS: dict[str, Kind] = {
     "transforms": Kind(name=".json", seeds=lambda: seeds_of_cameras()[:1], read=cvtgs.load_cameras),
     "inria": Kind(name=".json", seeds=lambda: seeds_of_cameras()[1:], read=cvtgs.load_cameras),
     "config": Kind(name=".toml", seeds=seeds_of_configs, read=SimplifyConfig.from_toml),
+    "boxes": Kind(name=".json", seeds=seeds_of_boxes, read=read_boxes),
+    "training": Kind(name=".toml", seeds=seeds_of_trainings, read=TrainConfig.from_toml),
+    "levels": Kind(name="levels.json", seeds=seeds_of_levels, read=read_index),
     "ksplat": Kind(name=".ksplat", seeds=seeds_of_ksplat, read=cvtgs.load),
     "meta": Kind(
         name="meta.json",

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cvtgs.errors import InputError, InputNotFoundError, InvalidArgumentError
+from cvtgs.text import MOST_LETTERS, shortened
 
 Corner = tuple[float, float, float]
 
@@ -79,7 +80,7 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:  # also lists in lists without end
         raise InvalidArgumentError(f"{path}: must be JSON, found none: {error}.") from None
     listed = values if isinstance(values, list) else [values]
     try:
@@ -87,6 +88,7 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
     except pydantic.ValidationError as error:
         problem = error.errors()[0]
         where = ".".join(str(part) for part in problem["loc"])
+        where = shortened(where if where.isprintable() else repr(where), MOST_LETTERS)
         raise InvalidArgumentError(
             f'{path}: must hold boxes like {{"min": [x, y, z], "max": [x, y, z]}}; '
             f"{where + ': ' if where else ''}{problem['msg'].lower()}."

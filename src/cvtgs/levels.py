@@ -5,14 +5,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
 
+import pydantic
 import torch
 
-from cvtgs.config.base import Record
-from cvtgs.errors import InvalidArgumentError
+from cvtgs.config.base import Record, explain
+from cvtgs.errors import FileFormatError, InvalidArgumentError
 from cvtgs.evaluation import Evaluation, SceneScores
 from cvtgs.evaluation.report import mean_of
 from cvtgs.io import atomic_output, check_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES
+from cvtgs.io.files import open_input
 from cvtgs.report import Level
 from cvtgs.text import printable
 
@@ -241,6 +243,8 @@ def add_scores(folder: str | os.PathLike[str], evaluation: Evaluation) -> Levels
         The index with scores, as it is now in the folder.
 
     Raises:
+        InputNotFoundError: There is no index.
+        FileFormatError: The index is not one that :func:`write_levels` writes.
         OutputError: The index cannot be written.
 
     Example:
@@ -257,7 +261,7 @@ def add_scores(folder: str | os.PathLike[str], evaluation: Evaluation) -> Levels
         (2, False)
     """
     place = Path(folder)
-    index = LevelsIndex.model_validate_json((place / INDEX_NAME).read_bytes())
+    index = read_index(place / INDEX_NAME)
     scores = {one.name: one for one in evaluation.scenes}
     levels = tuple(
         level.with_scores(scores[level.file]) if level.file in scores else level
@@ -266,6 +270,16 @@ def add_scores(folder: str | os.PathLike[str], evaluation: Evaluation) -> Levels
     index = index.model_copy(update={"levels": levels, "views": len(evaluation.views)})
     _write_index(index, place, overwrite=True)
     return index
+
+
+def read_index(path: Path) -> LevelsIndex:
+    """Read the index of levels."""
+    with open_input(path) as file:
+        content = file.read()
+    try:
+        return LevelsIndex.model_validate_json(content)
+    except pydantic.ValidationError as error:
+        raise FileFormatError(f"{path}: is not an index of levels: {explain(error)}") from error
 
 
 def _write_index(index: LevelsIndex, folder: Path, *, overwrite: bool) -> None:

@@ -62,6 +62,20 @@ def test_kept_inputs_end_in_a_result_or_one_clear_sentence(tmp_path):
     assert {kept: end for kept, end in ends.items() if end not in ("read", "refused")} == {}
 
 
+def test_boxes_nested_without_end_are_refused(tmp_path):
+    path = tmp_path / "boxes.json"
+    path.write_bytes(b"[" * 100_000)
+    assert fuzz_files.verdict(fuzz_seeds.READERS["boxes"].read, path) == "refused"
+    path.write_text(json.dumps({"min\n" * 1000: 1}))
+    assert fuzz_files.verdict(fuzz_seeds.READERS["boxes"].read, path) == "refused"
+
+
+def test_a_damaged_index_of_levels_is_refused(tmp_path):
+    path = tmp_path / "levels.json"
+    path.write_bytes(fuzz_seeds.seeds_of_levels()[0].replace(b'"levels"', b'"lev\\u001bels"'))
+    assert fuzz_files.verdict(fuzz_seeds.READERS["levels"].read, path) == "refused"
+
+
 def test_failing_inputs_are_made_small():
     assert fuzz_files.made_small(b"a" * 500 + b"bug" + b"c" * 300, lambda d: b"bug" in d) == b"bug"
     assert fuzz_files.made_small(b"", lambda data: True) == b""
