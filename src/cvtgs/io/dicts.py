@@ -156,7 +156,7 @@ def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
             raise InvalidSceneError(f"the names must be {_KNOWN}, found {shown(key)}.")
         if name in keys:
             raise InvalidSceneError(
-                f"a dictionary must give {name} once, found {keys[name]!r} and {key!r}."
+                f"a dictionary must give {name} once, found {shown(keys[name])} and {shown(key)}."
             )
         keys[name] = key
     missing = [

@@ -168,8 +168,8 @@ def check_stored(path: Path, tensors: Mapping[str, Tensor]) -> None:
         wanted, stored = tensor.numel() * tensor.element_size(), tensor.untyped_storage().nbytes()
         if wanted > stored:
             raise FileFormatError(
-                f"{path}: {name!r} must store each of its {wanted:,} bytes, found {stored:,}; if "
-                f"you trust the file, pass trust_sizes=True (--trust-sizes)."
+                f"{path}: {shown(name)} must store each of its {wanted:,} bytes, found {stored:,}; "
+                f"if you trust the file, pass trust_sizes=True (--trust-sizes)."
             )
 
 

@@ -16,7 +16,7 @@ from cvtgs.errors import CheckpointError, ConfigError, FileFormatError
 from cvtgs.io.tensors import pack_tensors, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet
 from cvtgs.mergenet.published import PublishedArchitecture, PublishedMergeNet
-from cvtgs.text import printable
+from cvtgs.text import printable, shown
 
 SHIPPED = ("standard", "paper")
 """Names of the checkpoints that come with the package."""
@@ -204,7 +204,7 @@ def _unpack(content: bytes, name: str) -> tuple[dict[str, Tensor], dict[str, str
     if metadata.get("format") != FORMAT:
         raise CheckpointError(
             f"{name}: the file holds no MergeNet; its format must be {FORMAT!r}, "
-            f"found {metadata.get('format')!r}."
+            f"found {shown(metadata.get('format'))}."
         )
     return tensors, metadata
 
@@ -229,7 +229,7 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
     if info.preset not in SHIPPED:
         raise CheckpointError(
             f"{name}: the preset of the checkpoint must be one of {', '.join(SHIPPED)}, "
-            f"found {info.preset!r}."
+            f"found {shown(info.preset)}."
         )
     ours, theirs = KINDS[info.architecture.kind](), info.architecture
     for feature in ("member_features", "pair_features", "cell_features"):

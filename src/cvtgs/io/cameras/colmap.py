@@ -16,6 +16,7 @@ from cvtgs.errors import FileFormatError
 from cvtgs.io.cameras.views import Lens, View, checked_lens
 from cvtgs.io.files import is_file, open_input
 from cvtgs.math import parameters
+from cvtgs.text import shown
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<iiQQ")
@@ -89,7 +90,7 @@ def _views(images: Sequence[_Image], lenses: Mapping[int, Lens], path: Path) -> 
     for image in images:
         if image.camera not in lenses:
             raise FileFormatError(
-                f"{path}: image {image.name!r} must have a camera of the file of cameras, "
+                f"{path}: image {shown(image.name)} must have a camera of the file of cameras, "
                 f"found camera {image.camera}."
             )
     quats = torch.tensor([image.quat for image in images], dtype=torch.float64).reshape(-1, 4)
@@ -259,7 +260,7 @@ def _images_of_txt(path: Path) -> list[_Image]:
             if len(points.split()) % 3:
                 raise _wrong(
                     f"{path}: line {number_of_points}",
-                    f"the points of image {images[-1].name!r} as X Y POINT3D_ID, or empty",
+                    f"the points of image {shown(images[-1].name)} as X Y POINT3D_ID, or empty",
                     points,
                 )
     return images

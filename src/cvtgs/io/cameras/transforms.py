@@ -248,7 +248,8 @@ def _listed(views: Sequence[View], names: Sequence[Any] | None, key: str, path: 
     for row, name in enumerate(names):
         if not isinstance(name, str) or PurePosixPath(name) not in known:
             raise FileFormatError(
-                f"{path}: row {row} of {key!r} must be the 'file_path' of a frame, found {name!r}."
+                f"{path}: row {row} of {key!r} must be the 'file_path' of a frame, found "
+                f"{shown(name)}."
             )
         wanted.add(PurePosixPath(name))
     return [view for view in views if PurePosixPath(view.name) in wanted]

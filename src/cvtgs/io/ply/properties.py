@@ -123,7 +123,7 @@ def _check_properties(vertex: Element, path: str) -> None:
     lists = [name for name, scalar in scalars.items() if is_standard(name) and not scalar]
     if lists:
         raise FileFormatError(
-            f"{path}: property {lists[0]!r} of 'vertex' must be a number, found a list."
+            f"{path}: property {shown(lists[0])} of 'vertex' must be a number, found a list."
         )
     missing = [name for name in standard_slots(0) if name not in scalars and name not in _OPTIONAL]
     if missing:

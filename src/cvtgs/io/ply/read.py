@@ -30,6 +30,7 @@ from cvtgs.io.ply.properties import (
 )
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
+from cvtgs.text import shown
 
 CHUNK_BYTES = 1 << 20
 """How much of a file is mapped at a time; a chunk and its copy fit in the second-level cache."""
@@ -82,12 +83,12 @@ def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -
 
 def _warn_of_dropped(header: Header, vertex: Element, path: str) -> None:
     dropped = [
-        f"element {element.name!r} ({element.count:,} rows)"
+        f"element {shown(element.name)} ({element.count:,} rows)"
         for element in header.elements
         if element is not vertex and element.count > 0
     ]
     dropped += [
-        f"list property {prop.name!r} of 'vertex' ({vertex.count:,} rows)"
+        f"list property {shown(prop.name)} of 'vertex' ({vertex.count:,} rows)"
         for prop in vertex.properties
         if prop.count_type
     ]
@@ -288,16 +289,18 @@ class _CleanStream(io.BufferedIOBase):
 def _explain(error: Any, elements: tuple[Element, ...], path: str) -> str:
     """Turn plyfile's error into one sentence with the file's own names."""
     element = elements[int(error.element.name[1:])]
-    place = f"{path}: row {error.row} of {element.name!r}"
+    place = f"{path}: row {error.row} of {shown(element.name)}"
     if error.message == "early end-of-file":
         return (
             f"{path}: the file is cut short: its header promises {element.count:,} rows of "
-            f"{element.name!r}, found {error.row:,}."
+            f"{shown(element.name)}, found {error.row:,}."
         )
     if error.prop is None:
         return f"{place} must hold {len(element.properties)} values, found more."
     prop = element.properties[int(error.prop.name[1:])]
     if error.message == "early end-of-line":
-        return f"{place} must have a value for property {prop.name!r}, found the end of the line."
+        return (
+            f"{place} must have a value for property {shown(prop.name)}, found the end of the line."
+        )
     kind = f"list of {prop.type}" if prop.count_type else prop.type
-    return f"{place}: property {prop.name!r} must be a {kind}, found something unreadable."
+    return f"{place}: property {shown(prop.name)} must be a {kind}, found something unreadable."
