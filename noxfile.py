@@ -35,16 +35,23 @@ def lint(session: nox.Session) -> None:
 
 @nox.session
 def tests(session: nox.Session) -> None:
-    """Unit, property and documentation tests, a process per core, with coverage."""
+    """Unit, property and documentation tests but the longest, a process per core, with coverage."""
     session.install(*CONSTRAINTS, "-e", ".[test]")
-    session.run("pytest", *PARALLEL, "--cov=cvtgs", *session.posargs)
+    session.run("pytest", *PARALLEL, "--cov=cvtgs", "-m", "not long", *session.posargs)
+
+
+@nox.session
+def long(session: nox.Session) -> None:
+    """The longest tests: kills, full disks, clusters, memory, whole trainings and evaluations."""
+    session.install(*CONSTRAINTS, "-e", ".[test]")
+    session.run("pytest", *PARALLEL, "-m", "long", *session.posargs)
 
 
 @nox.session(reuse_venv=True)
 def quick(session: nox.Session) -> None:
     """All tests but the slow ones: two minutes on two cores."""
     session.install(*CONSTRAINTS, "-e", ".[test]")
-    session.run("pytest", *PARALLEL, "-m", "not slow", *session.posargs)
+    session.run("pytest", *PARALLEL, "-m", "not slow and not long", *session.posargs)
 
 
 @nox.session

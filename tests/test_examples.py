@@ -98,7 +98,7 @@ def test_custom_merge_keeps_labels_apart(tmp_path: Path) -> None:
     assert merged.extras["share"].tolist() == pytest.approx(merged.extras["label"].tolist())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_train_tiny(tmp_path: Path) -> None:
     checkpoint = tmp_path / "tiny.safetensors"
     printed = run("train_tiny.py", checkpoint, "--steps", 2, "--count", 300)
@@ -122,7 +122,7 @@ def test_levels(tmp_path: Path) -> None:
     assert len(cvtgs.load(folder / "level1.spz")) == 20
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_tradeoff(tmp_path: Path) -> None:
     source, page = scene_file(tmp_path / "scene.ply"), tmp_path / "page"
     words = ("--rho", 0.1, "--presets", "draft", "fast", "--size", 64)

@@ -258,6 +258,7 @@ def test_no_name_that_means_everything():
     assert not [path for path in FILES if vague & set(path.with_suffix("").parts)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "statement",
     ["import cvtgs", "import cvtgs.simplifier", "import cvtgs; cvtgs.Simplifier; cvtgs.load"],

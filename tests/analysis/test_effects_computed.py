@@ -112,6 +112,7 @@ def test_all_rows_keep_their_bands_unless_told_otherwise():
     assert not run_with(scene, 1.0, effects={"sh": 0}).scene.shN.any()
 
 
+@pytest.mark.slow
 def test_refinement_leaves_empty_bands_alone():
     scene = with_zero_bands(random_scene(300, degree=2), 1)
     refine = {"steps": 3, "size": 32, "heldout": 2, "batch": 4}

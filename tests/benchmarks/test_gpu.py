@@ -21,7 +21,7 @@ def page_at(tmp_path: Path) -> Path:
     return page
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page(tmp_path, monkeypatch, capsys):
     page = page_at(tmp_path)
     monkeypatch.setattr(gpu, "HIGH", quick_high())
@@ -45,7 +45,7 @@ def quick_high() -> dict[str, object]:
     return {"preset": "high", "refine": changes, "visibility": {"views": 4, "size": 32}}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page_of_the_pretended_device(tmp_path, monkeypatch):
     page = page_at(tmp_path)
     monkeypatch.setattr(gpu, "HIGH", quick_high())

@@ -168,7 +168,7 @@ def test_results_of_two_networks_of_lpips_are_not_mixed(tmp_path):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_from_end_to_end_and_on_after_an_interruption(root, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     colmap_dataset(cvtgs.load(capture_of(root, "garden").model.path), root / "360_v2" / "room")

@@ -175,6 +175,7 @@ def test_compare_writes_page_sheet_and_maps(scenes, tmp_path, capsys):
     assert main([*words, "--overwrite"]) == 0
 
 
+@pytest.mark.slow
 def test_evaluate_and_compare_print_the_same_scores(folder, scenes, tmp_path, capsys):
     for number, words in enumerate(([], ["--cameras", str(folder / "transforms.json")])):
         words = [*scenes, *words, "--lpips", "off"]  # noqa: PLW2901

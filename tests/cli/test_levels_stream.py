@@ -102,6 +102,7 @@ def first_bytes(folder: Path) -> int:
     return sum(file.stat().st_size for file in [path, *files])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sog", "3dtiles"])
 def test_the_first_image_takes_a_twentieth_of_the_bytes(tmp_path: Path, kind: str) -> None:
     source, out = tmp_path / "a.ply", tmp_path / "out"

@@ -176,6 +176,7 @@ def test_python_m_cvtgs_and_broken_pipe_do_not_trace_back():
 full_disk = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 
 
+@pytest.mark.slow
 @full_disk
 @pytest.mark.parametrize("words", [["info", "a.ply"], ["--version"], ["info", "--help"]])
 def test_a_full_disk_behind_stdout_is_one_sentence(tmp_path, words):
@@ -195,6 +196,7 @@ def run_into(stdout, folder: Path, *words: str) -> subprocess.CompletedProcess[s
     )
 
 
+@pytest.mark.slow
 @full_disk
 def test_what_cannot_be_said_on_stderr_changes_no_exit_code(tmp_path):
     with Path("/dev/full").open("w") as full:

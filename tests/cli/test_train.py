@@ -60,6 +60,7 @@ def again(made, tmp_path) -> list[str]:
     return [*words, "--cache", str(made / "net.cache")]
 
 
+@pytest.mark.slow
 def test_everything_is_beside_the_checkpoint(made):
     names = {path.name for path in made.iterdir()}
     assert names == {
@@ -134,6 +135,7 @@ def test_an_existing_checkpoint_is_replaced_only_when_asked(again, made, tmp_pat
     assert output.read_bytes() == (made / "net.safetensors").read_bytes()
 
 
+@pytest.mark.slow
 def test_resume_goes_on_where_a_training_stopped(again, made, tmp_path, capsys, monkeypatch):
     true_step = train_loop._step
 
@@ -154,11 +156,13 @@ def test_resume_goes_on_where_a_training_stopped(again, made, tmp_path, capsys, 
     assert capsys.readouterr().out.startswith("best at step ")
 
 
+@pytest.mark.slow
 def test_resume_of_nothing_starts(again, made, tmp_path):
     assert main([*again, "--resume", "--quiet"]) == 0
     assert (tmp_path / "net.state").read_bytes() == (made / "net.state").read_bytes()
 
 
+@pytest.mark.slow
 def test_scenes_from_the_command_line(made, tmp_path, capsys):
     config = write_config(tmp_path, folders="")
     words = ["train", str(config), "-o", str(tmp_path / "net.safetensors"), "--quiet"]

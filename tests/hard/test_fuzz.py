@@ -185,7 +185,7 @@ def test_what_is_packed_is_damaged_inside(kind):
     assert seeds
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="forks and limits as Linux does")
 def test_every_fault_leaves_whole_files_or_none():
     """By another process: forks of one that runs tests would inherit its threads."""

@@ -72,7 +72,7 @@ def old(request) -> bytes | None:
     return request.param
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM", "SIGKILL"])  # Windows lacks one
 @pytest.mark.parametrize("name", WRITERS)
 def test_any_moment_leaves_the_old_file_or_none_or_the_new_one(tmp_path, name, sent, old):

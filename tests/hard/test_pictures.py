@@ -21,7 +21,6 @@ from hard_scenes import (
     DEVICES,
     PRESETS,
     ball,
-    dtypes,
     presets,
     simplifier,
     valid_case,
@@ -78,7 +77,9 @@ def scores(scene, small, cameras):
 
 
 @pytest.mark.slow
-@dtypes
+@pytest.mark.parametrize(
+    "dtype", [torch.float32, pytest.param(torch.float64, marks=pytest.mark.long)], ids=["32", "64"]
+)
 @each_case
 def test_each_case(make, dtype, subtests):
     """Its views, its images by every backend, its scores, and two steps of refinement."""

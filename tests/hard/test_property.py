@@ -67,7 +67,7 @@ def test_mixed_scenes_come_out_standard_and_exactly_as_many(preset, scene, share
     assert render(small, around(1, 12, 9, 10.0)).rgb.isfinite().all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @hypothesis.given(scene=mixed_scenes(), seed=st.integers(0, 99))
 @SETTINGS
 def test_the_order_of_mixed_rows_changes_nothing(scene, seed):

@@ -122,7 +122,7 @@ def make_full(folder: Path) -> dict[str, Path]:
     return paths
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @linux
 def test_small_files_take_less_than_a_gigabyte(tmp_path: Path) -> None:
     refused, read = make(tmp_path), make_full(tmp_path)

@@ -41,7 +41,7 @@ LOADED = (
 )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_plyfile_is_loaded_only_for_odd_files(tmp_path: Path) -> None:
     properties = gaussian_properties()
     rows = gaussian_rows(properties, 1)
@@ -59,6 +59,7 @@ def test_plyfile_is_loaded_only_for_odd_files(tmp_path: Path) -> None:
     assert printed(program, common, odd) == ["[]", "[]", "['plyfile']"]
 
 
+@pytest.mark.slow
 def test_a_scene_in_memory_needs_no_format() -> None:
     program = (
         "import sys, cvtgs\n"
@@ -70,7 +71,7 @@ def test_a_scene_in_memory_needs_no_format() -> None:
     assert printed(program) == ["", "atomic tensors"]  # of the merge network
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
 @pytest.mark.parametrize("end", FORMATS)
 def test_a_format_is_loaded_when_a_file_of_it_is_read(tmp_path: Path, end: str) -> None:

@@ -266,6 +266,7 @@ def test_no_cut_of_a_file_leaks_a_foreign_error(tmp_path: Path) -> None:
                 load(path)
 
 
+@pytest.mark.slow
 def test_no_random_damage_leaks_a_foreign_error(tmp_path: Path) -> None:
     draw = random.Random(0)
     path = tmp_path / "s.ply"

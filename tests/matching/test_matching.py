@@ -33,6 +33,7 @@ def views(scene):
     return observe(scene, mixed_views(scene, 10, size=48))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_least_squares_recover_known_colours(degree):
     """Images of a scene say which colours it had, where they show enough of it."""
@@ -111,6 +112,7 @@ def test_opacities_that_harm_held_out_images_are_not_taken(scene, views):
     assert found.scene is scene
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rho", [0.2, 0.05])
 def test_matching_is_better_than_standard_in_other_views(scene, rho):
     """The same cells, by weights of which none comes from images."""
@@ -124,6 +126,7 @@ def test_matching_is_better_than_standard_in_other_views(scene, rho):
     assert errors[1] < 0.95 * errors[0]
 
 
+@pytest.mark.slow
 def test_count_report_and_determinism(scene):
     simplifier = Simplifier(config=preset(), device="cpu")
     small, report = simplifier.run(scene, 0.1)
@@ -157,6 +160,7 @@ def test_protected_gaussians_stay_bit_for_bit(scene):
     assert report.matching.psnr_after > report.matching.psnr_before
 
 
+@pytest.mark.slow
 def test_every_level_is_matched(scene):
     levels = Simplifier(config=preset(), device="cpu").levels(scene, [0.2, 0.02])
     assert [len(level.scene) for level in levels] == [300, 30]

@@ -103,6 +103,7 @@ def test_one_block_is_the_scene_in_one_piece(scene, source, tmp_path):
     assert same_bits(cvtgs.load(tmp_path / "out.ply"), whole)
 
 
+@pytest.mark.slow
 def test_the_order_of_work_does_not_matter(source, tmp_path):
     def backwards(function, items):
         results = {item: function(item) for item in reversed(items)}
@@ -120,6 +121,7 @@ def test_the_size_of_ranges_does_not_matter(source, tmp_path):
     assert same_bits(cvtgs.load(tmp_path / "a.ply"), cvtgs.load(tmp_path / "b.ply"))
 
 
+@pytest.mark.slow
 def test_sums_do_not_depend_on_ranges(scene, source, monkeypatch):
     monkeypatch.setattr("cvtgs.outofcore.scan.CHUNK", 10)
     rows, frame = open_rows(source), robust_frame(scene.means)
@@ -132,6 +134,7 @@ def test_sums_do_not_depend_on_ranges(scene, source, monkeypatch):
     assert (total.mass, total.falloff_mass) == (whole.mass, whole.falloff_mass)
 
 
+@pytest.mark.slow
 def test_seams_cost_little(scene, source, tmp_path):
     simplify_file(source, tmp_path / "out.ply", 0.1, blocks=4)
     small = {

@@ -33,6 +33,7 @@ def test_dropped_bands_are_those_of_a_scene_without_them(scene, tmp_path):
     assert cvtgs.load(found).sh_degree == 1
 
 
+@pytest.mark.slow
 def test_axes_turn_the_scene_and_its_boxes(scene, tmp_path):
     wanted, _ = in_blocks(tmp_path, scene, "wanted.ply", boxes=[BOX])
     found, report = in_blocks(

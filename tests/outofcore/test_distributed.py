@@ -37,7 +37,7 @@ def cluster():
         yield found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore")
 def test_a_killed_worker_changes_nothing(cluster, source, tmp_path):
     from distributed import Client  # noqa: PLC0415 (optional)
@@ -201,7 +201,7 @@ def test_errors_of_workers_are_sentences(cluster, source):
             list(workers(lambda item: fails(InvalidSceneError, "ours", item), [1]))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
 @pytest.mark.parametrize("fault", ["no scheduler", "no cvtgs", "another cvtgs"])
 def test_the_command_ends_in_one_sentence(source, tmp_path, fault):

@@ -163,6 +163,7 @@ def test_a_halo_holds_all_that_may_be_a_neighbour(count):
         assert set(wanted[starts[own] : starts[own + 1]].flatten().tolist()) <= held
 
 
+@pytest.mark.slow
 def test_sites_move_as_in_one_piece(job):
     points = of_all(job, job.sample_path, "points")
     weights = of_all(job, job.sample_path, "weights")
@@ -231,6 +232,7 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
     assert int((sizes.sort().values - wanted_sizes.sort().values).abs().sum()) < moved // 50
 
 
+@pytest.mark.slow
 def test_cells_that_do_not_fit_into_memory_merge_by_parts(tmp_path, monkeypatch):
     cvtgs.save(cvtgs.synthetic.scene("room", 900, sh_degree=0, seed=2), tmp_path / "in.ply")
     monkeypatch.setattr("cvtgs.outofcore.memory.CELL_ROOM", 50)
@@ -312,7 +314,7 @@ def test_the_network_corrects_as_in_one_piece(job):
         torch.testing.assert_close(found, values, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_seams_cost_less_than_a_tenth_of_a_decibel(tmp_path):
     """Means over counts: one of them alone moves by more than a seam may cost."""
     scene = cvtgs.synthetic.scene("object", 20_000, sh_degree=0, seed=3)
@@ -332,6 +334,7 @@ def test_seams_cost_less_than_a_tenth_of_a_decibel(tmp_path):
     assert cut > whole - 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 2])
 def test_all_that_is_kept_stays_as_it_is_in_any_number_of_blocks(tmp_path, degree):
     scene = cvtgs.synthetic.scene("room", 600, sh_degree=degree, seed=1)

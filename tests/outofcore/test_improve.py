@@ -56,6 +56,7 @@ def psnr_of(scene, small):
     ]
 
 
+@pytest.mark.slow
 def test_matching_in_blocks_costs_little_more_than_blocks_do(scene, source, tmp_path, monkeypatch):
     """By views chosen as those of blocks are, blurred ones too; so few cells vary by 2 dB."""
     monkeypatch.setattr("cvtgs.views.mixed.TRIED", 1)
@@ -74,6 +75,7 @@ def test_matching_in_blocks_costs_little_more_than_blocks_do(scene, source, tmp_
     assert losses["matched"] < losses["standard"] + 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [MATCHED, REFINED])
 def test_the_order_of_blocks_does_not_matter(source, tmp_path, settings):
     def backwards(function, items):
@@ -90,7 +92,7 @@ def test_images_need_some_memory(source, tmp_path):
         in_blocks(source, tmp_path / "no.ply", MATCHED, blocks=None, memory=600_000_000)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_workers_give_the_same_bits(source, tmp_path):
     in_blocks(source, tmp_path / "a.ply", REFINED, blocks=3)
     with LocalWorkers(2) as workers:
@@ -98,6 +100,7 @@ def test_two_workers_give_the_same_bits(source, tmp_path):
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
+@pytest.mark.slow
 def test_refined_blocks_gain_and_protected_gaussians_stay(scene, source, tmp_path):
     lowest = float(scene.means[:, 2].kthvalue(len(scene) - 40).values)
     box = Box(min=(-99, -99, lowest), max=(99, 99, 99))

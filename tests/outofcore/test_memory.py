@@ -136,7 +136,7 @@ def test_the_least_memory_is_read() -> None:
         read_bytes("399MB")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="kilobytes of Linux")
 def test_blocks_stay_within_the_least_memory(tmp_path: Path) -> None:
     """Beside what torch, scipy and the network take: 280 MB here, more in builds for GPUs."""
@@ -156,7 +156,7 @@ def test_blocks_stay_within_the_least_memory(tmp_path: Path) -> None:
     assert int(done.stdout) < LEAST_BYTES - 280_000_000
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="uses ulimit")
 def test_a_job_under_a_limit_chooses_blocks_by_itself(tmp_path: Path) -> None:
     """With less than the scene takes at once, and more than the program itself does."""

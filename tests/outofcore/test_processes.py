@@ -37,6 +37,7 @@ def workers():
         yield found
 
 
+@pytest.mark.long
 def test_the_same_bits_and_the_same_progress(source, tmp_path, workers):
     events = {}
     for name, more in {"alone": {}, "together": {"workers": workers}}.items():
@@ -93,6 +94,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.long
 @on_posix
 @pytest.mark.parametrize("sign", ["SIGKILL", "SIGINT"])  # Windows lacks one
 def test_no_process_is_left_behind_and_the_run_continues(source, tmp_path, sign):

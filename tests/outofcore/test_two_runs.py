@@ -87,6 +87,7 @@ def test_the_lock_of_a_killed_process_is_free(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_second_run_is_refused_and_changes_nothing(source, tmp_path):
     output, whole, refused = tmp_path / "out.ply", tmp_path / "whole.ply", []
     simplify_file(source, whole, 0.1, blocks=3)
@@ -124,6 +125,7 @@ class SortsTwice:
         return [function(item) for item in items]
 
 
+@pytest.mark.slow
 def test_a_worker_taken_for_dead_changes_nothing(source, tmp_path):
     output, whole = tmp_path / "out.ply", tmp_path / "whole.ply"
     options = {"blocks": 3, "range_rows": 1000}
@@ -154,6 +156,7 @@ def test_a_worker_of_another_job_cannot_write(source, tmp_path):
     assert len(cvtgs.load(tmp_path / "out.ply")) == 600
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["missing", "short"])
 def test_files_that_did_not_arrive_are_not_adopted(source, tmp_path, damage):
     def lossy(function, items):

@@ -52,6 +52,7 @@ def test_invalid_rows_stay_and_do_no_harm():
     assert cvtgs.validity.invalid_rows(scene.select(torch.arange(3, 500))) == {}
 
 
+@pytest.mark.slow
 def test_invalid_rows_of_the_full_scene_are_left_out():
     full = full_scene()
     means = full.means.clone()
@@ -63,6 +64,7 @@ def test_invalid_rows_of_the_full_scene_are_left_out():
     assert same_bits(first.scene, second.scene)
 
 
+@pytest.mark.slow
 def test_gradients_that_are_not_finite_are_survived(monkeypatch):
     full = full_scene()
     module = import_module("cvtgs.refinement.optimize")
@@ -87,6 +89,7 @@ def test_rho_1_is_perfect_already():
     assert refined.report.psnr_after == 60
 
 
+@pytest.mark.slow
 def test_a_single_gaussian():
     full = full_scene()
     refined = refine(small_scene(full, 1e-9), full, steps=20, config=quick())
@@ -101,6 +104,7 @@ def test_other_kinds_of_scenes(kind):
     assert refine(small_scene(full), full, steps=10, config=quick()).report.gain >= 0
 
 
+@pytest.mark.slow
 def test_antialiased_scenes_are_shown_so():
     full = full_scene()
     object.__setattr__(full, "comments", ("SplatRenderMode: mip",))
@@ -114,6 +118,7 @@ def test_antialiased_scenes_are_shown_so():
     assert untagged.report.psnr_before != tagged.report.psnr_before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("other", [torch.float32, torch.float64])
 def test_float64_stays_float64(other):
     full = full_scene(200)
@@ -123,6 +128,7 @@ def test_float64_stays_float64(other):
     assert report.gain > 0
 
 
+@pytest.mark.slow
 def test_infinite_logits():
     full = full_scene()
     logits = full.logit_opacities.clone()

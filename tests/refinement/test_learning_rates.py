@@ -58,6 +58,7 @@ def test_what_cannot_be_drawn_does_not_move():
     assert factors[7] > 0.0
 
 
+@pytest.mark.slow
 def test_a_refinement_leaves_exact_ones_alone_and_moves_merged_ones():
     full = full_scene(500)
     small = discolored(small_scene(full, 0.5), 0.5)

@@ -16,6 +16,7 @@ from scenes import same_bits
 WILD = Rates(means=50, quats=5, log_scales=5, logit_opacities=50, sh0=50, shN=50)
 
 
+@pytest.mark.slow
 def test_wrong_colours_are_mended():
     full = full_scene()
     refined = refine(discolored(full), full, steps=40, config=quick())
@@ -69,6 +70,7 @@ def test_the_scenes_that_come_in_are_not_changed():
     assert same_bits(full, copies[1])
 
 
+@pytest.mark.slow
 def test_never_worse():
     """Steps so long that every scene but the first is nonsense."""
     full = full_scene()
@@ -85,6 +87,7 @@ def test_it_stops_when_held_out_views_do_not_improve():
     assert (report.steps, report.stopped) == (6, "patience")
 
 
+@pytest.mark.slow
 def test_the_same_steps_give_the_same_bits_and_another_seed_others():
     full = full_scene()
     small = discolored(small_scene(full))
@@ -127,6 +130,7 @@ def test_given_cameras():
     assert report.gain > 0
 
 
+@pytest.mark.slow
 def test_every_step_is_told_with_the_gain_so_far():
     events: list[ProgressEvent] = []
     full = full_scene()
@@ -149,6 +153,7 @@ def test_a_listener_can_end_it():
         refine(discolored(full), full, steps=12, config=quick(), listener=stop)
 
 
+@pytest.mark.slow
 def test_reports_are_joined():
     full = full_scene()
     small, report = cvtgs.Simplifier(device="cpu").run(full, 0.1)

@@ -69,6 +69,7 @@ def test_unknown_backend():
     assert str(caught.value) == "backend must be one of auto, torch, numba, gsplat, found 'cuda'."
 
 
+@pytest.mark.slow
 def test_without_numba():
     lines = python(
         "import sys\n"
@@ -91,6 +92,7 @@ def test_without_numba():
     ]
 
 
+@pytest.mark.slow
 def test_without_a_folder_for_compiled_code():
     pytest.importorskip("numba")
     lines = python(
@@ -102,6 +104,7 @@ def test_without_a_folder_for_compiled_code():
     assert lines == ["3"]
 
 
+@pytest.mark.slow
 def test_numba_leaves_the_threads_of_torch_as_they_are(monkeypatch):
     pytest.importorskip("numba")
     monkeypatch.setenv("NUMBA_NUM_THREADS", "2")
@@ -129,6 +132,7 @@ def test_numba_is_installed_with_the_package_where_it_has_wheels():
     assert not found.marker.evaluate({**here, "platform_machine": "ppc64le"})
 
 
+@pytest.mark.slow
 def test_importing_loads_no_optional_package():
     lines = python(
         "import sys\n"

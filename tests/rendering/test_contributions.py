@@ -130,6 +130,7 @@ def test_images_that_show_nothing_change_nothing():
     assert torch.equal(one.means, Simplifier(device="cpu").simplify(scene, 0.2).means)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["draft", "fast", "matched", "high"])
 def test_every_preset_gives_the_exact_count(name):
     settings = {"refine.size": "32", "visibility.size": "32", "refine.heldout": "2"}
@@ -146,6 +147,7 @@ def test_every_preset_gives_the_exact_count(name):
     assert report.checkpoint == ("none" if name in ("draft", "fast") else "standard")
 
 
+@pytest.mark.slow
 @backends
 def test_painting_a_scene_s_own_colours_gives_its_image(backend):
     scene = random_scene(60, degree=0, dtype=torch.float64)

@@ -56,7 +56,7 @@ def _torch_only(monkeypatch) -> None:
     monkeypatch.setattr("cvtgs.rendering.numba_backend.require", fail)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("_torch_only")
 @dtypes
 def test_refinement(dtype):
@@ -72,7 +72,7 @@ def test_refinement(dtype):
     torch.testing.assert_close(after.sh0, wanted.scene.sh0, **REFINED[dtype])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("_torch_only")
 @dtypes
 def test_presets_that_refine(dtype):

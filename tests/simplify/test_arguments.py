@@ -42,6 +42,7 @@ def test_a_preset_in_the_place_of_the_checkpoint():
         Simplifier("fast")
 
 
+@pytest.mark.slow
 def test_paths_are_taken_where_scenes_are(tmp_path):
     scene, path = random_scene(300), tmp_path / "scene.ply"
     scene.save(path)

@@ -44,6 +44,7 @@ def assert_looks_like(found: cvtgs.GaussianScene, wanted: cvtgs.GaussianScene) -
     assert min(scores.psnr.views) > 35.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["draft", "fast", "standard", "paper"])
 def test_presets(preset):
     scene = made()

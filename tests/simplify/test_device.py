@@ -60,6 +60,7 @@ def test_auto_takes_the_device_for_a_scene_of_the_cpu():
     assert traffic.copies
 
 
+@pytest.mark.slow
 def test_without_enough_memory_auto_takes_the_cpu():
     scene = random_scene(300)
     prepared = Simplifier(device="cpu").prepare(scene)
@@ -83,6 +84,7 @@ def test_a_named_device_without_enough_memory():
     )
 
 
+@pytest.mark.slow
 def test_short_chunks_where_long_ones_do_not_fit(monkeypatch):
     for name in ("mergenet.apply", "cells.merge"):
         monkeypatch.setattr(f"cvtgs.{name}.CHUNK_MEMBERS", 64)

@@ -20,6 +20,7 @@ def stages(report):
     return {cost.stage for cost in report.stages}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["standard", "draft", "paper", "high"])
 def test_every_run_gives_the_bits_of_a_run_of_its_own(scene, preset):
     quick = {"visibility.views": 4, "visibility.size": 32, "refine.steps": 2, "refine.size": 32}

@@ -116,6 +116,7 @@ def until(most: int, done: list[int]) -> Callable[..., Iterator[Any]]:
     return work
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_continued(tmp_path: Path, source: Path) -> None:
     stream(source, tmp_path / "whole")
     out, done = tmp_path / "out", list[int]()

@@ -339,7 +339,7 @@ def page(tmp_path_factory):
     return write_tradeoff(measured, folder).paths[-1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_plot_table_and_slider_are_there(page):
     html = dom(page)
     assert attribute(html, "ready") == "yes"

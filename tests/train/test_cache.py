@@ -152,6 +152,7 @@ DAMAGE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
 def test_a_damaged_file_is_made_anew(source, made, tmp_path, damage):
     first = prepare_scene(source, config_of(), tmp_path)

@@ -80,6 +80,7 @@ def test_a_training_scene_gains_in_views_never_seen(trained):
     assert found[trained.files.checkpoint] > found[None] + 1.0
 
 
+@pytest.mark.slow
 def test_the_loss_of_an_unseen_scene_falls(trained):
     config = trained.config
     case = some_case(COUNT, seed=UNSEEN, ratio=0.05, preset="paper")

@@ -56,6 +56,7 @@ def sphere(count: int, radius: float = 1.0) -> Tensor:
     return radius * torch.nn.functional.normalize(points, dim=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["object", "courtyard"])
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_no_view_is_beneath_the_floor(kind, convention):
