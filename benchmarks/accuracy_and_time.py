@@ -17,6 +17,7 @@ from benchmarks.quality import (
     CHOICES,
     Quality,
     Simplify,
+    cells_of,
     configuration,
     markdown_rows,
     means,
@@ -34,6 +35,8 @@ SWITCHES: Mapping[str, Mapping[str, str]] = {
     "visibility from 16 views": {"visibility.views": "16"},
     "100 steps of refinement": {"refine.steps": "100"},
 }
+
+TABLES = {"presets": ("Presets", PRESETS), "choices": ("One choice at a time", SWITCHES)}
 
 
 class Stopwatch:
@@ -60,19 +63,16 @@ def table(
     scores: Mapping[str, Sequence[Quality]],
     ratios: Sequence[float],
 ) -> str:
-    """Return a Markdown table: seconds, PSNR and SSIM of every row at every ratio."""
-    heads = [f"{name} at {rho:g}" for rho in ratios for name in ("seconds", "PSNR", "SSIM")]
+    """Return a Markdown table: seconds, PSNR, SSIM, LPIPS, alpha error of every row and ratio."""
+    columns = ("seconds", "PSNR", "SSIM", "LPIPS", "alpha error")
+    heads = [f"{name} at {rho:g}" for rho in ratios for name in columns]
     rows = [
         [
             name,
             *(
                 cell
                 for rho, quality in zip(ratios, scores[name], strict=True)
-                for cell in (
-                    f"{watches[name].seconds(rho):.2f}",
-                    f"{quality.psnr:.2f}",
-                    f"{quality.ssim:.4f}",
-                )
+                for cell in (f"{watches[name].seconds(rho):.2f}", *cells_of(quality))
             ),
         ]
         for name in watches
@@ -118,8 +118,10 @@ def chart(
 def main() -> None:
     parser = scoring_parser(__doc__)
     parser.add_argument("--png", type=Path, help="draw the presets there")
+    parser.add_argument("--table", choices=TABLES, help="this one alone")
     options = parser.parse_args()
-    for title, rows in (("Presets", PRESETS), ("One choice at a time", SWITCHES)):
+    for name in [options.table] if options.table else TABLES:
+        title, rows = TABLES[name]
         watches = {name: Stopwatch(configuration(options, row)) for name, row in rows.items()}
         simplifiers: dict[str, Simplify] = dict(watches)
         *_, found = measure(simplifiers, options)
