@@ -56,3 +56,20 @@ def test_interleaved_pixels_are_those_of_each_camera_from_its_own_first_one():
     for camera, first in zip(found.Ks, [(0, 0), (1, 0), (0, 1), (1, 1), (0, 0)], strict=True):
         assert torch.equal(camera, one.every(2, first=first).Ks[0])
     assert five.interleaved(1) is five
+
+
+@pytest.mark.parametrize(
+    ("point", "is_seen"),
+    [
+        ((0, 0, 1), True),
+        ((3.9, 2.9, 1), True),
+        ((4.1, 0, 1), False),
+        ((0, 3.1, 1), False),
+        ((-0.1, 0, 1), False),
+        ((8, 6, 2.1), True),
+        ((0, 0, -1), False),
+    ],
+)
+def test_whether_a_point_is_in_an_image(point, is_seen):
+    points = torch.tensor([[9.0, 9, 1], point])
+    assert Cameras(**GOOD).shows_any(points) is is_seen

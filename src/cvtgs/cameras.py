@@ -186,6 +186,22 @@ class Cameras:
         width, height = max(1, self.width // stride), max(1, self.height // stride)
         return replace(self, Ks=Ks, width=width, height=height, stride=self.stride * stride)
 
+    def shows_any(self, points: Float[Tensor, "n 3"]) -> bool:
+        """Return whether any point lies within any of the images.
+
+        Args:
+            points: ``(n, 3)`` positions in the units of the cameras.
+
+        Returns:
+            Whether one is in front of a camera and within its frame.
+        """
+        for view, intrinsics in zip(self.viewmats.to(points), self.Ks.to(points), strict=True):
+            x, y, depth = intrinsics @ (view[:3, :3] @ points.T + view[:3, 3:])
+            inside = (depth > 0) & (x >= 0) & (x <= self.width * depth)
+            if bool((inside & (y >= 0) & (y <= self.height * depth)).any()):
+                return True
+        return False
+
     def spread(self, count: int) -> Self:
         """Return cameras spread evenly over their order.
 

@@ -27,7 +27,7 @@ STAGE = "evaluate"
 """The stage of the progress events; a step is an image."""
 
 LEAST_COVER = 1e-4
-"""Cameras see nothing of a scene that covers less of every image (7 x 7 of 800 x 600 pixels)."""
+"""Cameras see nothing of a scene that is beside every image and covers less of each than this."""
 
 Images = UInt8[np.ndarray, "c h w 3"]
 Alphas = UInt8[np.ndarray, "c h w"]
@@ -263,7 +263,7 @@ def _score_images(
                 against_photographs[name].append(found)
             done += 1
             listener(ProgressEvent(stage=STAGE, done=done, total=total))
-    if most_cover < LEAST_COVER:
+    if most_cover < LEAST_COVER and not cameras.shows_any(reference.means):
         raise InvalidArgumentError(
             f"the cameras must see {reference_name}, found nothing of it in any of {len(cameras)} "
             f"views; give cameras of this scene, in its axes and units."
