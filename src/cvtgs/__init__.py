@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from cvtgs.scene import GaussianScene, concatenate
     from cvtgs.simplifier import Simplifier, simplify
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOME = {
     "Cameras": "cvtgs.cameras",
