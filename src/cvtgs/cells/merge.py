@@ -62,7 +62,7 @@ def merge_cells(
     """
     counts = partition.counts
     merged = scene.select(partition.order[partition.offsets[:-1]])
-    cells = partition.several()
+    cells, several = partition.select_several()
     done = len(counts) - len(cells)
     tensors, extras = merged.tensors(), dict(merged.extras)
     chunk = chunk_length(CHUNK_MEMBERS, scene.means.device)
@@ -100,8 +100,7 @@ def merge_cells(
         count: int = run.stop - run.start
         return count
 
-    chunks = partition.select_several(cells).chunks(chunk)
-    for count in in_threads(merge_chunk, chunks, scene.means.device):
+    for count in in_threads(merge_chunk, several.chunks(chunk), scene.means.device):
         done += count
         on_cells(done)
     return merged.with_tensors(tensors, extras)

@@ -113,9 +113,10 @@ class Partition:
         offsets = torch.nn.functional.pad(counts[cells].cumsum(0), (1, 0))
         return type(self)(order=self.order[true_rows(members, total)], offsets=offsets)
 
-    def select_several(self, cells: Int[Tensor, "k"]) -> Self:
-        """Keep what :meth:`several` returned: all others have one member each."""
-        return self.select(cells, len(self.order) - (len(self) - len(cells)))
+    def select_several(self) -> tuple[Int[Tensor, "k"], Self]:
+        """Return the cells of several members, ascending, and their partition."""
+        cells = self.several()
+        return cells, self.select(cells, len(self.order) - (len(self) - len(cells)))
 
     def keep_only(self, rows: Int[Tensor, "m"], total: int | None = None) -> Self:
         """Keep one member of some cells.

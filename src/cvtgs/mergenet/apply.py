@@ -68,8 +68,7 @@ def correct_cells(
     """
     counts = partition.counts
     sizes = counts if sizes is None else sizes
-    cells = partition.several()
-    several = partition.select_several(cells)
+    cells, several = partition.select_several()
     done = len(counts) - len(cells)
     originals = merged.tensors()
     tensors = {name: values.clone() for name, values in originals.items() if values.numel()}

@@ -22,7 +22,7 @@ from cvtgs.train.sources import Source
 
 Content = TypeVar("Content", TargetViews, Case)
 
-CACHE_VERSION = 4
+CACHE_VERSION = 5
 """Part of the name of every file; to be raised when the meaning of the content changes."""
 
 
@@ -114,7 +114,7 @@ def _packed_cases(cases: Iterable[Case | None]) -> dict[str, Tensor]:
         reference, prefix = case.reference, f"{number}/"
         if number == 0:
             tensors |= add_prefix("scene/", reference.scene.tensors())
-            tensors["light"] = reference.visibility.to(torch.float32)
+            tensors["visibility"] = reference.visibility.to(torch.float32)
             if reference.scene.antialiased:
                 tensors["antialiased"] = torch.ones(1)
         tensors |= add_prefix(prefix + "merged/", reference.merged.tensors())
@@ -139,9 +139,10 @@ def _unpacked_cases(name: str, tensors: Mapping[str, Tensor]) -> tuple[Case, ...
     # Merged Gaussians must be rendered as their scene is.
     comments = (ANTIALIASED_TAG,) if "antialiased" in tensors else ()
     scene = GaussianScene(**under_prefix("scene/", tensors), comments=comments)
-    light = tensors["light"]
+    visibility = tensors["visibility"]
     return tuple(
-        _case(name, scene, light, under_prefix(f"{number}/", tensors)) for number in range(count)
+        _case(name, scene, visibility, under_prefix(f"{number}/", tensors))
+        for number in range(count)
     )
 
 
@@ -150,9 +151,11 @@ def _entry_count(tensors: Mapping[str, Tensor]) -> int:
     return len({name.split("/")[0] for name in tensors if name.split("/")[0].isdecimal()})
 
 
-def _case(name: str, scene: GaussianScene, light: Tensor, tensors: Mapping[str, Tensor]) -> Case:
+def _case(
+    name: str, scene: GaussianScene, visibility: Tensor, tensors: Mapping[str, Tensor]
+) -> Case:
     partition = Partition(order=tensors["order"].long(), offsets=tensors["offsets"])
-    cells = partition.several()
+    cells, several = partition.select_several()
     return Case(
         scene_name=name,
         ratio=float(tensors["ratio"]),
@@ -161,10 +164,10 @@ def _case(name: str, scene: GaussianScene, light: Tensor, tensors: Mapping[str, 
             merged=GaussianScene(**under_prefix("merged/", tensors), comments=scene.comments),
             partition=partition,
             neighbors=tensors["neighbors"].long(),
-            visibility=light,
+            visibility=visibility,
         ),
         cells=cells,
-        part=partition.select_several(cells),
+        part=several,
         descriptors=Descriptors(**under_prefix("seen/", tensors)),
     )
 

@@ -190,10 +190,9 @@ def make_case(
     if target >= len(scene):
         return None
     reference = merge_scene(scene, target, config)
-    cells = reference.partition.several()
+    cells, part = reference.partition.select_several()
     if not len(cells):
         return None
-    part = reference.partition.select_several(cells)
     return describe_case(scene_name, ratio, reference, cells, part)
 
 
