@@ -1,6 +1,7 @@
 """``.ksplat``: all compressions against what was stored, several sections, and damage."""
 
 import struct
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +104,19 @@ def test_damage_is_one_sentence(tmp_path: Path, place: int, number: bytes, text:
     with pytest.raises(FileFormatError) as caught:
         cvtgs.load(path)
     assert text in str(caught.value)
+
+
+def test_a_bucket_of_a_hundred_million_takes_no_memory(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.ksplat", 1, section(1, 0, 300, seed=1))
+    content = bytearray(path.read_bytes())
+    content[4096 + 8 : 4096 + 12] = b"\0\0\0\x08"
+    path.write_bytes(content)
+    tracemalloc.start()
+    try:
+        assert len(cvtgs.load(path)) == 300
+        assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    finally:
+        tracemalloc.stop()
 
 
 def test_cut_or_random_files_never_end_in_another_error(tmp_path: Path) -> None:

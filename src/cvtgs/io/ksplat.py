@@ -168,8 +168,9 @@ def _read_section(
 def _buckets(section: _Section, lengths: Int[np.ndarray, "p"]) -> Int[np.ndarray, "n"]:
     """Return the bucket of every Gaussian: the full ones first, then those of given lengths."""
     room = section.used
-    full = min(section.full_buckets, room // max(1, section.bucket_size) + 1)
-    first = np.repeat(np.arange(full), section.bucket_size)[:room]
+    size = min(section.bucket_size, room)  # a damaged header may say four thousand million
+    full = min(section.full_buckets, room // max(1, size) + 1)
+    first = np.repeat(np.arange(full), size)[:room]
     clipped = np.minimum(lengths, room)
     if int(clipped.sum()) > 2 * room:  # a damaged file
         return first[:0]
