@@ -14,16 +14,11 @@ from cvtgs.evaluation import scorer as scorer_module
 from cvtgs.evaluation.scorer import BLACK, WHITE, Metrics, Scorer, ViewImage, render_view
 from cvtgs.math import parameters
 from cvtgs.refinement import RefineConfig
+from cvtgs.refinement import images as images_module
 from cvtgs.refinement import limits as limits_module
-from cvtgs.refinement.images import (
-    ImageBuffer,
-    RefineViews,
-    generated_views,
-    shared_views,
-    split_views,
-)
+from cvtgs.refinement.images import ImageBuffer, RefineViews, generated_views, split_views
 from cvtgs.refinement.limits import Limits
-from cvtgs.refinement.optimize import SceneOptimizer, heldout_psnr, psnr_cap
+from cvtgs.refinement.optimize import SceneOptimizer, heldout_psnr, psnr_cap, step_factor
 from cvtgs.refinement.refine import changed_count
 from cvtgs.rendering import observe
 from refine_cases import full_scene, quick, ring
@@ -53,6 +48,24 @@ def test_steps_are_counted():
         shares.append((limits.share(), limits.done))
     assert shares == [(0.25, 1), (0.5, 2), (0.75, 3), (1.0, 3)]
     assert limits.reached() == "steps"
+
+
+@pytest.mark.parametrize(
+    ("cooling", "wanted"),
+    [
+        (0.0, [1, 2 / 3, 1 / 2, 2 / 5]),
+        (0.5, [1, 2 / 3, 1 / 2, 1 / 5]),
+        (1.0, [1, 1 / 2, 1 / 4, 0.1]),
+    ],
+)
+def test_steps_become_shorter_and_end_at_nothing_if_so_wanted(cooling, wanted):
+    limits, config = Limits(None, steps=4), RefineConfig(half_after=2, cooling=cooling)
+    found = []
+    for _ in range(4):
+        found.append(step_factor(limits, config))
+        limits.begin()
+        limits.end("step")
+    assert found == pytest.approx(wanted)
 
 
 def test_time_ends_before_a_round_that_would_not_fit(clock):
@@ -252,7 +265,7 @@ def test_images_that_are_there_come_first_and_every_eighth_of_them_is_held_out()
     full, cameras = full_scene(50), ring(24)
     config = quick(stride=2, first_images=2, steps_per_image=50)
     observed = observe(full, cameras.select(torch.arange(16)).interleaved(2))
-    views = shared_views(observed, full, cameras, config=config, seed=0)
+    views = images_module.shared_views(observed, full, cameras, config=config, seed=0)
     assert (len(views.heldout), len(views.heldout_images), len(views.images)) == (0, 2, 14)
     images = ImageBuffer(full, views, config=config, seed=0)
     drawn = [images.draw() for _ in range(50)]
@@ -271,8 +284,10 @@ def test_images_that_are_there_come_first_and_every_eighth_of_them_is_held_out()
 def test_no_view_is_looked_for_before_one_is_due(monkeypatch):
     full = full_scene(50)
     observed = observe(full, ring(8))
-    monkeypatch.setattr("cvtgs.refinement.images.find_view_positions", None)
-    views = shared_views(observed, full, None, config=quick(steps_per_image=9), seed=0)
+    monkeypatch.setattr(images_module, "find_view_positions", None)
+    views = images_module.shared_views(
+        observed, full, None, config=quick(steps_per_image=9), seed=0
+    )
     images = ImageBuffer(full, views, config=quick(steps_per_image=9), seed=0)
     assert [images.draw().camera.stride for _ in range(8)] == [1] * 8
     with pytest.raises(TypeError):

@@ -222,6 +222,8 @@ class RefineConfig(Section):
             simplification is not refined.
         rates: Steps at the start.
         half_after: Steps after which they are half as long; after n times as many, 1 / (n + 1).
+        cooling: Share of the steps, or of the time, at the end, in which their length falls to
+            nothing on top of that.
         mse_weight: Weight of the logarithm of the mean squared error.
         image_weight: Weight of the logarithm of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) +
             0.2 gradient``.
@@ -248,6 +250,7 @@ class RefineConfig(Section):
     seconds: float = pydantic.Field(default=0.0, ge=0.0)
     rates: Rates = Rates()
     half_after: Count = 100
+    cooling: Share = 0.0
     mse_weight: Rate = 0.5
     image_weight: Rate = 0.5
     size: int = pydantic.Field(default=256, ge=16)

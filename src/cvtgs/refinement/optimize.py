@@ -67,7 +67,7 @@ def optimize(
     after, checks_without_gain = before, 0
     stopped = "perfect" if float(first.amin()) >= MOST_PSNR else limits.reached()
     while not stopped:
-        factor = 1 / (1 + limits.steps / config.half_after)
+        factor = step_factor(limits, config)
         limits.begin()
         # A random background: a wrong opacity shows over some color.
         target, background = images.draw(), images.draw_background()
@@ -95,6 +95,13 @@ def optimize(
         note = f"{after - before:+.2f} dB"
         listener(ProgressEvent(stage=STAGE, done=limits.done, total=limits.total, note=note))
     return Optimized(scene=best, before=before, after=after, stopped=stopped)
+
+
+def step_factor(limits: Limits, config: RefineConfig) -> float:
+    """Return how long a step is, as a share of the first one."""
+    left = 1.0 - limits.share()
+    cooled = left / config.cooling if left < config.cooling else 1.0
+    return cooled / (1 + limits.steps / config.half_after)
 
 
 def heldout_psnr(scene: GaussianScene, scorer: Scorer) -> Float[Tensor, "p"]:
