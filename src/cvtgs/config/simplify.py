@@ -45,6 +45,7 @@ MATCHED: Mapping[str, Any] = {
 THINNED: Mapping[str, Any] = {
     "steps": 250,
     "half_after": 60,
+    "cooling": 0.3,
     "size": 400,
     "stride": 2,
     "first_images": 32,
