@@ -95,7 +95,12 @@ def test_presets_that_refine(dtype):
 @pytest.mark.usefixtures("_torch_only")
 @dtypes
 def test_the_preset_that_matches(dtype):
-    settings = {"preset": "matched", "visibility": {"views": 4, "size": 32}}
+    settings = {
+        "preset": "matched",
+        "visibility": {"views": 4, "size": 32, "stride": 1},
+        "match": {"color_iterations": 6},
+        "refine": {"steps": 0},
+    }
     config = SimplifyConfig.from_mapping(settings)
     scene = random_scene(200, degree=1, dtype=dtype)
     wanted = Simplifier(config=config, device="cpu").simplify(scene, 0.2)
