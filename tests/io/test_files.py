@@ -254,6 +254,8 @@ def test_a_format_may_be_named_whatever_the_file_is_called(tmp_path: Path) -> No
     scene = storable_scene(5)
     cvtgs.save(scene, tmp_path / "a.data", format=".ply")
     assert same_bits(cvtgs.load(tmp_path / "a.data", format=".ply"), scene)
+    cvtgs.save(scene, tmp_path / "b.data", format="ply")
+    assert same_bits(cvtgs.load(tmp_path / "b.data", format="ply"), scene)
 
 
 @pytest.mark.parametrize(

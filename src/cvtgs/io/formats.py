@@ -102,7 +102,7 @@ def load(
             Splatfacto, ``.pt`` of gsplat's trainer. Of a folder, the scene that
             :func:`cvtgs.io.scene_file` finds. Or a file that is open in binary mode, which is read
             to its end; it need not be able to seek.
-        format: The suffix of the format, for example ``".splat"``, whatever the file is called.
+        format: The suffix of the format, ``".splat"`` or ``"splat"``, whatever the file is called.
             None goes by the name, and for an open file by its first bytes.
         device: Where the tensors are to be.
         sh_degree: SH bands above this degree are zeros, whatever the file holds; None for all. Of
@@ -157,7 +157,7 @@ def load(
                 trust_sizes=trust_sizes,
             )
     source = scene_file(path)
-    named = format or source
+    named = _dotted(format) or source
     suffix = _suffix_of(named, _READERS) if is_file(source) else ".ply"  # whose reader raises
     if suffix.endswith(".ply"):
         from cvtgs.io.ply.header import is_compressed_ply  # noqa: PLC0415 (loaded as readers are)
@@ -208,7 +208,7 @@ def save(
             ``.compressed.ply``, ``.spz``, ``.splat``, ``.sog``, ``.glb``, ``.gltf``,
             ``.spz.glb``, which is a glTF with an SPZ inside, or ``.usda`` (OpenUSD). Or a file
             that is open for writing in binary mode, to which all bytes go once the scene is ready.
-        format: The suffix of the format, for example ``".spz"``, whatever the file is called.
+        format: The suffix of the format, ``".spz"`` or ``"spz"``, whatever the file is called.
             None goes by the name; an open file is given a ``.ply``.
         overwrite: Whether an existing file may be replaced.
         axes: Where x, y and z of the file are to point, as :func:`cvtgs.io.change_axes` names
@@ -237,10 +237,10 @@ def save(
     """
     output: AbstractContextManager[BinaryIO]
     if isinstance(path, str | os.PathLike):
-        name, named = os.fspath(path), format or path
+        name, named = os.fspath(path), _dotted(format) or path
         output = atomic_output(path, overwrite=overwrite)
     else:
-        name, named = name_of(path), format or ".ply"
+        name, named = name_of(path), _dotted(format) or ".ply"
         output = written_to(path)
     suffix = _suffix_of(named, _WRITERS)
     if isinstance(path, str | os.PathLike):
@@ -304,6 +304,11 @@ def check_save(path: str | os.PathLike[str], overwrite: bool = False) -> None:
     """
     _suffix_of(path, _WRITERS)
     check_output(path, overwrite)
+
+
+def _dotted(suffix: str | None) -> str | None:
+    """Return the suffix of a format with its dot: ``ply`` means ``.ply``."""
+    return f".{suffix}" if suffix and "." not in suffix else suffix
 
 
 def _suffix_of(path: str | os.PathLike[str], known: Iterable[str]) -> str:
