@@ -34,7 +34,6 @@ MATCHED: Mapping[str, Any] = {
     "refine": {
         "steps": 50,
         "half_after": 40,
-        "cooling": 1.0,
         "size": 400,
         "stride": 2,
         "steps_per_image": 100,
