@@ -18,8 +18,8 @@ FORMATS = {
     ".ply": {"ply"},
     ".compressed.ply": {"ply", "compressed_ply", "arrays"},
     ".splat": {"splat", "arrays"},
-    ".spz": {"spz", "arrays", "sizes"},
-    ".sog": {"sog", "arrays", "documents", "sizes"},
+    ".spz": {"spz", "arrays"},
+    ".sog": {"sog", "arrays"},
 }
 
 
