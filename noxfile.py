@@ -49,7 +49,7 @@ def long(session: nox.Session) -> None:
 
 @nox.session(reuse_venv=True)
 def quick(session: nox.Session) -> None:
-    """All tests but the slow ones: two minutes on two cores."""
+    """All tests but the slow ones: three minutes on two cores."""
     session.install(*CONSTRAINTS, "-e", ".[test]")
     session.run("pytest", *PARALLEL, "-m", "not slow and not long", *session.posargs)
 
