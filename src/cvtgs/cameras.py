@@ -155,16 +155,11 @@ class Cameras:
         Returns:
             Cameras of smaller images.
         """
-        shifts = self.Ks.new_tensor([first[0] + 0.5, first[1] + 0.5])
-        Ks = self.Ks.clone()  # noqa: N806 (the name that gsplat gives it)
-        Ks[:, :2] /= stride
-        Ks[:, :2, 2] += 0.5 - shifts / stride
-        return replace(
-            self,
-            Ks=Ks,
+        return self._strided(
+            stride,
+            self.Ks.new_tensor([first]),
             width=-(-(self.width - first[0]) // stride),
             height=-(-(self.height - first[1]) // stride),
-            stride=self.stride * stride,
         )
 
     def interleaved(self, stride: int) -> Self:
@@ -180,10 +175,16 @@ class Cameras:
             return self
         rows = torch.arange(len(self), device=self.Ks.device)
         firsts = torch.stack([rows % stride, rows // stride % stride], dim=1).to(self.Ks)
+        width, height = max(1, self.width // stride), max(1, self.height // stride)
+        return self._strided(stride, firsts, width=width, height=height)
+
+    def _strided(
+        self, stride: int, firsts: Float[Tensor, "c_or_1 2"], *, width: int, height: int
+    ) -> Self:
+        """Return cameras of every ``stride``-th pixel from the columns and rows of the first on."""
         Ks = self.Ks.clone()  # noqa: N806 (the name that gsplat gives it)
         Ks[:, :2] /= stride
         Ks[:, :2, 2] += 0.5 - (firsts + 0.5) / stride
-        width, height = max(1, self.width // stride), max(1, self.height // stride)
         return replace(self, Ks=Ks, width=width, height=height, stride=self.stride * stride)
 
     def shows_any(self, points: Float[Tensor, "n 3"]) -> bool:
