@@ -142,21 +142,37 @@ def test_infinite_logits():
     assert torch.equal(scene.logit_opacities[~changed], logits[~changed])
 
 
-@pytest.mark.slow
-def test_random_backgrounds_keep_paint_out_of_an_empty_background(monkeypatch):
-    """Over black alone, what is black and opaque costs nothing."""
+def refined_beside_nothing():
+    """A full scene, what came in, and what 120 steps make of it."""
     full = random_scene(1500, degree=0, size=0.1)
     small = small_scene(full, 0.05)
     config = quick(size=48, heldout=12, patience=100)
-    refined = refine(small, full, steps=120, config=config).scene
-    monkeypatch.setattr(ImageBuffer, "draw_background", lambda self: torch.zeros(3))
-    over_black = refine(small, full, steps=120, config=config).scene
-    views = cvtgs.views.automatic_views(full, 4, width=48, height=48, seed=3)
-    wanted, before, after, black = (
-        cvtgs.render(scene, views).alpha for scene in (full, small, refined, over_black)
-    )
-    empty = wanted < 1e-3
+    return full, small, refine(small, full, steps=120, config=config).scene
+
+
+def alphas_of(*scenes):
+    """Their alphas in views of the first, and which pixels of it are empty."""
+    views = cvtgs.views.automatic_views(scenes[0], 4, width=48, height=48, seed=3)
+    alphas = [cvtgs.render(scene, views).alpha for scene in scenes]
+    empty = alphas[0] < 1e-3
     assert int(empty.sum()) > 1000
+    return alphas, empty
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="steps in own frames paint 3 % more into what was empty")
+def test_an_empty_background_stays_empty():
+    (_, before, after), empty = alphas_of(*refined_beside_nothing())
+    assert after[empty].mean() < before[empty].mean()
+
+
+@pytest.mark.slow
+def test_random_backgrounds_keep_paint_out_of_an_empty_background(monkeypatch):
+    """Over black alone, what is black and opaque costs nothing."""
+    full, small, refined = refined_beside_nothing()
+    monkeypatch.setattr(ImageBuffer, "draw_background", lambda self: torch.zeros(3))
+    _, _, over_black = refined_beside_nothing()
+    (wanted, before, after, black), empty = alphas_of(full, small, refined, over_black)
     assert after[empty].mean() < 0.95 * black[empty].mean()
     assert after[empty].mean() < 1.05 * before[empty].mean()
     assert (after - wanted).square().mean() < (before - wanted).square().mean()
