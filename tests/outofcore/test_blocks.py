@@ -280,13 +280,13 @@ def test_command(source, tmp_path, capsys, monkeypatch):
     words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.01"]
     words += ["--report", str(tmp_path / "report.json"), "--overwrite"]
     assert main([*words, "--memory", "2MB"]) == 0
-    assert "In 7 blocks." in capsys.readouterr().out
+    assert "In 8 blocks." in capsys.readouterr().out
     report = json.loads((tmp_path / "report.json").read_text())
-    assert (report["output_count"], report["blocks"]) == (60, 7)
+    assert (report["output_count"], report["blocks"]) == (60, 8)
     assert main([*words, "--memory", "7MB"]) == 0
     assert "blocks" not in capsys.readouterr().out
     monkeypatch.setattr("cvtgs.outofcore.available_memory", lambda: 3_000_000)
     assert main(words) == 0
-    assert "In 5 blocks." in capsys.readouterr().out
+    assert "In 8 blocks." in capsys.readouterr().out
     assert main([*words, "--memory", "2MB", "--refine", "3"]) == 1
     assert main([*words, "--memory", "2MB", "--time-budget", "20s"]) == 1

@@ -125,7 +125,7 @@ def test_little_memory_gives_blocks_and_no_division_by_zero(tmp_path: Path) -> N
     own = needed_memory(rows, rows.count) - BASE_BYTES
     assert block_count(rows, SMALL_BASE_BYTES + own) == 1
     assert block_count(rows, SMALL_BASE_BYTES + own - 1) > 1
-    assert block_count(rows, 0) == block_count(rows, SMALL_BASE_BYTES) == 2
+    assert block_count(rows, 0) == block_count(rows, SMALL_BASE_BYTES) == 4
     assert len({block_count(large, LEAST_BYTES + k * 20_000_000) for k in range(6)}) == 1
     assert sample_rows(LEAST_BYTES) < sample_rows(ROOMY_BYTES) == sample_rows(1 << 40)
 

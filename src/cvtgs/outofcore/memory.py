@@ -31,6 +31,9 @@ CELL_BYTES = 1500
 CELL_ROOM = 1_000_000
 """Cells that merge together if no memory is stated."""
 
+SHARED_BY = 4
+"""The number of blocks is a multiple of this, so that two or four workers end at the same time."""
+
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 
 
@@ -191,11 +194,11 @@ def block_count(source: PlyRows, memory: int) -> int:
         memory: Bytes.
 
     Returns:
-        1 if the whole file fits.
+        1 if the whole file fits, else a multiple of ``SHARED_BY``.
     """
     base = min(BASE_BYTES, base_bytes(memory))
     wanted = needed_memory(source, source.count) - BASE_BYTES
     if base + wanted <= memory:
         return 1
     room = (memory if memory > base else LEAST_BYTES) - base
-    return max(2, math.ceil(2 * wanted / room))
+    return SHARED_BY * math.ceil(2 * wanted / room / SHARED_BY)

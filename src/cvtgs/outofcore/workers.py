@@ -119,6 +119,8 @@ class LocalWorkers:
         self._pool = ProcessPoolExecutor(
             self._count, context, initializer=_begin, initargs=(self._watched, threads)
         )
+        for _ in range(self._count):  # they start while this process reads the sample
+            self._pool.submit(os.getpid)
         return self
 
     def __exit__(
