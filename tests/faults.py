@@ -54,6 +54,8 @@ def started(command: Command, folder: Path, *, limit: Callable[[], None] | None 
         os.dup2(errors, 2)
         os.dup2(errors, 1)
         tempfile.tempdir = os.environ["TMPDIR"] = str(temporary(folder))
+        # Any optimizer of torch makes this folder, in that for temporary files unless it is told.
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(folder.parent / "torch")
         if command.blocks:
             cvtgs.outofcore.block_count = lambda *_: command.blocks  # type: ignore[assignment]
             sys.modules["cvtgs.outofcore.run"].block_count = lambda *_: command.blocks  # type: ignore[attr-defined]

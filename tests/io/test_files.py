@@ -1,5 +1,6 @@
 """Finding and opening the file of a scene: bad paths, model folders, open files and pipes."""
 
+import importlib
 import io
 import json
 import os
@@ -9,6 +10,7 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -24,6 +26,7 @@ from cvtgs.errors import (
     OutputError,
 )
 from cvtgs.io import scene_file, scene_size
+from cvtgs.io.files import Document, _sentence
 from format_cases import DATA, storable_scene
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
 from scenes import random_scene, same_bits
@@ -287,3 +290,21 @@ def test_text_files_and_closed_files_are_refused(tmp_path: Path) -> None:
 def test_what_a_format_drops_is_said() -> None:
     with pytest.warns(DroppedDataWarning, match="the BytesIO: files of this format do not hold"):
         cvtgs.save(storable_scene(5), io.BytesIO(), format=".splat")
+
+
+def kinds_of_documents() -> list[type[Document]]:
+    for name in ("gltf.read", "sog.read", "sog.stream", "cameras.transforms"):
+        importlib.import_module(f"cvtgs.io.{name}")
+    found = [Document]
+    for kind in found:
+        found += kind.__subclasses__()
+    return [kind for kind in found if kind.__module__.startswith("cvtgs.")]
+
+
+@pytest.mark.parametrize("kind", kinds_of_documents(), ids=lambda kind: kind.__name__)
+def test_every_key_of_a_document_says_what_it_must_be(kind: type[Document]) -> None:
+    for key, field in kind.model_fields.items():
+        if field.annotation is not Any:
+            text = _sentence(kind, {key: 0.5}, [key], "file")
+            assert text.startswith(f"file: '{key}'")
+            assert " must be " in text

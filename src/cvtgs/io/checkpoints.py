@@ -124,6 +124,8 @@ def _names_in(path: Path) -> Iterator[str]:
         for entry in entries:
             if entry.compress_type != zipfile.ZIP_STORED:  # torch.save packs nothing
                 yield f"a packed {entry.filename}"
+            elif entry.compress_size != entry.file_size:
+                yield f"two lengths of {entry.filename}"
         for entry in entries:
             if entry.filename.endswith(".pkl"):
                 for operation, value, _ in pickletools.genops(archive.read(entry)):

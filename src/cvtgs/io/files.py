@@ -191,6 +191,7 @@ Whole = Annotated[
     Field(ge=-_MOST_WHOLE, le=_MOST_WHOLE, description="a whole number"),
 ]
 Text = Annotated[str, Strict(), Field(description="a text")]
+Flag = Annotated[bool, Strict(), Field(description="true or false")]
 Items = Annotated[list[Any], Field(description="a list")]
 Vector = Annotated[tuple[Number, Number, Number], Field(description="3 finite numbers")]
 AnyDocument = TypeVar("AnyDocument", bound=Document)

@@ -15,6 +15,7 @@ from cvtgs.errors import FileFormatError
 from cvtgs.io.files import (
     AnyDocument,
     Document,
+    Flag,
     Text,
     Whole,
     open_input,
@@ -108,7 +109,7 @@ class _Accessor(Document):
     bufferView: Size | None = None  # noqa: N815
     byteOffset: Size = 0  # noqa: N815
     componentType: Whole  # noqa: N815
-    normalized: bool = False
+    normalized: Flag = False
     count: Size
     type: Text
     sparse: Any = None

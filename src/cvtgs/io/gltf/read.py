@@ -15,7 +15,7 @@ from cvtgs.edit import Motion, merge, move
 from cvtgs.errors import DroppedDataWarning
 from cvtgs.io.arrays import Arrays, scene_of, unit_quats
 from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
-from cvtgs.io.files import Document, Items, Number, Whole, check_expansion, validated
+from cvtgs.io.files import Document, Items, Number, Text, Whole, check_expansion, validated
 from cvtgs.io.gltf.document import (
     AXES,
     COLOR_SPACE,
@@ -79,8 +79,8 @@ class _Primitive(Document):
 
 
 class _Splatting(Document):
-    kernel: str = KERNEL
-    colorSpace: str = COLOR_SPACE  # noqa: N815 (the name of glTF)
+    kernel: Text = KERNEL
+    colorSpace: Text = COLOR_SPACE  # noqa: N815 (the name of glTF)
     extensions: Entry
 
 
