@@ -32,6 +32,9 @@ from fault_commands import CLUSTER, COMMANDS, TRAINING, Command
 SIGNALS = {"SIGINT": 130, "SIGTERM": 143, "SIGKILL": -9}
 """Status after each signal, by name: Windows lacks one."""
 
+EARLY = {signal.SIGINT: 130, signal.SIGTERM: 143}
+"""What ends a fork before ``main`` takes signals over, as it ends an interpreter that starts."""
+
 BUSY = ("one run at a time may work on it", "must not exist yet", "must be")
 MOST_SECONDS = 300.0
 
@@ -43,7 +46,11 @@ class FaultError(Exception):
 def started(command: Command, folder: Path, *, limit: Callable[[], None] | None = None) -> int:
     """Fork a run of a command; what it prints goes to a file of its process."""
     sys.stdout.flush()
+    signal.pthread_sigmask(signal.SIG_BLOCK, EARLY)
     process = os.fork()
+    for number, status in EARLY.items() if process == 0 else ():
+        signal.signal(number, lambda *_, status=status: os._exit(status))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, EARLY)
     if process:
         return process
     code = 70

@@ -92,7 +92,8 @@ def run_process() -> NoReturn:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     code = main()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt from here on must not change it
+    for number in (signal.SIGINT, signal.SIGTERM):  # from here on nothing must change it
+        signal.signal(number, signal.SIG_IGN)
     try:
         if sys.stdout is not None:
             sys.stdout.flush()

@@ -1,5 +1,6 @@
 """The optimization of a scene: learning rates per Gaussian, steps of Adam, and what is kept."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -120,8 +121,9 @@ def psnr_cap(first: Float[Tensor, "p"]) -> float:
 class SceneOptimizer:
     """A scene as a start plus changes, and the optimizer of the changes.
 
-    A step of Adam (Kingma and Ba 2015, as ``SparseAdam`` does it) moves only the Gaussians that an
-    image shows: all others have no gradient, keep their momentum for later, and stay as they are.
+    A step of Adam (Kingma and Ba 2015) moves only the Gaussians that an image shows: all others
+    have no gradient, keep their momentum for later, and stay as they are. That is
+    ``torch.optim.SparseAdam``, but any optimizer of torch imports its compiler first: a second.
     Memory: five times the scene.
     """
 
@@ -144,12 +146,11 @@ class SceneOptimizer:
             if rate > 0 and self._start[name].numel()
         }
         self._moved = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
-        groups = [
-            {"params": [self._changes[name]], "lr": rate} for name, rate in self._rates.items()
-        ]
-        self._adam = (
-            torch.optim.SparseAdam(groups, betas=_BETAS, eps=_LEAST_ROOT) if groups else None
-        )
+        self._moments = {
+            name: (torch.zeros_like(self._start[name]), torch.zeros_like(self._start[name]))
+            for name in self._rates
+        }
+        self._steps = 0
 
     def scene(self) -> GaussianScene:
         """Return the scene, differentiable in the changes."""
@@ -162,24 +163,25 @@ class SceneOptimizer:
 
     def step(self, loss: Tensor, *, factor: float) -> None:
         """Move every Gaussian that has a finite gradient which is not zero."""
-        if self._adam is None or not loss.requires_grad:
+        if not self._rates or not loss.requires_grad:
             return
         changes = [self._changes[name] for name in self._rates]
         gradients = torch.autograd.grad(loss, changes, materialize_grads=True)
         rows = _rows_to_move(gradients)
-        for group, rate, change, gradient in zip(
-            self._adam.param_groups, self._rates.values(), changes, gradients, strict=True
-        ):
-            group["lr"] = factor * rate
+        self._steps += 1
+        biases = [1 - beta**self._steps for beta in _BETAS]
+        for (name, rate), gradient in zip(self._rates.items(), gradients, strict=True):
+            length = factor * rate * math.sqrt(biases[1]) / biases[0]
             largest = 0.5 * torch.finfo(gradient.dtype).max ** 0.5  # else its square overflows
-            change.grad = torch.sparse_coo_tensor(
-                rows[None],
-                gradient[rows].clamp(-largest, largest),
-                change.shape,
-                is_coalesced=True,
-                check_invariants=True,
+            some = gradient.index_select(0, rows).clamp_(-largest, largest)
+            means, squares = (
+                _moved_average(values, rows, new, beta)
+                for values, new, beta in zip(
+                    self._moments[name], (some, some.square()), _BETAS, strict=True
+                )
             )
-        self._adam.step()
+            change = -length * means.div_(squares.sqrt_().add_(_LEAST_ROOT))
+            self._changes[name].detach().index_add_(0, rows, change)
         self._moved[rows] = True
 
     @torch.no_grad()
@@ -212,6 +214,14 @@ def _units(scene: GaussianScene, scale: Float[Tensor, "n"]) -> dict[str, Tensor]
         "means": scale[:, None] * axes,
         "quats": scale[:, None] * torch.nn.functional.pad(turns, (1, 0)),
     }
+
+
+def _moved_average(values: Tensor, rows: Tensor, new: Tensor, beta: float) -> Tensor:
+    """Move running averages of some rows towards new values; return a copy of these rows."""
+    old = values.index_select(0, rows)
+    moved = (new - old).mul_(1 - beta).add_(old)
+    values.index_copy_(0, rows, moved)
+    return moved
 
 
 def _rows_to_move(gradients: tuple[Tensor, ...]) -> Tensor:
