@@ -22,6 +22,7 @@ WHEEL_TESTS = (
     "tests/evaluation/test_compare.py",
 )
 """What tells whether anything is missing in the wheel: data files, names, types, commands."""
+VIEWERS = ("playcanvas@2.23.3", "cesium@1.140.0")
 
 
 @nox.session
@@ -118,6 +119,16 @@ def speed(session: nox.Session) -> None:
     """Time and memory of whole runs; takes minutes, wants a quiet machine."""
     session.install(*CONSTRAINTS, ".")
     session.run("python", "-m", "benchmarks.speed", *session.posargs)
+
+
+@nox.session
+def viewers(session: nox.Session) -> None:
+    """Show streams in PlayCanvas' engine and CesiumJS, from npm, in headless Chromium."""
+    session.install(*CONSTRAINTS, "-e", ".[test]")
+    folder = session.create_tmp()
+    session.run("npm", "install", "--prefix", folder, *VIEWERS, "--ignore-scripts", external=True)
+    settings = {"CVTGS_NODE_MODULES": str(Path(folder).resolve() / "node_modules")}
+    session.run("pytest", "tests/streams/test_stream_viewers.py", *session.posargs, env=settings)
 
 
 @nox.session
