@@ -2,6 +2,7 @@
 
 import pickletools
 import re
+import warnings
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -110,7 +111,8 @@ def _unpickled(path: Path) -> Any:
                 f"{path}: must be a whole checkpoint of tensors and plain numbers, "
                 f"found {shown(name)}."
             )
-    with _numpy_numbers_ignored():
+    with _numpy_numbers_ignored(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch's, on what it is about to refuse
         return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
 
 

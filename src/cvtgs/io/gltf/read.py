@@ -235,11 +235,13 @@ def _read_attributes(file: GltfFile, one: _Placed) -> GaussianScene:
         for band in range(1, degree + 1)
         for number in range(2 * band + 1)
     ]
+    with np.errstate(invalid="ignore"):  # of numbers that are none; rows are checked later
+        log_scales = np.log(np.maximum(scales, _TINY))
     return scene_of(
         Arrays(
             means=means,
             quats=unit_quats(np.roll(quats, 1, axis=1)),
-            log_scales=np.log(np.maximum(scales, _TINY)),
+            log_scales=log_scales,
             logit_opacities=logit_from_opacity(opacities).numpy(),
             sh0=rows(coefficient(0, 0), "VEC3"),
             shN=np.stack(rest, axis=1) if rest else np.empty((len(means), 0, 3), np.float32),

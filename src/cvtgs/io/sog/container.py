@@ -20,6 +20,7 @@ MOST_META_BYTES = 1 << 20
 """Real ones have some ten thousand."""
 
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_LONGEST_NAME = 255  # of file systems
 """Those whose output zipfile bounds; a block of bzip2 or LZMA is unpacked whole."""
 
 PALETTE_COLUMNS = 64
@@ -103,6 +104,11 @@ def _reason(error: Exception) -> str:
 
 def _check_name(name: str, path: Path) -> None:
     plain = name.isprintable() and name not in ("", "..") and not set(name) & set("\\:")
+    if len(name) > _LONGEST_NAME:
+        raise FileFormatError(
+            f"{path}: the files of a SOG must have names of at most {_LONGEST_NAME} characters, "
+            f"found {shown(name)}."
+        )
     if PurePosixPath(name).name != name or not plain:
         raise FileFormatError(
             f"{path}: the files of a SOG must be named without folders, found {shown(name)}."
