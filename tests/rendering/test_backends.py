@@ -93,6 +93,24 @@ def test_without_numba():
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a limit of memory")
+def test_without_memory_for_numba_no_other_backend_is_taken():
+    pytest.importorskip("numba")
+    lines = python(
+        "import re, resource, torch\n"
+        "from cvtgs.rendering import choose_backend\n"
+        "status = open('/proc/self/status').read()\n"
+        "room = 1024 * int(re.search(r'VmSize:\\s+(\\d+) kB', status)[1]) + (20 << 20)\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (room, room))\n"
+        "try:\n"
+        "    print(choose_backend('auto', torch.device('cpu'))[0])\n"
+        "except MemoryError:\n"
+        "    print('no memory')\n"
+    )
+    assert lines == ["no memory"]
+
+
+@pytest.mark.slow
 def test_without_a_folder_for_compiled_code():
     pytest.importorskip("numba")
     lines = python(

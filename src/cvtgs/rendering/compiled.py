@@ -13,11 +13,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cvtgs.errors import MissingDependencyError
+from cvtgs.errors import MissingDependencyError, is_out_of_memory
 
 try:
     import numba
 except (ImportError, OSError) as error:
+    if is_out_of_memory(error.__context__ or error):  # another backend would give other bits
+        raise MemoryError from error
     raise MissingDependencyError(
         f"backend 'numba' needs the package numba, which cannot be imported ({error}); "
         f"install it with: pip install numba, or use backend='torch'."
