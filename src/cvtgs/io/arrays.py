@@ -80,13 +80,14 @@ def scene_of(arrays: Arrays, *, antialiased: bool = False) -> GaussianScene:
 
 
 def unit_quats(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Scale quaternions to unit length; zero becomes no rotation."""
-    largest = np.abs(quats).max(axis=1, keepdims=True)
-    nothing = largest == 0
-    scaled = np.where(nothing, quats.dtype.type(0), quats / np.where(nothing, 1, largest))
-    scaled[nothing[:, 0], 0] = 1
-    length = np.linalg.norm(scaled, axis=1, keepdims=True)
-    return np.asarray(scaled / length, dtype=quats.dtype)
+    """Scale quaternions to unit length; zero becomes no rotation, infinity no number."""
+    with np.errstate(invalid="ignore"):
+        largest = np.abs(quats).max(axis=1, keepdims=True)
+        nothing = largest == 0
+        scaled = np.where(nothing, quats.dtype.type(0), quats / np.where(nothing, 1, largest))
+        scaled[nothing[:, 0], 0] = 1
+        length = np.linalg.norm(scaled, axis=1, keepdims=True)
+        return np.asarray(scaled / length, dtype=quats.dtype)
 
 
 def to_bytes(values: Float[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:

@@ -67,9 +67,10 @@ def viewmat_of_pose(
     rotation: Float[np.ndarray, "3 3"], center: Float[np.ndarray, "3"], *, where: str
 ) -> Float[np.ndarray, "4 4"]:
     """Return the world-to-camera matrix of a camera's pose."""
-    skew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    determinant = float(np.linalg.det(rotation))
-    if skew > _SKEW or determinant < 0:
+    with np.errstate(over="ignore", invalid="ignore"):
+        skew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        determinant = float(np.linalg.det(rotation))
+    if not skew <= _SKEW or determinant < 0:  # NaN neither
         raise FileFormatError(
             f"{where}: the pose must hold a rotation without scale or mirror, "
             f"found a matrix of determinant {determinant:.6g} that is {skew:.3g} away from one."
@@ -78,7 +79,10 @@ def viewmat_of_pose(
     inverse = (left @ right).T
     viewmat = np.eye(4)
     viewmat[:3, :3] = inverse
-    viewmat[:3, 3] = -inverse @ center
+    with np.errstate(over="ignore", invalid="ignore"):
+        viewmat[:3, 3] = -inverse @ center
+    if not np.isfinite(viewmat).all():
+        raise FileFormatError(f"{where}: the camera must be nearer, found it at {center.tolist()}.")
     return viewmat
 
 
