@@ -78,10 +78,13 @@ def started(command: Command, folder: Path, *, limit: Callable[[], None] | None 
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
     except BaseException:  # what the process would print as a traceback
-        traceback.print_exc()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)
+        with suppress(MemoryError):
+            traceback.print_exc()
+    finally:
+        with suppress(MemoryError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(code)
 
 
 def ended(process: int, folder: Path) -> tuple[int, str]:

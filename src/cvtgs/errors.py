@@ -7,9 +7,10 @@ from contextlib import contextmanager
 
 _NO_MEMORY = re.compile(
     r"(?i)(can.?not|can't|not enough|out of|failed to) (allocate )?memory|bad.?alloc|"
-    r"ALLOC_FAILED|failed to map segment|can't start new thread|could not allocate"
+    r"ALLOC_FAILED|failed to map segment|can't start new thread|could not allocate|"
+    r"returned NULL without setting an exception"
 )
-"""How torch, CUDA and the loader of libraries tell that there is no memory."""
+"""How torch, CUDA, the loader of libraries and Python's imports tell that there is no memory."""
 
 
 class CvtgsError(Exception):
@@ -90,7 +91,7 @@ def is_out_of_memory(error: BaseException) -> bool:
         return True
     if isinstance(error, OSError) and error.errno == errno.ENOMEM:
         return True
-    told = isinstance(error, RuntimeError | ImportError | OSError)
+    told = isinstance(error, RuntimeError | ImportError | OSError | SystemError)
     return told and _NO_MEMORY.search(str(error)) is not None
 
 

@@ -11,7 +11,7 @@ from cvtgs.cameras import Cameras, look_at
 from cvtgs.math import parameters
 from cvtgs.refinement.images import generated_views
 from cvtgs.views import automatic_views, find_view_positions, mixed_views, random_views
-from cvtgs.views.layout import find_layout
+from cvtgs.views.layout import find_layout, hidden_share
 from cvtgs.views.mixed import NEAR
 from cvtgs.views.scoring import splat_sizes
 from cvtgs.views.up import Voxels, find_up
@@ -178,3 +178,21 @@ def test_a_ground_across_x_gives_a_unit_vector(sense):
     normals = torch.tensor([[sense, 0.0, 0.0]], dtype=torch.float64).repeat(500, 1)
     up = find_up(Voxels(points=points, normals=normals, log_sizes=points[:, 0]), points[:0])
     assert up.tolist() == [1.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_a_hollow_object_is_no_room(seed: int) -> None:
+    vase = cvtgs.synthetic.scene("object", 6000, sh_degree=0, seed=seed)
+    positions = find_view_positions(vase)
+    assert positions.layout.room is None
+    layout = positions.layout
+    away = torch.linalg.vector_norm(automatic_views(positions, 3).centers - layout.center, dim=1)
+    assert float(away.min()) > 2 * layout.radius
+
+
+def test_what_is_behind_walls_is_counted() -> None:
+    angles = torch.linspace(0, 2 * math.pi, 200, dtype=torch.float64)[:-1]
+    ring = torch.stack([angles.cos(), 0 * angles, angles.sin()], dim=1)
+    eye = torch.zeros(3, dtype=torch.float64)
+    assert hidden_share(eye, ring) == 0.0
+    assert math.isclose(hidden_share(eye, torch.cat([ring, 1.8 * ring])), 0.5)

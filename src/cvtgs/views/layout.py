@@ -13,7 +13,7 @@ from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import divide
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import valid_rows, with_finite_opacities
-from cvtgs.views.up import Voxels, among_others, find_floor, find_up, voxelize
+from cvtgs.views.up import VOXEL_SIZE, Voxels, among_others, find_floor, find_up, voxelize
 
 ENCLOSED = 0.7
 """A room hides this share of the upper half of what a camera in its middle could see."""
@@ -27,6 +27,13 @@ _NEAR = 2.2
 _GROWS = 0.1
 """In a room the sizes of Gaussians grow with their distance by this correlation: what lies behind
 the surfaces, where no image was taken, is large. In a hollow object they shrink."""
+
+_HIDDEN = 0.18
+"""In a room at most this share of surfaces is behind others, seen from its middle: some 0.1 were
+measured. Around a hollow object there are outer sides, a base, things beside it: 0.25 and more."""
+
+_BEHIND = 1.3
+"""So many times as far as the nearest surface in the same direction is behind it."""
 
 _FARTHEST = 6.0
 _MOST_POINTS = 10_000
@@ -73,6 +80,8 @@ def find_room(
     best = eyes[clearance.argmax()]
     if float(clearance.amax()) < FREE or enclosure(best, points, up) < ENCLOSED:
         return None
+    if hidden_share(best, points) > _HIDDEN:
+        return None
     if size_growth(sized, frame.center + frame.radius * best, frame.radius) < _GROWS:
         return None
     eye: Tensor = center + (0.58 * (high - low) + low) * up
@@ -94,6 +103,18 @@ def enclosure(
     filled = torch.zeros(_BANDS, _SECTORS, dtype=torch.bool)
     filled[bands[rise > 0], sectors[rise > 0]] = True
     return float(filled.double().mean())
+
+
+def hidden_share(eye: Float[Tensor, "3"], points: Float[Tensor, "v 3"]) -> float:
+    """Return the share of the surfaces around a point that are behind others, seen from it."""
+    offsets = points - eye
+    distances = torch.linalg.vector_norm(offsets, dim=1)
+    around = distances < _NEAR
+    offsets, distances = offsets[around], distances[around]
+    cells = _cells_of_cube(offsets)
+    nearest = distances.new_full((6 * _CELLS**2,), _NEAR)
+    nearest = nearest.scatter_reduce(0, cells, distances, "amin")
+    return float((distances > _BEHIND * nearest[cells] + VOXEL_SIZE).double().mean())
 
 
 def size_growth(sized: SizedPoints, eye: Float[Tensor, "3"], radius: float) -> float:
