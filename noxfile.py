@@ -123,12 +123,13 @@ def speed(session: nox.Session) -> None:
 
 @nox.session
 def viewers(session: nox.Session) -> None:
-    """Show streams in PlayCanvas' engine and CesiumJS, from npm, in headless Chromium."""
-    session.install(*CONSTRAINTS, "-e", ".[test]")
+    """Show scenes in viser, PlayCanvas' engine and CesiumJS, in headless Chromium."""
+    session.install(*CONSTRAINTS, "-e", ".[test,view]")
     folder = session.create_tmp()
     session.run("npm", "install", "--prefix", folder, *VIEWERS, "--ignore-scripts", external=True)
     settings = {"CVTGS_NODE_MODULES": str(Path(folder).resolve() / "node_modules")}
-    session.run("pytest", "tests/streams/test_stream_viewers.py", *session.posargs, env=settings)
+    files = ("tests/streams/test_stream_viewers.py", "tests/test_viewer_browser.py")
+    session.run("pytest", *files, *session.posargs, env=settings)
 
 
 @nox.session

@@ -21,6 +21,14 @@ QUIET = (
     "--hide-scrollbars",
 )
 
+SOFTWARE_WEBGL = (
+    *(word for word in QUIET if word != "--disable-gpu"),
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--remote-debugging-port=0",
+)
+
 needs_browser = pytest.mark.skipif(
     BROWSER is None, reason=f"needs one of {', '.join(BROWSERS)} on the PATH"
 )

@@ -23,7 +23,7 @@ import torch
 from PIL import Image
 
 import cvtgs
-from browser_cases import BROWSER, QUIET, needs_browser
+from browser_cases import BROWSER, SOFTWARE_WEBGL, needs_browser
 from cvtgs.cameras import look_at
 from cvtgs.streams import stream_file
 
@@ -31,8 +31,6 @@ MODULES = Path(os.environ.get("CVTGS_NODE_MODULES", "none"))
 PAGES = Path(__file__).parents[1] / "data" / "viewers"
 WIDTH, HEIGHT, FIELD_OF_VIEW = 640, 480, 50.0
 EYE, TARGET = (1.5, -1.2, -3.6), (0.0, 0.0, 0.0)
-SOFTWARE = [word for word in QUIET if word != "--disable-gpu"]
-SOFTWARE += ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 SECONDS = 120.0
 MOST = 2.0
 """Mean difference from our picture, of 255 levels: viewers cut Gaussians off elsewhere, and sort
@@ -117,8 +115,8 @@ def least_difference(
     camera = ",".join(map(str, (*EYE, *TARGET)))
     words = urlencode({"camera": camera, "fov": FIELD_OF_VIEW} | query)
     address = f"{served.address}/pages/{page}?{words}"
-    command = [str(BROWSER), *SOFTWARE, f"--user-data-dir={folder / 'profile'}"]
-    command += [f"--window-size={WIDTH},{HEIGHT}", "--remote-debugging-port=0", address]
+    command = [str(BROWSER), *SOFTWARE_WEBGL, f"--user-data-dir={folder / 'profile'}"]
+    command += [f"--window-size={WIDTH},{HEIGHT}", address]
     least, end = math.inf, time.monotonic() + SECONDS
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as browser:
         try:

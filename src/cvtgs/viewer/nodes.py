@@ -4,6 +4,7 @@ No other file imports viser.
 """
 
 import io
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from typing import TYPE_CHECKING, Any
@@ -106,6 +107,7 @@ def look_at(server: "viser.ViserServer", scene: GaussianScene) -> None:
     target = center + rotation[2] * max(depth, 1e-3)
     server.initial_camera.position = _three(center)
     server.initial_camera.look_at = _three(target)
+    server.initial_camera.fov = 2 * math.atan(camera.height / 2 / float(camera.Ks[0, 1, 1]))
 
 
 def _three(point: torch.Tensor) -> tuple[float, float, float]:

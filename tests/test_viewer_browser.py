@@ -1,0 +1,99 @@
+"""The page of ``cvtgs view`` and the page of its own, by viser, in headless Chromium.
+
+``nox -s viewers`` runs this. The browser finds no host but this one, so what it shows was fetched
+from nowhere else.
+"""
+
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import cvtgs
+from browser_cases import BROWSER, SOFTWARE_WEBGL, needs_browser
+from cvtgs.viewer import SceneViewer, ViewerServer, camera_of, scene_page
+
+SECONDS = 120.0
+WIDTH, HEIGHT = 1000, 700
+PICTURE = 300
+MOST = 1.5
+"""Mean difference from our picture, of 255 levels: 0.5 was seen, and 3 for another size."""
+
+pytestmark = [needs_browser, pytest.mark.long, pytest.mark.filterwarnings("ignore")]
+pytest.importorskip("viser", reason="needs viser: pip install 'cvtgs[view]'")
+
+
+@pytest.fixture(scope="module")
+def scene() -> cvtgs.GaussianScene:
+    return cvtgs.synthetic.scene("object", 12_000, sh_degree=0, seed=3)
+
+
+@contextmanager
+def browser(folder: Path, address: str, *words: str) -> Iterator[subprocess.Popen[bytes]]:
+    command = [str(BROWSER), *SOFTWARE_WEBGL, f"--user-data-dir={folder / 'profile'}"]
+    command += ["--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1", *words, address]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+
+
+def until(condition: Callable[[], bool], what: str) -> None:
+    end = time.monotonic() + SECONDS
+    while not condition():
+        assert time.monotonic() < end, what
+        time.sleep(0.5)
+
+
+def difference(small: cvtgs.GaussianScene, client: Any) -> float:
+    """Return the mean difference of the page's picture of a scene to ours."""
+    camera, width = client.camera, round(PICTURE * client.camera.aspect)
+    cameras = camera_of(
+        tuple(camera.wxyz), tuple(camera.position), fov=camera.fov, aspect=width / PICTURE
+    )
+    image = cvtgs.render(small, cameras.resized(width, PICTURE), background=torch.ones(3))
+    wanted = image.rgb[0].clamp(0, 1).mul(255).numpy()
+    return float(np.abs(client.get_render(PICTURE, width) - wanted).mean())
+
+
+def test_a_moved_slider_changes_the_picture(tmp_path: Path, scene: cvtgs.GaussianScene) -> None:
+    server = ViewerServer(SceneViewer(scene, {}, device="cpu"), preset="draft", rho=0.1)
+    clients, simplifier = server._server.get_clients, cvtgs.Simplifier(preset="draft", device="cpu")
+    first, second = (simplifier.simplify(scene, 10**power) for power in (-1.0, -2.5))
+    try:
+        server.finish()
+        with browser(tmp_path, server.address, f"--window-size={WIDTH},{HEIGHT}"):
+            until(lambda: len(clients()) == 1, "no browser came")
+            (client,) = clients().values()
+            until(lambda: difference(first, client) < MOST, "the first picture is another one")
+            assert difference(second, client) > MOST
+            server._slider.value = -2.5
+            until(lambda: difference(second, client) < MOST, "the picture did not change")
+            assert difference(first, client) > MOST
+    finally:
+        server.close()
+
+
+def test_the_page_of_its_own_shows_a_scene(tmp_path: Path, scene: cvtgs.GaussianScene) -> None:
+    page, picture = tmp_path / "page.html", tmp_path / "picture.png"
+    page.write_text(scene_page({"full": scene, "a tenth": scene}), encoding="utf-8")
+    words = (
+        "--virtual-time-budget=20000",
+        f"--screenshot={picture}",
+        f"--window-size={WIDTH},{HEIGHT}",
+    )
+    with browser(tmp_path, page.as_uri(), *words):
+        until(picture.is_file, "no picture was taken")
+    with Image.open(picture) as image:
+        pixels = np.asarray(image.convert("RGB"), dtype=np.float32)
+    right = pixels[:-60, WIDTH // 2 :]  # beside what viser says about WebGL
+    colored = np.ptp(right, axis=2) > 30
+    assert 0.01 < float(colored.mean()) < 0.9
