@@ -14,6 +14,8 @@ import json
 import os
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import mean
 
@@ -118,17 +120,16 @@ def blocks(options: argparse.Namespace) -> None:
     names = ("file", "memory each", "workers", "user CPU s", "wall s", "ratio", "peak MB")
     print(f"| {' | '.join((*names, 'Gaussians', 'blocks'))} |")
     print("|---|---|---|---|---|---|---|---|---|")
-    cores = sorted(os.sched_getaffinity(0))
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         output, report = Path(folder) / "small.ply", Path(folder) / "report.json"
         for file, workers in itertools.product(options.files, options.workers):
             memory = workers * read_bytes(options.memory)
-            os.sched_setaffinity(0, cores[:workers])  # processes that it starts inherit it
-            cost = run_python(
-                "-m", "cvtgs", "simplify", str(file), str(output), "--rho", str(options.rho),
-                "--memory", str(memory), "--workers", str(workers),
-                "--report", str(report), "--overwrite", "--quiet",
-            )  # fmt: skip
+            with cores(workers):
+                cost = run_python(
+                    "-m", "cvtgs", "simplify", str(file), str(output), "--rho", str(options.rho),
+                    "--memory", str(memory), "--workers", str(workers),
+                    "--report", str(report), "--overwrite", "--quiet",
+                )  # fmt: skip
             said, digest = json.loads(report.read_text()), hashlib.sha256(output.read_bytes())
             if workers == options.workers[0]:
                 wall, first = cost.wall_seconds, digest.digest()
@@ -140,6 +141,20 @@ def blocks(options: argparse.Namespace) -> None:
                 f"| {cost.peak_bytes / 1e6:.0f} | {said['output_count']:,} | {said['blocks']} |",
                 flush=True,
             )
+
+
+@contextmanager
+def cores(count: int) -> Iterator[None]:
+    """Give so many cores to the processes that are started, where the system can."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(before)[:count])  # they inherit it
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
 
 
 def make(options: argparse.Namespace) -> None:

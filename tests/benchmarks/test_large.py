@@ -14,6 +14,7 @@ def test_workers_are_compared(tmp_path, monkeypatch, capsys):
     def simplify(*words: str) -> Cost:
         workers = int(words[words.index("--workers") + 1])
         Path(words[words.index("simplify") + 2]).write_bytes(b"3" if workers == 3 else b"1")
+        assert words[words.index("--memory") + 1] == str(workers * 2 * 10**9)
         report = {"output_count": 1000, "blocks": 4}
         Path(words[words.index("--report") + 1]).write_text(json.dumps(report))
         return Cost(user_seconds=1.0, wall_seconds=8.0 / workers, peak_bytes=5 * 10**6, output="")
@@ -25,7 +26,7 @@ def test_workers_are_compared(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(large, "run_python", simplify)
     large.main()
     lines = capsys.readouterr().out.splitlines()[-3:]
-    start, end = "| scene, 0.01 GB | 4GB |", "| 5 | 1,000 | 4 |"
+    start, end = "| scene, 0.01 GB | 2GB |", "| 5 | 1,000 | 4 |"
     assert lines == [
         f"{start} 1 | 1.0 | 8.0 | 1.00, same bytes {end}",
         f"{start} 2 | 1.0 | 4.0 | 2.00, same bytes {end}",
