@@ -4,6 +4,7 @@ import os
 import pickle
 import signal
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -150,10 +151,10 @@ class LocalWorkers:
         Raises:
             RunError: A process was ended from outside.
         """
-        futures = [self._pool.submit(_call, pickle.dumps((function, item))) for item in items]
+        futures = deque(self._pool.submit(_call, pickle.dumps((function, one))) for one in items)
         try:
-            for future in futures:
-                result: Result = pickle.loads(future.result())  # made by a process of this one
+            while futures:  # a result that was taken is not kept, a scan has dozens of megabytes
+                result: Result = pickle.loads(futures.popleft().result())
                 yield result
         except BrokenProcessPool as error:
             raise RunError(

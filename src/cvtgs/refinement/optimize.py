@@ -181,7 +181,8 @@ class SceneOptimizer:
                 )
             )
             change = -length * means.div_(squares.sqrt_().add_(_LEAST_ROOT))
-            self._changes[name].detach().index_add_(0, rows, change)
+            values = self._changes[name].detach()
+            values.index_copy_(0, rows, change.add_(values.index_select(0, rows)))
         self._moved[rows] = True
 
     @torch.no_grad()

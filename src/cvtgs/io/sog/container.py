@@ -104,14 +104,14 @@ def _reason(error: Exception) -> str:
 
 def _check_name(name: str, path: Path) -> None:
     plain = name.isprintable() and name not in ("", "..") and not set(name) & set("\\:")
+    if PurePosixPath(name).name != name or not plain:
+        raise FileFormatError(
+            f"{path}: the files of a SOG must be named without folders, found {shown(name)}."
+        )
     if len(name) > _LONGEST_NAME:
         raise FileFormatError(
             f"{path}: the files of a SOG must have names of at most {_LONGEST_NAME} characters, "
             f"found {shown(name)}."
-        )
-    if PurePosixPath(name).name != name or not plain:
-        raise FileFormatError(
-            f"{path}: the files of a SOG must be named without folders, found {shown(name)}."
         )
 
 
