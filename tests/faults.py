@@ -32,8 +32,8 @@ from fault_commands import CLUSTER, COMMANDS, TRAINING, Command
 SIGNALS = {"SIGINT": 130, "SIGTERM": 143, "SIGKILL": -9}
 """Status after each signal, by name: Windows lacks one."""
 
-EARLY = {signal.SIGINT: 130, signal.SIGTERM: 143}
-"""What ends a fork before ``main`` takes signals over, as it ends an interpreter that starts."""
+EARLY = 75
+"""Status of a fork that a signal ends before ``main`` takes signals over, and touches anything."""
 
 BUSY = ("one run at a time may work on it", "must not exist yet", "must be")
 MOST_SECONDS = 300.0
@@ -46,11 +46,12 @@ class FaultError(Exception):
 def started(command: Command, folder: Path, *, limit: Callable[[], None] | None = None) -> int:
     """Fork a run of a command; what it prints goes to a file of its process."""
     sys.stdout.flush()
-    signal.pthread_sigmask(signal.SIG_BLOCK, EARLY)
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     process = os.fork()
-    for number, status in EARLY.items() if process == 0 else ():
-        signal.signal(number, lambda *_, status=status: os._exit(status))
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, EARLY)
+    for number in numbers if process == 0 else ():
+        signal.signal(number, lambda *_: os._exit(EARLY))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)
     if process:
         return process
     code = 70
@@ -168,11 +169,14 @@ def references(home: Path, names: list[str]) -> Iterator[tuple[str, float, dict[
 
 def kill(command: Command, folder: Path, seconds: float, name: str) -> int:
     """Start a command, send a signal after some seconds, and return its status."""
+    before = contents(folder)
     process = started(command, folder)
     time.sleep(seconds)
     with suppress(ProcessLookupError):  # it has ended
         os.kill(process, signal.Signals[name])
     code, text = ended(process, folder)
+    if code == EARLY and contents(folder) == before:
+        return code
     if code not in (0, SIGNALS[name]) and not (code == 130 and not text):
         raise FaultError(f"status {code} after {name}: {text}")
     sentences = [line for line in text.splitlines() if not line.startswith("cvtgs: warning: ")]

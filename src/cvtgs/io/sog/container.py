@@ -20,8 +20,10 @@ MOST_META_BYTES = 1 << 20
 """Real ones have some ten thousand."""
 
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_LONGEST_NAME = 255  # of file systems
 """Those whose output zipfile bounds; a block of bzip2 or LZMA is unpacked whole."""
+
+_LONGEST_NAME = 255
+"""Characters that file systems allow."""
 
 PALETTE_COLUMNS = 64
 """Entries of the SH palette in a row of its image."""
