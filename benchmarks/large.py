@@ -14,15 +14,13 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from statistics import mean
 
 import torch
 
 import cvtgs
-from benchmarks.measuring import machine, run_python
+from benchmarks.measuring import cores, machine, run_python
 from benchmarks.quality import score_views
 from cvtgs.outofcore import read_bytes, simplify_file
 from cvtgs.views import automatic_views
@@ -141,20 +139,6 @@ def blocks(options: argparse.Namespace) -> None:
                 f"| {cost.peak_bytes / 1e6:.0f} | {said['output_count']:,} | {said['blocks']} |",
                 flush=True,
             )
-
-
-@contextmanager
-def cores(count: int) -> Iterator[None]:
-    """Give so many cores to the processes that are started, where the system can."""
-    if not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, sorted(before)[:count])  # they inherit it
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)
 
 
 def make(options: argparse.Namespace) -> None:

@@ -5,7 +5,8 @@ import platform
 import statistics
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,6 +51,20 @@ def run(command: Sequence[str]) -> Cost:
         peak_bytes=cost.peak_memory_bytes,
         output=cost.output,
     )
+
+
+@contextmanager
+def cores(count: int) -> Iterator[None]:
+    """Give so many cores to the processes that are started, where the system can."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(before)[:count])  # they inherit it
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
 
 
 def fastest(run: Callable[[], object], *, runs: int) -> float:

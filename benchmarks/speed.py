@@ -1,11 +1,14 @@
-"""Time and memory of ``cvtgs simplify``: whole process, per stage, and against the floor.
+"""Time and memory of ``cvtgs simplify``: whole process, per stage, against the floor, by cores.
 
 The floor is what no method on cells can avoid: read the file, search the nearest site of every
 Gaussian once, write the result. ``python -m benchmarks.speed`` prints Markdown tables.
 """
 
 import argparse
+import itertools
 import json
+import os
+import statistics
 import tempfile
 import time
 from pathlib import Path
@@ -13,7 +16,8 @@ from pathlib import Path
 import torch
 
 import cvtgs
-from benchmarks.measuring import generated_scenes, machine, run_python, spread
+from benchmarks.measuring import cores, generated_scenes, machine, run_python, spread
+from cvtgs.devices import core_count
 from cvtgs.math.frames import morton_order, robust_frame
 
 SCENES = (("courtyard", 1_000_000, 0), ("courtyard", 250_000, 2), ("courtyard", 400_000, 3))
@@ -25,16 +29,18 @@ def main() -> None:
     parser.add_argument("--rho", type=float, default=0.01)
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--child", choices=("stages",), help=argparse.SUPPRESS)
+    parser.add_argument("--child", choices=("stages", "wall"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
-        print(json.dumps(stage_costs(options.files[0], options.rho, options.preset)))
+        measure = {"stages": stage_costs, "wall": stage_seconds}[options.child]
+        print(json.dumps(measure(options.files[0], options.rho, options.preset)))
         return
     with tempfile.TemporaryDirectory() as folder:
         files = options.files or generated_scenes(Path(folder), SCENES)
         print(f"{machine()}, torch {torch.__version__}; rho {options.rho:g}, {options.runs} runs\n")
         measure_processes(files, Path(folder), options)
         measure_stages(files, options)
+        measure_cores(files, options)
 
 
 def measure_processes(files: list[Path], folder: Path, options: argparse.Namespace) -> None:
@@ -65,14 +71,48 @@ def measure_stages(files: list[Path], options: argparse.Namespace) -> None:
     print("|---|" + "---|" * len(files))
     columns = []
     for file in files:
-        arguments = [str(file), "--rho", str(options.rho), "--preset", options.preset]
-        costs = [
-            json.loads(run_python("-m", "benchmarks.speed", "--child", "stages", *arguments).output)
-            for _ in range(options.runs)
-        ]
+        arguments = child_arguments(file, options)
+        costs = [run_child("stages", arguments) for _ in range(options.runs)]
         columns.append({name: [cost[name] for cost in costs] for name in costs[0]})
     for name in columns[0]:
         print(f"| {name} | " + " | ".join(spread(column[name]) for column in columns) + " |")
+
+
+def measure_cores(files: list[Path], options: argparse.Namespace) -> None:
+    """Wall seconds of the stages of ``Simplifier.run`` on one core and on all, in turn."""
+    if not hasattr(os, "sched_setaffinity"):
+        return
+    counts = (1, core_count())
+    for file in files:
+        found: dict[int, list[dict[str, float]]] = {count: [] for count in counts}
+        for _, count in itertools.product(range(options.runs), counts):
+            with cores(count):
+                found[count].append(run_child("wall", child_arguments(file, options)))
+        print(f"\n| wall s, {file.stem} | 1 core | {counts[1]} cores | ratio |\n|---|---|---|---|")
+        for name in found[1][0]:
+            one, several = ([run[name] for run in found[count]] for count in counts)
+            ratio = statistics.median(one) / statistics.median(several)
+            print(f"| {name} | {spread(one)} | {spread(several)} | {ratio:.2f} |")
+
+
+def child_arguments(file: Path, options: argparse.Namespace) -> list[str]:
+    return [str(file), "--rho", str(options.rho), "--preset", options.preset]
+
+
+def run_child(what: str, arguments: list[str]) -> dict[str, float]:
+    """Measure in a fresh process."""
+    output = run_python("-m", "benchmarks.speed", "--child", what, *arguments).output
+    costs: dict[str, float] = json.loads(output)
+    return costs
+
+
+def stage_seconds(file: Path, rho: float, preset: str) -> dict[str, float]:
+    """Measure the wall seconds of the stages once, in this process, after a small scene."""
+    scene, simplifier = cvtgs.load(file), cvtgs.Simplifier(config=preset, device="cpu")
+    simplifier.simplify(scene.select(torch.arange(min(20_000, len(scene)))), rho)
+    stages = simplifier.run(scene, rho).report.stages
+    seconds = {cost.stage: cost.seconds for cost in stages}
+    return seconds | {"all": sum(seconds.values())}
 
 
 def stage_costs(file: Path, rho: float, preset: str) -> dict[str, float]:

@@ -92,8 +92,9 @@ def gaussian_moments(
     count, device, center = len(rows), rows.device, frame.center.to(rows.device)
     means = torch.empty(3, count, dtype=torch.float64, device=device)
     covariances, colors = means.new_empty(6, count), torch.empty_like(means)
-    chunk = chunk_length(CHUNK, device)
-    for start in range(0, count, chunk):  # a few columns fit into a cache
+    chunk = chunk_length(CHUNK, device)  # a few columns fit into a cache
+
+    def compute(start: int) -> None:
         part = slice(start, start + chunk)
         some = rows[part]
         positions = scene.means.index_select(0, some).double() - center
@@ -105,6 +106,9 @@ def gaussian_moments(
             covariances[number, part] = (columns[i] * columns[j]).sum(0)
         bands = scene.sh0.index_select(0, some)[:, 0]
         colors[:, part] = (0.5 + SH_C0 * bands.double()).clamp(0.0, 1.5).T
+
+    for _ in in_threads(compute, range(0, count, chunk), device):
+        pass
     tiny = torch.finfo(torch.float64).tiny
     weights, masses = weights.double(), masses.double()
     units = [
