@@ -9,6 +9,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from cvtgs import synthetic
 from cvtgs.boxes import Box
 from cvtgs.config import SimplifyConfig
 from cvtgs.outofcore import simplify_file
+from cvtgs.scene import ANTIALIASED_TAG
 
 FILE = Path(__file__).with_name("digests.json")
 KINDS = {"object": 3, "room": 1, "landscape": 2, "haze": 3, "thin": 0, "courtyard": 2}
@@ -81,6 +83,11 @@ def damaged() -> Iterator:
         yield cvtgs.Simplifier(device="cpu").simplify(scene.with_tensors(tensors, extras), 0.1)
 
 
+def tagged() -> Iterator:
+    scene = replace(make("object"), comments=(ANTIALIASED_TAG,))
+    yield cvtgs.Simplifier(device="cpu").simplify(scene, 0.1)
+
+
 def in_double() -> Iterator:
     scene = make("landscape")
     double = {name: values.double() for name, values in scene.tensors().items()}
@@ -109,6 +116,7 @@ CASES = {
         in_blocks, "room", 5, boxes=(Box(min=(0, -1, 0), max=(0.4, 1, 0.4)),)
     ),
     "damaged rows": damaged,
+    "tagged mip": tagged,
     "float64": in_double,
 }
 

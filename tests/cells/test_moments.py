@@ -1,6 +1,7 @@
 """Merged cells against the scalar oracle, and what a merge conserves."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -16,6 +17,7 @@ from cvtgs.cells import (
 )
 from cvtgs.config import MergeConfig
 from cvtgs.math import depths, parameters
+from cvtgs.scene import ANTIALIASED_TAG
 from scenes import assert_same_gaussians, covariances_of, moved, oracle_rows, random_scene
 
 RULES = {
@@ -126,6 +128,26 @@ def test_saturating_never_gains_mass_and_never_exceeds_one():
     assert bool((small.opacities < 1).all())
     areas = parameters.mean_projected_area(small.scales)
     assert bool((small.masses <= areas).all())
+
+
+def test_saturating_takes_the_mean_of_two_depths_where_images_are_compensated():
+    """The square root of both depths' product, which is computed here member by member."""
+    scene, cells = random_scene(400, dtype=torch.float64), random_cells(400, 150)
+    plain = merged(scene, cells, RULES["standard"])
+    tagged = merged(replace(scene, comments=(ANTIALIASED_TAG,)), cells, RULES["standard"])
+    opaque = -math.log(0.01)
+    member_depths = -torch.log1p(-scene.opacities)
+    images = (member_depths.clamp_max(opaque) * scene.areas)[cells.order]
+    areas = parameters.mean_projected_area(plain.scales)
+    sums = torch.stack([part.sum() for part in images.split(cells.offsets.diff().tolist())])
+    plain_depths = -torch.log1p(-plain.opacities)
+    wanted = torch.sqrt(plain_depths * (sums / areas).clamp_max(opaque))
+    several = cells.offsets.diff() > 1
+    found = -torch.log1p(-tagged.opacities)
+    torch.testing.assert_close(found[several], wanted[several])
+    assert float((found - plain_depths)[several].amax()) > 0.1
+    for name in ("means", "log_scales", "quats", "sh0"):
+        torch.testing.assert_close(getattr(tagged, name), getattr(plain, name), rtol=0, atol=0)
 
 
 def test_union_adds_depths():

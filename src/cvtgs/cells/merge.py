@@ -80,7 +80,7 @@ def merge_cells(
             "quats": quats,
             "log_scales": parameters.positive_log(scales),
             "logit_opacities": parameters.logit_from_optical_depth(
-                merged_depth(members, areas, rule=config.opacity)
+                merged_depth(members, areas, rule=config.opacity, antialiased=scene.antialiased)
             ),
         }
         bands = ("sh0", "shN") if scene.shN.shape[1] else ("sh0",)
@@ -236,6 +236,7 @@ def merged_depth(
     areas: Float[Tensor, "m"],
     *,
     rule: Literal["saturating", "union"],
+    antialiased: bool = False,
 ) -> Float[Tensor, "m"]:
     """Return the optical depth of the Gaussian that stands for a cell.
 
@@ -245,6 +246,10 @@ def merged_depth(
         rule: ``union``: all members lie behind one another, depths add up (CVT-GS:
             ``1 - prod(1 - a)``). ``saturating``: what each sums to over an image adds up
             (:func:`cvtgs.math.depths.integrated_depth`), until the cell is opaque.
+        antialiased: Whether images are rendered with the compensation of mip-splatting. Then no
+            dilation closes the gaps between merged Gaussians, and ``saturating`` gives the
+            geometric mean of this depth and of that which conserves depth at the centre times
+            area: deeper, where opaque members lie side by side.
 
     Returns:
         Optical depths; the opacity is ``1 - exp(-depth)``.
@@ -253,7 +258,11 @@ def merged_depth(
         return segment_sum(members.depths, members.offsets)
     images = depths.integrated_depth(members.depths) * members.areas
     totals = segment_sum(images, members.offsets)
-    return depths.depth_from_integrated(parameters.divide(totals, areas)).clamp_max(OPAQUE)
+    found = depths.depth_from_integrated(parameters.divide(totals, areas)).clamp_max(OPAQUE)
+    if not antialiased:
+        return found
+    centers = segment_sum(members.depths.clamp_max(OPAQUE) * members.areas, members.offsets)
+    return torch.sqrt(found * parameters.divide(centers, areas).clamp_max(OPAQUE))
 
 
 def keep_representatives(

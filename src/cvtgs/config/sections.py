@@ -171,7 +171,8 @@ class MergeConfig(Section):
         area_power: A member weighs its opacity times its mean projected area to this power: 0 is
             the opacity alone, 1 the mass.
         opacity: ``saturating`` conserves the optical depth summed over an image, until the cell is
-            opaque; ``union`` is the opacity of members that lie exactly behind one another,
+            opaque, and gives more in scenes tagged mip (:func:`cvtgs.cells.merged_depth`);
+            ``union`` is the opacity of members that lie exactly behind one another,
             ``1 - prod(1 - a)``.
         representatives: Whether a cell whose members hardly touch keeps the one that shows most,
             instead of their moments.

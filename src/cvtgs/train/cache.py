@@ -22,7 +22,7 @@ from cvtgs.train.sources import Source
 
 Content = TypeVar("Content", TargetViews, Case)
 
-CACHE_VERSION = 5
+CACHE_VERSION = 6
 """Part of the name of every file; to be raised when the meaning of the content changes."""
 
 
