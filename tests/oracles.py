@@ -130,7 +130,9 @@ def member_weights(cell: Sequence[Gaussian], *, area_power: float) -> list[float
     return [value / total for value in raw]
 
 
-def merge(cell: Sequence[Gaussian], *, area_power: float, opacity: str) -> Gaussian:
+def merge(
+    cell: Sequence[Gaussian], *, area_power: float, opacity: str, antialiased: bool = False
+) -> Gaussian:
     """One Gaussian with the moments of the mixture that the cell is; nothing is widened."""
     shares = member_weights(cell, area_power=area_power)
     mean = sum(w * g.mean for w, g in zip(shares, cell, strict=True))
@@ -150,6 +152,9 @@ def merge(cell: Sequence[Gaussian], *, area_power: float, opacity: str) -> Gauss
         limit = -math.log(0.01)
         is_opaque = total >= spence(math.exp(-limit))
         depth = limit if is_opaque else brentq(lambda x: spence(math.exp(-x)) - total, 0, limit)
+        if antialiased:
+            center = math.fsum(min(g.depth, limit) * g.area for g in cell) / merged_area
+            depth = math.sqrt(depth * min(center, limit))
     return Gaussian(mean=np.asarray(mean), covariance=matrix, depth=min(depth, limit), sh=sh)
 
 

@@ -75,7 +75,10 @@ def check_that_cells_equal_the_oracle(make, scene, config):
     for cell in range(len(small)):
         rows = (labels == cell).nonzero()[:, 0].tolist()
         wanted = oracles.merge(
-            oracle_rows(scene, rows), area_power=config.area_power, opacity=config.opacity
+            oracle_rows(scene, rows),
+            area_power=config.area_power,
+            opacity=config.opacity,
+            antialiased=scene.antialiased,
         )
         size = math.sqrt(float(wanted.covariance.max()))
         place = tolerance * size + epsilon * float(scene.means[rows].abs().amax())

@@ -94,7 +94,7 @@ def gaussian_moments(
     covariances, colors = means.new_empty(6, count), torch.empty_like(means)
     chunk = chunk_length(CHUNK, device)  # a few columns fit into a cache
 
-    def compute(start: int) -> None:
+    def moments_of(start: int) -> None:
         part = slice(start, start + chunk)
         some = rows[part]
         positions = scene.means.index_select(0, some).double() - center
@@ -107,7 +107,7 @@ def gaussian_moments(
         bands = scene.sh0.index_select(0, some)[:, 0]
         colors[:, part] = (0.5 + SH_C0 * bands.double()).clamp(0.0, 1.5).T
 
-    for _ in in_threads(compute, range(0, count, chunk), device):
+    for _ in in_threads(moments_of, range(0, count, chunk), device):
         pass
     tiny = torch.finfo(torch.float64).tiny
     weights, masses = weights.double(), masses.double()
