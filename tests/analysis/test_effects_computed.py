@@ -246,10 +246,15 @@ def test_images_are_compensated_as_planned_and_the_tag_stays(is_tagged, choice, 
     assert small.comments == scene.comments
 
 
-@pytest.mark.parametrize("choice", ["on", "off"])
-def test_without_images_the_tag_changes_nothing(choice):
-    scene = tagged(random_scene(200))
-    assert same_bits(run_with(scene).scene, run_with(scene, effects={"mip": choice}).scene)
+def test_without_images_the_tag_deepens_merged_cells_unless_it_is_off():
+    scene, plain = tagged(random_scene(200)), random_scene(200)
+    small = run_with(scene).scene
+    assert same_bits(small, run_with(scene, effects={"mip": "on"}).scene)
+    off = run_with(scene, effects={"mip": "off"}).scene
+    assert off.comments == scene.comments
+    assert not torch.equal(off.logit_opacities, small.logit_opacities)
+    for name, values in run_with(plain).scene.tensors().items():
+        assert torch.equal(off.tensors()[name], values)
 
 
 def test_cells_of_one_member_are_not_shown_to_the_network(monkeypatch):
