@@ -86,7 +86,8 @@ class EffectPlan(pydantic.BaseModel):
 
     Attributes:
         sh: Colour depends on the direction of view: SH bands above the constant.
-        mip: Images of the scene are taken with the compensation of Mip-Splatting.
+        mip: Images of the scene are taken with the compensation of Mip-Splatting, and its cells are
+            merged for it.
         unbounded: Part of the mass is far away: far positions are contracted.
         haze: Faint Gaussians hold mass: they are sorted, and only the faintest left out.
         flat: Gaussians have two scales (2DGS), and none shall get a third.

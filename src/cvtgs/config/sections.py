@@ -29,7 +29,7 @@ class EffectsConfig(Section):
         sh: Degree up to which colour depends on the direction of view; ``on`` for all, ``off``
             for 0. Bands above come out as zeros.
         mip: Whether images of a scene that is tagged so are taken with the compensation of
-            Mip-Splatting. The tag stays in any case.
+            Mip-Splatting, and its cells merged for it. The tag stays in any case.
         unbounded: Whether far positions are pulled in, if there are any.
         haze: Whether faint Gaussians are kept by their mass; off leaves all of them out.
         flat: Whether a scene of Gaussians with two scales (2DGS) stays one.
@@ -171,9 +171,9 @@ class MergeConfig(Section):
         area_power: A member weighs its opacity times its mean projected area to this power: 0 is
             the opacity alone, 1 the mass.
         opacity: ``saturating`` conserves the optical depth summed over an image, until the cell is
-            opaque, and gives more in scenes tagged mip (:func:`cvtgs.cells.merged_depth`);
-            ``union`` is the opacity of members that lie exactly behind one another,
-            ``1 - prod(1 - a)``.
+            opaque, with more where opaque members lie side by side in scenes tagged mip
+            (:func:`cvtgs.cells.merged_depth`); ``union`` is the opacity of members that lie exactly
+            behind one another, ``1 - prod(1 - a)``.
         representatives: Whether a cell whose members hardly touch keeps the one that shows most,
             instead of their moments.
         align_axes: Whether axes of equal length turn to where the neighbours are
