@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from camera_files import pose, transforms, write_json
 from cvtgs import GaussianScene
 from cvtgs.config import SimplifyConfig
 from cvtgs.errors import OutputError
@@ -86,6 +87,22 @@ def test_scenes_for_validation_have_their_own_ratios_and_views(made, tmp_path):
     prepared = prepare_scene(source, config_of(), tmp_path)
     assert [case.ratio for case in prepared.cases] == [0.3]
     assert [tuple(views.rgb.shape) for views in prepared.views] == [(2, 36, 36, 3)]
+
+
+def test_cameras_of_a_file_are_spread_evenly_and_fitted(made, tmp_path):
+    """Three of the four, at the size of the validation; other cameras make new images."""
+    file = tmp_path / "made.transforms.json"
+    source = replace(source_of(made.scene, is_validation=True), make=made, cameras=file)
+    config = config_of()
+    config = config.model_copy(
+        update={"views": config.views.model_copy(update={"validation_count": 3})}
+    )
+    for first in (0, 4):
+        write_json(file, transforms(range(first, first + 4)))
+        (views,) = prepare_scene(source, config, tmp_path).views
+        assert tuple(views.rgb.shape) == (3, 27, 36, 3)
+        places = [torch.tensor(pose(first + row)[1]) for row in range(3)]
+        torch.testing.assert_close(views.cameras.centers, torch.stack(places))
 
 
 def test_learning_from_a_scene_that_validated_makes_new_images(source, made, tmp_path):

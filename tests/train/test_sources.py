@@ -45,6 +45,14 @@ def test_every_fifth_file_from_the_second_on_validates(tmp_path):
     assert names_of(sources, is_validation=False) == list("acdefh")
 
 
+def test_only_scenes_for_validation_have_cameras(tmp_path):
+    write_scenes(tmp_path, ["a", "exam"], 50)
+    for name in ("a", "exam"):
+        (tmp_path / f"{name}.transforms.json").write_text("{}", encoding="utf-8")
+    cameras = {source.name: source.cameras for source in find_sources(tiny_data(tmp_path), seed=0)}
+    assert cameras == {"a": None, "exam": tmp_path / "exam.transforms.json"}
+
+
 def test_several_folders_one_after_the_other(tmp_path):
     first, second = (write_scenes(tmp_path / name, [name], 5) for name in ("z", "exam"))
     sources = find_sources(tiny_data(first, folders=(first, second)), seed=0)

@@ -53,11 +53,12 @@ def prepare_scene(source: Source, config: TrainConfig, folder: Path) -> Training
     if config.kind == "published" and not source.is_validation:
         sizes = ()  # it learns from images of single cells
     count = config.views.validation_count if source.is_validation else config.views.count
-    scene = cache(source.make)
+    scene, file = cache(source.make), source.cameras
+    seen_from = config.seed if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
     views = _cached(
-        folder / f"{source.name}-views-{_key(source, sizes, count, config.seed)}.safetensors",
+        folder / f"{source.name}-views-{_key(source, sizes, count, seen_from)}.safetensors",
         lambda: _packed_views(
-            render_views(scene(), count, size=size, seed=config.seed + number)
+            render_views(scene(), count, size=size, seed=config.seed + number, file=file)
             for number, size in enumerate(sizes)
         ),
         _unpacked_views,

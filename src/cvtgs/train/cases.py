@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -16,6 +17,7 @@ from cvtgs.counts import target_count
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.filters import filter_rows
 from cvtgs.grouping import group_rows
+from cvtgs.io import load_cameras
 from cvtgs.mergenet import (
     MergeNet,
     PublishedMergeNet,
@@ -274,12 +276,17 @@ def _byte_count(value: Any) -> int:
     return sum(map(_byte_count, parts)) if isinstance(value, (tuple, dict)) else 0
 
 
-def render_views(scene: GaussianScene, count: int, *, size: int, seed: int) -> TargetViews:
-    """Render a full scene from automatic cameras and from random positions, near ones too.
+def render_views(
+    scene: GaussianScene, count: int, *, size: int, seed: int, file: Path | None = None
+) -> TargetViews:
+    """Render a full scene from cameras of a file, spread evenly, or from mixed views.
 
     Blurred views are learned from as well: the shipped networks were.
     """
-    cameras = mixed_views(scene, count, size=size, seed=seed, sharp=False)
+    if file is None:
+        cameras = mixed_views(scene, count, size=size, seed=seed, sharp=False)
+    else:
+        cameras = load_cameras(file).spread(count).fitted(size)
     with torch.no_grad():
         images = render(scene, cameras)
     return TargetViews(

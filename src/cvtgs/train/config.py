@@ -19,7 +19,8 @@ class DataConfig(Section):
     Attributes:
         folders: Folders of PLY files; relative ones start at the configuration file.
         validation: Names of files (without .ply) for validation only; every fifth file, from the
-            second on, if none is named.
+            second on, if none is named. They are looked at from the cameras of
+            ``NAME.transforms.json``, if it lies beside the file.
         generated: Generated training scenes of each kind.
         generated_validation: Generated scenes of each kind for validation only.
         generated_counts: Gaussians of generated scenes, in turn.
@@ -47,7 +48,7 @@ class DataConfig(Section):
 
 
 class ViewsConfig(Section):
-    """Images to train on: half from automatic cameras, half from random positions.
+    """Images to train on: a quarter from automatic cameras, the others from random positions.
 
     Attributes:
         count: Images of each scene at each size.

@@ -33,6 +33,7 @@ class Source:
         is_validation: Whether it is for validation only.
         origin: The file or generated scene that it is, or was cut from.
         make: Function that makes the scene.
+        cameras: File of cameras to validate from; None finds views.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Source:
     is_validation: bool
     origin: LearnedScene
     make: Callable[[], GaussianScene]
+    cameras: Path | None = None
 
 
 def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
@@ -95,13 +97,14 @@ def _from_files(
         count, name = len(load(path)), path.stem
         with path.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-        is_validation = name in held_out
+        is_validation, cameras = name in held_out, path.with_suffix(".transforms.json")
         whole = Source(
             name=name,
             identity=sha256,
             is_validation=is_validation,
             origin=LearnedScene(name=name, count=count, sha256=sha256, is_validation=is_validation),
             make=partial(_load_valid, path),
+            cameras=cameras if is_validation and cameras.is_file() else None,
         )
         if whole.is_validation:
             yield whole
