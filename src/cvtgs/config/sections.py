@@ -136,7 +136,7 @@ class VisibilityConfig(Section):
     views: int = pydantic.Field(default=0, ge=0)
     size: int = pydantic.Field(default=128, ge=16)
     stride: Count = 1
-    mass_share: Share = 0.7
+    mass_share: Share = 0.3
 
 
 class MatchConfig(Section):
@@ -206,12 +206,12 @@ class Rates(Section):
         shN: Colours that depend on the direction.
     """
 
-    means: Rate = 0.02
-    quats: Rate = 0.008
-    log_scales: Rate = 0.01
+    means: Rate = 0.04
+    quats: Rate = 0.016
+    log_scales: Rate = 0.02
     logit_opacities: Rate = 0.1
     sh0: Rate = 0.04
-    shN: Rate = 0.01  # noqa: N815 (the name that scenes give it)
+    shN: Rate = 0.002  # noqa: N815 (the name that scenes give it)
 
 
 class RefineConfig(Section):
@@ -244,7 +244,7 @@ class RefineConfig(Section):
 
     Example:
         >>> RefineConfig(size=128).rates.means
-        0.02
+        0.04
     """
 
     steps: int = pydantic.Field(default=0, ge=0)

@@ -33,6 +33,7 @@ MATCHED: Mapping[str, Any] = {
     "match": {"opacity_rounds": 1},
     "refine": {
         "steps": 50,
+        "rates": {"means": 0.03, "quats": 0.012, "log_scales": 0.015},
         "half_after": 40,
         "size": 400,
         "stride": 2,
@@ -42,13 +43,13 @@ MATCHED: Mapping[str, Any] = {
 }
 
 THINNED: Mapping[str, Any] = {
-    "steps": 250,
-    "half_after": 60,
+    "steps": 400,
+    "half_after": 96,
     "cooling": 0.3,
     "size": 400,
     "stride": 2,
     "first_images": 32,
-    "steps_per_image": 8,
+    "steps_per_image": 16,
     "check_every": 50,
 }
 
