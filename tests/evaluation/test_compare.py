@@ -151,10 +151,11 @@ def test_evaluate_refuses_what_makes_no_sense(scene, cameras):
 def test_cameras_of_another_scene_are_refused(scene, cameras):
     away = cameras.viewmats.clone()
     away[:, 0, 3] += 1e4  # the scene lies far to the right of every image
-    elsewhere = replace(cameras, viewmats=away)
+    elsewhere, events = replace(cameras, viewmats=away), []
     for score in (evaluate, compare):
         with pytest.raises(ValueError, match=r"must see full, found nothing of it in any of 3"):
-            score(scene, {"a": scene}, elsewhere, settings=OFF)
+            score(scene, {"a": scene}, elsewhere, settings=OFF, listener=events.append)
+    assert not events  # before anything is scored
     mixed = replace(cameras, viewmats=torch.cat([away[:2], cameras.viewmats[2:]]))
     assert evaluate(scene, {"a": scene}, mixed, settings=OFF).scenes
 

@@ -241,7 +241,11 @@ def _score_images(
     against_full: dict[str, list[ImageScores]] = {name: [] for name in scenes}
     against_photographs: dict[str, list[ImageScores]] = {name: [] for name in scenes}
     total, done, backend = len(cameras) * len(scenes), 0, ""
-    most_cover = 0.0
+    if not (cameras.shows_any(reference.means) or _covers_any(reference, cameras, settings)):
+        raise InvalidArgumentError(
+            f"the cameras must see {reference_name}, found nothing of it in any of {len(cameras)} "
+            f"views; give cameras of this scene, in its axes and units."
+        )
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
     for view in range(len(cameras)):
         camera = cameras.select(torch.tensor([view]))
@@ -254,7 +258,6 @@ def _score_images(
             keep(name, view, image)
             if truth is None:
                 truth = image
-                most_cover = max(most_cover, float(image.alpha.mean()))
             else:
                 alphas = (image.alpha, truth.alpha.to(image.alpha))
                 against_full[name].append(metrics.compare(color, truth.color, alphas=alphas))
@@ -263,11 +266,6 @@ def _score_images(
                 against_photographs[name].append(found)
             done += 1
             listener(ProgressEvent(stage=STAGE, done=done, total=total))
-    if most_cover < LEAST_COVER and not cameras.shows_any(reference.means):
-        raise InvalidArgumentError(
-            f"the cameras must see {reference_name}, found nothing of it in any of {len(cameras)} "
-            f"views; give cameras of this scene, in its axes and units."
-        )
     del against_full[reference_name]
     return Evaluation(
         reference=reference_name,
@@ -287,3 +285,9 @@ def _score_images(
             if rows
         ),
     )
+
+
+def _covers_any(scene: GaussianScene, cameras: Cameras, settings: EvaluationSettings) -> bool:
+    """Return whether Gaussians beside all images cover something of one."""
+    images = (render_view(scene, camera, backend=settings.backend) for camera in cameras.singles())
+    return any(float(image.alpha.mean()) >= LEAST_COVER for image in images)
