@@ -43,8 +43,8 @@ MATCHED: Mapping[str, Any] = {
 }
 
 THINNED: Mapping[str, Any] = {
-    "steps": 400,
-    "half_after": 96,
+    "steps": 320,
+    "half_after": 77,
     "cooling": 0.3,
     "size": 400,
     "stride": 2,
