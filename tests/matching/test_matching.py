@@ -140,13 +140,13 @@ def test_count_report_and_determinism(scene):
 
 def test_steps_learn_from_the_images_that_were_matched_to(scene, monkeypatch):
     """The full scene is rendered once, however many steps follow; a larger image is another."""
-    steps = {"size": 48, "stride": 2, "steps": 12, "steps_per_image": 20, "check_every": 4}
-    images = {"views": 16, "size": 48, "stride": 2, "mass_share": 0.7}
+    steps = {"size": 48, "stride": 2, "steps": 18, "steps_per_image": 20, "check_every": 3}
+    images = {"views": 32, "size": 48, "stride": 2}
     config = preset(visibility=images, refine=steps)
     small, report = Simplifier(config=config, device="cpu").run(scene, 0.1)
     assert [cost.stage for cost in report.stages][-2:] == ["match", "refine"]
     refined = report.refinement
-    assert (refined.images, refined.heldout, refined.steps) == (0, 2, 12)
+    assert (refined.images, refined.heldout, refined.steps) == (0, 4, 18)
     assert refined.gain > 0
     assert same_bits(small, Simplifier(config=config, device="cpu").simplify(scene, 0.1))
     other = preset(visibility={"views": 16, "size": 64}, refine=steps)

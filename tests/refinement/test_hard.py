@@ -9,8 +9,10 @@ import torch
 import cvtgs
 from cvtgs.config import Rates
 from cvtgs.math.parameters import LOGIT_LIMIT
+from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.refinement import refine
 from cvtgs.refinement.images import ImageBuffer
+from cvtgs.scene import concatenate
 from refine_cases import as_dtype, discolored, full_scene, quick, ring, small_scene
 from scenes import random_scene, same_bits
 
@@ -143,16 +145,27 @@ def test_infinite_logits():
     assert torch.equal(scene.logit_opacities[~changed], logits[~changed])
 
 
-def refined_beside_nothing():
+def refined_beside_nothing(*, stray=0, seed=0):
     """A full scene, what came in, and what 120 short steps make of it.
 
-    In images of 48 pixels steps of the usual length do not come to rest.
+    In images of 48 pixels steps of the usual length do not come to rest. Stray Gaussians, black
+    and nearly opaque, are added where the full scene is empty.
     """
     full = random_scene(1500, degree=0, size=0.1)
     small = small_scene(full, 0.05)
+    if stray:
+        some = small.select(torch.arange(stray))
+        directions = torch.nn.functional.normalize(some.means - small.means.mean(dim=0), dim=1)
+        around = 1.5 * (full.means - full.means.mean(dim=0)).norm(dim=1).amax()
+        black = some.with_tensors(
+            means=full.means.mean(dim=0) + around * directions,
+            logit_opacities=torch.full_like(some.logit_opacities, 2.0),
+            sh0=torch.full_like(some.sh0, -0.5 / SH_C0),
+        )
+        small = concatenate([small, black])
     rates = Rates(means=0.02, quats=0.008, log_scales=0.01)
     config = quick(size=48, heldout=12, patience=100, rates=rates)
-    return full, small, refine(small, full, steps=120, config=config).scene
+    return full, small, refine(small, full, steps=120, config=config, seed=seed).scene
 
 
 def alphas_of(*scenes):
@@ -172,12 +185,23 @@ def test_an_empty_background_stays_empty():
 
 
 @pytest.mark.slow
-def test_random_backgrounds_keep_paint_out_of_an_empty_background(monkeypatch):
+def test_an_empty_background_stays_nearly_empty():
+    """In the mean of three sets of views; one alone says little about a twentieth."""
+    paint, errors = [], []
+    for seed in range(3):
+        (wanted, before, after), empty = alphas_of(*refined_beside_nothing(seed=seed))
+        paint.append(after[empty].mean() / before[empty].mean())
+        errors.append((after - wanted).square().mean() / (before - wanted).square().mean())
+    assert torch.stack(paint).mean() < 1.05
+    assert max(errors) < 1.0
+
+
+@pytest.mark.slow
+def test_random_backgrounds_take_black_paint_from_an_empty_background(monkeypatch):
     """Over black alone, what is black and opaque costs nothing."""
-    full, small, refined = refined_beside_nothing()
+    full, small, refined = refined_beside_nothing(stray=20)
     monkeypatch.setattr(ImageBuffer, "draw_background", lambda self: torch.zeros(3))
-    _, _, over_black = refined_beside_nothing()
-    (wanted, before, after, black), empty = alphas_of(full, small, refined, over_black)
+    _, _, over_black = refined_beside_nothing(stray=20)
+    (_, before, after, black), empty = alphas_of(full, small, refined, over_black)
     assert after[empty].mean() < 0.95 * black[empty].mean()
-    assert after[empty].mean() < 1.05 * before[empty].mean()
-    assert (after - wanted).square().mean() < (before - wanted).square().mean()
+    assert after[empty].mean() < before[empty].mean()

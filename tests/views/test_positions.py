@@ -133,7 +133,9 @@ def test_splats_are_as_large_as_they_are_in_the_image():
         width=100,
         height=100,
     )
-    assert splat_sizes(layout, cameras).tolist() == pytest.approx([0.5 * 0.1 / 2], rel=1e-5)
+    sizes = splat_sizes(layout, cameras)
+    assert sizes.in_image.tolist() == pytest.approx([0.5 * 0.1 / 2], rel=1e-5)
+    assert sizes.in_scene.tolist() == pytest.approx([0.1 / layout.frame.radius], rel=1e-5)
 
 
 def test_where_splats_are_large_hardly_any_view_is():
@@ -148,6 +150,30 @@ def test_where_splats_are_large_hardly_any_view_is():
 
     assert share(random_views(positions, 64, size=32, seed=0)) > 0.5
     assert share(mixed_views(positions, 32, size=32)) < 0.2
+
+
+def test_the_smooth_back_of_an_object_is_looked_at():
+    """Its Gaussians are almost twice as large as those in front, and yet no fog."""
+    front, back = sphere(6000), sphere(1200, 0.97)
+    front, back = front[front[:, 2] < 0], back[back[:, 2] >= 0]
+    sizes = torch.cat([torch.full((len(front),), 0.012), torch.full((len(back),), 0.021)])
+    positions = find_view_positions(blobs(torch.cat([front, back]), sizes.log()))
+    assert int(positions.sharp_sides.sum()) >= 8
+    for cameras, least in (
+        (mixed_views(positions, 32, size=32), 0.1),
+        (automatic_views(positions, 8), 0.3),
+    ):
+        directions = torch.nn.functional.normalize(cameras.centers, dim=1)
+        assert float((directions[:, 2] > 0.3).double().mean()) >= least
+
+
+@pytest.mark.parametrize("count", [12, 32])
+def test_automatic_views_among_mixed_ones_are_all_around(count):
+    cameras = mixed_views(blobs(sphere(4000), torch.full((4000,), 0.03).log()), count, size=32)
+    x, _, z = cameras.centers[: count // 4].unbind(1)
+    angles = torch.atan2(z, x).sort().values
+    gaps = torch.cat([angles.diff(), angles[:1] + math.tau - angles[-1:]])
+    assert float(gaps.amax()) < 1.2 * math.tau / (count // 4)
 
 
 def test_same_scene_same_positions():

@@ -1,6 +1,7 @@
 """Random views of a scene, and a mixture of them with automatic ones."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -10,13 +11,17 @@ from cvtgs.cameras import Cameras, look_at
 from cvtgs.scene import SceneLike
 from cvtgs.views.automatic import automatic_views
 from cvtgs.views.positions import CameraPositions, as_positions
-from cvtgs.views.scoring import splat_sizes
+from cvtgs.views.scoring import SMOOTH, splat_sizes
 
 TRIED = 3
 """Views that are tried for each that is returned."""
 
-BLURRED = 2.0
-"""Views are blurred whose splats are so many times as large as in the sharpest quarter of them."""
+TOO_NEAR = 2.0
+"""Views are too near what they show at less than half the distance of the farthest quarter."""
+
+FOGGY = 1.4
+"""Views show fog whose splats are so many times as large in the scene, in radii, as in the sharpest
+tenth, and larger than those of smooth sides."""
 
 NEAR = (0.2, 1.4)
 """Distances of near views, robust radii: some are within the scene."""
@@ -98,6 +103,7 @@ def mixed_views(
     A quarter are automatic views, a quarter random views from near, within the scene too, and
     half random views from around it. Of each kind three times as many are tried, and those that
     show large splats come last: where no image was taken, a scene is a fog from which nobody looks.
+    So do those that are much nearer than others. Of the rest, views from all around are taken.
 
     Args:
         scene: A scene with at least one valid Gaussian, or what :func:`find_view_positions` found
@@ -129,7 +135,8 @@ def mixed_views(
         (random_views(positions, times * near, size=size, seed=seed + 1, reach=NEAR), near),
         (random_views(positions, times * far, size=size, seed=seed), far),
     ]
-    groups = [_sharp_ones(positions, cameras, wanted) for cameras, wanted in tried]
+    tried = [(cameras, wanted) for cameras, wanted in tried if wanted]
+    groups = _sharp_ones(positions, tried) if sharp else [cameras for cameras, _ in tried]
     return Cameras(
         viewmats=torch.cat([group.viewmats for group in groups]),
         Ks=torch.cat([group.Ks for group in groups]),
@@ -138,11 +145,18 @@ def mixed_views(
     )
 
 
-def _sharp_ones(positions: CameraPositions, cameras: Cameras, count: int) -> Cameras:
-    """Return the first views that are not blurred, and the least blurred others if need be."""
-    if len(cameras) == count:
-        return cameras
-    sizes = splat_sizes(positions.layout, cameras)
-    least = BLURRED * sizes.quantile(0.25)
-    kept = sizes.clamp_min(least).sort(stable=True).indices[:count].sort().values
-    return cameras.select(kept)
+def _sharp_ones(positions: CameraPositions, tried: Sequence[tuple[Cameras, int]]) -> list[Cameras]:
+    """Return as many views of each kind as are wanted; worse ones only if need be."""
+    sizes = [splat_sizes(positions.layout, cameras) for cameras, _ in tried]
+    in_scene = torch.cat([size.in_scene for size in sizes])
+    largest = max(SMOOTH, FOGGY * float(in_scene.quantile(0.1)))
+    chosen = []
+    for (cameras, wanted), size in zip(tried, sizes, strict=True):
+        closeness = size.in_image / size.in_scene
+        too_near = closeness / (TOO_NEAR * closeness.quantile(0.25))
+        faults = torch.maximum(too_near, size.in_scene / largest).clamp_min(1.0)
+        # Automatic views come in the order of a turn: of each three one, then the others.
+        spread = torch.arange(len(cameras)).view(wanted, TRIED).T.flatten()
+        best = faults[spread].sort(stable=True).indices[:wanted]
+        chosen.append(cameras.select(spread[best].sort().values))
+    return chosen

@@ -1,13 +1,16 @@
 """Positions from which somebody would look at a scene: above its floor, and not inside matter."""
 
+import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from cvtgs.cameras import Cameras, look_at
 from cvtgs.scene import SceneLike, as_scene
 from cvtgs.views.layout import ENCLOSED, FREE, SceneLayout, enclosure, find_layout, size_growth
+from cvtgs.views.scoring import PIXELS, SMOOTH, splat_sizes
 
 REACH = (0.2, 3.0)
 """Distances of the positions that are tried, in robust radii from the centre of the frame."""
@@ -25,6 +28,13 @@ _SLACK = 0.25
 
 _TOP = 0.98
 
+_SIDES = 32
+_OUTSIDE = 1.1
+"""Positions at least so many robust radii away look at a side of the scene."""
+
+_SIDE_DISTANCE, _SIDE_FIELD = 2.2, 50.0
+"""From where sides are looked at, robust radii, and the field of view, degrees."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraPositions:
@@ -33,12 +43,14 @@ class CameraPositions:
     Attributes:
         layout: Of the scene.
         least_growth: The least mean correlation of sizes with distances of a position.
+        sharp_sides: ``(32,)`` from which of 32 directions spread evenly the scene is sharp.
         eyes: ``(p, 3)`` positions that were tried and found good, scene units; at least one.
         distances: ``(p,)`` their distances from the centre of the frame, in robust radii.
     """
 
     layout: SceneLayout
     least_growth: float
+    sharp_sides: Bool[Tensor, "d"]
     eyes: Float[Tensor, "p 3"]
     distances: Float[Tensor, "p"]
 
@@ -51,11 +63,12 @@ class CameraPositions:
         Returns:
             A mask. A good position is above the floor, if there is one, and free; it is within
             the room if the scene is one, else not enclosed; and what is near has smaller
-            Gaussians than what is far, as it has where images were taken.
+            Gaussians than what is far, as it has where images were taken, or it looks from outside
+            at a side of small Gaussians: the smooth back of an object.
         """
         free = stand_free(self.layout, eyes)
-        rows = free.nonzero()[:, 0]
-        free[rows] = _growths(self.layout, eyes[rows]) >= self.least_growth
+        unsure = free & ~_sees_sharp_sides(self.layout, eyes, self.sharp_sides)
+        free[unsure] = _growths(self.layout, eyes[unsure]) >= self.least_growth
         return free
 
     def near(self, count: int, reach: tuple[float, float], seed: int) -> Float[Tensor, "c 3"]:
@@ -112,9 +125,17 @@ def find_view_positions(scene: SceneLike) -> CameraPositions:
     eyes = eyes[free] if bool(free.any()) else eyes[:1]
     growths = _growths(layout, eyes)
     least = float(growths.quantile(_TOP)) - _SLACK
-    eyes = eyes[growths >= least]
+    grows = growths >= least
+    sharp_sides = _sharp_sides(layout, eyes[~grows])
+    eyes = eyes[grows | _sees_sharp_sides(layout, eyes, sharp_sides)]
     distances = torch.linalg.vector_norm(eyes - center, dim=1) / radius
-    return CameraPositions(layout=layout, least_growth=least, eyes=eyes, distances=distances)
+    return CameraPositions(
+        layout=layout,
+        least_growth=least,
+        sharp_sides=sharp_sides,
+        eyes=eyes,
+        distances=distances,
+    )
 
 
 def as_positions(scene: SceneLike | CameraPositions) -> CameraPositions:
@@ -148,6 +169,59 @@ def stand_free(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, 
         elif above >= _BURIED:
             free[row] = enclosure(local[row], points, -layout.up) < _BURIED
     return free
+
+
+def _sharp_sides(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, "d"]:
+    """Return which sides are sharp, not from below, of those that some positions look at.
+
+    The back of an object may be all smooth: its Gaussians are larger than those of the front, and
+    shrink with the distance from behind, though images were taken there.
+    """
+    directions = _side_directions()
+    sides, is_outside = _sides(layout, eyes)
+    sharp = torch.zeros(len(directions), dtype=torch.bool)
+    if layout.room is None:
+        sharp[sides[is_outside]] = True
+    sharp &= directions @ layout.up >= 0
+    if not bool(sharp.any()):
+        return sharp
+    center, radius = layout.frame.center, layout.frame.radius
+    from_where = center + _SIDE_DISTANCE * radius * directions[sharp]
+    focal = 0.5 * PIXELS / math.tan(math.radians(0.5 * _SIDE_FIELD))
+    middle = PIXELS / 2
+    intrinsics = torch.tensor([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]])
+    cameras = Cameras(
+        viewmats=look_at(from_where, center.expand_as(from_where), layout.up),
+        Ks=intrinsics.double().repeat(len(from_where), 1, 1),
+        width=PIXELS,
+        height=PIXELS,
+    )
+    sharp[sharp.nonzero()[:, 0]] = splat_sizes(layout, cameras).in_scene <= SMOOTH
+    return sharp
+
+
+def _sees_sharp_sides(
+    layout: SceneLayout, eyes: Float[Tensor, "c 3"], sharp_sides: Bool[Tensor, "d"]
+) -> Bool[Tensor, "c"]:
+    sides, is_outside = _sides(layout, eyes)
+    return is_outside & sharp_sides[sides]
+
+
+def _sides(
+    layout: SceneLayout, eyes: Float[Tensor, "c 3"]
+) -> tuple[Int[Tensor, "c"], Bool[Tensor, "c"]]:
+    """Return which side each position is before, and whether it is outside."""
+    offsets = (eyes - layout.frame.center) / layout.frame.radius
+    is_outside = torch.linalg.vector_norm(offsets, dim=1) >= _OUTSIDE
+    return (offsets @ _side_directions().T).argmax(dim=1), is_outside
+
+
+def _side_directions() -> Float[Tensor, "d 3"]:
+    """Return unit vectors that are spread evenly (a Fibonacci lattice, Gonzalez 2010)."""
+    steps = torch.arange(_SIDES, dtype=torch.float64) + 0.5
+    heights, angles = 1 - 2 * steps / _SIDES, steps * math.pi * (3 - math.sqrt(5))
+    widths = (1 - heights.square()).sqrt()
+    return torch.stack([widths * angles.cos(), widths * angles.sin(), heights], dim=1)
 
 
 def _growths(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Float[Tensor, "c"]:

@@ -1,6 +1,7 @@
 """Score candidate cameras by small images of what they see."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,6 +24,10 @@ _MOST_NEAR = 0.08
 _MOST_BLOCKED = 0.3
 _LEAST_FILLED = {False: 0.12, True: 0.8}
 _VISIBLE = 0.25
+SMOOTH = 0.05
+"""Smooth sides that images were taken of have splats up to this share of the robust radius. The
+sample makes scenes of any number of Gaussians comparable."""
+
 _ENCLOSING = 2.5
 """Standard deviations within which a camera is inside of a Gaussian."""
 
@@ -73,26 +78,40 @@ def score_cameras(
     )
 
 
-def splat_sizes(layout: SceneLayout, cameras: Cameras) -> Float[Tensor, "c"]:
-    """Return the median size of what each camera shows, as a share of the image, float64.
+class SplatSizes(NamedTuple):
+    """Median sizes of the Gaussians that paint images: half of each image is by smaller ones.
 
-    Half of the image is painted by Gaussians of smaller projected standard deviations.
+    Attributes:
+        in_image: ``(c,)`` projected standard deviations, as a share of the image, float64.
+        in_scene: ``(c,)`` standard deviations, as a share of the robust radius, float64.
     """
+
+    in_image: Float[Tensor, "c"]
+    in_scene: Float[Tensor, "c"]
+
+
+def splat_sizes(layout: SceneLayout, cameras: Cameras) -> SplatSizes:
+    """Return how large the splats are that each camera, of at least one, shows."""
     sample, side = layout.sample, max(cameras.width, cameras.height)
     factor = PIXELS / side
     small = cameras.resized(
         max(8, round(factor * cameras.width)), max(8, round(factor * cameras.height))
     )
     widths = sample.log_scales.double().sort(dim=1).values[:, 1:].mean(dim=1).exp()
-    found = []
+    in_image, in_scene = [], []
     for camera in small.singles():
         painted = observe(sample, camera).contributions.double()
         ahead = sample.means.double() @ camera.viewmats[0, 2, :3] + camera.viewmats[0, 2, 3]
-        sizes, order = (widths / ahead.clamp_min(1e-9)).sort()
-        shares = painted[order].cumsum(dim=0)
-        middle = torch.searchsorted(shares, 0.5 * shares[-1])
-        found.append(sizes[middle] * camera.Ks[0, 0, 0] / PIXELS)
-    return torch.stack(found)
+        share = _weighted_median(widths / ahead.clamp_min(1e-9), painted)
+        in_image.append(share * camera.Ks[0, 0, 0] / PIXELS)
+        in_scene.append(_weighted_median(widths, painted) / layout.frame.radius)
+    return SplatSizes(torch.stack(in_image), torch.stack(in_scene))
+
+
+def _weighted_median(values: Float[Tensor, "n"], weights: Float[Tensor, "n"]) -> Tensor:
+    values, order = values.sort()
+    shares = weights[order].cumsum(dim=0)
+    return values[torch.searchsorted(shares, 0.5 * shares[-1])]
 
 
 def _inside_gaussians(layout: SceneLayout, cameras: Cameras) -> Bool[Tensor, "c"]:
