@@ -26,7 +26,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("typing")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_embedding_program_is_typed(folder: Path) -> None:
     done = check(PROGRAM, folder)
     assert done.returncode == 0, done.stdout

@@ -38,7 +38,7 @@ def test_table_and_files(source, tmp_path, capsys):
     assert "--overwrite" in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_that_fails_is_told_and_the_others_go_on(source, tmp_path, capsys, monkeypatch):
     from cvtgs.tradeoff import runs  # noqa: PLC0415 (to be changed here)
 

@@ -131,7 +131,7 @@ def test_shipped_checkpoints_are_small_and_say_what_they_are(name, path):
     assert all(torch.equal(ours[key], theirs[key]) for key in ours)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_flipped_bit_is_found(path):
     """One bit of every byte, which one by chance: in header, texts and weights alike."""
     net, dice = lively_net(torch.float32, architecture=SMALL), random.Random(0)

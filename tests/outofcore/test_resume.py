@@ -62,7 +62,7 @@ def test_a_killed_run_continues_with_the_missing_blocks(source, tmp_path):
     assert not folder.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
 @pytest.mark.parametrize("step", ["sums_02", "parts", "groups", "labels", "merged", "inflated"])
 def test_a_run_killed_between_steps_of_all_blocks_continues(source, tmp_path, step):
@@ -137,7 +137,7 @@ def test_blocks_of_another_job_are_not_used(source, tmp_path, change):
     assert not folder.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "kind", ["parts", "groups", "targets", "labels", "sent", "merged", "inflated", "small"]
 )

@@ -177,14 +177,14 @@ def alphas_of(*scenes):
     return alphas, empty
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xfail(strict=True, reason="steps in own frames paint 3 % more into what was empty")
 def test_an_empty_background_stays_empty():
     (_, before, after), empty = alphas_of(*refined_beside_nothing())
     assert after[empty].mean() < before[empty].mean()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_empty_background_stays_nearly_empty():
     """In the mean of three sets of views; one alone says little about a twentieth."""
     paint, errors = [], []

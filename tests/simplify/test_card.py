@@ -83,7 +83,7 @@ def test_images_and_gradients():
             torch.testing.assert_close(found, same, rtol=2e-3, atol=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_refinement_gains():
     full = full_scene(300)
     small = discolored(small_scene(full)).to(DEVICE)
@@ -93,7 +93,7 @@ def test_refinement_gains():
     assert refined.report.gain > 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_preset_that_refines():
     changes = {"steps": 2, "check_every": 2, "size": 32, "heldout": 4, "batch": 4}
     settings = {"preset": "high", "refine": changes, "visibility": {"views": 4, "size": 32}}

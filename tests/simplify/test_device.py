@@ -84,7 +84,7 @@ def test_a_named_device_without_enough_memory():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_short_chunks_where_long_ones_do_not_fit(monkeypatch):
     for name in ("mergenet.apply", "cells.merge"):
         monkeypatch.setattr(f"cvtgs.{name}.CHUNK_MEMBERS", 64)

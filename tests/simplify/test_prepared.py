@@ -21,7 +21,9 @@ def stages(report):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("preset", ["standard", "draft", "paper", "high"])
+@pytest.mark.parametrize(
+    "preset", ["standard", "draft", "paper", pytest.param("high", marks=pytest.mark.long)]
+)
 def test_every_run_gives_the_bits_of_a_run_of_its_own(scene, preset):
     quick = {"visibility.views": 4, "visibility.size": 32, "refine.steps": 2, "refine.size": 32}
     settings = {key: str(value) for key, value in quick.items()} if preset == "high" else {}

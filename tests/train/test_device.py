@@ -52,7 +52,7 @@ def stop_after_three(event: ProgressEvent) -> None:
         raise PowerCutError
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("_quick_curves")
 @pytest.mark.parametrize(
     ("kind", "copies"), [("scene", SCENE_COPIES), ("local", 10), ("published", 11)]
@@ -74,7 +74,7 @@ def test_copies_of_a_step(kind, copies, tmp_path):
     assert steps[-1] == min(steps) <= copies, traffic.copies
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("_quick_curves")
 @pytest.mark.parametrize("kind", ["scene", "local"])
 def test_training_and_resuming(kind, tmp_path):
