@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.cameras import Cameras, look_at
+from cvtgs.cameras import Cameras
 from cvtgs.devices import one_thread
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.scene import SceneLike
 from cvtgs.views.layout import SceneLayout
 from cvtgs.views.positions import REACH, CameraPositions, as_positions
-from cvtgs.views.scoring import score_cameras
+from cvtgs.views.scoring import cameras_at, score_cameras
 
 _ELEVATIONS = (20.0, 35.0, 12.0, 28.0)
 _OUTSIDE = (
@@ -96,7 +96,7 @@ def outside_candidates(
             eyes.append(math.cos(rise) * level + math.sin(rise) * layout.up)
         directions = torch.stack(eyes)
         rounds.append(
-            _cameras(
+            cameras_at(
                 layout.center + distance * factor * directions,
                 -directions,
                 layout.up,
@@ -126,7 +126,7 @@ def inside_candidates(
         steps = back * _distances_to_walls(layout, middle, -level)
         eyes = middle - steps[:, None] * level + lift * layout.height * layout.up
         directions = math.cos(pitch) * level + math.sin(pitch) * layout.up
-        rounds.append(_cameras(eyes, directions, layout.up, size=size, field=INSIDE_FIELD))
+        rounds.append(cameras_at(eyes, directions, layout.up, size=size, field=INSIDE_FIELD))
         distances.append(steps + 0.5 * layout.frame.radius)
     return CandidateCameras(inside=True, rounds=tuple(rounds), distances=tuple(distances))
 
@@ -140,7 +140,7 @@ def found_candidates(
     reach = REACH if inside else (1.4, REACH[1])
     eyes = torch.cat([positions.near(count, reach, seed + turn) for turn in range(_FOUND)])
     directions = layout.center - eyes if layout.room is None else layout.room - eyes
-    cameras = _cameras(
+    cameras = cameras_at(
         eyes, directions, layout.up, size=size, field=INSIDE_FIELD if inside else OUTSIDE_FIELD
     )
     rows = torch.arange(len(eyes)).split(count)
@@ -172,25 +172,6 @@ def _level_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tenso
     least = torch.eye(3, dtype=up.dtype)[up.abs().argmin()]
     right = torch.nn.functional.normalize(torch.linalg.cross(up, least), dim=0)
     return right, torch.linalg.cross(right, up)
-
-
-def _cameras(
-    eyes: Float[Tensor, "c 3"],
-    directions: Float[Tensor, "c 3"],
-    up: Float[Tensor, "3"],
-    *,
-    size: tuple[int, int],
-    field: float,
-) -> Cameras:
-    width, height = size
-    focal = 0.5 * min(size) / math.tan(math.radians(0.5 * field))
-    intrinsics = [[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]]
-    return Cameras(
-        viewmats=look_at(eyes, eyes + directions, up),
-        Ks=torch.tensor(intrinsics, dtype=eyes.dtype).repeat(len(eyes), 1, 1),
-        width=width,
-        height=height,
-    )
 
 
 _GOLDEN = 0.6180339887498949

@@ -7,10 +7,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.cameras import Cameras, look_at
 from cvtgs.scene import SceneLike, as_scene
 from cvtgs.views.layout import ENCLOSED, FREE, SceneLayout, enclosure, find_layout, size_growth
-from cvtgs.views.scoring import PIXELS, SMOOTH, splat_sizes
+from cvtgs.views.scoring import PIXELS, SMOOTH, cameras_at, splat_sizes
 
 REACH = (0.2, 3.0)
 """Distances of the positions that are tried, in robust radii from the centre of the frame."""
@@ -186,15 +185,12 @@ def _sharp_sides(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor
     if not bool(sharp.any()):
         return sharp
     center, radius = layout.frame.center, layout.frame.radius
-    from_where = center + _SIDE_DISTANCE * radius * directions[sharp]
-    focal = 0.5 * PIXELS / math.tan(math.radians(0.5 * _SIDE_FIELD))
-    middle = PIXELS / 2
-    intrinsics = torch.tensor([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]])
-    cameras = Cameras(
-        viewmats=look_at(from_where, center.expand_as(from_where), layout.up),
-        Ks=intrinsics.double().repeat(len(from_where), 1, 1),
-        width=PIXELS,
-        height=PIXELS,
+    cameras = cameras_at(
+        center + _SIDE_DISTANCE * radius * directions[sharp],
+        -directions[sharp],
+        layout.up,
+        size=(PIXELS, PIXELS),
+        field=_SIDE_FIELD,
     )
     sharp[sharp.nonzero()[:, 0]] = splat_sizes(layout, cameras).in_scene <= SMOOTH
     return sharp

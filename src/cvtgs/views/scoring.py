@@ -1,5 +1,6 @@
 """Score candidate cameras by small images of what they see."""
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -7,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cvtgs.cameras import Cameras
+from cvtgs.cameras import Cameras, look_at
 from cvtgs.math import parameters
 from cvtgs.rendering import observe, render
 from cvtgs.views.layout import SceneLayout
@@ -30,6 +31,26 @@ sample makes scenes of any number of Gaussians comparable."""
 
 _ENCLOSING = 2.5
 """Standard deviations within which a camera is inside of a Gaussian."""
+
+
+def cameras_at(
+    eyes: Float[Tensor, "c 3"],
+    directions: Float[Tensor, "c 3"],
+    up: Float[Tensor, "3"],
+    *,
+    size: tuple[int, int],
+    field: float,
+) -> Cameras:
+    """Return cameras of one size and field of view, degrees, along the shorter side."""
+    width, height = size
+    focal = 0.5 * min(size) / math.tan(math.radians(0.5 * field))
+    intrinsics = [[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]]
+    return Cameras(
+        viewmats=look_at(eyes, eyes + directions, up),
+        Ks=torch.tensor(intrinsics, dtype=eyes.dtype).repeat(len(eyes), 1, 1),
+        width=width,
+        height=height,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,10 +76,7 @@ def score_cameras(
     A camera is bad if it is inside of a Gaussian, if something near fills part of the image or
     hides the middle, or if the image is empty.
     """
-    factor = PIXELS / max(cameras.width, cameras.height)
-    small = cameras.resized(
-        max(8, round(factor * cameras.width)), max(8, round(factor * cameras.height))
-    )
+    small = _small(cameras)
     images = render(layout.sample, small, depth=True)
     depth = images.alpha.new_zeros(()) if images.depth is None else images.depth
     near = (images.alpha > _VISIBLE) & (depth < _NEAR * distances.to(depth)[:, None, None])
@@ -78,6 +96,13 @@ def score_cameras(
     )
 
 
+def _small(cameras: Cameras) -> Cameras:
+    factor = PIXELS / max(cameras.width, cameras.height)
+    return cameras.resized(
+        max(8, round(factor * cameras.width)), max(8, round(factor * cameras.height))
+    )
+
+
 class SplatSizes(NamedTuple):
     """Median sizes of the Gaussians that paint images: half of each image is by smaller ones.
 
@@ -92,11 +117,7 @@ class SplatSizes(NamedTuple):
 
 def splat_sizes(layout: SceneLayout, cameras: Cameras) -> SplatSizes:
     """Return how large the splats are that each camera, of at least one, shows."""
-    sample, side = layout.sample, max(cameras.width, cameras.height)
-    factor = PIXELS / side
-    small = cameras.resized(
-        max(8, round(factor * cameras.width)), max(8, round(factor * cameras.height))
-    )
+    sample, small = layout.sample, _small(cameras)
     widths = sample.log_scales.double().sort(dim=1).values[:, 1:].mean(dim=1).exp()
     in_image, in_scene = [], []
     for camera in small.singles():
