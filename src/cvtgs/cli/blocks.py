@@ -1,4 +1,4 @@
-"""Options of commands that work block by block, and the workers that these name."""
+"""Options of commands that work block by block, and the workers that they choose."""
 
 import argparse
 from collections.abc import Iterator
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
 
 
 class BlockWorkers(NamedTuple):
-    """What calls functions for blocks.
+    """Workers that process blocks, and their memory.
 
     Attributes:
         workers: Processes or a cluster; None for this process alone.
-        memory: Bytes that each of them may use.
+        memory: Bytes that each worker may use.
     """
 
     workers: "Workers | None"
@@ -47,7 +47,7 @@ def add_block_options(parser: argparse.ArgumentParser) -> None:
 
 
 def memory_of(options: argparse.Namespace) -> int:
-    """Return the bytes to work with, and refuse workers that cannot be."""
+    """Return the memory to use, in bytes; raise if the options of workers are invalid."""
     from cvtgs.outofcore import available_memory, read_bytes
     from cvtgs.outofcore.memory import memory_to_plan
 
@@ -63,7 +63,7 @@ def memory_of(options: argparse.Namespace) -> int:
 
 @contextmanager
 def block_workers(options: argparse.Namespace, memory: int) -> Iterator[BlockWorkers]:
-    """Start processes of this machine, or connect to a cluster."""
+    """Start processes on this machine, or connect to a cluster."""
     from cvtgs.outofcore import ClusterWorkers, LocalWorkers, connect, worker_count
 
     with ExitStack() as stack:

@@ -64,7 +64,7 @@ def completion(
 
 
 def values_of(action: argparse.Action) -> list[str]:
-    """Return the words that an option takes; none if it takes others, too."""
+    """Return the words to suggest as values of an option; an empty list if there are none."""
     if action.choices is not None:
         return [str(choice) for choice in action.choices]
     return {

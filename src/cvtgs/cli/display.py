@@ -13,23 +13,23 @@ from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.text import printable
 
 WIDTH = 80
-"""Columns that a line of output fills at most."""
+"""Maximum columns of a line of output."""
 
 TIE = "\N{NO-BREAK SPACE}"
-"""A space where no line may end; it is printed as an ordinary one."""
+"""A space at which lines do not break; it is printed as an ordinary space."""
 
 
 def say(text: str, *, file: TextIO | None = None, end: str = "\n", flush: bool = False) -> None:
-    """Print a text; control characters, and what the terminal cannot show, become escapes."""
+    """Print a text; escape control characters and characters that the terminal cannot show."""
     file = sys.stdout if file is None else file
-    if file is None:  # closed by who started the process
+    if file is None:  # closed by the parent process
         return
     with _console_errors(file):
         print(printable(text, file.encoding or "utf-8"), file=file, end=end, flush=flush)
 
 
 def flush_output() -> None:
-    """Print what is left in the buffer of stdout."""
+    """Flush stdout."""
     file = sys.stdout
     if file is None:
         return
@@ -39,7 +39,7 @@ def flush_output() -> None:
 
 @contextmanager
 def _console_errors(file: TextIO) -> Iterator[None]:
-    """Raise a full disk or a closed pipe as an error of cvtgs; ignore it on stderr."""
+    """Turn a full disk or a closed pipe into an error of cvtgs; ignore it on stderr."""
     try:
         yield
     except OSError as error:
@@ -49,7 +49,7 @@ def _console_errors(file: TextIO) -> Iterator[None]:
 
 
 def say_wrapped(text: str, *, file: TextIO | None = None, indent: int = 0) -> None:
-    """Print a sentence in lines of 80 columns, which end neither in a path nor at a ``TIE``."""
+    """Print a sentence in lines of 80 columns, without breaks inside words or at a ``TIE``."""
     for line in textwrap.wrap(
         printable(text),
         WIDTH,
@@ -62,7 +62,7 @@ def say_wrapped(text: str, *, file: TextIO | None = None, indent: int = 0) -> No
 
 
 def without_middle(text: str, width: int) -> str:
-    """Return a text, without its middle if it is longer than the width."""
+    """Return a text; replace its middle by dots if it is longer than the width."""
     text = printable(text)
     if len(text) <= width:
         return text
@@ -71,7 +71,7 @@ def without_middle(text: str, width: int) -> str:
 
 
 def size_text(count: int) -> str:
-    """Return a number of bytes in decimal units."""
+    """Return a number of bytes as text in decimal units."""
     if count < 1000:
         return f"{count} B"
     value = count / 1000
@@ -83,13 +83,13 @@ def size_text(count: int) -> str:
 
 
 def file_size(path: Path) -> str:
-    """Return the size of a scene file, or of the scene in a folder."""
+    """Return the size of a scene, which is a file or a folder, as text."""
     return size_text(cvtgs.io.scene_size(path))
 
 
 @contextmanager
 def progress_bars(*, quiet: bool, transient: bool = False) -> Iterator[ProgressListener]:
-    """Show a bar per stage on stderr if it is a terminal; transient ones are removed."""
+    """Show a bar per stage if stderr is a terminal; transient bars are removed at the end."""
     if quiet or not sys.stderr.isatty():
         yield silent
         return
@@ -99,7 +99,7 @@ def progress_bars(*, quiet: bool, transient: bool = False) -> Iterator[ProgressL
 
     with Progress(console=Console(stderr=True), transient=transient) as progress:
         bars: dict[str, TaskID] = {}
-        encoding = sys.stderr.encoding or "utf-8"  # None of a StringIO
+        encoding = sys.stderr.encoding or "utf-8"  # a StringIO has None
 
         def listen(event: ProgressEvent) -> None:
             if event.done == 0 or event.stage not in bars:

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from cvtgs.rendering import BackendName
 
 BACKENDS = ("torch", "numpy", "scipy", "numba", "gsplat")
-"""The packages that compute; cvtgs works without the last two."""
+"""The packages that cvtgs computes with; the last two are optional."""
 
 RENDERERS = ("torch", "numba", "gsplat")
 COUNT, RHO, SIDE = 20_000, 0.1, 256
-"""The small run: Gaussians, ratio, and width and height of an image in pixels."""
+"""The small run: Gaussians, ratio, and side of the square image in pixels."""
 
 
 class ShowVersions(argparse.Action):
@@ -45,7 +45,7 @@ class ShowVersions(argparse.Action):
 
 
 def version_lines() -> list[str]:
-    """Return a line for cvtgs, for Python, and for every package that computes."""
+    """Return one line each for cvtgs, Python and every package in ``BACKENDS``."""
     lines = [f"cvtgs {cvtgs.__version__}", f"Python {platform.python_version()}"]
     return lines + [f"{name} {version_of(name)}" for name in BACKENDS]
 
@@ -97,7 +97,7 @@ def doctor(options: argparse.Namespace) -> None:
     try:
         for line in _small_run(default):
             say(f"  {line}")
-    except Exception as error:  # whatever a driver or a broken installation raises
+    except Exception as error:  # drivers and broken installations raise anything
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise DeviceError(
             f"the default path does not work on {default}: {reason}; try cvtgs doctor --device cpu."
@@ -115,7 +115,7 @@ def _renderer_state(name: str, device: "torch.device") -> str:
 
 
 def _small_run(device: "torch.device") -> list[str]:
-    """Generate, simplify and render; return the time and the backend of each step."""
+    """Generate, simplify and render a scene; return a line with the time of each step."""
     import torch
 
     times = [time.perf_counter()]

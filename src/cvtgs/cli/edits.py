@@ -1,4 +1,4 @@
-"""Options of ``cvtgs convert`` that edit the scene on its way, and what they do."""
+"""The editing options of ``cvtgs convert``, and the edits."""
 
 import argparse
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ _NUMBERS = {
 
 
 def add_edit_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options, in the order in which they act."""
+    """Add the options, in the order in which they are applied."""
     group = parser.add_argument_group(
         "edits", "in this order, in the coordinates of a PLY; rows that stay keep their bits"
     )
@@ -66,7 +66,7 @@ def add_edit_options(parser: argparse.ArgumentParser) -> None:
 
 
 class SceneEdits:
-    """The edits of a command line: checked when it is made, applied to a scene later."""
+    """The edits of a command line: checked on construction, applied to a scene later."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         from cvtgs.boxes import checked_box
@@ -87,7 +87,7 @@ class SceneEdits:
         self.motion = _motion(options)
 
     def apply(self, scene: "GaussianScene") -> "tuple[GaussianScene, list[str]]":
-        """Edit a scene; return it, and what was dropped, a phrase each."""
+        """Return the edited scene, and one phrase for each kind of dropped Gaussians."""
         phrases = []
         for phrase, smaller in self._filtered(scene):
             if len(smaller) < len(scene):

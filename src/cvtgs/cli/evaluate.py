@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from cvtgs.tradeoff import Tradeoff
 
 MOST_CAMERAS = 8
-"""Cameras that a page shows unless ``--views`` sets another number."""
+"""Maximum number of cameras that a page shows unless ``--views`` is given."""
 
 SCORED_SIZE = 640
-"""Pixels of the longer side where scenes are scored, so that all commands print one score."""
+"""Longer side of scored images, pixels; shared so that all commands print the same scores."""
 
 ALPHA_MEANS = "alpha: mean |difference| of coverage; bias < 0: more of the background shows"
 
@@ -90,7 +90,7 @@ def render(options: argparse.Namespace) -> None:
 
 
 def file_names(views: Sequence[str]) -> list[str]:
-    """Return a PNG name for every view; numbered if two views have the same name."""
+    """Return a PNG file name for every view; number all if two views have the same name."""
     stems = []
     for view in views:
         name = PurePosixPath(view.replace("\\", "/")).name
@@ -104,7 +104,7 @@ def file_names(views: Sequence[str]) -> list[str]:
 
 
 class _Scenes(NamedTuple):
-    """The full scene, the others, and the bytes of all their files, by name."""
+    """The full scene and the other scenes, and the file sizes of all, by name."""
 
     name: str
     reference: "GaussianScene"
@@ -113,7 +113,7 @@ class _Scenes(NamedTuple):
 
 
 def _read_scenes(options: argparse.Namespace) -> _Scenes:
-    """Read REF and all SMALL, named after their files."""
+    """Read REF and every SMALL; name them after their files."""
     from cvtgs.devices import chosen_device
 
     paths = [options.reference, *options.small]

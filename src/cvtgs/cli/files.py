@@ -1,4 +1,4 @@
-"""``cvtgs info`` and ``cvtgs convert``: facts about a scene, and other formats."""
+"""``cvtgs info`` and ``cvtgs convert``: facts about a scene, and conversion between formats."""
 
 import argparse
 import sys
@@ -47,7 +47,7 @@ def show_info(options: argparse.Namespace) -> None:
 
 
 def is_checkpoint(path: Path) -> bool:
-    """Whether a name means a checkpoint: that of a shipped one, or a file of that format."""
+    """Return whether a path is the name of a shipped checkpoint or a ``.safetensors`` file."""
     shipped = str(path) in cvtgs.mergenet.SHIPPED and not path.exists()
     return shipped or path.suffix == ".safetensors"
 
@@ -166,7 +166,7 @@ def convert(options: argparse.Namespace) -> None:
 
 
 def _convert_one(job: SceneJob, edits: SceneEdits) -> Outcome:
-    """Convert one scene, and say what is lost."""
+    """Convert one scene, and report the data that is lost."""
     options = job.options
     axes = read_axes(options.axes)
     scenes = [
@@ -188,7 +188,7 @@ def _convert_one(job: SceneJob, edits: SceneEdits) -> Outcome:
         rest = "nothing but precision" if lost.changed else "nothing"
         say_wrapped(f"Lost: {'; '.join([*phrases, *lost.dropped]) or rest}.", file=stream)
     with warnings.catch_warnings():
-        if not options.quiet:  # it is said here
+        if not options.quiet:  # printed here instead
             warnings.simplefilter("ignore", DroppedDataWarning)
         cvtgs.io.save(
             scene,

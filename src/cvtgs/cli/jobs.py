@@ -1,4 +1,4 @@
-"""Which scenes a command reads and writes: one, many into a directory, or standard streams."""
+"""Scenes that a command reads and writes: one, many into a directory, or standard streams."""
 
 import argparse
 import glob
@@ -26,18 +26,18 @@ from cvtgs.errors import (
 from cvtgs.text import printable
 
 STREAM = "-"
-"""What stands for standard input or output."""
+"""The path that stands for standard input or output."""
 
 _OTHER_FORMATS = "write a scene of another format to a file, whose name says which it is"
 
 
 class Outcome(NamedTuple):
-    """What a command did to one scene.
+    """The result of a command for one scene.
 
     Attributes:
-        counts: For example ``500 -> 50 Gaussians``.
-        seconds: How long it took, as a text; empty if that is not said.
-        notes: Sentences to print before the line that says where the output is.
+        counts: Numbers of Gaussians, for example ``500 -> 50 Gaussians``.
+        seconds: The duration as text; empty if it is not printed.
+        notes: Further sentences to print.
     """
 
     counts: str
@@ -50,8 +50,8 @@ class SceneJob:
     """One scene to read, and the file to write.
 
     Attributes:
-        options: The command line, with ``input`` and ``output`` of this scene.
-        is_one_of_many: Whether others go to the same directory.
+        options: The options of the command, with ``input`` and ``output`` of this scene.
+        is_one_of_many: Whether the command writes to a directory (``-o DIR``).
         to_stream: Whether the output is copied to standard output.
     """
 
@@ -91,7 +91,7 @@ def add_paths(parser: CommandParser, *, options: str) -> None:
 
 
 def check_paths(parser: CommandParser, options: argparse.Namespace) -> None:
-    """Refuse a number of paths that does not go with -o, as wrong usage."""
+    """Exit with a usage error if the paths do not match the use of -o and --suffix."""
     if options.folder is None and len(options.paths) != 2:
         found = f"{len(options.paths)} {'path' if len(options.paths) == 1 else 'paths'}"
         parser.error(f"give IN and OUT, or any number of IN with -o DIR; found {found}")
@@ -103,7 +103,7 @@ def check_paths(parser: CommandParser, options: argparse.Namespace) -> None:
 
 @contextmanager
 def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
-    """Find the scenes of a command line; standard streams are files while the context is."""
+    """Find the scenes of a command; standard streams are temporary files within the context."""
     from cvtgs.io.streams import file_of
 
     if options.folder is not None:
@@ -127,7 +127,7 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
 
 
 def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> None:
-    """Do the work for every scene, and print the results and where they are."""
+    """Call ``work`` for every scene, and print the results and their paths."""
     first = jobs[0]
     if not first.is_one_of_many:
         _run_one(first, work)
@@ -185,7 +185,7 @@ def _run_one(job: SceneJob, work: Callable[[SceneJob], Outcome]) -> None:
 
 
 def _bytes_of(path: Path) -> int:
-    """Return the size of a scene before it may be replaced; 0 of what reading it will refuse."""
+    """Return the size of an input, which the output may replace; 0 if it cannot be read."""
     try:
         return cvtgs.io.scene_size(path)
     except OSError:
@@ -193,7 +193,7 @@ def _bytes_of(path: Path) -> int:
 
 
 def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
-    """Return a job for every scene to read; no two write the same file."""
+    """Return a job for every input; raise if two would write the same file."""
     from cvtgs.io.atomic import make_folder
 
     sources = [Path(path) for pattern in options.paths for path in _expanded(pattern)]
@@ -217,7 +217,7 @@ def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
 
 
 def _expanded(pattern: str) -> list[str]:
-    """Return the files of a pattern that the shell has not expanded, or of a folder of scenes."""
+    """Expand a pattern that the shell left unexpanded, or a folder of scenes."""
     if os.path.isdir(pattern):  # noqa: PTH112 (any path)
         return _in_folder(pattern)
     if os.path.lexists(pattern) or not glob.has_magic(pattern):
@@ -229,7 +229,7 @@ def _expanded(pattern: str) -> list[str]:
 
 
 def _in_folder(folder: str) -> list[str]:
-    """Return the scenes in a folder, or the folder itself if it holds a single one."""
+    """Return the scenes in a folder, or the folder itself if it is a scene."""
     from cvtgs.io.formats import READABLE_SUFFIXES
 
     try:
@@ -243,7 +243,7 @@ def _in_folder(folder: str) -> list[str]:
 
 
 def _output_name(source: Path, suffix: str | None) -> str:
-    """Return the name of a scene in a directory, with the suffix that sets its format."""
+    """Return the file name for the output of a scene, with the suffix that sets its format."""
     from cvtgs.io.formats import READABLE_SUFFIXES, WRITABLE_SUFFIXES
 
     if source.name == "meta.json":

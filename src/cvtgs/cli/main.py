@@ -1,4 +1,4 @@
-"""``cvtgs``: parse the command line, run a command, turn errors into exit codes."""
+"""The program ``cvtgs``: parse the command line, run a command, turn errors into exit codes."""
 
 import argparse
 import io
@@ -26,7 +26,7 @@ from cvtgs.cli.view import add_view
 from cvtgs.errors import CvtgsError, memory_errors
 
 WRITE_SEVERAL = ("levels", "render", "compare", "tradeoff", "demo", "train")
-"""Commands whose files belong together, so that one run at a time may write them."""
+"""Commands that write several files to one folder, which only one run at a time may do."""
 
 INTERRUPTED, TERMINATED, PIPE_CLOSED = 130, 143, 141
 MEMORY_ADVICE = (
@@ -50,13 +50,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except (KeyboardInterrupt, Exception) as error:
             # An interrupted import may raise another error instead of KeyboardInterrupt.
             if stop.code is not None:
-                signal.signal(signal.SIGINT, signal.SIG_IGN)  # of an impatient user
+                signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C changes nothing
                 if stop.code == INTERRUPTED:
                     say("cvtgs: interrupted; no incomplete file is left.", file=sys.stderr)
                 return stop.code
             if not isinstance(error, CvtgsError):
                 raise
-            if isinstance(error.__cause__, BrokenPipeError):  # of "cvtgs info | head"
+            if isinstance(error.__cause__, BrokenPipeError):  # as in "cvtgs info | head"
                 return PIPE_CLOSED
             say(f"cvtgs: error: {error}", file=sys.stderr)
             return 1
@@ -78,7 +78,7 @@ def _run(words: Sequence[str]) -> None:
 
 
 def _lock(options: argparse.Namespace) -> AbstractContextManager[None]:
-    """Return what keeps a second run from the files of a command that writes several."""
+    """Return a lock of the output folder if the command writes several files, else a no-op."""
     if options.command not in WRITE_SEVERAL:
         return nullcontext()
     from cvtgs.io.locks import folder_lock
@@ -88,16 +88,16 @@ def _lock(options: argparse.Namespace) -> AbstractContextManager[None]:
 
 def run_process() -> NoReturn:
     """Run the command line and end the process with its exit status."""
-    for stream in (sys.stdout, sys.stderr):  # also for what libraries print
+    for stream in (sys.stdout, sys.stderr):  # applies to output of libraries, too
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     code = main()
-    for number in (signal.SIGINT, signal.SIGTERM):  # from here on nothing must change it
+    for number in (signal.SIGINT, signal.SIGTERM):  # the exit status is final
         signal.signal(number, signal.SIG_IGN)
     try:
         if sys.stdout is not None:
             sys.stdout.flush()
-    except OSError:  # reported already; Python would report it again at exit
+    except OSError:  # already reported; Python would report it again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     sys.exit(code)
 
@@ -113,7 +113,7 @@ class _Stop:
         raise KeyboardInterrupt
 
     def notice(self, event: "sys.UnraisableHookArgs") -> None:
-        """Send the signal again if its exception was lost where none can be raised."""
+        """Send the signal again if its exception was raised where Python ignores exceptions."""
         if self.code is None:
             sys.__unraisablehook__(event)
             return

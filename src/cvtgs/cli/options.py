@@ -1,4 +1,4 @@
-"""Options that several commands share, and reading their values."""
+"""Options that several commands share, and functions that read their values."""
 
 import argparse
 import os
@@ -28,8 +28,8 @@ READABLE = (
 WRITABLE = ".ply, .compressed.ply, .spz, .splat, .sog, .glb, .gltf, .spz.glb or .usda"
 PRESET_NAMES = "draft, fast, standard, matched, high (from the fastest to the best) or paper"
 CAMERA_FILES = "transforms.json, a COLMAP model, cameras.json, or a folder of these"
-# By name, or by both spellings. The help of a value is a noun phrase, that of a flag begins with
-# a verb.
+# Keys are option names, with both spellings where there are two. Help texts of values are noun
+# phrases; those of flags begin with a verb.
 _SHARED: Mapping[str, Mapping[str, Any]] = {
     "input": {"metavar": "IN", "type": Path, "help": f"scene to read ({READABLE})"},
     "reference": {"metavar": "REF", "type": Path, "help": f"full scene ({READABLE})"},
@@ -135,13 +135,13 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
 
 
 class CommandParser(argparse.ArgumentParser):
-    """An argument parser that suggests the nearest command, option or choice for an unknown one."""
+    """Argument parser that suggests the nearest known command, option or choice."""
 
     check: "Callable[[CommandParser, argparse.Namespace], None] | None" = None
-    """Of a command that takes any number of paths: refuses what does not go together."""
+    """For commands with any number of paths: exits if paths and options do not fit together."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Report an unknown option, even if a required one is missing; then parse the words."""
+        """Parse the words; report an unknown option even if a required one is missing, too."""
         if self._subparsers is None:  # the parser of one command
             options = self._option_string_actions
             for word in takewhile(lambda word: word != "--", args or ()):
@@ -149,18 +149,18 @@ class CommandParser(argparse.ArgumentParser):
                 if name.startswith("--") and not any(one.startswith(name) for one in options):
                     self.error(f"unrecognized argument: {name}{suggestion(name, options)}")
         known, rest = super().parse_known_args(args, namespace)
-        if self.check is not None:  # paths may stand between options
+        if self.check is not None:  # allows paths between options
             known.paths += [word for word in rest if word == "-" or not word.startswith("-")]
             rest = [word for word in rest if word != "-" and word.startswith("-")]
             self.check(self, known)
         return known, rest
 
     def _print_message(self, message: str, file: Any = None) -> None:
-        """Print as :func:`say` does; argparse has no public way to."""
+        """Print with :func:`say`; argparse has no public hook for this."""
         say(message, file=file or sys.stderr, end="")
 
     def error(self, message: str) -> NoReturn:
-        """Print the usage and a message with a suggestion, and exit with status 2."""
+        """Print the usage and the message, if possible with a suggestion; exit with status 2."""
         wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
         if wrong:
             message += suggestion(wrong[1], re.findall(r"[\w-]+", wrong[2]))
@@ -168,7 +168,7 @@ class CommandParser(argparse.ArgumentParser):
 
 
 AddParser = Callable[..., CommandParser]
-"""``add_parser`` of the subparsers of ``cvtgs``: makes the parser of one command."""
+"""Type of the ``add_parser`` method of argparse, which makes the parser of one command."""
 
 
 def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
@@ -178,7 +178,7 @@ def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
 
 
 def read_words(text: str) -> list[str]:
-    """Read words with commas between them."""
+    """Read comma-separated words."""
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
@@ -216,7 +216,7 @@ def count(text: str) -> int:
 
 @contextmanager
 def _usage_errors() -> Iterator[None]:
-    """Raise wrong values as argparse shows them."""
+    """Raise invalid values as usage errors of argparse."""
     try:
         yield
     except InvalidArgumentError as error:
@@ -241,7 +241,7 @@ def read_axes(text: str | None) -> FileAxes:
 
 
 def read_settings(words: Sequence[str] = (), effects: str | None = None) -> dict[str, str]:
-    """Read ``--set`` and ``--effects`` as settings by dotted key; those of ``--set`` win."""
+    """Read ``--set`` and ``--effects`` as settings by dotted key; ``--set`` takes precedence."""
     example = "--effects needs NAME=VALUE, for example sh=1,mip=off"
     forced = _assignments([] if effects is None else effects.split(","), example)
     settings = {f"effects.{name}": value for name, value in forced.items()}
@@ -249,7 +249,7 @@ def read_settings(words: Sequence[str] = (), effects: str | None = None) -> dict
     known = list(_setting_names(cvtgs.SimplifyConfig))
     for key in settings:
         nearest = "" if key in known else suggestion(key, known, likeness=0.82)
-        if nearest:  # the configuration reports what is like no setting
+        if nearest:  # otherwise the configuration reports the unknown key
             raise ConfigError(f"{key}: is not a known setting{nearest}")
     return settings
 
@@ -276,7 +276,7 @@ def _setting_names(section: "type[pydantic.BaseModel]", prefix: str = "") -> Ite
 def read_scene(
     options: argparse.Namespace, config: "SimplifyConfig", *, axes: str | None = None
 ) -> "GaussianScene":
-    """Read the scene of ``IN`` without what ``--effects`` and ``--sh-degree`` leave out."""
+    """Read the scene ``IN`` without the columns that ``--effects`` and ``--sh-degree`` exclude."""
     kept = getattr(options, "sh_degree", None)
     limits = [limit for limit in (config.effects.sh, kept) if isinstance(limit, int)]
     scene = cvtgs.io.load(
@@ -292,9 +292,9 @@ def read_scene(
 
 
 def check_written_files(options: argparse.Namespace) -> None:
-    """Refuse to write OUT or the report over each other or over a file that is read.
+    """Raise if OUT or the report would overwrite each other or an input.
 
-    Only OUT may replace IN, which is read before.
+    Only OUT may replace IN, which is read before OUT is written.
     """
     read = {"IN": cvtgs.io.scene_file(options.input)} | {
         f"--{name}": Path(value)
@@ -316,6 +316,6 @@ def _is_same_file(path: Path, other: Path) -> bool:
     if os.path.realpath(path) == os.path.realpath(other):
         return True
     try:
-        return path.samefile(other)  # a link, or another spelling where case does not count
+        return path.samefile(other)  # a link, or another spelling on a case-insensitive file system
     except (OSError, ValueError):
         return False

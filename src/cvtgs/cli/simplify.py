@@ -1,4 +1,4 @@
-"""``cvtgs simplify``: a smaller scene, by size, quality or time, in memory or block by block."""
+"""``cvtgs simplify``: simplify scenes to a size, quality or time, in memory or in blocks."""
 
 import argparse
 import time
@@ -162,7 +162,7 @@ def simplify(options: argparse.Namespace) -> None:
 def _simplify_one(
     job: SceneJob, checkpoint: str | None, config: "SimplifyConfig", settings: Mapping[str, str]
 ) -> Outcome:
-    """Simplify one scene, in one piece or block by block, and say what was done."""
+    """Simplify one scene, in memory or block by block, and return the result to print."""
     options, notes = job.options, list[str]()
     options.begun = time.perf_counter() if job.is_one_of_many else STARTED
     with progress_bars(quiet=options.quiet, transient=job.is_one_of_many) as listener:
@@ -191,7 +191,7 @@ def _simplify_in_memory(
     settings: Mapping[str, str],
     listener: ProgressListener,
 ) -> "tuple[SimplifyReport, list[str]]":
-    """Read, simplify and save a scene; return the report, and notes to print below it."""
+    """Read, simplify and save a scene; return the report and notes to print with it."""
     notes = []
     axes = read_axes(options.axes)
     scene = read_scene(options, config, axes=axes.source)
@@ -254,7 +254,7 @@ def _write_report(options: argparse.Namespace, report: "SimplifyReport") -> None
 
 
 def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
-    """Return the settings of ``--refine`` and ``--refine-steps``; either one replaces both."""
+    """Return the settings of ``--refine`` and ``--refine-steps``; either option sets both."""
     if options.refine is None and options.refine_steps is None:
         return {}
     steps, seconds = options.refine_steps or 0, options.refine or 0.0
@@ -262,7 +262,7 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
 
 
 def _report_notes(report: "SimplifyReport") -> list[str]:
-    """Return what is worth a sentence beyond counts, sizes and seconds."""
+    """Return the sentences to print besides counts, sizes and seconds."""
     notes = []
     if report.device_note:
         notes.append(f"{report.device_note}.")
@@ -292,7 +292,7 @@ def _has_target(options: argparse.Namespace) -> bool:
 
 
 def check_goals(options: argparse.Namespace) -> None:
-    """Check the targets and the time budget, and the options that exclude them."""
+    """Check the targets and the time budget, and raise for options that exclude them."""
     if _has_target(options):
         from cvtgs.budget.count import checked_target
 
@@ -303,7 +303,7 @@ def check_goals(options: argparse.Namespace) -> None:
 
 
 def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int | None:
-    """Return the memory for simplifying block by block; None if it is not needed or possible."""
+    """Return the bytes for simplifying in blocks; None if blocks are not needed or not possible."""
     from cvtgs.io.ply import open_rows
     from cvtgs.outofcore import block_count, check_config
 
@@ -333,7 +333,7 @@ def _simplify_blocks(
     memory: int,
     listener: ProgressListener,
 ) -> "SimplifyReport":
-    """Simplify a file block by block, in processes of this machine or on a cluster."""
+    """Simplify a file block by block, on this machine or on a cluster."""
     axes = read_axes(options.axes)
     with block_workers(options, memory) as blocks:
         return cvtgs.outofcore.simplify_file(

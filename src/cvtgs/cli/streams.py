@@ -1,4 +1,4 @@
-"""``cvtgs levels --stream``: levels as chunks that viewers load while they show them."""
+"""``cvtgs levels --stream``: levels in chunks that viewers load progressively."""
 
 import argparse
 import math
@@ -23,7 +23,7 @@ OF_STREAMS = ("chunk", "environment", "memory", "workers", "scheduler", "place",
 
 
 def add_stream_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--stream`` and what goes with it."""
+    """Add ``--stream`` and its related options."""
     parser.add_argument(
         "--stream",
         choices=STREAMS,
@@ -59,7 +59,7 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_stream_options(options: argparse.Namespace) -> None:
-    """Check options of streams, before the long work that comes first."""
+    """Check the options of streams before the long work starts."""
     from cvtgs.streams import check_stream
 
     if options.stream is None:
@@ -83,7 +83,7 @@ def check_stream_options(options: argparse.Namespace) -> None:
 
 
 def read_transform(options: argparse.Namespace) -> tuple[float, ...] | None:
-    """Read ``--place`` or ``--transform``; None without them."""
+    """Read ``--place`` or ``--transform``; return None if neither is given."""
     from cvtgs.streams import check_transform, geo_transform
 
     if options.place is None and options.transform is None:
@@ -117,7 +117,7 @@ def stream_blocks(
     rhos: Sequence[float],
     axes: "FileAxes",
 ) -> bool:
-    """Write a stream block by block, if the scene does not fit into memory; return whether so."""
+    """Write a stream in blocks if the scene does not fit into memory; return whether it did."""
     from cvtgs.io.axes import SCENE_AXES
     from cvtgs.io.ply import open_rows
     from cvtgs.outofcore import block_count, check_config
@@ -163,7 +163,7 @@ def stream_levels(
     axes: "FileAxes",
     listener: "ProgressListener",
 ) -> None:
-    """Write levels that are in memory as a stream, and say what is in it."""
+    """Write levels that are in memory as a stream, and print its contents."""
     from cvtgs.streams import plan_stream, write_sog_stream, write_tiles
     from cvtgs.streams.plan import CHUNK_GAUSSIANS
 

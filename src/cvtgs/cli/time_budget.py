@@ -1,4 +1,4 @@
-"""``--time-budget``: choose the best preset that ends in time."""
+"""``--time-budget``: choose the best preset that finishes in time."""
 
 import argparse
 import math
@@ -16,20 +16,20 @@ if TYPE_CHECKING:
     from cvtgs.scene import GaussianScene
 
 STARTED = time.perf_counter()
-"""When this process started, about: a time budget counts from here."""
+"""Approximate start of this process, from which a time budget counts."""
 
 UNITS = {"s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 
 
 class ChosenPreset(NamedTuple):
-    """A preset, and the sentence that says why."""
+    """A preset, and the sentence that explains the choice."""
 
     name: str
     reason: str
 
 
 def check_time_budget(options: argparse.Namespace, *, has_target: bool) -> None:
-    """Check ``--time-budget``, and the options that exclude it or need it."""
+    """Check ``--time-budget``, and raise for options that exclude it or need it."""
     if options.time_budget is None:
         for name in ("recalibrate", "shipped_rates"):
             if getattr(options, name):
@@ -54,7 +54,7 @@ def check_time_budget(options: argparse.Namespace, *, has_target: bool) -> None:
 
 
 def read_seconds(text: str) -> float:
-    """Read the time of ``--time-budget``."""
+    """Read ``--time-budget``, in seconds."""
     number = text.strip().rstrip("abcdefghijklmnopqrstuvwxyz")
     unit = text.strip()[len(number) :] or "s"
     try:
@@ -74,7 +74,7 @@ def choose_preset(
     settings: Mapping[str, str],
     listener: "ProgressListener",
 ) -> ChosenPreset:
-    """Choose the best preset that fits into the rest of the time budget."""
+    """Choose the best preset that fits into the remaining time budget."""
     from cvtgs.budget.calibrate import is_calibrated
 
     budget, spent = read_seconds(options.time_budget), time.perf_counter() - options.begun

@@ -1,4 +1,4 @@
-"""``cvtgs train``: scenes in, a MergeNet checkpoint out."""
+"""``cvtgs train``: train a MergeNet checkpoint on scenes."""
 
 import argparse
 import math
@@ -87,7 +87,7 @@ def _with_scenes(config: "TrainConfig", folders: list[Path]) -> "TrainConfig":
 
 
 def print_validation(history: "History") -> None:
-    """Print a line about the last validation."""
+    """Print one line about the last validation."""
     last = history.validations[-1]
     gains = ", ".join(
         f"{sum(row) / len(row):+.2f} (least {min(row):+.2f}) at {ratio:g}"

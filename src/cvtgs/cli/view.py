@@ -59,7 +59,7 @@ def add_view(add_parser: AddParser) -> None:
 
 
 def check_page(options: argparse.Namespace) -> None:
-    """Check that the page of ``--viewer`` could be written, before the long work."""
+    """Check that the page of ``--viewer`` can be written, before the long work starts."""
     from cvtgs.viewer import check_viewer
 
     if options.viewer:
@@ -69,7 +69,7 @@ def check_page(options: argparse.Namespace) -> None:
 
 
 def write_page(options: argparse.Namespace, scenes: "Mapping[str, GaussianScene]") -> None:
-    """Write the page of ``--viewer`` beside the other files of a command, and say so."""
+    """Write the page of ``--viewer`` beside the other files of a command, and print its path."""
     from cvtgs.viewer import scene_page
 
     if not options.viewer:

@@ -1,4 +1,4 @@
-"""Options of cameras, images and scores, and reading their values."""
+"""Options for cameras, images and scores, and functions that read their values."""
 
 import argparse
 from collections.abc import Mapping
@@ -69,7 +69,7 @@ def background_color(options: argparse.Namespace) -> Color:
 
 
 def evaluation_settings(options: argparse.Namespace) -> "EvaluationSettings":
-    """Return how to render and score; a command without ``--lpips`` measures it if it can."""
+    """Return the settings of rendering and scoring; without the option, LPIPS is ``auto``."""
     return cvtgs.evaluation.EvaluationSettings(
         background=background_color(options),
         lpips=getattr(options, "lpips", "auto"),
@@ -80,7 +80,7 @@ def evaluation_settings(options: argparse.Namespace) -> "EvaluationSettings":
 def choose_cameras(
     options: argparse.Namespace, scene: "GaussianScene", *, most: int | None = None
 ) -> "Cameras":
-    """Read the cameras of an option or of the scene's folder, or find views of the scene."""
+    """Read ``--cameras`` or the cameras beside the scene; otherwise choose automatic views."""
     size, views = options.size or options.default_size, options.views or AUTOMATIC_VIEWS
     if options.cameras is not None:
         cameras = cvtgs.load_cameras(options.cameras, split=options.split)

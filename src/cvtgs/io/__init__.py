@@ -1,6 +1,6 @@
-"""Scenes in and out of files and dictionaries; cameras out of files.
+"""Read and write scenes as files and dictionaries, and read cameras from files.
 
-Names are loaded when they are first used, and a format when a file of it is read or written.
+Names are imported on first use, and a format when a file of it is read or written.
 """
 
 from importlib import import_module

@@ -1,7 +1,4 @@
-"""Scenes as numpy arrays, and how compact formats store rotations, colours and opacities.
-
-Readers and writers of compact formats convert stored parameters only here.
-"""
+"""Scenes as numpy arrays, and the conversions of parameters that compact formats share."""
 
 from dataclasses import dataclass
 
@@ -24,7 +21,7 @@ Bytes = NDArray[np.uint8]
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 HALF_RANGE = np.float32(np.sqrt(0.5))
-"""Largest magnitude of a component of a unit quaternion other than the largest."""
+"""Upper bound of the magnitudes of the three smaller components of a unit quaternion."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -80,7 +77,7 @@ def scene_of(arrays: Arrays, *, antialiased: bool = False) -> GaussianScene:
 
 
 def unit_quats(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Scale quaternions to unit length; zero becomes no rotation, infinity no number."""
+    """Scale quaternions to unit length; zero becomes the identity, infinity becomes NaN."""
     with np.errstate(invalid="ignore"):
         largest = np.abs(quats).max(axis=1, keepdims=True)
         nothing = largest == 0
@@ -91,18 +88,18 @@ def unit_quats(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
 
 
 def to_bytes(values: Float[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
-    """Round to the nearest of 0 to 255."""
+    """Round to the nearest integer from 0 to 255."""
     whole: Bytes = np.clip(np.rint(values), 0, 255).astype(np.uint8)
     return whole
 
 
 def opacity_bytes(logits: Float[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
-    """Store opacities as bytes."""
+    """Return the opacities of logits as bytes."""
     return to_bytes(255 * parameters.opacity_from_logit(torch.from_numpy(logits)).numpy())
 
 
 def logits_of_bytes(opacities: UInt8[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Read opacities that are bytes."""
+    """Return the logits of opacities that are stored as bytes."""
     values = torch.from_numpy(opacities.astype(np.float32) / np.float32(255))
     logits: Floats = parameters.logit_from_opacity(values).numpy()
     return logits
@@ -121,7 +118,7 @@ def sh0_of_colors(colors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 def drop_largest(
     quats: Float[np.ndarray, "n 4"],
 ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """Remove the largest component, after making it positive."""
+    """Remove the component of largest magnitude, after flipping signs to make it positive."""
     rows = np.arange(len(quats))
     largest = np.abs(quats).argmax(axis=1)
     signs = np.where(quats[rows, largest] < 0, -1, 1).astype(quats.dtype)
@@ -132,7 +129,7 @@ def drop_largest(
 def restore_largest(
     largest: Int[np.ndarray, "n"], others: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 4"]:
-    """Insert the largest component again, the inverse of :func:`drop_largest`."""
+    """Restore the largest component, the inverse of :func:`drop_largest`."""
     quats = np.empty((len(others), 4), others.dtype)
     rows = np.arange(len(others))
     quats[rows[:, None], _OTHERS[largest]] = others
@@ -142,7 +139,7 @@ def restore_largest(
 
 
 def morton_rows(means: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
-    """Order Gaussians along a Morton curve; far ones do not coarsen it."""
+    """Return the order along a Morton curve; distant Gaussians do not coarsen it."""
     middle = np.median(means, axis=0)
     away = means - middle
     radius = np.quantile(np.abs(away).max(axis=1), 0.9) or 1.0

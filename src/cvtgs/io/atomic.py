@@ -31,16 +31,16 @@ _RESERVED = {
 }
 
 _MOST_WRITERS = 16
-"""Writers of one output at once whose leftovers are found again after a kill."""
+"""Largest number of concurrent writers of an output whose leftovers are found after a kill."""
 
 _OLD_SECONDS = 3600
-"""Without locks, a temporary file that was not written to for so long is a leftover."""
+"""Without locks, a temporary file that was not written to for this long is a leftover."""
 
 _DISK_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 
 
 def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
-    """Check that a file could be written, before the work that it takes to fill it.
+    """Check that a file could be written, before its content is computed.
 
     Args:
         path: The file to write; symbolic links are followed.
@@ -60,7 +60,7 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
     if fault is not None:
         raise OutputError(f"{os.fspath(path)}: the output must have a name, found {fault}.")
     try:
-        if target.is_symlink():  # links that are no loop are followed
+        if target.is_symlink():  # realpath follows all links but loops
             raise OutputError(
                 f"{os.fspath(path)}: the output must be a file, found a loop of symbolic links."
             )
@@ -90,16 +90,16 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
 
 @contextmanager
 def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[BinaryIO]:
-    """Open a file for writing that appears under its name only when it is complete.
+    """Open a file for an atomic write: it appears under its name only when it is complete.
 
-    The content goes to a new file in the same directory, which takes the name at the end, in
-    one step. If the body raises anything, the new file is removed and an old one stays as it
-    was. Symbolic links are followed; a replaced file keeps its permissions.
+    The content goes to a temporary file in the same directory, which is moved to the name at the
+    end, in one step. If the body raises, the temporary file is removed and an existing file does
+    not change. Symbolic links are followed; a replaced file keeps its permissions.
 
     Args:
         path: The file to write.
         overwrite: Whether an existing file may be replaced. If not, a file that appears under
-            this name meanwhile is not replaced either.
+            this name during the write is not replaced either.
 
     Yields:
         The open binary file.
@@ -126,7 +126,7 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
-                if fcntl is not None:  # still locked, so nobody takes it for a leftover
+                if fcntl is not None:  # still locked, so not seen as a leftover
                     _publish(temporary, target, overwrite=overwrite)
             finally:
                 if fcntl is not None and _is_own(temporary, file):
@@ -145,7 +145,7 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
 
 
 def make_folder(folder: str | os.PathLike[str], *, parents: bool = True) -> None:
-    """Make a folder to write to, unless it is there."""
+    """Create a folder to write to, unless it exists."""
     try:
         Path(folder).mkdir(parents=parents, exist_ok=True)
     except OSError as error:
@@ -154,10 +154,10 @@ def make_folder(folder: str | os.PathLike[str], *, parents: bool = True) -> None
 
 
 def windows_fault(path: PureWindowsPath) -> str | None:
-    """Return what Windows would not write to under this name, or under another one."""
+    """Return why Windows rejects this name or writes to another one; None if it does not."""
     name = path.name
     wrong = sorted({letter for letter in name if letter in '<>:"|?*' or letter < " "})
-    if wrong:  # "a.ply:b" is a hidden part of the file a.ply
+    if wrong:  # "a.ply:b" is an alternate data stream of a.ply
         return f"the letters {' '.join(wrong)}, which Windows does not allow"
     if name.split(".")[0].rstrip(" ").upper() in _RESERVED:
         return f"{name}, which is a device on Windows"
@@ -167,7 +167,7 @@ def windows_fault(path: PureWindowsPath) -> str | None:
 
 
 def _open_temporary(target: Path) -> tuple[Path, BinaryIO]:
-    """Open a new file beside a target; those that killed processes have left are removed."""
+    """Open a temporary file beside a target, and remove those that killed processes left."""
     names = [f".{target.name[:48]}.{number}.tmp" for number in range(_MOST_WRITERS)]
     for place, name in enumerate(names):
         temporary = target.with_name(name)
@@ -188,18 +188,18 @@ def _open_temporary(target: Path) -> tuple[Path, BinaryIO]:
 
 
 def _lock(descriptor: int) -> bool:
-    """Lock a file until it is closed; False if another process holds it."""
+    """Lock a file until it is closed; return False if another process holds the lock."""
     if fcntl is None:
         return True
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        return error.errno not in (errno.EWOULDBLOCK, errno.EACCES)  # else there are no locks
+        return error.errno not in (errno.EWOULDBLOCK, errno.EACCES)  # else locks are unsupported
     return True
 
 
 def _remove_leftover(temporary: Path) -> None:
-    """Remove the file of a process that was killed; that of one which still writes stays."""
+    """Remove the temporary file of a killed process, but not one that is still written to."""
     with suppress(OSError):
         if fcntl is None:
             if time.time() - temporary.stat().st_mtime > _OLD_SECONDS:
@@ -215,7 +215,7 @@ def _remove_leftover(temporary: Path) -> None:
 
 
 def _is_own(temporary: Path, file: BinaryIO) -> bool:
-    """Return whether a name is still that of an open file, not of one made after it moved."""
+    """Return whether a path still names the open file, not one created after it moved."""
     try:
         return os.path.samestat(temporary.lstat(), os.fstat(file.fileno()))
     except (OSError, ValueError):
@@ -238,21 +238,21 @@ def _publish(temporary: Path, target: Path, *, overwrite: bool) -> None:
             take(temporary, target)
         except FileExistsError:
             raise
-        except (OSError, NotImplementedError):  # this system or this disk cannot
+        except (OSError, NotImplementedError):  # not supported by this system or disk
             continue
         return
     _claim(temporary, target)
 
 
 def _link(temporary: Path, target: Path) -> None:
-    """Take the name unless it is taken: unlike a rename, a link never replaces."""
+    """Create a hard link unless the name exists: unlike a rename, a link never replaces."""
     target.hardlink_to(temporary)
 
 
 def _rename(temporary: Path, target: Path) -> None:
-    """Take the name unless it is taken, where there are no hard links (FAT, some shares)."""
+    """Rename unless the name exists, for disks without hard links (FAT, some shares)."""
     if os.name == "nt":
-        temporary.rename(target)  # there it never replaces
+        temporary.rename(target)  # on Windows, this never replaces
         return
     libc = ctypes.CDLL(None, use_errno=True)
     if not hasattr(libc, "renameat2"):
@@ -264,7 +264,7 @@ def _rename(temporary: Path, target: Path) -> None:
 
 
 def _claim(temporary: Path, target: Path) -> None:
-    """Take the name with an empty file, then replace that: only a kill in between leaves it."""
+    """Create an empty file and replace it; only a kill in between leaves the empty file."""
     own = None
     try:
         with target.open("xb") as file:

@@ -1,4 +1,4 @@
-"""Axes of scenes and files: their names, and turning a scene from one to another."""
+"""Names of coordinate axes, and the conversion of scenes from one set of axes to another."""
 
 from functools import cache
 
@@ -15,10 +15,10 @@ AXES = (
     *("ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf"),
     *("lbd", "rbd", "lbu", "rbu", "lfd", "rfd", "lfu", "rfu"),
 )
-"""Where x, y and z point (left, right, up, down, back, forward), as SPZ numbers them from 1."""
+"""Where x, y and z point (left, right, up, down, back, forward); SPZ numbers these from 1."""
 
 SCENE_AXES = "rdf"
-"""The axes of scenes in memory: right, down, forward, as PLY files of 3DGS have them."""
+"""The axes of scenes in memory: right, down, forward, as in PLY files of 3DGS."""
 
 _DIRECTIONS = {"r": (1, 0, 0), "u": (0, 1, 0), "b": (0, 0, 1)}
 _DIRECTIONS |= {"l": (-1, 0, 0), "d": (0, -1, 0), "f": (0, 0, -1)}
@@ -28,7 +28,7 @@ _QUARTER_TURN = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]
 
 
 def checked_axes(name: str) -> str:
-    """Return the name of axes in lower case."""
+    """Check the name of axes, and return it in lower case."""
     if name.lower() not in AXES:
         raise InvalidArgumentError(
             f"axes must be three letters for x, y and z, such as rdf (right, down, forward: PLY) "
@@ -38,23 +38,23 @@ def checked_axes(name: str) -> str:
 
 
 def change_axes(scene: GaussianScene, source: str, target: str) -> GaussianScene:
-    """Turn a scene from one choice of axes to another.
+    """Convert a scene from one set of axes to another.
 
-    Names have a letter each for x, y and z: where it points, of left or right, up or down, back or
-    forward, for example ``"rdf"`` (PLY files of 3DGS) or ``"rub"`` (OpenGL, Niantic's apps). Where
-    only signs differ, only signs of centres, quaternions and SH coefficients change. Axes of the
-    other handedness mirror the scene.
+    Names have one letter for each of x, y and z, the direction in which it points: left or right,
+    up or down, back or forward. Examples are ``"rdf"`` (PLY files of 3DGS) and ``"rub"`` (OpenGL,
+    Niantic's apps). If only signs differ, only signs of centres, quaternions and SH coefficients
+    change. Axes of the other handedness mirror the scene.
 
     Args:
         scene: The scene.
         source: Its axes.
-        target: The axes to turn it to.
+        target: The axes to convert it to.
 
     Returns:
-        The turned scene; this one if the axes are the same.
+        The converted scene; the same object if the axes are the same.
 
     Raises:
-        InvalidArgumentError: There are no axes of this name.
+        InvalidArgumentError: The name of the axes is unknown.
 
     Example:
         >>> from cvtgs.synthetic import scene
@@ -71,12 +71,12 @@ def change_axes(scene: GaussianScene, source: str, target: str) -> GaussianScene
 
 
 def _matrix(name: str) -> Float[Tensor, "3 3"]:
-    """Return the axes as rows of right, up and back."""
+    """Return the axes as rows, in coordinates right, up and back."""
     return torch.tensor([_DIRECTIONS[letter] for letter in name], dtype=torch.float64)
 
 
 def _with_signs(scene: GaussianScene, x: int, y: int, z: int) -> GaussianScene:
-    """Change signs of coordinates; the axes of each Gaussian change theirs, too."""
+    """Flip signs of the coordinates, and of the axes of each Gaussian."""
     return scene.with_tensors(
         {
             "means": scene.means * scene.means.new_tensor([x, y, z]),
@@ -102,7 +102,7 @@ def _with_quarter_turn(scene: GaussianScene) -> GaussianScene:
 
 @cache
 def _sh_signs(x: int, y: int, z: int) -> Float[Tensor, "k"]:
-    """Return the sign of each SH function after that of coordinates, in a general direction."""
+    """Return the factor 1 or -1 of each SH function when coordinates change their signs."""
     direction = torch.tensor([[0.2, 0.5, 0.9]], dtype=torch.float64)
     turned = direction * direction.new_tensor([x, y, z])
     return (rest_basis(turned, 3) / rest_basis(direction, 3))[0].sign()
@@ -110,7 +110,7 @@ def _sh_signs(x: int, y: int, z: int) -> Float[Tensor, "k"]:
 
 @cache
 def _sh_quarter_turn() -> Float[Tensor, "k k"]:
-    """Return the matrix of the quarter turn; each entry is the root of a whole number / 16."""
+    """Return the SH matrix of the quarter turn; squares of entries are multiples of 1/16."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn(64, 3, generator=generator, dtype=torch.float64)
     directions /= directions.norm(dim=1, keepdim=True)

@@ -1,4 +1,4 @@
-"""Checkpoints of gsplat's trainer and of nerfstudio's Splatfacto: scenes before the export."""
+"""Read scenes from checkpoints of gsplat's trainer and of nerfstudio's Splatfacto."""
 
 import pickletools
 import re
@@ -27,7 +27,7 @@ _ALLOWED = re.compile(
     r"torch\.storage\.\w+Storage|numpy(\._?core\.multiarray\.scalar|\.dtype)|_codecs\.encode|"
     r"(builtins|__builtin__)\.(dict|list|set|tuple|int|float|complex)"
 )
-"""What a checkpoint may name: all that tensors and numbers need."""
+"""Names that a checkpoint may refer to: those that tensors and numbers need."""
 
 _BYTE_CODECS = re.compile(r"(?i)(hex|base.?64|quopri|quoted.?printable|uu|bz2|zlib|zip)(.?codec)?")
 _PREFIXES = ("", "_model.gauss_params.", "_model.", "module._model.gauss_params.")
@@ -36,12 +36,12 @@ _PREFIXES = ("", "_model.gauss_params.", "_model.", "module._model.gauss_params.
 def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
     """Read the scene of a checkpoint.
 
-    Two kinds are known: ``step-000029999.ckpt`` of nerfstudio, which holds the scene under
+    Two kinds are supported: ``step-000029999.ckpt`` of nerfstudio, which holds the scene under
     ``pipeline`` as ``_model.gauss_params.means`` (``_model.means`` before 2024) and so on; and
     ``ckpt_29999_rank0.pt`` of gsplat's examples, which holds it under ``splats``. Nothing in the
-    file is executed, and only the scene is loaded, not the state of the optimiser. Splatfacto
-    trains colours without SH through a sigmoid; these become ordinary colours. A tensor that
-    repeats numbers instead of storing them is refused, unless sizes are trusted.
+    file is executed, and only the scene is loaded, not the state of the optimiser. At SH degree 0,
+    Splatfacto trains colours through a sigmoid; these are converted to the usual ``sh0``. A tensor
+    that repeats numbers instead of storing them is refused, unless sizes are trusted.
     """
     with _damage_named(path):
         tensors, splatfacto = _scene_tensors(_unpickled(path), path)
@@ -56,7 +56,7 @@ def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
 
 
 def _scene_tensors(content: Any, path: Path) -> tuple[dict[str, Tensor], bool]:
-    """Return the tensors, and whether they are of Splatfacto."""
+    """Return the tensors, and whether they are from Splatfacto."""
     groups = content if isinstance(content, Mapping) else {}
     for group in ("splats", "pipeline"):
         state = groups.get(group)
@@ -79,9 +79,9 @@ def _keys_of(groups: Mapping[Any, Any]) -> str:
 
 @contextmanager
 def _damage_named(path: Path) -> Iterator[None]:
-    """Turn whatever pickle, zip, struct and torch raise for a damaged file into one sentence.
+    """Convert any error of pickle, zip, struct or torch on a damaged file to one sentence.
 
-    Texts of torch are not passed on: some advise to let the file execute what it likes.
+    torch's messages are not passed on: some advise letting the file execute arbitrary code.
     """
     try:
         yield
@@ -99,7 +99,7 @@ def _damage_named(path: Path) -> Iterator[None]:
 
 
 def _unpickled(path: Path) -> Any:
-    """Map the file into memory, so that only what is copied is read."""
+    """Load a checkpoint by memory mapping, so that only tensors that are copied are read."""
     with open_input(path) as file:
         if not zipfile.is_zipfile(file):
             raise FileFormatError(
@@ -112,19 +112,19 @@ def _unpickled(path: Path) -> Any:
                 f"found {shown(name)}."
             )
     with _numpy_numbers_ignored(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torch's, on what it is about to refuse
+        warnings.simplefilter("ignore")  # from torch, about content that it then refuses
         return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
 
 
 def _names_in(path: Path) -> Iterator[str]:
-    """Return what the pickles of a checkpoint name, and codecs that make bytes of bytes.
+    """Yield the names in the pickles of a checkpoint, codecs from bytes to bytes, and zip faults.
 
-    ``weights_only`` keeps code out, but allows ``bytearray`` and others that take any memory.
+    ``weights_only`` blocks code, but allows ``bytearray`` and other names that take any memory.
     """
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
         for entry in entries:
-            if entry.compress_type != zipfile.ZIP_STORED:  # torch.save packs nothing
+            if entry.compress_type != zipfile.ZIP_STORED:  # torch.save never compresses
                 yield f"a packed {entry.filename}"
             elif entry.compress_size != entry.file_size:
                 yield f"two lengths of {entry.filename}"
@@ -138,7 +138,7 @@ def _names_in(path: Path) -> Iterator[str]:
 
 
 class _IgnoredType:
-    """A stand-in for the types of numpy numbers."""
+    """A stand-in for the types of numpy scalars."""
 
     def __init__(self, *_: Any) -> None:
         pass
@@ -148,7 +148,7 @@ class _IgnoredType:
 
 
 def _ignored_number(module: str) -> Any:
-    """Build a stand-in for the maker of numpy numbers, whose module was renamed in numpy 2."""
+    """Build a stand-in for the constructor of numpy scalars, whose module numpy 2 renamed."""
 
     def scalar(*_: Any) -> float:
         return 0.0
@@ -159,9 +159,9 @@ def _ignored_number(module: str) -> Any:
 
 @contextmanager
 def _numpy_numbers_ignored() -> Iterator[None]:
-    """Let torch's restricted reader ignore numpy numbers: learning rates of schedulers.
+    """Let torch's restricted unpickler ignore numpy scalars (learning rates of schedulers).
 
-    It refuses them otherwise. Stand-ins of the same names build nothing.
+    It would refuse them. Stand-ins with the same names take their place and build nothing.
     """
     stand_ins = [
         _ignored_number("numpy.core.multiarray"),

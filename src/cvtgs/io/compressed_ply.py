@@ -1,4 +1,4 @@
-"""PlayCanvas' compressed PLY files: 16 bytes per Gaussian and one per view-dependent number."""
+"""PlayCanvas' compressed PLY files: 16 bytes per Gaussian and one per view-dependent SH value."""
 
 import os
 from dataclasses import replace
@@ -39,7 +39,7 @@ __all__ = ["read_compressed_ply", "write_compressed_ply"]
 Rows = NDArray[Any]
 
 _CHUNK_ROWS = 256
-"""Gaussians that share the ranges of a chunk."""
+"""Gaussians in a chunk, which share its ranges."""
 
 _RANGES = tuple(
     f"{end}_{name}"
@@ -47,7 +47,7 @@ _RANGES = tuple(
     for end in ("min", "max")
     for name in names
 )
-"""Properties of a chunk; the oldest files end before the colours."""
+"""Properties of a chunk; the oldest files lack those of colours."""
 
 _UNCOLORED = 12
 
@@ -55,13 +55,13 @@ _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 """Properties of a vertex, 32 bits each."""
 
 _THREE_BITS = (11, 10, 11)
-"""Of positions and scales."""
+"""Bits of positions and scales."""
 
 _COLOR_BITS = (8, 8, 8, 8)
-"""Of red, green, blue and opacity."""
+"""Bits of red, green, blue and opacity."""
 
 _QUAT_BITS = (10, 10, 10)
-"""Of the three smaller components of a rotation; the upper two bits say which is missing."""
+"""Bits of the three smaller components of a rotation; the top two bits index the missing one."""
 
 
 def read_compressed_ply(path: Path) -> GaussianScene:
@@ -74,7 +74,7 @@ def read_compressed_ply(path: Path) -> GaussianScene:
         The scene, with the comments of the file.
 
     Raises:
-        InputNotFoundError: There is no such file.
+        InputNotFoundError: The file does not exist.
         InputError: It cannot be opened or read.
         FileFormatError: It is not a compressed PLY file, or damaged.
     """
@@ -82,7 +82,7 @@ def read_compressed_ply(path: Path) -> GaussianScene:
         header = read_header(file, str(path))
         _check(header, path)
         tables = _read_tables(file, header, path)
-    with np.errstate(all="ignore"):  # damaged ranges give numbers that are not finite
+    with np.errstate(all="ignore"):  # damaged ranges give non-finite numbers
         return replace(_scene_of(tables), comments=header.comments)
 
 
@@ -116,7 +116,7 @@ def _between(
 
 
 def _ranges(chunks: Rows) -> Float[np.ndarray, "c 18"]:
-    """Return the ranges of each chunk; colours without any are in [0, 1]."""
+    """Return the ranges of each chunk; without ranges, colours are in [0, 1]."""
     names = _RANGES if _RANGES[-1] in (chunks.dtype.names or ()) else _RANGES[:_UNCOLORED]
     ranges = np.tile(np.array([0, 0, 0, 1, 1, 1], np.float32), (len(chunks), 3))
     for column, name in enumerate(names):
@@ -125,7 +125,7 @@ def _ranges(chunks: Rows) -> Float[np.ndarray, "c 18"]:
 
 
 def _rest(rows: Rows | None, count: int) -> Float[np.ndarray, "n k 3"]:
-    """Decode bytes to [-4, 4]: 0 and 255 to the ends, others to the middles of their steps."""
+    """Decode bytes to [-4, 4]: 0 and 255 to the ends, others to the centres of their steps."""
     if rows is None:
         return np.empty((count, 0, 3), np.float32)
     names = rows.dtype.names or ()
@@ -179,7 +179,7 @@ def _check_rest(table: Element, vertices: int, path: Path) -> None:
 
 
 def _read_tables(file: BinaryIO, header: Header, path: Path) -> dict[str, Rows]:
-    """Read every element, after checking that the file holds them all."""
+    """Read every element, after checking that the file is long enough for all."""
     if any(table.has_lists for table in header.elements):
         raise FileFormatError(f"{path}: a compressed PLY must hold no lists, found one.")
     dtypes = {table.name: row_dtype(table.columns) for table in header.elements}
@@ -249,7 +249,7 @@ def _packed(
 def _fractions(
     values: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "c 6"]]:
-    """Return where values lie between the least and largest of their chunk, and these two."""
+    """Return values as fractions of the range of their chunk, and the ranges."""
     starts = np.arange(0, len(values), _CHUNK_ROWS)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     size = np.diff(np.append(starts, len(values)))

@@ -1,4 +1,4 @@
-"""Scenes in and out of the dictionaries that gsplat and nerfstudio users hold."""
+"""Convert scenes from and to the dictionaries of gsplat and nerfstudio."""
 
 import warnings
 from collections.abc import Mapping
@@ -31,11 +31,11 @@ _KNOWN = (
 
 
 FEWEST_JUDGED = 100
-"""Of fewer Gaussians no value is called unlikely."""
+"""Values of fewer Gaussians are never reported as unlikely."""
 
 SMALL_SCALE = 0.5
-"""Logarithms of scales that are all above 0, half of them below this, would be of Gaussians of
-nearly one size above one unit; standard deviations are often like that."""
+"""Scales look activated if all are above 0 and their median is below this. As logarithms, they
+would be of Gaussians of nearly one size above one unit; standard deviations are often like that."""
 
 
 def from_dict(
@@ -43,26 +43,26 @@ def from_dict(
     *,
     activated: bool = False,
 ) -> GaussianScene:
-    """Make a scene of the dictionary of a gsplat or nerfstudio (Splatfacto) model.
+    """Convert the dictionary of a gsplat or nerfstudio (Splatfacto) model to a scene.
 
-    Tensors are detached and share memory with the mapping's, numpy arrays are copied. Half
-    precision becomes float32; where dtypes differ, the widest is taken.
+    Tensors are detached, and share memory with the mapping unless their values or dtype change;
+    numpy arrays are copied. Half precision becomes float32; if dtypes differ, the widest is used.
 
     Args:
         mapping: ``means (n, 3)``, ``quats (n, 4)`` w first, ``scales (n, 3)``, ``opacities (n,)``
             or ``(n, 1)``, ``sh0 (n, 1, 3)`` or ``features_dc (n, 3)``, and ``shN (n, k, 3)`` or
             ``features_rest (n, k, 3)``, which may be missing. A dictionary, or the
             ``torch.nn.ParameterDict`` that gsplat trains. A common prefix such as
-            ``_model.gauss_params.`` is fine; names without it are then ignored.
-        activated: Whether scales and opacities are what one sees (above 0; from 0 to 1) rather
-            than logarithms and logits, which both models hold. A warning says if values look like
-            the other.
+            ``_model.gauss_params.`` is accepted; names without it are then ignored.
+        activated: Whether scales (at least 0) and opacities (0 to 1) are activated. By default
+            they are logarithms and logits, as both models store them; a warning is issued if such
+            values look activated.
 
     Returns:
         The scene, on the device of the tensors.
 
     Raises:
-        InvalidSceneError: A name is missing, unknown or double, or a value does not fit.
+        InvalidSceneError: A name is missing, unknown or duplicate, or a value is invalid.
 
     Example:
         >>> scene = from_dict({
@@ -100,7 +100,7 @@ def from_dict(
 
 
 def activated_values(scene: GaussianScene) -> list[str]:
-    """Return what of a scene looks activated where stored values belong, with what was found."""
+    """Describe the scales and opacities of a scene that look activated instead of stored."""
     if len(scene) < FEWEST_JUDGED:
         return []
     found = []
@@ -122,7 +122,7 @@ def to_dict(scene: GaussianScene) -> dict[str, Tensor]:
     Returns:
         ``means (n, 3)``, ``quats (n, 4)`` w first, ``scales (n, 3)`` as logarithms, ``opacities
         (n,)`` as logits, ``sh0 (n, 1, 3)``, ``shN (n, k, 3)``; they share memory with the scene.
-        Extra columns, comments and layout are not in it.
+        Extra columns, comments and layout are left out.
 
     Example:
         >>> scene = from_dict({
@@ -172,7 +172,7 @@ def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _prefix(mapping: Mapping[str, Any]) -> str:
-    """Return the common prefix of the names: what stands before ``means``."""
+    """Return the common prefix of the names, which is the text before ``means``."""
     found = [key for key in mapping if str(key) == "means" or str(key).endswith(".means")]
     if len(found) > 1:
         raise InvalidSceneError(

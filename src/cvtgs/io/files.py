@@ -1,7 +1,4 @@
-"""Files of other programs: found and opened, no larger than they can be, JSON validated.
-
-Every failure is one clear sentence.
-"""
+"""Find and open the files of other programs, limit what they claim, and validate their JSON."""
 
 import json
 import os
@@ -20,25 +17,25 @@ from cvtgs.errors import CvtgsError, FileFormatError, InputError, InputNotFoundE
 from cvtgs.text import shown
 
 _POINTER = b"version https://git-lfs."
-"""How the few lines start that a clone without Git LFS has in place of a large file."""
+"""Start of the pointer file that replaces a large file in a clone without Git LFS."""
 
 _ITERATION = re.compile(r"iteration_(\d{1,18})")
 _STEP = re.compile(r"step-(\d{1,18})\.ckpt")
 
 
 FREE_BYTES = 1 << 26
-"""A scene of at most this many bytes in memory is read from a file of any size."""
+"""A scene of at most this many bytes in memory may come from a file of any size."""
 MOST_EXPANSION = 64
-"""Beyond that, a scene may have this many times the bytes of its file; real ones have 4 to 13."""
+"""Beyond that, a scene may take this many times the bytes of its file; real ones take 4 to 13."""
 _FLOATS = 14
-"""Numbers of a Gaussian without view-dependent colour."""
+"""Numbers of a Gaussian without view-dependent SH coefficients."""
 _MOST_WHOLE = 1 << 53
 """Whole numbers up to here are the same in every JSON parser."""
 
 
 @contextmanager
 def open_input(path: Path) -> Iterator[BinaryIO]:
-    """Open a regular file; what the system refuses, also while it is read, is an InputError."""
+    """Open a regular file; system errors, also on reading, become input errors of cvtgs."""
     try:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):  # opening a pipe would wait for ever
@@ -61,14 +58,14 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
 
 
 def is_file(path: Path) -> bool:
-    """Return whether there is a file; False where its folder may not be read."""
+    """Return whether a file exists; False if its folder is not readable."""
     return os.path.isfile(path)  # noqa: PTH113 (Path.is_file raises without permission)
 
 
 def scene_file(path: str | os.PathLike[str]) -> Path:
     """Find the file that holds the scene of a folder.
 
-    It looks for these, in this order:
+    These are tried in this order:
 
     - ``point_cloud/iteration_*/point_cloud.ply``, the largest iteration: a model of INRIA's code;
     - ``nerfstudio_models/step-*.ckpt`` or ``step-*.ckpt``, the largest step: a run of Splatfacto;
@@ -77,13 +74,13 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
     - ``meta.json``: an unbundled SOG.
 
     Args:
-        path: A folder, or a file, which is its own scene.
+        path: A folder, or a file, which is returned as it is.
 
     Returns:
         The file.
 
     Raises:
-        InputError: There is none of these in the folder, or it cannot be read.
+        InputError: The folder has none of these, or cannot be read.
 
     Example:
         >>> scene_file("scene.ply").name
@@ -113,7 +110,7 @@ def scene_size(path: str | os.PathLike[str]) -> int:
         path: A file, or a folder that :func:`scene_file` finds a scene in.
 
     Returns:
-        Bytes of its file; of an unbundled or a streamed SOG, those of its other files too.
+        Bytes of its file; for an unbundled or a streamed SOG, also those of its other files.
 
     Example:
         >>> import tempfile
@@ -148,10 +145,10 @@ def _numbered(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
 
 
 def check_expansion(path: Path | str, *, count: int, rest: int, stored: int) -> None:
-    """Refuse a file that claims far more Gaussians, of ``rest`` SH coefficients, than it can hold.
+    """Refuse a file that claims far more Gaussians than it can hold.
 
-    Every reader of a compressed format calls this before it unpacks anything, unless sizes are
-    trusted.
+    ``rest`` counts the view-dependent SH coefficients per channel. Every reader of a compressed
+    format calls this before it decompresses the Gaussians, unless sizes are trusted.
     """
     wanted = 4 * count * (_FLOATS + 3 * rest)
     if wanted > FREE_BYTES + MOST_EXPANSION * stored:
@@ -163,7 +160,7 @@ def check_expansion(path: Path | str, *, count: int, rest: int, stored: int) -> 
 
 
 def check_stored(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Refuse tensors of a checkpoint that repeat numbers instead of storing each."""
+    """Refuse tensors of a checkpoint that repeat numbers instead of storing each of them."""
     for name, tensor in tensors.items():
         wanted, stored = tensor.numel() * tensor.element_size(), tensor.untyped_storage().nbytes()
         if wanted > stored:
@@ -174,7 +171,7 @@ def check_stored(path: Path, tensors: Mapping[str, Tensor]) -> None:
 
 
 class Document(pydantic.BaseModel):
-    """A JSON object of which some keys are read; descriptions of fields say what they must be."""
+    """A JSON object of which some keys are read; errors quote the descriptions of fields."""
 
     model_config = pydantic.ConfigDict(frozen=True)
 
@@ -198,7 +195,7 @@ AnyDocument = TypeVar("AnyDocument", bound=Document)
 
 
 def validated(model: type[AnyDocument], value: Any, where: str) -> AnyDocument:
-    """Check a value of a document against a model; errors name the place, the key and the value."""
+    """Validate a value against a model; errors name the place, the key and the value."""
     try:
         return model.model_validate(value)
     except pydantic.ValidationError as error:
@@ -227,7 +224,7 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(data: bytes, path: str | Path) -> Any:
-    """Parse JSON that is read already."""
+    """Parse the bytes of a JSON file."""
     try:
         return json.loads(data.decode("utf-8-sig"))
     except json.JSONDecodeError as error:
@@ -239,5 +236,5 @@ def parse_json(data: bytes, path: str | Path) -> Any:
         raise FileFormatError(
             f"{path}: must be JSON in UTF-8, found another byte at {error.start:,}."
         ) from error
-    except (RecursionError, ValueError) as error:  # nested without end; numbers without end
+    except (RecursionError, ValueError) as error:  # too deeply nested; numbers too long
         raise FileFormatError(f"{path}: must be plain JSON, found: {error}.") from error

@@ -1,4 +1,4 @@
-"""Read and write scenes in the format that the suffix of the file name chooses."""
+"""Read and write scenes in the format that the suffix of the file name selects."""
 
 import os
 import warnings
@@ -42,20 +42,20 @@ _READERS: Mapping[str, str] = MappingProxyType(
         ".pt": "cvtgs.io.checkpoints:read_checkpoint",
     }
 )
-"""Readers by suffix, of which the first that fits counts; imported when they are needed."""
+"""Readers by suffix, imported when needed; the first suffix that fits counts."""
 
 _ADVICE = (
     "free some, or simplify a binary .ply block by block: cvtgs simplify IN OUT --memory AMOUNT"
 )
 
 _SIZED = (".compressed.ply", ".splat", ".ksplat")
-"""Formats besides plain PLY whose files have as many bytes as their rows take."""
+"""Formats besides plain PLY that store every row, so that ``trust_sizes`` does not apply."""
 
 _STREAM = "lod-meta.json"
-"""The file of a streamed SOG, the only format of several levels."""
+"""File name of a streamed SOG, the only format with several levels."""
 
 _STATES_AXES = (".spz", ".glb", ".gltf")
-"""Formats whose axes their readers know."""
+"""Formats whose readers convert axes themselves."""
 
 _FILE_AXES = {".spz.glb": "luf", ".glb": "luf", ".gltf": "luf", ".usda": "rub"}
 """Axes that a format prescribes, by suffix."""
@@ -95,38 +95,36 @@ def load(
     Unknown columns become extras; NaN and infinite values are returned as they are.
 
     Args:
-        path: The file; its suffix chooses the format: ``.ply`` (plain, or compressed by
+        path: The file; its suffix selects the format: ``.ply`` (plain, or compressed by
             PlayCanvas' tools), ``.spz``, ``.splat``, ``.ksplat``, ``.sog`` or the ``meta.json`` of
             a SOG, the ``lod-meta.json`` of a streamed SOG, ``.glb`` or ``.gltf`` with
-            ``KHR_gaussian_splatting``, ``.ckpt`` of nerfstudio's
-            Splatfacto, ``.pt`` of gsplat's trainer. Of a folder, the scene that
-            :func:`cvtgs.io.scene_file` finds. Or a file that is open in binary mode, which is read
-            to its end; it need not be able to seek.
-        format: The suffix of the format, ``".splat"`` or ``"splat"``, whatever the file is called.
-            None goes by the name, and for an open file by its first bytes.
-        device: Where the tensors are to be.
-        sh_degree: SH bands above this degree are zeros, whatever the file holds; None for all. Of
-            plain PLY files their columns are not even copied.
-        extras: Whether columns beyond the standard ones are carried; only plain PLY files have any.
-        axes: Where x, y and z of the file point, for example ``"rub"``, as
-            :func:`cvtgs.io.change_axes` names them; the scene is turned to ``"rdf"``, the axes of
-            PLY files. None for those that the file states, which ``.spz`` files of version 4 can,
-            or its format prescribes (``"luf"`` of glTF); others are taken to be ``"rdf"``.
+            ``KHR_gaussian_splatting``, ``.ckpt`` of nerfstudio's Splatfacto, ``.pt`` of gsplat's
+            trainer. In a folder, :func:`cvtgs.io.scene_file` finds the file. A file that is open
+            in binary mode is read to its end; it need not be seekable.
+        format: The suffix of the format, ``".splat"`` or ``"splat"``, which overrides the name of
+            the file. None detects it by the name, or by the first bytes of an open file.
+        device: The device of the tensors.
+        sh_degree: SH bands above this degree are set to zero; None keeps all. For plain PLY files
+            their columns are not even copied.
+        extras: Whether columns beyond the standard ones are kept; only plain PLY files have any.
+        axes: The axes of the file, for example ``"rub"``, as :func:`cvtgs.io.change_axes` names
+            them; the scene is converted to ``"rdf"``, the axes of PLY files. None uses those that
+            the file states (``.spz`` files of version 4 can) or its format prescribes (``"luf"``
+            for glTF), and ``"rdf"`` for other files.
         trust_sizes: Whether a compressed file may unpack to any size. By default, one that claims
             far more Gaussians than its bytes can hold is refused before it takes memory.
-        lod: Level of a streamed SOG; None for 0, the finest. Other files have none.
+        lod: Level of a streamed SOG; None for 0, the finest. Other files have no levels.
 
     Returns:
         The scene: float32, or float64 if the file has double coordinates.
 
     Raises:
-        InputNotFoundError: There is no such file.
+        InputNotFoundError: The file does not exist.
         InputError: It cannot be opened or read, or the folder holds no scene.
-        FileFormatError: The format is unknown, or the file is not what its format promises.
+        FileFormatError: The format is unknown, or the file does not conform to it.
         MissingDependencyError: Reading this file needs an optional package.
-        DeviceError: The device is not there.
-        InvalidArgumentError: There is no such SH degree, there are no such axes, or there is no
-            such level.
+        DeviceError: The device is not available.
+        InvalidArgumentError: The SH degree, the axes or the level do not exist.
         OutOfMemoryError: The scene does not fit into memory.
 
     Example:
@@ -158,7 +156,7 @@ def load(
             )
     source = scene_file(path)
     named = _dotted(format) or source
-    suffix = _suffix_of(named, _READERS) if is_file(source) else ".ply"  # whose reader raises
+    suffix = _suffix_of(named, _READERS) if is_file(source) else ".ply"  # the PLY reader raises
     if suffix.endswith(".ply"):
         from cvtgs.io.ply.header import is_compressed_ply  # noqa: PLC0415 (loaded as readers are)
 
@@ -197,32 +195,32 @@ def save(
 ) -> None:
     """Write a scene to a file, completely or not at all.
 
-    A scene that was loaded from a PLY is written to one with the properties, their order, types
-    and comments of that file, so that ``load(save(scene))`` gives the same bits. The other
-    formats round. What they cannot hold at all is warned about before anything is written
+    A scene that was loaded from a PLY file is written to a PLY file with the same properties,
+    order, types and comments, so that loading it again gives the same bits. Other formats round.
+    If a format cannot hold some data at all, there is a warning before anything is written
     (:class:`cvtgs.errors.DroppedDataWarning`); :func:`cvtgs.io.losses` reports it without writing.
 
     Args:
         scene: The scene, on any device.
-        path: The file to write; its suffix chooses the format: ``.ply``,
-            ``.compressed.ply``, ``.spz``, ``.splat``, ``.sog``, ``.glb``, ``.gltf``,
-            ``.spz.glb``, which is a glTF with an SPZ inside, or ``.usda`` (OpenUSD). Or a file
-            that is open for writing in binary mode, to which all bytes go once the scene is ready.
-        format: The suffix of the format, ``".spz"`` or ``"spz"``, whatever the file is called.
-            None goes by the name; an open file is given a ``.ply``.
+        path: The file to write; its suffix selects the format: ``.ply``, ``.compressed.ply``,
+            ``.spz``, ``.splat``, ``.sog``, ``.glb``, ``.gltf``, ``.spz.glb`` (a glTF with an SPZ
+            inside) or ``.usda`` (OpenUSD). A file that is open for writing in binary mode gets all
+            bytes once the scene is encoded.
+        format: The suffix of the format, ``".spz"`` or ``"spz"``, which overrides the name of the
+            file. None detects it by the name, and writes a ``.ply`` to an open file.
         overwrite: Whether an existing file may be replaced.
-        axes: Where x, y and z of the file are to point, as :func:`cvtgs.io.change_axes` names
-            them; the scene, whose own are ``"rdf"``, is turned to them. None for those of the
-            format: ``"luf"`` of glTF, ``"rub"`` of OpenUSD, ``"rdf"`` of the others. ``.spz``
-            files of version 4 state them.
+        axes: The axes of the file, as :func:`cvtgs.io.change_axes` names them; the scene, whose
+            axes are ``"rdf"``, is converted to them. None uses those of the format: ``"luf"`` for
+            glTF, ``"rub"`` for OpenUSD, ``"rdf"`` for the others. ``.spz`` files of version 4
+            state their axes.
         spz_version: Version of ``.spz`` files: 4, or 3 or 2 for older readers.
 
     Raises:
         FileFormatError: The format is unknown or cannot be written.
         OutputExistsError: The file exists and may not be replaced.
         OutputError: The file cannot be written (directory missing, no permission, disk full).
-        InvalidSceneError: Something in the scene has no place in the format.
-        InvalidArgumentError: There are no such axes, or there is no such version.
+        InvalidSceneError: The format cannot represent the scene.
+        InvalidArgumentError: The axes or the version do not exist.
 
     Example:
         >>> import tempfile
@@ -261,15 +259,15 @@ def save(
 
 
 def losses(scene: GaussianScene, path: str | os.PathLike[str]) -> Losses:
-    """Report what of a scene a file would not hold, before it is written.
+    """Report which data of a scene a file would not hold, without writing it.
 
     Args:
         scene: The scene.
         path: The file; only its name is used.
 
     Returns:
-        What would be dropped, what rounded or reordered (nothing for a ``.ply``), how many
-        Gaussians are left, and of which SH degree.
+        The data that would be dropped, and rounded or reordered (none for a ``.ply``), and the
+        number and SH degree of the Gaussians in the file.
 
     Raises:
         FileFormatError: The format is unknown or cannot be written.
@@ -286,7 +284,7 @@ def losses(scene: GaussianScene, path: str | os.PathLike[str]) -> Losses:
 
 
 def check_save(path: str | os.PathLike[str], overwrite: bool = False) -> None:
-    """Check that :func:`save` could write a file, before the long work that comes first.
+    """Check that :func:`save` could write a file, before the scene is computed.
 
     Args:
         path: The file to write.
@@ -307,12 +305,12 @@ def check_save(path: str | os.PathLike[str], overwrite: bool = False) -> None:
 
 
 def _dotted(suffix: str | None) -> str | None:
-    """Return the suffix of a format with its dot: ``ply`` means ``.ply``."""
+    """Return the suffix of a format with a leading dot: ``ply`` means ``.ply``."""
     return f".{suffix}" if suffix and "." not in suffix else suffix
 
 
 def _suffix_of(path: str | os.PathLike[str], known: Iterable[str]) -> str:
-    """Return the suffix of a file name, or the name, that chooses its format."""
+    """Return the suffix, or the whole file name, that selects the format."""
     path = Path(path)
     for suffix in known:
         if path.name.lower().endswith(suffix):

@@ -19,10 +19,10 @@ _HEADER = struct.Struct("<BBxxIIIIHxx3fff")
 _SECTION = struct.Struct("<IIIIfHxxIIIIH")
 
 _NUMBERS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
-"""Types of positions, of scales and rotations, and of SH, by level of compression."""
+"""Types of positions, of scales and rotations, and of SH, by compression level."""
 
 _RANGE = 32767
-"""Positions are whole numbers around this one, unless the section says another."""
+"""Quantised positions are centred on this number, unless the section states another."""
 
 _SH_RANGE = (-1.5, 1.5)
 _COMPONENTS = (0, 9, 24)
@@ -34,7 +34,7 @@ class _Section(NamedTuple):
 
     used: int
     room: int
-    """Gaussians that the section has bytes for."""
+    """Number of Gaussians that the section has bytes for."""
     bucket_size: int
     buckets: int
     block_size: float
@@ -49,8 +49,9 @@ class _Section(NamedTuple):
 def read_ksplat(path: Path) -> GaussianScene:
     """Read a ``.ksplat`` file.
 
-    Sections of Gaussians in buckets: f32, or positions of 16 bits about the centre of the bucket
-    and halves; opacities and colours are bytes, SH up to degree 2 f32, halves or bytes.
+    The file has sections of Gaussians in buckets. Positions, scales and rotations are f32; or
+    positions are 16 bits about the centre of the bucket, and scales and rotations are halves.
+    Opacities and colours are bytes; SH up to degree 2 are f32, halves or bytes.
     """
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -166,9 +167,9 @@ def _read_section(
 
 
 def _buckets(section: _Section, lengths: Int[np.ndarray, "p"]) -> Int[np.ndarray, "n"]:
-    """Return the bucket of every Gaussian: the full ones first, then those of given lengths."""
+    """Return the bucket of every Gaussian: full buckets first, then those of given lengths."""
     room = section.used
-    size = min(section.bucket_size, room)  # a damaged header may say four thousand million
+    size = min(section.bucket_size, room)  # a damaged header may state four billion
     full = min(section.full_buckets, room // max(1, size) + 1)
     first = np.repeat(np.arange(full), size)[:room]
     clipped = np.minimum(lengths, room)
@@ -179,7 +180,7 @@ def _buckets(section: _Section, lengths: Int[np.ndarray, "p"]) -> Int[np.ndarray
 
 
 def _rest(stored: Float[np.ndarray, "n c"], degree: int) -> Float[np.ndarray, "n k 3"]:
-    """Sort components, which are by band and then by channel; bands that are missing are 0."""
+    """Reorder SH components, stored by band and then by channel; missing bands are 0."""
     rest = np.zeros((len(stored), _COMPONENTS[degree] // 3, 3), np.float32)
     start = 0
     for band in (1, 2):

@@ -1,4 +1,4 @@
-"""What each format holds, and what of a scene it therefore loses."""
+"""Limits of each format, and the data of a scene that is lost in it."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -13,13 +13,13 @@ from cvtgs.validity import writable_rows
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Losses:
-    """What a file will not hold of a scene.
+    """The data of a scene that a file will not hold.
 
     Attributes:
-        dropped: What is left out or cut off, a phrase each; worth a warning.
-        changed: What is rounded or reordered, as in every file of the format.
-        count: Gaussians that will be in the file.
-        sh_degree: Their SH degree there.
+        dropped: Data that are left out or clamped, one phrase each; they deserve a warning.
+        changed: Data that are rounded or reordered, as in every file of the format; lost comments.
+        count: Number of Gaussians in the file.
+        sh_degree: Their SH degree in the file.
     """
 
     dropped: tuple[str, ...]
@@ -30,18 +30,18 @@ class Losses:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FormatLimits:
-    """What files of a format hold."""
+    """The limits of files of a format."""
 
     sh_degree: int
     antialiased: bool
-    """Whether they record that a scene was trained with anti-aliasing."""
+    """Whether files record that a scene was trained with anti-aliasing."""
     comments: bool = False
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Least and largest value of a tensor, by its name."""
+    """Minimum and maximum of the values of a tensor, by its name."""
     largest_coordinate: Callable[[GaussianScene], float] | None = None
-    """Computes the largest coordinate that a file of a scene holds; None if any fits."""
+    """Computes the largest coordinate that a file of a scene can hold; None if unlimited."""
     changed: tuple[str, ...]
-    """What is rounded or reordered."""
+    """Phrases for data that are rounded or reordered."""
 
 
 def _largest_spz_coordinate(scene: GaussianScene) -> float:
@@ -73,7 +73,7 @@ _GLTF = FormatLimits(
     sh_degree=3,
     antialiased=True,
     comments=True,
-    ranges={"log_scales": (-87.3, 88.7)},  # scales that are float32
+    ranges={"log_scales": (-87.3, 88.7)},  # scales are stored as float32
     changed=("scales and opacities as float32, not their logarithms and logits",),
 )
 
@@ -101,7 +101,7 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
         ".splat": FormatLimits(
             sh_degree=0,
             antialiased=False,
-            # colours in [0, 1] and half a step; scales that are float32
+            # colours in [0, 1] plus half a step; scales are stored as float32
             ranges={"sh0": (-1.7794, 1.7794), "log_scales": (-87.3, 88.7)},
             changed=(
                 "colours and opacities in steps of 1/255",
@@ -123,7 +123,7 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
         ),
     }
 )
-"""Limits by suffix; a ``.ply`` has none."""
+"""Limits by suffix; ``.ply`` has none."""
 
 _VALUES = {
     "means": "coordinates",
@@ -134,7 +134,7 @@ _VALUES = {
 
 
 def losses_within(scene: GaussianScene, limits: FormatLimits) -> Losses:
-    """Report what of a scene is lost in a format."""
+    """Report which data of a scene a format loses."""
     changed = list(limits.changed)
     others = [line for line in scene.comments if ANTIALIASED_TAG.lower() not in line.lower()]
     if others and not limits.comments:

@@ -1,4 +1,4 @@
-"""One run at a time works on an output: a lock beside it that says who holds it."""
+"""Locks beside outputs, so that one run at a time works on each; they name their holder."""
 
 import json
 import os
@@ -16,8 +16,8 @@ from cvtgs.errors import OutputBusyError, OutputError
 def output_lock(path: str | os.PathLike[str]) -> Iterator[None]:
     """Hold the lock of an output, a hidden file ``.NAME.lock`` beside it.
 
-    The system releases it when the process ends, however it ends; the file is removed with it, or
-    by the next run after a kill.
+    The system releases it when the process ends, in whichever way. The file is removed on release,
+    or by the next run after a kill.
     """
     from filelock import FileLock, SoftFileLock, Timeout  # noqa: PLC0415 (loaded when used)
 
@@ -35,14 +35,14 @@ def output_lock(path: str | os.PathLike[str]) -> Iterator[None]:
         raise OutputError(
             f"{os.fspath(path)}: its folder must allow a lock file, found: {reason}."
         ) from error
-    is_soft = isinstance(lock, SoftFileLock)  # its file has a content of its own
+    is_soft = isinstance(lock, SoftFileLock)  # its file has its own content
     try:
         if not is_soft:
             with suppress(OSError):  # a locked file cannot be written to on Windows
                 file.write_text(_signature(), encoding="utf-8")
         yield
     finally:
-        if os.name == "posix" and not is_soft:  # while it is held, so no other lock is removed
+        if os.name == "posix" and not is_soft:  # while locked, so no other lock is removed
             with suppress(OSError):
                 file.unlink()
         lock.release()
@@ -52,7 +52,7 @@ def output_lock(path: str | os.PathLike[str]) -> Iterator[None]:
 def folder_lock(path: str | os.PathLike[str]) -> Iterator[None]:
     """Hold the lock of a folder to write several files to, as :func:`output_lock` does.
 
-    There is none where no file can be made, so that whatever writes there says what is wrong.
+    If no file can be created there, nothing is locked, so that the writer reports the fault.
     """
     place = lock_path(path).parent
     if place.is_dir() and os.access(place, os.W_OK | os.X_OK):
@@ -63,7 +63,7 @@ def folder_lock(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def lock_path(path: str | os.PathLike[str]) -> Path:
-    """Return the lock file of an output: beside it, or in a folder beside which none can be."""
+    """Return the lock file of an output: beside it, or in it if its parent is not writable."""
     target = Path(os.path.realpath(path))
     if target.is_dir() and not os.access(target.parent, os.W_OK | os.X_OK):
         return target / ".lock"
@@ -71,7 +71,7 @@ def lock_path(path: str | os.PathLike[str]) -> Path:
 
 
 def _signature() -> str:
-    """Describe this process for others."""
+    """Describe this process for other processes."""
     command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:2]]) if sys.argv else "python"
     started = time.strftime("%Y-%m-%d %H:%M:%S")
     holder = {"process": os.getpid(), "host": socket.gethostname()}
@@ -79,7 +79,7 @@ def _signature() -> str:
 
 
 def _holder(file: Path) -> str:
-    """Describe the process that holds a lock, as far as can be told."""
+    """Describe the process that holds a lock, as far as it is known."""
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
         return "process {process} on {host} ({command}, since {since})".format_map(found)

@@ -37,7 +37,7 @@ _LEAST_SCALE = np.finfo(np.float32).tiny
 def read_splat(path: Path) -> GaussianScene:
     """Read a ``.splat`` file.
 
-    A Gaussian is three f32 of position, three f32 of scale (not its logarithm), and bytes:
+    A Gaussian is three f32 of position, three f32 of scale (not its logarithm), and eight bytes:
     red, green, blue, opacity, and the quaternion, w first, as ``128 + 128 q``.
     """
     with open_input(path) as file:

@@ -1,4 +1,4 @@
-"""Scenes in open binary files: a pipe, a socket, a zip member, bytes in memory."""
+"""Open binary files as input and output: pipes, sockets, zip members, bytes in memory."""
 
 import re
 import shutil
@@ -12,7 +12,7 @@ from typing import BinaryIO, Protocol, cast
 from cvtgs.errors import CvtgsError, FileFormatError, InputError, OutputError
 
 MEMORY_BYTES = 1 << 26
-"""A file is built in memory up to this size, and on the disk beyond it."""
+"""A file is built in memory up to this size, and on disk beyond it."""
 
 _FIRST_BYTES = {b"ply": ".ply", b"\x1f\x8b": ".spz", b"NGSP": ".spz", b"glTF": ".glb"}
 _TORCH_MEMBER = re.compile(r"[^/]+/data\.pkl")
@@ -22,7 +22,7 @@ class ByteSource(Protocol):
     """An open binary file to read."""
 
     def read(self, size: int = -1, /) -> bytes:
-        """Return the next bytes; none at the end."""
+        """Return the next bytes; empty at the end."""
         ...
 
 
@@ -42,10 +42,10 @@ def file_of(
     name: str | None = None,
     advice: str = "give format= for another one, such as '.splat'",
 ) -> Iterator[Path]:
-    """Copy what is left of a stream to a file, which is there while the context is.
+    """Copy the rest of a stream to a temporary file, which exists while the context is open.
 
-    Errors of the context that name the file name the stream instead: by ``name``, or by its own.
-    ``advice`` says what to do where the first bytes tell no format.
+    Errors in the context that name the file name the stream instead, by ``name`` or its own name.
+    ``advice`` ends the error message if the first bytes match no format.
     """
     name = name or name_of(stream)
     with TemporaryDirectory(prefix="cvtgs-") as folder:
@@ -81,7 +81,7 @@ def file_of(
 
 @contextmanager
 def written_to(stream: ByteSink) -> Iterator[BinaryIO]:
-    """Open a file that can seek, and copy it to a stream when it is complete."""
+    """Open a seekable file, and copy it to a stream when it is complete."""
     with SpooledTemporaryFile(max_size=MEMORY_BYTES) as file:
         yield cast(BinaryIO, file)
         file.seek(0)
@@ -95,7 +95,7 @@ def written_to(stream: ByteSink) -> Iterator[BinaryIO]:
 
 
 def format_of(path: Path) -> str | None:
-    """Return the suffix of the format that a file has by its content; None if it tells none."""
+    """Return the suffix of the format that the content of a file shows; None if unknown."""
     with path.open("rb") as file:
         first = file.read(4)
     for start, suffix in _FIRST_BYTES.items():
@@ -107,19 +107,19 @@ def format_of(path: Path) -> str | None:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
     except (zipfile.BadZipFile, ValueError, OSError):
-        return ".sog"  # whose reader says what is wrong
+        return ".sog"  # the SOG reader reports the damage
     return ".pt" if any(map(_TORCH_MEMBER.fullmatch, names)) else ".sog"
 
 
 def name_of(stream: ByteSource | ByteSink) -> str:
-    """Return what to call a stream in messages."""
+    """Return the name of a stream for messages."""
     name = getattr(stream, "name", None)
     return name if isinstance(name, str) else f"the {type(stream).__name__}"
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[BinaryIO]:
-    """Open a temporary file; a full disk is an OutputError that names its folder."""
+    """Open a temporary file; failure to create it is an OutputError that names its folder."""
     try:
         file = path.open("xb")
     except OSError as error:

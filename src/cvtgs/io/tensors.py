@@ -1,4 +1,4 @@
-"""Named tensors in safetensors files: what networks and caches are stored in, never a pickle."""
+"""Named tensors in safetensors files, which store networks and caches (never pickles)."""
 
 import json
 import os
@@ -19,7 +19,7 @@ def pack_tensors(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> 
     own = {name: values.detach().cpu().contiguous() for name, values in tensors.items()}
     content = save(own)
     length = int.from_bytes(content[:8], "little")
-    # safetensors would write the texts in another order every time.
+    # safetensors would write the metadata in another order every time.
     header = {"__metadata__": dict(sorted(metadata.items())), **json.loads(content[8 : 8 + length])}
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     text += b" " * (-len(text) % 8)
@@ -43,13 +43,13 @@ def unpack_tensors(content: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
 def save_tensors(
     path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, str]
 ) -> None:
-    """Write tensors to a file, completely or not at all; an existing file is replaced."""
+    """Write tensors to a file atomically; an existing file is replaced."""
     with atomic_output(path, overwrite=True) as file:
         file.write(pack_tensors(tensors, metadata))
 
 
 def map_tensors(path: str | os.PathLike[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Map the tensors of a file; their pages are read when they are used."""
+    """Map the tensors of a file into memory; pages are read on use."""
     from safetensors import SafetensorError, safe_open  # noqa: PLC0415
 
     if not Path(path).is_file():

@@ -14,19 +14,19 @@ from cvtgs.scene import GaussianScene
 from cvtgs.text import printable
 
 AXES = "rub"
-"""Right, up, back: axes of a stage whose up axis is Y."""
+"""Right, up, back: the axes of a stage whose up axis is Y."""
 
 _CHUNK_ROWS = 1 << 15
 _SIGMAS = 3.0
-"""Bounds hold Gaussians up to here, in standard deviations."""
+"""Extent of a Gaussian in the bounds, in standard deviations."""
 
 
 def write_usda(scene: GaussianScene, file: BinaryIO) -> None:
-    """Write a stage with one prim, in the order and the axes of the scene; numbers keep float32.
+    """Write a stage with one prim, in the scene's order and axes; numbers keep float32 precision.
 
     Args:
         scene: The scene, on any device.
-        file: Where to, open for writing.
+        file: The output, open for writing.
 
     Raises:
         InvalidSceneError: No Gaussian of the scene is finite.
@@ -65,7 +65,7 @@ def _document(scene: GaussianScene, arrays: Arrays) -> Iterator[str]:
 
 
 def _array(name: str, values: Floats) -> Iterator[str]:
-    """Return an attribute, a part at a time; rows of several numbers are tuples."""
+    """Yield the text of an attribute in chunks; rows of several numbers are tuples."""
     row = "%.9g" if values.ndim == 1 else f"({', '.join(['%.9g'] * values.shape[1])})"
     yield f"    {name} = ["
     for start in range(0, len(values), _CHUNK_ROWS):

@@ -1,4 +1,4 @@
-"""Scenes that do not fit into memory: blocks of space, one after the other or on a cluster."""
+"""Simplify scenes that do not fit into memory in blocks of space, here or on a cluster."""
 
 from cvtgs.outofcore.distributed import ClusterWorkers, connect, simplify_distributed
 from cvtgs.outofcore.memory import available_memory, block_count, needed_memory, read_bytes

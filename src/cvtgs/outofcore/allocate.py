@@ -1,7 +1,7 @@
-"""Allocation over all blocks: cells merge wherever they lie, and Gaussians move to those that fit.
+"""Allocation over all blocks: cells merge across block borders, and Gaussians change groups.
 
-Blocks describe the parts of cells that they hold. One process adds these up, merges pairs of cells
-until as many groups are left as are wanted, and gives each group to the block of its heaviest cell.
+Each block describes its parts of cells. One process adds up these parts, merges pairs of cells
+until the wanted number of groups is left, and gives each group to the block of its heaviest cell.
 """
 
 import json
@@ -25,24 +25,24 @@ from cvtgs.outofcore.job import SENT_BYTES, Job
 from cvtgs.outofcore.rows import BlockRows, read_rows, send_rows
 
 KEY = 1 << 32
-"""A cell or group is known everywhere by its block times this, plus its number in the block."""
+"""The global key of a cell or group is its block times this, plus its number in the block."""
 
 
 def cell_parts(
     job: Job, block: int, rows: BlockRows, owners: Int[Tensor, "n"], labels: Int[Tensor, "n"]
 ) -> dict[str, Tensor]:
-    """Return the part of every cell that lies in a block, by name of its tensor.
+    """Return the parts of cells in a block, as tensors by name.
 
     Args:
         job: The job.
         block: The block.
-        rows: Its Gaussians.
-        owners: Block of the cell of each; -1 is this block.
-        labels: Number of the cell in its block.
+        rows: Gaussians of the block.
+        owners: Block of the cell of each Gaussian; -1 is this block.
+        labels: Number of the cell of each Gaussian in the block of the cell.
 
     Returns:
-        ``parts``: the part that each Gaussian belongs to, own cells first. ``remote``: block and
-        number of the cell of every other part. The moments of all parts.
+        ``parts``: the part that each Gaussian belongs to; parts of own cells come first.
+        ``remote``: block and number of the cell of every other part. The moments of all parts.
     """
     count = job.cells[block]
     away = (owners >= 0).nonzero()[:, 0]
@@ -55,7 +55,7 @@ def cell_parts(
 
 
 def _members(job: Job, rows: BlockRows) -> Moments:
-    """Return the moments of Gaussians, in units that are the same in all blocks."""
+    """Return the moments of Gaussians, in the same units for all blocks."""
     scan, scene = job.read_scan(), rows.scene
     return cells.gaussian_moments(
         scene,
@@ -69,7 +69,7 @@ def _members(job: Job, rows: BlockRows) -> Moments:
 
 @one_thread()
 def allocate(job: Job) -> None:
-    """Choose which cells of all blocks become one, and write the groups of every block."""
+    """Choose the cells of all blocks that merge, and write the groups of every block."""
     if job.path("targets.json").exists() and all(
         job.groups_path(block).exists() for block in job.blocks_with_sites()
     ):
@@ -93,7 +93,7 @@ def allocate(job: Job) -> None:
 
 
 def _regions(job: Job) -> list[list[int]]:
-    """Return runs of blocks whose cells fit into memory together: one if all do."""
+    """Return runs of blocks whose cells fit into memory together; a single run if all fit."""
     regions: list[list[int]] = []
     held = 0
     for block in job.blocks_with_sites():
@@ -106,7 +106,7 @@ def _regions(job: Job) -> list[list[int]]:
 
 
 def _allocate_region(job: Job, region: Sequence[int], count: int) -> list[int]:
-    """Merge the cells of some blocks, write the groups, and return how many each block gets."""
+    """Merge the cells of a region, write its groups, and return the number of groups per block."""
     config = _costs(job)
     sizes = torch.tensor([job.cells[block] for block in region])
     fine = _add_parts(job, region)
@@ -122,7 +122,7 @@ def _allocate_region(job: Job, region: Sequence[int], count: int) -> list[int]:
     ranks[order] = torch.arange(count)
     labels = ranks[labels]
     groups = cells.group_moments(fine, labels, count)
-    near = torch.arange(count).expand(REASSIGN, -1).clone()  # none but itself
+    near = torch.arange(count).expand(REASSIGN, -1).clone()  # no neighbours but itself
     if config.reassign:
         found = cvt.nearest_neighbors(groups.means.T, REASSIGN)
         near[: found.shape[1]] = found.T
@@ -138,12 +138,12 @@ def _allocate_region(job: Job, region: Sequence[int], count: int) -> list[int]:
 
 
 def _costs(job: Job) -> AllocationConfig:
-    """Return what merging costs at the ratio of all blocks together."""
+    """Return the costs of merging at the ratio of the whole scene."""
     return allocation_at(job.total / job.read_scan().row_count, job.config.allocation)
 
 
 def _add_parts(job: Job, region: Sequence[int]) -> Moments:
-    """Return the cells of some blocks, of which other blocks may hold parts."""
+    """Return the moments of the cells of a region, including their parts in other blocks."""
     starts, total = torch.full((job.blocks,), -1), 0
     for block in region:
         starts[block] = total
@@ -160,7 +160,7 @@ def _add_parts(job: Job, region: Sequence[int]) -> Moments:
 
 
 def _cells_of_parts(job: Job, block: int, remote: Int[Tensor, "r 2"]) -> tuple[Tensor, Tensor]:
-    """Return block and number of the cell of every part that a block holds."""
+    """Return block and number of the cell of every part in a block."""
     count = job.cells[block]
     owners = torch.cat([torch.full((count,), block), remote[:, 0]])
     return owners, torch.cat([torch.arange(count), remote[:, 1]])
@@ -170,7 +170,7 @@ def _cells_of_parts(job: Job, block: int, remote: Int[Tensor, "r 2"]) -> tuple[T
 def join(job: Job, block: int) -> None:
     """Write the group of every Gaussian of a block, and the rows that belong to remote groups.
 
-    Of those in the block of a group, the one that fits it best stays, so no group is empty.
+    Each group keeps the best-fitting Gaussian of its own block, so no group becomes empty.
     """
     if job.labels_path(block).exists():
         return
@@ -193,7 +193,7 @@ def join(job: Job, block: int) -> None:
 def _reassigned(
     job: Job, block: int, members: Moments, found: Int[Tensor, "n"]
 ) -> Int[Tensor, "n"]:
-    """Move every Gaussian once to the group that explains it best, in any block."""
+    """Move every Gaussian once to the neighbouring group that fits it best, in any block."""
     used = torch.unique(found)
     (near,) = _take(job, used, "near")
     keys = torch.unique(torch.cat([used, near.flatten()]))
@@ -214,7 +214,7 @@ def _reassigned(
 
 
 def _take(job: Job, keys: Int[Tensor, "k"], *names: str) -> list[Tensor]:
-    """Read columns of tables in the files of groups, in whatever blocks they are."""
+    """Read columns of tables in the group files of all blocks, by global key."""
     ascending, inverse = torch.unique(keys, return_inverse=True)
     parts: list[list[Tensor]] = [[] for _ in names]
     for block, rows in _by_block(ascending):
@@ -225,6 +225,6 @@ def _take(job: Job, keys: Int[Tensor, "k"], *names: str) -> list[Tensor]:
 
 
 def _by_block(keys: Int[Tensor, "k"]) -> list[tuple[int, Tensor]]:
-    """Return the blocks of ascending keys, and the numbers in each."""
+    """Return each block of ascending keys, with the numbers in it."""
     blocks, counts = torch.unique_consecutive(keys // KEY, return_counts=True)
     return list(zip(blocks.tolist(), (keys % KEY).split(counts.tolist()), strict=True))

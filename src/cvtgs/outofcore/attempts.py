@@ -1,4 +1,4 @@
-"""Files of rows that one attempt to sort a range has written, before they are adopted."""
+"""Files of rows that one attempt to sort a range writes, before the job adopts them."""
 
 import secrets
 import zlib
@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 
 class SortedFile(NamedTuple):
-    """A file that one attempt to sort a range has written, before it is adopted.
+    """A file that one attempt to sort a range wrote, before the job adopts it.
 
     Attributes:
-        name: Name that it gets in the folder of the job.
-        attempt: Name that it has.
-        size: Bytes.
+        name: Final name in the folder of the job.
+        attempt: Current name.
+        size: Size in bytes.
         checksum: CRC-32 of its content.
     """
 
@@ -23,9 +23,9 @@ class SortedFile(NamedTuple):
 
 
 class Attempt:
-    """The files that one call writes for a range; a second call for it writes others.
+    """The files that one call writes for a range; every other call for it writes other files.
 
-    So a worker that was taken for dead and still writes cannot damage those that are used.
+    Therefore a worker that was presumed dead but still writes cannot damage the files in use.
     """
 
     def __init__(self, folder: str) -> None:
@@ -34,14 +34,14 @@ class Attempt:
         self._found: dict[str, tuple[int, int]] = {}
 
     def append(self, name: str, content: bytes) -> None:
-        """Append to the file that is to get a name."""
+        """Append to the file with this final name."""
         with (self._folder / self._name(name)).open("ab") as file:
             file.write(content)
         size, checksum = self._found.get(name, (0, 0))
         self._found[name] = (size + len(content), zlib.crc32(content, checksum))
 
     def files(self) -> tuple[SortedFile, ...]:
-        """Return what was written."""
+        """Return the written files."""
         return tuple(
             SortedFile(name, self._name(name), size, checksum)
             for name, (size, checksum) in self._found.items()

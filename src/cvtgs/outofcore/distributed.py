@@ -1,4 +1,4 @@
-"""Blocks on many machines, by the distributed scheduler of Dask; only this file imports it."""
+"""Run blocks on many machines with Dask's distributed scheduler; only this file imports it."""
 
 import logging
 import os
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 MAX_DEATHS = 5
-"""Rounds of workers that may die with a task before it is given up."""
+"""Number of rounds in which workers may die with a task before it is given up."""
 
 ANSWER_SECONDS = 30.0
-"""How long a scheduler, a first worker, or a worker that is asked something may take."""
+"""Seconds in which a scheduler must answer, a first worker appear, or a worker answer a check."""
 
 _SHARE_SECONDS = 10.0
-"""How long a shared disk may take until a worker sees a new file."""
+"""Seconds that a shared disk may take to show a new file to a worker."""
 
 
 def simplify_distributed(
@@ -45,27 +45,26 @@ def simplify_distributed(
 ) -> SimplifyReport:
     """Simplify a file on the workers of a Dask cluster.
 
-    What :func:`cvtgs.outofcore.simplify_file` does, with the same bits for the same number of
-    blocks (processors of one kind given): ranges of the file and blocks are tasks of a few
-    seconds to minutes each, and all that they exchange are files in the folder beside the output.
-    Every worker must see source and output under the same path. The tasks of a worker that dies
-    are done again.
+    The result has the same bits as that of :func:`cvtgs.outofcore.simplify_file` with the same
+    number of blocks, on processors of one kind. Ranges of the file and blocks are tasks of a few
+    seconds to minutes each, which exchange data only through files in the folder beside the output.
+    Every worker must see source and output under the same path. If a worker dies, its tasks rerun.
 
     Args:
         source: A binary PLY file.
         rho: Ratio of Gaussians to keep, in (0, 1].
         client: A client of the cluster, or the address of its scheduler.
         output: The file to write; None writes ``<stem>_rho<rho>.ply`` beside the source.
-        **options: Those of :func:`cvtgs.outofcore.simplify_file`; ``memory`` is that of one task.
+        **options: Options of :func:`cvtgs.outofcore.simplify_file`; ``memory`` is per task.
 
     Returns:
         The report.
 
     Raises:
         MissingDependencyError: ``distributed`` is not installed.
-        RunError: There is no such scheduler, its workers cannot do the work (no access, another
-            version), or a task fails again and again.
-        CvtgsError: What :func:`cvtgs.outofcore.simplify_file` raises.
+        RunError: The scheduler does not answer, its workers cannot do the job (no access, another
+            version), or a task fails repeatedly.
+        CvtgsError: Any other error of :func:`cvtgs.outofcore.simplify_file`.
     """
     if output is None:
         output = Path(source).with_name(f"{Path(source).stem}_rho{rho:g}.ply")
@@ -82,11 +81,11 @@ def connect(address: str) -> "Client":
         address: Its address, such as ``tcp://10.0.0.1:8786``.
 
     Returns:
-        A client, to be closed by the caller.
+        A client, which the caller must close.
 
     Raises:
         MissingDependencyError: ``distributed`` is not installed.
-        RunError: There is no such scheduler.
+        RunError: No scheduler answers at the address.
     """
     try:
         from distributed import Client  # noqa: PLC0415 (optional)
@@ -95,7 +94,7 @@ def connect(address: str) -> "Client":
             "work on many machines needs the package distributed; "
             "install it with: pip install 'cvtgs[dask]'."
         ) from error
-    for name in ("distributed", "distributed.client"):  # what they tell is raised, too
+    for name in ("distributed", "distributed.client"):  # their messages are raised as errors, too
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         return Client(address, timeout=ANSWER_SECONDS)
@@ -105,12 +104,12 @@ def connect(address: str) -> "Client":
 
 
 class _Worker(NamedTuple):
-    """What a worker says of itself.
+    """The answer of a worker to a check.
 
     Attributes:
-        versions: Of what the result depends on.
-        source_bytes: Size of the source as it sees it, None if it does not.
-        sees_folder: Whether it reads and may write the folder of the job.
+        versions: Versions of the software that the result depends on.
+        source_bytes: Size of the source as the worker sees it; None if it cannot see it.
+        sees_folder: Whether the worker can read and write the folder of the job.
     """
 
     versions: dict[str, str]
@@ -124,7 +123,7 @@ def _versions() -> dict[str, str]:
 
 
 def _look(source: str, probe: str, token: str) -> _Worker:
-    """Look on a worker at what it has; shared disks get a while to show the probe."""
+    """Return the state of the worker that this runs on; wait for shared disks to show the probe."""
     path, deadline = Path(probe), time.monotonic() + _SHARE_SECONDS
     while not path.exists() and path.parent.parent.parent.is_dir() and time.monotonic() < deadline:
         time.sleep(0.2)
@@ -140,7 +139,7 @@ def _look(source: str, probe: str, token: str) -> _Worker:
 
 
 def _call(function: Callable[[Any], Any], versions: dict[str, str], item: Any) -> Any:
-    """Call a function on a worker, unless one of another version has joined meanwhile."""
+    """Call a function on a worker; raise if the worker joined late and has other versions."""
     if versions != _versions():
         raise RunError(_differs("a worker", _versions()))
     return function(item)
@@ -153,7 +152,7 @@ def _differs(worker: str, found: dict[str, str]) -> str:
 
 
 class ClusterWorkers:
-    """Calls functions on the workers of a cluster, again where a worker died or a disk failed.
+    """Calls functions on the workers of a cluster; repeats calls if a worker dies or a disk fails.
 
     Args:
         client: A client of the cluster.
@@ -163,17 +162,17 @@ class ClusterWorkers:
         self._client = client
 
     def check(self, job: Job) -> int:
-        """Check within half a minute that all workers can do a job.
+        """Check that all workers can do a job; each wait ends within half a minute.
 
         Args:
-            job: The job; its folder is there.
+            job: The job; its folder must exist.
 
         Returns:
-            How many workers there are.
+            The number of workers.
 
         Raises:
-            RunError: There is none, or one has no cvtgs, another version, or no access to the
-                source or to the folder of the output.
+            RunError: There is no worker, or one has no cvtgs, another version, or no access to
+                the source or to the folder of the output.
         """
         with _scheduler_errors():
             addresses = self._wait_for_workers()
@@ -182,7 +181,7 @@ class ClusterWorkers:
         return len(addresses)
 
     def _check_access(self, addresses: Sequence[str], job: Job) -> None:
-        """Refuse workers that do not see what a job reads and writes."""
+        """Raise if a worker cannot access the files that a job reads and writes."""
         from distributed import wait  # noqa: PLC0415 (optional)
 
         token, probe = secrets.token_hex(8), job.path("probe")
@@ -192,7 +191,7 @@ class ClusterWorkers:
             address: self._client.submit(_look, *arguments, workers=[address], pure=False)
             for address in addresses
         }
-        with suppress(TimeoutError):  # who has not answered is named below
+        with suppress(TimeoutError):  # workers without an answer are named below
             wait(list(futures.values()), timeout=ANSWER_SECONDS)
         try:
             for address, future in futures.items():
@@ -202,7 +201,7 @@ class ClusterWorkers:
             self._cancel(list(futures.values()))
 
     def _check_packages(self, addresses: Sequence[str]) -> None:
-        """Refuse workers without this cvtgs, which may never answer to a function of it."""
+        """Raise if a worker lacks this cvtgs: calls of its functions might never be answered."""
         from distributed import wait  # noqa: PLC0415 (optional)
 
         call, answers = self._client.submit, {}
@@ -251,7 +250,7 @@ class ClusterWorkers:
             The results, in the order of the items.
 
         Raises:
-            RunError: A task fails again and again.
+            RunError: A task fails repeatedly.
         """
         call = self._client.submit
         with _scheduler_errors():
@@ -307,7 +306,7 @@ class ClusterWorkers:
 
 
 def _check_answer(address: str, future: "Future[Any]", job: Job) -> None:
-    """Refuse a worker that cannot do a job."""
+    """Raise if a worker cannot do a job."""
     if future.status == "error":
         raise RunError(
             f"{address}: this worker must have cvtgs {cvtgs.__version__}, found: "
@@ -338,7 +337,7 @@ def _check_answer(address: str, future: "Future[Any]", job: Job) -> None:
 
 @contextmanager
 def _scheduler_errors() -> Iterator[None]:
-    """Turn what a client raises when its scheduler is gone into one sentence."""
+    """Turn the errors of a client whose scheduler is gone into one clear error."""
     try:
         yield
     except (CancelledError, OSError) as error:
@@ -355,7 +354,7 @@ def _gone() -> RunError:
 
 
 def _told(error: BaseException | None) -> str:
-    """Return what an error of a library says, in one line."""
+    """Return the message of a library's error in one line."""
     lines = [line for line in str(error).splitlines() if line.strip()]
     text = f"{type(error).__name__}: {lines[0].strip()}" if lines else type(error).__name__
     return text[:200].rstrip(".")

@@ -14,16 +14,16 @@ from cvtgs.cvt import NearestSite, nearest_several
 from cvtgs.io.tensors import map_tensors
 
 RUN = 1 << 9
-"""Consecutive balls that are compared with a box together, before each of them is."""
+"""Number of consecutive balls whose common box is tested before the single balls."""
 
 
 class OtherBlock(NamedTuple):
-    """Positions in another block, read only where they are needed.
+    """Positions in another block, which are loaded lazily.
 
     Attributes:
         number: Number of the block.
         bounds: ``(2, d)`` bounding box of the positions.
-        load: Returns the ``(m, d)`` positions, at least one.
+        load: Loads the ``(m, d)`` positions, at least one.
     """
 
     number: int
@@ -32,23 +32,23 @@ class OtherBlock(NamedTuple):
 
 
 def other_blocks(paths: Mapping[int, Path], *, name: str) -> Iterator[OtherBlock]:
-    """Return blocks by the paths of their files; positions are the tensor ``name`` in these."""
+    """Return blocks from the paths of their files; the tensor ``name`` holds the positions."""
     for block, path in paths.items():
         tensors, _ = map_tensors(path)
         yield OtherBlock(block, tensors["bounds"], partial(tensors.__getitem__, name))
 
 
 def bounding_box(points: Float[Tensor, "n d"]) -> Float[Tensor, "2 d"]:
-    """Return the least and the largest coordinates of points."""
+    """Return the minimum and the maximum coordinates of points."""
     return torch.stack([points.amin(dim=0), points.amax(dim=0)]).double()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Balls:
-    """Balls around points, within which something else may be nearer than what was found.
+    """Balls around points; only positions inside a ball can be nearer than those already found.
 
     Attributes:
-        centers: ``(n, d)`` positions, best along a space-filling curve.
+        centers: ``(n, d)`` positions; ideally sorted along a space-filling curve.
         squared: ``(n,)`` squared radii.
         run_boxes: ``(r, 2, d)`` bounding boxes of runs of consecutive centres.
         run_squared: ``(r,)`` largest squared radius of each run.
@@ -72,7 +72,7 @@ class Balls:
         )
 
     def touching(self, box: Float[Tensor, "2 d"]) -> Int[Tensor, "k"]:
-        """Return the rows of the balls that reach into a box."""
+        """Return the rows of the balls that intersect a box."""
         low, high = box
         gaps = torch.maximum(self.run_boxes[:, 0] - high, low - self.run_boxes[:, 1])
         runs = (gaps.clamp_min(0.0).square().sum(dim=1) < self.run_squared).nonzero()[:, 0]
@@ -95,7 +95,7 @@ class Assignment(NamedTuple):
     """The nearest site of every point, in any block.
 
     Attributes:
-        blocks: ``(n,)`` block of the site; -1 is the own block.
+        blocks: ``(n,)`` block of the site; -1 is the point's own block.
         labels: ``(n,)`` number of the site in its block.
         squared: ``(n,)`` squared distance to it, in float64.
     """
@@ -112,9 +112,9 @@ def assign_points(
     *,
     nearest: NearestSite,
 ) -> Assignment:
-    """Find the nearest site of every point among those of all blocks.
+    """Find the nearest site of every point among the sites of all blocks.
 
-    Only points that are nearer to the box of another block than to their site are searched there.
+    A point is searched in another block only if that block's box is nearer than its best site.
     """
     if len(sites):
         labels, squared = nearest(points, sites)
@@ -138,7 +138,7 @@ def assign_points(
 def halo_cells(
     centers: Float[Tensor, "m 3"], others: Iterable[OtherBlock], *, count: int
 ) -> Int[Tensor, "h 2"]:
-    """Return block and number of remote cells that may be among the nearest of an own cell."""
+    """Return block and number of remote cells that may be among an own cell's ``count`` nearest."""
     centers = centers.double()
     if len(centers) > count:
         _, distances = nearest_several(centers, centers, count + 1)

@@ -1,7 +1,7 @@
-"""Finished blocks are matched to images of the full scene and refined, one by one.
+"""Match finished blocks to images of the full scene and refine them, one by one.
 
-Of a block, all Gaussians are drawn; of the others, those of the small scene. These are the same in
-images of both scenes, and fixed, so what differs is the block.
+In images of the full scene, only the block itself shows all of its Gaussians; the other blocks show
+their simplified ones, fixed and the same as in images of the small scene. Only the block differs.
 """
 
 from collections.abc import Sequence
@@ -26,21 +26,21 @@ from cvtgs.scene import GaussianScene, concatenate
 from cvtgs.views import CameraPositions, find_view_positions, mixed_views
 
 NEAR = 0.5
-"""Cameras stand among what lies within this share of the diagonal of a block around it."""
+"""Camera positions depend on Gaussians around a block up to this share of its diagonal away."""
 
 
 LATER_SEED = 307
-"""Added to the seed: views to learn from are others than those for matching."""
+"""Added to the seed, so that views for refinement differ from those for matching."""
 
 
 class Drawn(NamedTuple):
-    """What is drawn while a block is improved.
+    """The scenes that are rendered while a block is improved.
 
     Attributes:
-        small: The fixed Gaussians, then those of the small block.
+        small: The fixed Gaussians, then those of the simplified block.
         full: The fixed Gaussians, then the members of the cells of the block.
-        fixed: Number of fixed Gaussians: all small ones of other blocks, and protected ones.
-        positions: Where cameras may be that look at the block.
+        fixed: Number of fixed Gaussians: protected ones, and the simplified ones of other blocks.
+        positions: Possible positions of cameras that look at the block.
     """
 
     small: GaussianScene
@@ -51,7 +51,7 @@ class Drawn(NamedTuple):
 
 @one_thread()
 def improve(job: Job, block: int) -> None:
-    """Match a small block to images and refine it; the others are drawn as they were before."""
+    """Match a simplified block to images and refine it; other blocks are rendered unimproved."""
     if job.improved_path(block).exists():
         return
     own, found, config = load(job.small_path(block)), read_cells(job, block), job.config
@@ -94,7 +94,7 @@ def improve(job: Job, block: int) -> None:
 
 
 def _draw(job: Job, block: int, own: GaussianScene, found: BlockCells) -> Drawn:
-    """Read what other blocks have become, and put all together."""
+    """Read the other simplified blocks, and build the scenes to render."""
     plan, effects = job.read_scan().plan, job.config.effects
 
     def bare(scene: GaussianScene) -> GaussianScene:
@@ -117,7 +117,7 @@ def _draw(job: Job, block: int, own: GaussianScene, found: BlockCells) -> Drawn:
 
 
 def _near(means: Float[Tensor, "n 3"], own: Float[Tensor, "m 3"]) -> Tensor:
-    """Return which positions lie around a block."""
+    """Return a mask of the positions in or around a block."""
     low, high = own.amin(dim=0), own.amax(dim=0)
     reach = NEAR * (high - low).norm()
     near: Tensor = ((means >= low - reach) & (means <= high + reach)).all(dim=1)
@@ -125,7 +125,7 @@ def _near(means: Float[Tensor, "n 3"], own: Float[Tensor, "m 3"]) -> Tensor:
 
 
 def join_matchings(reports: Sequence[MatchReport]) -> MatchReport:
-    """Return one report of all blocks: sums of views, means of PSNR."""
+    """Combine the reports of all blocks: sums of views, means of PSNR."""
     return MatchReport(
         views=sum(report.views for report in reports),
         opacities_kept=all(report.opacities_kept for report in reports),
@@ -136,7 +136,7 @@ def join_matchings(reports: Sequence[MatchReport]) -> MatchReport:
 
 
 def join_refinements(reports: Sequence[RefineReport]) -> RefineReport:
-    """Return one report of all blocks: sums of steps, views and seconds, means of PSNR."""
+    """Combine the reports of all blocks: sums of steps, views and seconds, means of PSNR."""
     stops = {report.stopped for report in reports}
     cost = reports[0].cost
     return RefineReport(

@@ -1,4 +1,4 @@
-"""The job of an out-of-core run: all that a process needs, and where the files of blocks lie."""
+"""The job of an out-of-core run: all data that a process needs, and the paths of block files."""
 
 import hashlib
 import json
@@ -26,19 +26,19 @@ from cvtgs.outofcore.attempts import SortedFile
 from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, write_scan
 
 SENT_BYTES = "sent_bytes"
-"""What the file of labels of a block says of the size of the file of its sent rows."""
+"""Entry of the label file of a block: bytes of the file of its sent rows."""
 
 
 class Manifest(pydantic.BaseModel):
-    """What is written once all rows are sorted into blocks; from then on a job can be resumed.
+    """Record written once all rows are sorted into blocks; from then on the job can be resumed.
 
     Attributes:
-        key: Digest of all that the result depends on.
+        key: Digest of everything that the result depends on.
         source: Path of the source.
-        total: Number of Gaussians that all blocks keep.
-        cells: Number of cells that the tessellation makes in each block, at least as many in all.
-        cell_room: Cells that may merge together.
-        left_out_mass: Mass of what the filter leaves out.
+        total: Number of Gaussians that all blocks keep together.
+        cells: Number of cells of the tessellation in each block; their sum is at least ``total``.
+        cell_room: Number of cells that may merge together in one process.
+        left_out_mass: Mass of the Gaussians that the filter leaves out.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -53,19 +53,19 @@ class Manifest(pydantic.BaseModel):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """What is to be done, small enough to be sent to every process.
+    """Description of the whole job, small enough to be sent to every process.
 
     Attributes:
-        folder: Folder of the files that blocks exchange; every process must see it.
-        source: The file.
-        target: Number of Gaussians to keep, those in boxes among them.
+        folder: Folder of the files that blocks exchange; every process must have access.
+        source: The input file.
+        target: Number of Gaussians to keep, including those in boxes.
         blocks: Number of blocks.
         boxes: Protected regions.
-        config: Every choice.
+        config: The configuration.
         has_network: Whether the folder holds a checkpoint.
         range_rows: Rows of the file that one process reads in one call.
-        sample_rows: Gaussians that stand for all where the blocks are laid out.
-        axes: Where x, y and z of the file to write are to point.
+        sample_rows: Size of the sample of Gaussians from which the blocks are laid out.
+        axes: Axes of the output: the directions of x, y and z.
     """
 
     folder: str
@@ -84,7 +84,7 @@ class Job:
         return Path(self.folder) / name
 
     def rows_path(self, block: int, number: int) -> Path:
-        """Return the file with the rows of a block that come from one range of the source."""
+        """Return the file with the rows of one range of the source that lie in a block."""
         return self.path(f"rows_{block:05d}_{number:05d}")
 
     def kept_path(self, number: int) -> Path:
@@ -100,7 +100,7 @@ class Job:
         return self.path(f"sites_{iteration:02d}_{block:05d}")
 
     def sums_path(self, iteration: int, block: int) -> Path:
-        """Return the file with the sums of the points of a block by site, own and remote."""
+        """Return the file with the sums of the points of a block per own and remote site."""
         return self.path(f"sums_{iteration:02d}_{block:05d}")
 
     def parts_path(self, block: int) -> Path:
@@ -112,7 +112,7 @@ class Job:
         return self.path(f"groups_{block:05d}")
 
     def labels_path(self, block: int) -> Path:
-        """Return the file with the own group of every row, and how many rows go to other blocks."""
+        """Return the file with the own group of every row, and the row counts sent to blocks."""
         return self.path(f"labels_{block:05d}")
 
     def sent_path(self, block: int) -> Path:
@@ -124,7 +124,7 @@ class Job:
         return self.path(f"merged_{block:05d}")
 
     def inflated_path(self, block: int) -> Path:
-        """Return the file with the same Gaussians inflated, and with the neighbours of each."""
+        """Return the file with the merged Gaussians after inflation, and the neighbours of each."""
         return self.path(f"inflated_{block:05d}")
 
     def small_path(self, block: int) -> Path:
@@ -136,7 +136,7 @@ class Job:
         return self.path(f"improved_{block:05d}.ply")
 
     def finished_path(self, block: int) -> Path:
-        """Return the last of the files of a finished block."""
+        """Return the final file of a finished block."""
         return self.improved_path(block) if self.uses_images else self.small_path(block)
 
     @property
@@ -147,7 +147,7 @@ class Job:
 
     @property
     def goes_by_steps(self) -> bool:
-        """Whether every step runs for all blocks before the next; one block may need only one."""
+        """Whether each step runs for all blocks before the next; else there is only one step."""
         return self.blocks > 1 or self.uses_images
 
     def report_path(self, block: int) -> Path:
@@ -162,17 +162,17 @@ class Job:
 
     @property
     def total(self) -> int:
-        """Number of Gaussians that all blocks keep."""
+        """Number of Gaussians that all blocks keep together."""
         return self._manifest().total
 
     @property
     def cells(self) -> tuple[int, ...]:
-        """Number of cells that the tessellation makes in each block."""
+        """Number of cells of the tessellation in each block."""
         return self._manifest().cells
 
     @property
     def targets(self) -> tuple[int, ...]:
-        """Number of Gaussians that each block keeps, which is known when groups are."""
+        """Number of Gaussians that each block keeps; known once the groups are."""
         if not self.goes_by_steps:
             return (self.total,)
         return tuple(json.loads(self.path("targets.json").read_bytes()))
@@ -186,7 +186,7 @@ class Job:
         return [block for block, target in enumerate(self.targets) if target]
 
     def blocks_with_rows(self) -> list[int]:
-        """Return the blocks that have rows; some may weigh too little to have cells."""
+        """Return the blocks with rows; the weight of some may be too small for a cell."""
         numbers = [rows.number for rows in self.ranges()]
         return [
             block
@@ -199,20 +199,20 @@ class Job:
         return load_checkpoint(self.path("network.safetensors")) if self.has_network else None
 
     def write_network(self, checkpoint: Checkpoint) -> None:
-        """Write the checkpoint where every process finds it."""
+        """Write the checkpoint to the folder of the job."""
         with atomic_output(self.path("network.safetensors"), overwrite=True) as file:
             file.write(save_checkpoint(checkpoint.net, checkpoint.info))
 
     def read_scan(self) -> SceneScan:
-        """Read what all blocks need of the whole scene."""
+        """Read the data of the whole scene that all blocks need."""
         return read_scan(self.path("scan.safetensors"))
 
     def write_scan(self, scan: SceneScan) -> None:
-        """Write the scan where every process finds it."""
+        """Write the scan to the folder of the job."""
         write_scan(scan, self.path("scan.safetensors"))
 
     def key(self, checkpoint: Checkpoint | None) -> str:
-        """Return a digest of all that the result depends on: file, choices, network, version."""
+        """Return a digest of everything the result depends on: file, options, network, versions."""
         path = Path(self.source.path)
         stat = path.stat()
         with path.open("rb") as file:
@@ -234,9 +234,9 @@ class Job:
         return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
     def can_resume(self, key: str) -> bool:
-        """Return whether the folder holds all rows of just this job, sorted into blocks.
+        """Return whether the folder holds all sorted rows of exactly this job.
 
-        Later files that a lost disk or machine has damaged are removed, to be made again.
+        Files of later steps that a failed disk or machine damaged are removed, to be made again.
         """
         try:
             self.read_scan()
@@ -248,7 +248,7 @@ class Job:
         return True
 
     def has_sorted_rows(self) -> bool:
-        """Return whether the rows that were sorted into blocks are still there, and whole."""
+        """Return whether the files of sorted rows still exist and are intact."""
         try:
             text = self.path("sorted.json").read_text(encoding="utf-8")
             return all(self._is_whole(name, *facts) for name, facts in json.loads(text).items())
@@ -256,7 +256,7 @@ class Job:
             return False
 
     def start_over(self) -> None:
-        """Make an empty folder; what earlier jobs of this output have left is removed."""
+        """Make an empty folder; remove files that earlier jobs of this output left."""
         parent = Path(self.folder).parent
         shutil.rmtree(parent, ignore_errors=True)
         try:
@@ -268,10 +268,10 @@ class Job:
             ) from error
 
     def adopt(self, files: Iterable[SortedFile]) -> None:
-        """Give the files of finished attempts their names, and remove those of all others."""
+        """Give the files of finished attempts their final names, and remove other attempts."""
         adopted = list(files)
         for path in self.path("").glob("rows_*"):
-            path.unlink()  # of a sort with another filter
+            path.unlink()  # from an earlier sort with another filter
         for file in adopted:
             try:
                 found = self.path(file.attempt).stat().st_size
@@ -291,21 +291,21 @@ class Job:
 
     @property
     def cell_room(self) -> int:
-        """How many cells of the tessellation may merge together."""
+        """Number of cells that may merge together in one process."""
         return self._manifest().cell_room
 
     @property
     def left_out_mass(self) -> float:
-        """Mass of what the filter leaves out, squared scene units."""
+        """Mass of the Gaussians that the filter leaves out, squared scene units."""
         return self._manifest().left_out_mass
 
     def write_manifest(self, manifest: Manifest) -> None:
-        """Write that all rows are sorted."""
+        """Write the manifest, which marks all rows as sorted."""
         with atomic_output(self.path("manifest.json"), overwrite=True) as file:
             file.write(manifest.model_dump_json(indent=2).encode())
 
     def _is_whole(self, name: str, size: int, checksum: int) -> bool:
-        """Return whether a file of rows has the size and the content that were written."""
+        """Return whether a file of rows still has its original size and checksum."""
         with self.path(name).open("rb") as file:
             if os.fstat(file.fileno()).st_size != size:
                 return False
@@ -315,7 +315,7 @@ class Job:
         return found == checksum
 
     def _remove_damaged(self) -> None:
-        """Remove the files of steps that are not whole: the steps are done again."""
+        """Remove damaged files of steps, so that these steps run again."""
         for kind in ("sample", "sites", "sums", "parts", "groups", "labels", "merged", "inflated"):
             for path in self.path("").glob(f"{kind}_*"):
                 try:
@@ -330,7 +330,7 @@ class Job:
                     path.unlink(missing_ok=True)
         try:
             blocks = self.blocks_with_cells()
-        except (OSError, ValueError, TypeError):  # without them no finished block can be checked
+        except (OSError, ValueError, TypeError):  # blocks cannot be checked without it
             for path in (self.path("targets.json"), *self.path("").glob("small_*")):
                 path.unlink(missing_ok=True)
             return
@@ -349,9 +349,9 @@ class Job:
 
 
 def job_folder(output: str | os.PathLike[str], key: str) -> str:
-    """Return the folder of a job: its key, within a hidden folder beside the output.
+    """Return the folder of a job: named by its key, in a hidden folder beside the output.
 
-    A worker that still writes for another job of this output cannot reach it.
+    A worker that still writes for another job of this output therefore cannot write to it.
     """
     target = Path(os.path.realpath(output))
     return str(target.with_name(f".{target.name}.blocks") / key[:16])

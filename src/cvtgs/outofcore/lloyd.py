@@ -1,4 +1,4 @@
-"""One tessellation over all blocks: seeds by block, then iterations of Lloyd across blocks."""
+"""One tessellation of all blocks: seeds per block, then Lloyd iterations across blocks."""
 
 from typing import NamedTuple
 
@@ -25,12 +25,12 @@ from cvtgs.outofcore.rows import read_rows
 
 
 class EmbeddedRows(NamedTuple):
-    """The Gaussians of a block in the space of the tessellation.
+    """The Gaussians of a block, embedded in the space of the tessellation.
 
     Attributes:
-        order: ``(n,)`` their rows along a Morton curve, int32.
-        points: ``(n, d)`` their positions in that order.
-        weights: ``(n,)`` their weights in that order.
+        order: ``(n,)`` row numbers along a Morton curve, int32.
+        points: ``(n, d)`` positions in this order.
+        weights: ``(n,)`` weights in this order.
     """
 
     order: Tensor
@@ -42,7 +42,7 @@ class EmbeddedRows(NamedTuple):
 def seed(job: Job, block: int) -> None:
     """Choose the first sites of a block, and the points that Lloyd samples.
 
-    A block without cells gets neither; its Gaussians go to other blocks.
+    A block without cells gets neither; its Gaussians join cells of other blocks.
     """
     if job.sites_path(0, block).exists():
         return
@@ -59,7 +59,7 @@ def seed(job: Job, block: int) -> None:
 
 @one_thread()
 def accumulate(job: Job, iteration: int, block: int) -> float:
-    """Sum the points of a block by their nearest site, own or remote; return their energy."""
+    """Sum the points of a block per nearest site, own or remote; return their energy."""
     if job.cells[block] == 0:
         return 0.0
     path = job.sums_path(iteration, block)
@@ -68,7 +68,7 @@ def accumulate(job: Job, iteration: int, block: int) -> float:
     tensors, _ = map_tensors(job.sample_path(block))
     points, weights = tensors["points"], tensors["weights"]
     count, found = _assign(job, iteration, block, points)
-    # Remote sites are numbered behind the own ones.
+    # Remote sites are numbered after the own ones.
     away = (found.blocks >= 0).nonzero()[:, 0]
     pairs = torch.stack([found.blocks[away], found.labels[away]], dim=1)
     remote, numbers = torch.unique(pairs, dim=0, return_inverse=True)
@@ -82,7 +82,7 @@ def accumulate(job: Job, iteration: int, block: int) -> float:
 
 
 def move_sites(job: Job, iteration: int) -> None:
-    """Move the sites of all blocks to their centroids; holds one block and all remote sums."""
+    """Move the sites of all blocks to their centroids; memory: one block and all remote sums."""
     blocks = job.blocks_with_sites()
     left = [block for block in blocks if not job.sites_path(iteration + 1, block).exists()]
     if not left:
@@ -126,12 +126,12 @@ def assign(job: Job, iterations: int, block: int) -> None:
 
 
 def _embedded_rows(job: Job, block: int, order: Tensor | None = None) -> EmbeddedRows:
-    """Embed the Gaussians of a block; an order that is known is not computed again."""
+    """Embed the Gaussians of a block in a given order, or in one computed here."""
     scan = job.read_scan()
     scene, areas, visibility = read_rows(job, block, is_slim=True)
     analysis = SceneAnalysis(
         frame=scan.frame,
-        farthest=0.0,  # flyaways are left out already
+        farthest=0.0,  # flyaways are already left out
         opacities=scene.opacities,
         areas=areas[:0],  # the tessellation uses apparent areas only
         apparent_areas=areas,
@@ -150,7 +150,7 @@ def _embedded_rows(job: Job, block: int, order: Tensor | None = None) -> Embedde
 
 
 def _assign(job: Job, iteration: int, block: int, points: Tensor) -> tuple[int, Assignment]:
-    """Return the number of own sites, and the nearest site of every point in any block."""
+    """Return the number of own sites, and the nearest site of any block for every point."""
     has_duplicates = job.read_scan().plan.duplicates.active
     nearest = choose_search(has_duplicates=has_duplicates)
     sites = points[:0].double()
@@ -166,8 +166,8 @@ def _assign(job: Job, iteration: int, block: int, points: Tensor) -> tuple[int, 
 
 
 def _fill_empty(found: Assignment, count: int, weights: Tensor) -> tuple[Assignment, int]:
-    """Let every own site keep a point of its block; also return how many had none."""
-    if count == len(weights):  # then seeds were all points, in their order
+    """Assign a point of the block to every empty own site; also return the number of these."""
+    if count == len(weights):  # then all points are seeds, in the same order
         own = torch.arange(count)
         return Assignment(torch.full_like(own, -1), own, torch.zeros_like(found.squared)), 0
     away = found.blocks >= 0

@@ -1,4 +1,4 @@
-"""Memory: how much is free, how much a simplification takes, and how many blocks that makes."""
+"""Free memory, the memory that a simplification needs, and the resulting number of blocks."""
 
 import math
 import re
@@ -14,22 +14,22 @@ BASE_BYTES = 450_000_000
 """Interpreter, torch and scipy (280 MB), network, sample, grid of depths, and a chunk of rows."""
 
 SMALL_BASE_BYTES = 350_000_000
-"""The same with a sample of a quarter, for those who have less than ``ROOMY_BYTES``."""
+"""The same with a quarter of the sample, for less memory than ``ROOMY_BYTES``."""
 
 ROOMY_BYTES = 500_000_000
-"""With less than this, the sample is small."""
+"""With less memory than this, the sample is small."""
 
 LEAST_BYTES = 400_000_000
-"""The small base and a small block: no run in blocks takes less."""
+"""Minimum memory of a run in blocks: the small base and a small block."""
 
 IMAGE_BYTES = 400_000_000
-"""Set aside for images of the scene and what they are made of."""
+"""Memory reserved for images of the scene and their intermediate data."""
 
 CELL_BYTES = 1500
-"""What a cell of the tessellation takes while pairs of cells merge; some 1,030 were measured."""
+"""Bytes per cell while pairs of cells merge; some 1,030 were measured."""
 
 CELL_ROOM = 1_000_000
-"""Cells that merge together if no memory is stated."""
+"""Number of cells that may merge together if no memory is given."""
 
 SHARED_BY = 4
 """The number of blocks is a multiple of this, so that two or four workers end at the same time."""
@@ -47,7 +47,7 @@ def read_bytes(text: str) -> int:
         Bytes.
 
     Raises:
-        InvalidArgumentError: It is no amount, or too little to work with.
+        InvalidArgumentError: The text is not an amount, or the amount is too small.
 
     Example:
         >>> read_bytes("4GB"), read_bytes("1.5 GiB")
@@ -69,10 +69,10 @@ def read_bytes(text: str) -> int:
 
 
 def available_memory() -> int:
-    """Return how much more memory this process may use.
+    """Return the bytes of memory that this process may still use.
 
-    The least of what the machine has free, of the limits of the control groups (versions 1 and 2)
-    that a container or a job runs in, and of the limits of the process (``ulimit -v``).
+    This is the minimum of the free memory of the machine, the memory left in the control groups
+    (versions 1 and 2) of a container or a job, and the limit of the process (``ulimit -v``).
 
     Returns:
         Bytes.
@@ -94,15 +94,15 @@ def available_memory() -> int:
 
 
 def memory_to_plan(free: int) -> int:
-    """Return the memory to plan with by default: what is free, but enough for a small block.
+    """Return the default memory to plan with: the free memory, but at least ``LEAST_BYTES``.
 
-    The estimates are twice what is used, so less than that would only make more blocks.
+    Estimates are twice the actual use, so planning with less would only give more blocks.
     """
     return max(free, LEAST_BYTES)
 
 
 def control_group_rooms(root: Path) -> list[int]:
-    """Return the bytes left in each control group with a limit that this process is in."""
+    """Return the bytes left in each control group of this process that has a limit."""
     try:
         lines = (root / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError):
@@ -116,7 +116,7 @@ def control_group_rooms(root: Path) -> list[int]:
             names, top = _VERSION_1, root / "sys/fs/cgroup/memory"
         else:
             continue
-        # Limits of parents hold too; in a container, the path may be that outside of it.
+        # Limits of parents apply, too; in a container, the path may be the one outside of it.
         parts = [part for part in path.split("/") if part not in ("", "..")]
         folders = {top.joinpath(*parts[:depth]) for depth in range(len(parts) + 1)}
         rooms += [room for folder in folders if (room := _room(folder, names)) is not None]
@@ -129,7 +129,7 @@ class _GroupFiles(NamedTuple):
     limit: str
     usage: str
     cache: str
-    """Key in ``memory.stat`` of file pages that the system takes back first."""
+    """Key in ``memory.stat`` of the file pages that the system reclaims first."""
 
 
 _VERSION_1 = _GroupFiles("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
@@ -152,25 +152,25 @@ def _room(folder: Path, names: _GroupFiles) -> int | None:
 
 
 def base_bytes(memory: int | None) -> int:
-    """Return what a run takes beside its blocks, which have as much with little memory."""
+    """Return the bytes of a run without its blocks; with little memory, blocks get a fixed rest."""
     if memory is None or memory >= ROOMY_BYTES:
         return BASE_BYTES
     return max(SMALL_BASE_BYTES, memory - (LEAST_BYTES - SMALL_BASE_BYTES))
 
 
 def sample_rows(memory: int) -> int:
-    """Return how many Gaussians stand for all where blocks are laid out."""
+    """Return the size of the sample from which the blocks are laid out."""
     return SAMPLE_ROWS if memory >= ROOMY_BYTES else SAMPLE_ROWS // 4
 
 
 def needed_memory(source: PlyRows, rows: int) -> int:
-    """Estimate what it takes to simplify some rows at once.
+    """Estimate the memory needed to simplify some rows at once.
 
     Measured at rho 0.01: 290 bytes per Gaussian without view-dependent colour, 630 with degree 3.
 
     Args:
         source: The file.
-        rows: How many of its rows.
+        rows: Number of its rows.
 
     Returns:
         Bytes.
@@ -179,13 +179,13 @@ def needed_memory(source: PlyRows, rows: int) -> int:
 
 
 def cell_room(memory: int | None) -> int:
-    """Return how many cells of the tessellation may merge together."""
+    """Return how many cells of the tessellation may merge together in this memory."""
     room = CELL_ROOM * CELL_BYTES if memory is None else memory - base_bytes(memory)
     return max(0, room) // CELL_BYTES
 
 
 def block_count(source: PlyRows, memory: int) -> int:
-    """Choose how many blocks fit into memory one after the other.
+    """Choose the number of blocks, so that any one of them fits into memory.
 
     A block holds at most twice the mean number of rows (:func:`cvtgs.outofcore.scan.scan_scene`).
 

@@ -1,4 +1,4 @@
-"""The cells of a block become Gaussians: merged, inflated, corrected, with remote neighbours."""
+"""Turn the cells of a block into Gaussians: merge, inflate, correct, with remote neighbours."""
 
 import warnings
 from collections.abc import Callable
@@ -30,13 +30,13 @@ EXTRA = "extra/"
 
 
 class BlockReport(CellStatistics):
-    """What was done to a block.
+    """Report of a block.
 
     Attributes:
-        input_count: Gaussians in the cells of the block.
+        input_count: Number of Gaussians in the cells of the block.
         mass_out: Opacity times mean projected area of the result, squared scene units.
-        matching: What matching to images gained; None if there was none.
-        refinement: What a refinement gained; None if there was none.
+        matching: Report of the matching to images; None if there was none.
+        refinement: Report of the refinement; None if there was none.
     """
 
     model_config = pydantic.ConfigDict(ser_json_inf_nan="constants")
@@ -51,8 +51,8 @@ class BlockCells(NamedTuple):
     """The Gaussians in the cells of a block.
 
     Attributes:
-        original: With all columns that are to be used.
-        scene: With the SH bands that are computed with.
+        original: The Gaussians with all columns that the effects select.
+        scene: The same with only the SH bands that are used.
         visibility: ``(n,)`` ambient visibility, 0 to 1.
         partition: Rows of every cell.
     """
@@ -68,7 +68,7 @@ class WithHalo(NamedTuple):
 
     Attributes:
         scene: One Gaussian per cell; no extra columns.
-        sizes: ``(m + h,)`` members of each cell.
+        sizes: ``(m + h,)`` number of members of each cell.
         own_count: Number of own cells, m.
     """
 
@@ -96,7 +96,7 @@ def merge(job: Job, block: int) -> None:
 
 @one_thread()
 def inflate(job: Job, block: int) -> None:
-    """Find the neighbours of the cells of a block, align axes, and inflate."""
+    """Find the neighbours of the cells of a block, align axes and inflate."""
     path = job.inflated_path(block)
     if path.exists():
         return
@@ -107,7 +107,7 @@ def inflate(job: Job, block: int) -> None:
     remote = halo_cells(own["means"], others, count=near)
     merged, _, own_count = _with_halo(job, block, remote, job.merged_path)
     neighbors = cvt.nearest_neighbors(merged.means, near)[:own_count]
-    # Only the number of members of a cell counts here, so their rows are left out.
+    # Only the number of members per cell matters here, so their rows are left out.
     offsets = torch.nn.functional.pad(own["sizes"].cumsum(0), (1, 0))
     shown = cells.Partition(order=own["sizes"][:0], offsets=offsets)
     inflated = shape_merged(merged, shown, neighbors, job.config.merge)
@@ -120,7 +120,7 @@ def inflate(job: Job, block: int) -> None:
 
 @one_thread()
 def correct(job: Job, block: int) -> None:
-    """Correct the cells of a block by the network, if there is one, and write the block."""
+    """Correct the cells of a block with the network, if there is one, and write the block."""
     if job.small_path(block).exists():
         return
     original, scene, visibility, partition = read_cells(job, block)
@@ -153,14 +153,14 @@ def correct(job: Job, block: int) -> None:
 
 @one_thread()
 def simplify_block(job: Job, block: int) -> None:
-    """Simplify the only block of a job as a scene in one piece, and write it."""
+    """Simplify the only block of a job like a scene in memory, and write it."""
     if job.small_path(block).exists():
         return
     scan = job.read_scan()
     rows = read_rows(job, block)
     scene = select_columns(rows.scene, job.config.effects)
     analysis = analysis_of(scan, rows)
-    no_filter = {"min_opacity": 0.0, "max_flyaway_share": 0.0}  # rows are filtered when sorted
+    no_filter = {"min_opacity": 0.0, "max_flyaway_share": 0.0}  # the sort filtered the rows
     filter_config = job.config.filter.model_copy(update=no_filter)
     config = job.config.model_copy(update={"filter": filter_config})
     checkpoint = job.read_network()
@@ -185,7 +185,7 @@ def read_cells(job: Job, block: int) -> BlockCells:
 
 
 def _with_halo(job: Job, block: int, remote: Tensor, path: Callable[[int], Path]) -> WithHalo:
-    """Read the merged Gaussians of a block, and the remote ones in the order of their blocks."""
+    """Read the merged Gaussians of a block, then the remote ones in the order of their blocks."""
     own, _ = map_tensors(path(block))
     names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN", "sizes")
     parts = {name: [own[name]] for name in names}
@@ -208,7 +208,7 @@ def read_report(job: Job, block: int) -> BlockReport:
 def write_block(
     job: Job, block: int, small: GaussianScene, report: BlockReport, *, is_improved: bool = False
 ) -> None:
-    """Write a finished block: the report first, because its scene says that it is finished."""
+    """Write a finished block; its report comes first, since the scene file marks it as finished."""
     path = job.improved_path(block) if is_improved else job.small_path(block)
     axes = job.axes if path == job.finished_path(block) else SCENE_AXES
     with atomic_output(job.report_path(block), overwrite=True) as file:

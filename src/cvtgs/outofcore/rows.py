@@ -1,4 +1,4 @@
-"""Rows of the source: sorted into the files of blocks, and read back for a block and its cells."""
+"""Sort rows of the source into files of blocks, and read them back by block or by cell."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,10 +21,10 @@ from cvtgs.outofcore.scan import CHUNK, RowRange, SceneScan
 from cvtgs.scene import GaussianScene
 
 AREA, VISIBILITY, CELL = "cvtgs_apparent_area", "cvtgs_visibility", "cvtgs_cell"
-"""Columns of block files beyond those of the source."""
+"""Columns of block files in addition to those of the source."""
 
 MAPPED_ROWS = 1 << 14
-"""Rows that are mapped together, and released again."""
+"""Number of rows that are mapped and released together."""
 
 
 class BlockRows(NamedTuple):
@@ -32,7 +32,7 @@ class BlockRows(NamedTuple):
 
     Attributes:
         scene: The Gaussians.
-        apparent_areas: ``(n,)`` areas as they count in images.
+        apparent_areas: ``(n,)`` areas as they count in images: smaller if distant or enclosed.
         visibility: ``(n,)`` ambient visibility, 0 to 1.
     """
 
@@ -42,13 +42,13 @@ class BlockRows(NamedTuple):
 
 
 class SortedCounts(NamedTuple):
-    """What a range of the source adds to every block.
+    """The contribution of a range of the source to every block.
 
     Attributes:
-        rows: Number of Gaussians.
-        cells: Their weight in cells, none above 1, for each chunk of rows.
-        left_out: Mass of what the filter leaves out, for each chunk of rows.
-        files: Where the rows are.
+        rows: Number of Gaussians per block.
+        cells: Weight per chunk of rows and block, in cells; a Gaussian counts at most 1.
+        left_out: Mass that the filter leaves out, one entry per chunk that loses any.
+        files: Files of the rows.
     """
 
     rows: list[int]
@@ -59,7 +59,7 @@ class SortedCounts(NamedTuple):
 
 @one_thread()
 def sort_range(job: Job, rows: RowRange) -> SortedCounts:
-    """Write the rows of a range into one file per block, which nobody else writes to."""
+    """Write the rows of a range into one file per block, to which no other call writes."""
     scan, attempt = job.read_scan(), Attempt(job.folder)
     row_counts = torch.zeros(job.blocks, dtype=torch.int64)
     cell_counts, left_out = [], []
@@ -101,7 +101,7 @@ def sort_range(job: Job, rows: RowRange) -> SortedCounts:
 def _filtered(
     scan: SceneScan, config: TessellationConfig, scene: GaussianScene, rows: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the rows that the filter does not leave out, their apparent area and visibility."""
+    """Return the rows that pass the filter, their apparent areas and their visibility."""
     means, opacities = scene.means[rows], scene.opacities[rows]
     areas = scene.select(rows).areas
     visibility = analysis.visibility_at(scan.visibility, means, scan.frame)
@@ -130,13 +130,13 @@ def record_type(job: Job, *, with_cell: bool = False) -> np.dtype[Any]:
 
 
 def read_rows(job: Job, block: int, *, is_slim: bool = False) -> BlockRows:
-    """Read the rows that were sorted into a block; slim ones have one colour, no extra columns."""
+    """Read the rows of a block; slim ones have only the constant SH band and no extra columns."""
     counts = [count for _, count in _row_files(job, block)]
     return _assembled(job, _row_pieces(job, block), sum(counts), is_slim=is_slim)
 
 
 def analysis_of(scan: SceneScan, rows: BlockRows) -> analysis.SceneAnalysis:
-    """Return what is known of the Gaussians of a block, by the scan of the whole scene."""
+    """Return the analysis of the Gaussians of a block, based on the scan of the whole scene."""
     scene = rows.scene
     return analysis.SceneAnalysis(
         frame=scan.frame,
@@ -169,7 +169,7 @@ def read_members(job: Job, block: int) -> tuple[BlockRows, Tensor]:
 
 
 def kept_rows(job: Job) -> Iterator[NDArray[Any]]:
-    """Map the protected rows of every range, in parts."""
+    """Map the protected rows of every range, in pieces."""
     for rows in job.ranges():
         path = job.kept_path(rows.number)
         if path.exists():
@@ -178,7 +178,7 @@ def kept_rows(job: Job) -> Iterator[NDArray[Any]]:
 
 
 def send_rows(job: Job, block: int, owners: Tensor, labels: Tensor) -> Tensor:
-    """Write the rows that belong to remote cells; return how many go to each block."""
+    """Write the rows that belong to remote cells; return the number sent to each block."""
     kind, parts, start = record_type(job, with_cell=True), [], 0
     for rows in _row_pieces(job, block):
         part = slice(start, start + len(rows))
@@ -197,7 +197,7 @@ def send_rows(job: Job, block: int, owners: Tensor, labels: Tensor) -> Tensor:
 
 
 def _received(job: Job, block: int) -> Iterator[NDArray[Any]]:
-    """Return the rows that other blocks have sent, piece by piece."""
+    """Return the rows that other blocks sent, in pieces."""
     kind = record_type(job, with_cell=True)
     for other in job.blocks_with_rows():
         if other == block:
@@ -208,7 +208,7 @@ def _received(job: Job, block: int) -> Iterator[NDArray[Any]]:
 
 
 def _row_pieces(job: Job, block: int) -> Iterator[NDArray[Any]]:
-    """Return the rows that were sorted into a block, piece by piece."""
+    """Return the rows that were sorted into a block, in pieces."""
     for path, count in _row_files(job, block):
         yield from _mapped(path, record_type(job), 0, count)
 
@@ -226,7 +226,7 @@ def _mapped(path: Path, kind: np.dtype[Any], start: int, count: int) -> Iterator
 
 
 def _assembled(job: Job, pieces: Iterator[NDArray[Any]], count: int, *, is_slim: bool) -> BlockRows:
-    """Build a scene of pieces; their other columns are copied on the way."""
+    """Build a scene from pieces, and copy their areas and visibility."""
     areas, visibility = torch.empty(count).double(), torch.empty(count).double()
 
     def copied() -> Iterator[NDArray[Any]]:

@@ -1,4 +1,4 @@
-"""Simplify a file block by block: in bounded memory, resumable, on one machine or on many."""
+"""Simplify a file block by block: in bounded memory, resumable, on one or many machines."""
 
 import math
 import os
@@ -48,7 +48,7 @@ from cvtgs.scene import concatenate
 from cvtgs.simplifier import Simplifier
 
 RANGE_ROWS, MOST_RANGES = 1 << 18, 64
-"""Rows of the file that one process reads in one call, at least, and number of such calls."""
+"""Minimum rows of the file that one process reads in one call; maximum number of such calls."""
 
 
 def simplify_file(  # noqa: PLR0913 (options by name)
@@ -72,40 +72,40 @@ def simplify_file(  # noqa: PLR0913 (options by name)
 ) -> SimplifyReport:
     """Simplify a file that need not fit into memory.
 
-    The file is read in parts and sorted into blocks of space, which lie in a hidden folder beside
-    the output; each block is simplified with its exact share of the Gaussians to keep. If this
-    is interrupted, the same call continues with the blocks that are not finished. The result
-    depends on the number of blocks, not on the workers or their order.
+    The file is read in parts and sorted into blocks of space, which are stored in a hidden folder
+    beside the output. Each block is simplified to its exact share of the Gaussians to keep. After
+    an interruption, the same call continues with the unfinished blocks. The result depends on the
+    number of blocks, not on the workers or their order.
 
     Args:
         source: A binary PLY file.
-        output: The file to write; a ``.ply`` is written without being held in memory.
+        output: The file to write; a ``.ply`` is written without holding all of it in memory.
         rho: Ratio of Gaussians to keep, in (0, 1].
         count: Number of Gaussians to keep, instead of ``rho``.
-        max_count: Number of Gaussians to keep if there are more.
-        memory: Bytes that one process may use; None for what is free.
+        max_count: Maximum number of Gaussians to keep, instead of ``rho``.
+        memory: Bytes that one process may use; None for all free memory.
         blocks: Number of blocks, instead of ``memory``.
-        boxes: Gaussians with their centres in these are kept as they are, and come first.
+        boxes: Gaussians with centres in these are kept unchanged and come first in the output.
         sh_degree: SH bands above this degree are dropped; None keeps all.
-        source_axes: Where x, y and z of the source point; None for those of PLY files.
-        output_axes: Where they are to point in the output; None for those of its format.
+        source_axes: Directions of x, y and z in the source; None for those of PLY files.
+        output_axes: Directions of x, y and z in the output; None for those of its format.
         simplifier: Configuration and network; None for the defaults.
-        workers: Calls functions for ranges of the file and for blocks; None calls them here, one
-            after the other.
+        workers: Call functions for ranges of the file and for blocks; None calls them one after
+            the other in this process.
         range_rows: Rows of the file that one process reads in one call; None for 260,000, or a
-            64th of the file.
+            64th of the file if that is more.
         overwrite: Whether an existing output may be replaced.
         listener: Called with progress events.
 
     Returns:
-        The report; statistics of cells are those of all blocks, seconds those of every process.
+        The report, with cell statistics of all blocks and wall-clock seconds of all stages.
 
     Raises:
-        ConfigError: The configuration refines for seconds instead of steps.
+        ConfigError: The configuration cannot be used with blocks (:func:`check_config`).
         InvalidArgumentError: Ratio, count or boxes cannot be met.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
-        OutputBusyError: Another run is at work on this output.
+        OutputBusyError: Another run is writing this output.
 
     Example:
         >>> import tempfile
@@ -170,15 +170,15 @@ def rows_per_range(count: int) -> int:
 
 
 def check_config(config: SimplifyConfig, *, with_images: bool = True) -> None:
-    """Refuse a configuration that cannot be followed block by block.
+    """Raise if a configuration cannot be applied block by block.
 
     Args:
-        config: Every choice.
-        with_images: Whether blocks may be matched to images of the scene, or refined.
+        config: The configuration.
+        with_images: Whether blocks may be matched to images of the scene or refined.
 
     Raises:
-        ConfigError: It takes images of the scene where it may not, or refines for seconds, which
-            would give other bits every time.
+        ConfigError: The configuration uses images of the scene where it may not, or refines for a
+            time in seconds, which would give different bits in every run.
     """
     if not with_images and (config.uses_renders or config.refine.enabled):
         raise ConfigError(
@@ -201,12 +201,12 @@ def check_config(config: SimplifyConfig, *, with_images: bool = True) -> None:
 def _scan_and_sort(
     job: Job, key: str, workers: Workers, clock: StageClock, *, room: int
 ) -> Manifest:
-    """Scan the file and sort its rows into blocks; return what is to be made of them."""
+    """Scan the file and sort its rows into blocks; return the manifest."""
     found = sort_into_blocks(job, workers, clock)
     total = sum(found.rows)
     finer = finer_count(found.rest, total, job.config.allocation)
-    finer = min(finer, max(found.rest, total // 2))  # sites of Lloyd, held by one process
-    if finer < sum(1 for count in found.rows if count):  # so few: the heaviest blocks get one each
+    finer = min(finer, max(found.rest, total // 2))  # one process holds all sites of Lloyd
+    if finer < sum(1 for count in found.rows if count):  # the heaviest get one each
         order = sorted(range(job.blocks), key=lambda block: -found.cells[block])
         cells = [int(block in order[:finer]) for block in range(job.blocks)]
     else:
@@ -222,7 +222,7 @@ def _scan_and_sort(
 
 
 def _run_blocks(job: Job, workers: Workers, clock: StageClock) -> int:
-    """Simplify the blocks that are not finished; return how many were."""
+    """Simplify the unfinished blocks; return how many were already finished."""
     with_cells = job.blocks_with_cells()
     resumed = sum(job.finished_path(block).exists() for block in with_cells)
     last = correct if job.goes_by_steps else simplify_block
@@ -235,10 +235,10 @@ def _run_blocks(job: Job, workers: Workers, clock: StageClock) -> int:
 
 
 def _tessellate_and_merge(job: Job, workers: Workers, clock: StageClock) -> tuple[float, ...]:
-    """Group the Gaussians of all blocks into cells, merge and inflate these.
+    """Group the Gaussians of all blocks into cells; merge and inflate the cells.
 
-    Each step is done for all blocks before the next, so the result has no seams: the sites of
-    Lloyd move together, cells merge across borders, and neighbours are those of the whole scene.
+    Each step runs for all blocks before the next, so the result has no seams: the sites of Lloyd
+    move together, cells merge across block borders, and neighbours come from the whole scene.
     Returns the energy before every Lloyd iteration.
     """
     blocks, iterations = job.blocks_with_rows(), job.config.cvt.iterations
@@ -279,7 +279,7 @@ def _run_all(
 def assemble_blocks(
     job: Job, output: str | os.PathLike[str], *, axes: str | None, overwrite: bool
 ) -> None:
-    """Write protected rows and blocks behind one another."""
+    """Write the protected rows and then all blocks."""
     blocks = [job.finished_path(block) for block in job.blocks_with_cells()]
     if is_plain_ply(output):
         with atomic_output(output, overwrite=overwrite) as file:
@@ -291,13 +291,13 @@ def assemble_blocks(
 
 
 def is_plain_ply(output: str | os.PathLike[str]) -> bool:
-    """Return whether an output is a PLY, into which rows go as they are."""
+    """Return whether an output is an uncompressed PLY, into which rows are copied unchanged."""
     name = Path(output).name.lower()
     return name.endswith(".ply") and not name.endswith(".compressed.ply")
 
 
 def _kept_files(job: Job) -> list[Path]:
-    """Write the protected rows as blocks are written: with these columns and axes."""
+    """Write the protected rows in files with the columns and axes of blocks."""
     paths = []
     for number, rows in enumerate(kept_rows(job)):
         paths.append(job.path(f"unchanged_{number:05d}.ply"))

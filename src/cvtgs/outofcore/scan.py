@@ -1,4 +1,4 @@
-"""The scan: what all blocks need of the whole scene, and the k-d partition into blocks."""
+"""Scan of the whole scene: data that all blocks need, and the k-d partition into blocks."""
 
 import json
 from collections import Counter
@@ -33,7 +33,7 @@ class KdPartition:
         axes: ``(k,)`` the axis along which each node splits.
         thresholds: ``(k,)`` coordinate of each splitting plane; points below it go left.
         children: ``(k, 2)`` left and right child of each node; ``-1 - b`` is block b.
-        count: Number of blocks; with one there is no node.
+        count: Number of blocks; a single block has no nodes.
     """
 
     axes: Int[Tensor, "k"]
@@ -57,7 +57,7 @@ class KdPartition:
 def partition_space(
     points: Float[Tensor, "n 3"], measure: Float[Tensor, "n"], count: int
 ) -> KdPartition:
-    """Split space into blocks of equal measure, each time across the axis of largest variance."""
+    """Split space into blocks of equal measure, each time along the axis of largest variance."""
     axes: list[int] = []
     thresholds: list[float] = []
     children: list[list[int]] = []
@@ -98,7 +98,7 @@ def _widest_axis(points: Tensor, weights: Tensor) -> int:
 
 
 def _weighted_quantile(coordinates: Tensor, weights: Tensor, share: float) -> float:
-    """Return a coordinate below which this share of the weight lies."""
+    """Return a coordinate below which the given share of the weight lies."""
     if len(coordinates) == 0:
         return 0.0
     order = torch.sort(coordinates, stable=True).indices
@@ -111,13 +111,13 @@ def _weighted_quantile(coordinates: Tensor, weights: Tensor, share: float) -> fl
 
 
 SAMPLE_ROWS = 1 << 18
-"""Gaussians that stand for all where frame, effect plan and partition are found."""
+"""Size of the sample from which frame, effect plan and partition are computed."""
 
 CHUNK = 1 << 15
-"""Rows that are read together."""
+"""Number of rows that are read together."""
 
 MAPPED_ROWS = 1 << 15
-"""Rows of the file that are mapped together where a sample is taken of them."""
+"""Number of rows of the file that are mapped together while a sample is read."""
 
 
 class RowRange(NamedTuple):
@@ -140,12 +140,12 @@ class RangeTotals(NamedTuple):
     Attributes:
         depths: Grid of optical depths (:func:`cvtgs.analysis.add_depths`).
         masses: ``(c,)`` sum of opacity times mean projected area over each chunk of rows, squared
-            scene units; one after the other they add up to the same bits whatever the ranges.
-        falloff_masses: ``(c,)`` sums of the same times the perspective falloff.
-        far_masses: ``(f,)`` the latter of each Gaussian beyond the distance of flyaways.
-        invalid_rows: Numbers of other rows, by the attribute that is NaN, infinite or zero.
+            scene units; added in order, they give the same bits for any division into ranges.
+        falloff_masses: ``(c,)`` the same sums with masses times the perspective falloff.
+        far_masses: ``(f,)`` mass times falloff of each Gaussian beyond the distance of flyaways.
+        invalid_rows: Number of invalid rows, by the attribute that is NaN, infinite or zero.
         valid_count: Number of valid rows.
-        kept_count: Number of those in boxes.
+        kept_count: Number of valid rows in boxes.
     """
 
     depths: Int[Tensor, "voxels"]
@@ -158,29 +158,29 @@ class RangeTotals(NamedTuple):
 
     @property
     def mass(self) -> float:
-        """Mass of all rows."""
+        """Mass of all valid rows."""
         return reduce(add, self.masses, 0.0)
 
     @property
     def falloff_mass(self) -> float:
-        """Mass of all rows with the perspective falloff."""
+        """Mass of all valid rows, times the perspective falloff."""
         return reduce(add, self.falloff_masses, 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SceneScan:
-    """What all blocks need of the whole scene.
+    """Data of the whole scene that all blocks need.
 
     Attributes:
         frame: Robust centre and radius.
-        plan: The effects that the scene calls for.
+        plan: The effects that the scene needs.
         visibility: Grid of ambient visibility (:func:`cvtgs.analysis.visibility_grid`).
         min_opacity: The filter leaves out Gaussians of lower opacity.
-        max_flyaway_mass: It leaves out flyaways whose mass, with perspective falloff, is at most
-            this; -1 leaves out none.
+        max_flyaway_mass: The filter leaves out flyaways whose mass, times the perspective falloff,
+            is at most this; -1 leaves out none.
         mean_weight: Mean weight in the tessellation, before the floor.
         min_weight: The floor of the weights.
-        cell_weight: Weight of one cell; a heavier Gaussian counts as one cell. 0 if all do.
+        cell_weight: Weight of one cell; heavier Gaussians count as one cell. 0 if all count as one.
         area_power: Power of the area in the weight.
         partition: The blocks, in contracted space.
         mass: Opacity times mean projected area of all valid Gaussians, squared scene units.
@@ -206,7 +206,7 @@ class SceneScan:
 
 
 def read_sample(source: PlyRows, count: int = SAMPLE_ROWS) -> GaussianScene:
-    """Read some ``count`` Gaussians at equal steps over the file; return the valid ones."""
+    """Read about ``count`` Gaussians at equal steps over the file; return the valid ones."""
     step = max(1, source.count // count)
     rows = step * max(1, MAPPED_ROWS // step)
     starts = range(0, source.count, rows)
@@ -251,7 +251,7 @@ def scan_range(
 
 
 def add_totals(parts: Iterable[RangeTotals]) -> RangeTotals:
-    """Return the totals of all ranges; the grid of the first is added to in place."""
+    """Add up the totals of all ranges; the grid of the first is changed in place."""
     first, *others = parts
     total, far_masses = first, [first.far_masses]
     for part in others:
@@ -280,9 +280,9 @@ def scan_scene(
 ) -> SceneScan:
     """Choose filter thresholds, scale of the weights and partition from the sample.
 
-    So many Gaussians as the target stay at least; the tessellation makes as many cells or more. The
-    measure of a block is half its number of Gaussians and half their weight, so none has more than
-    about twice the mean of either.
+    The filter keeps at least ``target`` Gaussians; ``cells`` is at least ``target``. The measure of
+    a block is the mean of its shares of the Gaussians and of their weight, so that no block has
+    more than about twice the average of either.
     """
     grid = analysis.visibility_grid(totals.depths)
     sample = analysis.select_columns(sample, config.effects)
@@ -327,14 +327,14 @@ def scan_scene(
 
 
 def _max_flyaway_mass(totals: RangeTotals, max_share: float) -> float:
-    """Return the largest mass of a flyaway that is left out, -1 if none is."""
+    """Return the largest mass of a flyaway that is left out; -1 if none is left out."""
     ascending = torch.sort(totals.far_masses).values
     left_out = ascending[ascending.cumsum(0) <= max_share * totals.falloff_mass]
     return float(left_out[-1]) if max_share > 0 and len(left_out) else -1.0
 
 
 def _cell_weight(weights: Float[Tensor, "n"], cells: float) -> float:
-    """Bisect for the weight w at which ``sum min(1, weights / w)`` is the number of cells."""
+    """Return, by bisection, the w at which ``sum min(1, weights / w)`` is the number of cells."""
     low, high = 0.0, float(weights.sum())
     for _ in range(100):
         middle = (low + high) / 2
@@ -348,7 +348,7 @@ def _cell_weight(weights: Float[Tensor, "n"], cells: float) -> float:
 
 
 def write_scan(scan: SceneScan, path: Path) -> None:
-    """Write a scan: its tensors, and all else as JSON, each under its dotted name."""
+    """Write a scan: tensors as they are, other values as JSON, each under its dotted name."""
     tensors: dict[str, Tensor] = {}
     texts: dict[str, str] = {}
 
@@ -371,13 +371,13 @@ _ADAPTERS = {kind: pydantic.TypeAdapter(kind) for kind in (float, int, dict[str,
 
 
 def read_scan(path: Path) -> SceneScan:
-    """Read what :func:`write_scan` wrote."""
+    """Read a scan that :func:`write_scan` wrote."""
     scan: SceneScan = _build("scan", SceneScan, *map_tensors(path))
     return scan
 
 
 def _build(name: str, kind: Any, tensors: Mapping[str, Tensor], texts: Mapping[str, str]) -> Any:
-    """Build a value of its parts; a closure that calls itself would keep the file mapped."""
+    """Build a value from its parts; a recursive closure instead would keep the file mapped."""
     if kind in _ADAPTERS:
         return _ADAPTERS[kind].validate_json(texts[name])
     kinds = get_type_hints(kind) if is_dataclass(kind) else {}

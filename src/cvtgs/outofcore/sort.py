@@ -1,4 +1,4 @@
-"""Sort a file into blocks: one pass that scans it, one that writes the rows of every block."""
+"""Sort a file into blocks: the first pass scans it, the second writes the rows of every block."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -26,13 +26,13 @@ from cvtgs.outofcore.workers import Workers, with_progress
 
 
 class SortedBlocks(NamedTuple):
-    """The blocks, after all rows are sorted into them.
+    """The blocks after all rows are sorted into them.
 
     Attributes:
-        rest: Gaussians that all blocks are to keep together.
-        rows: Gaussians in each block.
-        cells: Their weight in cells, none above 1.
-        left_out_mass: Mass of what the filter leaves out, squared scene units.
+        rest: Number of Gaussians that all blocks keep together.
+        rows: Number of Gaussians in each block.
+        cells: Weight of each block, in cells; a Gaussian counts at most 1.
+        left_out_mass: Mass that the filter leaves out, squared scene units.
     """
 
     rest: int
@@ -47,17 +47,17 @@ def sort_into_blocks(
     """Scan the file and sort its rows into blocks.
 
     Args:
-        job: The job, whose folder is empty.
-        workers: Calls functions for ranges of the file.
+        job: The job; its folder must be empty.
+        workers: Call functions for ranges of the file.
         clock: Measures both stages.
-        keep_all: Whether the filter leaves nothing out.
+        keep_all: Whether the filter is turned off.
 
     Returns:
-        How many Gaussians there are in each block.
+        The numbers of Gaussians and the weights of the blocks.
 
     Raises:
         InvalidSceneError: No row is valid.
-        InvalidArgumentError: There is no Gaussian left beside those in boxes.
+        InvalidArgumentError: No Gaussian is left besides those in boxes.
     """
     ranges = job.ranges()
     with clock.stage("scan", len(ranges)) as advance:
@@ -75,9 +75,9 @@ def sort_into_blocks(
 def _scan(
     job: Job, workers: Workers, ranges: Sequence[RowRange], advance: Callable[[int], None]
 ) -> tuple[int, SceneScan]:
-    """Return how many Gaussians all blocks are to keep, and what they need of the scene.
+    """Return the number of Gaussians that all blocks keep, and the scan of the scene.
 
-    The sample is let go of at the end.
+    The sample is freed on return.
     """
     sample = read_sample(job.source, job.sample_rows)
     if len(sample) == 0:
@@ -118,7 +118,7 @@ def _sort(
     left_out_mass = 0.0
     for part in with_progress(workers(partial(sort_range, job), ranges), advance):
         rows = [a + b for a, b in zip(rows, part.rows, strict=True)]
-        for chunk in part.cells:  # one after the other: the same bits whatever the ranges
+        for chunk in part.cells:  # in order: the same bits for any division into ranges
             cells = [a + b for a, b in zip(cells, chunk, strict=True)]
         for mass in part.left_out:
             left_out_mass += mass

@@ -1,4 +1,4 @@
-"""Workers: what calls functions for ranges of a file and for blocks, here or elsewhere."""
+"""Workers, which call functions for ranges of a file and for blocks, here or elsewhere."""
 
 import os
 import pickle
@@ -34,7 +34,7 @@ class Workers(Protocol):
 
         Args:
             function: A function that can be pickled.
-            items: Its arguments; the calls are independent.
+            items: The arguments; the calls are independent.
 
         Returns:
             The results, in the order of the items.
@@ -44,16 +44,16 @@ class Workers(Protocol):
 
 @runtime_checkable
 class CheckedWorkers(Workers, Protocol):
-    """Workers that may be elsewhere, and are asked first whether they can do a job."""
+    """Workers that may be on other machines, and are checked before a job."""
 
     def check(self, job: Job) -> int:
-        """Refuse workers that cannot do a job.
+        """Raise if a worker cannot do a job.
 
         Args:
-            job: The job; its folder is there.
+            job: The job; its folder must exist.
 
         Returns:
-            How many workers there are.
+            The number of workers.
         """
         ...
 
@@ -61,7 +61,7 @@ class CheckedWorkers(Workers, Protocol):
 def begin(
     job: Job, workers: Workers, clock: StageClock, checkpoint: Checkpoint | None, *, resumes: bool
 ) -> None:
-    """Make the folder of a job, unless it resumes, and ask workers whether they can do it."""
+    """Make the folder of a job and write its network, unless it resumes; check the workers."""
     if not resumes:
         job.start_over()
     if isinstance(workers, CheckedWorkers):
@@ -72,26 +72,26 @@ def begin(
 
 
 def sequentially(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
-    """Call a function for one item after the other, in this process."""
+    """Call a function for each item in order, in this process."""
     yield from map(function, items)
 
 
 def with_progress(results: Iterable[Result], advance: Callable[[int], None]) -> Iterator[Result]:
-    """Return the results, and report how many there are so far."""
+    """Yield the results, and report their number so far."""
     for done, result in enumerate(results, start=1):
         yield result
         advance(done)
 
 
 def worker_count(memory: int, wanted: int | None = None) -> int:
-    """Choose how many processes work on blocks.
+    """Choose the number of processes that work on blocks.
 
     Args:
-        memory: Bytes for all of them together.
-        wanted: How many there should be; None for one on each core.
+        memory: Bytes for all processes together.
+        wanted: The wanted number; None for one per core.
 
     Returns:
-        At least 1, and no more than have 1 GB each, for torch and a block of some size.
+        At least 1, and at most one per GB, which torch and a block of some size need.
 
     Example:
         >>> worker_count(4_000_000_000, 8)
@@ -101,10 +101,10 @@ def worker_count(memory: int, wanted: int | None = None) -> int:
 
 
 class LocalWorkers:
-    """Calls functions in processes of this machine, as long as it is entered.
+    """Context manager that calls functions in processes of this machine.
 
-    The processes end with this one, whatever ends it. A program that uses them must guard what it
-    does by ``if __name__ == "__main__":``, since they import it.
+    However this process ends, the others end with it. A program that uses them must guard its main
+    code with ``if __name__ == "__main__":``, since they import it.
 
     Args:
         count: Number of processes.
@@ -114,7 +114,7 @@ class LocalWorkers:
         self._count = count
 
     def __enter__(self) -> Self:
-        context = get_context("spawn")  # a fork would copy locks that torch's threads hold
+        context = get_context("spawn")  # fork would copy locks that torch's threads hold
         self._watched, self._alive = context.Pipe(duplex=False)
         threads = max(1, core_count() // self._count)
         self._pool = ProcessPoolExecutor(
@@ -132,7 +132,7 @@ class LocalWorkers:
     ) -> None:
         if kind is None:
             self._pool.shutdown()
-        self._alive.close()  # ends those that are still at work
+        self._alive.close()  # ends processes that still work
         self._pool.shutdown(cancel_futures=True)
         self._watched.close()
 
@@ -143,17 +143,17 @@ class LocalWorkers:
 
         Args:
             function: A function that can be pickled.
-            items: Its arguments.
+            items: The arguments.
 
         Yields:
             The results, in the order of the items.
 
         Raises:
-            RunError: A process was ended from outside.
+            RunError: A process ended unexpectedly.
         """
         futures = deque(self._pool.submit(_call, pickle.dumps((function, one))) for one in items)
         try:
-            while futures:  # a result that was taken is not kept, a scan has dozens of megabytes
+            while futures:  # drops results once yielded: a scan has dozens of megabytes
                 result: Result = pickle.loads(futures.popleft().result())
                 yield result
         except BrokenProcessPool as error:
@@ -167,13 +167,13 @@ class LocalWorkers:
 
 
 def _call(work: bytes) -> bytes:
-    """Call a function; as bytes, since torch would hand tensors over by files in a folder."""
+    """Call a pickled function; as objects, torch would pass tensors through files in a folder."""
     function, item = pickle.loads(work)  # made by the process that started this one
     return pickle.dumps(function(item))
 
 
 def _begin(watched: Connection, threads: int) -> None:
-    """Prepare a process: it leaves Ctrl-C to the first one, and ends when that one does."""
+    """Prepare a worker process: it leaves Ctrl-C to its parent, and ends when the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ["OMP_NUM_THREADS"] = str(threads)
     threading.Thread(target=_end_with, args=(watched,), daemon=True).start()

@@ -1,4 +1,4 @@
-"""Levels of a scene as a tree of chunks that viewers load while they show it."""
+"""Levels of a scene as a tree of chunks, which viewers load progressively."""
 
 from cvtgs.streams.blocks import StreamReport, stream_file
 from cvtgs.streams.files import INDEX_NAMES, StreamLevel, check_stream

@@ -1,4 +1,4 @@
-"""A stream of a file that need not fit into memory: blocks of space, each a part of the stream."""
+"""Streams of files that need not fit into memory, written as one part per block of space."""
 
 import hashlib
 import json
@@ -56,13 +56,13 @@ __all__ = ["StreamReport", "stream_file"]
 
 
 class StreamReport(NamedTuple):
-    """What was written.
+    """Report of a written stream.
 
     Attributes:
-        levels: Of each level, the finest first.
+        levels: Counts and bytes of each level, the finest first.
         chunks: Number of chunks.
         blocks: Number of blocks.
-        resumed_blocks: Blocks that an earlier run had finished.
+        resumed_blocks: Number of blocks that an earlier run had finished.
     """
 
     levels: tuple[StreamLevel, ...]
@@ -81,15 +81,15 @@ class BlockLevel(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamJob:
-    """What is to be done, small enough to be sent to every process.
+    """Description of the whole job, small enough to be sent to every process.
 
     Attributes:
-        job: The file, its blocks, and the folder of their files.
-        form: Kind of the stream.
+        job: The input file, its blocks, and the folder of their files.
+        form: Format of the stream.
         chunk_gaussians: Gaussians of the finest level in a chunk.
-        axes: Axes of the file, and of what is written.
+        axes: Axes of the input file and of the output.
         sh_degree: Highest SH degree to keep; None keeps all.
-        environment_radii: What lies farther away is the environment; None for none.
+        environment_radii: Robust radii beyond which Gaussians are the environment; None for none.
     """
 
     job: Job
@@ -101,15 +101,15 @@ class StreamJob:
 
     @property
     def folder(self) -> Path:
-        """Folder of the files of the stream until all are there."""
+        """Folder that holds the files of the stream until all are written."""
         return self.job.path("stream")
 
     def part_path(self, block: int) -> Path:
-        """Return the file that says what was written of a block."""
+        """Return the path of the JSON file with the :class:`StreamPart` of a block."""
         return self.job.path(f"part_{block:05d}.json")
 
     def finished(self, block: int) -> StreamPart | None:
-        """Return what was written of a block, if all of it is there."""
+        """Return the written part of a block; None unless all its files are complete."""
         try:
             part = StreamPart.model_validate_json(self.part_path(block).read_bytes())
             sizes = [_bytes_of((self.folder / name), self.form.kind) for name in part.names]
@@ -120,13 +120,13 @@ class StreamJob:
         return part if sum(sizes) == sum(level.bytes for level in part.levels) else None
 
     def targets(self) -> list[list[int]]:
-        """Return how many Gaussians each block has at each level, the finest first."""
+        """Return the number of Gaussians of each block at each level, the finest first."""
         found: list[list[int]] = json.loads(self.job.path("targets.json").read_bytes())["targets"]
         return found
 
 
 def _bytes_of(path: Path, kind: str) -> int:
-    """Return the size of a file that an index names, or of the folder of a SOG."""
+    """Return the bytes of a file that an index names; for a SOG, those of its folder."""
     if kind == "sog":
         return sum(file.stat().st_size for file in path.parent.iterdir())
     return path.stat().st_size
@@ -152,40 +152,40 @@ def stream_file(  # noqa: PLR0913 (options by name)
 ) -> StreamReport:
     """Write a file that need not fit into memory as a stream of levels.
 
-    The file is sorted into blocks of space, which lie in a hidden folder beside the output; each
-    block is made smaller to its exact share of every level, by the analysis of the whole scene, and
-    written as a part of the stream. If this is interrupted, the same call continues with the
-    blocks that are not finished. The result depends on the number of blocks, not on the workers.
+    The file is sorted into blocks of space, which are stored in a hidden folder beside the output.
+    Each block is simplified to its exact share of every level, based on the analysis of the whole
+    scene, and written as a part of the stream. After an interruption, the same call continues with
+    the unfinished blocks. The result depends on the number of blocks, not on the workers.
 
     Args:
         source: A binary PLY file.
-        folder: Where to write; made if it is missing. All files are there at the end, or none.
+        folder: Folder to write to; created if it is missing. All files are written, or none.
         rhos: Ratios of the levels, in (0, 1].
         kind: ``sog`` or ``3dtiles``.
-        memory: Bytes that one process may use; None for what is free.
+        memory: Bytes that one process may use; None for all free memory.
         blocks: Number of blocks, instead of ``memory``.
         chunk_gaussians: Gaussians of the finest level in a chunk.
-        environment_radii: What lies farther from the middle than so many robust radii is the
-            environment of a streamed SOG, in one size for all levels; None for none.
-        transform: Where 3D Tiles stand (:func:`cvtgs.streams.geo_transform`).
-        axes: Axes of the file, and of what is written.
+        environment_radii: Gaussians farther from the centre than this, in robust radii, are the
+            environment of a streamed SOG, which all levels share; None for no environment.
+        transform: Root transform of 3D Tiles (:func:`cvtgs.streams.geo_transform`).
+        axes: Axes of the input file and of the output.
         sh_degree: Highest SH degree to keep; None keeps all.
         simplifier: Configuration and network; None for the defaults.
-        workers: Calls functions for ranges of the file and for blocks; None calls them here, one
-            after the other.
+        workers: Call functions for ranges of the file and for blocks; None calls them one after
+            the other in this process.
         overwrite: Whether files of an earlier stream may be replaced.
         listener: Called with progress events.
 
     Returns:
-        What was written.
+        The report.
 
     Raises:
-        ConfigError: The configuration takes images of the scene, which needs all of it.
-        InvalidArgumentError: Ratios are out of range or give one size twice.
+        ConfigError: The configuration renders images, which needs the whole scene in memory.
+        InvalidArgumentError: A ratio is out of range, or two ratios give the same size.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
-        OutputExistsError: There is something that may not be replaced.
-        OutputBusyError: Another run is at work on this output.
+        OutputExistsError: The folder holds files that may not be replaced.
+        OutputBusyError: Another run is writing this output.
 
     Example:
         >>> import tempfile
@@ -235,7 +235,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
     key = hashlib.sha256(json.dumps(facts).encode()).hexdigest()
     spec = replace(spec, job=replace(job, folder=job_folder(folder, key)))
     check_stream(folder, kind, overwrite=overwrite)
-    with output_lock(Path(spec.job.folder).parent):  # commands hold the lock of the folder
+    with output_lock(Path(spec.job.folder).parent):  # commands lock the output folder
         parts, resumed = _run(spec, targets, simplifier, workers, StageClock(listener, _CPU))
         write_index(form, parts, spec.folder)
         publish(spec.folder, Path(folder), kind, overwrite=overwrite)
@@ -254,7 +254,7 @@ def _run(
     workers: Workers,
     clock: StageClock,
 ) -> tuple[list[StreamPart], int]:
-    """Sort the file, and write the parts that are not there yet; return all of them."""
+    """Sort the file and write the missing parts; return all parts and the number resumed."""
     job = spec.job
     resumes = job.has_sorted_rows() and job.path("targets.json").exists()
     begin(job, workers, clock, simplifier.checkpoint, resumes=resumes)
@@ -275,7 +275,7 @@ def _run(
 def _write_targets(
     spec: StreamJob, targets: Sequence[int], rows: Sequence[int], cells: Sequence[float]
 ) -> None:
-    """Share every level out to the blocks: by their weight, at least one where there are rows."""
+    """Divide every level among the blocks by weight; blocks with rows get at least one Gaussian."""
     total = sum(rows)
     if total < spec.job.source.count:
         warnings.warn(
@@ -295,7 +295,7 @@ def _write_targets(
 
 @one_thread()
 def write_block(spec: StreamJob, block: int) -> None:
-    """Make a block smaller to all of its sizes, and write it as a part of the stream."""
+    """Simplify a block to all of its sizes, and write it as a part of the stream."""
     job, targets = spec.job, spec.targets()[block]
     rows = read_rows(job, block)
     checkpoint = job.read_network()
@@ -323,14 +323,14 @@ def reduce_levels(
     *,
     net: MergeNet | PublishedMergeNet | None,
 ) -> list[BlockLevel]:
-    """Make a scene smaller to several sizes, the finest first; coarse ones of cells of the finest.
+    """Simplify a scene to several sizes, the finest first; coarse ones merge cells of the finest.
 
     Args:
-        scene: The Gaussians, with valid rows.
-        analysis: What is known of them.
+        scene: The Gaussians; all rows must be valid.
+        analysis: Their analysis.
         targets: The sizes, descending.
-        config: Every choice.
-        net: Corrects merged Gaussians; None for no correction.
+        config: The configuration.
+        net: Network that corrects merged Gaussians; None for no correction.
 
     Returns:
         One level per size.

@@ -1,4 +1,4 @@
-"""The files of a stream: chunks of one or more parts of a scene, and the index that names them."""
+"""The files of a stream: the chunks of one or more parts of a scene, and an index of them."""
 
 import json
 import os
@@ -23,16 +23,16 @@ INDEX_NAMES = {"sog": "lod-meta.json", "3dtiles": "tileset.json"}
 
 
 _OWN_NAME = re.compile(r'"(\d+_\d+\.glb|\d+_\d+_\d+(?=/meta\.json")|environment(?=/meta\.json"))')
-"""In an index, what a stream of ours consists of."""
+"""Matches the file and folder names in an index that cvtgs itself can have written."""
 
 
 class StreamLevel(NamedTuple):
-    """What was written of a level.
+    """Counts of a written level.
 
     Attributes:
-        gaussians: How many.
-        files: Files, or folders of files.
-        bytes: Bytes of all of them.
+        gaussians: Number of Gaussians.
+        files: Number of files, or of folders of files.
+        bytes: Total bytes of the files.
     """
 
     gaussians: int
@@ -41,16 +41,16 @@ class StreamLevel(NamedTuple):
 
 
 class StreamPart(Record):
-    """What was written of a part of a scene; parts are those that are in memory at once.
+    """A written part of a scene; a part is the share that is in memory at once.
 
     Attributes:
-        levels: What was written of each level, the finest first.
+        levels: Counts of each level, the finest first.
         chunks: Number of chunks.
-        names: Files as the index names them, in the order in which it counts them.
+        names: File names as in the index, in the order of its file numbers.
         tree: The node of the index that holds the part.
-        box_min: Least coordinates of its chunks.
-        box_max: Largest coordinates.
-        environment: File with its part of the environment; None if it has none.
+        box_min: Minimum coordinates of its chunks.
+        box_max: Maximum coordinates.
+        environment: File with the part's share of the environment; None if it has none.
     """
 
     levels: tuple[StreamLevel, ...]
@@ -63,38 +63,38 @@ class StreamPart(Record):
 
 
 class StreamFormat(Protocol):
-    """A kind of stream."""
+    """A format of streams."""
 
     @property
     def kind(self) -> str:
-        """Its name, a key of ``INDEX_NAMES``."""
+        """Name of the format, a key of ``INDEX_NAMES``."""
         ...
 
     def write_part(
         self, plan: StreamPlan, folder: Path, *, part: int, listener: ProgressListener
     ) -> StreamPart:
-        """Write the chunks of a part under names that no other part has.
+        """Write the chunks of a part under names that no other part uses.
 
         Args:
             plan: Levels and chunks of the part.
-            folder: Where to write.
+            folder: Folder to write to.
             part: Number of the part.
             listener: Called after each file.
 
         Returns:
-            What was written.
+            The written part.
         """
         ...
 
     def index(self, parts: Sequence[StreamPart], folder: Path) -> dict[str, Any]:
-        """Return the content of the index, of parts in an order in which neighbours are near.
+        """Return the content of the index.
 
         Args:
-            parts: All parts.
-            folder: Where they are, and where files that all parts share are written.
+            parts: All parts, ordered so that consecutive ones are close in space.
+            folder: Folder of the parts; files that all parts share are written to it.
 
         Returns:
-            What is written as JSON.
+            The content, to be written as JSON.
         """
         ...
 
@@ -107,7 +107,7 @@ def write_stream(
     overwrite: bool,
     listener: ProgressListener,
 ) -> tuple[StreamLevel, ...]:
-    """Write a stream of one part; all of it is there, or nothing."""
+    """Write a stream of one part; either all files are written or none."""
     place = Path(folder)
     check_stream(place, form.kind, overwrite=overwrite)
     with _hidden_folder(place) as hidden:
@@ -118,14 +118,14 @@ def write_stream(
 
 
 def write_index(form: StreamFormat, parts: Sequence[StreamPart], folder: Path) -> None:
-    """Write the index of parts that are in a folder."""
+    """Write the index of the parts in a folder."""
     content = json.dumps(form.index(parts, folder), separators=(",", ":"))
     with atomic_output(folder / INDEX_NAMES[form.kind], overwrite=True) as file:
         file.write(content.encode())
 
 
 def join_levels(parts: Sequence[StreamPart]) -> tuple[StreamLevel, ...]:
-    """Add up what was written of each level."""
+    """Add up the counts of each level over all parts."""
     levels = zip(*(part.levels for part in parts), strict=True)
     return tuple(StreamLevel(*map(sum, zip(*level, strict=True))) for level in levels)
 
@@ -135,12 +135,12 @@ def join_trees(
     leaf: Callable[[int], dict[str, Any]],
     inner: Callable[[Corner, Corner, list[dict[str, Any]]], dict[str, Any]],
 ) -> dict[str, Any]:
-    """Build the tree above parts: each node holds half of the parts of the one above.
+    """Build the tree above parts; each node has half of the parts of its parent.
 
     Args:
         parts: The parts.
-        leaf: Returns the node of a part, by its number.
-        inner: Returns a node of its box and its children.
+        leaf: Returns the node of the part with a given number.
+        inner: Returns an inner node from its box corners and its children.
 
     Returns:
         The root.
@@ -158,24 +158,24 @@ def join_trees(
 
 
 def join_boxes(lows: Sequence[Corner], highs: Sequence[Corner]) -> tuple[Corner, Corner]:
-    """Return the box around boxes."""
+    """Return the bounding box of boxes."""
     x, y, z = map(min, zip(*lows, strict=True))
     right, down, far = map(max, zip(*highs, strict=True))
     return (x, y, z), (right, down, far)
 
 
 def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool = False) -> None:
-    """Check that a stream could be written, before the long work that comes first.
+    """Check that a stream can be written, before the long work starts.
 
     Args:
-        folder: Where to write; made if it is missing.
+        folder: Folder to write to; created if it is missing.
         kind: ``sog`` or ``3dtiles``.
         overwrite: Whether files of an earlier stream may be replaced.
 
     Raises:
-        OutputExistsError: There is a stream that may not be replaced, or something else that is
-            not a stream of this kind.
-        OutputError: Nothing can be written there.
+        OutputExistsError: The folder holds a stream that may not be replaced, or other files but
+            no stream of this kind.
+        OutputError: The folder cannot be written to.
 
     Example:
         >>> import tempfile
@@ -184,7 +184,7 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
     """
     place = Path(folder)
     if not place.exists():
-        check_output(place)  # its parent is there and writable
+        check_output(place)  # checks that its parent exists and is writable
         return
     index = place / INDEX_NAMES[kind]
     check_output(index, overwrite)
@@ -197,7 +197,7 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
 
 @contextmanager
 def _hidden_folder(place: Path) -> Iterator[Path]:
-    """Make a hidden folder beside a folder to write; it is gone at the end."""
+    """Make a temporary hidden folder beside the output folder, or in it if need be."""
     target = Path(os.path.realpath(place))
     hidden = target.with_name(f".{target.name}.stream")
     if target.is_dir() and not os.access(target.parent, os.W_OK | os.X_OK):
@@ -211,14 +211,14 @@ def _hidden_folder(place: Path) -> Iterator[Path]:
 
 
 def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
-    """Move the files of a finished stream to where they belong, the index last.
+    """Move the files of a finished stream to the output folder, the index last.
 
-    Hidden files stay: they are for a run that continues.
+    Hidden files are not published: only resumed runs need them.
     """
     check_stream(place, kind, overwrite=overwrite)
     index, target = INDEX_NAMES[kind], Path(os.path.realpath(place))
     try:
-        if not target.exists() or not any(target.iterdir()):  # then all of them at once
+        if not target.exists() or not any(target.iterdir()):  # then one rename publishes all files
             if target.exists():
                 target.rmdir()
             hidden.rename(target)
@@ -235,14 +235,14 @@ def publish(hidden: Path, place: Path, kind: str, *, overwrite: bool) -> None:
             if (place / name).is_dir():
                 _remove(place / name)
             (hidden / name).replace(place / name)
-        for name in old:  # of the stream before, which had more of them
+        for name in old:  # left over from the replaced stream
             _remove(place / name)
     except OSError as error:
         raise _refused(place, error) from error
 
 
 def _names_of(index: Path) -> set[str]:
-    """Return the files and folders of ours that an index names."""
+    """Return the files and folders in an index that cvtgs itself can have written."""
     try:
         text = index.read_text(encoding="utf-8")
     except (OSError, ValueError):
@@ -263,5 +263,5 @@ def _refused(place: Path, error: OSError) -> OutputError:
 
 
 def _has_files(folder: Path) -> bool:
-    """Return whether there is anything but hidden files, such as locks."""
+    """Return whether a folder holds any files except hidden ones, such as locks."""
     return any(not path.name.startswith(".") for path in folder.iterdir())

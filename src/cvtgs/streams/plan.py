@@ -1,9 +1,9 @@
-"""Which Gaussians of every level form a chunk, so that chunks of unlike levels fit together.
+"""Divide the Gaussians of every level into chunks, so that chunks of different levels fit together.
 
-Chunks are made of Gaussians of the coarsest level. A Gaussian of a finer level is in the chunk of
-the coarse one that stands for most of its own input rows, wherever its centre is. Where levels are
-nested, all levels of a chunk therefore stand for the same part of the scene, and next to a chunk of
-another level nothing is missing and nothing is there twice.
+Chunks are formed from the Gaussians of the coarsest level. A Gaussian of a finer level belongs to
+the chunk of the coarse Gaussian that replaces most of its input rows, wherever its centre is. If
+levels are nested, all levels of a chunk therefore show the same part of the scene, and between
+neighbouring chunks of different levels, nothing is missing and nothing is shown twice.
 """
 
 from collections.abc import Iterable, Sequence
@@ -21,25 +21,25 @@ from cvtgs.math.parameters import rotation_matrices
 from cvtgs.scene import GaussianScene
 
 CHUNK_GAUSSIANS = 1 << 15
-"""Gaussians of the finest level in a chunk, at most, unless a coarse one stands for more."""
+"""Maximum number of finest Gaussians in a chunk, unless one coarse Gaussian replaces more."""
 
 ENVIRONMENT_GAUSSIANS = 1 << 16
-"""Gaussians of the environment, at most, unless the coarsest level has more so far away."""
+"""Maximum size of the environment, unless the coarsest level has more that far away."""
 
 _SIGMAS = 3.0
-"""Boxes of chunks hold Gaussians up to here, in standard deviations."""
+"""Extent of Gaussians in the boxes of chunks, in standard deviations."""
 
 _SPREAD = (0.05, 0.95)
-"""Quantiles whose distance decides across which axis a node is cut; far Gaussians do not count."""
+"""Quantiles whose distance selects the axis of a split; they exclude outlying Gaussians."""
 
 _SAMPLE = 1 << 16
-"""Points that are looked at for that."""
+"""Points used for these quantiles."""
 
 Corner = tuple[float, float, float]
 
 
 class StreamedLevel(Protocol):
-    """What a stream takes of a level, such as :class:`cvtgs.report.Level`."""
+    """What a stream needs of a level, such as :class:`cvtgs.report.Level`."""
 
     @property
     def scene(self) -> GaussianScene:
@@ -48,12 +48,12 @@ class StreamedLevel(Protocol):
 
     @property
     def geometric_error(self) -> float:
-        """How far they are from those of the full scene, scene units."""
+        """Their distance from the Gaussians of the full scene, scene units."""
         ...
 
     @property
     def assignment(self) -> Int[Tensor, "n"] | None:
-        """Row of the Gaussian that stands for each input row; -1 for none, None if all are kept."""
+        """Row of the Gaussian that replaces each input row, -1 for none; None if all are kept."""
         ...
 
 
@@ -62,9 +62,9 @@ class StreamChunk:
     """The same part of a scene at every level.
 
     Attributes:
-        rows: Rows of every level, the finest first, along a Morton curve.
-        box_min: Least coordinates of the Gaussians of all levels, three sigmas wide.
-        box_max: Largest coordinates.
+        rows: Row numbers in every level, the finest first, along a Morton curve.
+        box_min: Minimum coordinates of the Gaussians of all levels, at three sigmas.
+        box_max: Maximum coordinates.
     """
 
     rows: tuple[Int[Tensor, "k"], ...]
@@ -76,9 +76,9 @@ class StreamNode(NamedTuple):
     """A node of the tree of chunks.
 
     Attributes:
-        box_min: Least coordinates of its chunks.
-        box_max: Largest coordinates.
-        children: Two nodes; none for a leaf.
+        box_min: Minimum coordinates of its chunks.
+        box_max: Maximum coordinates.
+        children: Two nodes; empty for a leaf.
         chunk: Number of its chunk; None for an inner node.
     """
 
@@ -94,9 +94,9 @@ class StreamPlan(NamedTuple):
     Attributes:
         levels: The levels, the finest first.
         chunks: The chunks.
-        root: The tree.
-        environment: What is so far away that all levels share it, and no chunk has it; None if
-            nothing is.
+        root: Root of the tree.
+        environment: Gaussians that are so far away that they are in no chunk and all levels share
+            them; None if there are none.
     """
 
     levels: tuple[StreamedLevel, ...]
@@ -106,13 +106,13 @@ class StreamPlan(NamedTuple):
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Gaussians in the chunks of each level."""
+        """Number of Gaussians in the chunks of each level."""
         rows = zip(*(chunk.rows for chunk in self.chunks), strict=True)
         return tuple(sum(map(len, level)) for level in rows)
 
 
 class _Cut(NamedTuple):
-    """A node of the tree over the Gaussians of the coarsest level, before boxes are known."""
+    """A node of the tree over the Gaussians of the coarsest level, without its box."""
 
     chunk: int | None = None
     sides: tuple["_Cut", ...] = ()
@@ -128,18 +128,18 @@ def plan_stream(
 
     Args:
         levels: Levels of one scene, of different sizes, as
-            :meth:`~cvtgs.simplifier.Simplifier.levels` makes them.
-        chunk_gaussians: Gaussians of the finest level in a chunk; a Gaussian of the coarsest level
-            is never cut, so chunks are larger where it stands for more.
-        environment_radii: What lies farther from the middle than so many robust radii is the
-            environment, in one size for all levels; None leaves everything in chunks.
+            :meth:`~cvtgs.simplifier.Simplifier.levels` returns them.
+        chunk_gaussians: Maximum number of finest Gaussians in a chunk. A Gaussian of the
+            coarsest level is never split, so a chunk is larger if one replaces more.
+        environment_radii: Gaussians farther from the centre than this, in robust radii, are the
+            environment, which all levels share; None puts all Gaussians into chunks.
 
     Returns:
         The plan. Every row of every level is in one chunk, or so far away that the environment
-        stands for it.
+        replaces it.
 
     Raises:
-        InvalidArgumentError: There is no level, two have one size, or chunks are to be empty.
+        InvalidArgumentError: There is no level, two have the same size, or chunks would be empty.
 
     Example:
         >>> from cvtgs import Simplifier, synthetic
@@ -162,7 +162,7 @@ def plan_stream(
 def near_rows(
     coarsest: GaussianScene, frame: RobustFrame, radii: float | None
 ) -> Bool[Tensor, "c"]:
-    """Return which Gaussians go into chunks, at least one; the others are the environment."""
+    """Return a mask of the Gaussians in chunks, at least one; the others are the environment."""
     near = torch.ones(len(coarsest), dtype=torch.bool)
     if radii is not None:
         distances = frame.distances(coarsest.means).cpu()
@@ -173,7 +173,7 @@ def near_rows(
 def plan_part(
     ordered: Sequence[StreamedLevel], near: Bool[Tensor, "c"], *, chunk_gaussians: int
 ) -> StreamPlan:
-    """Build the chunks of a part of a scene; sizes of levels may be equal, the finest is first."""
+    """Build the chunks of a part of a scene; levels are finest first and may have equal sizes."""
     coarsest = ordered[-1]
     means = coarsest.scene.means.double().cpu()
     weights = torch.ones(len(means), dtype=torch.int64)
@@ -193,7 +193,7 @@ def plan_part(
 def _environment(
     levels: Sequence[StreamedLevel], labels: Sequence[Int[Tensor, "m"]]
 ) -> GaussianScene:
-    """Return what is in no chunk, of the finest level at which it is not too much."""
+    """Return the Gaussians in no chunk, from the finest level with few enough of them."""
     far = [(own < 0).nonzero()[:, 0] for own in labels]
     fitting = (level for level, rows in enumerate(far) if len(rows) <= ENVIRONMENT_GAUSSIANS)
     level = next(fitting, len(levels) - 1)
@@ -202,7 +202,7 @@ def _environment(
 
 
 def _parents(level: StreamedLevel, coarsest: StreamedLevel) -> Int[Tensor, "m"]:
-    """Return the Gaussian of the coarsest level that stands for most rows of each of a level."""
+    """Return, for each Gaussian of a level, the coarsest one that replaces most of its rows."""
     count, wide = len(level.scene), len(coarsest.scene)
     if level is coarsest:
         return torch.arange(count)
@@ -210,10 +210,10 @@ def _parents(level: StreamedLevel, coarsest: StreamedLevel) -> Int[Tensor, "m"]:
     own = _assignment(level)
     both = (own >= 0) & (coarse >= 0)
     pairs, votes = torch.unique(own[both] * wide + coarse[both], return_counts=True)
-    order = torch.sort(votes, stable=True).indices  # the most votes are written last
+    order = torch.sort(votes, stable=True).indices  # later writes win: the most votes come last
     parents = torch.full((count,), -1)
     parents[pairs[order] // wide] = pairs[order] % wide
-    missing = (parents < 0).nonzero()[:, 0]  # all of its rows were left out of the coarsest
+    missing = (parents < 0).nonzero()[:, 0]  # the coarsest level left out all of their rows
     means, sites = level.scene.means.double().cpu(), coarsest.scene.means.double().cpu()
     for rows in missing.split(1 << 10):
         parents[rows] = torch.cdist(means[rows], sites).argmin(dim=1)
@@ -234,7 +234,7 @@ def _cut(
     *,
     most: int,
 ) -> tuple[_Cut, int]:
-    """Cut near Gaussians of the coarsest level in two until no part stands for too many."""
+    """Split the near Gaussians of the coarsest level until no part replaces more than ``most``."""
     count = 0
 
     def part(rows: Int[Tensor, "k"]) -> _Cut:
@@ -253,7 +253,7 @@ def _cut(
 
 
 def _widest(points: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
-    """Return the coordinate of points that is spread most; far points do not count."""
+    """Return the coordinate with the largest spread, without outliers."""
     some = points[:: 1 + len(points) // _SAMPLE]
     ends = torch.tensor(_SPREAD, dtype=points.dtype)
     low, high = some.quantile(ends, dim=0)

@@ -27,14 +27,14 @@ from cvtgs.streams.plan import Corner, StreamNode, StreamPlan
 __all__ = ["write_sog_stream"]
 
 FILE_GAUSSIANS = 1 << 18
-"""Gaussians in a file, at most, unless a chunk has more."""
+"""Maximum number of Gaussians in a file, unless a single chunk has more."""
 
 
 _FAR = "environment"
 
 
 class _Unit(NamedTuple):
-    """A SOG: consecutive chunks of a level."""
+    """A SOG, which holds consecutive chunks of a level."""
 
     name: str
     level: int
@@ -47,8 +47,8 @@ class SogFormat:
     """Streamed SOG, as PlayCanvas' engine and SuperSplat's viewer load it.
 
     Attributes:
-        file_gaussians: Gaussians in a SOG, at most; a chunk is never cut.
-        kind: Its name.
+        file_gaussians: Maximum number of Gaussians in a SOG; a chunk is never split.
+        kind: Name of the format.
     """
 
     file_gaussians: int = FILE_GAUSSIANS
@@ -57,7 +57,7 @@ class SogFormat:
     def write_part(
         self, plan: StreamPlan, folder: Path, *, part: int = 0, listener: ProgressListener = silent
     ) -> StreamPart:
-        """Write chunks of a level one behind the other, so that what is near is in one file."""
+        """Write the chunks of a level consecutively, so that nearby chunks share a file."""
         units = list(_units(plan, part, self.file_gaussians))
         sizes = [0] * len(plan.levels)
         for number, unit in enumerate(units):
@@ -117,21 +117,21 @@ def write_sog_stream(
 ) -> tuple[StreamLevel, ...]:
     """Write a streamed SOG, as PlayCanvas' engine and SuperSplat's viewer load it.
 
-    Chunks of a level lie one behind the other in SOGs of bounded size, so that what is near is in
-    one file. All files are there at the end, or none.
+    Chunks of a level are consecutive in SOGs of bounded size, so that nearby chunks share a file.
+    All files are written, or none.
 
     Args:
         plan: Levels and chunks.
-        folder: Where to write; made if it is missing.
-        file_gaussians: Gaussians in a SOG, at most; a chunk is never cut.
+        folder: Folder to write to; created if it is missing.
+        file_gaussians: Maximum number of Gaussians in a SOG; a chunk is never split.
         overwrite: Whether files of an earlier stream may be replaced.
         listener: Called after each SOG.
 
     Returns:
-        What was written of each level, the finest first.
+        The written counts of each level, the finest first.
 
     Raises:
-        OutputExistsError: There is something that may not be replaced.
+        OutputExistsError: The folder holds files that may not be replaced.
         OutputError: A file cannot be written.
         InvalidSceneError: A Gaussian is not finite.
 
@@ -151,7 +151,7 @@ def write_sog_stream(
 
 
 def _write_sog(scene: GaussianScene, folder: Path) -> int:
-    """Write an unbundled SOG; return its bytes."""
+    """Write an unbundled SOG; return its size in bytes."""
     make_folder(folder, parents=False)
     total = 0
     for name, content in encode_sog(scene).files():
@@ -172,7 +172,7 @@ def _units(plan: StreamPlan, part: int, most: int) -> Iterator[_Unit]:
 
 
 def _packed(counts: Sequence[int], most: int) -> Iterator[range]:
-    """Return runs of chunks with at most so many Gaussians, or of a single chunk."""
+    """Return ranges of chunks with at most ``most`` Gaussians, or with a single larger chunk."""
     start = total = 0
     for chunk, count in enumerate(counts):
         if total and total + count > most:
@@ -183,7 +183,7 @@ def _packed(counts: Sequence[int], most: int) -> Iterator[range]:
 
 
 def _tree(plan: StreamPlan, units: Sequence[_Unit]) -> dict[str, Any]:
-    """Return the tree of the chunks of a part, which counts files from 0."""
+    """Return the tree of the chunks of a part, with file numbers from 0."""
     places: list[dict[str, Any]] = [{} for _ in plan.chunks]
     for number, unit in enumerate(units):
         offset = 0
@@ -212,7 +212,7 @@ def _bound(low: Corner, high: Corner) -> dict[str, Any]:
 
 
 def _shifted(node: dict[str, Any], before: int) -> dict[str, Any]:
-    """Return the tree of a part whose files follow others."""
+    """Return the tree with ``before`` added to its file numbers."""
     if "children" in node:
         return {**node, "children": [_shifted(child, before) for child in node["children"]]}
     lods = node["lods"].items()

@@ -1,4 +1,4 @@
-"""Write 3D Tiles 1.1: ``tileset.json``, and glTF tiles with SPZ inside, as CesiumJS loads them."""
+"""Write 3D Tiles 1.1 for CesiumJS: ``tileset.json``, and glTF tiles that contain SPZ."""
 
 import math
 import os
@@ -21,19 +21,19 @@ from cvtgs.streams.plan import Corner, StreamNode, StreamPlan
 __all__ = ["check_transform", "geo_transform", "write_tiles"]
 
 TILE_GAUSSIANS = 1 << 16
-"""Gaussians in a tile, at most, unless it holds the coarsest level or a single chunk."""
+"""Maximum number of Gaussians in a tile, unless it holds the coarsest level or a single chunk."""
 
 EARTH_RADIUS, FLATTENING = 6378137.0, 1 / 298.257223563
 """Equatorial radius, metres, and flattening of WGS 84."""
 
 ERROR_PIXELS = 16.0
-"""Viewers refine where the error of a tile covers more pixels than this, by default; it is to be
-where Gaussians are off by one."""
+"""By default, viewers refine a tile whose error covers more pixels than this. Tile errors are
+multiplied by it, so that viewers refine where Gaussians are off by one pixel."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Tile:
-    """A tile: some consecutive chunks at one level, and the tiles that replace it."""
+    """A tile: consecutive chunks at one level, and the finer tiles that replace it."""
 
     node: StreamNode
     level: int
@@ -43,13 +43,13 @@ class _Tile:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TilesFormat:
-    """3D Tiles 1.1 as CesiumJS loads them.
+    """3D Tiles 1.1, as CesiumJS loads them.
 
     Attributes:
-        tile_gaussians: Gaussians in a tile, at most; a chunk is never cut.
-        transform: From the axes of the tileset (x, y, z up; metres) to where it stands, 16 numbers
-            column by column; None leaves it where it is.
-        kind: Its name.
+        tile_gaussians: Maximum number of Gaussians in a tile; a chunk is never split.
+        transform: Root transform from the axes of the tileset (z up, metres) to its place, 16
+            numbers column by column; None for no transform.
+        kind: Name of the format.
     """
 
     tile_gaussians: int = TILE_GAUSSIANS
@@ -59,7 +59,7 @@ class TilesFormat:
     def write_part(
         self, plan: StreamPlan, folder: Path, *, part: int = 0, listener: ProgressListener = silent
     ) -> StreamPart:
-        """Write the tiles of a part; the first has the coarsest level of all of it."""
+        """Write the tiles of a part; the first holds the coarsest level of the whole part."""
         root = _tiles(plan, self.tile_gaussians)
         tiles = list(_listed(root))
         names = {id(tile): f"{part}_{number}.glb" for number, tile in enumerate(tiles)}
@@ -85,7 +85,7 @@ class TilesFormat:
         )
 
     def index(self, parts: Sequence[StreamPart], folder: Path) -> dict[str, Any]:
-        """Return the content of ``tileset.json``; there are no other files beside the tiles."""
+        """Return the content of ``tileset.json``; tiles share no other file."""
         low, high = join_boxes([part.box_min for part in parts], [part.box_max for part in parts])
         root = join_trees(parts, lambda part: parts[part].tree, _parent)
         placed = {} if self.transform is None else {"transform": list(self.transform)}
@@ -110,26 +110,26 @@ def write_tiles(
 ) -> tuple[StreamLevel, ...]:
     """Write 3D Tiles.
 
-    The root holds the coarsest level of the whole scene. Each tile is replaced by those of its
-    parts at a finer level, down to the finest level of single chunks. Tiles have the axes of glTF,
-    boxes those of 3D Tiles (z up). All files are there at the end, or none.
+    The root holds the coarsest level of the whole scene. Finer tiles of its parts replace a tile,
+    down to the finest level of single chunks. Tiles use the axes of glTF, and boxes use those of
+    3D Tiles (z up). All files are written, or none.
 
     Args:
         plan: Levels and chunks.
-        folder: Where to write; made if it is missing.
-        tile_gaussians: Gaussians in a tile, at most; a chunk is never cut.
-        transform: Where the tileset stands, 16 numbers column by column, as :func:`geo_transform`
-            makes them; None leaves it where it is.
+        folder: Folder to write to; created if it is missing.
+        tile_gaussians: Maximum number of Gaussians in a tile; a chunk is never split.
+        transform: Root transform of the tileset, 16 numbers column by column, as returned by
+            :func:`geo_transform`; None for no transform.
         overwrite: Whether files of an earlier stream may be replaced.
         listener: Called after each tile.
 
     Returns:
-        What was written of each level, the finest first. A level may be in more than one depth of
-        the tree; its tiles are counted once each.
+        The written counts of each level, the finest first. A level may occur at several depths of
+        the tree; each of its tiles is counted once.
 
     Raises:
-        InvalidArgumentError: The transform is none.
-        OutputExistsError: There is something that may not be replaced.
+        InvalidArgumentError: The transform is not affine and invertible.
+        OutputExistsError: The folder holds files that may not be replaced.
         OutputError: A file cannot be written.
         InvalidSceneError: No Gaussian of a tile is finite.
 
@@ -152,10 +152,10 @@ def write_tiles(
 
 
 def geo_transform(longitude: float, latitude: float, height: float = 0.0) -> tuple[float, ...]:
-    """Return the transform of a tileset that stands somewhere on the Earth.
+    """Return the transform that places a tileset on the Earth.
 
-    Its x goes to the east, y to the north, z up; its units are metres. The ellipsoid is that of
-    WGS 84 (EPSG 4978).
+    The tileset's x axis points east, y north and z up, in metres. The ellipsoid is that of WGS 84
+    (EPSG 4978).
 
     Args:
         longitude: Degrees, east is positive.
@@ -166,7 +166,7 @@ def geo_transform(longitude: float, latitude: float, height: float = 0.0) -> tup
         16 numbers, column by column.
 
     Raises:
-        InvalidArgumentError: There is no such place.
+        InvalidArgumentError: A coordinate is out of range or not finite.
 
     Example:
         >>> [round(number) for number in geo_transform(0.0, 0.0)[12:]]
@@ -199,16 +199,16 @@ def geo_transform(longitude: float, latitude: float, height: float = 0.0) -> tup
 
 
 def check_transform(numbers: Sequence[float]) -> tuple[float, ...]:
-    """Return the transform of a tileset, if it is one.
+    """Check the transform of a tileset.
 
     Args:
         numbers: 16 numbers, column by column.
 
     Returns:
-        The same.
+        The same numbers.
 
     Raises:
-        InvalidArgumentError: It is no affine transform that can be undone.
+        InvalidArgumentError: The transform is not affine and invertible.
     """
     values = tuple(map(float, numbers))
     is_matrix = len(values) == 16 and all(map(math.isfinite, values))
@@ -224,14 +224,14 @@ def check_transform(numbers: Sequence[float]) -> tuple[float, ...]:
 
 
 def _tiles(plan: StreamPlan, most: int) -> _Tile:
-    """Build the tree of tiles: below each, the next level that its parts have room for."""
+    """Build the tree of tiles; the children of a tile have the next finer level that fits."""
     sums = [[0] for _ in plan.levels]
     for chunk in plan.chunks:
         for total, rows in zip(sums, chunk.rows, strict=True):
             total.append(total[-1] + len(rows))
 
     def level_of(chunks: range, above: int) -> int:
-        """Return the finest level that fits into a tile; at least one finer at a single chunk."""
+        """Return the finest level that fits into a tile; for a single chunk, at least one finer."""
         fitting = [
             level
             for level in range(above)
@@ -241,7 +241,7 @@ def _tiles(plan: StreamPlan, most: int) -> _Tile:
         return min(fitting, default=last)
 
     def below(node: StreamNode, chunks: range, above: int) -> Iterator[_Tile]:
-        """Return the tiles that replace those of a level above, within a node."""
+        """Return the finer tiles that replace level ``above`` within a node."""
         if above == 0:
             return
         level = level_of(chunks, above)
@@ -271,7 +271,7 @@ def _listed(tile: _Tile) -> Iterator[_Tile]:
 
 
 def _error(plan: StreamPlan, tile: _Tile) -> float:
-    """Return the geometric error of a tile; that of a finer one is never larger."""
+    """Return the geometric error of a tile; finer tiles never have larger errors."""
     errors = [level.geometric_error for level in plan.levels[: tile.level + 1]]
     return ERROR_PIXELS * max(errors) if tile.children else 0.0
 
@@ -288,7 +288,7 @@ def _entry(plan: StreamPlan, tile: _Tile, names: dict[int, str]) -> dict[str, An
 
 
 def _parent(low: Corner, high: Corner, children: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return a tile without content, which viewers never stop at."""
+    """Return a tile without content, which viewers always refine."""
     errors = [child["geometricError"] for child in children]
     return {
         "boundingVolume": {"box": _box(low, high)},
@@ -298,7 +298,7 @@ def _parent(low: Corner, high: Corner, children: list[dict[str, Any]]) -> dict[s
 
 
 def _box(low: Corner, high: Corner) -> Sequence[float]:
-    """Return a box of 3D Tiles, whose z is up: x left, y back and z up of the scene."""
+    """Return a box in the axes of 3D Tiles: x is left, y back and z up in the scene."""
     corners = [(-x, -z, -y) for x, y, z in (low, high)]
     middle = [(a + b) / 2 for a, b in zip(*corners, strict=True)]
     half = [abs(a - b) / 2 for a, b in zip(*corners, strict=True)]

@@ -1,4 +1,4 @@
-"""A page in the browser that shows a scene while its size is chosen."""
+"""A browser page that shows a scene while the user chooses its size."""
 
 from cvtgs.viewer.nodes import check_viewer, scene_page
 from cvtgs.viewer.scenes import SceneViewer, ShownScene, camera_of

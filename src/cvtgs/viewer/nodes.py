@@ -1,4 +1,4 @@
-"""Scenes on a server of viser, and a page of its own that shows them.
+"""Scenes on a viser server, and standalone pages that show them.
 
 No other file imports viser.
 """
@@ -25,22 +25,22 @@ if TYPE_CHECKING:
 __all__ = ["check_viewer", "scene_page"]
 
 _FLIP_SECONDS = 2.0
-"""How long a page of its own shows each scene."""
+"""Seconds for which a standalone page shows each scene."""
 
 _ANY_PORT = 8999
-"""Where the search for a free port begins, for a page that is not served."""
+"""First port tried for the temporary server that records a standalone page."""
 
 _ABOVE = 1.8
-"""Labels are so many robust radii above the middle of their scene."""
+"""Height of a label above the centre of its scene, in robust radii."""
 
 
 def scene_page(scenes: Mapping[str, GaussianScene]) -> str:
-    """Return a page of its own with a 3D viewer, whose time line flips between scenes.
+    """Return a standalone page with a 3D viewer, whose time line flips between scenes.
 
     Colours are those of the constant SH band.
 
     Args:
-        scenes: The scenes by name; the camera starts where the first is seen well.
+        scenes: The scenes by name; the camera starts at a good view of the first.
 
     Returns:
         HTML that needs no server and fetches nothing.
@@ -60,14 +60,14 @@ def scene_page(scenes: Mapping[str, GaussianScene]) -> str:
 
 
 class SceneNode:
-    """A scene on a server, and a label with its name that is seen when it is."""
+    """A scene on a server, and a label with its name that is shown and hidden with it."""
 
     def __init__(self, server: "viser.ViserServer", name: str, path: str) -> None:
         self._server, self._name, self._path = server, name, path
         self._splats: Any = None
 
     def draw(self, scene: GaussianScene, *, visible: bool) -> None:
-        """Show a scene, instead of the one before."""
+        """Draw a scene in place of the current one."""
         part = scene.select(valid_rows(scene)).to("cpu")
         covariances = build_covariances(part.scales, normalize_quats(part.quats))
         self._splats = self._server.scene.add_gaussian_splats(
@@ -85,12 +85,12 @@ class SceneNode:
         )
 
     def show(self, visible: bool) -> None:
-        """Show or hide it, with its label."""
+        """Show or hide the scene and its label."""
         self._splats.visible = visible
 
 
 def record_page(server: "viser.ViserServer", nodes: Sequence[SceneNode]) -> str:
-    """Record one scene after the other, and return the page."""
+    """Record the scenes one after the other, and return the page."""
     recorder = server.get_scene_serializer()
     for shown in nodes:
         for node in nodes:
@@ -100,7 +100,7 @@ def record_page(server: "viser.ViserServer", nodes: Sequence[SceneNode]) -> str:
 
 
 def look_at(server: "viser.ViserServer", scene: GaussianScene) -> None:
-    """Let cameras start where a scene is seen well."""
+    """Set the initial camera to a good view of the scene."""
     camera = automatic_views(scene.to("cpu"), 1)
     rotation, center = camera.viewmats[0, :3, :3], camera.centers[0]
     depth = float(rotation[2] @ (robust_frame(scene.means).center.cpu().double() - center))
@@ -117,7 +117,7 @@ def _three(point: torch.Tensor) -> tuple[float, float, float]:
 
 def start_server(host: str, port: int) -> "viser.ViserServer":
     module = _viser()
-    with redirect_stdout(io.StringIO()):  # viser prints, whatever verbose is
+    with redirect_stdout(io.StringIO()):  # viser prints even if verbose is False
         server: viser.ViserServer = module.ViserServer(
             host=host, port=port, label="cvtgs", verbose=False
         )
@@ -131,7 +131,7 @@ def stop_server(server: "viser.ViserServer") -> None:
 
 
 def check_viewer() -> None:
-    """Check that a page could be served, before scenes are read.
+    """Check that pages can be served, before scenes are read.
 
     Raises:
         MissingDependencyError: viser is not installed.

@@ -1,4 +1,4 @@
-"""The scenes of a page: simplified again and again, scored and saved."""
+"""The scenes of a page, which are simplified repeatedly, scored and saved."""
 
 import math
 import os
@@ -23,18 +23,18 @@ __all__ = ["SceneViewer", "ShownScene"]
 FULL, SIMPLIFIED = "full scene", "simplified"
 
 WARM_RATIO = 0.5
-"""Ratio to be ready for: from an eighth on, single Gaussians are paired with their neighbours."""
+"""Largest ratio to prepare for: above an eighth, pairs of single Gaussians merge."""
 
 SCORE_SIDE = 480
-"""Longer side of the images that a view is scored on, pixels."""
+"""Longer side of scored images, pixels."""
 
 
 class ShownScene(NamedTuple):
-    """A scene on the page, and what is said of it.
+    """A scene on the page, and a description.
 
     Attributes:
         scene: The scene.
-        facts: A line of text.
+        facts: The description, one line of text.
     """
 
     scene: GaussianScene
@@ -42,15 +42,15 @@ class ShownScene(NamedTuple):
 
 
 class SceneViewer:
-    """Simplifies one scene again and again; what does not depend on the size is done once.
+    """Simplifies one scene repeatedly; work that does not depend on the size is done once.
 
     Args:
         scene: The full scene.
-        others: Scenes to look at beside it, by name.
-        device: Where to compute, as :class:`cvtgs.Simplifier` takes it.
+        others: Other scenes to show, by name.
+        device: Device to compute on, as for :class:`cvtgs.Simplifier`.
 
     Raises:
-        InvalidArgumentError: A name of another scene is one of the viewer's own.
+        InvalidArgumentError: Another scene has a name that the viewer itself uses.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -78,18 +78,18 @@ class SceneViewer:
             self.scenes[name] = ShownScene(other, _counted(other, scene))
 
     def simplify(self, preset: str, rho: float) -> ShownScene:
-        """Simplify the scene, and keep the result among the scenes.
+        """Simplify the scene, and add the result to the scenes.
 
         Args:
             preset: Name of a preset.
             rho: Ratio of Gaussians to keep, in (0, 1].
 
         Returns:
-            The small scene.
+            The simplified scene.
 
         Raises:
             InvalidArgumentError: The ratio is out of range.
-            ConfigError: There is no such preset.
+            ConfigError: The preset does not exist.
         """
         if preset not in self._prepared:
             simplifier = Simplifier(preset=preset, device=self._device)
@@ -100,20 +100,20 @@ class SceneViewer:
         return self.scenes[SIMPLIFIED]
 
     def warm_up(self, preset: str) -> None:
-        """Compute what all sizes share, so that the first move of the slider is as quick as others.
+        """Compute the data that all sizes share, so that the first slider move is not slower.
 
         Args:
-            preset: Name of a preset; nothing is done if the scene was not simplified by it.
+            preset: Name of a preset; no-op unless the scene was simplified with it.
         """
         if preset in self._prepared:
             self._prepared[preset].warm_up(WARM_RATIO)
 
     def score(self, name: str, cameras: Cameras) -> float:
-        """Return the mean PSNR of a scene against the full one, dB.
+        """Return the mean PSNR of a scene against the full scene, in dB.
 
         Args:
-            name: Which scene.
-            cameras: From where.
+            name: Name of the scene.
+            cameras: Cameras to render from.
 
         Returns:
             The mean over the cameras; infinite for the full scene itself.
@@ -128,14 +128,14 @@ class SceneViewer:
         """Write a scene to a new file.
 
         Args:
-            name: Which scene.
-            path: The file; its suffix chooses the format.
+            name: Name of the scene.
+            path: The file; its suffix sets the format.
 
         Returns:
-            A line that says what was written.
+            A line with the path and the number of Gaussians.
 
         Raises:
-            CvtgsError: What :func:`cvtgs.save` raises.
+            CvtgsError: The name is empty, or :func:`cvtgs.save` fails.
         """
         if not os.fspath(path).strip():
             raise OutputError("a file name is needed to save a scene, found none.")
@@ -152,16 +152,16 @@ def _counted(scene: GaussianScene, full: GaussianScene) -> str:
 def camera_of(
     wxyz: tuple[float, ...], position: tuple[float, ...], *, fov: float, aspect: float
 ) -> Cameras:
-    """Return the camera of a view of the page.
+    """Return the camera that a visitor of the page looks through.
 
     Args:
         wxyz: Rotation from the camera (x right, y down, z forward) to the world.
-        position: Of the camera, scene units.
+        position: Position of the camera, scene units.
         fov: Vertical field of view, radians.
-        aspect: Width by height.
+        aspect: Width divided by height.
 
     Returns:
-        One camera of a small image.
+        One camera, with images of at most ``SCORE_SIDE`` pixels.
     """
     quat = torch.tensor([wxyz], dtype=torch.float64)
     rotation = rotation_matrices(quat)[0]

@@ -1,4 +1,4 @@
-"""The server of a page: a slider of rho, presets, scores and saving."""
+"""The server of the page, with a slider of rho, presets, scores and saving."""
 
 import math
 import threading
@@ -19,27 +19,27 @@ if TYPE_CHECKING:
 __all__ = ["ViewerServer"]
 
 SLIDER = (-3.5, 0.0, 0.05)
-"""Decimal logarithms of rho: least, largest, step."""
+"""Range of the slider in log10 of rho: minimum, maximum, step."""
 
 _GIVE_UP = 0.5
-"""Seconds between looks at whether the page was closed."""
+"""Seconds between checks whether the server was closed."""
 
 
 class ViewerServer:
-    """The page: a server of viser with the scenes, a slider of rho, presets, scores and saving.
+    """A viser server that shows the scenes, with a slider of rho, presets, scores and saving.
 
-    Colours are those of the constant SH band, since viser shows no others; scores take all bands.
+    Colours are those of the constant SH band, since viser shows no others; scores use all bands.
 
     Args:
         viewer: The scenes.
         host: Address to listen on.
-        port: Port to listen on; the next free one is taken.
+        port: Port to listen on; if it is taken, the next free one.
         preset: Preset to start with.
         rho: Ratio to start with, in (0, 1].
 
     Raises:
         MissingDependencyError: viser is not installed.
-        ConfigError: There is no such preset.
+        ConfigError: The preset does not exist.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class ViewerServer:
         self._worker.start()
 
     def page(self) -> str:
-        """Return a page of its own with what is shown now; its time line flips between scenes.
+        """Return a standalone page with the current scenes; its time line flips between them.
 
         Returns:
             HTML that needs no server and fetches nothing.
@@ -95,11 +95,11 @@ class ViewerServer:
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """URL of the page."""
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
     def wait(self) -> None:
-        """Serve until the process is interrupted."""
+        """Serve until the process is interrupted or the server is closed."""
         while not self._closed:
             self._worker.join(timeout=_GIVE_UP)
 
@@ -115,7 +115,7 @@ class ViewerServer:
         stop_server(self._server)
 
     def _work(self) -> None:
-        """Simplify for the latest position of the slider; positions in between are skipped."""
+        """Simplify for the latest position of the slider; skip positions in between."""
         while not self._closed:
             self._wanted.wait()
             self._wanted.clear()
@@ -124,7 +124,7 @@ class ViewerServer:
                 is_first = not self._first.is_set()
                 self._first.set()
                 if is_first and not (self._wanted.is_set() or self._closed):
-                    with suppress(CvtgsError):  # the next run says it
+                    with suppress(CvtgsError):  # the next run reports it
                         self._viewer.warm_up(self._preset.value)
 
     def _simplify(self) -> str:
@@ -159,7 +159,7 @@ class ViewerServer:
         return self._viewer.save(self._shown.value, self._path.value.strip())
 
     def _try(self, action: Callable[[], str]) -> None:
-        """Run something for the page; what goes wrong is said there."""
+        """Run an action, and show its result or its error on the page."""
         try:
             self._notes.content = printable(action())
         except CvtgsError as error:

@@ -1,4 +1,4 @@
-"""Cameras from the files of NeRF, nerfstudio, COLMAP and INRIA's code."""
+"""Read cameras from files of NeRF, nerfstudio, COLMAP and INRIA's code."""
 
 from cvtgs.io.cameras.load import load_cameras
 

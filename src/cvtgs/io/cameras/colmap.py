@@ -1,4 +1,4 @@
-"""A sparse COLMAP model: a file of cameras and a file of images, binary or text."""
+"""Read sparse COLMAP models: a file of cameras and a file of images, binary or text."""
 
 import math
 import os
@@ -38,14 +38,14 @@ class _Image:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Model:
-    """A camera model that a pinhole camera can stand for."""
+    """A COLMAP camera model that a pinhole camera can replace."""
 
     number: int
-    """Its name in binary files."""
+    """Its identifier in binary files."""
     parameters: int
-    """How many it has: focal lengths, principal point, distortion."""
+    """Number of parameters: focal lengths, principal point, distortion."""
     focals: int
-    """How many of them are focal lengths, 1 or 2."""
+    """Number of focal lengths among them, 1 or 2."""
 
 
 _MODELS: Mapping[str, _Model] = MappingProxyType(
@@ -74,7 +74,7 @@ def is_colmap(folder: Path) -> bool:
 
 
 def colmap_views(folder: Path) -> list[View]:
-    """Read a sparse model; binary files go before text files."""
+    """Read a sparse model; binary files take precedence over text files."""
     if is_file(folder / "images.bin"):
         lenses = _cameras_of_bin(folder / "cameras.bin")
         images = _images_of_bin(folder / "images.bin")
@@ -104,7 +104,7 @@ def _views(images: Sequence[_Image], lenses: Mapping[int, Lens], path: Path) -> 
 
 
 def _checked_image(name: str, camera: int, *, pose: Sequence[float], where: str) -> _Image:
-    """Build an image; poses that are none are errors."""
+    """Build an image; raise an error if its pose or name is invalid."""
     if not all(map(math.isfinite, pose)) or not any(pose[:4]):
         raise FileFormatError(
             f"{where}: the pose must be finite with a quaternion other than 0, "
@@ -116,7 +116,7 @@ def _checked_image(name: str, camera: int, *, pose: Sequence[float], where: str)
 
 
 def _model_name(number: int) -> str:
-    """Return the name of the model that a binary file calls by number."""
+    """Return the name of a camera model from its identifier in binary files."""
     names = {model.number: name for name, model in _MODELS.items()} | _OTHERS
     return names.get(number, f"number {number}")
 
@@ -154,7 +154,7 @@ def _lens_of(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Bytes:
-    """A binary file that never reads more than there is."""
+    """A binary file whose reads are checked against its size."""
 
     file: BinaryIO
     size: int
@@ -168,7 +168,7 @@ class _Bytes:
         return layout.unpack(self.file.read(layout.size))
 
     def count(self, what: str, *, least: int) -> int:
-        """Read a count of rows, and refuse it where the file is too short for them."""
+        """Read a count of rows, and refuse it if the file is too short for them."""
         (count,) = self.take(_COUNT, f"the count of {what}")
         self.check(count * least, f"{count:,} {what}")
         return int(count)
@@ -177,7 +177,7 @@ class _Bytes:
         self.file.seek(size, os.SEEK_CUR)
 
     def name(self, what: str) -> str:
-        """Read a text that ends in a zero byte."""
+        """Read a text that ends with a zero byte."""
         start = self.file.tell()
         text, zero, _ = self.file.read(_MAX_NAME + 1).partition(b"\0")
         if not zero:
@@ -212,7 +212,7 @@ def _cameras_of_bin(path: Path) -> dict[int, Lens]:
 
 
 def _images_of_bin(path: Path) -> list[_Image]:
-    """Read ``images.bin``; the points in the images are skipped."""
+    """Read ``images.bin``; the points of the images are skipped."""
     images: list[_Image] = []
     with open_input(path) as file:
         data = _Bytes(file=file, size=os.fstat(file.fileno()).st_size, path=path)
@@ -225,7 +225,7 @@ def _images_of_bin(path: Path) -> list[_Image]:
 
 
 def _cameras_of_txt(path: Path) -> dict[int, Lens]:
-    """Read ``cameras.txt``: number, model, width, height and parameters in a line."""
+    """Read ``cameras.txt``: each line has number, model, width, height and parameters."""
     lenses: dict[int, Lens] = {}
     with open_input(path) as file:
         for number, line in _lines(file):
@@ -248,7 +248,7 @@ def _cameras_of_txt(path: Path) -> dict[int, Lens]:
 
 
 def _images_of_txt(path: Path) -> list[_Image]:
-    """Read ``images.txt``: a line with number, pose, camera and name, and a line of points."""
+    """Read ``images.txt``: a line of number, pose, camera and name, then a line of points."""
     images: list[_Image] = []
     with open_input(path) as file:
         lines = _lines(file)

@@ -1,4 +1,4 @@
-"""Read cameras; the files at the path say which format it is."""
+"""Read cameras, with the format detected from the files at the path."""
 
 import os
 from pathlib import Path
@@ -18,38 +18,38 @@ _KNOWN_FILES = (
 def load_cameras(path: str | os.PathLike[str], *, split: Split | None = None) -> Cameras:
     """Read the cameras of a capture.
 
-    A folder is searched for these, in this order:
+    In a folder, these are tried in this order:
 
     - ``transforms.json`` of NeRF, instant-ngp or nerfstudio; or ``transforms_train.json`` and
-      ``transforms_test.json``. OpenGL axes become OpenCV axes. Intrinsics are those of the frame,
-      else of the file; the principal point is in the middle if it is not given; a missing image
-      size is read from the PNG images. ``applied_transform`` is ignored: the cameras stay in the
-      world of the file. A scene that nerfstudio exported has been moved and scaled since, unless
-      it was trained without.
+      ``transforms_test.json``. OpenGL axes become OpenCV axes. Intrinsics come from the frame,
+      else from the file; the default principal point is the image centre; a missing image size is
+      read from the PNG images. ``applied_transform`` is ignored: the cameras stay in the world of
+      the file. Scenes exported by nerfstudio are moved and scaled relative to it, unless this was
+      disabled in training.
     - a COLMAP model in ``sparse/0``, ``sparse`` or the folder itself, binary before text, of any
       pinhole model; the cameras are in the order of their names.
     - ``cameras.json`` of INRIA's 3DGS code.
 
-    :class:`cvtgs.cameras.Cameras` have one image size: where sizes differ, the most frequent one
-    is taken (the first of equals) and the intrinsics of the others are scaled to it, along rows
-    and columns by themselves; photographs are to be resized alike. Distortion is left out with a
+    :class:`cvtgs.cameras.Cameras` have one image size. If sizes differ, the most frequent one (the
+    first in a tie) is used, and the intrinsics of other cameras are scaled to it, separately for
+    rows and columns; photographs must be resized in the same way. Distortion is left out with a
     warning.
 
     The split is that of the files (``transforms_test.json``, or ``test_filenames`` in the file).
-    Where they have none, every 8th camera in the order of names, from the first, is for testing.
+    If there is none, every 8th camera in the order of names, from the first, is for testing.
 
     Args:
         path: A folder, or one of these files.
         split: ``"train"``, ``"test"``, or None for all cameras, training first.
 
     Returns:
-        The cameras, float32 on the CPU; their names are the image names or paths of the file.
+        The cameras, float64 on the CPU; their names are the image names or paths in the file.
 
     Raises:
-        InvalidArgumentError: There is no such split, or the file is that of the other one.
-        InputNotFoundError: There is no such path, or nothing known in the folder.
+        InvalidArgumentError: The split does not exist, or the file is that of the other split.
+        InputNotFoundError: The path does not exist, or the folder has none of these files.
         InputError: A file cannot be opened or read.
-        FileFormatError: A file is not what its format promises, or has no camera of the split.
+        FileFormatError: A file does not conform to its format, or has no camera of the split.
 
     Example:
         >>> import json, tempfile

@@ -1,4 +1,4 @@
-"""Cameras in JSON files: ``transforms.json`` of NeRF and nerfstudio, ``cameras.json`` of INRIA."""
+"""Read JSON cameras: ``transforms.json`` of NeRF and nerfstudio, ``cameras.json`` of INRIA."""
 
 import math
 import struct
@@ -51,7 +51,7 @@ _Given = TypeVar("_Given")
 
 
 class _Intrinsics(Document):
-    """What a frame gives, or the file for all its frames."""
+    """Intrinsics of a frame, or of the file for all its frames."""
 
     w: Whole | None = None
     h: Whole | None = None
@@ -99,7 +99,7 @@ class _InriaCamera(Document):
 
 
 _Levels = Sequence[tuple[_Intrinsics, str]]
-"""What is given for a frame, then for the whole file, and how errors call the place."""
+"""Intrinsics of a frame, then of the whole file, each with the name of the place in errors."""
 
 
 def inria_views(entries: Sequence[Any], path: Path) -> list[View]:
@@ -171,7 +171,7 @@ def _view(content: Any, document: _Transforms, *, path: Path, where: str) -> Vie
 
 
 def _lens(frame: _Frame, document: _Transforms, *, path: Path, where: str) -> Lens:
-    """Build a lens: each number of the frame, else of the file, else from the image size."""
+    """Build a lens; each number is from the frame, else the file, else from the image size."""
     width, height = _size(frame, document, path=path, where=where)
     levels: _Levels = ((frame, where), (document, str(path)))
     fx, fy = _focal(levels, "x", pixels=width), _focal(levels, "y", pixels=height)

@@ -1,4 +1,4 @@
-"""Views and lenses, which every camera format is read to, and the cameras built from them."""
+"""Views and lenses, the common form of all camera formats, and cameras built from them."""
 
 import warnings
 from collections import Counter
@@ -14,7 +14,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.errors import DroppedDataWarning, FileFormatError
 
 MAX_PIXELS = 1 << 20
-"""Images may not be wider or higher; a size beyond it is a damaged number."""
+"""Largest width and height of images; a larger number is considered damaged."""
 
 _SKEW = 0.01
 _TEST_EVERY = 8
@@ -34,12 +34,12 @@ class Lens:
     width: int
     height: int
     distorted: bool = False
-    """Whether the file gives a distortion, which is left out."""
+    """Whether the file has a distortion, which is left out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """One photograph's camera; it has the name or path that the file has."""
+    """The camera of one photograph; its name is the name or path in the file."""
 
     name: str
     viewmat: Float[np.ndarray, "4 4"]
@@ -48,7 +48,7 @@ class View:
 
 
 def checked_lens(lens: Lens, where: str) -> Lens:
-    """Return the lens; intrinsics that no camera has are errors."""
+    """Return the lens, after checking that its intrinsics are possible."""
     if not (1 <= lens.width <= MAX_PIXELS and 1 <= lens.height <= MAX_PIXELS):
         raise FileFormatError(
             f"{where}: the image size must be from 1 to {MAX_PIXELS:,} pixels, "
@@ -66,11 +66,11 @@ def checked_lens(lens: Lens, where: str) -> Lens:
 def viewmat_of_pose(
     rotation: Float[np.ndarray, "3 3"], center: Float[np.ndarray, "3"], *, where: str
 ) -> Float[np.ndarray, "4 4"]:
-    """Return the world-to-camera matrix of a camera's pose."""
+    """Return the world-to-camera matrix of a camera-to-world pose."""
     with np.errstate(over="ignore", invalid="ignore"):
         skew = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
         determinant = float(np.linalg.det(rotation))
-    if not skew <= _SKEW or determinant < 0:  # NaN neither
+    if not skew <= _SKEW or determinant < 0:  # also refuses NaN
         raise FileFormatError(
             f"{where}: the pose must hold a rotation without scale or mirror, "
             f"found a matrix of determinant {determinant:.6g} that is {skew:.3g} away from one."
@@ -87,7 +87,7 @@ def viewmat_of_pose(
 
 
 def hold_out(views: Sequence[View], split: Split | None) -> list[View]:
-    """Return a split: every 8th view by name is for testing, as in Mip-NeRF 360 and 3DGS."""
+    """Return a split; every 8th view by name is for testing, as in Mip-NeRF 360 and 3DGS."""
     if split is None:
         return list(views)
     by_name = sorted(range(len(views)), key=lambda row: views[row].name)
@@ -96,7 +96,7 @@ def hold_out(views: Sequence[View], split: Split | None) -> list[View]:
 
 
 def to_cameras(views: Sequence[View], path: str) -> Cameras:
-    """Build cameras of the most frequent image size, and warn of distortion once."""
+    """Build cameras of the most frequent image size, and warn once about distortion."""
     sizes = Counter((view.lens.width, view.lens.height) for view in views)
     (width, height), _ = sizes.most_common(1)[0]
     _warn_of_distortion(views, path)

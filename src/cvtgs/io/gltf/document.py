@@ -30,7 +30,7 @@ QUANTIZATION = "KHR_mesh_quantization"
 KERNEL = "ellipse"
 COLOR_SPACE = "srgb_rec709_display"
 AXES = "luf"
-"""Of every glTF: y up, z forward, so x left (section 3.4 of glTF 2.0)."""
+"""Axes of every glTF: y up, z forward, hence x left (section 3.4 of glTF 2.0)."""
 
 POSITION, COLOR = "POSITION", "COLOR_0"
 ROTATION, SCALE, OPACITY = f"{SPLATS}:ROTATION", f"{SPLATS}:SCALE", f"{SPLATS}:OPACITY"
@@ -61,8 +61,8 @@ _ENCODINGS = {
     ),
     POSITION: (_INTEGERS, f"floats, or with {QUANTIZATION} of bytes or shorts"),
 }
-"""Integers that attributes may be, component type and whether normalized, and their names; all may
-be floats, and others are nothing else."""
+"""Integer encodings of attributes (component type, whether normalized) and the text for errors. All
+attributes may be floats; those that are not listed must be."""
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _MOST_STRIDE = 252
 _LONGEST_NAME = 255
@@ -117,18 +117,18 @@ class _Accessor(Document):
 
 @dataclass(slots=True, kw_only=True)
 class GltfFile:
-    """A glTF document and its bytes, each looked up, checked and read when it is needed."""
+    """A glTF document and its bytes; entries and buffers are checked and read lazily."""
 
     path: Path
     root: GltfRoot
     binary: bytes | None = None
     """The binary chunk of a ``.glb``."""
     stored: int
-    """Bytes on the disk, with those of buffers beside the file that were read."""
+    """Bytes of the file on disk, plus those read so far from buffers beside it."""
     _buffers: dict[int, bytes] = field(default_factory=dict)
 
     def entry(self, model: type[AnyDocument], name: str, index: int) -> AnyDocument:
-        """Return a checked entry of one of the lists of the document."""
+        """Return a checked entry of a list of the document."""
         entries = getattr(self.root, name)
         if not 0 <= index < len(entries):
             raise self.error(f"{name} has {len(entries):,} entries, found a reference to {index}")
@@ -139,7 +139,7 @@ class GltfFile:
         return FileFormatError(f"{self.path}: {text}.")
 
     def view(self, index: int) -> tuple[memoryview, int | None]:
-        """Return the bytes of a buffer view, and the stride that it states."""
+        """Return the bytes of a buffer view, and its stride if it states one."""
         view = self.entry(_View, "bufferViews", index)
         content = self._buffer(view.buffer)
         end = view.byteOffset + view.byteLength
@@ -236,7 +236,7 @@ class GltfFile:
         parts = urlsplit(uri)
         name = PurePosixPath(unquote(parts.path))
         outside = name.is_absolute() or ".." in name.parts or not name.parts or "\\" in str(name)
-        outside |= len(uri) > _LONGEST_NAME  # such as damaged data
+        outside |= len(uri) > _LONGEST_NAME  # such as a damaged data URI
         if parts.scheme or parts.netloc or parts.query or outside or not str(name).isprintable():
             raise self.error(
                 f"buffers[{index}] must be in the folder of the file, found {shown(uri)}"
@@ -248,7 +248,7 @@ class GltfFile:
 
 
 def open_gltf(path: Path) -> GltfFile:
-    """Read a ``.glb`` or ``.gltf``: its JSON, and the binary chunk."""
+    """Read the JSON and the binary chunk of a ``.glb`` or ``.gltf``."""
     with open_input(path) as file:
         content = file.read()
     binary, text = None, content
@@ -261,7 +261,7 @@ def open_gltf(path: Path) -> GltfFile:
 
 
 def _chunks(content: bytes, path: Path) -> tuple[bytes, bytes | None]:
-    """Split a ``.glb`` into its JSON and its binary chunk."""
+    """Split a ``.glb`` into its JSON chunk and its binary chunk."""
     if len(content) < HEADER.size:
         raise FileFormatError(
             f"{path}: a .glb must start with {HEADER.size} bytes of header, found {len(content)}."

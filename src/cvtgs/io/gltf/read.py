@@ -1,4 +1,4 @@
-"""Read the splats of a glTF: those of all nodes of its scene, where the nodes put them."""
+"""Read the Gaussians of all nodes of a glTF scene, transformed by their nodes."""
 
 import warnings
 from collections.abc import Iterator
@@ -43,7 +43,7 @@ from cvtgs.text import printable, shown
 _KNOWN = (SPLATS, SPZ, QUANTIZATION)
 _POINTS = 0
 _EVENNESS = 1e-4
-"""How far a node may be from an even scale, relative to it."""
+"""Tolerance for the scale of a node to count as uniform, relative to it."""
 
 _TINY = np.finfo(np.float32).tiny
 
@@ -89,7 +89,7 @@ class _Compression(Document):
 
 
 class _Placed(NamedTuple):
-    """A primitive of splats, what the extension says of it, and where its node puts it."""
+    """A primitive of splats with its extension, its place in errors and its node's matrix."""
 
     primitive: _Primitive
     splatting: _Splatting
@@ -112,14 +112,14 @@ def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False)
     if not trust_sizes:
         _check_sizes(file, placed)
     scenes = []
-    for one in placed:  # a comprehension is a level of the stack in Python 3.11 only
+    for one in placed:  # a comprehension adds a stack level in Python 3.11 only
         scenes.append(_read_primitive(file, one, trust_sizes=trust_sizes))
     scene = scenes[0] if len(scenes) == 1 else merge(scenes)
     return change_axes(scene, axes, SCENE_AXES)
 
 
 def _splats(file: GltfFile) -> Iterator[_Placed]:
-    """Return the primitives of splats of all nodes of the scene; others are warned about."""
+    """Yield the splat primitives of all nodes of the scene; warn about other primitives."""
     others = 0
     for index, matrix in _placed_meshes(file):
         mesh = file.entry(_Mesh, "meshes", index)
@@ -141,7 +141,7 @@ def _splats(file: GltfFile) -> Iterator[_Placed]:
 
 
 def _placed_meshes(file: GltfFile) -> Iterator[tuple[int, Matrix]]:
-    """Return the meshes of the nodes of the scene; all meshes where there is no scene."""
+    """Yield the meshes of the scene's nodes with matrices; all meshes if there is no scene."""
     if not file.root.scenes:
         yield from ((index, np.eye(4)) for index in range(len(file.root.meshes)))
         return
@@ -176,7 +176,7 @@ def _local_matrix(node: _Node) -> Matrix:
 
 
 def _check_sizes(file: GltfFile, placed: list[_Placed]) -> None:
-    """Refuse nodes that show the same bytes again and again; SPZ inside is checked on its own."""
+    """Refuse nodes that repeat the same bytes too often; SPZ inside is checked separately."""
     total = rest = 0
     for one in placed:
         if POSITION in one.primitive.attributes:
@@ -235,7 +235,7 @@ def _read_attributes(file: GltfFile, one: _Placed) -> GaussianScene:
         for band in range(1, degree + 1)
         for number in range(2 * band + 1)
     ]
-    with np.errstate(invalid="ignore"):  # of numbers that are none; rows are checked later
+    with np.errstate(invalid="ignore"):  # of NaN; rows are checked later
         log_scales = np.log(np.maximum(scales, _TINY))
     return scene_of(
         Arrays(
@@ -258,7 +258,7 @@ def _index(file: GltfFile, one: _Placed, name: str) -> int:
 
 
 def _degree(file: GltfFile, one: _Placed) -> int:
-    """Return the SH degree; every coefficient of it and of those below must be there."""
+    """Return the SH degree; check that all coefficients up to this degree are present."""
     names = one.primitive.attributes
     degree = 0
     for band in range(1, len(REST_COUNTS)):
@@ -288,7 +288,7 @@ def _with_comments(scene: GaussianScene, extras: Any) -> GaussianScene:
 
 
 def _moved(file: GltfFile, scene: GaussianScene, one: _Placed) -> GaussianScene:
-    """Move Gaussians to where their node puts them."""
+    """Transform Gaussians by the matrix of their node."""
     matrix = one.matrix
     if np.array_equal(matrix, np.eye(4)):
         return scene

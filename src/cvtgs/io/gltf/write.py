@@ -43,12 +43,12 @@ _CHUNK_ROWS = 1 << 18
 _ARRAY_BUFFER = 34962
 _MOST_BYTES = 1 << 32
 _SPZ_VERSION: Final = 3
-"""The newest that readers of the draft of the extension take."""
+"""The newest version that readers of the draft of the extension accept."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Attribute:
-    """An attribute of all Gaussians; its values are made a part at a time."""
+    """An attribute of all Gaussians; its values are computed in chunks."""
 
     name: str
     kind: str
@@ -80,7 +80,7 @@ def write_glb(scene: GaussianScene, file: BinaryIO) -> None:
 
 
 def write_gltf(scene: GaussianScene, file: BinaryIO) -> None:
-    r"""Write a ``.gltf``: as :func:`write_glb`, but as one JSON text with the numbers in base64."""
+    r"""Write a ``.gltf`` like :func:`write_glb`, but as one JSON text with numbers in base64."""
     arrays = arrays_of(scene)
     attributes, count = _attributes(arrays), len(arrays.means)
     document = _document(scene, arrays, attributes)
@@ -94,14 +94,14 @@ def write_gltf(scene: GaussianScene, file: BinaryIO) -> None:
 def write_spz_glb(scene: GaussianScene, file: BinaryIO) -> None:
     """Write a ``.glb`` with ``KHR_gaussian_splatting_compression_spz_2``: an SPZ inside a glTF.
 
-    The SPZ has the axes of the glTF, as CesiumJS reads it. Readers without the extension show
+    The SPZ has the axes of the glTF, as CesiumJS reads it. Viewers without the extension show
     nothing.
     """
     arrays = arrays_of(scene)
     packed = io.BytesIO()
     write_spz(scene, packed, version=_SPZ_VERSION)
     content = packed.getvalue()
-    # Those that the draft of the extension lists; colours and opacities are in COLOR_0.
+    # Keep those that the draft of the extension lists; COLOR_0 has colours and opacities.
     left_out = (OPACITY, coefficient(0, 0))
     attributes = [one for one in _attributes(arrays) if one.name not in left_out]
     document = _document(scene, arrays, attributes, compressed=len(content))
@@ -152,7 +152,7 @@ def _document(
     *,
     compressed: int | None = None,
 ) -> dict[str, Any]:
-    """Return the document without its buffers; accessors of compressed values have no view."""
+    """Return the document without buffers; accessors of compressed values have no view."""
     accessors, views, offset, count = [], [], 0, len(arrays.means)
     for number, one in enumerate(attributes):
         accessor: dict[str, Any] = {"componentType": one.component, "count": count}
@@ -201,7 +201,7 @@ def _json(document: dict[str, Any]) -> bytes:
 
 
 def _start_glb(file: BinaryIO, document: dict[str, Any], size: int) -> None:
-    """Write header and JSON of a ``.glb``, and the start of its binary chunk."""
+    """Write the header and JSON of a ``.glb``, and the start of its binary chunk."""
     text = _json(document)
     text += b" " * (-len(text) % 4)
     padded = size + -size % 4

@@ -1,4 +1,4 @@
-"""PLY files of 3DGS scenes, as INRIA's code and its successors write them."""
+"""PLY files of 3DGS scenes, in the layout of INRIA's code and its successors."""
 
 from cvtgs.io.ply.read import assemble, read_ply
 from cvtgs.io.ply.rows import PlyRows, join_plys, open_rows

@@ -1,4 +1,4 @@
-"""The header of a PLY file: read to a small typed value, and written."""
+"""Read the header of a PLY file as a small typed value, and write it."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -40,7 +40,7 @@ class ScalarType:
     code: str
     """The numpy type, without byte order."""
     dtype: torch.dtype
-    """The torch dtype that holds every value and that every torch operation knows."""
+    """The torch dtype that holds every value and that every torch operation supports."""
 
 
 SCALARS: Mapping[str, ScalarType] = MappingProxyType(
@@ -70,7 +70,7 @@ TYPE_NAMES: Mapping[str, str] = MappingProxyType(
         "float64": "double",
     }
 )
-"""Every name of a PLY number type, and the canonical one."""
+"""Canonical names of PLY number types, by all their names."""
 
 FLOAT_TYPES = ("float", "double")
 
@@ -110,7 +110,7 @@ class Element:
         return tuple((prop.name, prop.type) for prop in self.properties if not prop.count_type)
 
     def row_bytes(self, encoding: Encoding) -> int:
-        """Return the least size of a row."""
+        """Return the minimum size of a row in bytes."""
         if encoding == "ascii":
             return 2 * len(self.properties)
         return sum(prop.least_bytes for prop in self.properties)
@@ -175,7 +175,7 @@ def read_header(file: BinaryIO, path: str) -> Header:
 
 
 def _kind_of(block: bytes) -> str:
-    """Return what a file is instead of a PLY file, judged by its first bytes."""
+    """Describe a file that is not a PLY file, judged by its first bytes."""
     for start, found in _OTHER_FILES.items():
         if block.startswith(start):
             return found
@@ -218,7 +218,7 @@ def _is_count(text: str) -> bool:
 
 
 def _is_name(text: str) -> bool:
-    """Return whether a name is short enough for an error text; real ones have some 20 letters."""
+    """Return whether a name is short enough for error texts; real ones have about 20 letters."""
     return len(text) <= _MAX_NAME_LETTERS
 
 
@@ -245,7 +245,7 @@ def _check_unique(elements: tuple[Element, ...], path: str) -> None:
 
 
 def is_compressed_ply(path: Path) -> bool:
-    """Return whether a PLY file has packed vertices, whatever its name; False if unreadable."""
+    """Return whether a PLY file of any name has packed vertices; False if unreadable."""
     try:
         with open_input(path) as file:
             elements = read_header(file, str(path)).elements
@@ -255,7 +255,7 @@ def is_compressed_ply(path: Path) -> bool:
 
 
 def header_bytes(comments: Iterable[str], elements: Iterable[tuple[str, int, Layout]]) -> bytes:
-    """Write the header of a binary little endian file; elements have a name, rows and columns."""
+    """Return the header of a binary little endian file; elements are (name, rows, columns)."""
     lines = ["ply", "format binary_little_endian 1.0"]
     for comment in comments:
         if "\n" in comment:

@@ -1,4 +1,4 @@
-"""INRIA's vertex properties: the only file that maps names in a PLY to tensors of a scene."""
+"""INRIA's vertex properties, and the only mapping from PLY names to tensors of a scene."""
 
 import re
 from collections.abc import Iterable
@@ -22,11 +22,11 @@ _REST_NAME = re.compile(r"f_rest_(0|[1-9][0-9]*)")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Slot:
-    """Where the column of a property lies in a scene."""
+    """The place of the column of a property in a scene."""
 
     tensor: str
     index: tuple[int, ...]
-    """Position in that tensor behind the row, for example ``(0,)``."""
+    """Index into that tensor after the row, for example ``(0,)``."""
 
     @property
     def rows(self) -> tuple[slice | int, ...]:
@@ -35,7 +35,7 @@ class Slot:
 
 
 def standard_slots(rest_count: int) -> dict[str, Slot]:
-    """Return the standard properties in INRIA's order, and where each belongs."""
+    """Return the standard properties in INRIA's order with their slots."""
     return {
         **{name: Slot(tensor="means", index=(i,)) for i, name in enumerate("xyz")},
         **{f"f_dc_{c}": Slot(tensor="sh0", index=(0, c)) for c in range(3)},
@@ -89,12 +89,12 @@ def find_vertices(header: Header, path: str) -> Element:
 
 
 def check_size(header: Header, vertex: Element, *, path: str, size: int) -> None:
-    """Check that the file is long enough for the rows it promises, before room is made for them."""
+    """Check that a file is long enough for its rows, before memory is allocated for them."""
     before = header.elements[: header.elements.index(vertex)]
     room = size - header.data_offset
     room -= sum(element.count * element.row_bytes(header.encoding) for element in before)
     if header.encoding == "ascii":
-        room += 1  # the last line may lack its line end
+        room += 1  # the last line may lack its newline
     row_bytes = vertex.row_bytes(header.encoding)
     if vertex.count * row_bytes > room:
         exact = header.encoding != "ascii" and not vertex.has_lists
@@ -107,10 +107,10 @@ def check_size(header: Header, vertex: Element, *, path: str, size: int) -> None
 
 
 def layout_of(vertex: Element) -> Layout:
-    """Return the layout that a scene keeps, to be written with it again.
+    """Return the layout that a scene keeps and will be written with.
 
-    Lists are left out. Standard properties that the file stores as integers are ``float`` from
-    here on, since merged values are not whole numbers.
+    Lists are left out. Standard properties that the file stores as integers become ``float``,
+    since merged values are not whole numbers.
     """
     return tuple(
         (name, "float" if is_standard(name) and kind not in FLOAT_TYPES else kind)

@@ -1,7 +1,4 @@
-"""Read a 3DGS scene from a PLY file: mapped where the layout is the common one, else by plyfile.
-
-No other file imports plyfile.
-"""
+"""Read PLY scenes: the common layout by memory mapping, others by plyfile, imported only here."""
 
 import io
 import os
@@ -33,10 +30,10 @@ from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 from cvtgs.text import shown
 
 CHUNK_BYTES = 1 << 20
-"""How much of a file is mapped at a time; a chunk and its copy fit in the second-level cache."""
+"""Bytes of a file that are mapped at a time; a chunk and its copy fit into the L2 cache."""
 
 _CHUNK_ROWS = 1 << 12
-"""How many rows of plyfile are copied at a time; a cache holds them."""
+"""Rows of plyfile that are copied at a time; they fit into a cache."""
 
 _NOT_ASCII = bytes.maketrans(bytes(range(128, 256)), b"?" * 128)
 
@@ -44,19 +41,19 @@ _NOT_ASCII = bytes.maketrans(bytes(range(128, 256)), b"?" * 128)
 def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -> GaussianScene:
     """Read a scene from a PLY file of any encoding, property order and number type.
 
-    The common layout (binary little endian, vertices first) is memory-mapped, the rest is read
-    by plyfile; both give the same scene.
+    The common layout (binary little endian, vertices first) is memory-mapped; plyfile reads the
+    others. Both give the same scene.
 
     Args:
         path: The file.
-        sh_degree: Columns of SH bands above are not copied and come as zeros; None for all.
+        sh_degree: SH bands above this degree are not copied but set to zero; None keeps all.
         extras: Whether columns beyond the standard ones are copied.
 
     Returns:
-        The scene, on the CPU. Values are returned as they are, NaN and infinity too.
+        The scene, on the CPU. Values are returned as they are, including NaN and infinity.
 
     Raises:
-        InputNotFoundError: There is no such file.
+        InputNotFoundError: The file does not exist.
         InputError: It cannot be opened or read.
         FileFormatError: It is not a PLY file of a 3DGS scene, or damaged.
     """
@@ -110,7 +107,7 @@ def assemble(
     sh_degree: int | None = None,
     with_extras: bool = True,
 ) -> GaussianScene:
-    """Copy rows into a new scene, chunk by chunk; memory is the scene plus what chunks hold."""
+    """Copy rows into a new scene, chunk by chunk; memory is the scene plus that of chunks."""
     types = dict(layout)
     tensors = _empty_tensors(count, rest_count_of(types) or 0, dtype_of(layout))
     extras = {
@@ -119,7 +116,7 @@ def assemble(
         if with_extras and not is_standard(name) and name not in NORMALS
     }
     if sh_degree is not None and REST_COUNTS[sh_degree] < tensors["shN"].shape[1]:
-        # Zeros of numpy take no memory until they are written to, those of torch do.
+        # numpy's zeros take no memory until they are written to; torch's do.
         zeros = np.zeros(tensors["shN"].shape, tensors["shN"].numpy().dtype)
         tensors["shN"] = torch.from_numpy(zeros)
     standard = _standard_columns(tensors, types, sh_degree)
@@ -164,7 +161,7 @@ def _empty_tensors(count: int, rest_count: int, dtype: torch.dtype) -> dict[str,
 def _standard_columns(
     tensors: dict[str, Tensor], types: dict[str, str], sh_degree: int | None
 ) -> dict[str, NDArray[Any]]:
-    """Return a writable view of every standard column that is to be read, in file order."""
+    """Return writable views of the standard columns to read, in file order."""
     slots = standard_slots(tensors["shN"].shape[1])
     if sh_degree is not None:
         read = REST_COUNTS[sh_degree]
@@ -181,7 +178,7 @@ def _standard_columns(
 
 
 def can_map(header: Header) -> bool:
-    """Return whether the vertex rows can be mapped as they are."""
+    """Return whether the vertex rows can be memory-mapped without conversion."""
     first = header.elements[0]
     little = header.encoding == "binary_little_endian"
     return little and first.name == "vertex" and not first.has_lists
@@ -190,7 +187,7 @@ def can_map(header: Header) -> bool:
 def _mapped_chunks(file: BinaryIO, header: Header) -> Iterator[NDArray[Any]]:
     """Map the vertex rows, a megabyte at a time.
 
-    Each chunk is unmapped when the caller lets go of it, so the file's pages do not add up:
+    Each chunk is unmapped when the caller releases it, so the file's pages do not accumulate:
     memory is one or two chunks.
     """
     vertex = header.elements[0]
@@ -207,7 +204,7 @@ def _parsed_chunks(
 ) -> Iterator[NDArray[Any]]:
     """Read the vertex rows of any PLY file.
 
-    ASCII rows and rows with lists are held in memory as a whole, others are mapped.
+    ASCII rows and rows with lists are held in memory completely; others are mapped.
     """
     rows = _read_rows(file, header, vertex=vertex, path=path)
     for start in range(0, vertex.count, _CHUNK_ROWS):
@@ -221,7 +218,7 @@ def _read_rows(file: BinaryIO, header: Header, *, vertex: Element, path: str) ->
     stream = _CleanStream(file, header, plain_header=_plain_header(header, needed))
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy's, on empty lists
+            warnings.simplefilter("ignore")  # from numpy, about empty lists
             data = PlyData.read(stream)[f"e{len(needed) - 1}"].data
     except PlyElementParseError as error:
         raise FileFormatError(_explain(error, needed, path)) from error
@@ -236,11 +233,11 @@ def _read_rows(file: BinaryIO, header: Header, *, vertex: Element, path: str) ->
 
 
 def _plain_header(header: Header, elements: tuple[Element, ...]) -> bytes:
-    """Write the header as plyfile wants it: no blanks, comments or odd names; e0, p0, ..."""
+    """Return a header for plyfile: no blanks or comments, and plain names e0, p0, ..."""
     lines = ["ply", f"format {header.encoding} 1.0"]
     for i, element in enumerate(elements):
         if element.count == 0 or (header.encoding != "ascii" and not element.properties):
-            continue  # no bytes
+            continue  # holds no bytes
         lines.append(f"element e{i} {element.count}")
         for j, prop in enumerate(element.properties):
             length = f"list {prop.count_type} " if prop.count_type else ""
@@ -249,7 +246,7 @@ def _plain_header(header: Header, elements: tuple[Element, ...]) -> bytes:
 
 
 class _CleanStream(io.BufferedIOBase):
-    """A PLY file whose header has been replaced; positions are those of the real file."""
+    """A PLY file with a replaced header; positions are those of the original file."""
 
     def __init__(self, file: BinaryIO, header: Header, *, plain_header: bytes) -> None:
         self._file = file
@@ -259,7 +256,7 @@ class _CleanStream(io.BufferedIOBase):
         file.seek(header.data_offset)
 
     def read(self, size: int | None = -1, /) -> bytes:
-        if size is None or size < 0:  # of a damaged list
+        if size is None or size < 0:  # from a damaged list
             raise ValueError("a list cannot have a negative length")
         data = self._pending.read(size)
         if data or size == 0:
@@ -287,7 +284,7 @@ class _CleanStream(io.BufferedIOBase):
 
 
 def _explain(error: Any, elements: tuple[Element, ...], path: str) -> str:
-    """Turn plyfile's error into one sentence with the file's own names."""
+    """Convert plyfile's error to one sentence with the names in the file."""
     element = elements[int(error.element.name[1:])]
     place = f"{path}: row {error.row} of {shown(element.name)}"
     if error.message == "early end-of-file":

@@ -1,4 +1,4 @@
-"""Rows of a PLY file that is too large to be read at once, and files put together from others."""
+"""Read rows of PLY files that are too large to be read at once, and concatenate PLY files."""
 
 import os
 import shutil
@@ -27,11 +27,11 @@ class PlyRows:
         path: The file.
         count: Number of rows.
         names: Names and numpy types of the columns.
-        layout: Names and PLY types, as a scene keeps them.
+        layout: Names and PLY types of the columns, as a scene keeps them.
         comments: Comment lines of the file.
         offset: Where the first row starts, in bytes.
-        sh_degree: Scenes have no SH bands above this degree; None for all of the file.
-        axes: Where x, y and z of the file point.
+        sh_degree: SH bands above this degree are left out of scenes; None keeps all.
+        axes: The axes of the file.
     """
 
     path: str
@@ -49,43 +49,43 @@ class PlyRows:
         return np.dtype(list(self.names))
 
     def read(self, start: int, stop: int, step: int = 1) -> NDArray[Any]:
-        """Map some rows.
+        """Map a range of rows into memory.
 
         Args:
             start: First row.
             stop: Row after the last one.
-            step: Every how many rows.
+            step: Stride between rows.
 
         Returns:
-            A structured array; pages are read when they are used.
+            A structured array; pages are read on use.
         """
         place = self.offset + start * self.dtype.itemsize
         rows = np.memmap(self.path, self.dtype, "r", place, (stop - start,)).view(np.ndarray)
         return rows[::step]
 
     def scene(self, rows: NDArray[Any]) -> GaussianScene:
-        """Make a scene of rows.
+        """Build a scene from rows.
 
         Args:
             rows: Structured array with at least the columns of the file.
 
         Returns:
-            A scene as :func:`cvtgs.load` makes it.
+            A scene as :func:`cvtgs.load` returns it.
         """
         return self.assemble([rows], len(rows))
 
     def assemble(
         self, parts: Iterable[NDArray[Any]], count: int, *, is_slim: bool = False
     ) -> GaussianScene:
-        """Make a scene of rows that come in parts.
+        """Build a scene from rows in several parts.
 
         Args:
             parts: Structured arrays with at least the columns of the file.
-            count: How many rows all of them have.
+            count: Total number of rows.
             is_slim: Whether SH bands above the constant one and extra columns are left out.
 
         Returns:
-            A scene as :func:`cvtgs.load` makes it.
+            A scene as :func:`cvtgs.load` returns it.
         """
         degree = 0 if is_slim else self.sh_degree
         scene = assemble(
@@ -108,18 +108,18 @@ def open_rows(
 
     Args:
         path: The file.
-        sh_degree: SH bands above this degree are left out of scenes; None for none.
-        axes: Where x, y and z of the file point; None for those of PLY files. Scenes are turned to
-            these.
+        sh_degree: SH bands above this degree are left out of scenes; None keeps all.
+        axes: The axes of the file; None for those of PLY files. Scenes are converted to those of
+            PLY files.
 
     Returns:
         Its rows.
 
     Raises:
-        InvalidArgumentError: There are no such axes.
-        InputNotFoundError: There is no such file.
+        InvalidArgumentError: The axes do not exist.
+        InputNotFoundError: The file does not exist.
         InputError: It cannot be opened.
-        FileFormatError: It is no binary little endian PLY of a 3DGS scene, with vertices first.
+        FileFormatError: It is not a binary little endian PLY of a 3DGS scene, vertices first.
     """
     name = os.fspath(path)
     with open_input(Path(path)) as file:
@@ -145,12 +145,12 @@ def open_rows(
 
 
 def join_plys(paths: Sequence[str | os.PathLike[str]], file: BinaryIO) -> int:
-    """Write the rows of PLY files behind one another; memory is one buffer.
+    """Write the concatenated rows of PLY files; memory is one buffer.
 
     Args:
-        paths: Files that :func:`cvtgs.save` has written, with the same columns; at least one. The
+        paths: One or more files that :func:`cvtgs.save` has written, with the same columns. The
             comments are those of the first.
-        file: Where to, open for writing.
+        file: The output, open for writing.
 
     Returns:
         Number of rows.

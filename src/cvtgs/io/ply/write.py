@@ -1,4 +1,4 @@
-"""Write a 3DGS scene to a PLY file, with the properties of its source as far as they fit."""
+"""Write a 3DGS scene to a PLY file, with the properties of its source where they fit."""
 
 import warnings
 from typing import Any, BinaryIO
@@ -20,7 +20,7 @@ from cvtgs.io.ply.properties import (
 from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 
 CHUNK_BYTES = 1 << 20
-"""How much is gathered before it is written."""
+"""Bytes that are gathered before they are written."""
 
 _NATURAL_TYPES = {
     torch.bool: "uchar",
@@ -40,15 +40,15 @@ _NATURAL_TYPES = {
 def write_ply(scene: GaussianScene, file: BinaryIO) -> None:
     r"""Write a scene as binary little endian PLY.
 
-    Properties, their order and their types are those of the file that the scene came from; a
+    Properties, their order and their types are those of the file that the scene was read from; a
     scene made in memory gets INRIA's. Memory is one chunk.
 
     Args:
         scene: The scene, on any device.
-        file: Where to, open for writing.
+        file: The output, open for writing.
 
     Raises:
-        InvalidSceneError: The scene is empty, or something in it has no place in a PLY file.
+        InvalidSceneError: The scene is empty, or a PLY file cannot represent it.
         OSError: The file cannot be written.
 
     Example:
@@ -112,8 +112,8 @@ def _warn_of_flattened(scene: GaussianScene, layout: Layout) -> None:
 def _output_layout(scene: GaussianScene) -> Layout:
     """Return the properties to write.
 
-    A scene that was read keeps names, order and types. Where its layout no longer fits,
-    the standard properties follow the scene (SH degree, dtype), columns that are gone are left
+    A scene that was read keeps names, order and types. Where its layout no longer fits, the
+    standard properties follow the scene (SH degree, dtype), columns that no longer exist are left
     out, and new extras are appended. A scene without a layout gets INRIA's.
     """
     _check_names(scene)
@@ -140,7 +140,7 @@ def _output_layout(scene: GaussianScene) -> Layout:
         for i, (name, _) in enumerate(kept)
         if name.startswith("f_dc_") or rest_index(name) is not None
     ]
-    end = max(colours, default=len(kept) - 1) + 1  # view-dependent colours belong behind these
+    end = max(colours, default=len(kept) - 1) + 1  # view-dependent colours follow these
     added = [
         (name, _extra_type(name, column, None))
         for name, column in scene.extras.items()
@@ -168,7 +168,7 @@ def _check_names(scene: GaussianScene) -> None:
 
 
 def _extra_type(name: str, column: Tensor, kind: str | None) -> str:
-    """Return the type of the column in the source if it holds every value, else its own."""
+    """Return the type in the source file if it holds every value, else the column's own."""
     if kind is not None and SCALARS[kind].dtype == column.dtype and _fits(column, kind):
         return kind
     if column.dtype == torch.int64:

@@ -1,4 +1,4 @@
-"""Where the files of a SOG lie (in a zip, or beside ``meta.json``), and its WebP images."""
+"""Access to the files of a SOG (in a zip, or beside ``meta.json``) and its WebP images."""
 
 import io
 import os
@@ -17,22 +17,22 @@ from cvtgs.text import shown
 
 META = "meta.json"
 MOST_META_BYTES = 1 << 20
-"""Real ones have some ten thousand."""
+"""Largest size of ``meta.json``; real ones have about ten thousand bytes."""
 
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""Those whose output zipfile bounds; a block of bzip2 or LZMA is unpacked whole."""
+"""Compression methods whose output zipfile bounds; it unpacks blocks of bzip2 or LZMA whole."""
 
 _LONGEST_NAME = 255
-"""Characters that file systems allow."""
+"""Characters that file systems allow in a name."""
 
 PALETTE_COLUMNS = 64
-"""Entries of the SH palette in a row of its image."""
+"""Entries of the SH palette per row of its image."""
 
 Reader = Callable[[str, int], bytes]
-"""Reads a file by its name; one of more than this many bytes is an error."""
+"""Reads a file by its name; a file of more than the given number of bytes is an error."""
 
 StoredBytes = Callable[[Sequence[str]], int]
-"""Returns how many bytes files have on the disk, packed as they are."""
+"""Returns the size of files on disk in bytes, as compressed."""
 
 
 def open_container(path: Path) -> AbstractContextManager[tuple[Reader, StoredBytes]]:
@@ -64,7 +64,7 @@ def _inside(path: Path) -> Iterator[tuple[Reader, StoredBytes]]:
     with open_input(path) as file:
         try:
             archive = zipfile.ZipFile(file)
-        except Exception as error:  # zipfile passes on what its parts raise
+        except Exception as error:  # zipfile passes on errors of its parts
             if is_out_of_memory(error):
                 raise
             raise FileFormatError(
@@ -139,14 +139,14 @@ def decode_webp(content: bytes, where: str, *, most_pixels: int) -> UInt8[np.nda
         raise FileFormatError(f"{where} must be a WebP image, found something else.") from error
     except FileFormatError:
         raise
-    except Exception as error:  # Pillow passes on what its codecs raise
+    except Exception as error:  # Pillow passes on errors of its codecs
         if is_out_of_memory(error):
             raise
         raise FileFormatError(f"{where} must be a whole image, found: {_reason(error)}.") from error
 
 
 def encode_webp(numbers: UInt8[np.ndarray, "h w 4"]) -> bytes:
-    """Write numbers to a lossless image, those below opacity 0 too."""
+    """Write numbers to a lossless image, including those of pixels with opacity 0."""
     from PIL import Image  # noqa: PLC0415
 
     file = io.BytesIO()

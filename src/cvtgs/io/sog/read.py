@@ -1,4 +1,4 @@
-"""Read a SOG, version 1 or 2: its ``meta.json``, and the values of its images."""
+"""Read a SOG, version 1 or 2: its ``meta.json`` and the values in its images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ class _TwoImages(Document):
 
 
 class _Means(_TwoImages):
-    """Least and largest of ``sign(x) log(1 + |x|)`` per axis."""
+    """Minimum and maximum of ``sign(x) log(1 + |x|)`` per axis."""
 
     mins: Vector
     maxs: Vector
@@ -58,8 +58,8 @@ class _Means(_TwoImages):
 
 class _Root(Document):
     version: Annotated[Whole, Field(ge=1, le=2, description="1 or 2")] | None = None
-    model: Any = None  # of splat-transform
-    antialias: Any = None  # of the first description of the format
+    model: Any = None  # written by splat-transform
+    antialias: Any = None  # from the first description of the format
 
 
 _Codes = Annotated[
@@ -78,7 +78,7 @@ class _Palette(_TwoImages):
 
 
 class _Version2(_Root):
-    """Bytes index a codebook of at most 256 numbers, the same in all channels."""
+    """Bytes index a codebook of at most 256 numbers, shared by all channels."""
 
     count: Whole
     means: _Means
@@ -116,7 +116,7 @@ class _PaletteRange(_TwoImages):
 
 
 class _Version1(_Root):
-    """Bytes are equal steps from a least to a largest number per channel."""
+    """Bytes are equal steps from a minimum to a maximum per channel."""
 
     means: _ShapedMeans
     scales: _ThreeRanges
@@ -148,11 +148,11 @@ def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
         The scene.
 
     Raises:
-        InputNotFoundError: There is no such file, or an image is missing.
+        InputNotFoundError: The file does not exist, or an image is missing.
         InputError: A file cannot be opened or read.
         FileFormatError: It is not a SOG, or damaged.
     """
-    # Numbers of a damaged file may be beyond float32.
+    # A damaged file may hold numbers beyond float32.
     with open_container(path) as (read, stored), np.errstate(all="ignore"):
         where = str(path) if path.name == META else f"{path}: {META}"
         meta = _read_meta(parse_json(read(META, MOST_META_BYTES), where), where)
@@ -256,7 +256,7 @@ class _Images:
 
 
 def _means(images: _Images, part: _Means) -> Float[np.ndarray, "n 3"]:
-    """Read 16 bits per axis, two bytes in two images."""
+    """Decode 16 bits per axis, with the low and high bytes in two images."""
     low, high = (images.rows(name)[:, :3].astype(np.uint16) for name in part.files)
     whole = low | high << np.uint16(8)
     least, largest = np.array(part.mins), np.array(part.maxs)
@@ -266,7 +266,7 @@ def _means(images: _Images, part: _Means) -> Float[np.ndarray, "n 3"]:
 
 
 def _quats(stored: UInt8[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Decode three components; the last byte is 252 plus the missing one, else no rotation."""
+    """Decode three components; the last byte is 252 plus the omitted one, else identity."""
     tags = stored[:, 3].astype(np.int64) - _FIRST_TAG
     others = (stored[:, :3].astype(np.float32) / np.float32(127.5) - 1) * np.sqrt(np.float32(0.5))
     quats = restore_largest(np.maximum(tags, 0), others)
@@ -289,7 +289,7 @@ def _decoded(
 
 
 def _rest(images: _Images, meta: _Meta) -> Float[np.ndarray, "n k 3"]:
-    """Look labels up in the palette, and its bytes in the codebook; a label beyond it is 0."""
+    """Look labels up in the palette, and its bytes in the codebook; unknown labels give 0."""
     part = meta.document.shN
     if part is None or meta.palette is None:
         return np.empty((meta.count, 0, 3), np.float32)

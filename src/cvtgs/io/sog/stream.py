@@ -1,4 +1,4 @@
-"""Read a streamed SOG: ``lod-meta.json``, a tree of chunks, and SOGs that hold rows of many."""
+"""Read a streamed SOG: ``lod-meta.json`` with a tree of chunks, and SOGs with rows of chunks."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -41,12 +41,12 @@ class _Range(NamedTuple):
 
 
 def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> GaussianScene:
-    """Read one level of a streamed SOG, as splat-transform and PlayCanvas' engine know them.
+    """Read one level of a streamed SOG, the format of splat-transform and PlayCanvas' engine.
 
     Args:
-        path: The ``lod-meta.json``; its SOGs lie in its folder.
-        lod: The level, 0 for the finest. Chunks without it give their next coarser one, or their
-            coarsest.
+        path: The ``lod-meta.json``; its SOGs are in its folder.
+        lod: The level, 0 for the finest. Chunks without this level give their next coarser level,
+            or their coarsest.
         trust_sizes: Whether images may unpack to any size.
 
     Returns:
@@ -55,8 +55,8 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
     Raises:
         InputNotFoundError: A file is missing.
         InputError: A file cannot be opened or read.
-        FileFormatError: It is not a streamed SOG, damaged, or names files outside of its folder.
-        InvalidArgumentError: There is no such level.
+        FileFormatError: It is not a streamed SOG, damaged, or names files outside its folder.
+        InvalidArgumentError: The level does not exist.
     """
     with open_input(path) as file:
         content = parse_json(file.read(), path)
@@ -95,7 +95,7 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
 
 
 def _chunks(tree: dict[str, Any], path: Path) -> Iterator[dict[str, Any]]:
-    """Return the levels of every leaf of the tree."""
+    """Yield the levels of every leaf of the tree."""
     waiting: list[Any] = [tree]
     while waiting:
         node = waiting.pop()
@@ -115,7 +115,7 @@ def _chunks(tree: dict[str, Any], path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _level_of(levels: dict[str, Any], lod: int, where: str) -> int | None:
-    """Return the level of a chunk to read: that, the next coarser one, or the coarsest."""
+    """Return the level of a chunk to read: ``lod``, the next coarser one, or the coarsest."""
     wrong = [key for key in levels if not (key.isascii() and key.isdigit() and len(key) < 4)]
     if wrong:
         raise FileFormatError(f"{where}: levels must be whole numbers, found {shown(wrong[0])}.")
@@ -126,7 +126,7 @@ def _level_of(levels: dict[str, Any], lod: int, where: str) -> int | None:
 def _check_count(
     meta: _LodMeta, ranges: dict[int, list[_Range]], lod: int | None, path: Path
 ) -> None:
-    """Refuse rows that are in two chunks, and another sum than the file states."""
+    """Refuse rows that are in two chunks, and a total other than the file states."""
     for number, parts in ranges.items():
         parts.sort()
         for before, after in pairwise(parts):
@@ -161,7 +161,7 @@ def _inside(path: Path, name: str) -> Path:
 
 
 def _read_rows(source: Path, parts: Sequence[_Range], *, trust_sizes: bool) -> GaussianScene:
-    """Read some rows of a SOG, in ascending order; all where no range is given."""
+    """Read ranges of rows of a SOG, in ascending order; all rows if no range is given."""
     scene = read_sog(source, trust_sizes=trust_sizes)
     if parts and parts[-1].end > len(scene):
         raise FileFormatError(

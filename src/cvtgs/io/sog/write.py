@@ -1,4 +1,4 @@
-"""Write a SOG: the few numbers and colour functions that it stores, and its images."""
+"""Write a SOG: its codebooks, its SH palette and its images."""
 
 import json
 import zipfile
@@ -25,7 +25,7 @@ from cvtgs.io.sog.container import META, PALETTE_COLUMNS, encode_webp
 from cvtgs.math.spherical_harmonics import degree_of
 from cvtgs.scene import GaussianScene
 
-_TIME = (1980, 1, 1, 0, 0, 0)  # the same scene gives the same bytes
+_TIME = (1980, 1, 1, 0, 0, 0)  # fixed, so that the same scene gives the same bytes
 _QUAT_TAG = 252
 
 Images = dict[str, UInt8[np.ndarray, "h w 4"]]
@@ -40,13 +40,13 @@ _RELATIVE_ROUNDING = 1e-5
 
 
 class EncodedSog(NamedTuple):
-    """The files of a SOG before they are written: ``meta.json`` and images by their stems."""
+    """The files of a SOG before they are written: ``meta.json``, and images by file stem."""
 
     meta: dict[str, Any]
     images: Images
 
     def files(self) -> Iterator[tuple[str, bytes]]:
-        """Return names and contents, the images first; one is encoded at a time."""
+        """Yield names and contents, the images first; images are encoded one at a time."""
         for name, pixels in self.images.items():
             yield f"{name}.webp", encode_webp(pixels)
         yield META, json.dumps(self.meta).encode()
@@ -66,10 +66,10 @@ def encode_sog(scene: GaussianScene) -> EncodedSog:
     """Encode an unbundled SOG of version 2 whose rows are in the order of the scene.
 
     Args:
-        scene: The scene, on any device, of rows that a SOG can hold.
+        scene: The scene, on any device; a SOG must be able to hold all its rows.
 
     Returns:
-        What to write.
+        The encoded files.
 
     Raises:
         InvalidSceneError: A Gaussian of the scene is not finite.
@@ -148,7 +148,7 @@ def _rest(rest: Float[np.ndarray, "n k 3"]) -> tuple[Images, dict[str, Any]]:
 
 
 def _numbers(codes: Float[np.ndarray, "256"]) -> list[float]:
-    """Return numbers of float32 with no more digits than tell them apart."""
+    """Return float32 numbers with as few digits as distinguish them."""
     return [float(str(code)) for code in codes]
 
 
@@ -172,18 +172,18 @@ def _image(
 
 
 class Codebook(NamedTuple):
-    """Numbers in ascending order, and the index of the one that replaces each value."""
+    """Codes in ascending order, and the index of the code that replaces each value."""
 
     codes: Float[np.ndarray, "256"]
     labels: UInt8[np.ndarray, "*n"]
 
 
 def codebook(values: Float[np.ndarray, "*n"]) -> Codebook:
-    """Find 256 numbers that values are rounded to with little squared error.
+    """Find 256 codes that values can be rounded to with a small squared error.
 
-    One-dimensional k-means (Lloyd 1982) on the sorted values, from codes whose density follows
-    the cube root of that of the values (Panter and Dite 1951). Up to 256 different values are
-    kept. Memory: three copies of the values in float64.
+    This is one-dimensional k-means (Lloyd 1982) on the sorted values. The density of the initial
+    codes follows the cube root of that of the values (Panter and Dite 1951). Up to 256 distinct
+    values are kept. Memory: three copies of the values in float64.
     """
     ordered = np.sort(values, axis=None).astype(np.float64)
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
@@ -212,33 +212,33 @@ def _first_codes(ordered: Float[np.ndarray, "n"]) -> Float[np.ndarray, "256"]:
 
 
 class Palette(NamedTuple):
-    """At most 65,536 rows, and the index of the one that replaces each of the given rows."""
+    """At most 65,536 rows, and the index of the entry that replaces each of the given rows."""
 
     entries: Float[np.ndarray, "p d"]
     labels: Int[np.ndarray, "n"]
 
 
 def palette_size(count: int) -> int:
-    """Return the number of entries for so many rows: a power of 2, at least half of them.
+    """Return the palette size: a power of 2, at least half of the rows but at most 65,536.
 
-    As splat-transform does. A palette of all rows is most of a file of a small scene: 452 of 668 kB
-    of 15,000 Gaussians.
+    This follows splat-transform. A palette of all rows would be most of the file of a small scene:
+    452 of 668 kB for 15,000 Gaussians.
     """
     return min(PALETTE, 1 << max(10, count.bit_length() - 1))
 
 
 def palette(rows: Float[np.ndarray, "n d"], most: int | None = None) -> Palette:
-    """Find a few rows that replace many.
+    """Find a palette of a few rows that replaces many rows.
 
-    Up to ``most`` rows are kept. Of more, the half of the groups with the largest squared errors is
-    split, each at the mean of its most varied column (after Wu 1991, many groups at once), until
-    there are ``most``; entries are means of groups. This takes seconds for a million rows, where
-    k-means would take an hour on a CPU. Memory: three copies of the rows.
+    Up to ``most`` rows are kept. More rows are grouped: the half of the groups with the largest
+    squared errors is split, each at the mean of the column of largest variance (after Wu 1991, but
+    many groups at once), until there are ``most`` groups. Entries are group means. A million rows
+    take seconds; k-means would take an hour on a CPU. Memory: three copies of the rows.
     """
     most = palette_size(len(rows)) if most is None else most
     if len(rows) <= most:
         return Palette(rows, np.arange(len(rows)))
-    middle = rows.mean(axis=0)  # about it, squares lose no digits
+    middle = rows.mean(axis=0)  # centred, so that squares lose no digits
     shifted = torch.from_numpy(rows - middle)
     squares = shifted.square()
     order, starts = torch.arange(len(rows)), torch.zeros(1, dtype=torch.int64)
@@ -254,7 +254,7 @@ def palette(rows: Float[np.ndarray, "n d"], most: int | None = None) -> Palette:
 def _split(
     rows: Tensor, squares: Tensor, order: Tensor, starts: Tensor, *, most: int
 ) -> tuple[Tensor, Tensor]:
-    """Split the half of the groups with the largest errors; give the new order and starts."""
+    """Split the half of the groups with the largest errors; return the new order and starts."""
     means, mean_squares = _group_means(rows, order, starts), _group_means(squares, order, starts)
     variances = mean_squares - means.square()
     variances = torch.where(variances > _RELATIVE_ROUNDING * mean_squares, variances, 0.0)
@@ -270,11 +270,11 @@ def _split(
 
 
 def _groups(starts: Tensor, count: int) -> Tensor:
-    """Return the number of the group of every place."""
+    """Return the group number of every position."""
     ends = torch.cat([starts[1:], starts.new_tensor([count])])
     return torch.repeat_interleave(ends - starts)
 
 
 def _group_means(rows: Tensor, order: Tensor, starts: Tensor) -> Tensor:
-    """Average the rows of every group, without a copy of them in its order."""
+    """Average the rows of every group, without copying them in group order."""
     return torch.nn.functional.embedding_bag(order, rows, starts, mode="mean")

@@ -1,4 +1,4 @@
-"""The ``.spz`` files of Niantic: 20 bytes per Gaussian and one per view-dependent number."""
+"""Niantic's ``.spz`` files: 20 bytes per Gaussian and one per view-dependent SH value."""
 
 from cvtgs.io.spz.read import decode_spz, read_spz
 from cvtgs.io.spz.write import write_spz

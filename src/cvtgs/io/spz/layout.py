@@ -1,4 +1,4 @@
-"""What reading and writing ``.spz`` files share: header and sizes of blocks."""
+"""Header and block sizes of ``.spz`` files, for reading and writing."""
 
 import struct
 from dataclasses import dataclass
@@ -10,16 +10,16 @@ HEADER = struct.Struct("<IIIBBBB")
 ANTIALIASED_FLAG = 1
 EXTENSIONS_FLAG = 2
 AXES_EXTENSION = 0xADBE0003
-"""The type of Adobe's extension for the axes; its number counts the axes from 1."""
+"""The type of Adobe's extension for the axes, which it numbers from 1."""
 
 FOURTH_HEADER_BYTES = 32
-"""Of version 4; extensions follow, then the sizes of the blocks, then the blocks."""
+"""Header size of version 4; extensions follow, then the sizes of the blocks, then the blocks."""
 
 TABLE_ENTRY = struct.Struct("<QQ")
-"""Bytes of a block, packed and unpacked."""
+"""Compressed and uncompressed size of a block, in bytes."""
 
 COLOR_SCALE = np.float32(0.15)
-"""Bytes of colour are ``0.5 + 0.15 sh0``, so that they hold more than what can be shown."""
+"""Colour bytes store ``0.5 + 0.15 sh0``, a wider range than displayable colours."""
 
 STORED_REST_COUNTS = (0, 3, 8, 15, 24)
 """View-dependent coefficients per channel that files may hold, by degree."""
@@ -33,11 +33,11 @@ class SpzHeader:
     count: int
     sh_degree: int
     fractional_bits: int
-    """Binary places of coordinates."""
+    """Number of fractional bits of coordinates."""
     flags: int
-    """Antialiased, extensions."""
+    """Bits for antialiased and extensions."""
     streams: int = 0
-    """Number of compressed blocks of version 4; reserved before."""
+    """Number of compressed blocks of version 4; reserved in older versions."""
 
     @property
     def antialiased(self) -> bool:

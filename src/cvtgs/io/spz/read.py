@@ -1,4 +1,4 @@
-"""Read an ``.spz`` file: header, decompressed blocks (never more than it promises), and values."""
+"""Read an ``.spz`` file, without decompressing more than the header promises."""
 
 import struct
 import warnings
@@ -31,7 +31,7 @@ Blocks = dict[str, UInt8[np.ndarray, "b"]]
 
 
 class _Content(NamedTuple):
-    """What a file holds; the axes only if it states them."""
+    """The content of a file; axes only if it states them."""
 
     header: SpzHeader
     blocks: Blocks
@@ -41,7 +41,7 @@ class _Content(NamedTuple):
 _GZIP = b"\x1f\x8b"
 _MOST_BITS = 24
 _MOST_EXPANSION = 1032
-"""Deflate cannot make more than this many bytes of one."""
+"""Deflate cannot expand one byte to more than this many."""
 
 _TABLE_START = slice(16, 20)
 
@@ -49,23 +49,23 @@ _TABLE_START = slice(16, 20)
 def read_spz(path: Path, *, axes: str | None = None, trust_sizes: bool = False) -> GaussianScene:
     """Read an ``.spz`` file of version 1 to 4.
 
-    Few files state their axes, by an extension of version 4. Files that do not are taken to have
-    those of PLY files, as most tools write them; Niantic's apps write ``"rub"``.
+    Few files state their axes, by an extension of version 4. Other files are assumed to have the
+    axes of PLY files, as most tools write them; Niantic's apps write ``"rub"``.
 
     Args:
         path: The file.
-        axes: The axes of the file, as :func:`cvtgs.io.change_axes` names them, whatever it
-            states; None for those that it states, else those of PLY files.
+        axes: The axes of the file, as :func:`cvtgs.io.change_axes` names them, instead of those
+            that it states; None for those that it states, else those of PLY files.
         trust_sizes: Whether the file may unpack to any size.
 
     Returns:
         The scene. SH bands above degree 3 are left out with a warning.
 
     Raises:
-        InputNotFoundError: There is no such file.
+        InputNotFoundError: The file does not exist.
         InputError: It cannot be opened or read.
         FileFormatError: It is not an ``.spz`` file, or damaged.
-        InvalidArgumentError: There are no axes of this name.
+        InvalidArgumentError: The name of the axes is unknown.
     """
     axes = None if axes is None else checked_axes(axes)
     with open_input(path) as file:
@@ -76,7 +76,7 @@ def read_spz(path: Path, *, axes: str | None = None, trust_sizes: bool = False) 
 def decode_spz(
     content: bytes, path: Path | str, *, axes: str | None = None, trust_sizes: bool = False
 ) -> GaussianScene:
-    """Decode the content of an ``.spz`` file, read already, as :func:`read_spz` does."""
+    """Decode the bytes of an ``.spz`` file as :func:`read_spz` does."""
     found = _parsed(content, path, trust_sizes=trust_sizes)
     header, blocks = found.header, found.blocks
     if header.sh_degree > 3:
@@ -115,7 +115,7 @@ def _means(stored: UInt8[np.ndarray, "n 3 b"], header: SpzHeader) -> Float[np.nd
 
 
 def _quats(stored: UInt8[np.ndarray, "n b"]) -> Float[np.ndarray, "n 4"]:
-    """Decode three bytes (x, y, z, with w at least 0) or four (two bits, three of ten)."""
+    """Decode three bytes (x, y, z; w is at least 0) or four (fields of 2, 10, 10, 10 bits)."""
     if stored.shape[1] == 3:
         xyz = stored.astype(np.float32) / np.float32(127.5) - 1
         return restore_largest(np.zeros(len(xyz), np.int64), xyz)
@@ -153,7 +153,7 @@ def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Conte
         raise FileFormatError(f"{path}: must be whole gzip, found damage: {error}.") from error
     if len(payload) < wanted:
         raise _too_short(path, header, wanted, f"{len(payload):,}")
-    if surplus and header.flags & EXTENSIONS_FLAG:  # nothing says where they end
+    if surplus and header.flags & EXTENSIONS_FLAG:  # their end is not recorded
         raise FileFormatError(
             f"{path}: an .spz file of version {header.version} must have no extensions, found "
             f"some; write it as version 4."
@@ -202,7 +202,7 @@ def _read_version_4(content: bytes, path: Path | str, *, trust_sizes: bool) -> _
 
 
 def _stated_axes(extensions: bytes, path: Path | str) -> str | None:
-    """Return the axes that the extensions state: records of type, number of bytes, and bytes."""
+    """Return the axes that extensions state; these are records of type, size and content."""
     axes, at = None, 0
     while at + 8 <= len(extensions):
         kind, size = struct.unpack_from("<II", extensions, at)

@@ -40,7 +40,7 @@ _STEPS = 1 << 23
 _OUTLIERS = 0.001
 _CHUNK_ROWS = 1 << 18
 _ZSTD_LEVEL = 12
-"""As small as gzip, in the same time; level 19 is 4 % smaller and takes ten times as long."""
+"""Size and time are those of gzip; level 19 is 4 % smaller and takes ten times as long."""
 
 
 Version = Literal[2, 3, 4]
@@ -52,17 +52,17 @@ def write_spz(
 ) -> None:
     """Write an ``.spz`` file, in the order and the axes of the scene.
 
-    Numbers are rounded as Niantic's library rounds them, so that its files and these are alike.
+    Numbers are rounded as in Niantic's library, so that the files of both agree.
 
     Args:
         scene: The scene, on any device.
-        file: Where to, open for writing.
+        file: The output, open for writing.
         version: 4 (zstd), or 3 (gzip) or 2 (gzip, rotations in 24 instead of 32 bits) for older
             readers.
-        axes: What version 4 states as the axes of the file; nothing is turned.
+        axes: The axes that a file of version 4 states; the scene is not converted.
 
     Raises:
-        InvalidArgumentError: There is no such version, or there are no such axes.
+        InvalidArgumentError: The version or the axes do not exist.
         InvalidSceneError: No Gaussian of the scene is finite.
         OSError: The file cannot be written.
 
@@ -123,11 +123,11 @@ def largest_coordinate(scene: GaussianScene) -> float:
 
 
 def _fractional_bits(scene: GaussianScene) -> int:
-    """Choose the binary places of the coordinates.
+    """Choose the number of fractional bits of the coordinates.
 
-    12, as Niantic's library has it, or more in scenes smaller than 8 units, so that a coordinate
-    has 16 bits at least, or fewer in scenes larger than 2,048 units. A thousandth of the
-    Gaussians may lie beyond; they are moved to the border.
+    The usual number is 12, as in Niantic's library. Scenes smaller than 8 units get more (at most
+    22), so that a coordinate has at least 16 bits; scenes larger than 2,048 units get fewer. Up to
+    a thousandth of the Gaussians may lie beyond the range; they are clamped to it.
     """
     rows = scene.means.detach()[writable_rows(scene)].abs().amax(dim=1)
     if not len(rows):
@@ -139,7 +139,7 @@ def _fractional_bits(scene: GaussianScene) -> int:
 
 
 def _blocks(arrays: Arrays, header: SpzHeader) -> Iterator[Iterator[UInt8[np.ndarray, "n b"]]]:
-    """Return the blocks in the order of the file, a part of a block at a time."""
+    """Yield the blocks in the order of the file, each in chunks."""
     rows = range(0, len(arrays.means), _CHUNK_ROWS)
     parts = [slice(start, start + _CHUNK_ROWS) for start in rows]
     yield (_means(arrays.means[part], header.fractional_bits) for part in parts)
@@ -168,7 +168,7 @@ def _quats(quats: Float[np.ndarray, "n 4"], version: int) -> UInt8[np.ndarray, "
 
 
 def _rest(rest: Float[np.ndarray, "n k 3"]) -> UInt8[np.ndarray, "n b"]:
-    """Round to 5 bits in the first band and to 4 above it, which is what makes gzip effective."""
+    """Round the first band to 5 bits and others to 4, which makes gzip effective."""
     bands = np.repeat([8, 16], [REST_COUNTS[1], REST_COUNTS[3] - REST_COUNTS[1]])
     steps = bands[: rest.shape[1], None].astype(np.float32)
     stored = np.floor((np.rint(128 * rest) + 128 + steps / 2) / steps) * steps
