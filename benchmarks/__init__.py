@@ -1,1 +1,1 @@
-"""Scripts behind every figure of the README and the docs; run as ``python -m benchmarks.X``."""
+"""Scripts that measure every figure in the README and docs; run ``python -m benchmarks.X``."""

@@ -1,16 +1,16 @@
 """The paper's ablation table, for both configurations: the gain of each part of CVT-GS.
 
-``python -m benchmarks.ablation -o docs`` leaves out one part at a time of ``paper`` and of
-``standard``, each with its network, and prints PSNR, SSIM and LPIPS against the full scene as
-Markdown; the folder gets that and a chart of the means, anew after every scene. Scenes and judges
-are those of ``benchmarks.quality``: name files, give ``--lpips WEIGHTS`` or ``--scorer COMMAND``.
+``python -m benchmarks.ablation -o docs`` omits one part at a time of ``paper`` and of ``standard``,
+each with its network, and prints PSNR, SSIM and LPIPS against the full scene as Markdown. The
+folder gets this table and a chart of the means, updated after every scene. Scenes and scorers are
+chosen as in ``benchmarks.quality``: name files, give ``--lpips WEIGHTS`` or ``--scorer COMMAND``.
 
 - w/o CVT: k-NN groups instead of the tessellation; filter, merge, inflation and network stay.
 - w/o filter: every valid Gaussian enters the tessellation.
 - w/o MergeNet: merged by moments (and inflation) alone.
 - full: ``Simplifier("paper")`` and ``Simplifier("standard")``.
 - our network: the cells of ``paper`` with a network of the design of ``standard``, trained on them
-  (``benchmarks/paper-gated.safetensors``): what design and training make of the same cells.
+  (``benchmarks/paper-gated.safetensors``). It shows the effect of design and training alone.
 """
 
 import argparse
@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def variants(options: argparse.Namespace) -> dict[str, Simplify]:
-    """Return every row of the table: both presets, each in full and without each part."""
+    """Return the simplifier of every row: both presets, in full and without each part."""
     rows: dict[str, Simplify] = {}
     for preset in PRESETS:
         config = configuration(options, {"preset": preset})
@@ -89,7 +89,7 @@ def row(preset: str, part: str) -> str:
 
 
 def report(table: Table, options: argparse.Namespace) -> str:
-    """Report what was measured, then how it came out."""
+    """Return the report: the settings of the measurement, then the results."""
     images = f"cvtgs' own renderer, {VIEWS} automatic views of {SIZE} x {SIZE} pixels"
     scenes = "FILES" if options.files else f"--count {options.count}"
     nets = ", ".join(
@@ -113,7 +113,7 @@ def described(name: str | Path) -> str:
 
 
 def chart(averages: Mapping[str, Sequence[Quality]], ratios: Sequence[float]) -> bytes:
-    """Draw the means over the ratio: a row of panels per metric, a column per preset."""
+    """Plot the means over the ratio: a row of panels per metric, a column per preset."""
     measured = {
         field: label
         for field, label in METRICS.items()
@@ -147,16 +147,16 @@ def chart(averages: Mapping[str, Sequence[Quality]], ratios: Sequence[float]) ->
 
 
 def nearest_groups(points: Float[Tensor, "n d"], count: int, *, seed: int) -> Int[Tensor, "n"]:
-    """Group points around random ones: each seed takes its nearest free points.
+    """Group points around random seeds: each seed takes its nearest free points.
 
     Seeds are drawn uniformly, without replacement. In the order of the draw each takes the
-    ``floor(n / count) - 1`` points nearest to it that are neither a seed nor taken. The fewer than
-    ``count`` points that are left over join their nearest seed. No weights, no colours, no
-    iterations: groups are of nearly equal size, and late ones are not compact, since they find
-    their surroundings taken. Memory: two k-d trees, some ``150 n`` bytes.
+    ``floor(n / count) - 1`` points nearest to it that are neither a seed nor taken. The remaining
+    points, fewer than ``count``, join their nearest seed. There are no weights, colours or
+    iterations. Groups have nearly equal sizes; late ones are not compact, since points near them
+    are already taken. Memory: two k-d trees, some ``150 n`` bytes.
 
-    "k-NN grouping" is what the alternative to the tessellation is called; this is our reading of
-    the name.
+    The paper calls this alternative to the tessellation "k-NN grouping"; the algorithm is our
+    interpretation of the name.
 
     Args:
         points: Positions.
@@ -164,7 +164,7 @@ def nearest_groups(points: Float[Tensor, "n d"], count: int, *, seed: int) -> In
         seed: Seed of the draw.
 
     Returns:
-        Group of every point, 0 to ``count - 1``; none is empty.
+        Group of every point, 0 to ``count - 1``; no group is empty.
 
     Example:
         >>> nearest_groups(torch.tensor([[0.0], [1.0], [9.0], [8.0]]), 2, seed=1).tolist()
@@ -180,7 +180,7 @@ def nearest_groups(points: Float[Tensor, "n d"], count: int, *, seed: int) -> In
     tree = KDTree(places)
     taken = count
     for group, place in enumerate(places[seeds]) if wanted else ():
-        # A tree of which at least half is free finds free points without looking at many.
+        # Queries stay cheap as long as at least half of the tree is free.
         if 2 * (len(points) - taken) < len(rows):
             rows = rows[labels[rows] < 0]
             tree = KDTree(places[rows])
@@ -194,7 +194,7 @@ def nearest_groups(points: Float[Tensor, "n d"], count: int, *, seed: int) -> In
 def nearest_free(
     tree: KDTree, rows: np.ndarray, place: np.ndarray, *, labels: np.ndarray, count: int
 ) -> np.ndarray:
-    """Find the nearest rows of a tree that have no label, looking ever further."""
+    """Find the nearest rows of a tree that have no label, by growing the search."""
     looked_at = 2 * count
     while True:
         looked_at = min(looked_at, len(rows))
@@ -208,7 +208,7 @@ def nearest_free(
 def grouped_simplifier(
     config: cvtgs.SimplifyConfig, net: MergeNet | PublishedMergeNet | None
 ) -> Simplify:
-    """Simplify with k-NN groups instead of the tessellation; all else as configured."""
+    """Return a simplifier with k-NN groups instead of the tessellation, otherwise as configured."""
 
     def simplify(scene: cvtgs.GaussianScene, rho: float) -> cvtgs.GaussianScene:
         count = cvtgs.target_count(len(scene), rho)
@@ -233,7 +233,7 @@ def regroup(
 ) -> cvtgs.GaussianScene:
     """Merge, inflate and correct the cells of any grouping, as the pipeline does.
 
-    With the partition of the reference itself this gives what ``Simplifier`` gives.
+    With the partition of the reference itself, the result is that of ``Simplifier``.
     """
     scene = reference.scene
     merged = merge_and_inflate(

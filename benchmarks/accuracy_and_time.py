@@ -1,8 +1,8 @@
-"""What accuracy costs in time: every preset, and every choice of ``standard`` switched alone.
+"""Time against accuracy: every preset, and ``standard`` with one choice changed at a time.
 
-``python -m benchmarks.accuracy_and_time --png FILE`` takes the same scenes and judges as
+``python -m benchmarks.accuracy_and_time --png FILE`` uses the scenes and scorers of
 ``benchmarks.quality``, prints the tables of ``docs/accuracy-and-time.md`` and draws its plot.
-Seconds are processor seconds of ``Simplifier.run``, without start, reading and writing: the mean
+Seconds are CPU seconds of ``Simplifier.run``, without start-up, reading and writing, as a mean
 over the scenes.
 """
 
@@ -40,21 +40,21 @@ TABLES = {"presets": ("Presets", PRESETS), "choices": ("One choice at a time", S
 
 
 class Stopwatch:
-    """Simplifies, and keeps the processor seconds of every ratio."""
+    """A simplifier that records its CPU seconds by ratio."""
 
     def __init__(self, config: cvtgs.SimplifyConfig) -> None:
         self._simplifier = cvtgs.Simplifier(config=config)
         self._spent: dict[float, list[float]] = defaultdict(list)
 
     def __call__(self, scene: cvtgs.GaussianScene, rho: float) -> cvtgs.GaussianScene:
-        """Simplify, and remember what it took."""
+        """Simplify, and record the CPU seconds."""
         start = time.process_time()
         small = self._simplifier.simplify(scene, rho)
         self._spent[rho].append(time.process_time() - start)
         return small
 
     def seconds(self, rho: float) -> float:
-        """Return the mean over the scenes."""
+        """Return the mean CPU seconds over the scenes."""
         return mean(self._spent[rho])
 
 
@@ -63,7 +63,7 @@ def table(
     scores: Mapping[str, Sequence[Quality]],
     ratios: Sequence[float],
 ) -> str:
-    """Return a Markdown table: seconds, PSNR, SSIM, LPIPS, alpha error of every row and ratio."""
+    """Return a Markdown table: seconds, PSNR, SSIM, LPIPS, alpha error by row and ratio."""
     columns = ("seconds", "PSNR", "SSIM", "LPIPS", "alpha error")
     heads = [f"{name} at {rho:g}" for rho in ratios for name in columns]
     rows = [
@@ -85,7 +85,7 @@ def chart(
     scores: Mapping[str, Sequence[Quality]],
     ratios: Sequence[float],
 ) -> bytes:
-    """Draw PSNR and SSIM over seconds, one line per ratio, points by preset."""
+    """Plot PSNR and SSIM over seconds, one line per ratio and one point per preset."""
     seconds = [watch.seconds(rho) for watch in watches.values() for rho in ratios]
     marks = ticks(min(seconds), max(seconds))
     panels = []

@@ -1,4 +1,4 @@
-"""The image of the README: two generated scenes in full, and with 10 % and 1 % of their Gaussians.
+"""Draw the README image: two generated scenes in full and with 10 % and 1 % of their Gaussians.
 
 ``python -m benchmarks.before_after docs/images/before_after.jpg`` needs Pillow and a minute.
 """
@@ -19,7 +19,7 @@ WIDTH, HEIGHT, GAP, TEXT = 600, 400, 6, 17
 
 
 class Shot(NamedTuple):
-    """A generated scene, and the automatic view of it to show."""
+    """A generated scene, and the automatic view to show."""
 
     kind: str
     seed: int
@@ -57,7 +57,7 @@ def image_of(scene: cvtgs.GaussianScene, camera: cvtgs.Cameras) -> Image.Image:
 
 
 def captioned(image: Image.Image, text: str) -> Image.Image:
-    """Write a text into the lower left corner."""
+    """Draw a text in the lower left corner."""
     draw, font = ImageDraw.Draw(image, "RGBA"), ImageFont.load_default(TEXT)
     box = (0, HEIGHT - TEXT - 14, font.getlength(text) + 20, HEIGHT)
     draw.rectangle(box, fill=(0, 0, 0, 150))

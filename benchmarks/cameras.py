@@ -1,7 +1,7 @@
-"""Cameras that were picked by eye for a scene, and images of full scenes kept on disk.
+"""Hand-picked cameras of a scene, and a disk cache of images of full scenes.
 
-Cameras of ``NAME.ply`` lie beside it in ``NAME.cameras.json``: ``width`` and ``height`` in pixels,
-the matrix ``K`` of intrinsics, and ``world_to_camera``, a list of 4 x 4 matrices with OpenCV axes.
+The cameras of ``NAME.ply`` are in ``NAME.cameras.json`` beside it: ``width`` and ``height`` in
+pixels, the intrinsic matrix ``K``, and ``world_to_camera``, a list of 4 x 4 OpenCV matrices.
 """
 
 import hashlib
@@ -25,12 +25,12 @@ CACHE = Path(tempfile.gettempdir()) / "cvtgs-full-images"
 
 
 def cameras_file(scene: Path) -> Path:
-    """Return where the cameras of a scene lie, if there are any."""
+    """Return the path of the cameras of a scene, which may not exist."""
     return scene.with_suffix(".cameras.json")
 
 
 def cameras_beside(scene: Path, *, size: int | None = None) -> Cameras:
-    """Read the cameras that lie beside a scene; ``size`` is the longer side, in pixels."""
+    """Read the cameras beside a scene; ``size`` is the longer side of the images, in pixels."""
     path = cameras_file(scene)
     if not path.is_file():
         raise SystemExit(f"{scene}: needs cameras beside it in {path.name}, found none.")
@@ -49,9 +49,9 @@ class FullImages:
 
     Attributes:
         scene: The full scene.
-        cameras: From where to look.
-        folder: Where images are kept. Their names hold what they depend on: scene, camera, size
-            and the source of the renderer.
+        cameras: The cameras.
+        folder: Cache folder. File names are hashes of scene, camera, size and the renderer's
+            source.
     """
 
     scene: cvtgs.GaussianScene
@@ -59,7 +59,7 @@ class FullImages:
     folder: Path = CACHE
 
     def images(self) -> Iterator[ViewImage]:
-        """Return the image of each camera, from disk where it is there."""
+        """Yield the image of each camera, from disk if it is cached."""
         about_scene = _digest(self.scene)
         for camera in self.cameras.singles():
             key = hashlib.sha256(about_scene)
@@ -78,7 +78,7 @@ class FullImages:
 
 
 def _digest(scene: cvtgs.GaussianScene) -> bytes:
-    """Return a digest of what an image of the scene depends on, the renderer's source included."""
+    """Return a hash of the scene and of the renderer's source."""
     found = hashlib.sha256(str(scene.antialiased).encode())
     tensors = (
         scene.means, scene.log_scales, scene.quats, scene.logit_opacities, scene.sh0, scene.shN

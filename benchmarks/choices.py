@@ -1,18 +1,18 @@
-r"""What choices of ``simplify`` are worth, seen by cameras that were picked by eye.
+r"""Measure the gain of choices of ``simplify``, seen from hand-picked cameras.
 
-Every ``--set`` is one configuration, a list of settings that differ from the base; ``preset`` is
-one of them:
+Every ``--set`` is one configuration: a list of settings that differ from the base; ``preset``
+is one of the settings:
 
     python -m benchmarks.choices a.ply b.ply --rho 0.1 0.01 \
         --set cvt.color=0.1 --set cvt.color=0.1 merge.network=false --set preset=high
 
-Cameras lie beside each scene (``benchmarks.cameras`` says how), or are automatic ones with
-``--automatic``. Every line has PSNR, SSIM, the mean absolute error of alpha, its bias (negative:
-more of the background shows through than in the full scene), each with its difference to the base,
-and processor seconds of the simplification alone, in one process. Means over the scenes come last.
-``--base merge.network=false`` changes what everything is compared with. Images of full scenes are
-kept in ``--cache``, so that a second run starts at once. With ``--pages DIR`` there is a page per
-scene and ratio to look at, with maps of the errors of colour and of alpha.
+Cameras are read from a file beside each scene (see ``benchmarks.cameras``), or are automatic views
+with ``--automatic``. Every line has PSNR, SSIM, the mean absolute error of alpha, its bias
+(negative: more of the background shows through than in the full scene), each with its difference
+to the base, and CPU seconds of the simplification alone, in one process. Means over the scenes
+come last. ``--base merge.network=false`` changes the base. Images of full scenes are cached in
+``--cache``, so that a second run starts at once. ``--pages DIR`` writes a page per scene and ratio
+with maps of the colour and alpha errors.
 """
 
 import argparse
@@ -48,7 +48,7 @@ Settings = Mapping[str, str]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """What one configuration makes of one scene at one ratio.
+    """Scores and time of one configuration on one scene at one ratio.
 
     Attributes:
         scene: Name of the scene, or ``mean``.
@@ -59,7 +59,7 @@ class Row:
         lpips: None if it was not measured.
         alpha_error: Mean absolute difference of alpha.
         alpha_bias: Mean of alpha minus that of the full scene.
-        seconds: Processor time of the simplification.
+        seconds: CPU time of the simplification.
     """
 
     scene: str
@@ -123,7 +123,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def settings_of(words: Sequence[str]) -> dict[str, str]:
-    """Return settings by key."""
+    """Parse ``key=value`` words."""
     wrong = [word for word in words if "=" not in word]
     if wrong:
         raise SystemExit(f"a setting must be KEY=VALUE, found {wrong[0]!r}.")
@@ -131,7 +131,7 @@ def settings_of(words: Sequence[str]) -> dict[str, str]:
 
 
 def warm_up() -> None:
-    """Let code compile or load before anything is measured."""
+    """Compile and load code before anything is measured."""
     cvtgs.Simplifier().simplify(cvtgs.synthetic.scene("object", 1000, sh_degree=0, seed=0), 0.1)
 
 
@@ -195,7 +195,7 @@ def score(small: cvtgs.GaussianScene, full: FullImages, metrics: Metrics) -> Ite
 
 
 def means(rows: Sequence[Row]) -> Iterator[Row]:
-    """Average over scenes, for every ratio and configuration in their order."""
+    """Average over the scenes, for every ratio and configuration in their order."""
     for rho, name in dict.fromkeys((row.rho, row.name) for row in rows):
         some = [row for row in rows if (row.rho, row.name) == (rho, name)]
         distances = [row.lpips for row in some if row.lpips is not None]
@@ -219,11 +219,11 @@ COLUMNS = {
     "alpha_error": ("alpha error", 6, 4),
     "alpha_bias": ("alpha bias", 7, 4),
 }
-"""Heading, width and digits of each score."""
+"""Heading, column width and decimals of each score."""
 
 
 def heads(options: argparse.Namespace) -> str:
-    """Return the headings of the lines."""
+    """Return the header line."""
     cells = [f"{'scene':16}", f"{'rho':>6}"]
     cells += [
         f"{title:>{width + digits + 4}}"
@@ -234,7 +234,7 @@ def heads(options: argparse.Namespace) -> str:
 
 
 def line(row: Row, rows: Sequence[Row]) -> str:
-    """Return the text of a row, each score with its difference to the base."""
+    """Format a row, each score with its difference to the base."""
     base = next(
         each for each in rows if (each.scene, each.rho, each.name) == (row.scene, row.rho, BASE)
     )
@@ -248,7 +248,7 @@ def line(row: Row, rows: Sequence[Row]) -> str:
 
 
 def save(rows: Sequence[Row], path: Path | None) -> None:
-    """Write all rows as JSON, if there is a file for them."""
+    """Write all rows as JSON, if a file is given."""
     if path is not None:
         write_file(path, (json.dumps([asdict(row) for row in rows], indent=1) + "\n").encode())
 

@@ -1,10 +1,10 @@
 r"""Compare the presets, other methods and external tools: quality against seconds.
 
-``python -m benchmarks.compare SCENE.ply ... -o DIR`` compares as CVT-GS does, but with images of
-the full scene instead of photographs: every method gets the same scenes and the same number of
-Gaussians M, and one scorer renders what it writes, without fine-tuning. Seconds are those of a
-separate process, with start, reading and writing. Output are Markdown tables, means over the
-scenes first; the folder gets them and a plot, updated after every scene.
+``python -m benchmarks.compare SCENE.ply ... -o DIR`` follows the comparison of CVT-GS, but with
+images of the full scene instead of photographs: every method gets the same scenes and the same
+number of Gaussians M, and one scorer renders all results, without fine-tuning. Seconds are those
+of a separate process, including start-up, reading and writing. The script prints Markdown tables,
+means over the scenes first; the folder gets them and a plot, updated after every scene.
 
 Methods are the presets of cvtgs, ``standard, no network``, the baselines of
 ``benchmarks.baselines``, and any tool that reads and writes PLY files:
@@ -13,12 +13,12 @@ Methods are the presets of cvtgs, ``standard, no network``, the baselines of
         --methods standard "mass pruning" NanoGS \
         --tool "other=other-tool {IN} -o {OUT} --keep {RHO} --max {COUNT}"
 
-Scenes and judges are chosen as in ``benchmarks.quality``; with ``--cameras CAPTURE --split test
---images DIR`` the judge compares with photographs. Let it run once on a small scene first:
-what compiles itself does so then. ``--results FILE`` adds the results to those that the file has,
-and shows all of them, so that methods can be run one by one; with ``--methods`` and no name, it
-only shows them. ``--outputs DIR`` keeps every file that a method wrote with its seconds, and does
-not run again what lies there.
+Scenes and scorers are chosen as in ``benchmarks.quality``; ``--cameras CAPTURE --split test
+--images DIR`` scores against photographs. Run it once on a small scene first, so that compiled
+code is compiled and cached. ``--results FILE`` adds the results to those in the file and shows
+all of them, so that methods can be run one by one; ``--methods`` without names only shows them.
+``--outputs DIR`` keeps every file that a method wrote, with its seconds, and reuses kept files
+instead of running the method again.
 """
 
 import argparse
@@ -54,7 +54,7 @@ NO_NETWORK = "standard, no network"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """One scene, and how far to go.
+    """One scene and a target count.
 
     Attributes:
         source: The scene's file.
@@ -110,7 +110,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def own_methods(settings: Sequence[str]) -> dict[str, list[str]]:
-    """Return the commands of cvtgs itself, by name."""
+    """Return the commands of cvtgs, by name."""
     command = [sys.executable, "-m", "cvtgs", "simplify", "{IN}", "{OUT}", "--count", "{COUNT}"]
     command += ["--overwrite", "--quiet"]
     command += [part for setting in settings for part in ("--set", setting)]
@@ -121,7 +121,7 @@ def own_methods(settings: Sequence[str]) -> dict[str, list[str]]:
 
 
 def commands_of(options: argparse.Namespace) -> dict[str, list[str]]:
-    """Return every method's command, with places to fill in, by name."""
+    """Return the command of every method, with placeholders, by name."""
     run_baseline = [sys.executable, "-m", "benchmarks.baselines"]
     methods = own_methods(options.set) | {
         name: [*run_baseline, name, "{IN}", "{OUT}", "--count", "{COUNT}"] for name in BASELINES
@@ -143,7 +143,7 @@ def commands_of(options: argparse.Namespace) -> dict[str, list[str]]:
 
 
 def measure(commands: Mapping[str, list[str]], options: argparse.Namespace) -> Iterator[Table]:
-    """Run every method on every scene; give the table so far after each scene."""
+    """Run every method on every scene; yield the table so far after each scene."""
     table: dict[str, dict[str, dict[float, Result | None]]] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -166,7 +166,7 @@ def measure(commands: Mapping[str, list[str]], options: argparse.Namespace) -> I
 def sources(
     options: argparse.Namespace, folder: Path
 ) -> Iterator[tuple[str, cvtgs.GaussianScene, Path]]:
-    """Return name, scene and file of every scene; generated ones are written to the folder."""
+    """Yield name, scene and file of every scene; generated ones are written to the folder."""
     for number, (name, scene) in enumerate(scenes(options.files, options.count)):
         path = options.files[number] if options.files else folder / "full.ply"
         if not options.files:
@@ -178,7 +178,7 @@ Run = tuple[cvtgs.GaussianScene, Cost]
 
 
 def attempt(command: Sequence[str], task: Task, *, keep: bool) -> Run | None:
-    """Run a method's command on a task, unless its file was kept; None if it fails."""
+    """Run a method's command on a task, or load its kept file; return None on failure."""
     output, costs = task.output, task.output.with_suffix(".json")
     if keep and output.is_file() and costs.is_file():
         return cvtgs.load(output), Cost(**json.loads(costs.read_text(encoding="utf-8")))
@@ -202,7 +202,7 @@ def attempt(command: Sequence[str], task: Task, *, keep: bool) -> Run | None:
 
 
 def filled(part: str, places: Mapping[str, str]) -> str:
-    """Replace the places in one argument; other braces stay as they are."""
+    """Replace the placeholders in one argument; other braces stay."""
     anywhere = "|".join(re.escape(place) for place in places)
     return re.sub(anywhere, lambda found: places[found[0]], part)
 
@@ -210,7 +210,7 @@ def filled(part: str, places: Mapping[str, str]) -> str:
 def judged(
     scene: cvtgs.GaussianScene, runs: Mapping[tuple[str, Task], Run | None], *, score: Scorer
 ) -> dict[str, dict[float, Result | None]]:
-    """Score everything that was made of one scene, all at once."""
+    """Score all results of one scene in one call of the scorer."""
     small = [made[0] for made in runs.values() if made is not None]
     found = iter(score(scene, small) if small else [])
     rows: dict[str, dict[float, Result | None]] = {}
@@ -226,7 +226,7 @@ def judged(
 
 
 def report(table: Table, options: argparse.Namespace) -> str:
-    """Report what was measured, the tables, and what is not as it should be."""
+    """Return the report: settings, tables, wrong counts and failures."""
     judge = "cvtgs' own renderer, " + (
         "cameras beside the scenes"
         if options.files and all(cameras_file(file).is_file() for file in options.files)

@@ -1,4 +1,4 @@
-"""Results of a comparison: kept in a file, and shown as Markdown tables and as a chart."""
+"""Results of a comparison, as a JSON file, Markdown tables and a chart."""
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -15,14 +15,14 @@ Clock = Literal["wall", "cpu"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
-    """What one run of one method gave.
+    """Quality and cost of one run of one method.
 
     Attributes:
-        quality: Against the full scene.
-        wall_seconds: From the start of the process to its end.
-        cpu_seconds: Processor time outside the kernel.
-        count: Gaussians that it wrote.
-        wanted: Gaussians that it should have written.
+        quality: Scores against the full scene.
+        wall_seconds: Wall-clock time of the process from start to end.
+        cpu_seconds: User CPU time.
+        count: Number of Gaussians in the output.
+        wanted: Number of Gaussians that the output should have.
     """
 
     quality: Quality
@@ -32,16 +32,16 @@ class Result:
     wanted: int
 
     def seconds(self, clock: Clock) -> float:
-        """Return the time on a clock."""
+        """Return the wall-clock or the CPU time."""
         return self.wall_seconds if clock == "wall" else self.cpu_seconds
 
 
 Table = Mapping[str, Mapping[str, Mapping[float, Result | None]]]
-"""One result per ratio, None for a failure, by method, by scene; what was not run is missing."""
+"""Results by scene, method and ratio; None for a failed run, missing if not run."""
 
 
 def joined(first: Table, second: Table) -> Table:
-    """Return the results of both; those of the second win."""
+    """Merge two tables; results of the second take precedence."""
     scenes = dict.fromkeys([*first, *second])
     found: dict[str, dict[str, dict[float, Result | None]]] = {name: {} for name in scenes}
     for table in (first, second):
@@ -52,7 +52,7 @@ def joined(first: Table, second: Table) -> Table:
 
 
 def results_json(table: Table) -> str:
-    """Write results as JSON text."""
+    """Return results as JSON text."""
     records = [
         {"scene": scene, "method": method, "rho": rho, "result": result and asdict(result)}
         for scene, rows in table.items()
@@ -63,7 +63,7 @@ def results_json(table: Table) -> str:
 
 
 def read_results(path: Path) -> Table:
-    """Read what :func:`results_json` wrote; nothing if there is no file."""
+    """Read a file of :func:`results_json`; return an empty table if there is no file."""
     table: dict[str, dict[str, dict[float, Result | None]]] = {}
     for record in json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []:
         found = record["result"]
@@ -92,8 +92,8 @@ def markdown(
 ) -> str:
     """Return two Markdown tables per ratio: means over all scenes, then scene by scene.
 
-    A dash stands where a run failed, is missing or nothing was measured. A metric that nobody
-    measured has no column.
+    A dash marks a run that failed or is missing, and a score that was not measured. A metric
+    without any value has no column.
     """
     parts = []
     for rho in ratios:
@@ -106,7 +106,7 @@ def markdown(
 
 
 def means_table(table: Table, rho: float, clock: Clock) -> str:
-    """Return the means over all scenes, a row per method."""
+    """Return a Markdown table of means over all scenes, a row per method."""
     everything = [result for rows in table.values() for row in rows.values() for result in _at(row)]
     metrics = {
         name: metric
@@ -126,7 +126,7 @@ def means_table(table: Table, rho: float, clock: Clock) -> str:
 
 
 def scenes_table(table: Table, rho: float) -> str:
-    """Return PSNR and SSIM, a row per method and a column per scene."""
+    """Return a Markdown table of PSNR and SSIM, a row per method and a column per scene."""
     rows = []
     for method in methods_of(table):
         found = [scene.get(method, {}).get(rho) for scene in table.values()]
@@ -147,13 +147,13 @@ def _at(row: Mapping[float, Result | None]) -> Iterable[Result]:
 
 
 def _cell(values: Sequence[float | None], form: str) -> str:
-    """Return the text of a mean, or a dash if a value is missing."""
+    """Format the mean of values, or return a dash if a value is missing."""
     known = [value for value in values if value is not None]
     return f"{mean(known):{form}}" if len(known) == len(values) else "-"
 
 
 def wrong_counts(table: Table) -> str:
-    """Name the runs that did not give exactly M Gaussians; quality is not comparable there."""
+    """List the runs without exactly M Gaussians, whose quality is not comparable."""
     lines = [
         f"- {method}, {scene}, {rho:g}: {found.count:,} instead of {found.wanted:,}"
         for scene, rows in table.items()
@@ -165,7 +165,7 @@ def wrong_counts(table: Table) -> str:
 
 
 def failures(table: Table) -> str:
-    """Name the runs that failed."""
+    """List the runs that failed."""
     lines = [
         f"- {method}, {scene}, {rho:g}"
         for scene, rows in table.items()
@@ -177,9 +177,9 @@ def failures(table: Table) -> str:
 
 
 def chart(table: Table, ratios: Sequence[float], *, clock: Clock = "wall") -> bytes | None:
-    """Draw mean PSNR over mean seconds, a line per method and a point per ratio.
+    """Plot mean PSNR over mean seconds, a line per method and a point per ratio.
 
-    Points that some scene lacks are left out; None if there are no others.
+    Points that lack a result of any scene are left out; return None if no points remain.
     """
     series = []
     for method in methods_of(table):

@@ -1,10 +1,10 @@
-"""How well seconds are predicted: the cost model of ``--time-budget`` against what happens.
+"""Compare seconds predicted by the cost model of ``--time-budget`` with measured seconds.
 
-``python -m benchmarks.cost_model`` simplifies generated scenes that the calibration has not seen,
-other kinds, seeds and sizes, by every preset to choose from, each run in a process of its own, and
-prints predicted against measured seconds of all stages as Markdown. Of several runs the fastest
-counts, as in the calibration: other programs only ever make a run slower. On a machine that is
-busy all the time, ``--clock undisturbed`` leaves out what other programs took, stage by stage.
+``python -m benchmarks.cost_model`` simplifies generated scenes of kinds, seeds and sizes that the
+calibration has not seen, with every preset to choose from. Each run is a separate process. The
+script prints predicted and measured seconds of all stages as Markdown. Of several runs the fastest
+counts, as in the calibration, since other programs only make runs slower. On a constantly busy
+machine, ``--clock undisturbed`` subtracts the time of other programs, stage by stage.
 """
 
 import argparse
@@ -50,7 +50,7 @@ class Row:
 
     @property
     def error(self) -> float:
-        """Return the error as a share of what was measured."""
+        """Return the error relative to the measured seconds."""
         return self.predicted / self.measured - 1
 
 
@@ -81,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def measured(file: Path, folder: Path, model: CostModel, options: argparse.Namespace) -> list[Row]:
-    """Run every preset and ratio on one file."""
+    """Measure every preset and ratio on one file."""
     scene = cvtgs.load(file)
     rows = []
     for rho in options.rho:

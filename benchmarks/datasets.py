@@ -1,14 +1,14 @@
-"""Datasets of posed photographs, and the models that were trained on them, found below a folder.
+"""Find datasets of posed photographs, and models trained on them, below a folder.
 
-A scene is a folder of its published name (``garden``) with cameras: ``sparse/0`` of COLMAP,
-``transforms_test.json``, or ``transforms.json``. Its model is any other folder of that name, or one
-within the scene's, with the files of a training code:
+A scene is a folder with its published name (``garden``) and cameras: ``sparse/0`` of COLMAP,
+``transforms_test.json`` or ``transforms.json``. Its model is any other folder of that name, or a
+folder within the scene's, with the files of a training code:
 
 - INRIA: ``point_cloud/iteration_*/point_cloud.ply``
 - nerfstudio: ``splat.ply`` or ``step-*.ckpt``, with ``dataparser_transforms.json`` beside or above
 - gsplat: ``ply/point_cloud_*.ply`` or ``ckpts/ckpt_*_rank0.pt``
 
-What each training did to the world of the cameras: ``benchmarks.worlds``.
+``benchmarks.worlds`` handles the transforms that each training applied to the camera coordinates.
 """
 
 import os
@@ -28,10 +28,10 @@ from cvtgs.evaluation.scorer import Color
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 DEEPEST = 5
-"""Folders are searched to this depth below the one that is given."""
+"""Depth to which folders below the given one are searched."""
 
 DOWNSCALED = ("images_2", "images_4", "images_8", "images")
-"""Folders of photographs, in the order in which one is taken where the published one is missing."""
+"""Folders of photographs to fall back to, in this order, if the published one is missing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,8 +41,8 @@ class Dataset:
     Attributes:
         name: Its name.
         scenes: The folder of the photographs of each scene, by the scene's name.
-        background: Colour behind transparent pixels and scenes.
-        source: Where it is to be had.
+        background: Background colour of transparent pixels and of renderings.
+        source: Where to download it.
     """
 
     name: str
@@ -78,7 +78,7 @@ DATASETS = (
         source=INRIA_DATA,
     ),
 )
-"""The sets of the evaluation of CVT-GS, with the scenes and image sizes of that of 3DGS."""
+"""The datasets in the evaluation of CVT-GS, with the scenes and image sizes of 3DGS."""
 
 LAYOUTS: Mapping[str, Sequence[re.Pattern[str]]] = {
     "INRIA": (re.compile(r"point_cloud/iteration_(\d+)/point_cloud\.ply"),),
@@ -88,7 +88,7 @@ LAYOUTS: Mapping[str, Sequence[re.Pattern[str]]] = {
     ),
     "nerfstudio": (re.compile(r"splat\.ply"), re.compile(r"(?:\w+/)?step-(\d+)\.ckpt")),
 }
-"""How each training code names its models; the number is that of the step."""
+"""File name patterns of the models of each training code; the number is the step."""
 
 
 class Model(NamedTuple):
@@ -116,14 +116,14 @@ class Capture:
 
 
 class Found(NamedTuple):
-    """The scenes below a folder, and a sentence about each that is missing or incomplete."""
+    """The scenes below a folder, and a sentence on each missing or incomplete scene."""
 
     captures: tuple[Capture, ...]
     notes: tuple[str, ...]
 
 
 class TestViews(NamedTuple):
-    """The cameras that were held out, their photographs, and the folder of these."""
+    """The held-out cameras, their photographs, and the folder of the photographs."""
 
     cameras: Cameras
     photographs: Float[Tensor, "c h w 3"]
@@ -175,7 +175,7 @@ def read_test_views(capture: Capture) -> TestViews:
 
 
 def sparse_folder(folder: Path) -> Path | None:
-    """Return where a scene has a model of COLMAP, which goes before other cameras."""
+    """Return the folder of a COLMAP model, which takes precedence over other cameras."""
     places = (folder / "sparse" / "0", folder / "sparse")
     return next((place for place in places if place.is_dir()), None)
 
@@ -196,7 +196,7 @@ def _has_cameras(folder: Path) -> bool:
 
 
 def _find_model(folders: Sequence[Path]) -> Model | None:
-    """Return the model of most steps: of the folders in order, INRIA's first."""
+    """Return the model with the most steps, in the first folder and layout that has one."""
     for folder in dict.fromkeys(folders):
         files = sorted(
             path
@@ -218,7 +218,7 @@ def _find_model(folders: Sequence[Path]) -> Model | None:
 
 
 def _match(pattern: re.Pattern[str], path: Path) -> re.Match[str] | None:
-    """Match the end of a path, whole parts of it."""
+    """Match whole components at the end of a path."""
     parts = pattern.pattern.count("/") + 1
     for count in (parts, parts - 1):
         found = pattern.fullmatch("/".join(path.parts[-count:])) if count else None

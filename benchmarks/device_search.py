@@ -1,9 +1,9 @@
-"""The nearest site by plain torch operations, for devices: is it faster than the host's k-d tree?
+"""Compare a nearest-site search in torch operations on the device with the host's k-d tree.
 
-cvtgs copies positions to the host and searches there. This search stays on the device: exact, with
-a cost near to linear in the number of points, and few operations. ``python -m
-benchmarks.device_search`` prints seconds, comparisons and operations of growing sizes;
-``benchmarks.gpu`` has a table of both searches on a card.
+cvtgs copies positions to the host and searches there. The search in this file stays on the device.
+It is exact, its cost is nearly linear in the number of points, and it takes few operations.
+``python -m benchmarks.device_search`` prints seconds, comparisons and operations for growing
+sizes; ``benchmarks.gpu`` has a table of both searches on a GPU.
 """
 
 import argparse
@@ -19,19 +19,19 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from cvtgs.cvt import nearest_scipy
 
 FAN = 8
-"""Children of a box, and sites of a smallest one."""
+"""Number of children of a box, and of sites in a leaf."""
 
 CHUNK = 1 << 13
-"""Points that a CPU searches together; a device takes 32 times as many."""
+"""Points per chunk on a CPU; chunks on other devices are 32 times as large."""
 
 
 class Found(NamedTuple):
     """Nearest sites.
 
     Attributes:
-        labels: ``(n,)`` the nearest site of every point; of equally near ones the first.
+        labels: ``(n,)`` the nearest site of every point; the first of equally near sites.
         squared: ``(n,)`` squared distances, float64.
-        compared: Boxes and sites that points were compared with, in all.
+        compared: Total number of comparisons of points with boxes and sites.
     """
 
     labels: Int[Tensor, "n"]
@@ -40,10 +40,10 @@ class Found(NamedTuple):
 
 
 class Boxes(NamedTuple):
-    """Bounds of runs of sites; a level has one box for each ``FAN`` of the level below.
+    """Bounds of runs of sites; a level has one box per ``FAN`` boxes of the level below.
 
     Attributes:
-        low: ``(d, b)`` least coordinates.
+        low: ``(d, b)`` smallest coordinates.
         high: ``(d, b)`` largest coordinates.
     """
 
@@ -54,16 +54,16 @@ class Boxes(NamedTuple):
 def nearest_by_boxes(points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"]) -> Found:
     """Find the nearest site of every point through a tree of boxes along a Morton curve.
 
-    The sites of the run in which a point would lie bound its distance. Level by level, points keep
-    the boxes that are nearer than that. Distances to boxes round as those to sites do, so no box
-    is left out by rounding.
+    The sites next to a point on the curve give an upper bound of its distance. Level by level,
+    points keep the boxes within that bound. Distances to boxes and to sites are rounded alike, so
+    rounding drops no box.
 
     Args:
         points: Positions.
         sites: Positions on the same device, at least one.
 
     Returns:
-        Labels, squared distances, and how many comparisons it took.
+        Labels, squared distances and the number of comparisons.
     """
     columns, low = points.double().T.contiguous(), sites.double().amin(dim=0)
     side = (sites.double().amax(dim=0) - low).clamp_min(torch.finfo(torch.float64).tiny)
@@ -83,7 +83,7 @@ def nearest_by_boxes(points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"]) 
 def curve_codes(
     points: Float[Tensor, "n d"], low: Float[Tensor, "d"], side: Float[Tensor, "d"]
 ) -> Int[Tensor, "n"]:
-    """Return places along a Morton curve in any number of dimensions, clamped."""
+    """Return clamped positions along a Morton curve in any number of dimensions."""
     bits = 62 // points.shape[1]
     steps = ((points - low) / side * (2**bits - 1)).clamp(0, 2**bits - 1).long()
     codes = torch.zeros_like(steps[:, 0])
@@ -94,7 +94,7 @@ def curve_codes(
 
 
 def tree_of(sites: Float[Tensor, "d m"]) -> list[Boxes]:
-    """Return levels of boxes, the sites first; each is filled up with its last box."""
+    """Return levels of boxes, the sites first; each level is padded with its last box."""
     levels = [Boxes(sites, sites)]
     while levels[-1].low.shape[1] > FAN:
         full = [torch.cat([x, x[:, -1:].expand(-1, -x.shape[1] % FAN)], dim=1) for x in levels[-1]]
@@ -112,7 +112,7 @@ def _search(
 ) -> tuple[Tensor, Tensor, int]:
     count, device = points.shape[1], points.device
     own = torch.arange(count, device=device)
-    # Two runs about the place bound the distance.
+    # The sites of two runs around the position give the upper bound.
     starts = (places - FAN).clamp(0, max(0, len(order) - 2 * FAN))
     near = (starts[:, None] + torch.arange(2 * FAN, device=device)).clamp_max(len(order) - 1)
     bounds = _squared(points, own[:, None], near, levels[0]).amin(dim=1)
@@ -122,21 +122,21 @@ def _search(
     for number, level in enumerate(reversed(levels)):
         if number:
             children = nodes[:, None] * FAN + torch.arange(FAN, device=device)
-            last = level.low.shape[1] - 1  # boxes that fill up have no children
+            last = level.low.shape[1] - 1  # padding has no children
             rows, nodes = rows.repeat_interleave(FAN), children.flatten().clamp_max(last)
         squared = _squared(points, rows, nodes, level)
         compared += len(rows)
         kept = (squared <= bounds[rows]).nonzero()[:, 0]
         rows, nodes, squared = rows[kept], nodes[kept], squared[kept]
     best = bounds.scatter_reduce(0, rows, squared, "amin")
-    found = order[nodes.clamp_max(len(order) - 1)]  # what fills up is the last site
+    found = order[nodes.clamp_max(len(order) - 1)]  # padding is the last site
     found = torch.where(squared == best[rows], found, len(order))
     labels = torch.full((count,), len(order), device=device)
     return labels.scatter_reduce(0, rows, found, "amin"), best, compared
 
 
 def _squared(points: Tensor, rows: Tensor, nodes: Tensor, level: Boxes) -> Tensor:
-    """Return squared distances of points to boxes; column by column, to bound memory."""
+    """Return squared distances of points to boxes, column by column to save memory."""
     total = torch.zeros((), dtype=torch.float64, device=points.device)
     for column, low, high in zip(points, *level, strict=True):
         place = column[rows]
@@ -145,7 +145,7 @@ def _squared(points: Tensor, rows: Tensor, nodes: Tensor, level: Boxes) -> Tenso
 
 
 class Operations(TorchDispatchMode):
-    """Counts operations: on a device each is a launch, or few."""
+    """Counts operations; each is one kernel launch or a few."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -157,7 +157,7 @@ class Operations(TorchDispatchMode):
 
 
 def sample(count: int, axes: int, device: torch.device) -> Float[Tensor, "n d"]:
-    """Return points on the surface of a ball, with smooth colours in the other columns."""
+    """Return points on a sphere, with smooth colours in the other columns."""
     generator = torch.Generator().manual_seed(count)
     points = torch.randn(count, 3, generator=generator, dtype=torch.float64)
     points = points / points.norm(dim=1, keepdim=True)
@@ -168,7 +168,7 @@ def sample(count: int, axes: int, device: torch.device) -> Float[Tensor, "n d"]:
 def seconds(
     search: Callable[[Tensor, Tensor], tuple[Tensor, Tensor] | Found], points: Tensor, sites: Tensor
 ) -> float:
-    """Return the processor seconds of a search on a CPU, else seconds by the clock."""
+    """Return CPU seconds of a search on a CPU, and wall-clock seconds on other devices."""
     clock = time.process_time if points.device.type == "cpu" else time.perf_counter
     start = clock()
     float(search(points, sites)[1].sum())  # waits for the device
@@ -178,7 +178,7 @@ def seconds(
 def search_table(
     device: torch.device, counts: Sequence[int], *, axes: int, share: float
 ) -> list[str]:
-    """Return Markdown lines: both searches, for growing numbers of points."""
+    """Return Markdown lines that compare both searches for growing numbers of points."""
     lines = [
         f"| points of {axes} numbers, sites | k-d tree on the host s | boxes on the device s "
         f"| comparisons for each point | operations |",

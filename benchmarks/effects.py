@@ -1,7 +1,7 @@
-"""What each effect costs and saves: scenes that call for it and scenes that do not.
+"""Measure the cost and savings of each effect, on scenes that need it and scenes that do not.
 
-``python -m benchmarks.effects -o docs/effects.md`` renews the tables of that page. Every effect is
-planned, forced on and forced off, each in fresh processes; of their runs the fastest counts.
+``python -m benchmarks.effects -o docs/effects.md`` updates the tables of that page. Every effect is
+planned, forced on and forced off, each in fresh processes; the fastest run counts.
 """
 
 import argparse
@@ -29,7 +29,7 @@ LOOK = {"visibility": {"views": 8}}
 
 
 class Case(NamedTuple):
-    """One effect: a scene that calls for it, one that does not, and what else is set."""
+    """One effect: a scene that needs it, one that does not, and other settings."""
 
     calls: Callable[[int], GaussianScene]
     does_not: Callable[[int], GaussianScene]
@@ -57,7 +57,7 @@ def without_faint(count: int) -> GaussianScene:
 
 
 def surfels(count: int) -> GaussianScene:
-    """A scene of Gaussians with two scales, which is written without a third."""
+    """Return a scene of Gaussians with two scales, which is saved without a third scale."""
     scene = make("object", count, sh_degree=0)
     log_scales = scene.log_scales.clone()
     log_scales[torch.arange(count), log_scales.argmin(dim=1)] = FLAT_LOG_SCALE
@@ -70,7 +70,7 @@ def surfels(count: int) -> GaussianScene:
 
 
 def _right_handed(quats: torch.Tensor, order: torch.Tensor) -> torch.Tensor:
-    """Bring axes into another order; the third is turned round where that makes a mirror."""
+    """Reorder axes; the third is negated where the new order is left-handed."""
     matrices = cvtgs.math.parameters.quats_to_matrices(cvtgs.math.parameters.normalize_quats(quats))
     axes = matrices.gather(2, order[:, None, :].expand(-1, 3, -1))
     axes[:, :, 2] *= torch.linalg.det(axes)[:, None]
@@ -143,7 +143,7 @@ def effect_table(options: argparse.Namespace) -> str:
 def row(name: str, path: Path, options: argparse.Namespace, *, settings: Mapping[str, Any]) -> str:
     choices = ("auto", CASES[name].on, CASES[name].off)
     found: dict[str, dict[str, Any]] = {}
-    for _ in range(options.processes):  # in turns, so that a busy minute hits all of them
+    for _ in range(options.processes):  # interleaved, so that a busy minute affects all choices
         for choice in dict.fromkeys(choices):
             words = ["--child", name, str(path), choice, json.dumps(dict(settings))]
             words += ["--rho", str(options.rho), "--runs", str(options.runs)]
@@ -174,7 +174,7 @@ def row(name: str, path: Path, options: argparse.Namespace, *, settings: Mapping
 def run_child(
     name: str, path: str, choice: str, settings: str, options: argparse.Namespace
 ) -> dict[str, Any]:
-    """Read and simplify some times in this process, and write what comes out."""
+    """Read and simplify repeatedly in this process, and write the last result."""
     values = {**json.loads(settings), "effects": {name: choice}}
     config = SimplifyConfig.from_mapping(values)
     choices = config.effects
@@ -187,14 +187,14 @@ def run_child(
         seconds.append(resource.getrusage(resource.RUSAGE_SELF).ru_utime - start)
     peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a third scale that its file has no place for
+        warnings.simplefilter("ignore")  # about a third scale that the file cannot hold
         cvtgs.save(small, Path(path).with_suffix(f".{choice}.ply"), overwrite=True)
     active = getattr(report.plan, name).active
     return {"seconds": min(seconds), "peak": peak, "active": active}
 
 
 def figure_table(count: int) -> str:
-    """What it costs to decide, against a whole simplification of the same scene."""
+    """Return a table of the cost of each decision, against a simplification of the same scene."""
     scene = without_bands(count)
     frame, masses, opacities = robust_frame(scene.means), scene.masses, scene.opacities
     parts: Mapping[str, Callable[[], object]] = {

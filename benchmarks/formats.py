@@ -1,9 +1,9 @@
-"""Cost of each format: bytes, seconds, and quality after a round trip.
+"""Measure each format: bytes, seconds, and quality after a round trip.
 
-``python -m benchmarks.formats`` prints Markdown tables. Seconds are those of one process that has
-imported everything; images are rendered by cvtgs from automatic views. ``--readers`` compares the
-memory-mapped reader of common PLY files with plyfile instead: CPU seconds and peak memory, each
-reading in a process of its own.
+``python -m benchmarks.formats`` prints Markdown tables. Seconds are measured in one process, after
+all imports; images are rendered by cvtgs from automatic views. ``--readers`` instead compares the
+memory-mapped reader of common PLY files with plyfile: CPU seconds and peak memory, each read in
+its own process.
 """
 
 import argparse
@@ -63,7 +63,7 @@ def compare_formats(options: argparse.Namespace) -> None:
 
 
 def measured(scene: cvtgs.GaussianScene, end: str, runs: int) -> str:
-    """Return the row of a format."""
+    """Measure a format and return its table row."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"a.{end}"
         write = [seconds(lambda: cvtgs.save(scene, path, overwrite=True)) for _ in range(runs)]

@@ -1,14 +1,14 @@
-"""Train a scene from photographs, simplify it, and score it on photographs that were held out.
+"""Train a scene from photographs, simplify it, and score it on held-out photographs.
 
-``python -m benchmarks.from_photographs -o DIR`` takes pictures of a generated scene as a dataset;
-``python -m benchmarks.from_photographs FOLDER -o DIR`` takes one in the layout of NeRF-Synthetic
-(``transforms_train.json``, ``transforms_test.json``). A fixed number of Gaussians, from random
-points or from those of ``--points``, is fitted to the training pictures by gradient descent,
-without densification: a plain loop that a CPU can run, not a replacement for a trainer. What comes
-out is made smaller, and all are scored on the test pictures, which nothing has seen.
+``python -m benchmarks.from_photographs -o DIR`` renders a generated scene to make a dataset;
+``python -m benchmarks.from_photographs FOLDER -o DIR`` reads one in the layout of NeRF-Synthetic
+(``transforms_train.json``, ``transforms_test.json``). A fixed number of Gaussians, starting from
+random points or from those of ``--points``, is fitted to the training images by gradient descent
+without densification: a plain loop that a CPU can run, not a replacement for a trainer. The
+result is simplified, and all scenes are scored on the test images, which no step has used.
 
 DIR gets the dataset (if it was generated), the trained model in INRIA's layout, and
-``from_photographs.md``. A model that is there already is not trained again.
+``from_photographs.md``. An existing model is not trained again.
 """
 
 import argparse
@@ -44,7 +44,7 @@ RATES = {
     "sh0": 1e-2,
     "shN": 5e-4,
 }
-"""Learning rates of Adam; that of means is in radii of the scene, and all fall to a tenth."""
+"""Learning rates of Adam, which decay to a tenth; that of means is in scene radii."""
 
 FIRST_OPACITY = 0.1
 METHODS = ("paper", "paper, no network", "standard", "mass pruning")
@@ -101,7 +101,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def take_pictures(folder: Path, *, views: int, size: int, seed: int) -> None:
-    """Write pictures of a generated scene as NeRF-Synthetic does, every eighth for testing."""
+    """Write images of a generated scene in NeRF-Synthetic's layout; every eighth is for testing."""
     scene = cvtgs.synthetic.scene("object", 60_000, sh_degree=1, seed=seed)
     cameras = automatic_views(scene, views, width=size, height=size, seed=seed)
     for split in ("train", "test"):
@@ -117,7 +117,7 @@ def take_pictures(folder: Path, *, views: int, size: int, seed: int) -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(values).save(path)
             pose = np.linalg.inv(camera.viewmats[0].double().numpy())
-            pose[:, 1:3] *= -1  # the axes of OpenGL
+            pose[:, 1:3] *= -1  # to OpenGL axes
             frames.append(
                 {"file_path": f"./{split}/{path.stem}", "transform_matrix": pose.tolist()}
             )
@@ -127,7 +127,7 @@ def take_pictures(folder: Path, *, views: int, size: int, seed: int) -> None:
 
 
 def read_split(folder: Path, split: str, size: int) -> tuple[Cameras, Float[Tensor, "c h w 3"]]:
-    """Read the cameras and the pictures of a split, over white."""
+    """Read the cameras and the images of a split, over white."""
     cameras = fit_cameras(cvtgs.load_cameras(folder / f"transforms_{split}.json"), folder)
     if size < max(cameras.width, cameras.height):
         cameras = cameras.fitted(size)
@@ -137,7 +137,7 @@ def read_split(folder: Path, split: str, size: int) -> tuple[Cameras, Float[Tens
 def first_scene(
     cameras: Cameras, count: int, *, points: Float[Tensor, "n 3"] | None, seed: int
 ) -> cvtgs.GaussianScene:
-    """Return grey balls that touch, at given points or at random ones where cameras look."""
+    """Return touching grey balls at given points, or at random points where cameras look."""
     g = torch.Generator().manual_seed(seed)
     if points is None:
         middle, radius = looked_at(cameras)
@@ -159,7 +159,7 @@ def first_scene(
 
 
 def looked_at(cameras: Cameras) -> tuple[Float[Tensor, "3"], float]:
-    """Return the point nearest to all view axes, and half the height of what is seen there."""
+    """Return the point nearest to all view axes, and 0.8 of half the width of the view there."""
     axes, centers = cameras.viewmats[:, 2, :3].double(), cameras.centers.double()
     across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None]
     middle = torch.linalg.solve(across.sum(dim=0), (across @ centers[:, :, None]).sum(dim=0))[:, 0]
@@ -176,7 +176,7 @@ def fit(
     seed: int,
     say: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
 ) -> cvtgs.GaussianScene:
-    """Fit a scene to pictures by Adam and ``0.8 L1 + 0.2 (1 - SSIM)``, a picture per step."""
+    """Fit a scene to images with Adam and ``0.8 L1 + 0.2 (1 - SSIM)``, one image per step."""
     tensors = {name: values.clone().requires_grad_() for name, values in scene.tensors().items()}
     _, radius = looked_at(cameras)
     optimizer = torch.optim.Adam(
@@ -204,7 +204,7 @@ def fit(
 
 
 def simplifier(name: str) -> Callable[[cvtgs.GaussianScene, int], cvtgs.GaussianScene]:
-    """Return a method by its name."""
+    """Return a simplification method by name."""
     if name == "mass pruning":
         return baseline(name)
     preset, separator, _ = name.partition(",")
@@ -213,7 +213,7 @@ def simplifier(name: str) -> Callable[[cvtgs.GaussianScene, int], cvtgs.Gaussian
 
 
 def table(rows: dict[str, Quality]) -> str:
-    """Return scores on the photographs, and what is lost of those of the trained scene."""
+    """Return a table of scores on the photographs, and of losses against the trained scene."""
     full, *_ = rows.values()
     lines = [
         [name, *cells_of(found)[:3], f"{found.psnr - full.psnr:+.2f}"]

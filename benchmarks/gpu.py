@@ -1,7 +1,7 @@
-"""Time and memory on a CUDA device beside the CPU: stages, renderers and steps of training.
+"""Measure time and memory on a CUDA device and on the CPU: stages, renderers, training steps.
 
-``python -m benchmarks.gpu`` writes its Markdown tables to docs/gpu.md. ``nox -s gpu`` also runs the
-tests that a device makes sense for, before.
+``python -m benchmarks.gpu`` writes its Markdown tables to docs/gpu.md. ``nox -s gpu`` first runs
+the tests that are useful on a device.
 """
 
 import argparse
@@ -31,10 +31,10 @@ from cvtgs.views import automatic_views
 PAGE = Path("docs/gpu.md")
 COUNTS = (1_000_000, 4_200_000, 13_600_000)
 HIGH: dict[str, Any] = {"preset": "high"}
-"""The configuration that refines."""
+"""The configuration with refinement."""
 
 CASE_COUNT = 20_000
-"""Gaussians of the scene to train on."""
+"""Number of Gaussians of the scene to train on."""
 
 TRAININGS = ("scene", "local")
 """Kinds of training to time."""
@@ -67,7 +67,7 @@ def main() -> None:
 
 
 def stage_table(device: torch.device, counts: Sequence[int], *, rho: float, runs: int) -> list[str]:
-    """Seconds and peak of every stage, the median of runs, and seconds of one run on the CPU."""
+    """Return a table of median seconds and peak per stage, and of seconds of a run on the CPU."""
     lines = [
         "| Gaussians, SH 0 | stage | device s | peak on the device MB | CPU s | CPU / device |",
         "|---|---|---|---|---|---|",
@@ -97,7 +97,7 @@ def stage_table(device: torch.device, counts: Sequence[int], *, rho: float, runs
 
 
 def refining_table(device: torch.device, count: int, *, rho: float) -> list[str]:
-    """Seconds of the preset ``high``."""
+    """Return a table of seconds of the preset ``high``."""
     scene = cvtgs.synthetic.scene("courtyard", count, sh_degree=0, seed=0).to(device)
     config = SimplifyConfig.from_mapping(HIGH)
     _, (report,) = repeat(scene, config, rho, device=device, runs=0)
@@ -113,7 +113,7 @@ def refining_table(device: torch.device, count: int, *, rho: float) -> list[str]
 
 
 def renderer_table(device: torch.device, count: int, *, size: int, runs: int) -> list[str]:
-    """Seconds of one image and of its gradient by each renderer that works on the device."""
+    """Return a table of seconds per image and gradient of each renderer that works there."""
     scene = cvtgs.synthetic.scene("courtyard", count, sh_degree=0, seed=0)
     cameras = automatic_views(scene, 1, width=size, height=size)
     scene, wanted = scene.to(device), None
@@ -146,7 +146,7 @@ def renderer_table(device: torch.device, count: int, *, size: int, runs: int) ->
 
 
 def training_table(device: torch.device, *, steps: int) -> list[str]:
-    """Steps a second of both trainings, without the first fifth, on the device and on the CPU."""
+    """Return a table of steps per second of both trainings on the device and on the CPU."""
     lines = ["| training | device steps/s | CPU steps/s |", "|---|---|---|"]
     data = DataConfig(generated=1, generated_validation=1, generated_counts=(CASE_COUNT,))
     for kind in TRAININGS:
@@ -165,7 +165,7 @@ def training_table(device: torch.device, *, steps: int) -> list[str]:
 
 
 def steps_a_second(config: TrainConfig, device: torch.device) -> float:
-    """Train, and count the steps after the first fifth by the clock."""
+    """Train, and return steps per second of wall-clock time after the first fifth."""
     times: list[float] = []
 
     def listen(event: ProgressEvent) -> None:
@@ -187,7 +187,7 @@ def repeat(
     device: torch.device,
     runs: int,
 ) -> tuple[list[GaussianScene], list[SimplifyReport]]:
-    """Simplify again and again; the first run, which loads kernels, counts only if it is alone."""
+    """Simplify repeatedly; the first run loads kernels and counts only if it is the only one."""
     simplifier = Simplifier(config=config, device=device)
     results = [simplifier.run(scene, rho) for _ in range(runs + 1)]
     counted = results[1:] or results
@@ -195,7 +195,7 @@ def repeat(
 
 
 def seconds(work: Callable[[], object], device: torch.device) -> float:
-    """Return the wall-clock seconds of some work on a device."""
+    """Return the wall-clock seconds of a function on a device."""
     start = time.perf_counter()
     work()
     if device.type == "cuda":
@@ -204,7 +204,7 @@ def seconds(work: Callable[[], object], device: torch.device) -> float:
 
 
 def row(count: int, stage: str, found: float, peak: int, cpu: float | None) -> str:
-    """Return a line of the table of stages."""
+    """Format a row of the table of stages."""
     ratio = "" if cpu is None else f"{cpu / found:.1f}"
     beside = "" if cpu is None else f"{cpu:.3f}"
     return f"| {count:,} | {stage} | {found:.3f} | {peak / 1e6:.0f} | {beside} | {ratio} |"
@@ -217,7 +217,7 @@ def equal(one: GaussianScene, other: GaussianScene) -> bool:
 
 
 def different_rows(one: GaussianScene, other: GaussianScene) -> int:
-    """Return how many Gaussians of two scenes on the CPU differ by more than 1e-3 somewhere."""
+    """Count the Gaussians of two scenes on the CPU that differ by more than 1e-3 in any value."""
     pairs = zip(one.tensors().values(), other.tensors().values(), strict=True)
     differ = torch.zeros(len(one), dtype=torch.bool)
     for first, second in pairs:

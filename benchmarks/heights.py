@@ -1,9 +1,9 @@
-"""What presets and settings gain over ``standard`` in views from all around, by their height.
+"""Measure the gain of presets and settings over ``standard``, by the height of the viewpoint.
 
 ``python -m benchmarks.heights FILES --rho 0.1 high "standard refine.steps=100"`` scores each
-variant (a preset, and settings after it) in twelve random directions at nine heights, from below
-and from inside the ground too, by cvtgs' own renderer, and prints Markdown. Few views mislead
-where some of them stand inside solid ground: there, PSNR changes by tens of decibels.
+variant (a preset, followed by settings) from twelve random directions at each of nine heights,
+including from below and from inside the ground, with cvtgs' own renderer, and prints Markdown.
+A small set of views misleads if some are inside solid ground, where PSNR changes by tens of dB.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from cvtgs.math.frames import robust_frame
 
 HEIGHTS = ((90, 1.5), (60, 1.2), (35, 1.6), (20, 1.2), (20, 2.8), (10, 2.2), (-15, 2.8), (-35, 2.0),
            (-60, 1.5))  # fmt: skip
-"""Degrees above the plane of x and z, and distance in robust radii."""
+"""Elevation in degrees from the xz plane toward +y, and distance in robust radii."""
 
 
 def main() -> None:
@@ -53,7 +53,7 @@ def main() -> None:
 def views_at(
     scene: cvtgs.GaussianScene, height: float, far: float, count: int, *, size: int, seed: int
 ) -> Cameras:
-    """Look at the middle of a scene from random directions at one height and distance."""
+    """Return cameras that look at the centre of a scene from one elevation and distance."""
     frame = robust_frame(scene.means[scene.opacities > 0.1])
     turns = 2 * math.pi * torch.rand(count, generator=torch.Generator().manual_seed(seed)).double()
     rise = torch.full_like(turns, math.radians(height))
@@ -71,7 +71,7 @@ def views_at(
 
 
 def scores(scene: cvtgs.GaussianScene, variant: str, cameras: list[Cameras], rho: float) -> Tensor:
-    """Return the mean PSNR at every height."""
+    """Return the mean PSNR at each height."""
     preset, *words = variant.split()
     settings = dict(word.split("=", 1) for word in words)
     config = cvtgs.SimplifyConfig.compose(preset=preset, settings=settings)

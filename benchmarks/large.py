@@ -1,10 +1,10 @@
-"""Levels and blocks: what several sizes cost, and large files in bounded memory.
+"""Measure levels of detail, and out-of-core runs on large files.
 
-``python -m benchmarks.large levels`` compares levels with runs of their own, in time and PSNR;
-``seams`` compares blocks with one piece; ``blocks`` simplifies a large generated file in a process
-of its own and prints its user CPU seconds and peak memory, and with ``--workers 1 2`` how much
-faster two workers on two cores are than one on one, and whether they write the same bytes. Tables
-are Markdown.
+``python -m benchmarks.large levels`` compares levels with separate runs, in time and PSNR;
+``seams`` compares runs by blocks with runs in one piece; ``blocks`` simplifies a large generated
+file in its own process and prints its user CPU seconds and peak memory. With ``--workers 1 2`` it
+also prints the speedup of two workers on two cores over one on one, and whether both write the
+same bytes. Tables are Markdown.
 """
 
 import argparse
@@ -54,13 +54,13 @@ def main() -> None:
 
 
 def levels(options: argparse.Namespace) -> None:
-    """Time of three levels against the finest alone, and PSNR against runs of their own.
+    """Print the time of three levels against the finest alone, and PSNR against separate runs.
 
-    PSNR is the mean over several counts, as for seams.
+    PSNR is the mean over several counts, as in ``seams``.
     """
     print("| scene | finest, CPU s | levels, CPU s | ratio | PSNR, own runs | levels gain |")
     print("|---|---|---|---|---|---|")
-    torch.set_num_threads(1)  # threads that wait for one another would count as CPU time
+    torch.set_num_threads(1)  # waiting threads would count as CPU time
     simplifier = cvtgs.Simplifier(device="cpu")
     for name, scene in scenes(options):
         simplifier.simplify(scene.select(torch.arange(1000)), 0.1)  # loads scipy
@@ -91,9 +91,9 @@ def levels(options: argparse.Namespace) -> None:
 
 
 def seams(options: argparse.Namespace) -> None:
-    """PSNR of scenes made by blocks against those made in one piece, mean over several counts.
+    """Print PSNR of runs by blocks against runs in one piece, as means over several counts.
 
-    A count that is one per cent larger or smaller moves a single figure by more than a seam does.
+    Changing the count by one per cent changes a single figure by more than seams do.
     """
     numbers = [1, *(int(word) for word in options.blocks.split(","))]
     print(f"| scene, rho {options.rho:g} | one piece |", *(f"{n} blocks |" for n in numbers[1:]))
@@ -114,7 +114,7 @@ def seams(options: argparse.Namespace) -> None:
 
 
 def blocks(options: argparse.Namespace) -> None:
-    """Whole processes on large files, and each number of workers against the first."""
+    """Measure whole processes on large files, and each number of workers against the first."""
     names = ("file", "memory each", "workers", "user CPU s", "wall s", "ratio", "peak MB")
     print(f"| {' | '.join((*names, 'Gaussians', 'blocks'))} |")
     print("|---|---|---|---|---|---|---|---|---|")
@@ -142,7 +142,7 @@ def blocks(options: argparse.Namespace) -> None:
 
 
 def make(options: argparse.Namespace) -> None:
-    """Write a courtyard of ``--count`` Gaussians without view-dependent colour."""
+    """Write a courtyard scene of ``--count`` Gaussians without view-dependent colour."""
     (file,) = options.files
     cvtgs.save(cvtgs.synthetic.scene("courtyard", options.count, sh_degree=0, seed=0), file)
 
@@ -156,7 +156,7 @@ def scenes(options: argparse.Namespace) -> list[tuple[str, cvtgs.GaussianScene]]
 
 
 def scores(scene: cvtgs.GaussianScene, small: dict[str, cvtgs.GaussianScene]) -> dict[str, float]:
-    """Return mean PSNR over automatic views."""
+    """Return the mean PSNR over automatic views, by name."""
     cameras = automatic_views(scene, 6, width=400, height=300)
     return {name: found.psnr for name, found in score_views(scene, small, cameras).items()}
 

@@ -1,4 +1,4 @@
-"""What benchmarks share: cost of processes and functions, generated files, tables of a page."""
+"""Shared by benchmarks: cost of processes and functions, generated files, tables on pages."""
 
 import os
 import platform
@@ -21,10 +21,10 @@ class Cost:
     """Cost of one process, its children not included.
 
     Attributes:
-        user_seconds: Processor time outside the kernel.
-        wall_seconds: Time from start to end.
-        peak_bytes: Largest resident size.
-        output: Its standard output.
+        user_seconds: User CPU time.
+        wall_seconds: Wall-clock time from start to end.
+        peak_bytes: Peak resident size.
+        output: Its stdout.
     """
 
     user_seconds: float
@@ -34,7 +34,7 @@ class Cost:
 
 
 def run_python(*arguments: str) -> Cost:
-    """Run this Python with arguments, and measure."""
+    """Run this Python with arguments and measure it."""
     return run([sys.executable, *arguments])
 
 
@@ -55,12 +55,12 @@ def run(command: Sequence[str]) -> Cost:
 
 @contextmanager
 def cores(count: int) -> Iterator[None]:
-    """Give so many cores to the processes that are started, where the system can."""
+    """Limit child processes to a number of cores, where the system supports it."""
     if not hasattr(os, "sched_setaffinity"):
         yield
         return
     before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, sorted(before)[:count])  # they inherit it
+    os.sched_setaffinity(0, sorted(before)[:count])  # children inherit this
     try:
         yield
     finally:
@@ -68,7 +68,7 @@ def cores(count: int) -> Iterator[None]:
 
 
 def fastest(run: Callable[[], object], *, runs: int) -> float:
-    """Return the smallest processor seconds of several runs."""
+    """Return the smallest CPU seconds of several runs."""
     seconds = []
     for _ in range(runs):
         start = time.process_time()
@@ -78,7 +78,7 @@ def fastest(run: Callable[[], object], *, runs: int) -> float:
 
 
 def spread(values: Sequence[float]) -> str:
-    """Return median, smallest and largest."""
+    """Format median, minimum and maximum."""
     return f"{statistics.median(values):.2f} ({min(values):.2f}-{max(values):.2f})"
 
 
@@ -107,14 +107,14 @@ def generated_scenes(
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a file, completely or not at all, and its folder."""
+    """Write a file atomically; create its folder if missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_output(path, overwrite=True) as file:
         file.write(content)
 
 
 def renew_tables(page: Path, text: str, *, script: str) -> None:
-    """Replace the tables that a script made on a page."""
+    """Replace the tables of a script on a page."""
     start, end = f"<!-- tables: python -m {script} -->", "<!-- end of tables -->"
     before, rest = page.read_text(encoding="utf-8").split(start)
     after = rest.split(end)[1]

@@ -1,7 +1,7 @@
-"""How numbers fare on hard scenes: condition, residuals, float32 against float64, and time.
+"""Measure numerics on hard scenes: condition, residuals, float32 against float64, and time.
 
-``python -m benchmarks.numerics -o docs/numerics.md`` renews the tables of that page, from the
-catalogue of ``tests/hard_cases.py``.
+``python -m benchmarks.numerics -o docs/numerics.md`` updates the tables of that page, from the
+catalogue in ``tests/hard_cases.py``.
 """
 
 import argparse
@@ -64,7 +64,7 @@ def main() -> None:
 
 
 def catalogue() -> Cases:
-    """Return the hard cases of the tests."""
+    """Load the hard cases of the tests."""
     sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
     from hard_cases import CASES  # noqa: PLC0415 (found there only)
 
@@ -82,7 +82,7 @@ def error_table(cases: Cases, count: int) -> str:
 
 
 def time_table(cases: Cases, count: int) -> str:
-    """CPU seconds of a simplification to a tenth, and how many times those of the easy scene."""
+    """Return a table of CPU seconds at rho 0.1, and their ratio to those of the easy scene."""
     easy = {preset: cpu_seconds(catalogue()["ball"], count, preset) for preset in PRESETS}
     lines = [f"{machine()}; {count:,} Gaussians to a tenth, the faster of two runs, CPU seconds.\n"]
     lines += ["| case | " + " | ".join(f"{p} | / ball" for p in PRESETS) + " |"]
@@ -104,12 +104,12 @@ def cpu_seconds(
 ) -> float:
     scene, simplifier = make(count, torch.float32), Simplifier(config=preset, device="cpu")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of dropped rows
+        warnings.simplefilter("ignore")  # about dropped rows
         return fastest(lambda: simplifier.simplify(scene, 0.1), runs=2)
 
 
 def figures(make: Callable[[int, torch.dtype], GaussianScene], count: int) -> Figures:
-    """Take one scene through the stages in both precisions, with the cells of float64."""
+    """Run the stages on one scene in both precisions, with the cells of float64."""
     single = valid(make(count, torch.float32))
     double = in_float64(single)
     target = max(1, len(single) // 10)
@@ -148,7 +148,7 @@ def in_float64(scene: GaussianScene) -> GaussianScene:
 
 
 def grouped(scene: GaussianScene, target: int) -> tuple[Tensor, float]:
-    """Group by position alone; labels in the order of the rows, and the energy."""
+    """Group by position alone; return labels in row order, and the energy."""
     points = embed(scene.means, frame=robust_frame(scene.means), contraction=1.0)
     order = morton_order(points, ties=scene.masses)
     weights = torch.ones(len(scene), dtype=torch.float64)
@@ -159,7 +159,7 @@ def grouped(scene: GaussianScene, target: int) -> tuple[Tensor, float]:
 
 
 def exact_covariances(scene: GaussianScene, part: Partition, power: float) -> Tensor:
-    """Covariances before they are split into scales and turns, in float64."""
+    """Return merged covariances in float64, before decomposition into scales and rotations."""
     members = gather_members(scene, part)
     return mean_and_covariance(members, members.weights(power))[1]
 

@@ -2,15 +2,14 @@
 
 DATASETS is a folder with NeRF-Synthetic, Mip-NeRF 360, Tanks and Temples and Deep Blending, or some
 of their scenes, and with models that were trained on them by INRIA's code, nerfstudio or gsplat
-(``benchmarks.datasets`` says how they are found). Every method gets each model and writes 10 %,
-1 % and 0.1 % of its Gaussians, in a process of its own, without fine-tuning. Images from the
-cameras that were held out (every eighth, or ``transforms_test.json``) are compared with their
-photographs at the published size: PSNR, SSIM, LPIPS. Seconds are those of the process, from start
-to end.
+(``benchmarks.datasets`` says how they are found). Every method simplifies each model to 10 %, 1 %
+and 0.1 % of its Gaussians, in its own process, without fine-tuning. Images from the held-out
+cameras (every eighth, or ``transforms_test.json``) are compared with their photographs at the
+published size: PSNR, SSIM, LPIPS. Seconds are wall-clock seconds of the process from start to end.
 
-DIR gets ``paper.md``, the tables with the published figures beside them (``published.json``),
-``results.json``, and the small scenes in ``scenes``. A run that was interrupted goes on where it
-stopped: start it again. Scenes that are missing or cannot be used are named and left out.
+DIR gets ``paper.md`` (tables next to the published figures of ``published.json``),
+``results.json``, and the simplified scenes in ``scenes``. To resume an interrupted run, start it
+again. Scenes that are missing or unusable are listed and left out.
 """
 
 import argparse
@@ -42,7 +41,7 @@ FULL = "full scene"
 MERGED = "paper, no network"
 OURS = ("paper", MERGED, "standard")
 LARGE = (800, 800)
-"""Pixels of images on which any network of LPIPS can be measured."""
+"""An image size in pixels that every LPIPS network accepts."""
 
 PUBLISHED = Path(__file__).with_name("published.json")
 
@@ -57,7 +56,7 @@ class Gain(pydantic.BaseModel):
 
 
 class Published(pydantic.BaseModel):
-    """Published figures, and where they are from."""
+    """Published figures and their source."""
 
     source: str
     gains: tuple[Gain, ...]
@@ -92,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def keep_network(path: Path, network: str) -> None:
-    """Note the network of LPIPS; refuse to go on with another one."""
+    """Record the LPIPS network; exit if earlier results used another one."""
     before = path.read_text(encoding="utf-8") if path.is_file() else network
     if before != network:
         raise SystemExit(
@@ -120,7 +119,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def commands(methods: Sequence[str]) -> dict[str, list[str]]:
-    """Return the command of every method, with places to fill in."""
+    """Return the command of every method, with placeholders."""
     own = own_methods([])
     baseline = [sys.executable, "-m", "benchmarks.baselines"]
     known = {
@@ -134,7 +133,7 @@ def commands(methods: Sequence[str]) -> dict[str, list[str]]:
 def measure(
     capture: Capture, table: Table, options: argparse.Namespace, metrics: Metrics
 ) -> Iterator[Table]:
-    """Yield each new result of a scene as a table."""
+    """Yield each new result of a scene as a table of one entry."""
     known = table.get(key_of(capture), {})
     todo = [
         (method, rho)
@@ -198,7 +197,7 @@ def report(
     options: argparse.Namespace,
     network: str,
 ) -> str:
-    """Write the page: published gains first, then a part per dataset."""
+    """Return the page: published gains first, then a section per dataset."""
     layouts = ", ".join(sorted({capture.model.layout for capture in captures}))
     parts = [
         "# The evaluation of CVT-GS\n",
@@ -222,14 +221,14 @@ def report(
 def spread_full(
     rows: Mapping[str, Mapping[float, Result | None]], ratios: Sequence[float]
 ) -> dict[str, Mapping[float, Result | None]]:
-    """Show the full scene beside every ratio."""
+    """Repeat the result of the full scene at every ratio."""
     full = rows.get(FULL, {}).get(1.0)
     others = {name: row for name, row in rows.items() if name != FULL}
     return {FULL: dict.fromkeys(ratios, full), **others}
 
 
 def gains_table(table: Table, ratios: Sequence[float]) -> str:
-    """Compare differences of PSNR with the published ones, means over the scenes that have both."""
+    """Compare PSNR gains with the published ones, as means over the scenes with both results."""
     published = Published.model_validate(json.loads(PUBLISHED.read_text(encoding="utf-8")))
     lines = []
     for gain in published.gains:

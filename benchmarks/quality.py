@@ -1,14 +1,14 @@
-"""PSNR, SSIM and LPIPS against the full scene, of every preset or of single choices.
+"""PSNR, SSIM and LPIPS against the full scene, for every preset or for single choices.
 
 ``python -m benchmarks.quality`` scores the presets on generated scenes with cvtgs' own renderer and
-views. Scenes of your own: name the files; cameras that lie beside a file (``benchmarks.cameras``)
-are used. LPIPS: ``--lpips WEIGHTS``. Another judge: ``--scorer
-"python score.py --json {full} {small}"``; it gets the full scene and the small ones, and prints a
-JSON list of objects with ``psnr``, ``ssim`` and perhaps ``lpips``, in that order. One scene with
-cameras: ``--cameras CAPTURE``; with photographs: ``--images DIR``, to score against them.
+views. For your own scenes, name the files; cameras beside a file (``benchmarks.cameras``) are used.
+For LPIPS give ``--lpips WEIGHTS``. For another scorer give ``--scorer
+"python score.py --json {full} {small}"``; it gets the full scene and the simplified ones, and
+prints a JSON list in the same order, of objects with ``psnr``, ``ssim`` and optionally ``lpips``.
+For one scene with cameras give ``--cameras CAPTURE``; ``--images DIR`` scores against photographs.
 
-``--choices`` changes one choice of ``standard`` at a time instead; ``--set merge.network=false``
-measures the choices without a network, which was trained for all of them as they are.
+``--choices`` instead changes one choice of ``standard`` at a time; ``--set merge.network=false``
+measures the choices without the network, which was trained with all of them unchanged.
 """
 
 import argparse
@@ -45,7 +45,7 @@ from cvtgs.views import automatic_views
 
 VIEWS = 8
 SIZE = 400
-"""What cvtgs' own renderer looks at: automatic views, and pixels on each side."""
+"""Number of automatic views, and their width and height in pixels, for the own renderer."""
 
 RATIOS = (0.1, 0.01, 0.001)
 MEAN = "mean"
@@ -54,13 +54,13 @@ SCORES = ("psnr", "ssim", "lpips", "alpha_error", "alpha_bias")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quality:
-    """How close the images of a small scene come to those of the full one.
+    """Scores of the images of a simplified scene against those of the full one.
 
     Attributes:
         psnr: dB.
         ssim: At most 1.
-        lpips: At least 0, less is better; None if it was not measured.
-        alpha_error: Mean absolute difference of alpha, less is better; None if not measured.
+        lpips: At least 0, lower is better; None if not measured.
+        alpha_error: Mean absolute difference of alpha, lower is better; None if not measured.
         alpha_bias: Mean of alpha minus that of the full scene; None if not measured.
     """
 
@@ -72,7 +72,7 @@ class Quality:
 
     @classmethod
     def of(cls, scores: SceneScores) -> Self:
-        """Take the means of an evaluation."""
+        """Make a quality of the means of an evaluation."""
         return cls(
             psnr=scores.psnr.mean,
             ssim=scores.ssim.mean,
@@ -83,17 +83,17 @@ class Quality:
 
 
 Simplify = Callable[[cvtgs.GaussianScene, float], cvtgs.GaussianScene]
-"""Takes a scene and the ratio to keep."""
+"""Function of a scene and the ratio to keep."""
 
 Scorer = Callable[[cvtgs.GaussianScene, Sequence[cvtgs.GaussianScene]], list[Quality]]
-"""Takes the full scene and small ones."""
+"""Function of the full scene and simplified ones."""
 
 Table = Mapping[str, Mapping[str, Sequence[Quality]]]
-"""One quality per ratio, by the name of the variant, by the name of the scene."""
+"""One quality per ratio, by name of the scene and name of the variant."""
 
 
 def scoring_parser(description: str | None) -> argparse.ArgumentParser:
-    """Make a parser that knows what to score, at which ratios, and by whom."""
+    """Make a parser with options for scenes, ratios and scorers."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("files", nargs="*", type=Path, help="scenes; generated ones if none")
     parser.add_argument("--rho", type=float, nargs="+", default=list(RATIOS))
@@ -117,7 +117,7 @@ def scoring_parser(description: str | None) -> argparse.ArgumentParser:
 
 
 def configuration(options: argparse.Namespace, settings: Mapping[str, str]) -> cvtgs.SimplifyConfig:
-    """Put together what the command line sets, and ``settings``, which win; ``preset`` is one."""
+    """Compose a configuration of the command line and ``settings`` (``preset`` too), which win."""
     values = {**dict(item.split("=", 1) for item in options.set), **settings}
     return cvtgs.SimplifyConfig.compose(preset=values.pop("preset", None), settings=values)
 
@@ -133,7 +133,7 @@ def variants_of(
 
 
 def measure(variants: Mapping[str, Simplify], options: argparse.Namespace) -> Iterator[Table]:
-    """Score every variant on every scene; give the table so far after each scene."""
+    """Score every variant on every scene; yield the table so far after each scene."""
     table: dict[str, dict[str, list[Quality]]] = {}
     for name, scene in scenes(options.files, options.count):
         file = options.files[len(table)] if options.files else None
@@ -146,7 +146,7 @@ def measure(variants: Mapping[str, Simplify], options: argparse.Namespace) -> It
 
 
 def scenes(files: Sequence[Path], count: int) -> Iterator[tuple[str, cvtgs.GaussianScene]]:
-    """Return the scenes of the files, or one generated scene of each kind, with their names."""
+    """Yield names and scenes of the files, or one generated scene of each kind."""
     stems = Counter(file.stem for file in files)
     for file in files:
         yield file.stem if stems[file.stem] == 1 else str(file), cvtgs.load(file)
@@ -155,7 +155,7 @@ def scenes(files: Sequence[Path], count: int) -> Iterator[tuple[str, cvtgs.Gauss
 
 
 def make_scorer(options: argparse.Namespace, file: Path | None) -> Scorer:
-    """Make what the options ask for, for the scene of a file or for a generated one."""
+    """Make the scorer that the options ask for, for the scene of a file or a generated one."""
     if options.scorer:
         return command_scorer(options.scorer)
     weights = None if options.lpips is None else any_lpips(options.lpips)
@@ -168,7 +168,7 @@ def make_scorer(options: argparse.Namespace, file: Path | None) -> Scorer:
 
 
 def given_scorer(options: argparse.Namespace, weights: LpipsWeights | None) -> Scorer:
-    """Score from given cameras, against the full scene or against photographs."""
+    """Return a scorer from given cameras, against the full scene or against photographs."""
     if len(options.files) != 1:
         raise SystemExit(f"--cameras are those of one scene, found {len(options.files)} scenes.")
     try:
@@ -188,10 +188,10 @@ class PhotographJudge(NamedTuple):
     """Scores scenes against photographs.
 
     Attributes:
-        cameras: From where they were taken.
+        cameras: The cameras of the photographs.
         photographs: One per camera, of the size of the cameras.
-        background: Colour behind scenes.
-        metrics: What to compute.
+        background: Background colour of the renderings.
+        metrics: The metrics to compute.
     """
 
     cameras: Cameras
@@ -213,7 +213,7 @@ class PhotographJudge(NamedTuple):
 
 
 def any_lpips(path: Path) -> LpipsWeights:
-    """Read LPIPS weights of whichever network the file holds."""
+    """Read LPIPS weights of either network."""
     try:
         return load_lpips("vgg", path)
     except FileFormatError:
@@ -221,7 +221,7 @@ def any_lpips(path: Path) -> LpipsWeights:
 
 
 def own_scorer(weights: LpipsWeights | None, cameras: Cameras | None = None) -> Scorer:
-    """Score by cvtgs' own renderer, from cameras or else from automatic views."""
+    """Return a scorer with cvtgs' own renderer, from cameras or else from automatic views."""
 
     def score(full: cvtgs.GaussianScene, small: Sequence[cvtgs.GaussianScene]) -> list[Quality]:
         views = cameras or automatic_views(full, VIEWS, width=SIZE, height=SIZE)
@@ -235,14 +235,14 @@ def own_scorer(weights: LpipsWeights | None, cameras: Cameras | None = None) -> 
 def score_views(
     full: cvtgs.GaussianScene, small: Mapping[str, cvtgs.GaussianScene], cameras: Cameras
 ) -> dict[str, Quality]:
-    """Return scores of small scenes against the full one, means over the cameras."""
+    """Return scores of simplified scenes against the full one, as means over the cameras."""
     settings = EvaluationSettings(lpips="off")
     found = cvtgs.evaluate(full, small, cameras, settings=settings)
     return {one.name: Quality.of(one) for one in found.scenes}
 
 
 def command_scorer(template: str) -> Scorer:
-    """Score by a command, which gets files and prints JSON with scores by their names."""
+    """Return a scorer by a command, which gets files and prints named scores as JSON."""
 
     def score(full: cvtgs.GaussianScene, small: Sequence[cvtgs.GaussianScene]) -> list[Quality]:
         with tempfile.TemporaryDirectory() as folder:
@@ -279,7 +279,7 @@ def means(table: Table) -> dict[str, list[Quality]]:
 
 
 def mean_or_none(values: Sequence[float | None]) -> float | None:
-    """Average, if every value is known."""
+    """Return the mean, or None if any value is None."""
     known = [value for value in values if value is not None]
     return mean(known) if len(known) == len(values) else None
 
@@ -305,7 +305,7 @@ def markdown_rows(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def cells_of(quality: Quality) -> tuple[str, str, str, str]:
-    """Return the text of four columns; a dash for what was not measured."""
+    """Return the text of four columns; a dash for values not measured."""
     distance, error = (
         "-" if value is None else f"{value:.4f}" for value in (quality.lpips, quality.alpha_error)
     )

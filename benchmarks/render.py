@@ -1,7 +1,7 @@
-"""Time and memory of rendering: forward, and forward and backward, by each backend.
+"""Measure time and memory of rendering with each backend, forward and forward plus backward.
 
-``python -m benchmarks.render`` prints a Markdown table. Each backend runs in a process of its
-own; its first images, which may compile, are timed apart.
+``python -m benchmarks.render`` prints a Markdown table. Each backend runs in its own process; its
+first images, which may compile, are timed separately.
 """
 
 import argparse
@@ -80,7 +80,7 @@ def costs(options: argparse.Namespace) -> dict[str, float | list[float]]:
 
 
 def orbit(scene: cvtgs.GaussianScene, count: int, size: int) -> Cameras:
-    """Look at the middle of the scene from around it, by turns from above and from below."""
+    """Return cameras around the centre of the scene, at two alternating heights toward -y."""
     center = scene.means.median(dim=0).values.cpu().double()
     ways = (scene.means.cpu().double() - center).norm(dim=1)
     distance = 2.0 * statistics.median(ways[:: max(1, len(ways) // 1000)].tolist())

@@ -1,7 +1,7 @@
-"""Time and memory of ``cvtgs simplify``: whole process, per stage, against the floor, by cores.
+"""Measure time and memory of ``cvtgs simplify``: process, stages, against the floor, by cores.
 
-The floor is what no method on cells can avoid: read the file, search the nearest site of every
-Gaussian once, write the result. ``python -m benchmarks.speed`` prints Markdown tables.
+The floor is the work that no cell-based method can avoid: read the file, search the nearest site of
+every Gaussian once, write the result. ``python -m benchmarks.speed`` prints Markdown tables.
 """
 
 import argparse
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def measure_processes(files: list[Path], folder: Path, options: argparse.Namespace) -> None:
-    """Whole processes: interpreter and torch start, reading and writing included."""
+    """Measure whole processes, including start-up of Python and torch, reading and writing."""
     bare = [run_python("-c", "import torch") for _ in range(options.runs)]
     bare_peak = max(cost.peak_bytes for cost in bare)
     print("| process | user CPU s | wall s | peak MB | above bare torch / file |")
@@ -66,7 +66,7 @@ def measure_processes(files: list[Path], folder: Path, options: argparse.Namespa
 
 
 def measure_stages(files: list[Path], options: argparse.Namespace) -> None:
-    """CPU seconds of the stages, and the ratio of their sum to the floor, in fresh processes."""
+    """Measure CPU seconds of the stages and their sum over the floor, in fresh processes."""
     print("\n| CPU s per stage | " + " | ".join(file.stem for file in files) + " |")
     print("|---|" + "---|" * len(files))
     columns = []
@@ -79,7 +79,7 @@ def measure_stages(files: list[Path], options: argparse.Namespace) -> None:
 
 
 def measure_cores(files: list[Path], options: argparse.Namespace) -> None:
-    """Wall seconds of the stages of ``Simplifier.run`` on one core and on all, in turn."""
+    """Measure wall seconds of the stages of ``Simplifier.run``, alternating one and all cores."""
     if not hasattr(os, "sched_setaffinity"):
         return
     counts = (1, core_count())
@@ -107,7 +107,7 @@ def run_child(what: str, arguments: list[str]) -> dict[str, float]:
 
 
 def stage_seconds(file: Path, rho: float, preset: str) -> dict[str, float]:
-    """Measure the wall seconds of the stages once, in this process, after a small scene."""
+    """Measure wall seconds of the stages once, in this process, after a small warm-up scene."""
     scene, simplifier = cvtgs.load(file), cvtgs.Simplifier(config=preset, device="cpu")
     simplifier.simplify(scene.select(torch.arange(min(20_000, len(scene)))), rho)
     stages = simplifier.run(scene, rho).report.stages
@@ -116,7 +116,7 @@ def stage_seconds(file: Path, rho: float, preset: str) -> dict[str, float]:
 
 
 def stage_costs(file: Path, rho: float, preset: str) -> dict[str, float]:
-    """Measure the stages and the floor once, in this process; scipy's start is not counted."""
+    """Measure the stages and the floor once, in this process, without the import of scipy."""
     cvtgs.cvt.nearest_scipy(torch.zeros(1, 3), torch.zeros(1, 3))
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "small.ply"
@@ -136,7 +136,7 @@ def stage_costs(file: Path, rho: float, preset: str) -> dict[str, float]:
 
 
 def one_pass(scene: cvtgs.GaussianScene, count: int) -> float:
-    """Search the nearest of ``count`` sites for every Gaussian, by position only."""
+    """Time the search of the nearest of ``count`` sites for every Gaussian, by position only."""
     points = robust_frame(scene.means).contract(scene.means)
     points = points[morton_order(points)]
     sites = points[:: len(points) // count][:count]

@@ -1,7 +1,7 @@
-"""Points and needles against mass pruning: cells that keep a member, and cells that do not.
+"""Compare cells with and without representatives with mass pruning, on points and needles.
 
-``python -m benchmarks.thin_scenes`` prints PSNR and SSIM of images without the compensation of
-Mip-Splatting, by automatic views, for scenes of ``tests/hard_cases.py``.
+``python -m benchmarks.thin_scenes`` prints PSNR and SSIM of images from automatic views, without
+the compensation of Mip-Splatting, for scenes of ``tests/hard_cases.py``.
 """
 
 import argparse

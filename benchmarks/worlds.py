@@ -1,18 +1,18 @@
-"""The world of a trained model: how its training turned, moved and scaled that of the cameras.
+"""Find the transform from the cameras' world space to that of a trained model.
 
-INRIA's code leaves it as it is, nerfstudio writes down what it did, and gsplat's trainer does not:
-by default (``normalize_world_space``) it
+INRIA's code applies none. nerfstudio records its transform. gsplat's trainer does not record it; by
+default (``normalize_world_space``) it
 
-1. turns the mean up axis of all cameras to that of a camera, -y,
-2. moves the focus to the origin, the median by coordinate of the points on the cameras' optical
+1. rotates the mean up axis of all cameras to the camera's up axis, -y,
+2. moves the focus to the origin: the coordinate-wise median of the points on the cameras' optical
    axes that are nearest to it,
 3. scales the median distance of the cameras to 1,
-4. moves the median of the points of COLMAP to the origin and turns their principal axes to x, y, z,
+4. moves the median of the COLMAP points to the origin and rotates their principal axes to x, y, z,
    the largest variance first.
 
-The signs of these axes depend on its version and on the linear algebra of its machine. Of the four
-worlds, and the one that was left as it was, a model is of that in which the points of COLMAP, from
-which it was trained, lie nearest to its Gaussians.
+The signs of these axes depend on gsplat's version and on the linear algebra library. This leaves
+four candidate worlds, besides the untransformed one. The world of a model is the candidate in which
+the COLMAP points, from which the model was trained, are nearest to its Gaussians.
 """
 
 import json
@@ -35,17 +35,17 @@ from cvtgs.cameras import Cameras
 
 TRANSFORM = "dataparser_transforms.json"
 FARTHEST = 0.05
-"""Median distance of points to the nearest Gaussian, in median distances of the points to their
-middle. It is at most 0.016 between two halves of thirteen captures, and 0.02 to 0.5 between two of
-them that were normalized."""
+"""Limit of the median distance of points to the nearest Gaussian, relative to the median distance
+of the points to their centre. It is at most 0.016 between two halves of each of thirteen captures,
+and 0.02 to 0.5 between two different captures that were normalized."""
 FEWEST = 20
-"""Points that are enough to find a world by."""
+"""Smallest number of points from which a world is found."""
 
 Points = Float[np.ndarray, "p 3"]
 
 
 class World(NamedTuple):
-    """Where a point ``x`` of the cameras' world is in that of a model: ``turn @ x + shift``.
+    """The map ``turn @ x + shift`` of points from the cameras' world to that of a model.
 
     Attributes:
         turn: A rotation times a scale.
@@ -56,12 +56,12 @@ class World(NamedTuple):
     shift: Float[Tensor, "3"] = torch.zeros(3, dtype=torch.float64)
 
     def move_points(self, points: Points) -> Points:
-        """Return points of the cameras' world in that of the model."""
+        """Transform points from the cameras' world to the model's."""
         moved: Points = points @ self.turn.numpy().T + self.shift.numpy()
         return moved
 
     def move_cameras(self, cameras: Cameras) -> Cameras:
-        """Return cameras that see in the model's world what they saw in their own."""
+        """Transform cameras from their own world to the model's."""
         viewmats = cameras.viewmats.double().clone()
         rotations = viewmats[:, :3, :3] @ (self.turn / torch.det(self.turn) ** (1 / 3)).T
         centers = cameras.centers.double() @ self.turn.T + self.shift
@@ -71,7 +71,7 @@ class World(NamedTuple):
 
 
 def place_cameras(capture: Capture, scene: cvtgs.GaussianScene, cameras: Cameras) -> Cameras:
-    """Return cameras of a dataset in the world of its model; refuse the model of another scene."""
+    """Transform cameras of a dataset to the world of its model; exit if the scenes differ."""
     means = scene.means[scene.opacities > 0.1].double()
     means = means[torch.isfinite(means).all(dim=1)]
     if not len(means):
@@ -91,7 +91,7 @@ def place_cameras(capture: Capture, scene: cvtgs.GaussianScene, cameras: Cameras
 
 
 def nerfstudio_world(path: Path) -> World:
-    """Read what nerfstudio wrote down beside or above a model; nothing moved if it did not."""
+    """Read nerfstudio's transform beside or above a model; the identity if there is none."""
     places = [parent / TRANSFORM for parent in path.parents[:3]]
     place = next((place for place in places if place.is_file()), None)
     if place is None:
@@ -102,7 +102,7 @@ def nerfstudio_world(path: Path) -> World:
 
 
 def gsplat_worlds(cameras: Cameras, points: Points) -> Iterator[World]:
-    """Yield the four worlds into which gsplat may have normalized all cameras and points."""
+    """Yield the four worlds to which gsplat may have normalized cameras and points."""
     axes = cameras.viewmats[:, :3, :3].double().numpy()  # rows: right, down, forward
     centers = cameras.centers.double().numpy()
     up = -axes[:, 1].mean(axis=0)
@@ -124,7 +124,7 @@ def gsplat_worlds(cameras: Cameras, points: Points) -> Iterator[World]:
 
 
 def read_points(folder: Path) -> Points:
-    """Read the points of a sparse model of COLMAP; none if it has no file of them."""
+    """Read the points of a sparse COLMAP model; return none if there is no points file."""
     for name, read in (("points3D.bin", _binary_points), ("points3D.txt", _text_points)):
         path = folder / name
         if path.is_file():
@@ -138,7 +138,7 @@ def read_points(folder: Path) -> Points:
 
 
 def _binary_points(data: bytes) -> Iterator[Sequence[float]]:
-    """Yield positions; each record has number, position, colour, error, and a track of its own."""
+    """Yield positions; a record has id, position, colour, error and a track of varying length."""
     record, at = struct.Struct("<Q3d3BdQ"), struct.calcsize("<Q")
     for _ in range(struct.unpack_from("<Q", data)[0]):
         found = record.unpack_from(data, at)
@@ -155,7 +155,7 @@ def _text_points(data: bytes) -> Iterator[Sequence[str]]:
 def _nearest_world(
     capture: Capture, worlds: list[World], points: Points, means: Float[Tensor, "n 3"]
 ) -> World:
-    """Return the world in which points lie nearest to Gaussians; refuse if that is not near."""
+    """Return the world in which points are nearest to Gaussians; exit if none is near."""
     points = points[:: max(1, len(points) // 2000)]
     tree = KDTree(means.numpy())
     distances = []
@@ -174,10 +174,10 @@ def _nearest_world(
 
 
 def _check_looks(capture: Capture, means: Float[Tensor, "n 3"], cameras: Cameras) -> None:
-    """Refuse a model that is not where its cameras look.
+    """Exit if a model is not where its cameras look.
 
-    Half of the cameras must have a hundredth of the Gaussians that show in their images. A stricter
-    rule would refuse captures whose cameras stand on one side.
+    At least half of the cameras must have more than 1 % of the Gaussians ``means`` in their image.
+    A stricter rule would reject captures whose cameras are all on one side.
     """
     means = means[:: max(1, len(means) // 4096)]
     local = means @ cameras.viewmats[:, :3, :3].double().mT + cameras.viewmats[:, None, :3, 3]

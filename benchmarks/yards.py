@@ -1,9 +1,9 @@
-"""Yards as trained models of unbounded captures look, to train on and to judge networks by.
+"""Generate yards that resemble trained unbounded captures, to train and evaluate networks.
 
-``python -m benchmarks.yards FOLDER`` writes those that the shipped ``standard`` learned from
-(``yard11`` to ``yard14``) and those that its gate was found with (``yard1`` to ``yard3``), each
-with its cameras. Gaussians are dense in the middle and grow with the distance; a twentieth of them
-is a shell of huge, faint ones, 5 to 30 times as far as anything else, and some float in the air.
+``python -m benchmarks.yards FOLDER`` writes the yards that the shipped ``standard`` was trained on
+(``yard11`` to ``yard14``) and those with which its gate was found (``yard1`` to ``yard3``), each
+with its cameras. Gaussians are dense in the middle and grow with the distance. About 4 % of them
+form a shell of huge, faint Gaussians 40 to 250 units away, and some are floaters.
 """
 
 import argparse
@@ -34,7 +34,7 @@ YARDS = {
     "yard13": (60_000, 13, 2),
     "yard14": (100_000, 14, 1),
 }
-"""Gaussians, seed and SH degree of every yard."""
+"""Number of Gaussians, seed and SH degree of every yard."""
 
 SHARES = {
     "ground": 0.42,
@@ -44,16 +44,16 @@ SHARES = {
     "grass": 0.12,
     "walls": 0.12,
 }
-"""Shares of the Gaussians; the rest is the object in the middle."""
+"""Shares of the Gaussians; the rest form the object in the middle."""
 
 WAVES = ((0.2, 0.25), (0.7, 0.25), (2.5, 0.3), (9.0, 0.4))
-"""Lengths and heights of the waves of a texture."""
+"""Wavelengths and amplitudes of the waves of a texture."""
 
 VIEWS, WIDTH, HEIGHT = 10, 400, 300
 
 
 class Part(NamedTuple):
-    """Some Gaussians, activated."""
+    """Gaussians with activated parameters."""
 
     means: Array
     scales: Array
@@ -110,7 +110,7 @@ def yard(count: int, *, seed: int, degree: int) -> GaussianScene:
 
 
 def cameras() -> dict[str, object]:
-    """Return cameras of somebody who walks around the object, as ``cameras.json`` has them."""
+    """Return cameras of a walk around the object, in the layout of ``cameras.json``."""
     turns, steps = torch.arange(VIEWS) * 2 * math.pi / VIEWS, torch.arange(VIEWS) % 3
     heights, away = torch.tensor([0.5, 0.8, 1.3])[steps], torch.tensor([1.6, 2.2, 2.8])[steps]
     eyes = torch.stack([away * torch.cos(turns), -heights, away * torch.sin(turns)], dim=1).double()
@@ -213,7 +213,7 @@ def _floaters(count: int, rng: np.random.Generator) -> Part:
 
 
 def _texture(points: Array, rng: np.random.Generator) -> Array:
-    """Return a sum of waves in random directions at every point."""
+    """Evaluate a sum of waves in random directions at every point."""
     total = np.zeros(len(points))
     for length, height in WAVES:
         for _ in range(4):
@@ -228,7 +228,7 @@ def _unit(vectors: Array) -> Array:
 
 
 def _turned_to(normals: Array) -> Array:
-    """Return quaternions that turn the third axis to the normals."""
+    """Return quaternions that rotate the third axis to the normals."""
     third = np.broadcast_to(np.array([0, 0, 1.0]), normals.shape)
     return _unit(np.concatenate([1 + normals[:, 2:], np.cross(third, normals)], axis=1))
 

@@ -1,4 +1,4 @@
-"""Score presets on a scene, without photographs, and make a page that shows them side by side.
+"""Score presets on a scene without photographs, and write a page that shows them side by side.
 
 python examples/compare.py scene.ply page --rho 0.01 --presets draft standard high
 """
@@ -11,7 +11,7 @@ from cvtgs.evaluation import EvaluationSettings, compare, write_comparison
 
 
 def main() -> None:
-    """Simplify by every preset, score, write."""
+    """Simplify with every preset, score, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("input", type=Path)
     parser.add_argument("output", type=Path, help="folder for index.html")
@@ -25,7 +25,7 @@ def main() -> None:
         for preset in options.presets
     }
     views = cvtgs.views.automatic_views(scene, 4, width=options.size, height=options.size)
-    # lpips="auto" measures LPIPS, too, where its weights are found.
+    # lpips="auto" also measures LPIPS if its weights are found.
     comparison = compare(scene, small, views, settings=EvaluationSettings(lpips="off"))
     for scores in comparison.evaluation.scenes:
         print(f"{scores.name:<10} {scores.psnr.mean:6.2f} dB, SSIM {scores.ssim.mean:.3f}")

@@ -1,9 +1,9 @@
-"""A merge rule of your own: cells never cross a label, so objects stay apart.
+"""Define your own merge rule: cells never span several labels, so objects stay separate.
 
 python examples/custom_merge.py labelled.ply small.ply --column label --rho 0.05
 
-The stages are functions. Here the space of the tessellation gets one more coordinate, so that
-Gaussians of different labels are far from one another, and each cell is merged by moments.
+The stages are functions. This example adds a coordinate to the space of the tessellation, so that
+Gaussians of different labels are far apart. Each cell is merged by moments.
 """
 
 import argparse
@@ -16,11 +16,11 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.math.frames import morton_order, robust_frame
 
 APART = 1e3
-"""In robust radii: farther than anything in the scene."""
+"""Distance between labels in robust radii, larger than any distance in the scene."""
 
 
 def main() -> None:
-    """Read, simplify label by label in one pass, write."""
+    """Read, simplify all labels in one pass, write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("input", type=Path)
     parser.add_argument("output", type=Path)
@@ -36,7 +36,7 @@ def main() -> None:
 def merge_within(
     scene: cvtgs.GaussianScene, labels: torch.Tensor, rho: float
 ) -> cvtgs.GaussianScene:
-    """Simplify a scene of valid rows; no cell holds two labels that are heavy enough for cells."""
+    """Simplify a scene of valid rows; labels with enough mass for a cell never share one."""
     config, frame = SimplifyConfig.from_preset("standard"), robust_frame(scene.means)
     order = morton_order(frame.contract(scene.means))
     scene, labels = scene.select(order), labels[order]

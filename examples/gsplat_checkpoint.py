@@ -1,8 +1,8 @@
-"""Make a checkpoint of gsplat's trainer smaller, and train on from there.
+"""Simplify a checkpoint of gsplat's trainer for further use with the trainer.
 
 python examples/gsplat_checkpoint.py results/garden/ckpts/ckpt_29999_rank0.pt small.pt --rho 0.1
 
-The output is again a dictionary with "splats", which ``simple_trainer.py --ckpt small.pt`` renders.
+The output is a dictionary with "splats" again, which ``simple_trainer.py --ckpt small.pt`` renders.
 """
 
 import argparse
@@ -22,7 +22,7 @@ def main() -> None:
     options = parser.parse_args()
     scene = cvtgs.load(options.checkpoint)
     small = cvtgs.Simplifier().simplify(scene, options.rho)
-    # In memory, cvtgs.from_dict(model.splats) and cvtgs.to_dict(small) do the same without files.
+    # In memory, use cvtgs.from_dict(model.splats) and cvtgs.to_dict(small) instead of files.
     torch.save({"step": 0, "splats": cvtgs.to_dict(small)}, options.output)
 
 

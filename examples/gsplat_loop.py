@@ -1,8 +1,8 @@
-"""Simplify in the middle of a training loop as gsplat's users write it, and train on.
+"""Simplify in the middle of a training loop written for gsplat, and continue training.
 
 python examples/gsplat_loop.py --steps 50
 
-With CUDA and gsplat the images come from gsplat.rasterization; elsewhere from cvtgs.rendering.
+With CUDA and gsplat, gsplat.rasterization renders the images; otherwise cvtgs.rendering does.
 """
 
 import argparse
@@ -13,7 +13,7 @@ import cvtgs
 
 
 def main() -> None:
-    """Make targets, simplify the model, and go on training it."""
+    """Render targets, simplify the model, and continue training it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=20_000)
     parser.add_argument("--steps", type=int, default=50)
@@ -22,9 +22,9 @@ def main() -> None:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     trained = cvtgs.synthetic.scene("object", options.count, sh_degree=1, seed=0).to(device)
     views = cvtgs.views.automatic_views(trained, 4, width=options.size, height=options.size)
-    targets = image(cvtgs.to_dict(trained), views)  # photographs, in a loop of your own
+    targets = image(cvtgs.to_dict(trained), views)  # in your own loop: photographs
 
-    scene = cvtgs.from_dict(cvtgs.to_dict(trained))  # of a model: cvtgs.from_dict(model.splats)
+    scene = cvtgs.from_dict(cvtgs.to_dict(trained))  # for a model: cvtgs.from_dict(model.splats)
     small = cvtgs.to_dict(cvtgs.Simplifier().simplify(scene, 0.1))
     splats = {name: torch.nn.Parameter(values) for name, values in small.items()}
     rates = {"scales": 5e-3, "opacities": 5e-2, "sh0": 2e-3}
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def image(splats: dict[str, torch.Tensor], views: cvtgs.Cameras) -> torch.Tensor:
-    """Render the parameters of a model, differentiably: by gsplat where it works."""
+    """Render the parameters of a model differentiably, by gsplat where it works."""
     names = {"scales": "log_scales", "opacities": "logit_opacities"}
     scene = cvtgs.GaussianScene(**{names.get(key, key): values for key, values in splats.items()})
     return cvtgs.render(scene, views, backend="auto").rgb

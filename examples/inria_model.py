@@ -1,9 +1,9 @@
-"""Make a model folder of INRIA's code smaller, into a model folder that its viewer opens.
+"""Simplify a model folder of INRIA's code into a model folder that its viewer opens.
 
 python examples/inria_model.py output/garden garden-small --rho 0.1
 
-Both are scored from the training cameras: ``cvtgs evaluate output/garden garden-small`` takes the
-folders as they are.
+``cvtgs evaluate output/garden garden-small`` scores the folders directly, from the training
+cameras.
 """
 
 import argparse

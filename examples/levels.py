@@ -1,4 +1,4 @@
-"""Make the levels of a viewer in one go: little more time than the finest alone.
+"""Make all levels of detail for a viewer in one run, in little more time than the finest alone.
 
 python examples/levels.py scene.ply levels --rho 0.25 0.05 0.01 --suffix .spz
 """
@@ -10,7 +10,7 @@ import cvtgs
 
 
 def main() -> None:
-    """Read, make all levels, write each."""
+    """Read, make all levels, write each level."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("input", type=Path)
     parser.add_argument("output", type=Path, help="folder for level0, level1, ...")
@@ -22,7 +22,7 @@ def main() -> None:
     for number, level in enumerate(levels):
         path = options.output / f"level{number}{options.suffix}"
         cvtgs.save(level.scene, path)
-        # A viewer may switch to a coarser level where this error is below a pixel.
+        # A viewer can switch to a coarser level once this error is below a pixel.
         print(f"{path}: {len(level.scene):,} Gaussians, error {level.geometric_error:.3g} units")
 
 

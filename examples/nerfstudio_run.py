@@ -1,9 +1,9 @@
-"""Make the newest checkpoint of a Splatfacto run smaller, without ``ns-export``.
+"""Simplify the newest checkpoint of a Splatfacto run, without ``ns-export``.
 
 python examples/nerfstudio_run.py outputs/room/splatfacto/2026-01-01_120000 room.spz --rho 0.1
 
-Splatfacto moves and scales its scenes, so cameras of the ``transforms.json`` do not fit them; look
-from automatic views, as ``cvtgs compare`` does without ``--cameras``.
+Splatfacto moves and scales its scenes, so the cameras of ``transforms.json`` do not fit them. Use
+automatic views, as ``cvtgs compare`` does without ``--cameras``.
 """
 
 import argparse

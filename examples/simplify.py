@@ -1,4 +1,4 @@
-"""Make a scene smaller, and print what was done.
+"""Simplify a scene and print a report.
 
 python examples/simplify.py scene.ply small.ply --rho 0.01
 """
@@ -17,7 +17,7 @@ def main() -> None:
     parser.add_argument("--rho", type=float, default=0.01)
     parser.add_argument("--preset", default="standard", choices=list(cvtgs.PRESETS))
     options = parser.parse_args()
-    cvtgs.io.check_save(options.output)  # before the work
+    cvtgs.io.check_save(options.output)  # fail early
     simplifier = cvtgs.Simplifier(config=options.preset, listener=tell)
     small, report = simplifier.run(cvtgs.load(options.input), options.rho)
     cvtgs.save(small, options.output)
@@ -28,7 +28,7 @@ def main() -> None:
 
 
 def tell(event: cvtgs.ProgressEvent) -> None:
-    """Show progress; a listener that raises stops the work."""
+    """Show progress; a listener can stop the run by raising an exception."""
     if event.done == event.total:
         print(f"{event.stage} is done")
 

@@ -1,4 +1,4 @@
-"""Measure seconds against PSNR on a scene of yours, preset by preset.
+"""Measure seconds and PSNR of each preset on your own scene.
 
 python examples/tradeoff.py scene.ply page --rho 0.01 --presets draft standard high
 """
@@ -13,7 +13,7 @@ from cvtgs.views import automatic_views
 
 
 def main() -> None:
-    """Measure, print, and write a table, a plot and a page."""
+    """Measure, print results, and write a table, a plot and a page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("input", type=Path)
     parser.add_argument("output", type=Path)

@@ -1,8 +1,8 @@
-"""Train a MergeNet on generated scenes, and use it: a complete run of seconds, to start from.
+"""Train a MergeNet on generated scenes and use it: a complete run in seconds, as a starting point.
 
 python examples/train_tiny.py tiny.safetensors --steps 20
 
-So short a training learns nothing of use; recipes/standard.toml is what the shipped one learned by.
+Such a short training learns nothing useful; the shipped network began with recipes/standard.toml.
 """
 
 import argparse
@@ -13,7 +13,7 @@ from cvtgs.train import DataConfig, History, TrainConfig, TrainFiles, ViewsConfi
 
 
 def main() -> None:
-    """Train, then simplify with what was learned."""
+    """Train, then simplify with the trained network."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--steps", type=int, default=20)
@@ -37,7 +37,7 @@ def main() -> None:
 
 
 def show(history: History) -> None:
-    """Print the mean gain over scenes that are not learned from."""
+    """Print the mean gain over scenes that are not trained on."""
     last = history.validations[-1]
     print(f"step {last.step}: {last.mean_gain:+.3f} dB")
 

@@ -1,7 +1,7 @@
-"""Other methods as readable reference implementations, written from their papers' formulas.
+"""Readable reference implementations of other methods, written from the formulas in their papers.
 
-Nothing is copied from anybody's code. ``python -m benchmarks.baselines METHOD IN OUT --count M``
-runs one of them on a file. As in the comparisons of CVT-GS, nothing is fine-tuned afterwards.
+No code is copied. ``python -m benchmarks.baselines METHOD IN OUT --count M`` runs one method on a
+file. As in the comparisons of CVT-GS, results are not fine-tuned.
 """
 
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from cvtgs.scene import GaussianScene
 
 
 class Simplify(Protocol):
-    """What every baseline is."""
+    """The signature of every baseline."""
 
     def __call__(self, scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScene:
         """Return exactly ``count`` valid standard Gaussians."""
@@ -27,11 +27,11 @@ BASELINES: Mapping[str, str] = {
     "GHAP": "ghap.simplify",
     "NanoGS": "nano_gs.simplify",
 }
-"""Names, and where the functions are; they are imported when they are asked for."""
+"""Names and functions of the baselines, which are imported on demand."""
 
 
 def baseline(name: str) -> Simplify:
-    """Return a baseline by its name."""
+    """Import a baseline by name."""
     module, _, function = BASELINES[name].partition(".")
     found: Simplify = getattr(import_module(f"benchmarks.baselines.{module}"), function)
     return found

@@ -24,5 +24,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line of cvtgs does
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as in the command line of cvtgs
     main()

@@ -1,4 +1,4 @@
-"""Rows of a scene that baselines use and keep, and its Gaussians as densities."""
+"""Selection of the rows that baselines use and keep, covariances, and new Gaussians."""
 
 from dataclasses import replace
 
@@ -13,13 +13,13 @@ from cvtgs.validity import invalid_rows, standardized
 
 
 def usable(scene: GaussianScene, count: int) -> GaussianScene:
-    """Return the valid rows as standard Gaussians, of which ``count`` can be kept.
+    """Return the valid rows as standard Gaussians, at least ``count``.
 
-    Invalid rows, extra columns and the layout of the file are left out; opacities are brought
-    inside (0, 1) and quaternions to unit length. The comments stay, and the mip tag with them.
+    Invalid rows, extra columns and the layout of the file are dropped; opacities are clamped to
+    the inside of (0, 1) and quaternions normalized. Comments stay, including the mip tag.
 
     Raises:
-        InvalidArgumentError: ``count`` is below 1 or there are fewer valid rows.
+        InvalidArgumentError: ``count`` is below 1 or exceeds the number of valid rows.
     """
     valid = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
     for mask in invalid_rows(scene).values():
@@ -32,7 +32,7 @@ def usable(scene: GaussianScene, count: int) -> GaussianScene:
 
 
 def keep_largest(scene: GaussianScene, scores: Float[Tensor, "n"], *, count: int) -> GaussianScene:
-    """Keep the rows with the largest scores, in their order; of equal ones the first."""
+    """Keep the rows with the largest scores, in their order; of equal scores the first."""
     best = torch.sort(scores, descending=True, stable=True).indices[:count]
     return scene.select(best.sort().values)
 
@@ -40,7 +40,7 @@ def keep_largest(scene: GaussianScene, scores: Float[Tensor, "n"], *, count: int
 def covariances_of(scene: GaussianScene) -> Float[Tensor, "n 3 3"]:
     """Build covariances with positive eigenvalues: flat Gaussians get 1e-6 of their extent.
 
-    Without that no Kullback-Leibler divergence from a flat Gaussian would be finite. For the same
+    Otherwise Kullback-Leibler divergences from flat Gaussians would be infinite. For the same
     reason no scale is below 1e-30.
     """
     scales = torch.exp(scene.log_scales.double()).clamp_min(1e-30)
@@ -54,7 +54,7 @@ def from_moments(
     shapes: Float[Tensor, "m 3 3"],
     appearance: dict[str, Tensor],
 ) -> GaussianScene:
-    """Make Gaussians of moments and appearance, with the dtype and the comments of the scene."""
+    """Make Gaussians from moments and appearance, with dtype and comments of the scene."""
     scales, quats = parameters.decompose_covariances(shapes)
     tensors = {"means": means, "quats": quats, "log_scales": parameters.positive_log(scales)}
     return scene.with_tensors(

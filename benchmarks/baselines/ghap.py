@@ -8,15 +8,15 @@ composite transport divergence, by majorisation and minimisation (Zhang et al. 2
     minimise  mean_c and cov_c match the moments of the members, weighted by opacity
 
 which is k-means on means and covariances: moments minimise the weighted sum of those divergences.
-Colour and opacity are copied from the original whose mean is nearest.
+Colour and opacity are copied from the original Gaussian with the nearest mean.
 
-Where ours differs:
+Differences from the paper:
 
-- The fine-tuning of the appearance by training images, the paper's second stage, is left out.
-- Each block gets its share of M by its number of Gaussians and largest remainders, so that the
-  count is exact; the tree is less deep if there are too few Gaussians for 1024 blocks.
-- Centres start at members drawn at random, uniformly; a centre that loses its members restarts at
-  the member that is served worst. Ten iterations at most.
+- The paper's second stage, fine-tuning of the appearance on training images, is left out.
+- Each block gets its share of M in proportion to its number of Gaussians, by largest remainders, so
+  that the count is exact; the tree is shallower if there are too few Gaussians for 1024 blocks.
+- Centres start at members drawn uniformly at random; a centre that loses its members restarts at
+  the member with the largest divergence. There are at most ten iterations.
 """
 
 import torch
@@ -29,13 +29,13 @@ from cvtgs.scene import GaussianScene
 
 BLOCKS = 1024
 MEMBERS = 64
-"""A block holds this many Gaussians at least."""
+"""Smallest number of Gaussians in a block."""
 
 ITERATIONS = 10
 
 
 def simplify(scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScene:
-    """Reduce the mixture to ``count`` Gaussians; the seed draws the first centres."""
+    """Reduce the mixture to ``count`` Gaussians; the seed determines the initial centres."""
     valid = usable(scene, count)
     means, shapes = valid.means.double(), covariances_of(valid)
     generator = torch.Generator().manual_seed(seed)
@@ -55,7 +55,7 @@ def simplify(scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScen
 
 
 def kd_blocks(means: Float[Tensor, "n 3"], most: int) -> list[Int[Tensor, "b"]]:
-    """Halve along the widest axis at the median, as often as ``most`` blocks allow."""
+    """Halve blocks at the median of their widest axis while at most ``most`` blocks result."""
     blocks = [torch.arange(len(means))]
     while 2 * len(blocks) <= most:
         blocks = [half for block in blocks for half in halves(means, block)]
@@ -121,7 +121,7 @@ def divergences(
 
 
 def filled(labels: Int[Tensor, "n"], costs: Float[Tensor, "n m"], count: int) -> Int[Tensor, "n"]:
-    """Return every empty cluster the worst served member of those that have company."""
+    """Give every empty cluster the costliest member of a cluster with more than one."""
     labels = labels.clone()
     sizes = labels.bincount(minlength=count)
     for empty in (sizes == 0).nonzero()[:, 0].tolist():
@@ -141,7 +141,7 @@ def moments(
     labels: Int[Tensor, "n"],
     count: int,
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3 3"]]:
-    """Match mean and covariance of every cluster's mixture."""
+    """Compute mean and covariance of every cluster's mixture."""
     totals = torch.zeros(count, dtype=weights.dtype).index_add_(0, labels, weights)
     shares = weights / totals[labels]
     centers = torch.zeros(count, 3, dtype=means.dtype)

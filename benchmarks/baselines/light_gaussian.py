@@ -1,21 +1,20 @@
 """LightGaussian's pruning (Fan, Wang, Wen, Zhu, Xu, Wang: arXiv 2311.17245, NeurIPS 2024).
 
-The global significance of a Gaussian (the paper's equation of GS_j; its number was not at hand) is
+The global significance of a Gaussian (the paper's equation of GS_j, number not known to us) is
 
     GS_j = sum over the pixels of all views that it hits of  opacity_j * T * gamma(V_j)
 
 with T the transmittance in front of it, V_j its volume, and ``gamma(V) = V_norm ^ beta``, where
 ``V_norm = min(max(V / V_max90, 0), 1)`` and beta = 0.1. The M most significant ones are kept.
 
-Where ours differs:
+Differences from the paper:
 
-- A hit counts with the alpha that is blended there, ``opacity * G(pixel)``, instead of the bare
-  opacity: what is summed is the contribution to the image, and no threshold decides what a hit
-  is.
+- A hit is weighted by the blended alpha, ``opacity * G(pixel)``, instead of the opacity. The sum is
+  then the contribution to the image, and no threshold is needed to define a hit.
 - V_max90, "the 90 % largest of all sorted Gaussians", is read as the 90 % quantile: only the
-  largest tenth is clipped, which is what the clipping is there for (excessive floaters).
-- The training views are not there in this protocol: automatic views stand for them, other ones
-  than those that judge.
+  largest tenth is clipped, in line with the purpose of the clipping (excessive floaters).
+- This protocol has no training views. Automatic views replace them, which differ from those used
+  for scoring.
 - The recovery training, distillation and quantisation that follow in the paper are left out.
 """
 
@@ -35,7 +34,7 @@ QUANTILE = 0.9
 
 
 def simplify(scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScene:
-    """Keep the ``count`` Gaussians of most global significance; the seed turns the views."""
+    """Keep the ``count`` Gaussians of largest global significance; the seed rotates the views."""
     valid = usable(scene, count)
     cameras = automatic_views(valid, VIEWS, width=SIZE, height=SIZE, seed=seed + 1)
     significance = contributions(valid, cameras) * volume_factor(valid.log_scales)
@@ -43,9 +42,9 @@ def simplify(scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScen
 
 
 def volume_factor(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Return ``gamma``: the volume over the 90 % quantile of all, at most 1, to the power 0.1.
+    """Return ``gamma``: volume over the 90 % quantile of all, at most 1, to the power 0.1.
 
-    In logarithms, so that no volume under- or overflows. ``4 pi / 3`` cancels.
+    Computed in logarithms, so that no volume under- or overflows. ``4 pi / 3`` cancels.
     """
     log_volumes = log_scales.double().sum(dim=1)
     ranked = log_volumes.sort().values

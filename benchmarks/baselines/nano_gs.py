@@ -1,9 +1,9 @@
 """NanoGS (Xiong, Liu, Zhou, Chen, Fan, Feng: arXiv 2603.16103, 2026): greedy merging of pairs.
 
 Gaussians with opacities below 0.1 are dropped. Then each pass builds the graph of the 16 nearest
-neighbours, gives every edge a cost, takes disjoint edges greedily, cheapest first, and replaces
-each pair by one Gaussian. That halves the scene at most; passes repeat until M are left, and the
-last one takes only as many pairs as are needed.
+neighbours, computes a cost for every edge, takes disjoint edges greedily, cheapest first, and
+replaces each pair by one Gaussian. A pass at most halves the scene; passes repeat until M are left,
+and the last pass merges only as many pairs as needed.
 
 - Merge by "mass-preserved moment matching": weights are opacity times volume; mean, covariance and
   SH coefficients are weighted means (the covariance with the spread of the means); the opacity is
@@ -11,17 +11,17 @@ last one takes only as many pairs as are needed.
 - Cost: the Kullback-Leibler divergence from the pair's mixture to its merge, plus the squared
   difference of the SH coefficients.
 
-Where ours differs, since the paper's equations and code were not at hand (the code's licence
-forbids copies; what it does is known from a description):
+Differences, since we had neither the paper's equations nor its code (whose licence forbids
+copying; its behaviour is known from a description):
 
-- The divergence of a mixture has no closed form. We take the upper bound of Runnalls (2007):
+- The divergence of a mixture has no closed form. We use the upper bound of Runnalls (2007):
   ``log det S_merged / 2 - sum of w_i log det S_i / 2`` with weights that sum to 1, which needs no
-  samples and draws nothing.
-- The squared difference of SH counts with factor 1.
-- That the original drops faint Gaussians is inferred: it loses haze, and without the filter ours
-  is far behind. On the scene guitar at rho 0.1 / 0.01 / 0.001 the original measured 26.9 / 22.1 /
-  20.2 dB, ours 26.6 / 21.9 / 18.7 with the filter and 24.1 / 21.3 / 18.3 without. Where fewer than
-  M would stay, the heaviest of the faint ones stay too.
+  samples or random numbers.
+- The squared difference of SH coefficients has the factor 1.
+- We infer that the original drops faint Gaussians: it loses haze, and without the filter ours is
+  far behind. On the scene guitar at rho 0.1 / 0.01 / 0.001 the original measured 26.9 / 22.1 /
+  20.2 dB, ours 26.6 / 21.9 / 18.7 with the filter and 24.1 / 21.3 / 18.3 without. If fewer than M
+  would remain, the heaviest of the faint Gaussians stay too.
 """
 
 import torch
@@ -51,7 +51,7 @@ def simplify(scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScen
 
 
 def visible(scene: GaussianScene, at_least: int) -> GaussianScene:
-    """Drop faint Gaussians, as far as enough stay."""
+    """Drop faint Gaussians, but keep at least ``at_least`` Gaussians."""
     return scene.select(
         visible_rows(
             scene.opacities,
@@ -64,7 +64,7 @@ def visible(scene: GaussianScene, at_least: int) -> GaussianScene:
 
 
 def neighbor_edges(means: Float[Tensor, "n 3"]) -> Int[Tensor, "e 2"]:
-    """Return the edges to the nearest neighbours, each once, the smaller row first."""
+    """Return the edges to the nearest neighbours, each once with the smaller row first."""
     places = means.double().numpy()
     near = min(NEIGHBORS + 1, len(places))
     found = torch.from_numpy(KDTree(places).query(places, k=near)[1])
@@ -75,7 +75,7 @@ def neighbor_edges(means: Float[Tensor, "n 3"]) -> Int[Tensor, "e 2"]:
 
 
 def edge_costs(scene: GaussianScene, edges: Int[Tensor, "e 2"]) -> Float[Tensor, "e"]:
-    """Return what merging the two ends of each edge costs. About 1 kB per edge of a chunk."""
+    """Return the cost of merging the two ends of each edge. Memory: 1 kB per edge of a chunk."""
     shapes, log_weights = covariances_of(scene), log_masses(scene)
     log_dets = torch.logdet(shapes)
     costs = []
@@ -96,7 +96,7 @@ def log_masses(scene: GaussianScene) -> Float[Tensor, "n"]:
 def merged_moments(
     means: Float[Tensor, "e 2 3"], shapes: Float[Tensor, "e 2 3 3"], shares: Float[Tensor, "e 2"]
 ) -> tuple[Float[Tensor, "e 3"], Float[Tensor, "e 3 3"]]:
-    """Match mean and covariance of pairs; shares of a pair sum to 1."""
+    """Compute mean and covariance of pairs; the shares of a pair sum to 1."""
     gap = means[:, 1] - means[:, 0]
     center = means[:, 0] + shares[:, 1:] * gap
     inner = (shares[:, :, None, None] * shapes).sum(dim=1)
@@ -107,10 +107,10 @@ def merged_moments(
 def disjoint_edges(
     edges: Int[Tensor, "e 2"], costs: Float[Tensor, "e"], *, nodes: int
 ) -> Int[Tensor, "m 2"]:
-    """Take edges greedily, cheapest first, so that none share an end; cheapest come first.
+    """Take edges without common ends greedily, cheapest first; return them sorted by cost.
 
-    Edges that are the cheapest at both of their ends are taken together, and what touches them
-    goes (locally dominant edges, Preis 1999), which takes what the sequential greedy search takes.
+    Edges that are the cheapest at both ends are taken together, and edges that touch them are
+    removed (locally dominant edges, Preis 1999). The result is that of sequential greedy search.
     """
     ranked = edges[torch.sort(costs, stable=True).indices]
     left = torch.arange(len(ranked))
@@ -128,7 +128,7 @@ def disjoint_edges(
 
 
 def merge_pairs(scene: GaussianScene, pairs: Int[Tensor, "m 2"]) -> GaussianScene:
-    """Replace each pair by one Gaussian; the others stay as they are, and come first."""
+    """Replace each pair by one Gaussian; the others stay unchanged and come first."""
     shares = log_masses(scene)[pairs].softmax(dim=1)
     means, shapes = merged_moments(
         scene.means.double()[pairs], covariances_of(scene)[pairs], shares

@@ -1,8 +1,8 @@
-"""Pruning without images: keep the M Gaussians of most opacity, or of most mass.
+"""Pruning without images: keep the M Gaussians of largest opacity, or of largest mass.
 
-The simplest baselines of every paper; no source is needed. Mass is opacity times mean projected
-area of the one-sigma ellipsoid (Cauchy 1832: a quarter of its surface), which is what a Gaussian
-paints, averaged over all directions, if nothing hides it.
+These are the simplest baselines of every paper and need no source. Mass is opacity times the mean
+projected area of the one-sigma ellipsoid (Cauchy 1832: a quarter of its surface): the area that an
+unoccluded Gaussian paints, averaged over all directions.
 """
 
 from benchmarks.baselines.gaussians import keep_largest, usable
@@ -16,6 +16,6 @@ def keep_most_opaque(scene: GaussianScene, count: int, *, seed: int = 0) -> Gaus
 
 
 def keep_most_mass(scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScene:
-    """Keep the ``count`` Gaussians of most mass; nothing is random."""
+    """Keep the ``count`` Gaussians of largest mass; nothing is random."""
     valid = usable(scene, count)
     return keep_largest(valid, valid.masses, count=count)

@@ -1,25 +1,25 @@
 """PUP 3D-GS (Hanson, Tu, Singla, Jayawardhana, Zwicker, Goldstein: arXiv 2406.10219, CVPR 2025).
 
 The sensitivity of the reconstruction error to a Gaussian is the log determinant of its block of
-the Fisher approximation of the Hessian, on mean and scale only (the paper's numbers of equations
-were not at hand):
+the Fisher approximation of the Hessian, for mean and scale only (we do not know the paper's
+equation numbers):
 
     U_i = log det( sum over pixels and channels of  g g^T ),   g = d color / d (mean_i, scale_i)
 
 a 6 x 6 matrix. The M most sensitive Gaussians are kept.
 
-Where ours differs:
+Differences from the paper:
 
-- The paper's kernel has g for every pixel. Ours estimates the sum without a kernel: with
+- The paper's kernel computes g for every pixel. Ours estimates the sum without a kernel: with
   independent random signs e per pixel and channel, ``h = sum e g`` is the gradient of one number,
   and ``E[h h^T] = sum g g^T``, since ``E[e e'] = 0`` for different pixels. Every probe is one
   backward pass; the matrix is the mean over the probes of a view, summed over views. This is
-  unbiased. The log determinant of a noisy matrix is too small, by much the same amount for all
-  that many probes see, so the ranking is noisy rather than skewed. A Gaussian needs six probes
-  that see it, or its matrix is singular and it is dropped first.
+  unbiased. The log determinant of a noisy matrix is too small, by about the same amount for all
+  Gaussians seen by many probes, so the ranking is noisy rather than biased. A Gaussian must be seen
+  by six probes; otherwise its matrix is singular and it is dropped first.
 - Scales are the standard deviations, not their logarithms.
-- The training views are not there in this protocol: automatic views stand for them, other ones
-  than those that judge. The paper's prune-refine rounds are left out.
+- This protocol has no training views. Automatic views replace them, which differ from those used
+  for scoring. The paper's prune-refine rounds are left out.
 """
 
 import torch
@@ -38,7 +38,7 @@ PROBES = 4
 
 
 def simplify(scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScene:
-    """Keep the ``count`` most sensitive Gaussians; the seed draws signs and turns the views."""
+    """Keep the ``count`` most sensitive Gaussians; the seed draws signs and rotates the views."""
     valid = usable(scene, count)
     cameras = automatic_views(valid, VIEWS, width=SIZE, height=SIZE, seed=seed + 1)
     generator = torch.Generator().manual_seed(seed)
@@ -67,8 +67,8 @@ def projected_fisher(
         camera: One camera.
         probes: Numbers per pixel and channel. Random signs make the result an unbiased estimate
             of the sum of ``g g^T`` over pixels and channels; so does any random matrix whose rows
-            have unit covariance. One-hot probes times the root of their number give it exactly.
-        backend: What renders.
+            have unit covariance. One-hot probes times the root of their number make it exact.
+        backend: The rendering backend.
 
     Returns:
         One symmetric matrix per Gaussian, float64: mean first, then scale.
@@ -90,7 +90,7 @@ def projected_fisher(
 def sensitivity(fisher: Float[Tensor, "n 6 6"]) -> Float[Tensor, "n"]:
     """Return ``log det``; minus infinity where the matrix is singular.
 
-    Each matrix is scaled to a unit diagonal first, so that units do not matter for the arithmetic.
+    Each matrix is first scaled to a unit diagonal, so that units do not affect the arithmetic.
     """
     size = fisher.diagonal(dim1=1, dim2=2)
     dead = (size <= 0).any(dim=1) | ~size.isfinite().all(dim=1)

@@ -1,4 +1,4 @@
-"""``python -m cvtgs`` and the command ``cvtgs``."""
+"""The entry point of ``python -m cvtgs`` and of the command ``cvtgs``."""
 
 import os
 import signal
@@ -7,7 +7,7 @@ from typing import NoReturn
 
 
 def run() -> NoReturn:
-    """Run the command line; an interrupt while its code is loaded is no traceback either."""
+    """Run the command line; an interrupt during its import prints no traceback either."""
     signal.signal(signal.SIGINT, _leave)
     from cvtgs.cli.main import run_process  # noqa: PLC0415 (takes time to load)
 

@@ -1,4 +1,4 @@
-"""Boxes: regions of a scene, by the centres of Gaussians."""
+"""Axis-aligned boxes, and masks of the Gaussians whose centres lie in them."""
 
 import json
 import os
@@ -17,7 +17,7 @@ Corner = tuple[float, float, float]
 
 
 class Box(pydantic.BaseModel):
-    """A box along the axes; its faces belong to it.
+    """An axis-aligned box, faces included.
 
     Attributes:
         min: Least coordinates, scene units.
@@ -41,7 +41,7 @@ class Box(pydantic.BaseModel):
 
 
 def checked_box(low: Sequence[float], high: Sequence[float], name: str) -> Box:
-    """Build a box of numbers that a user gave under a name."""
+    """Build a box from numbers that the user gave; errors mention the name of the option."""
     try:
         return Box.model_validate({"min": tuple(low), "max": tuple(high)})
     except pydantic.ValidationError as error:
@@ -62,8 +62,8 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
 
     Raises:
         InputNotFoundError: There is no such file.
-        InputError: It cannot be read.
-        InvalidArgumentError: It holds something else.
+        InputError: The file cannot be read.
+        InvalidArgumentError: The file holds something else.
 
     Example:
         >>> import tempfile
@@ -80,7 +80,7 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
-    except (ValueError, RecursionError) as error:  # also lists in lists without end
+    except (ValueError, RecursionError) as error:  # RecursionError: lists nested too deeply
         raise InvalidArgumentError(f"{path}: must be JSON, found none: {error}.") from None
     listed = values if isinstance(values, list) else [values]
     try:
@@ -99,14 +99,14 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
 
 
 def inside(boxes: Sequence[Box], means: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Return which centres lie in a box.
+    """Return a mask of the centres that lie in any of some boxes.
 
     Args:
         boxes: The boxes.
         means: Positions, scene units.
 
     Returns:
-        A mask.
+        The mask.
 
     Example:
         >>> box = Box(min=(0, 0, 0), max=(1, 1, 1))
@@ -121,14 +121,14 @@ def inside(boxes: Sequence[Box], means: Float[Tensor, "n 3"]) -> Bool[Tensor, "n
 
 
 def check_mask(keep: Tensor, count: int) -> None:
-    """Refuse what is not a mask of so many Gaussians.
+    """Check that a value is a mask of the Gaussians of a scene.
 
     Args:
         keep: The mask.
         count: Number of Gaussians of the scene.
 
     Raises:
-        InvalidArgumentError: It has another shape or dtype.
+        InvalidArgumentError: It is no tensor, or has another shape or dtype.
     """
     if not isinstance(keep, Tensor) or keep.dtype != torch.bool or keep.shape != (count,):
         shape = f"{keep.dtype} {tuple(keep.shape)}" if isinstance(keep, Tensor) else repr(keep)
@@ -138,7 +138,7 @@ def check_mask(keep: Tensor, count: int) -> None:
 
 
 def check_room(kept: int, *, target: int, total: int) -> None:
-    """Check that protected Gaussians leave something of the target for the rest."""
+    """Check that the target leaves at least one Gaussian for the unprotected ones, if any."""
     needed = kept + (1 if kept < total else 0)
     if kept and min(target, total) < needed:
         raise InvalidArgumentError(

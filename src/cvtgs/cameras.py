@@ -1,4 +1,4 @@
-"""Pinhole cameras, and view matrices of cameras that look at points."""
+"""Pinhole cameras, and view matrices from camera positions and targets."""
 
 from dataclasses import dataclass, replace
 from typing import Self
@@ -17,11 +17,11 @@ class Cameras:
     Attributes:
         viewmats: ``(c, 4, 4)`` from world to camera; OpenCV axes: x right, y down, z forward.
         Ks: ``(c, 3, 3)`` intrinsics in pixels; pixel centres are at half-integers.
-        width: Pixels per row.
-        height: Rows.
+        width: Image width, pixels.
+        height: Image height, pixels.
         names: Name of each camera, such as its photograph's file name; empty if they have none.
-        stride: Above 1, the images are every ``stride``-th pixel of finer ones, in both directions;
-            ``Ks``, width and height are those of the coarser grid (:meth:`every`).
+        stride: If above 1, the images hold every ``stride``-th pixel of finer ones, in both
+            directions; ``Ks``, width and height are those of the coarser grid (:meth:`every`).
 
     Raises:
         InvalidArgumentError: Shapes, dtypes, devices or sizes do not fit together.
@@ -74,7 +74,7 @@ class Cameras:
 
     @property
     def view_names(self) -> tuple[str, ...]:
-        """Names of the views: ``view 1`` and so on if they have none."""
+        """Names of the views; ``view 1`` and so on if the cameras have none."""
         return self.names or tuple(f"view {number}" for number in range(1, len(self) + 1))
 
     @property
@@ -87,16 +87,16 @@ class Cameras:
         """Return some of the cameras.
 
         Args:
-            rows: Their numbers.
+            rows: Indices of the cameras.
 
         Returns:
-            Those cameras.
+            The selected cameras.
         """
         names = tuple(self.names[row] for row in rows.tolist()) if self.names else ()
         return replace(self, viewmats=self.viewmats[rows], Ks=self.Ks[rows], names=names)
 
     def singles(self) -> list[Self]:
-        """Return each camera by itself.
+        """Split into single cameras.
 
         Returns:
             One :class:`Cameras` per camera, in order.
@@ -107,19 +107,19 @@ class Cameras:
         """Move the cameras to a device.
 
         Args:
-            device: Where to.
+            device: The target device.
 
         Returns:
-            The cameras there.
+            The cameras on that device.
         """
         return replace(self, viewmats=self.viewmats.to(device), Ks=self.Ks.to(device))
 
     def resized(self, width: int, height: int) -> Self:
-        """Return cameras that see the same in images of another size.
+        """Return cameras with the same field of view and another image size.
 
         Args:
-            width: Pixels per row.
-            height: Rows.
+            width: Image width, pixels.
+            height: Image height, pixels.
 
         Returns:
             Cameras with scaled intrinsics.
@@ -128,11 +128,11 @@ class Cameras:
         return replace(self, Ks=self.Ks * factors[:, None], width=width, height=height)
 
     def fitted(self, side: int, *, least: int = 1) -> Self:
-        """Return cameras that see the same in images of a certain longer side.
+        """Return cameras with the same field of view and a given longer image side.
 
         Args:
-            side: Pixels of the longer side.
-            least: Pixels that no side falls below.
+            side: Longer side of the images, pixels.
+            least: Smallest length of either side, pixels.
 
         Returns:
             Cameras with scaled intrinsics.
@@ -145,11 +145,11 @@ class Cameras:
     def every(self, stride: int, *, first: tuple[int, int] = (0, 0)) -> Self:
         """Return cameras that see only every ``stride``-th pixel, as sharp as in the whole image.
 
-        What they render is ``image[:, row::stride, column::stride]``: splats are as wide as in the
-        whole image, while smaller images (:meth:`resized`) swell them.
+        They render ``image[:, row::stride, column::stride]``: splats keep the width that they have
+        in the whole image, while smaller images (:meth:`resized`) make them wider.
 
         Args:
-            stride: Pixels from one to the next, along rows and columns.
+            stride: Step between pixels, along rows and columns.
             first: Column and row of the first pixel, each below the stride.
 
         Returns:
@@ -163,13 +163,13 @@ class Cameras:
         )
 
     def interleaved(self, stride: int) -> Self:
-        """Return cameras that see only every ``stride``-th pixel, each from another first one on.
+        """Return cameras that see only every ``stride``-th pixel, with offsets that differ.
 
         Args:
-            stride: Pixels from one to the next, along rows and columns; 1 leaves all as it is.
+            stride: Step between pixels, along rows and columns; 1 changes nothing.
 
         Returns:
-            Cameras of smaller images, of one size: see :meth:`every`.
+            Cameras of smaller images, all of one size; see :meth:`every`.
         """
         if stride == 1:
             return self
@@ -181,20 +181,20 @@ class Cameras:
     def _strided(
         self, stride: int, firsts: Float[Tensor, "c_or_1 2"], *, width: int, height: int
     ) -> Self:
-        """Return cameras of every ``stride``-th pixel from the columns and rows of the first on."""
+        """Return cameras of every ``stride``-th pixel, given the column and row of the first."""
         Ks = self.Ks.clone()  # noqa: N806 (the name that gsplat gives it)
         Ks[:, :2] /= stride
         Ks[:, :2, 2] += 0.5 - (firsts + 0.5) / stride
         return replace(self, Ks=Ks, width=width, height=height, stride=self.stride * stride)
 
     def shows_any(self, points: Float[Tensor, "n 3"]) -> bool:
-        """Return whether any point lies within any of the images.
+        """Check whether any point lies within any of the images.
 
         Args:
             points: ``(n, 3)`` positions in the units of the cameras.
 
         Returns:
-            Whether one is in front of a camera and within its frame.
+            Whether a point is in front of a camera and within its image.
         """
         for view, intrinsics in zip(self.viewmats.to(points), self.Ks.to(points), strict=True):
             x, y, depth = intrinsics @ (view[:3, :3] @ points.T + view[:3, 3:])
@@ -204,19 +204,19 @@ class Cameras:
         return False
 
     def spread(self, count: int) -> Self:
-        """Return cameras spread evenly over their order.
+        """Return some of the cameras, evenly spaced in their order.
 
         Args:
-            count: How many, at least 1; all if there are no more.
+            count: Number of cameras, at least 1; all are returned if there are no more.
 
         Returns:
-            Those cameras.
+            The selected cameras.
         """
         return self.select(torch.tensor(spread_rows(len(self), count)))
 
 
 def spread_rows(length: int, count: int) -> tuple[int, ...]:
-    """Return row numbers spread evenly over a length, all if ``count`` is no less."""
+    """Return ``count`` evenly spaced row numbers below a length, or all if it is shorter."""
     count = min(count, length)
     return tuple((k * length) // count for k in range(count))
 
@@ -228,12 +228,12 @@ def look_at(
 
     Args:
         eyes: Positions of the cameras.
-        targets: What each camera has in the middle of its image; not its own position.
+        targets: Point in the middle of each image; must differ from the position of the camera.
         up: Direction that is up in the images; need not be of unit length.
 
     Returns:
-        World-to-camera matrices with OpenCV axes. A camera that looks along ``up`` gets some
-        upright direction at right angles to it.
+        World-to-camera matrices with OpenCV axes. For a camera that looks along ``up``, another
+        direction is taken as up.
 
     Example:
         >>> up = torch.tensor([0.0, -1.0, 0.0])

@@ -1,4 +1,4 @@
-"""StageClock: what each stage of a call costs in time and memory."""
+"""StageClock, which measures the time and memory of each stage of a call."""
 
 import sys
 import time
@@ -12,16 +12,16 @@ from cvtgs.progress import ProgressEvent, ProgressListener, silent
 
 
 class StageCost(pydantic.BaseModel):
-    """What one stage cost.
+    """The cost of one stage.
 
     Attributes:
         stage: Name of the stage.
         seconds: Wall-clock seconds.
-        cpu_seconds: Processor seconds of the whole process.
-        peak_memory_bytes: Largest resident size of the process up to the end of the stage, or 0
-            where the system does not tell; it never falls from stage to stage.
-        peak_device_memory_bytes: Largest size of tensors on a CUDA device during the stage, those
-            of the process before it included; 0 elsewhere.
+        cpu_seconds: CPU seconds of the whole process.
+        peak_memory_bytes: Peak resident size of the process up to the end of the stage, so it
+            never falls from stage to stage; 0 if the system does not report it.
+        peak_device_memory_bytes: Peak size of all tensors of the process on a CUDA device during
+            the stage, including those allocated earlier; 0 on other devices.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -34,11 +34,11 @@ class StageCost(pydantic.BaseModel):
 
 
 class StageClock:
-    """Measures stages one after the other and tells a listener about them.
+    """A clock that measures consecutive stages and reports progress to a listener.
 
     Args:
         listener: Called when a stage starts, advances and ends.
-        device: Where the stages compute; CUDA work is waited for.
+        device: Device that the stages compute on; CUDA is synchronised at the end of each.
     """
 
     def __init__(self, listener: ProgressListener, device: torch.device) -> None:
@@ -48,14 +48,14 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str, total: int = 1) -> Iterator[Callable[[int], None]]:
-        """Measure what happens inside.
+        """Measure the body of the ``with`` statement.
 
         Args:
             name: Name of the stage.
-            total: Steps of the stage.
+            total: Number of steps of the stage.
 
         Yields:
-            A function to call with the number of steps that are done.
+            A function to call with the number of finished steps.
         """
 
         def advance(done: int) -> None:
@@ -64,7 +64,7 @@ class StageClock:
 
         on_cuda = self._device.type == "cuda"
         advance(0)
-        if on_cuda and torch.cuda.is_initialized():  # else there is no peak yet, and it would fail
+        if on_cuda and torch.cuda.is_initialized():  # fails otherwise; there is no peak yet
             torch.cuda.reset_peak_memory_stats(self._device)
         wall, cpu = time.perf_counter(), time.process_time()
         yield advance
@@ -85,10 +85,10 @@ class StageClock:
 
 
 def peak_memory_bytes() -> int:
-    """Return the largest resident size of this process so far.
+    """Return the peak resident size of this process so far.
 
     Returns:
-        Bytes; 0 where the system does not tell (Windows).
+        Bytes; 0 if the system does not report it (Windows).
 
     Example:
         >>> peak_memory_bytes() >= 0

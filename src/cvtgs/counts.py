@@ -1,4 +1,4 @@
-"""How many Gaussians to keep: ratios and counts as written, and shares of a count."""
+"""The number of Gaussians to keep: parsing ratios and counts, and splitting a count."""
 
 import math
 import re
@@ -12,7 +12,7 @@ _UNITS = {"": 1, "k": 1000, "m": 1_000_000}
 
 
 def read_ratio(text: str) -> float:
-    """Return a ratio that is written as a number or in per cent.
+    """Parse a ratio that is written as a number or in per cent.
 
     Args:
         text: For example ``0.05`` or ``5%``.
@@ -21,7 +21,7 @@ def read_ratio(text: str) -> float:
         The ratio, which may be out of range.
 
     Raises:
-        InvalidArgumentError: It is no number.
+        InvalidArgumentError: The text is not a number.
 
     Example:
         >>> read_ratio("0.7%")
@@ -36,7 +36,7 @@ def read_ratio(text: str) -> float:
 
 
 def read_count(text: str) -> int:
-    """Return a number of Gaussians that may be written with k for thousands or M for millions.
+    """Parse a number of Gaussians; k stands for thousands and M for millions.
 
     Args:
         text: For example ``50000``, ``50_000``, ``50k`` or ``1.5M``.
@@ -45,7 +45,7 @@ def read_count(text: str) -> int:
         The count, at least 1.
 
     Raises:
-        InvalidArgumentError: It is no whole number above 0.
+        InvalidArgumentError: The text is not a whole number above 0.
 
     Example:
         >>> read_count("50k"), read_count("1.5M")
@@ -65,20 +65,20 @@ def target_count(
 ) -> int:
     """Return the number of Gaussians to keep.
 
-    ``rho`` is taken as the decimal number that was written: 0.07 of 100 Gaussians are 7, though
-    the nearest double times 100 is a little more.
+    ``rho`` is taken as the decimal number that was written: 0.07 of 100 Gaussians are 7, although
+    the nearest double times 100 is slightly more.
 
     Args:
         total: Number of Gaussians, N.
         rho: Ratio to keep, in (0, 1].
         count: Number to keep, 1 to N, instead of ``rho``.
-        max_count: Number to keep if there are more, instead of ``rho`` and ``count``.
+        max_count: Maximum number to keep, instead of ``rho`` and ``count``.
 
     Returns:
         ``ceil(rho * N)``, or ``count``, or ``min(max_count, N)``.
 
     Raises:
-        InvalidArgumentError: A value is out of range, or not exactly one is given.
+        InvalidArgumentError: A value is out of range, or not exactly one of the three is given.
 
     Example:
         >>> target_count(250, 0.01), target_count(10, 1e-9)
@@ -108,7 +108,7 @@ def target_count(
 
 
 def shortfall(valid: int, total: int, target: int) -> str:
-    """Return why fewer Gaussians come out than asked for, or an empty text.
+    """Return the reason why fewer Gaussians are kept than asked for; empty if there is none.
 
     Args:
         valid: Number of valid Gaussians.
@@ -126,18 +126,18 @@ def shortfall(valid: int, total: int, target: int) -> str:
 
 
 def shared_out(total: int, shares: Sequence[float], *, rooms: Sequence[int]) -> list[int]:
-    """Split a count in proportion to shares, by largest remainder, within what there is room for.
+    """Split a count in proportion to shares by largest remainder, with an upper limit for each.
 
     Args:
-        total: What to split; at least the number of rooms above 0, at most their sum.
+        total: Count to split; at least the number of limits above 0, at most their sum.
         shares: Numbers, at least 0.
-        rooms: The most that each may get; where it is not 0, at least 1 is given.
+        rooms: Upper limit for each; where it is above 0, at least 1 is given.
 
     Returns:
         One count per share; they add up to ``total``. Of equal remainders the first wins.
 
     Raises:
-        InvalidArgumentError: The total cannot be split so.
+        InvalidArgumentError: The total cannot be split within the limits.
 
     Example:
         >>> shared_out(10, [1.0, 1.0, 2.0], rooms=[9, 9, 9])
@@ -154,7 +154,7 @@ def shared_out(total: int, shares: Sequence[float], *, rooms: Sequence[int]) -> 
     exact = [Fraction(share) for share in shares]
     fixed: set[int] = set()
     while True:
-        # Those whose quota lies outside their room get the nearest end of it; the others share.
+        # A quota outside its limits is fixed at the nearest limit; the others share the rest.
         free = [k for k in range(len(rooms)) if k not in fixed]
         left = total - sum(counts[k] for k in fixed)
         weight = sum(exact[k] for k in free)

@@ -1,4 +1,4 @@
-"""The device to compute on: by name, its memory, and the number of its threads."""
+"""Devices: choice by name, chunk lengths, out-of-memory fallbacks, and CPU threads."""
 
 import gc
 import os
@@ -16,10 +16,10 @@ import torch
 from cvtgs.errors import DeviceError, OutOfMemoryError, is_out_of_memory
 
 LONGER_CHUNKS = 32
-"""How many times as much as on a CPU is computed together on another device, at most."""
+"""Maximum length of a chunk on other devices, as a multiple of its length on a CPU."""
 
 CHUNK_BYTES = 1 << 28
-"""Device memory for each chunk as long as on a CPU, which takes a quarter of it at most."""
+"""Device memory to reserve per chunk of CPU length, which takes at most a quarter of it."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -27,12 +27,12 @@ _SHORT_CHUNKS = ContextVar("short_chunks", default=False)
 
 
 def resolve_device(device: str | torch.device) -> torch.device | None:
-    """Return the device of a name, None for ``auto``; raise DeviceError if it is not there."""
+    """Return the named device, None for ``auto``; raise DeviceError if it cannot be used."""
     return None if device == "auto" else usable_device(device)
 
 
 def usable_device(device: str | torch.device) -> torch.device:
-    """Return the device of a name; raise DeviceError if it is not there."""
+    """Return the named device; raise DeviceError if it cannot be used."""
     try:
         resolved = torch.device(device)
         torch.empty(0, device=resolved)
@@ -43,7 +43,7 @@ def usable_device(device: str | torch.device) -> torch.device:
 
 
 def chosen_device(device: str | torch.device, home: str | torch.device = "cpu") -> torch.device:
-    """Return the device of a name; for ``auto`` CUDA if the data are on the CPU, else ``home``."""
+    """Return the named device; for ``auto``, CUDA (if any) for data on the CPU, else ``home``."""
     resolved, home = resolve_device(device), torch.device(home)
     if resolved is not None:
         return resolved
@@ -51,7 +51,7 @@ def chosen_device(device: str | torch.device, home: str | torch.device = "cpu") 
 
 
 def device_name(device: torch.device) -> str:
-    """Name what a device is made of."""
+    """Return the hardware name of a device."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     if device.type != "cpu":
@@ -65,19 +65,19 @@ def device_name(device: torch.device) -> str:
 
 
 def chunk_length(length: int, device: torch.device) -> int:
-    """Return how much to compute together on a device.
+    """Return the length of a chunk on a device.
 
-    A chunk that fits the caches of a CPU is too short for a GPU, where every chunk costs the
-    launches of its operations. It depends on the memory that a device has, not on what is free,
-    so that the same device gives the same bits.
+    A chunk that fits the caches of a CPU is too short for a GPU, where every chunk costs kernel
+    launches. The length depends on the total memory of the device, not on its free memory, so that
+    the same device gives the same bits.
 
     Args:
-        length: What a CPU computes together.
-        device: Where it is computed.
+        length: Length of a chunk on a CPU.
+        device: Device to compute on.
 
     Returns:
-        The length on a CPU; elsewhere 32 times as much, or less on CUDA with less than 8 GiB, and
-        not more in the second attempt of :func:`within_memory`.
+        The same length on a CPU, and in the second attempt of :func:`within_memory`; elsewhere 32
+        times as much, or less on CUDA devices with less than 8 GiB.
 
     Example:
         >>> chunk_length(100, torch.device("cpu"))
@@ -98,19 +98,19 @@ def within_memory(
     work: str,
     may_leave: bool,
 ) -> Result:
-    """Compute on a device; if its memory ends, in short chunks, and then on the CPU if that may be.
+    """Compute on a device; if it runs out of memory, retry with short chunks, then on the CPU.
 
     Args:
-        compute: Takes the device, and a note for the report: empty, or what happened.
-        device: Where to compute.
-        work: What is computed, for the error.
-        may_leave: Whether the CPU may be taken instead of the device.
+        compute: Takes the device and a note for the report, which is empty in the first attempt.
+        device: Device to compute on.
+        work: Description of the computation, for the error message.
+        may_leave: Whether to fall back to the CPU.
 
     Returns:
-        What ``compute`` returns.
+        The result of ``compute``.
 
     Raises:
-        OutOfMemoryError: The device has too little memory, and it is the only one.
+        OutOfMemoryError: The device has too little memory, and the CPU may not be used.
 
     Example:
         >>> within_memory(
@@ -130,7 +130,7 @@ def within_memory(
         finally:
             _SHORT_CHUNKS.reset(token)
         note = f"{device} ran out of memory; computed there in short chunks"
-        gc.collect()  # what the failed attempt held
+        gc.collect()  # frees the tensors of the failed attempt
         if device.type == "cuda":
             torch.cuda.empty_cache()
     if not may_leave:
@@ -142,14 +142,14 @@ def within_memory(
 
 
 def core_count() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def thread_count() -> int:
-    """Return how many threads a search may use: one for each core, or ``OMP_NUM_THREADS``."""
+    """Return the number of threads for a search: one per core, at most ``OMP_NUM_THREADS``."""
     limit = os.environ.get("OMP_NUM_THREADS", "")
     return max(1, min(core_count(), int(limit))) if limit.isdecimal() else core_count()
 
@@ -157,18 +157,18 @@ def thread_count() -> int:
 def in_threads(
     function: Callable[[Item], Result], items: Iterable[Item], device: torch.device
 ) -> Iterator[Result]:
-    """Call a function for chunks, as many at a time as torch uses threads; each call uses one.
+    """Call a function for chunks in as many threads as torch uses; each call uses one thread.
 
-    Chunks are too short for torch to split its operations on them well. Every chunk gives the
-    same bits whatever the number of threads.
+    Chunks are too short for torch to parallelise its operations on them well. Every chunk gives
+    the same bits, whatever the number of threads.
 
     Args:
-        function: Computes on one chunk; several calls run at the same time.
+        function: Computes one chunk; must be thread-safe.
         items: The chunks.
-        device: Where it computes: others than CPUs get one chunk after the other.
+        device: Device of the computation; on other devices than CPUs, chunks run sequentially.
 
     Returns:
-        The results, in the order of the items, each computed when it is asked for or before.
+        The results, in the order of the items, each computed when it is requested or earlier.
 
     Example:
         >>> list(in_threads(abs, [-1, 2, -3], torch.device("cpu")))
@@ -194,22 +194,22 @@ def _in_pool(
         try:
             for item in items:
                 waiting.append(pool.submit(function, item))
-                if len(waiting) > 2 * threads:  # so that few results wait at any time
+                if len(waiting) > 2 * threads:  # limits the number of pending results
                     yield waiting.popleft().result()
             while waiting:
                 yield waiting.popleft().result()
         finally:
             for future in waiting:
                 future.cancel()
-            torch.set_num_threads(before)  # threads that start later would have one, too
+            torch.set_num_threads(before)  # threads started later would also be limited to one
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch compute in one thread.
+    """Make torch use one thread.
 
-    Sums then do not depend on the number of cores, and pieces too small to be shared do not wait
-    for one another.
+    Sums then do not depend on the number of cores, and operations that are too small to parallelise
+    do not wait for threads.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

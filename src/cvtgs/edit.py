@@ -1,4 +1,4 @@
-"""Edit scenes: crop, drop, move and merge. What an edit does not concern keeps its bits."""
+"""Edits of scenes: crop, drop, move and merge. Unaffected values stay bit-identical."""
 
 import math
 import warnings
@@ -30,11 +30,11 @@ _NO_SHIFT = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sphere:
-    """A ball; its surface belongs to it.
+    """A ball, surface included.
 
     Attributes:
-        center: Its middle, scene units.
-        radius: Its radius, scene units, at least 0.
+        center: Centre, scene units.
+        radius: Radius, scene units, at least 0.
 
     Raises:
         InvalidArgumentError: A number is not finite, or the radius is negative.
@@ -58,12 +58,12 @@ class Sphere:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
-    """A change of position that keeps shapes: ``x`` becomes ``scale * R x + shift``.
+    """A similarity transform: ``x`` becomes ``scale * R x + shift``.
 
     Attributes:
-        quat: The rotation ``R``, w first, of any length but 0.
+        quat: The rotation ``R`` as a quaternion, w first, of any length but 0.
         scale: Factor of all lengths, above 0.
-        shift: Translation, scene units, after the others.
+        shift: Translation, scene units, applied last.
 
     Raises:
         InvalidArgumentError: A number is not finite, the factor is not above 0, or the quaternion
@@ -95,7 +95,7 @@ class Motion:
         """Build a motion from angles.
 
         Args:
-            angles: Degrees about x, then y, then z, axes that stay where they are.
+            angles: Degrees about x, then y, then z; the axes are fixed (extrinsic rotations).
             scale: Factor of all lengths.
             shift: Translation.
 
@@ -108,7 +108,7 @@ class Motion:
         quat = torch.tensor([_NO_TURN], dtype=torch.float64)
         for axis, angle in enumerate(angles):
             turn = torch.zeros(1, 4, dtype=torch.float64)
-            # sinpi of quarter turns has no rounding, which sin of radians has
+            # exact for quarter turns, unlike the sine of rounded radians
             turn[0, 0], turn[0, 1 + axis] = _cos_sin(angle / 2)
             quat = multiply_quats(turn, quat)
         w, x, y, z = quat[0].tolist()
@@ -127,10 +127,10 @@ def crop(scene: GaussianScene, regions: Sequence[Box | Sphere]) -> GaussianScene
 
     Args:
         scene: The scene; it is not changed.
-        regions: Boxes and spheres, at least one; Gaussians in any of them stay.
+        regions: Boxes and spheres, at least one; Gaussians in any of them are kept.
 
     Returns:
-        The Gaussians that stay, in their order, bit for bit; this scene if all do.
+        The kept Gaussians, in their order, bit for bit; the same object if all are kept.
 
     Raises:
         InvalidArgumentError: There is no region.
@@ -156,10 +156,10 @@ def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
 
     Args:
         scene: The scene; it is not changed.
-        least: Least opacity that stays, 0 to 1.
+        least: Smallest opacity to keep, 0 to 1.
 
     Returns:
-        The others, in their order, bit for bit; this scene if none is dropped.
+        The others, in their order, bit for bit; the same object if none is dropped.
 
     Raises:
         InvalidArgumentError: The opacity is not from 0 to 1.
@@ -172,7 +172,7 @@ def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
     """
     if not 0 <= least <= 1:
         raise InvalidArgumentError(f"the least opacity must be from 0 to 1, found {least!r}.")
-    # Not of clamped opacities: those of 1 - 1e-6 would not reach 1.
+    # Opacities are not clamped here: clamped ones end at 1 - 1e-6 and never reach 1.
     return _kept(scene, ~(torch.sigmoid(scene.logit_opacities.double()) < least))
 
 
@@ -181,10 +181,10 @@ def drop_large(scene: GaussianScene, largest: float) -> GaussianScene:
 
     Args:
         scene: The scene; it is not changed.
-        largest: Largest standard deviation that stays, scene units, above 0.
+        largest: Largest standard deviation to keep, scene units, above 0.
 
     Returns:
-        The others, in their order, bit for bit; this scene if none is dropped.
+        The others, in their order, bit for bit; the same object if none is dropped.
 
     Raises:
         InvalidArgumentError: The size is not above 0.
@@ -205,15 +205,15 @@ def _kept(scene: GaussianScene, keep: Tensor) -> GaussianScene:
 
 
 def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
-    """Turn, scale and shift a scene, colours included.
+    """Rotate, scale and translate a scene; view-dependent colours rotate with it.
 
     Args:
         scene: The scene; it is not changed.
-        motion: Where to.
+        motion: The transform.
 
     Returns:
-        The scene there. Only tensors that change are computed: a translation keeps all but the
-        centres, a factor all but centres and scales.
+        The moved scene. Only tensors that change are computed: a translation changes the centres
+        alone, a scale factor the centres and scales alone.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -240,20 +240,20 @@ def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
 
 
 def merge(scenes: Sequence[GaussianScene]) -> GaussianScene:
-    """Return the Gaussians of several scenes as one scene, whatever they hold.
+    """Return the Gaussians of several scenes as one scene; degrees and dtypes may differ.
 
-    Scenes of fewer SH bands get zeros, and all become float64 if one is. Extra columns that one
-    of them lacks are left out with a warning. Where some were trained with anti-aliasing and
-    others were not, viewers cannot show both as they should be, which is warned about.
+    Missing SH bands are filled with zeros, and the result is float64 if any scene is. Extra columns
+    that a scene lacks are dropped with a warning. If only some scenes were trained with
+    anti-aliasing, viewers cannot show all of them correctly, so a warning says so.
 
     Args:
         scenes: At least one, all on one device.
 
     Returns:
-        All Gaussians, in the order of the scenes, with the comments of all.
+        All Gaussians, in the order of the scenes, with all comments.
 
     Raises:
-        InvalidSceneError: There is no scene, or they are on several devices.
+        InvalidSceneError: There is no scene, or the scenes are on several devices.
 
     Example:
         >>> from cvtgs.synthetic import scene as make

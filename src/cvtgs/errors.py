@@ -1,4 +1,4 @@
-"""The errors and warnings of cvtgs; each is also the builtin that it specialises."""
+"""The errors and warnings of cvtgs; each also derives from the builtin that it specialises."""
 
 import errno
 import re
@@ -10,7 +10,7 @@ _NO_MEMORY = re.compile(
     r"ALLOC_FAILED|failed to map segment|can't start new thread|could not allocate|"
     r"returned NULL without setting an exception"
 )
-"""How torch, CUDA, the loader of libraries and Python's imports tell that there is no memory."""
+"""Out-of-memory messages of torch, CUDA, the dynamic loader and Python's imports."""
 
 
 class CvtgsError(Exception):
@@ -18,7 +18,7 @@ class CvtgsError(Exception):
 
 
 class InvalidArgumentError(CvtgsError, ValueError):
-    """An argument is outside what the function accepts (a ratio, a count, a shape)."""
+    """An argument is not acceptable (a ratio, a count, a shape)."""
 
 
 class InvalidSceneError(CvtgsError, ValueError):
@@ -30,7 +30,7 @@ class ConfigError(CvtgsError, ValueError):
 
 
 class FileFormatError(CvtgsError, ValueError):
-    """A file is not what its format promises; the text names path, property and row."""
+    """A file violates its format; the message names path, property and row."""
 
 
 class InputNotFoundError(CvtgsError, FileNotFoundError):
@@ -42,7 +42,7 @@ class InputError(CvtgsError, OSError):
 
 
 class OutputExistsError(CvtgsError, FileExistsError):
-    """The file to write exists already and overwriting was not asked for."""
+    """The file to write already exists and overwriting was not requested."""
 
 
 class OutputError(CvtgsError, OSError):
@@ -50,11 +50,11 @@ class OutputError(CvtgsError, OSError):
 
 
 class OutputBusyError(OutputError):
-    """Another run works on the same output; the text says which process."""
+    """Another run is writing the same output; the message says which process."""
 
 
 class DeviceError(CvtgsError, RuntimeError):
-    """The device that was asked for is not there, or cannot do what was asked."""
+    """The requested device does not exist, or does not support the operation."""
 
 
 class CheckpointError(CvtgsError, ValueError):
@@ -62,31 +62,31 @@ class CheckpointError(CvtgsError, ValueError):
 
 
 class OutOfMemoryError(CvtgsError, MemoryError):
-    """There is not enough memory; the text says what to do."""
+    """There is not enough memory; the message says what to do."""
 
 
 class TrainingError(CvtgsError, RuntimeError):
-    """A training cannot go on; the text says where it stopped, and which file is good."""
+    """A training run cannot continue; the message says where it stopped and which file is good."""
 
 
 class RunError(CvtgsError, RuntimeError):
-    """A process that cvtgs started has failed; the text says why."""
+    """A process that cvtgs started has failed; the message says why."""
 
 
 class GoalError(CvtgsError, ValueError):
-    """No result meets what was asked for (a quality, a time); the text says what comes closest."""
+    """No result meets the goal (a quality, a time); the message names the closest one."""
 
 
 class MissingDependencyError(CvtgsError, ImportError):
-    """An optional package is not installed; the text says what to install."""
+    """An optional package is not installed; the message says what to install."""
 
 
 class DroppedDataWarning(UserWarning):
-    """Something in the input was left out; the text says what, how much and why."""
+    """Something in the input was dropped; the message says what, how much and why."""
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error of any library means that there is not enough memory."""
+    """Check whether an error of any library means that there is not enough memory."""
     if isinstance(error, MemoryError):
         return True
     if isinstance(error, OSError) and error.errno == errno.ENOMEM:
@@ -97,7 +97,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 @contextmanager
 def memory_errors(work: str, advice: str) -> Iterator[None]:
-    """Turn what every library raises without memory into one sentence."""
+    """Turn the out-of-memory errors of all libraries into one OutOfMemoryError."""
     try:
         yield
     except Exception as error:

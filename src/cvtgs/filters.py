@@ -1,4 +1,4 @@
-"""The filter: faint Gaussians and flyaways that are left out before the tessellation."""
+"""The filter, which drops faint Gaussians and flyaways before the tessellation."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from cvtgs.math.segments import running_sums, true_rows
 from cvtgs.scene import GaussianScene
 
 FLYAWAY_RADII = 100.0
-"""In robust radii: no sky lies so far."""
+"""Distance beyond which a Gaussian may be a flyaway, in robust radii; no sky lies so far."""
 
 
 class FilteredRows(NamedTuple):
@@ -21,8 +21,8 @@ class FilteredRows(NamedTuple):
 
     Attributes:
         rows: ``(k,)`` their row numbers, ascending.
-        left_out: Number of the others.
-        left_out_mass_share: Their share of the mass.
+        left_out: Number of dropped Gaussians.
+        left_out_mass_share: Share of the mass that the dropped Gaussians hold.
     """
 
     rows: Int[Tensor, "k"]
@@ -33,18 +33,18 @@ class FilteredRows(NamedTuple):
 def filter_rows(
     scene: GaussianScene, analysis: SceneAnalysis, target: int, config: FilterConfig
 ) -> FilteredRows:
-    """Leave out faint Gaussians and flyaways, but never so many that fewer than the target stay.
+    """Drop faint Gaussians and flyaways, but keep at least the target number of Gaussians.
 
-    Faint Gaussians all go, unless they are the haze of the scene: then only the faintest do.
+    All faint Gaussians are dropped, but if they are the haze of the scene, only the faintest are.
 
     Args:
-        scene: The Gaussians, with valid rows.
-        analysis: Their areas, and whether the scene has haze.
-        target: Number of Gaussians that must stay.
+        scene: The Gaussians; all rows must be valid.
+        analysis: Areas and effect plan of the scene.
+        target: Minimum number of Gaussians to keep.
         config: Thresholds.
 
     Returns:
-        The rows that stay, and what is left out.
+        The rows that stay, and statistics of the dropped ones.
     """
     opacities = analysis.opacities
     keep, share = opacities >= config.min_opacity, config.max_mass_share
@@ -77,18 +77,18 @@ def visible_rows(
     max_mass_share: float,
     at_least: int,
 ) -> Bool[Tensor, "n"]:
-    """Leave out the faintest Gaussians, as long as hardly any mass goes with them.
+    """Drop the faintest Gaussians up to a share of the mass.
 
-    With ``max_mass_share = 1`` this is the filter of CVT-GS: everything below ``min_opacity``
-    goes. A smaller share keeps haze, which is many faint Gaussians with real mass.
+    With ``max_mass_share = 1`` this is the filter of CVT-GS: everything below ``min_opacity`` is
+    dropped. A smaller share keeps haze, which is many faint Gaussians with real mass.
 
     Args:
         opacities: Opacities.
         masses: Opacity times mean projected area, any unit.
         min_opacity: Gaussians at or above this opacity always stay.
-        max_mass_share: The faintest go while their mass is at most this share of the total; of
-            equally faint ones, those of least mass go first.
-        at_least: If fewer than this many would stay, the heaviest of the others stay too.
+        max_mass_share: The faintest are dropped while their mass is at most this share of the
+            total; of equally faint ones, the lightest are dropped first.
+        at_least: If fewer than this many would stay, the heaviest of the dropped ones stay too.
 
     Returns:
         Mask of the Gaussians that stay.
@@ -102,7 +102,7 @@ def visible_rows(
         [False, True, True]
     """
     faint = (opacities < min_opacity).nonzero()[:, 0]
-    faint = faint[torch.sort(masses[faint], stable=True).indices]  # of equally faint ones
+    faint = faint[torch.sort(masses[faint], stable=True).indices]  # breaks ties of opacity
     faint = faint[torch.sort(opacities[faint], stable=True).indices]
     dropped = faint
     if max_mass_share < 1:
@@ -120,14 +120,14 @@ def visible_rows(
 def flyaway_rows(
     distances: Float[Tensor, "n"], masses: Float[Tensor, "n"], *, max_share: float
 ) -> Bool[Tensor, "n"]:
-    """Find Gaussians that lie absurdly far away and paint next to nothing.
+    """Find Gaussians that lie absurdly far away and contribute next to nothing.
 
-    Merged with others they would become one huge blob. A sky has real mass, and stays.
+    Merging them with others would give one huge blob. A sky has real mass, and stays.
 
     Args:
         distances: Distances from the middle of the scene, in robust radii.
-        masses: Masses as seen from there.
-        max_share: The least massive ones are found, while they hold at most this share.
+        masses: Masses as seen from the middle.
+        max_share: Share of the total mass up to which the lightest far Gaussians are flyaways.
 
     Returns:
         Mask of the flyaways.

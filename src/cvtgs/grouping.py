@@ -1,4 +1,4 @@
-"""Grouping: which Gaussians become one, by a tessellation and what merging its cells costs."""
+"""Grouping of Gaussians into cells: a tessellation, then allocation by merge costs."""
 
 import math
 from collections.abc import Callable
@@ -17,22 +17,22 @@ from cvtgs.math.segments import label_sums
 from cvtgs.scene import GaussianScene
 
 MEMBERS_PER_CELL = 4
-"""A tessellation whose cells would have fewer Gaussians on average is left out."""
+"""If cells would have fewer Gaussians on average, the tessellation is skipped."""
 
 REASSIGN = 7
-"""Cells around its own that a Gaussian may move to."""
+"""Number of neighbouring cells that a Gaussian may move to."""
 
 COLOR_CELLS = 10_000
-"""The number of cells that ``cvt.color`` is meant for."""
+"""The number of cells at which ``cvt.color`` applies unchanged."""
 
 
 class Grouping(NamedTuple):
-    """Which Gaussians form which cell, and how good the tessellation is.
+    """The cells, and the quality of the tessellation.
 
     Attributes:
         partition: Rows of the scene that make up every cell.
         weights: ``(m,)`` summed weights of the members of every cell.
-        refilled: Cells that were empty after Lloyd and took a Gaussian from another.
+        refilled: Number of cells that were empty after Lloyd and took a Gaussian from another.
         energies: Energy before every Lloyd iteration, over the Gaussians that Lloyd samples.
         energy: Energy of the final cells, over all Gaussians.
         backend: Name of the nearest-site search.
@@ -51,12 +51,12 @@ class WeightedRows(NamedTuple):
 
     Attributes:
         scene: The Gaussians.
-        rows: ``(k,)`` which of them.
-        weights: ``(k,)`` what each weighs in the tessellation.
-        masses: ``(k,)`` what each weighs in the moments of its cell.
-        apparent_masses: ``(k,)`` mass as images show it, by which merging costs.
-        moments: Moments of each; None if they are not known yet.
-        neighbors: Gaussians that each may merge with; None if they are not known yet.
+        rows: ``(k,)`` rows of the scene.
+        weights: ``(k,)`` weights in the tessellation.
+        masses: ``(k,)`` weights in the moments of a cell.
+        apparent_masses: ``(k,)`` apparent masses, which scale the costs of merging.
+        moments: Moments of each Gaussian; None if not computed yet.
+        neighbors: Gaussians that each may merge with; None if not computed yet.
     """
 
     scene: GaussianScene
@@ -69,11 +69,11 @@ class WeightedRows(NamedTuple):
 
 
 class OrderedRows(NamedTuple):
-    """What grouping computes of Gaussians whatever the number of cells.
+    """The part of grouping that does not depend on the number of cells.
 
     Attributes:
-        filtered: ``(k,)`` the rows as the filter left them.
-        points: The same along the Morton curve, with their moments.
+        filtered: ``(k,)`` rows that passed the filter.
+        points: The same rows in Morton order, with their moments.
     """
 
     filtered: Int[Tensor, "k"]
@@ -90,16 +90,15 @@ def group_rows(
     ordered: OrderedRows | None = None,
     on_iteration: Callable[[int], None] = lambda done: None,
 ) -> Grouping:
-    """Group Gaussians into cells: tessellate, merge cheap pairs of cells, move what fits others.
+    """Group Gaussians into cells: tessellate, merge cheap pairs of cells, reassign members.
 
     Args:
         scene: The Gaussians.
-        rows: Which of them, after the filter.
+        rows: Rows that passed the filter.
         analysis: Frame, apparent areas and effect plan.
         target: Number of cells, at most k.
-        config: The tessellation (``config.cvt``), what follows it (``config.allocation``), and
-            the seed.
-        ordered: What was computed of the same rows before; ignored if the rows are others.
+        config: The configuration; ``cvt``, ``allocation`` and ``seed`` are used.
+        ordered: Cached result of :func:`order_rows`; ignored if its rows differ.
         on_iteration: Called with the number of finished Lloyd iterations.
 
     Returns:
@@ -125,7 +124,7 @@ def group_rows(
 def _weighted(
     scene: GaussianScene, rows: Int[Tensor, "k"], analysis: SceneAnalysis, config: SimplifyConfig
 ) -> WeightedRows:
-    """Bring Gaussians into the order of the curve, and weigh them."""
+    """Sort Gaussians along the Morton curve, and compute their weights."""
     # Advanced indexing (`values[rows]`) takes three to five times as long as `index_select`.
     opacities = analysis.opacities.index_select(0, rows)
     masses = analysis.apparent_areas.index_select(0, rows) * opacities
@@ -148,7 +147,7 @@ def _weighted(
 
 
 def _moments(points: WeightedRows, analysis: SceneAnalysis) -> cells.Moments:
-    """Compute the moments of each, in robust radii."""
+    """Compute the moments of each Gaussian, in robust radii."""
     return cells.gaussian_moments(
         points.scene,
         points.rows,
@@ -168,13 +167,13 @@ def _tessellate(
     has_duplicates: bool,
     on_iteration: Callable[[int], None],
 ) -> tuple[cvt.Tessellation, Int[Tensor, "k"]]:
-    """Tessellate Gaussians in the order of the curve, and allocate the cells; return both.
+    """Tessellate Gaussians in Morton order, allocate cells, and return tessellation and labels.
 
-    ``total`` is the number of Gaussians that all cells hold.
+    ``total`` is the number of Gaussians of the scene in all cells.
     """
     scene, rows = points.scene, points.rows
     count = finer_count(target, len(rows), config.allocation)
-    if count == len(rows):  # each is a cell of its own, in any space
+    if count == len(rows):  # every Gaussian is its own cell, so the space does not matter
         space = scene.means.index_select(0, rows)
     else:
         space = embed_rows(scene, rows, analysis, target, config)
@@ -201,9 +200,9 @@ def _tessellate(
 
 
 def finer_count(target: int, available: int, config: AllocationConfig) -> int:
-    """Return how many cells the tessellation makes, from which pairs merge.
+    """Return the number of cells of the tessellation, before pairs of cells merge.
 
-    Where its cells would have few members, pairs merge from single Gaussians: all that are there.
+    If its cells would have few members, merging starts from single Gaussians, all ``available``.
     """
     if config.oversampling == 1.0:
         return target
@@ -212,7 +211,7 @@ def finer_count(target: int, available: int, config: AllocationConfig) -> int:
 
 
 def allocation_at(ratio: float, config: AllocationConfig) -> AllocationConfig:
-    """Return the configuration with the weight of colour for a ratio of cells to Gaussians."""
+    """Return the configuration with the colour weight scaled to a ratio of cells to Gaussians."""
     return config.model_copy(update={"color": config.color * ratio**config.color_power})
 
 
@@ -225,18 +224,19 @@ def allocate(
     *,
     neighbors: Int[Tensor, "n k"] | None = None,
 ) -> Int[Tensor, "n"]:
-    """Merge cells in pairs until the target is met, and move members to the cell that fits.
+    """Merge cells in pairs down to the target count, and move members to the cell that fits best.
 
     Args:
-        members: Moments of what is grouped.
-        labels: Cell of each; none is empty. As many cells as members are numbered as they are.
+        members: Moments of the members.
+        labels: Cell of each member; no cell is empty. If there are as many cells as members, cell
+            ``i`` is member ``i``.
         count: Number of cells.
-        target: Number of cells to leave.
-        config: Costs.
-        neighbors: Neighbours of the cells; None finds them.
+        target: Target number of cells.
+        config: Weights of the costs.
+        neighbors: Neighbours of the cells; None computes them.
 
     Returns:
-        The new cell of each member; none is empty.
+        The new cell of each member; no cell is empty.
     """
     groups = members if count == len(labels) else cells.group_moments(members, labels, count)
     if count > target:
@@ -261,18 +261,18 @@ def group_cells(
     *,
     on_iteration: Callable[[int], None] = lambda done: None,
 ) -> Grouping:
-    """Group the cells of a finer size into coarser ones, so that levels are nested.
+    """Group the cells of a finer level into coarser ones, so that levels are nested.
 
     Args:
-        merged: The merged Gaussians of the finer size.
-        grouping: The cells of the finer size.
+        merged: The merged Gaussians of the finer level.
+        grouping: The cells of the finer level.
         analysis: Frame and effect plan of the scene.
-        target: Number of cells, at most that of the finer size.
+        target: Number of cells, at most that of the finer level.
         config: As for :func:`group_rows`.
         on_iteration: Called with the number of finished Lloyd iterations.
 
     Returns:
-        Cells that consist of whole finer cells; members are Gaussians of the scene.
+        Cells that consist of whole finer cells; their members are Gaussians of the scene.
     """
     fine = torch.arange(len(merged), device=merged.device)
     masses = grouping.weights * merged.opacities
@@ -305,7 +305,7 @@ def group_cells(
 def _grouping(
     tessellation: cvt.Tessellation, rows: Tensor, labels: Tensor, weights: Tensor
 ) -> Grouping:
-    """Return the cells of labelled rows, with their weights."""
+    """Return the grouping of labelled rows, given the weights of the cells."""
     local = cells.Partition.from_labels(labels, len(weights))
     return Grouping(
         partition=replace(local, order=rows.index_select(0, local.order)),
@@ -326,7 +326,7 @@ def curve_order(
 ) -> Int[Tensor, "k"]:
     """Return the order of Gaussians along a Morton curve, ties by mass.
 
-    The curve runs through contracted space: it stays fine where the bulk is, whatever flies away.
+    The curve runs through contracted space, so that flyaways do not coarsen it near the middle.
     """
     points = cvt.embed(scene.means.index_select(0, rows), frame=frame, contraction=1.0)
     return morton_order(points, ties=masses)
@@ -355,31 +355,31 @@ def order_rows(
     analysis: SceneAnalysis,
     config: SimplifyConfig,
 ) -> OrderedRows:
-    """Compute what does not depend on the number of cells, to group the same Gaussians again.
+    """Compute the part of grouping that does not depend on the number of cells, for reuse.
 
     Args:
         scene: The Gaussians.
-        rows: Which of them, after the filter.
+        rows: Rows that passed the filter.
         analysis: Frame, apparent areas and effect plan.
         config: Weights.
 
     Returns:
-        What :func:`group_rows` takes; 152 bytes per Gaussian.
+        The argument ``ordered`` of :func:`group_rows`; 152 bytes per Gaussian.
     """
     points = _weighted(scene, rows, analysis, config)
     return OrderedRows(rows, points._replace(moments=_moments(points, analysis)))
 
 
 def add_neighbors(ordered: OrderedRows, target: int, config: AllocationConfig) -> OrderedRows:
-    """Find the neighbours of single Gaussians, if pairs of them are to merge.
+    """Add the neighbours of single Gaussians, if merging starts from single Gaussians.
 
     Args:
-        ordered: What was computed of them before.
+        ordered: The result of :func:`order_rows`.
         target: Number of cells.
-        config: How many neighbours each has.
+        config: Number of neighbours.
 
     Returns:
-        The same with neighbours, 48 bytes per Gaussian; itself if they are there or of no use.
+        The same with neighbours, 48 bytes per Gaussian; unchanged if it has them or needs none.
     """
     points, total = ordered.points, len(ordered.filtered)
     if points.neighbors is not None or points.moments is None:

@@ -1,4 +1,4 @@
-"""SceneInfo: what is known of a scene before anything is done to it."""
+"""SceneInfo: facts about a scene, without simplifying it."""
 
 import pydantic
 import torch
@@ -19,22 +19,22 @@ QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 
 
 class SceneInfo(pydantic.BaseModel):
-    """Facts about a scene. Those about values are taken over its valid rows.
+    """Facts about a scene; statistics of values are over its valid rows.
 
     Attributes:
-        count: Gaussians, N.
+        count: Number of Gaussians, N.
         sh_degree: Degree of the spherical harmonics.
         dtype: float32 or float64.
         bounds: Smallest and largest x, y, z of the centres, scene units.
         robust_center: Median of each coordinate.
-        robust_radius: The 70 % quantile of the distance to it.
+        robust_radius: The 70 % quantile of the distance to ``robust_center``.
         opacity_quantiles: Opacities at 0, 5, 25, 50, 75, 95 and 100 %.
         mass: Sum of opacity times mean projected area, squared scene units.
         mass_shares: Share of the mass that the heaviest 0.1, 1, 10 and 50 % of Gaussians hold.
         faint_share: Share of Gaussians with opacity below 0.1.
-        faint_mass_share: Their share of the mass.
-        invalid_rows: Rows with NaN, infinite or zero values, by attribute.
-        invalid_count: Rows that are invalid.
+        faint_mass_share: Share of the mass that these hold.
+        invalid_rows: Number of rows with NaN, infinite or zero values, by attribute.
+        invalid_count: Number of invalid rows.
         antialiased: Whether the scene is tagged as trained with anti-aliasing.
         comments: Comment lines of the file.
         extra_columns: Names of the columns beyond the standard ones.
@@ -70,7 +70,7 @@ def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInf
 
     Args:
         scene: Any scene, or a file or folder of one.
-        config: For which simplification to plan; None for the default one.
+        config: Configuration to plan the effects for; None for the default one.
 
     Returns:
         The facts.

@@ -1,4 +1,4 @@
-"""Several sizes of one scene on the disk, and an index for viewers to choose among them."""
+"""Levels of a scene on disk, and an index from which viewers choose among them."""
 
 import os
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from cvtgs.text import printable
 __all__ = ["INDEX_NAME", "LevelEntry", "LevelsIndex", "add_scores", "level_names", "write_levels"]
 
 INDEX_NAME = "levels.json"
-"""Name of the index beside the levels."""
+"""Name of the index file, in the folder of the levels."""
 
 Corner = tuple[float, float, float]
 
@@ -31,21 +31,21 @@ class LevelEntry(Record):
 
     Attributes:
         file: Name of the file, in the folder of the index.
-        rho: Ratio of Gaussians that was given.
-        count: Gaussians in the file.
+        rho: Ratio of Gaussians that was requested.
+        count: Number of Gaussians in the file.
         bytes: Size of the file.
         geometric_error: Root mean square distance from the Gaussians of the full scene to those
-            that represent them, weighted by mass; scene units. 0 if all are there.
-        box_min: Least coordinates of the centres in the file, in its axes, scene units.
+            that represent them, weighted by apparent mass; scene units. 0 if all are kept.
+        box_min: Smallest coordinates of the centres in the file, in its axes, scene units.
         box_max: Largest coordinates of the centres in the file.
         nested: Whether each of its cells consists of whole cells of the finest level.
-        seconds: Wall-clock seconds beyond what finer levels had done already.
-        psnr: Mean PSNR of the file against the full scene, dB; None if it was not measured.
-        ssim: The same for SSIM.
-        lpips: The same for LPIPS.
-        alpha_error: The same for the absolute difference of accumulated alpha.
-        alpha_bias: The same for the difference itself; negative where more of the background
-            shows through.
+        seconds: Wall-clock seconds in addition to the work shared with finer levels.
+        psnr: Mean PSNR of the file against the full scene, dB; None if not measured.
+        ssim: Mean SSIM, likewise.
+        lpips: Mean LPIPS, likewise.
+        alpha_error: Mean absolute difference of accumulated alpha, likewise.
+        alpha_bias: Mean signed difference of accumulated alpha, likewise; negative if more of the
+            background shows through.
     """
 
     file: str
@@ -69,8 +69,8 @@ class LevelEntry(Record):
 
         Args:
             level: The level.
-            rho: Ratio that was given.
-            path: Its file.
+            rho: Ratio that was requested.
+            path: File of the level.
 
         Returns:
             The entry, without scores.
@@ -90,10 +90,10 @@ class LevelEntry(Record):
         )
 
     def with_scores(self, scores: SceneScores) -> Self:
-        """Add scores.
+        """Return the entry with scores.
 
         Args:
-            scores: The scores of the file.
+            scores: Scores of the file.
 
         Returns:
             A new entry.
@@ -110,13 +110,13 @@ class LevelEntry(Record):
 
 
 class LevelsIndex(Record):
-    """All levels of a scene, as ``levels.json`` holds them.
+    """All levels of a scene: the content of ``levels.json``.
 
     Attributes:
         version: Version of this format.
-        source: Name of the file of the full scene.
-        source_count: Its Gaussians.
-        views: Views that the scores are means over; 0 without scores.
+        source: File name of the full scene.
+        source_count: Number of Gaussians of the full scene.
+        views: Number of views that the scores are means over; 0 without scores.
         levels: The levels, the finest first.
     """
 
@@ -141,11 +141,11 @@ def _corner(point: torch.Tensor) -> Corner:
 
 
 def level_names(rhos: Sequence[float], suffix: str = ".ply") -> tuple[str, ...]:
-    """Name the files of levels.
+    """Return the file names of levels.
 
     Args:
         rhos: Ratios.
-        suffix: End of the names, which says the format.
+        suffix: File suffix, which selects the format.
 
     Returns:
         One name per ratio.
@@ -160,9 +160,9 @@ def level_names(rhos: Sequence[float], suffix: str = ".ply") -> tuple[str, ...]:
 def check_levels(
     folder: str | os.PathLike[str], names: Sequence[str], *, overwrite: bool = False
 ) -> None:
-    """Check that levels could be written, before the long work that comes first."""
+    """Check that levels can be written, before any long computation."""
     for name in names:
-        if name.endswith(".usda"):  # the only format that is written and not read
+        if name.endswith(".usda"):  # the only write-only format
             raise InvalidArgumentError(
                 "levels need a format that can be read again, found '.usda'; write them as .ply, "
                 "and convert these."
@@ -192,10 +192,10 @@ def write_levels(
 
     Args:
         levels: The levels.
-        folder: Where to write; made if it is missing.
-        rhos: The ratio of each.
+        folder: Folder to write to; created if it is missing.
+        rhos: Ratio of each level.
         source: Name of the full scene.
-        suffix: End of the names, which says the format.
+        suffix: File suffix, which selects the format.
         axes: The axes of the files, as :func:`cvtgs.io.change_axes` names them; None for those
             of the format.
         overwrite: Whether existing files may be replaced.
@@ -233,18 +233,18 @@ def write_levels(
 
 
 def add_scores(folder: str | os.PathLike[str], evaluation: Evaluation) -> LevelsIndex:
-    """Add scores to the index of levels that were written.
+    """Add scores to the index of levels on disk.
 
     Args:
-        folder: Where :func:`write_levels` wrote.
-        evaluation: Scores of the files, by their names.
+        folder: Folder that :func:`write_levels` wrote to.
+        evaluation: Scores of the files, by file name.
 
     Returns:
         The index with scores, as it is now in the folder.
 
     Raises:
         InputNotFoundError: There is no index.
-        FileFormatError: The index is not one that :func:`write_levels` writes.
+        FileFormatError: The index is not one that :func:`write_levels` wrote.
         OutputError: The index cannot be written.
 
     Example:

@@ -15,7 +15,7 @@ SSIM_WINDOW = 11
 
 SQUARED_FLOOR = 1e-5
 IMAGE_FLOOR = 1e-3
-"""Added to errors before their logarithm, so that near-perfect images count less."""
+"""Floors added to errors before the logarithm, so that near-perfect images count less."""
 
 
 def l1_loss(
@@ -25,7 +25,7 @@ def l1_loss(
 
     Args:
         prediction: ``(c, h, w, 3)`` rendered images.
-        target: ``(c, h, w, 3)`` what they should be.
+        target: ``(c, h, w, 3)`` target images.
 
     Returns:
         A scalar, 0 for equal images; differentiable in both.
@@ -49,7 +49,7 @@ def ssim_loss(
 
     Args:
         prediction: ``(c, h, w, 3)`` rendered images, not clipped.
-        target: ``(c, h, w, 3)`` what they should be.
+        target: ``(c, h, w, 3)`` target images.
 
     Returns:
         A scalar from 0 (equal images) to 2; differentiable in both.
@@ -73,8 +73,8 @@ def mean_ssim(
     """Return the structural similarity (SSIM) of each image (Wang, Bovik, Sheikh, Simoncelli 2004).
 
     Window 11 x 11, Gaussian of 1.5 pixels, K1 = 0.01, K2 = 0.03, range of values 1, each channel
-    by itself. Border "valid", as in the paper (section III-C, equation 13): only windows inside
-    the image count, so the mean is over ``(h - 10) * (w - 10)`` places. Memory: about 12 copies
+    separately. Border "valid", as in the paper (section III-C, equation 13): only windows inside
+    the image count, so the mean is over ``(h - 10) * (w - 10)`` positions. Memory: about 12 copies
     of one stack of images, and as much again for the gradient.
     """
     check_pair(prediction, target, least=SSIM_WINDOW)
@@ -97,16 +97,16 @@ def gradient_loss(
     """Return the mean of ``|dx|`` plus the mean of ``|dy|`` of the image difference.
 
     The derivatives are differences of neighbouring pixels, inside the image only: ``w - 1`` of
-    them in a row and ``h - 1`` in a column. A constant offset costs nothing, a shifted or
-    blurred edge does.
+    them in a row and ``h - 1`` in a column. A constant offset has no cost; a shifted or blurred
+    edge has.
 
     Args:
         prediction: ``(c, h, w, 3)`` rendered images.
-        target: ``(c, h, w, 3)`` what they should be.
+        target: ``(c, h, w, 3)`` target images.
 
     Returns:
-        A scalar, at least 0; differentiable in both. An image of one column (row) has no
-        ``dx`` (``dy``), which then counts 0.
+        A scalar, at least 0; differentiable in both. For images of one column (row), ``dx``
+        (``dy``) counts as 0.
 
     Raises:
         InvalidArgumentError: Shape, dtype or device do not fit.
@@ -141,7 +141,7 @@ def image_loss(
 
     Args:
         prediction: ``(c, h, w, 3)`` rendered images.
-        target: ``(c, h, w, 3)`` what they should be, in [0, 1].
+        target: ``(c, h, w, 3)`` target images, in [0, 1].
         ssim_weight: ``l``, from 0 to 1.
         gradient_weight: ``l_g``, at least 0.
 
@@ -182,13 +182,12 @@ def relative_loss(
 ) -> Float[Tensor, ""]:
     """Return ``w_s log(mse) + w_i log(image_loss) + w_d log(1 - SSIM)``.
 
-    It falls with the PSNR of the images by as much whether they are good or poor.
-
-    A term of weight 0 is not computed.
+    A gain in PSNR lowers it by the same amount whether the images are good or poor. A term of
+    weight 0 is not computed.
 
     Args:
         prediction: ``(c, h, w, 3)`` rendered images.
-        target: ``(c, h, w, 3)`` what they should be.
+        target: ``(c, h, w, 3)`` target images.
         squared_weight: ``w_s``, at least 0.
         image_weight: ``w_i``, at least 0.
         ssim_weight: ``w_d``, at least 0.

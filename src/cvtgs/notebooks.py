@@ -1,4 +1,4 @@
-"""How scenes and results show themselves in notebooks: an image and the facts, as HTML."""
+"""HTML representations of scenes and results for notebooks: an image and facts."""
 
 import base64
 import html
@@ -16,16 +16,16 @@ from cvtgs.views import automatic_views
 WIDTH, HEIGHT = 320, 240
 
 MOST_DRAWN = 200_000
-"""Of larger scenes only the heaviest Gaussians are drawn, so that a cell takes about a second."""
+"""Only the heaviest Gaussians of larger scenes are drawn, so that a cell takes about a second."""
 
 
 def scene_html(scene: GaussianScene) -> str:
-    """Return an image of a scene beside its facts."""
+    """Return HTML with an image of a scene beside its facts."""
     return _panel("GaussianScene", scene, _scene_facts(scene))
 
 
 def result_html(result: Simplified) -> str:
-    """Return an image of a simplified scene beside what was done."""
+    """Return HTML with an image of a simplified scene beside facts about the simplification."""
     scene, report = result
     facts = {
         "Gaussians": f"{report.input_count:,} &rarr; {report.output_count:,}",
@@ -42,7 +42,7 @@ def result_html(result: Simplified) -> str:
 
 
 def _scene_facts(scene: GaussianScene) -> dict[str, str]:
-    """Return the facts of a scene, as HTML, by name."""
+    """Return facts about a scene, as HTML, by name."""
     tensors = [*scene.tensors().values(), *scene.extras.values()]
     size = sum(tensor.numel() * tensor.element_size() for tensor in tensors)
     facts = {
@@ -73,7 +73,7 @@ def _panel(title: str, scene: GaussianScene, facts: Mapping[str, str]) -> str:
 
 
 def _image(scene: GaussianScene) -> tuple[str, str]:
-    """Return the HTML of an image, empty if there is nothing to see, and a note below the facts."""
+    """Return the HTML of an image, empty if none can be made, and a note for below the facts."""
     if len(scene) > MOST_DRAWN:
         drawn = scene.select(torch.topk(scene.masses.nan_to_num(), MOST_DRAWN).indices)
         caption = f"drawn: the {MOST_DRAWN:,} heaviest"

@@ -1,6 +1,6 @@
-"""The method from top to bottom: filter, group, merge, correct.
+"""The stages of the method in order: filter, group, merge, correct.
 
-A scene in one piece, levels, protected regions and the out-of-core run call these functions.
+Single runs, levels, protected regions and out-of-core runs all call these functions.
 """
 
 import math
@@ -28,13 +28,13 @@ from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities
 
 NEIGHBORS = 8
-"""Cells around a cell that may cover its ends, and that the network sees."""
+"""Number of neighbouring cells that may cover the ends of a cell, and that the network sees."""
 
 NESTED_FROM = 4
-"""A level is made of finer cells only where there are, on average, so many of them in a cell."""
+"""A level is built from finer cells only if each of its cells holds this many on average."""
 
 CHUNK = 1 << 18
-"""Gaussians whose distance is measured together, to bound memory."""
+"""Gaussians per chunk of distances, to bound memory."""
 
 
 class Merged(NamedTuple):
@@ -42,8 +42,9 @@ class Merged(NamedTuple):
 
     Attributes:
         scene: The merged Gaussians, in the order of the cells.
-        partition: The members that each of them stands for: one where a representative was kept.
-        neighbors: ``(m, k)`` nearest other cells; k is 0 if neither inflation nor a network asks.
+        partition: Members that each merged Gaussian stands for; one if it is a representative.
+        neighbors: ``(m, k)`` nearest other cells; k is 0 if neither inflation nor a network needs
+            them.
     """
 
     scene: GaussianScene
@@ -56,10 +57,10 @@ class Reduced(NamedTuple):
 
     Attributes:
         scene: The small scene.
-        statistics: What the report says about the filter and the cells.
+        statistics: Statistics of the filter and the cells, for the report.
         grouping: The cells; None if all Gaussians are kept.
         merged: One Gaussian per cell before the network; None if all Gaussians are kept.
-        matching: What matching to images gained; None if there was none.
+        matching: Report of the matching to images; None if there was none.
     """
 
     scene: GaussianScene
@@ -80,20 +81,20 @@ def reduce_scene(
     finest: Reduced | None = None,
     ordered: OrderedRows | None = None,
 ) -> Reduced:
-    """Run all stages that follow the analysis: filter, tessellate, merge, correct.
+    """Run the stages after the analysis: filter, tessellate, merge, correct.
 
     Args:
-        scene: The Gaussians, with valid rows, on the device to compute on.
-        analysis: What is known of them.
+        scene: The Gaussians, on the device to compute on; all rows must be valid.
+        analysis: Their analysis.
         target: Number of Gaussians to keep.
-        config: Every choice.
-        net: Corrects merged Gaussians, on the same device; None for no correction.
+        config: The configuration.
+        net: Network that corrects merged Gaussians, on the same device; None for no correction.
         clock: Measures each stage.
-        finest: A finer size of the same scene, whose cells are grouped; None groups Gaussians.
-        ordered: What :func:`order_gaussians` computed of the scene; None computes it.
+        finest: A finer level of the same scene, whose cells are grouped; None groups Gaussians.
+        ordered: Result of :func:`order_gaussians` for the scene; None computes it.
 
     Returns:
-        The small scene, with its cells; all Gaussians, with finite opacities, if none has to go.
+        The small scene, with its cells; all Gaussians, with finite opacities, if all are kept.
     """
     if target >= len(scene.means):
         return Reduced(with_finite_opacities(scene))
@@ -153,9 +154,10 @@ def reduce_scene(
 def order_gaussians(
     scene: GaussianScene, analysis: SceneAnalysis, config: SimplifyConfig
 ) -> OrderedRows:
-    """Compute what grouping needs of a scene whatever its target, for :func:`reduce_scene`.
+    """Compute the target-independent part of grouping, for :func:`reduce_scene`.
 
-    It holds where the filter leaves the target enough rows; else the filter brings some back.
+    It is used only if the filter leaves enough rows for the target; otherwise the filter brings
+    some rows back, and grouping computes this part again.
     """
     filtered = filter_rows(scene, analysis, 1, config.filter)
     return order_rows(scene, filtered.rows, analysis, config)
@@ -170,14 +172,14 @@ def merge_and_inflate(
     with_network: bool,
     on_cells: Callable[[int], None] = lambda done: None,
 ) -> Merged:
-    """Merge every cell into one Gaussian, align its axes, and inflate what must cover its cell.
+    """Merge every cell into one Gaussian, align its axes, and inflate it if it must cover its cell.
 
     Args:
         scene: The Gaussians.
         partition: Rows of every cell.
-        config: How a cell becomes one Gaussian.
+        config: Settings of the merge.
         areas: Mean projected areas of the Gaussians.
-        with_network: Whether a network will ask for the neighbours.
+        with_network: Whether a network needs the neighbours.
         on_cells: Called with the number of finished cells.
 
     Returns:
@@ -197,7 +199,7 @@ def merge_members(
     areas: Float[Tensor, "n"],
     on_cells: Callable[[int], None] = lambda done: None,
 ) -> tuple[GaussianScene, cells.Partition]:
-    """Merge every cell by its members alone; also return the members that each stands for."""
+    """Merge every cell by its members alone; also return the members each result stands for."""
     merged = cells.merge_cells(scene, partition, config=config, on_cells=on_cells)
     if not config.representatives:
         return merged, partition
@@ -205,7 +207,7 @@ def merge_members(
 
 
 def neighbor_count(config: MergeConfig, *, with_network: bool) -> int:
-    """Return how many neighbours inflation or a network asks for; 0 if neither does."""
+    """Return how many neighbours inflation or a network needs; 0 if neither needs any."""
     inflates = config.inflation > 0.0 or config.covered_inflation > 0.0
     return NEIGHBORS if inflates or with_network else 0
 
@@ -216,7 +218,7 @@ def shape_merged(
     neighbors: Int[Tensor, "m k"],
     config: MergeConfig,
 ) -> GaussianScene:
-    """Align axes and inflate; merged Gaussians beyond the partition are neighbours only."""
+    """Align axes and inflate; merged Gaussians beyond the partition only serve as neighbours."""
     if config.align_axes:
         merged = cells.align_axes(merged, shown, neighbors)
     if config.inflation == 0.0 and config.covered_inflation == 0.0:
@@ -227,13 +229,13 @@ def shape_merged(
 
 
 class LevelFacts(NamedTuple):
-    """What is known of one of several sizes.
+    """The error of a level, and the assignment of its Gaussians.
 
     Attributes:
         geometric_error: Root mean square distance from Gaussians to those that replace them,
             weighted by apparent mass; 0 if all are kept.
-        assignment: ``(n,)`` row of the small Gaussian that stands for each input row, int32, on
-            the CPU; -1 for those that were left out. None if all are kept.
+        assignment: ``(n,)`` row of the small Gaussian that represents each input row, int32, on
+            the CPU; -1 for dropped rows. None if all are kept.
     """
 
     geometric_error: float = 0.0
@@ -241,7 +243,7 @@ class LevelFacts(NamedTuple):
 
 
 def level_facts(scene: GaussianScene, analysis: SceneAnalysis, reduced: Reduced) -> LevelFacts:
-    """Measure how far a small scene is from the full one, and say what stands for what."""
+    """Compute the geometric error of a small scene, and the assignment of rows to its Gaussians."""
     if reduced.grouping is None:
         return LevelFacts()
     partition = reduced.grouping.partition
@@ -251,7 +253,7 @@ def level_facts(scene: GaussianScene, analysis: SceneAnalysis, reduced: Reduced)
 
 
 def nests_in(target: int, finest: Reduced | None) -> bool:
-    """Return whether a level is to be made of the cells of a finer one."""
+    """Check whether a level is to be built from the cells of a finer one."""
     return finest is not None and NESTED_FROM * target <= len(finest.scene)
 
 
@@ -262,10 +264,7 @@ def geometric_error(
     *,
     masses: Float[Tensor, "n"],
 ) -> float:
-    """Return the root mean square distance from Gaussians to those that replace them.
-
-    Masses weigh the mean; the distance is in scene units.
-    """
+    """Return the mass-weighted RMS distance from Gaussians to their replacements, scene units."""
     squares, total = 0.0, 0.0
     ids = segment_ids(partition.offsets, len(partition.order))
     chunk = chunk_length(CHUNK, scene.device)

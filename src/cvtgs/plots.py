@@ -1,4 +1,4 @@
-"""Draw charts as PNG bytes; the only file that imports matplotlib, and only when it draws."""
+"""Charts as PNG bytes; the only file that imports matplotlib, and it does so lazily."""
 
 import io
 import math
@@ -9,13 +9,13 @@ from typing import Any
 from cvtgs.errors import InvalidArgumentError, MissingDependencyError
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-"""Okabe and Ito 2008: distinct with any colour vision."""
+"""Palette of Okabe and Ito 2008, distinct with any colour vision."""
 
 STYLES = ("-", "--", ":")
-"""Further series take the colours again, in the next style."""
+"""Line styles; when the colours are used up, they repeat in the next style."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<")
-"""When the styles are used up, too, points are marked, in the next shape."""
+"""Markers; when the styles are used up too, points are marked, in the next shape."""
 
 DPI = 100
 SMALLEST_SIDE = 100
@@ -30,10 +30,10 @@ _LABEL_POSITIONS = (
     (-6, 6, "right", "bottom"),
     (-6, -6, "right", "top"),
 )
-"""Positions of a label near its point: points to the right and up, and alignments."""
+"""Label positions: offsets to the right and up of the point, in typographic points; alignments."""
 
 Extents = tuple[float, float, float, float]
-"""Left, lower, right and upper end in pixels."""
+"""Left, lower, right and upper edges in pixels."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,12 +41,12 @@ class Series:
     """One line.
 
     Attributes:
-        name: Its name in the legend; series of one name have one style in every panel.
-        x: Positions of its points.
-        y: Their values; the line has gaps where they are not finite.
-        markers: Whether its points are marked.
+        name: Name in the legend; series of the same name share a style in all panels.
+        x: x coordinates of the points.
+        y: y coordinates of the points; the line has gaps where they are not finite.
+        markers: Whether the points are marked.
         labels: Text at each point; empty for none.
-        hollow: Which points are hollow and left out of the line; empty for none.
+        hollow: Whether each point is hollow and not part of the line; empty for none.
     """
 
     name: str
@@ -63,9 +63,9 @@ class Panel:
 
     Attributes:
         series: At least one.
-        title: Text above it.
-        x_label: What x is, with its unit.
-        y_label: What y is, with its unit.
+        title: Title above the panel.
+        x_label: Label of the x axis, with unit.
+        y_label: Label of the y axis, with unit.
         x_ticks: Ticks of the x axis; chosen by matplotlib if empty.
         log_x: Whether the x axis is logarithmic.
         log_y: Whether the y axis is logarithmic.
@@ -91,19 +91,19 @@ def line_chart(
     """Draw panels of lines under one legend.
 
     Args:
-        panels: Row by row.
-        columns: Panels in a row.
-        share_y: Whether the panels of a row have the same y axis.
-        width: Pixels per row, at least 100.
-        height: Rows, at least 100.
+        panels: Panels, row by row.
+        columns: Number of panels in a row.
+        share_y: Whether the panels of a row share their y axis.
+        width: Image width in pixels, at least 100.
+        height: Image height in pixels, at least 100.
 
     Returns:
         A PNG file; the same arguments give the same bytes with the same matplotlib.
 
     Raises:
-        InvalidArgumentError: There is nothing to draw, a series has not as many x as y, labels
-            or hollow flags, there are more names than styles, the size is too small, or a value
-            does not fit its logarithmic axis.
+        InvalidArgumentError: There is nothing to draw; the x, y, labels or hollow flags of a series
+            differ in number; there are more names than styles; the size is too small; or a value
+            on a logarithmic axis is not positive.
         MissingDependencyError: matplotlib is not installed.
 
     Example:
@@ -131,7 +131,7 @@ def line_chart(
             frameon=False,
         )
     if any(series.labels for panel in panels for series in panel.series):
-        figure.draw_without_rendering()  # the layout moves axes, and so the places of labels
+        figure.draw_without_rendering()  # the layout moves the axes, and labels with them
         for panel, axes in zip(panels, figure.axes, strict=False):
             _write_labels(axes, panel)
     file = io.BytesIO()
@@ -140,7 +140,7 @@ def line_chart(
 
 
 def _figure(width: float, height: float) -> Any:
-    """Return a figure of a size in inches that belongs to no window and no global list."""
+    """Return a figure of a size in inches, without a window and outside pyplot's global state."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 (optional)
         from matplotlib.figure import Figure  # noqa: PLC0415
@@ -155,7 +155,7 @@ def _figure(width: float, height: float) -> Any:
 
 
 def _styles(panels: Sequence[Panel]) -> dict[str, dict[str, str]]:
-    """Return a style for every name, in the order of appearance."""
+    """Return a style for every name, assigned in order of appearance."""
     names = dict.fromkeys(series.name for panel in panels for series in panel.series)
     most = len(COLORS) * len(STYLES) * len(MARKERS)
     if len(names) > most:
@@ -207,7 +207,7 @@ def _columns(points: Sequence[tuple[float, float, bool]]) -> tuple[list[float], 
 
 
 def _write_labels(axes: Any, panel: Panel) -> None:
-    """Write each label where it hides least of the points and of the other labels."""
+    """Write each label where it covers the least of the points and the other labels."""
     points = [
         (label, (x, y))
         for series in panel.series
@@ -233,7 +233,7 @@ def _write_labels(axes: Any, panel: Panel) -> None:
 
 
 def _put(text: Any, number: int) -> Extents:
-    """Move a label to one of its positions, and return its pixels there."""
+    """Move a label to one of its positions, and return its extents there."""
     right, up, horizontal, vertical = _LABEL_POSITIONS[number]
     text.xyann = (right, up)
     text.set(horizontalalignment=horizontal, verticalalignment=vertical)
@@ -242,13 +242,13 @@ def _put(text: Any, number: int) -> Extents:
 
 
 def _cost(box: Extents, taken: Sequence[Extents], frame: Extents) -> float:
-    """Return the area of others that a label hides, and of itself outside, in square pixels."""
+    """Return the area that a label covers of others, plus its area outside the frame, in pixels."""
     outside = _shared(box, box) - _shared(box, frame)
     return outside + sum(_shared(box, other) for other in taken)
 
 
 def _shared(one: Extents, other: Extents) -> float:
-    """Return the area that two boxes share, square pixels."""
+    """Return the area of the intersection of two boxes, square pixels."""
     width = min(one[2], other[2]) - max(one[0], other[0])
     height = min(one[3], other[3]) - max(one[1], other[1])
     return max(0.0, width) * max(0.0, height)

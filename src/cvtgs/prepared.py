@@ -1,4 +1,4 @@
-"""Prepared: a scene to be made smaller again and again, on a device with enough memory."""
+"""Prepared: a scene to simplify repeatedly, with a fallback if the device lacks memory."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -38,20 +38,20 @@ from cvtgs.validity import (
 
 
 class Prepared:
-    """A scene to be made smaller again and again; what does not depend on the count is kept.
+    """A scene to simplify repeatedly; results that do not depend on the count are cached.
 
-    From the second run on, 152 more bytes per Gaussian are kept, and another 48 from the second
-    run on that leaves more than an eighth of the Gaussians; or from ``warm_up`` on.
+    From the second run or ``warm_up`` on, 152 more bytes per Gaussian are cached, and another 48
+    once such a run keeps more than an eighth of the Gaussians.
 
-    ``Simplifier.prepare`` makes these. Every run gives the bits of ``Simplifier.run``;
-    the report of the first one has the stages that are shared.
+    ``Simplifier.prepare`` creates instances. Every run gives the bits of ``Simplifier.run``; the
+    report of the first run includes the shared stages.
 
     Args:
-        scene: The scene as it came.
-        config: Every choice.
-        checkpoint: What corrects merged Gaussians; None for no network.
-        device: Where to compute; None chooses as ``auto`` does.
-        cameras: Cameras for presets that render the scene; None finds views.
+        scene: The input scene.
+        config: The configuration.
+        checkpoint: Checkpoint of the network that corrects merged Gaussians; None for no network.
+        device: Device to compute on; None chooses as ``auto`` does.
+        cameras: Cameras for presets that render the scene; None generates views.
         listener: Called with progress events.
     """
 
@@ -71,12 +71,12 @@ class Prepared:
         self._cameras, self._listener = cameras, listener
         self._device = chosen_device(device or "auto", scene.device)
         self._may_leave = device is None
-        self._device_note = ""  # of the present run
-        self._move_note = ""  # of all runs since the device was left
+        self._device_note = ""  # for the current run
+        self._move_note = ""  # for all runs after a fallback to another device
         self._forget()
 
     def _begin(self, device: torch.device, note: str) -> None:
-        """Begin an attempt on a device; after a failed one, let go of its tensors."""
+        """Begin an attempt on a device; after a failed one, release its tensors."""
         if note:
             self._forget()
         if device != self._device:
@@ -84,7 +84,7 @@ class Prepared:
         self._device_note = note or self._move_note
 
     def _forget(self) -> None:
-        """Let go of all that is on the device."""
+        """Release everything that is cached on the device."""
         self._net: MergeNet | PublishedMergeNet | None = None
         self._checked: CheckedScene | None = None
         self._analysis: SceneAnalysis | None = None
@@ -99,7 +99,7 @@ class Prepared:
         max_count: int | None = None,
         keep: Bool[Tensor, "n"] | None = None,
     ) -> Simplified:
-        """Make the scene smaller, and report; arguments and errors as for ``Simplifier.run``.
+        """Simplify the scene, and report; arguments and errors as for ``Simplifier.run``.
 
         Returns:
             The scene and the report.
@@ -142,7 +142,7 @@ class Prepared:
         return self._result(reduced, checked, analysis, target, clock, kept_count=len(protected))
 
     def warm_up(self, rho: float) -> None:
-        """Compute now what the second run computes for all later ones.
+        """Compute and cache in advance the results that the second run would cache.
 
         Args:
             rho: The largest ratio to expect.
@@ -162,7 +162,7 @@ class Prepared:
         self._order(checked.scene, analysis, target, clock)
 
     def levels(self, rhos: Sequence[float]) -> tuple[Level, ...]:
-        """Make the scene smaller in several sizes; see ``Simplifier.levels``.
+        """Simplify the scene to several levels; see ``Simplifier.levels``.
 
         Returns:
             One level per ratio, in the order of the ratios.
@@ -199,7 +199,7 @@ class Prepared:
         return found
 
     def _analyze(self, target: int, clock: StageClock) -> tuple[CheckedScene, SceneAnalysis]:
-        """Check and analyze the scene, once; one that stays whole needs its effect plan only."""
+        """Check and analyze the scene once; if all Gaussians are kept, it is planned only."""
         if self._checked is None:
             with clock.stage("check"):
                 used = select_columns(self._scene, self._config.effects).to(self._device)
@@ -226,7 +226,7 @@ class Prepared:
     def _order(
         self, valid: GaussianScene, analysis: SceneAnalysis, target: int, clock: StageClock
     ) -> None:
-        """Keep what grouping computes of all Gaussians, from the second run on."""
+        """Cache the target-independent part of grouping, from the second run on."""
         if self._has_run and self._ordered is None and target < len(valid):
             with clock.stage("order"):
                 self._ordered = order_gaussians(valid, analysis, self._config)
@@ -243,9 +243,9 @@ class Prepared:
         finest: Reduced | None = None,
         ordered: OrderedRows | None = None,
     ) -> Reduced:
-        """Reduce all valid Gaussians; if none has to go, they stay as they are.
+        """Reduce all valid Gaussians; if all can be kept, they stay unchanged.
 
-        Where invalid rows alone make up the difference, they come out as standard Gaussians.
+        If the target is below N but dropping invalid rows meets it, the others are standardized.
         """
         if target >= len(valid):
             is_whole = target == self._total
@@ -262,7 +262,7 @@ class Prepared:
         )
 
     def _match(self, reduced: Reduced, analysis: SceneAnalysis, clock: StageClock) -> Reduced:
-        """Match the small scene to the images of the analysis, if the configuration says so."""
+        """Match the small scene to the images of the analysis, if there are any."""
         if reduced.grouping is None or analysis.observed is None:
             return reduced
         from cvtgs.matching import cell_contributions, match_views  # noqa: PLC0415 (few need it)
@@ -296,7 +296,7 @@ class Prepared:
         *,
         kept_count: int = 0,
     ) -> Simplified:
-        """Report, restore what was not computed with, and refine if the configuration says so."""
+        """Report, restore columns that were left out, and refine if the configuration says so."""
         scene, total = self._scene, self._total
         masses = [(analysis.areas * analysis.opacities).sum(), reduced.scene.masses.sum()]
         mass_in, mass_out = torch.stack(masses).tolist()

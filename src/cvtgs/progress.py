@@ -1,4 +1,4 @@
-"""Progress events: what a long call reports while it runs."""
+"""Progress events, which long calls report while they run."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ class ProgressEvent:
 
     Attributes:
         stage: Name of the stage, for example ``"tessellate"``.
-        done: Steps finished so far, 0 when the stage starts.
-        total: Steps of the whole stage; ``done == total`` when it has ended.
-        note: What the stage has to say so far, for example ``"+1.20 dB"``; empty if nothing.
+        done: Number of finished steps; 0 when the stage starts.
+        total: Number of steps of the stage; ``done == total`` when it has ended.
+        note: Intermediate result of the stage, for example ``"+1.20 dB"``; empty if none.
     """
 
     stage: str
@@ -22,7 +22,7 @@ class ProgressEvent:
 
 
 ProgressListener = Callable[[ProgressEvent], None]
-"""Anything that takes a :class:`ProgressEvent`. An exception that it raises ends the call."""
+"""A callable that takes a :class:`ProgressEvent`. An exception that it raises ends the call."""
 
 
 def silent(event: ProgressEvent) -> None:

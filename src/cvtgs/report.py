@@ -1,4 +1,4 @@
-"""SimplifyReport: what was done, what was left out, and what it cost."""
+"""SimplifyReport and other reports: actions, dropped data and costs of a run."""
 
 from pkgutil import resolve_name
 from typing import NamedTuple
@@ -15,22 +15,22 @@ from cvtgs.scene import GaussianScene
 
 
 class RefineReport(Record):
-    """What a refinement did.
+    """Report of a refinement.
 
     Attributes:
-        steps: Steps that were taken.
-        images: Images of the full scene that were rendered to learn from.
-        heldout: Views that were held out and decided.
-        psnr_before: PSNR of the scene that came in over the held-out views, dB; each counts as
-            at most 10 dB more than their median.
-        psnr_after: The same of the scene that came out; never less.
-        gain: Their difference, dB.
-        changed_count: Gaussians that are not what they were.
-        stopped: Why it ended: ``steps``, ``time``, ``patience`` (held-out views stopped
+        steps: Number of steps.
+        images: Number of images of the full scene that were rendered for training.
+        heldout: Number of held-out views, which decide what is kept.
+        psnr_before: Mean PSNR of the input scene over the held-out views, dB; each view counts at
+            most 10 dB above their median.
+        psnr_after: The same for the refined scene; never less.
+        gain: Difference of the two, dB.
+        changed_count: Number of Gaussians that changed.
+        stopped: Why the refinement ended: ``steps``, ``time``, ``patience`` (held-out views stopped
             improving), or ``perfect`` (there was nothing to gain).
-        backend: What rendered.
-        device: Where it ran.
-        cost: What it cost, as the stage ``refine``.
+        backend: Name of the renderer.
+        device: Device of the refinement.
+        cost: Cost of the refinement, as the stage ``refine``.
     """
 
     steps: int
@@ -47,16 +47,15 @@ class RefineReport(Record):
 
 
 class MatchReport(Record):
-    """What matching merged Gaussians to images of the full scene did.
+    """Report of matching merged Gaussians to images of the full scene.
 
     Attributes:
-        views: Images of the full scene.
-        opacities_kept: Whether the matched opacities stayed: they did no harm to every eighth
-            image.
-        psnr_before: PSNR of the mean squared error of every eighth image (all of fewer than
-            eight) before, dB.
-        psnr_after: The same afterwards.
-        backend: What rendered.
+        views: Number of images of the full scene.
+        opacities_kept: Whether the matched opacities were kept, because they lowered the error of
+            the held-out images: every eighth image, or all if there are fewer than eight.
+        psnr_before: PSNR of the mean squared error of the held-out images before matching, dB.
+        psnr_after: The same after matching.
+        backend: Name of the renderer.
     """
 
     views: int
@@ -67,19 +66,20 @@ class MatchReport(Record):
 
 
 class CellStatistics(Record):
-    """What the filter left out, and what the cells of a tessellation are like.
+    """Statistics of the filter and of the cells.
 
     Attributes:
-        filtered_count: Faint Gaussians and flyaways that were left out of the tessellation.
-        filtered_mass_share: Their share of the mass.
-        single_member_cells: Cells of one Gaussian, or with one of theirs as representative: it is
-            kept as it is.
-        largest_cell: Members of the largest cell.
-        refilled_cells: Cells that were empty after Lloyd and took a Gaussian from another.
+        filtered_count: Number of faint Gaussians and flyaways that the filter dropped.
+        filtered_mass_share: Share of the mass that these hold.
+        single_member_cells: Number of cells that keep one Gaussian unchanged: their only member,
+            or a representative.
+        largest_cell: Number of members of the largest cell.
+        refilled_cells: Number of cells that were empty after Lloyd and took a Gaussian from
+            another.
         energies: Energy of the tessellation before every Lloyd iteration, over the Gaussians that
             Lloyd samples, in squared robust radii.
-        energy: The same of the final cells, over all Gaussians.
-        backend: What searched the nearest site.
+        energy: Energy of the final cells, over all Gaussians.
+        backend: Name of the nearest-site search.
     """
 
     filtered_count: int = 0
@@ -93,32 +93,33 @@ class CellStatistics(Record):
 
 
 class SimplifyReport(CellStatistics):
-    """What a simplification did.
+    """Report of a simplification.
 
     Attributes:
-        input_count: Gaussians in, N.
-        output_count: Gaussians out.
-        target_count: ``ceil(rho * N)``, or the count that was asked for.
+        input_count: Number of input Gaussians, N.
+        output_count: Number of output Gaussians.
+        target_count: ``ceil(rho * N)``, or the requested count.
         rho: ``target_count / input_count``.
-        invalid_rows: Rows that were dropped, by the attribute that is NaN, infinite or zero. A
-            row with several bad attributes counts once for each.
-        invalid_count: Rows that were dropped.
-        shortfall: Why ``output_count`` is below ``target_count``, else empty.
-        kept_count: Protected Gaussians, which were kept as they are.
-        blocks: Blocks of space that were simplified one by one; 1 for the scene in one piece.
-        resumed_blocks: Those of them that were done already when this run started.
+        invalid_rows: Number of dropped rows, by the attribute that is NaN, infinite or zero. A row
+            with several bad attributes counts once for each.
+        invalid_count: Number of dropped rows.
+        shortfall: Why ``output_count`` is below ``target_count``; empty if it is not.
+        kept_count: Number of protected Gaussians, which stay unchanged.
+        blocks: Number of spatial blocks that were simplified one by one; 1 without blocks.
+        resumed_blocks: Number of blocks that were already done when this run started.
         mass_in: Opacity times mean projected area of the input, squared scene units.
-        mass_out: The same of the output.
-        checkpoint: What corrected the merged Gaussians: a shipped name, a file, or ``none``.
-        device: Where it ran.
-        device_note: Why it ran elsewhere, or in short chunks: the memory of the chosen device ran
-            out; else empty.
-        views: Where images of the scene were rendered from: ``N cameras`` that were given or lay
-            beside it, ``found`` by cvtgs, or ``none`` without images.
+        mass_out: The same for the output.
+        checkpoint: Checkpoint that corrected the merged Gaussians: a shipped name, a file, or
+            ``none``.
+        device: Device of the run.
+        device_note: Says if the chosen device ran out of memory, and whether the run then used
+            short chunks or the CPU; else empty.
+        views: Origin of the views of rendered images: ``N cameras`` that were given or found with
+            the file, ``found`` by cvtgs, or ``none`` without images.
         plan: The effects that the scene called for.
-        stages: What each stage cost.
-        matching: What matching to images of the scene gained; None if there was none.
-        refinement: What a refinement gained afterwards; None if there was none.
+        stages: Cost of each stage.
+        matching: Report of the matching to images; None if there was none.
+        refinement: Report of the refinement; None if there was none.
         config: The configuration.
     """
 
@@ -167,7 +168,7 @@ class SimplifyReport(CellStatistics):
 
 
 class Simplified(NamedTuple):
-    """A small scene, and how it was made.
+    """A simplified scene and its report.
 
     Attributes:
         scene: The small scene.
@@ -178,22 +179,22 @@ class Simplified(NamedTuple):
     report: SimplifyReport
 
     def _repr_html_(self) -> str:
-        """Return an image and what was done, for notebooks."""
+        """Return HTML with an image and facts, for notebooks."""
         text: str = resolve_name("cvtgs.notebooks:result_html")(self)
         return text
 
 
 class Level(NamedTuple):
-    """One size of a scene, of several.
+    """One of several levels of a scene.
 
     Attributes:
         scene: The small scene.
-        report: What was done, and what it cost beyond what finer sizes had cost already.
+        report: Report of the level; costs exclude the work shared with finer levels.
         geometric_error: Root mean square distance from Gaussians to the small ones that replace
             them, weighted by apparent mass; scene units.
-        nested: Whether every cell consists of whole cells of the finest size.
-        assignment: ``(n,)`` row of the small Gaussian that stands for each valid input row, int32;
-            -1 for those that were left out. None if all are kept.
+        nested: Whether every cell consists of whole cells of the finest level.
+        assignment: ``(n,)`` row of the small Gaussian that represents each valid input row, int32;
+            -1 for dropped rows. None if all are kept.
     """
 
     scene: GaussianScene

@@ -1,4 +1,4 @@
-"""GaussianScene: the Gaussians of a scene, as files and optimisers store them."""
+"""GaussianScene: the Gaussians of a scene in stored (not activated) parameters."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ ANTIALIASED_TAG = "SplatRenderMode: mip"
 """The comment of scenes that were trained with anti-aliasing (Mip-Splatting)."""
 
 FLAT_LOG_SCALE = -20.0
-"""Third log-scale of Gaussians that have two scales (2DGS): two billionths of a unit."""
+"""Third log-scale of Gaussians with two scales (2DGS): two billionths of a scene unit."""
 
 _CHUNK = 1 << 16
 
@@ -30,8 +30,8 @@ _TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 class GaussianScene:
     """A 3D Gaussian Splatting scene of ``n`` Gaussians, as files and optimisers store it.
 
-    Values are not checked, only shapes, dtypes and devices: a scene may hold the NaN rows of the
-    file that it came from. :func:`cvtgs.validity.invalid_rows` tells which rows are not usable.
+    Only shapes, dtypes and devices are checked, not values: a scene may hold the NaN rows of its
+    file. :func:`cvtgs.validity.invalid_rows` finds unusable rows.
 
     Attributes:
         means: ``(n, 3)`` centres, scene units.
@@ -42,8 +42,8 @@ class GaussianScene:
         shN: ``(n, k, 3)`` view-dependent SH bands, k in {0, 3, 8, 15}.
         extras: Further columns ``(n,)`` by name, of any dtype; they are carried along.
         comments: Comment lines of the file, such as ``SplatRenderMode: mip``.
-        layout: Property names and types of the file, in order; empty if there was none.
-            ``cvtgs.io`` writes the scene back in it, and a file without a third scale is one of
+        layout: Property names and types of the file, in order; empty if there was no file.
+            ``cvtgs.io`` writes the scene with the same layout; a file without a third scale holds
             flat Gaussians.
 
     Raises:
@@ -70,7 +70,7 @@ class GaussianScene:
     layout: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse shapes, dtypes and devices that do not fit together."""
+        """Check that shapes, dtypes and devices fit together."""
         for name, tensor in self.tensors().items():
             if not isinstance(tensor, Tensor):
                 raise InvalidSceneError(
@@ -112,7 +112,7 @@ class GaussianScene:
 
     @property
     def scales(self) -> Float[Tensor, "n 3"]:
-        """Standard deviations along the own axes, scene units."""
+        """Standard deviations along the axes of each Gaussian, scene units."""
         return torch.exp(self.log_scales)
 
     @property
@@ -146,7 +146,7 @@ class GaussianScene:
 
     @property
     def antialiased(self) -> bool:
-        """Whether the scene was trained with anti-aliasing and must be shown so."""
+        """Whether the scene was trained with anti-aliasing and must be rendered with it."""
         return ANTIALIASED_TAG.lower() in "\n".join(self.comments).lower()
 
     @property
@@ -180,13 +180,13 @@ class GaussianScene:
         }
 
     def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> Self:
-        """Take some Gaussians, with all that belongs to them.
+        """Return some of the Gaussians, with all their tensors and extra columns.
 
         Args:
             rows: Row numbers, or a mask.
 
         Returns:
-            A scene with those rows, copied.
+            A scene with a copy of those rows.
         """
         if rows.dtype == torch.bool:
             rows = rows.nonzero()[:, 0]
@@ -202,17 +202,17 @@ class GaussianScene:
         )
 
     def __getitem__(self, rows: slice | Sequence[int] | Tensor) -> Self:
-        """Take some Gaussians, as :meth:`select` does.
+        """Return some of the Gaussians, as :meth:`select` does.
 
         Args:
             rows: A slice, a mask, or row numbers.
 
         Returns:
-            A scene with those rows, copied.
+            A scene with a copy of those rows.
 
         Raises:
-            InvalidArgumentError: A mask does not have an entry for every Gaussian, or rows is a
-                single number or a text.
+            InvalidArgumentError: A mask has not one entry per Gaussian, or ``rows`` is a single
+                number or a string.
         """
         if isinstance(rows, slice):
             these = range(len(self))[rows]
@@ -245,33 +245,33 @@ class GaussianScene:
         """Write the scene to a file, as :func:`cvtgs.save` does.
 
         Args:
-            path: The file to write; its suffix chooses the format. Or an open binary file.
-            format: The suffix of the format, if the name of the file does not say it.
+            path: Path of the file, whose suffix chooses the format, or an open binary file.
+            format: Suffix of the format, if the file name does not have it.
             overwrite: Whether an existing file may be replaced.
-            axes: Where x, y and z of the file are to point; None for the axes of the format.
+            axes: Directions of x, y and z in the file; None for the axes of the format.
         """
         resolve_name("cvtgs.io.formats:save")(
             self, path, format=format, overwrite=overwrite, axes=axes
         )
 
     def with_sh_degree(self, degree: int) -> Self:
-        """Drop the SH bands above a degree; files of the scene get smaller.
+        """Drop the SH bands above a degree, which makes files of the scene smaller.
 
         Args:
             degree: 0 to 3.
 
         Returns:
-            The same Gaussians with fewer bands; this scene if it has none above the degree.
+            The same Gaussians with fewer bands; the same object if there are none above the degree.
 
         Raises:
-            InvalidArgumentError: There is no such degree.
+            InvalidArgumentError: The degree is not from 0 to 3.
         """
         if degree not in range(len(spherical_harmonics.REST_COUNTS)):
             raise InvalidArgumentError(f"the SH degree must be from 0 to 3, found {degree!r}.")
         if degree >= self.sh_degree:
             return self
         count = spherical_harmonics.REST_COUNTS[degree]
-        # A copy: sums over cells read rows in one piece.
+        # A contiguous copy, since sums over cells read whole rows.
         return self.with_tensors({"shN": self.shN[:, :count].contiguous()}, self.extras)
 
     def with_tensors(
@@ -280,18 +280,18 @@ class GaussianScene:
         extras: Mapping[str, Tensor] | None = None,
         **named: Tensor,
     ) -> Self:
-        """Return a scene of other Gaussians with the comments and the layout of this one.
+        """Return a scene with some tensors replaced, and the comments and layout of this one.
 
         Args:
             tensors: Some or all of the six standard tensors by name.
-            extras: All further columns; None for those of this scene.
+            extras: All extra columns; None for those of this scene.
             named: Standard tensors by keyword: ``scene.with_tensors(sh0=colors)``.
 
         Returns:
             The new scene.
 
         Raises:
-            InvalidSceneError: There is no such tensor, or they do not fit together.
+            InvalidSceneError: A tensor name is unknown, or tensors do not fit together.
         """
         given = {**(tensors or {}), **named}
         unknown = sorted(given.keys() - set(_TENSORS))
@@ -307,10 +307,10 @@ class GaussianScene:
         """Move the scene to a device.
 
         Args:
-            device: Where to.
+            device: The target device.
 
         Returns:
-            This scene if it is there already, else a copy.
+            The same object if it is already there, else a copy.
         """
         target = torch.device(device)
         if target == self.device:
@@ -321,30 +321,30 @@ class GaussianScene:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let scenes be pickled and deep-copied, though a mapping proxy cannot be."""
+        """Support pickling and deep copies, which mapping proxies do not."""
         values: dict[str, Any] = {**self.tensors(), "extras": dict(self.extras)}
         values |= {"comments": self.comments, "layout": self.layout}
         return partial(type(self), **values), ()
 
     def __repr__(self) -> str:
-        """Report count, degree, dtype and device, not the values."""
+        """Return count, degree, dtype and device, not the values."""
         return (
             f"GaussianScene({len(self):,} Gaussians, SH degree {self.sh_degree}, "
             f"{str(self.dtype).removeprefix('torch.')}, {self.device})"
         )
 
     def _repr_html_(self) -> str:
-        """Return an image and the facts, for notebooks."""
+        """Return HTML with an image and facts, for notebooks."""
         text: str = resolve_name("cvtgs.notebooks:scene_html")(self)
         return text
 
 
 SceneLike = GaussianScene | str | os.PathLike[str]
-"""A scene, or the file or folder of one."""
+"""A scene, or the path of its file or folder."""
 
 
 def as_scene(scene: SceneLike, name: str = "scene") -> GaussianScene:
-    """Return a scene as it is, and read the path of one; refuse anything else."""
+    """Return a scene unchanged, or read it from a path; raise for anything else."""
     if isinstance(scene, GaussianScene):
         return scene
     if isinstance(scene, str | os.PathLike):

@@ -1,4 +1,4 @@
-"""What users call to make scenes smaller; what it runs is in :mod:`cvtgs.pipeline`."""
+"""The public entry points of a simplification; :mod:`cvtgs.pipeline` has its stages."""
 
 import os
 from collections.abc import Sequence
@@ -20,22 +20,22 @@ from cvtgs.views import find_own_cameras
 
 
 class Simplifier:
-    """Makes scenes smaller: N Gaussians in, exactly ``ceil(rho * N)`` standard Gaussians out.
+    """A simplifier: N Gaussians in, exactly ``ceil(rho * N)`` standard Gaussians out.
 
     Args:
         ckpt: MergeNet checkpoint: ``standard`` or ``paper``, which come with the package, or a
-            file; ``auto`` is the shipped one that fits the configuration's preset, ``None``
-            merges by moments alone.
-        config: A configuration, or the name of a preset; None is the preset of the checkpoint.
+            file. ``auto`` takes the shipped one that fits the preset of the configuration;
+            ``None`` merges by moments alone.
+        config: A configuration, or the name of a preset; None takes the preset of the checkpoint.
         preset: The name of a preset, instead of a configuration.
-        device: Where to compute: ``auto`` stays where the scene is, but takes CUDA for scenes on
-            the CPU if there is one; or any torch device. The result is where the scene was.
+        device: Any torch device, or ``auto``: the device of the scene, but CUDA, if available, for
+            a scene on the CPU. The result is on the device of the scene.
         listener: Called with progress events.
 
     Raises:
         CheckpointError: The checkpoint cannot be used.
         ConfigError: There is no such preset, or it has no network but a checkpoint is given.
-        DeviceError: There is no such device.
+        DeviceError: The device cannot be used.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -80,19 +80,19 @@ class Simplifier:
         cameras: Cameras | None = None,
         keep: Bool[Tensor, "n"] | None = None,
     ) -> GaussianScene:
-        """Make a scene smaller.
+        """Simplify a scene.
 
         Args:
-            scene: The scene, which is not changed, or a file or folder of one.
+            scene: The scene, which is not changed, or the path of its file or folder.
             rho: Ratio of Gaussians to keep, in (0, 1].
             count: Number of Gaussians to keep, instead of ``rho``.
-            max_count: Number to keep if there are more; a smaller scene stays as it is.
-            cameras: Cameras for presets that render the scene; None finds views.
-            keep: Mask of Gaussians that are kept as they are; they count, and come first.
+            max_count: Maximum number to keep; a smaller scene is not reduced.
+            cameras: Cameras for presets that render the scene; None finds or generates views.
+            keep: Mask of Gaussians to keep unchanged; they count towards the target and come first.
 
         Returns:
-            A scene of exactly ``ceil(rho * N)`` (or the count) Gaussians; fewer only if so many
-            rows are invalid. With ``rho = 1``, the scene's own valid rows.
+            A scene of exactly ``ceil(rho * N)`` (or the count) Gaussians; fewer only if invalid
+            rows leave fewer. With ``rho = 1``, the scene's own valid rows.
 
         Raises:
             InvalidArgumentError: Ratio or count is out of range, or not exactly one is given.
@@ -111,7 +111,7 @@ class Simplifier:
         cameras: Cameras | None = None,
         keep: Bool[Tensor, "n"] | None = None,
     ) -> Simplified:
-        """Make a scene smaller, and report; arguments and errors as for :meth:`simplify`.
+        """Simplify a scene, and report; arguments and errors as for :meth:`simplify`.
 
         Returns:
             The scene and the report.
@@ -127,18 +127,18 @@ class Simplifier:
         *,
         cameras: Cameras | None = None,
     ) -> tuple[Level, ...]:
-        """Make a scene smaller in several sizes, in little more time than the finest takes.
+        """Simplify a scene to several levels, in little more time than the finest takes.
 
-        The finest size is what :meth:`run` returns, bit for bit. Cells of a coarser one consist of
-        whole cells of the finest, where it is at least four times as coarse.
+        The finest level equals the result of :meth:`run`, bit for bit. The cells of a level that is
+        at least four times as coarse consist of whole cells of the finest level.
 
         Args:
-            scene: The scene, which is not changed, or a file or folder of one.
+            scene: The scene, which is not changed, or the path of its file or folder.
             rhos: Ratios of Gaussians to keep, in (0, 1], in any order.
-            cameras: Cameras for presets that render the scene; None finds views.
+            cameras: Cameras for presets that render the scene; None finds or generates views.
 
         Returns:
-            One level per ratio, in the order of the ratios; each of exactly ``ceil(rho * N)``.
+            One level per ratio, in the order of the ratios, of exactly ``ceil(rho * N)`` Gaussians.
 
         Raises:
             InvalidArgumentError: A ratio is out of range, or there is none.
@@ -153,15 +153,15 @@ class Simplifier:
         return self.prepare(scene, cameras=cameras).levels(rhos)
 
     def prepare(self, scene: SceneLike, *, cameras: Cameras | None = None) -> Prepared:
-        """Get ready to make a scene smaller again and again, for a slider or a search.
+        """Prepare a scene to be simplified repeatedly, for a slider or a search.
 
-        What does not depend on the number of Gaussians is done in the first run only.
+        Steps that do not depend on the target count run once only.
 
         Args:
-            scene: The scene, which is not changed, and must not be while this is used; or a
-                file or folder of one.
-            cameras: Cameras for presets that render the scene; None takes those that lie beside
-                a file or in a folder (:func:`cvtgs.views.find_own_cameras`), or finds views.
+            scene: The scene, which is not changed and must not be modified while the result is in
+                use, or the path of its file or folder.
+            cameras: Cameras for presets that render the scene; None takes those beside the file or
+                in the folder (:func:`cvtgs.views.find_own_cameras`), or else generates views.
 
         Returns:
             The prepared scene.
@@ -197,25 +197,25 @@ def simplify(
     preset: str = "standard",
     device: str | torch.device = "auto",
 ) -> GaussianScene:
-    """Make a scene smaller.
+    """Simplify a scene.
 
-    :class:`cvtgs.Simplifier` does the same, with more choices and a report.
+    :class:`cvtgs.Simplifier` does the same, with more options and a report.
 
     Args:
-        scene: The scene, or a file or folder that :func:`cvtgs.load` reads.
+        scene: The scene, or the path of a file or folder that :func:`cvtgs.load` reads.
         rho: Ratio of Gaussians to keep, in (0, 1].
         count: Number of Gaussians to keep, instead of ``rho``.
-        max_count: Number to keep if there are more; a smaller scene stays as it is.
+        max_count: Maximum number to keep; a smaller scene is not reduced.
         preset: Name of the preset, from ``draft``, the fastest, to ``high``, the best.
-        device: Where to compute, as for :class:`cvtgs.Simplifier`.
+        device: Device to compute on, as for :class:`cvtgs.Simplifier`.
 
     Returns:
-        A scene of exactly ``ceil(rho * N)`` (or the count) Gaussians; fewer only if so many rows
-        are invalid.
+        A scene of exactly ``ceil(rho * N)`` (or the count) Gaussians; fewer only if invalid rows
+        leave fewer.
 
     Raises:
         InputError: The file cannot be read.
-        FileFormatError: The file is not what its format promises.
+        FileFormatError: The file violates its format.
         ConfigError: There is no such preset.
         InvalidArgumentError: Ratio or count is out of range, or not exactly one is given.
         InvalidSceneError: The scene has no valid row.

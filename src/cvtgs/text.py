@@ -1,4 +1,4 @@
-"""Texts from files and users in messages: names, comments and paths, printable and short."""
+"""Make text from files and users safe to show in messages: printable and short."""
 
 import json
 import re
@@ -9,19 +9,19 @@ from typing import Any
 _UNSAFE = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
 )
-"""Control characters but tab and line feed, those that change the direction, lone surrogates."""
+"""Control characters except tab and line feed, direction marks, and lone surrogates."""
 
 MOST_LETTERS = 60
-"""Of a value in an error text."""
+"""Maximum length of a value in an error message."""
 
 
 def shortened(text: str, length: int) -> str:
-    """Cut a text that is too long."""
+    """Truncate a text to a maximum length."""
     return text if len(text) <= length else f"{text[: length - 3]}..."
 
 
 def printable(text: str, encoding: str = "utf-8") -> str:
-    r"""Return a text with what a terminal obeys, or cannot encode, as ``\u001b`` (also in JSON)."""
+    r"""Escape control and unencodable characters of a text, such as ``\u001b`` (valid in JSON)."""
     text = _UNSAFE.sub(lambda match: _escaped(match[0]), text)
     try:
         text.encode(encoding)
@@ -43,16 +43,16 @@ def _escaped(letter: str) -> str:
 
 
 def shown(value: Any, length: int = MOST_LETTERS) -> str:
-    """Return a value as Python writes it, cut after some characters."""
+    """Return the ``repr`` of a value, truncated to a maximum length."""
     try:
         return shortened(repr(value), length)
-    except RecursionError:  # lists in lists in lists
+    except RecursionError:  # lists nested too deeply
         return f"a deeply nested {type(value).__name__}"
-    except ValueError:  # Python writes no number of thousands of digits
+    except ValueError:  # Python refuses to print numbers of thousands of digits
         return "a number of thousands of digits"
 
 
 def suggestion(word: str, choices: Iterable[str], *, likeness: float = 0.6) -> str:
-    """Return "; did you mean X?" with the choice most like a word; empty if none is alike."""
+    """Return "; did you mean X?" with the choice closest to a word; empty if none is close."""
     near = get_close_matches(word, list(choices), n=1, cutoff=likeness)
     return f"; did you mean {near[0]}?" if near else ""

@@ -1,4 +1,4 @@
-"""Which rows renderers can draw, and how valid input becomes standard Gaussians."""
+"""Detection of rows that renderers cannot draw, and standardization of valid rows."""
 
 import math
 import warnings
@@ -13,23 +13,23 @@ from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 
 UNIT_TOLERANCE = 1e-5
-"""Quaternions whose squared length is this near 1 count as unit quaternions."""
+"""Quaternions whose squared length differs from 1 by at most this count as unit quaternions."""
 
 MAX_LOG_SCALE = math.log(torch.finfo(torch.float32).max)
-"""The logarithm of the largest scale that files and renderers, which hold float32, can express."""
+"""The logarithm of the largest float32 scale, since files and renderers hold float32."""
 
 _FAR = 1e6
-"""Distance from the origin at which float32 keeps steps of a sixteenth of a unit."""
+"""Distance from the origin at which float32 has a resolution of a sixteenth of a unit."""
 
 
 class CheckedScene(NamedTuple):
-    """The valid rows of a scene, and how many others there were.
+    """The valid rows of a scene, and the number of dropped rows.
 
     Attributes:
         scene: The valid Gaussians.
-        invalid_rows: Rows that were dropped, by the attribute that is NaN, infinite or zero.
-        invalid_count: Rows that were dropped.
-        is_valid: ``(n,)`` mask of the others; None if no row was dropped.
+        invalid_rows: Number of dropped rows, by the attribute that is NaN, infinite or zero.
+        invalid_count: Number of dropped rows.
+        is_valid: ``(n,)`` mask of the valid rows; None if no row was dropped.
     """
 
     scene: GaussianScene
@@ -39,13 +39,13 @@ class CheckedScene(NamedTuple):
 
 
 def check_rows(scene: GaussianScene) -> CheckedScene:
-    """Drop rows with NaN, infinite or zero values where there must be none, and warn.
+    """Drop invalid rows (:func:`invalid_rows`), and warn about them.
 
     Args:
         scene: The Gaussians.
 
     Returns:
-        The valid rows, and what was dropped.
+        The valid rows, and counts of the dropped ones.
 
     Raises:
         InvalidSceneError: No row is valid.
@@ -76,8 +76,8 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
     """Find the rows that no renderer can draw.
 
     NaN or infinite means, scales and SH coefficients, NaN opacities, and quaternions that are
-    zero, NaN or infinite are invalid. Scales beyond float32 count as infinite, and those of
-    minus infinity, which are 0, are invalid too. Infinite opacity logits are valid.
+    zero, NaN or infinite are invalid. Scales beyond float32 count as infinite. Log-scales of minus
+    infinity, which are scales of 0, are invalid too. Infinite opacity logits are valid.
 
     Args:
         scene: Any scene.
@@ -95,19 +95,19 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
         if name == "logit_opacities":
             masks[name] = values.isnan()
             continue
-        # Without an array of booleans per value: a finite number times 0 is 0, any other is NaN,
-        # and a sum with a NaN is NaN.
+        # Avoids a boolean array with an entry per value: a finite number times 0 is 0, any other
+        # is NaN, and a sum with a NaN is NaN.
         parts = values.flatten(start_dim=1).split(1 << 16)
         masks[name] = torch.cat([(part * 0).sum(dim=1) != 0 for part in parts])
     masks["quats"] |= (scene.quats == 0).all(dim=1)
     masks["log_scales"] |= (scene.log_scales > MAX_LOG_SCALE).any(dim=1)
-    # One answer for all masks: a device is asked only once.
+    # All masks at once, so that the host synchronises with the device only once.
     any_bad = torch.stack([mask.any() for mask in masks.values()]).tolist()
     return {name: mask for (name, mask), bad in zip(masks.items(), any_bad, strict=True) if bad}
 
 
 def valid_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
-    """Return which rows renderers can draw.
+    """Return a mask of the rows that renderers can draw.
 
     Args:
         scene: Any scene.
@@ -127,13 +127,13 @@ def valid_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
 
 
 def writable_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
-    """Return which rows compact formats can hold: finite in float32, with a rotation.
+    """Return a mask of the rows that compact formats can hold.
 
     Args:
         scene: Any scene.
 
     Returns:
-        Mask of these rows.
+        Mask of rows that are finite in float32 and whose quaternion is not zero.
     """
     rows = ~scene.logit_opacities.isnan() & (scene.quats != 0).any(dim=1)
     for name, tensor in scene.tensors().items():
@@ -149,7 +149,7 @@ def with_finite_opacities(scene: GaussianScene) -> GaussianScene:
         scene: A scene with valid rows.
 
     Returns:
-        The scene itself if there is nothing to replace.
+        The scene; the same object if there is nothing to replace.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -166,13 +166,13 @@ def with_finite_opacities(scene: GaussianScene) -> GaussianScene:
 
 
 def standardized(scene: GaussianScene) -> GaussianScene:
-    """Bring opacities strictly inside (0, 1) and quaternions to unit length.
+    """Clamp opacities to strictly inside (0, 1) and normalize quaternions.
 
     Args:
         scene: A scene with valid rows.
 
     Returns:
-        A scene in which rows that were so already are unchanged, bit for bit.
+        The scene; rows that already satisfy this are unchanged, bit for bit.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -188,7 +188,7 @@ def standardized(scene: GaussianScene) -> GaussianScene:
 
 
 def warn_of_lost_digits(scene: GaussianScene) -> None:
-    """Warn of a scene so far from its origin that float32 keeps no small differences."""
+    """Warn if a scene is so far from its origin that float32 loses small differences."""
     if len(scene) == 0 or scene.means.element_size() > 4:
         return
     middle = scene.means.nanmedian(dim=0).values.double()

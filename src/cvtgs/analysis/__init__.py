@@ -1,4 +1,4 @@
-"""What a scene is like: frame, areas, visibility, and the effects that it calls for."""
+"""Analysis of a scene: frame, areas, visibility, and the effects that it calls for."""
 
 from cvtgs.analysis.analyze import (
     SceneAnalysis,

@@ -1,7 +1,4 @@
-"""SceneAnalysis: all that the stages need to know of a scene, computed once.
-
-And the columns of a scene that are computed with, and how the others come back.
-"""
+"""SceneAnalysis, computed once for all stages; selecting and restoring columns of a scene."""
 
 from dataclasses import dataclass, replace
 from typing import Self
@@ -22,25 +19,25 @@ from cvtgs.scene import ANTIALIASED_TAG, FLAT_LOG_SCALE, GaussianScene
 from cvtgs.views import mixed_views
 
 MIN_OPACITY = 1e-6
-"""Opacities below count as this where something is divided by them."""
+"""Floor of opacities in divisions."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SceneAnalysis:
-    """What is known of the valid Gaussians of a scene.
+    """The analysis of the valid Gaussians of a scene.
 
     Attributes:
         frame: Robust centre and radius of the scene.
         farthest: Largest distance to the centre, in robust radii.
         opacities: ``(n,)`` opacities in (0, 1).
         areas: ``(n,)`` mean projected areas, squared scene units, float64.
-        apparent_areas: ``(n,)`` the same as they count in images: smaller for what is far from the
+        apparent_areas: ``(n,)`` areas as they count in images: smaller for Gaussians far from the
             middle or enclosed by others.
         visibility: ``(n,)`` ambient visibility of every Gaussian, 0 (enclosed) to 1 (free);
             empty if neither weights nor the network use it.
         plan: The effects that the scene calls for.
-        observed: Images of the scene and what these Gaussians add to them; None if later stages
-            do not use them.
+        observed: Images of the scene and the contributions of these Gaussians to them; None if
+            later stages do not use them.
     """
 
     frame: RobustFrame
@@ -59,7 +56,7 @@ class SceneAnalysis:
             rows: Row numbers.
 
         Returns:
-            Their values; frame, farthest distance and plan are still those of the whole scene.
+            Their values; frame, farthest distance and plan remain those of the whole scene.
         """
         observed = self.observed
         if observed is not None:
@@ -80,9 +77,9 @@ def analyze(
     """Analyze a scene without rendering it.
 
     Args:
-        scene: The Gaussians, with valid rows.
-        config: Every choice.
-        with_visibility: Whether a network will ask for the ambient visibility.
+        scene: The Gaussians; all rows must be valid.
+        config: The configuration.
+        with_visibility: Whether a network needs the ambient visibility.
 
     Returns:
         Frame, areas, visibility and effect plan.
@@ -118,16 +115,16 @@ def apparent_areas(
     *,
     config: TessellationConfig,
 ) -> Float[Tensor, "n"]:
-    """Return areas as they count in images, smaller for what is far from the middle or enclosed.
+    """Return areas as they count in images: smaller if far from the middle or enclosed.
 
     Args:
         areas: Mean projected areas.
         distances: Distances to the centre of the scene, in robust radii.
-        visibility: Ambient visibility; ignored if enclosed Gaussians count fully.
-        config: What counts.
+        visibility: Ambient visibility; ignored if ``config.hidden_share`` is 1.
+        config: Whether distance and enclosure count.
 
     Returns:
-        Areas, in the unit of ``areas``.
+        Apparent areas, in the unit of ``areas``.
     """
     apparent = areas
     if config.perspective:
@@ -144,16 +141,16 @@ def measure_visibility(
     *,
     cameras: Cameras | None = None,
 ) -> SceneAnalysis:
-    """Correct apparent areas by what every Gaussian contributes to images of the scene.
+    """Correct apparent areas by the contributions of Gaussians to images of the scene.
 
     Args:
-        scene: The Gaussians, with valid rows.
-        analysis: Their analysis so far.
-        config: Every choice; ``config.visibility`` says how many images, and how far they count.
-        cameras: Cameras to render from; None finds views.
+        scene: The Gaussians; all rows must be valid.
+        analysis: Their analysis.
+        config: The configuration; ``config.visibility`` sets the images and their weight.
+        cameras: Cameras to render from; None generates views.
 
     Returns:
-        The analysis with other apparent areas, and haze decided by them.
+        The analysis with corrected apparent areas, and the haze effect decided by them.
     """
     choices = config.visibility
     if cameras is None:
@@ -182,15 +179,15 @@ def measure_visibility(
 
 
 def select_columns(scene: GaussianScene, choices: EffectsConfig) -> GaussianScene:
-    """Leave out what was switched off, before the scene is looked at.
+    """Drop SH bands and extra columns that the configuration switches off.
 
     Args:
         scene: Any scene.
-        choices: What was forced on or off.
+        choices: Effects that are forced on or off.
 
     Returns:
-        A scene of the same Gaussians, with the SH bands and the columns that are to be used; the
-        scene itself if those are all.
+        A scene of the same Gaussians with the SH bands and columns to use; the same object if
+        nothing is dropped.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -208,15 +205,14 @@ def select_columns(scene: GaussianScene, choices: EffectsConfig) -> GaussianScen
 
 
 def drop_unused_bands(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
-    """Leave out the SH bands that a scene does not call for.
+    """Drop the SH bands that a scene does not call for, and the mip tag (:func:`drop_mip_tag`).
 
     Args:
-        scene: The scene that was planned for.
-        plan: What it calls for.
+        scene: The scene that the plan was made for.
+        plan: The effect plan.
 
     Returns:
-        The scene with the other bands, which are copied if there are any, and tagged as
-        :func:`drop_mip_tag` does; itself if that changes nothing.
+        The scene with a copy of the remaining bands; the same object if nothing changes.
 
     Example:
         >>> from cvtgs.analysis import plan_effects
@@ -231,14 +227,14 @@ def drop_unused_bands(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
 
 
 def drop_mip_tag(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
-    """Take the tag of antialiasing off a scene, if images of it are to be taken without.
+    """Remove the anti-aliasing tag of a scene, if it is to be rendered without anti-aliasing.
 
     Args:
         scene: Any scene.
-        plan: Whether they are antialiased.
+        plan: The effect plan; ``plan.mip`` decides.
 
     Returns:
-        The scene; itself if there is nothing to take off.
+        The scene; the same object if there is nothing to remove.
 
     Example:
         >>> from cvtgs.config import SimplifyConfig
@@ -257,16 +253,16 @@ def drop_mip_tag(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
 
 
 def restore_columns(small: GaussianScene, scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
-    """Make a small scene of the same kind as the one that it was made from.
+    """Restore the SH degree, the comments and the flatness of the input in a small scene.
 
     Args:
         small: The small scene, with the bands that were computed.
-        scene: The scene that came in.
-        plan: What it called for.
+        scene: The input scene.
+        plan: The effect plan of the input scene.
 
     Returns:
-        The small scene with the SH degree and the comments of ``scene``: zeros where bands were
-        left out, and no third scale if its Gaussians have two.
+        The small scene with the SH degree and the comments of ``scene``: dropped bands are zeros,
+        and third scales are negligible if the Gaussians of ``scene`` have two scales.
 
     Example:
         >>> from cvtgs.analysis import plan_effects

@@ -1,4 +1,4 @@
-"""EffectPlan: which effects a scene calls for, and the figures that decide."""
+"""EffectPlan: the effects that a scene calls for, and the figures that decide."""
 
 import math
 from itertools import pairwise
@@ -15,40 +15,40 @@ from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
 from cvtgs.scene import GaussianScene
 
 BAND_LOSS = 1e-5
-"""Bands of the spherical harmonics that together change no colour by more are left out."""
+"""Bands of the spherical harmonics that together change no colour by more are dropped."""
 
 UNBOUNDED_SHARE = 0.05
 """A scene with more than this share of its mass far away is unbounded."""
 
 FULLY_UNBOUNDED_SHARE = 0.1
-"""From this share on it is so fully; in between, by degrees: no scene lies on an edge."""
+"""From this share on, contraction has full strength; in between it sets in gradually."""
 
 DUPLICATE_SHARE = 0.01
-"""With more than this share of duplicates, it pays to search for each place only once."""
+"""With more than this share of duplicates, it pays to search only once per position."""
 
 UNBOUNDED_DISTANCE = 3.0
-"""In robust radii: what lies beyond is far away."""
+"""Distance beyond which Gaussians count as far away, in robust radii."""
 
 SAMPLE = 1 << 14
-"""Gaussians, spread over the rows, that are looked at first."""
+"""Approximate size of the sample, evenly spaced in the rows, that is examined first."""
 
 HASHED = 1 << 12
-"""Duplicates are counted among at least so many Gaussians."""
+"""Smallest expected size of the sample in which duplicates are counted."""
 
 CHUNK = 1 << 14
 
 LEAST_CONTRAST = 1e-6
-"""Scenes of one colour count as having this contrast."""
+"""Floor of the contrast, for scenes of a single colour."""
 
 
 class Effect(pydantic.BaseModel):
-    """One effect, whether it is computed, and the figure that decided.
+    """The decision on one effect, and the figure that decided.
 
     Attributes:
         active: Whether the effect is computed.
-        figure: What was measured on the scene.
-        meaning: What the figure is, and where the threshold lies.
-        forced: Whether the configuration decided, and not the figure.
+        figure: Figure that was measured on the scene.
+        meaning: Meaning of the figure, and its threshold.
+        forced: Whether the configuration decided instead of the figure.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -60,11 +60,11 @@ class Effect(pydantic.BaseModel):
 
 
 class BandsEffect(Effect):
-    """View-dependent colour: which bands of the spherical harmonics are computed.
+    """View-dependent colour: the bands of the spherical harmonics to compute.
 
     Attributes:
-        degree: The bands up to this degree are; those above come out as zeros.
-        bands: The figure of every band that was looked at, from degree 1 on.
+        degree: Highest degree that is computed; bands above it are written as zeros.
+        bands: Figure of every band of the scene, from degree 1 on.
     """
 
     degree: int
@@ -72,29 +72,28 @@ class BandsEffect(Effect):
 
 
 class GradedEffect(Effect):
-    """An effect that sets in by degrees.
+    """An effect that sets in gradually.
 
     Attributes:
-        strength: From 0, which changes nothing, to 1.
+        strength: Strength, from 0 (no change) to 1.
     """
 
     strength: float
 
 
 class EffectPlan(pydantic.BaseModel):
-    """What a scene calls for. The names are those of :class:`cvtgs.config.EffectsConfig`.
+    """The effects that a scene calls for, named as in :class:`cvtgs.config.EffectsConfig`.
 
     Attributes:
-        sh: Colour depends on the direction of view: SH bands above the constant.
-        mip: Images of the scene are taken with the compensation of Mip-Splatting, and its cells are
-            merged for it.
+        sh: View-dependent colour: SH bands above the constant one are computed.
+        mip: The scene is rendered with the compensation of Mip-Splatting, and its cells are merged
+            for it.
         unbounded: Part of the mass is far away: far positions are contracted.
-        haze: Faint Gaussians hold mass: they are sorted, and only the faintest left out.
-        flat: Gaussians have two scales (2DGS), and none shall get a third.
-        duplicates: Gaussians lie exactly on others: the nearest site is searched once for each
-            place.
+        haze: Faint Gaussians hold mass: only the faintest are dropped.
+        flat: Gaussians have two scales (2DGS), and none gets a third.
+        duplicates: Gaussians share positions: the nearest site is searched once per position.
         extras: Columns beyond the standard ones are carried along.
-        visibility: Images tell what each Gaussian paints.
+        visibility: Images measure the contribution of each Gaussian.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -120,12 +119,12 @@ def plan_effects(
     """Decide which effects a scene calls for.
 
     Args:
-        scene: The Gaussians, with valid rows.
+        scene: The Gaussians; all rows must be valid.
         masses: Opacity times mean projected area of every Gaussian.
         apparent_masses: The same with apparent areas; None for ``masses``.
         distances: Distances to the centre of the scene, in robust radii.
-        config: Choices that override the decisions, and the thresholds of the filter; None for
-            the defaults.
+        config: Overrides of the decisions, and the thresholds of the filter; None for the
+            defaults.
 
     Returns:
         The plan.
@@ -144,7 +143,7 @@ def plan_effects(
         haze_share(scene.opacities, apparent, config),
         duplicate_share(scene.means, scene.sh0),
     ]
-    far, hazy, duplicates = torch.stack(shares).tolist()  # a device is asked only once
+    far, hazy, duplicates = torch.stack(shares).tolist()  # one synchronization with the device
     antialiased, two_scales = scene.antialiased, scene.has_two_scales
     above = (far - UNBOUNDED_SHARE) / (FULLY_UNBOUNDED_SHARE - UNBOUNDED_SHARE)
     beyond = f"share of mass beyond {UNBOUNDED_DISTANCE:g} robust radii"
@@ -192,13 +191,13 @@ def plan_effects(
 def haze_share(
     opacities: Float[Tensor, "n"], apparent_masses: Float[Tensor, "n"], config: SimplifyConfig
 ) -> Float[Tensor, ""]:
-    """Return the share of apparent mass that faint Gaussians hold."""
+    """Return the share of the apparent mass that faint Gaussians hold."""
     masses = apparent_masses.double()
     return divide((masses * (opacities < config.filter.min_opacity)).sum(), masses.sum())
 
 
 def plan_haze(share: float, config: SimplifyConfig) -> Effect:
-    """Decide by the share of apparent mass whether faint Gaussians are the haze of a scene."""
+    """Decide whether faint Gaussians are haze, by their share of the apparent mass."""
     choice, most = config.effects.haze, config.filter.max_mass_share
     below = config.filter.min_opacity
     return Effect(
@@ -229,7 +228,7 @@ def _plan_bands(scene: GaussianScene, choice: str | int) -> BandsEffect:
 
 
 def _by_share(share: float, choice: str, least: float, meaning: str) -> Effect:
-    """Decide on an effect: on above a share of ``least``, or of 0 if it is forced on."""
+    """Decide on an effect: on above the share ``least``, or above 0 if it is forced on."""
     return Effect(
         active=share > (least if choice == "auto" else 0.0) and choice != "off",
         figure=share,
@@ -239,18 +238,18 @@ def _by_share(share: float, choice: str, least: float, meaning: str) -> Effect:
 
 
 def band_losses(scene: GaussianScene, *, enough: float) -> tuple[float, ...]:
-    """Return the most that leaving out a band of the spherical harmonics can change a colour.
+    """Return the largest change of a colour by dropping each band of the spherical harmonics.
 
-    A pixel mixes colours with weights that add up to 1 at most, so no pixel changes by more. By
+    A pixel mixes colours with weights that sum to at most 1, so no pixel changes by more. By
     the addition theorem (Unsöld 1927), a band of degree l with coefficients c changes a channel
-    by at most ``sqrt((2 l + 1) / (4 pi) sum c^2)``; the sum is over all channels here. That is
-    divided by the standard deviation of the constant colours, weighted by opacity, if it is below
+    by at most ``sqrt((2 l + 1) / (4 pi) sum c^2)``; here the sum is over all channels. This bound
+    is divided by the opacity-weighted standard deviation of the constant colours, if that is below
     1.
 
     Args:
-        scene: The Gaussians, with valid rows.
-        enough: The search ends as soon as the highest band has this, since it and all below it
-            are needed then; the figures are those of the Gaussians that were looked at so far.
+        scene: The Gaussians; all rows must be valid.
+        enough: The search ends when the highest band reaches this value, since all bands are
+            needed then; the figures are those of the Gaussians examined so far.
 
     Returns:
         One number for each degree above 0.
@@ -275,7 +274,7 @@ def band_losses(scene: GaussianScene, *, enough: float) -> tuple[float, ...]:
     for part in (*spread, *scene.shN.split(chunk_length(CHUNK, scene.means.device))):
         figures = [contrast]
         for low, high in pairwise(REST_COUNTS[: len(losses) + 1]):
-            sums = part[:, low:high].square().sum(dim=(1, 2))  # of whole rows, which is fast
+            sums = part[:, low:high].square().sum(dim=(1, 2))  # sums of whole rows are fast
             figures.append(torch.nn.functional.pad(sums, (0, 1)).amax().double())
         deviation, *squares = torch.stack(figures).tolist()
         unit = min(1.0, max(deviation, LEAST_CONTRAST))
@@ -288,11 +287,11 @@ def band_losses(scene: GaussianScene, *, enough: float) -> tuple[float, ...]:
 
 
 def far_share(distances: Float[Tensor, "n"], masses: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Return the share of mass that lies far away.
+    """Return the share of the mass that is far away.
 
     Args:
         distances: Distances to the centre of the scene, in robust radii.
-        masses: Masses.
+        masses: Masses of the Gaussians.
 
     Returns:
         A number in [0, 1].
@@ -305,9 +304,10 @@ def far_share(distances: Float[Tensor, "n"], masses: Float[Tensor, "n"]) -> Floa
 
 
 def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) -> Float[Tensor, ""]:
-    """Return the share of Gaussians that lie exactly where another of the same colour does.
+    """Return the share of Gaussians at exactly the position of another of the same colour.
 
-    Large scenes are estimated from a sample by a hash of the position, which duplicates share.
+    For large scenes it is estimated from a sample, which is chosen by a hash of the position, so
+    that duplicates are sampled together.
 
     Args:
         means: Positions.
@@ -336,7 +336,7 @@ def duplicate_share(means: Float[Tensor, "n 3"], sh0: Float[Tensor, "n 1 3"]) ->
 
 
 def _hash(means: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
-    """Mix the bits of positions; equal ones give equal numbers, which may be negative."""
+    """Hash positions; equal positions give equal hashes, which may be negative."""
     whole = torch.int32 if means.dtype == torch.float32 else torch.int64
     x, y, z = means.contiguous().view(whole).unbind(1)
     mixed = x * 73856093 + y * 19349663 + z * 83492791  # wraps round

@@ -1,4 +1,4 @@
-"""Ambient visibility: how freely a Gaussian can be seen from nearby, without rendering."""
+"""Ambient visibility: how freely a Gaussian can be seen from nearby, computed without rendering."""
 
 import torch
 from jaxtyping import Float, Int
@@ -14,14 +14,14 @@ HALF_GRID = 64
 """Voxels from the middle of the grid to its border."""
 
 REACH = 6
-"""Voxels whose depth counts in each direction."""
+"""Number of voxels in each direction whose optical depth counts."""
 
 MAX_DEPTH = 1e6
 FIXED_POINT = 2**20
 
 SLAB = 32
 CHUNK = 1 << 16
-"""Gaussians of one pass, to bound memory."""
+"""Gaussians per chunk, to bound memory."""
 
 
 def ambient_visibility(
@@ -29,10 +29,10 @@ def ambient_visibility(
 ) -> Float[Tensor, "n"]:
     """Return how freely every Gaussian can be seen from a quarter of a robust radius around it.
 
-    What lies inside a solid takes a share of the cells and is never seen. Masses are summed over
-    voxels, which gives the optical depth of a voxel; the transmittance of the next voxels is
-    averaged over the six directions of the axes. The reach is short: the walls of a room stay
-    visible from the inside, and haze from everywhere. This is our own rule, not part of CVT-GS.
+    Gaussians inside a solid would take a share of the cells and are never seen. The masses in a
+    voxel give its optical depth; the transmittance of the next voxels is averaged over the six
+    axis directions. The reach is short, so that the walls of a room stay visible from the inside,
+    and haze from everywhere. This is our own rule, not part of CVT-GS.
 
     Args:
         means: Positions, scene units.
@@ -40,8 +40,8 @@ def ambient_visibility(
         frame: Centre and radius of the scene.
 
     Returns:
-        Numbers from 0 (enclosed) to 1 (free) in float64; 1 beyond the grid. Memory is some
-        35 MB for the grid, and ``12 n`` bytes.
+        Numbers from 0 (enclosed) to 1 (free) in float64; 1 beyond the grid. Memory is about 35 MB
+        for the grid, plus ``12 n`` bytes.
 
     Example:
         >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
@@ -57,10 +57,10 @@ def empty_depth_grid(device: torch.device) -> Int[Tensor, "voxels"]:
     """Return an empty grid of optical depths, for :func:`add_depths`.
 
     Args:
-        device: Where to.
+        device: Device of the grid.
 
     Returns:
-        Zeros, in whole numbers: parts of a scene add up to the same grid in any order.
+        Integer zeros: parts of a scene can be added in any order and give the same grid.
 
     Example:
         >>> int(empty_depth_grid(torch.device("cpu")).sum())
@@ -100,7 +100,7 @@ def add_depths(
         voxel, shrinkage = _voxels_of(means[part], frame)
         voxels[part] = voxel.to(torch.int32)
         depths = masses[part] * (shrinkage / (frame.radius * VOXEL)).square()
-        # Whole numbers add up to the same sum in any order, so every device gives the same.
+        # Integer sums do not depend on the order, so every device gives the same grid.
         whole = (depths.clamp_max(MAX_DEPTH) * FIXED_POINT).round().to(torch.int64)
         sums.index_add_(0, voxel, whole)
     return voxels
@@ -110,10 +110,10 @@ def visibility_grid(sums: Int[Tensor, "voxels"]) -> Float[Tensor, "voxels"]:
     """Return the ambient visibility of every voxel of a finished grid.
 
     Args:
-        sums: What :func:`add_depths` summed.
+        sums: The grid that :func:`add_depths` filled.
 
     Returns:
-        Numbers from 0 to 1 in float32; the last is that of everything beyond the grid, 1.
+        Numbers from 0 to 1 in float32; the last entry is 1, for everything beyond the grid.
 
     Example:
         >>> float(visibility_grid(empty_depth_grid(torch.device("cpu"))).amin())
@@ -123,7 +123,7 @@ def visibility_grid(sums: Int[Tensor, "voxels"]) -> Float[Tensor, "voxels"]:
     grid = (sums[:-1].to(torch.float32) / FIXED_POINT).reshape(size, size, size)
     visible = torch.zeros_like(grid)
     for axis in range(3):  # the transmittance of the next voxels, averaged over six directions
-        across = 1 if axis == 0 else 0  # slabs of another axis, to bound memory
+        across = 1 if axis == 0 else 0  # slabs along another axis, to bound memory
         slabs = zip(grid.split(SLAB, across), visible.split(SLAB, across), strict=True)
         for slab, target in slabs:
             through = torch.exp(-_windows(slab, axis))
@@ -138,12 +138,12 @@ def visibility_at(
     """Look up the ambient visibility of Gaussians.
 
     Args:
-        grid: What :func:`visibility_grid` returns.
+        grid: The result of :func:`visibility_grid`.
         means: Positions, scene units.
         frame: Centre and radius of the scene.
 
     Returns:
-        What :func:`ambient_visibility` returns for the whole scene.
+        The same values as :func:`ambient_visibility` for the whole scene.
 
     Example:
         >>> frame = RobustFrame(center=torch.zeros(3, dtype=torch.float64), radius=1.0)
@@ -159,7 +159,7 @@ def visibility_at(
 def _voxels_of(
     means: Float[Tensor, "n 3"], frame: RobustFrame
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"]]:
-    """Return the voxel of each position, and how much smaller things are there when contracted."""
+    """Return the voxel of each position, and the factor by which contraction shrinks it there."""
     size, local = 2 * HALF_GRID, frame.normalize(means)
     distance = torch.linalg.vector_norm(local, dim=1).clamp_min(1.0)
     shrinkage = (1.0 + torch.log(distance)) / distance
@@ -170,7 +170,7 @@ def _voxels_of(
 
 
 def _windows(slab: Float[Tensor, "a b c"], axis: int) -> Float[Tensor, "d e f"]:
-    """Sum every run of voxels as long as the reach, those that leave the grid at the ends too."""
+    """Sum every run of ``REACH`` voxels, including runs that leave the grid at either end."""
     padded = torch.nn.functional.pad(slab, [0, 0] * (2 - axis) + [REACH, REACH])
     count = slab.shape[axis] + REACH + 1
     sums = padded.narrow(axis, 0, count).clone()
@@ -180,7 +180,7 @@ def _windows(slab: Float[Tensor, "a b c"], axis: int) -> Float[Tensor, "d e f"]:
 
 
 def perspective_falloff(distances: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Return how much smaller a far Gaussian appears from the middle of the scene.
+    """Return the factor on the area of a far Gaussian as seen from the middle of the scene.
 
     Args:
         distances: Distances to the centre of the scene, in robust radii.

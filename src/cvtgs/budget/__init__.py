@@ -1,4 +1,4 @@
-"""Settings from goals: a time budget, or a quality to reach."""
+"""Choice of a preset for a time budget, and of a count for a quality."""
 
 from cvtgs.budget.calibrate import cost_model, shipped_model
 from cvtgs.budget.costs import CostModel, Work

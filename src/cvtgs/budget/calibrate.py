@@ -1,4 +1,4 @@
-"""Measure the cost of the presets on this machine once, and keep it in the user's cache."""
+"""Calibration: the cost of the presets on this machine, measured once and cached for the user."""
 
 import hashlib
 import json
@@ -32,45 +32,45 @@ from cvtgs.synthetic import scene as make
 STAGE = "calibrate"
 
 PATIENCE_SECONDS = 1.0
-"""A measurement is repeated, and the fastest counts, until it has taken so long."""
+"""A measurement is repeated, and the fastest counts, until it has taken this long in total."""
 
 MOST_REPEATS = 3
 
 MOST_CPU_SECONDS = 15.0
-"""Processor seconds after which nothing is repeated, and no more is measured than must be."""
+"""CPU seconds after which nothing is repeated, and only mandatory trials are measured."""
 
 LEAST_MEASURED = 3
-"""Trials that every preset is measured on in any case: small and large, many cells and few."""
+"""Number of mandatory measurements of every preset: small and large, many cells and few."""
 
 MOST_START_SECONDS = 1.0
-"""What takes longer to load was compiled, which happens once in the life of an installation."""
+"""Cap on loading time: anything beyond it was compilation, which happens once per installation."""
 
 CANDIDATES = tuple(name for name in PRESETS if name != "paper")
-"""Presets to choose from; ``paper`` is there to compare with."""
+"""Presets to choose from; ``paper`` is only for comparison."""
 
 SHORT = (
     {"views": 3, "steps": 4, "batch": 4, "heldout": 2, "size": 256},
     {"views": 5, "steps": 5, "batch": 5, "heldout": 2, "size": 352},
 )
-"""Images and refinements are cut to this, in turn: their cost grows with number and pixels."""
+"""Reduced settings of images and refinements, used alternately to vary number and pixels."""
 
 SHORTEST = {"views": 1, "steps": 1, "batch": 4, "heldout": 1, "size": 32}
-"""Enough to load what a preset needs."""
+"""Settings just large enough to load the libraries that a preset needs."""
 
 RENDERERS = ("gsplat", "numba")
-"""Packages that render faster than torch; importing one to ask takes longer than many a run."""
+"""Packages that render faster than torch; not imported to check, as that can outlast a run."""
 
 VERSION: Literal[3] = 3
-"""Of the file; raised when features change, so that older files are measured again."""
+"""Version of the cache file; raised when features change, so that older files are replaced."""
 
 SHIPPED_RATES = "rates.json"
-"""Beside this file; ``python -m benchmarks.cost_model --ship`` writes it."""
+"""File beside this module, written by ``python -m benchmarks.cost_model --ship``."""
 
 STALE_SECONDS = 90 * 24 * 3600.0
-"""Machines change: drivers, limits, neighbours."""
+"""Age after which a cached model expires, since drivers, limits and other loads change."""
 
 StageSeconds = Callable[[SimplifyConfig, GaussianScene, int], Mapping[str, float]]
-"""Returns the seconds by stage of a simplification of a scene to so many Gaussians."""
+"""Returns the seconds, by stage, of the simplification of a scene to a target count."""
 
 Calibration = Callable[[], CostModel]
 
@@ -90,11 +90,11 @@ TRIALS = (
     Trial(kind="room", count=100_000, sh_degree=3, ratios=(0.003, 0.05)),
     Trial(kind="courtyard", count=60_000, sh_degree=1, ratios=(0.01, 0.2)),
 )
-"""Small and large, with few and many colours, a few and many cells: no two alike."""
+"""Small and large scenes, with few and many colour coefficients, and few and many cells."""
 
 
 class CachedModel(Record, allow_inf_nan=False):
-    """The content of the file."""
+    """The content of the cache file."""
 
     version: Literal[3]
     key: dict[str, str]
@@ -112,22 +112,22 @@ def cost_model(
 ) -> CostModel:
     """Return the cost of presets on this machine; the first call measures and caches it.
 
-    It is measured again when the machine, the device, the number of threads, the versions of torch
-    or cvtgs, or the presets are others, after 90 days, and when the file is damaged. Where nothing
-    can be written, it is measured for this call only.
+    It is measured again if the machine, the device, the number of threads, the versions of Python,
+    torch or cvtgs, the installed renderers or the presets change, after 90 days, and if the cache
+    file is damaged. If the file cannot be written, the result is not cached.
 
     Args:
-        device: Where presets compute.
+        device: Device that the presets run on.
         recalibrate: Whether to measure again in any case.
-        calibration: Measures; None for the real one, which takes about 20 seconds.
-        folder: Where to cache; None for ``cvtgs`` in the user's cache folder.
-        listener: Called after each measurement.
+        calibration: Function that measures; None for the real one, which takes about 20 seconds.
+        folder: Cache folder; None for ``cvtgs`` in the user's cache folder.
+        listener: Called with progress events.
 
     Returns:
         The model.
 
     Raises:
-        DeviceError: There is no such device.
+        DeviceError: The device cannot be used.
 
     Example:
         >>> import tempfile
@@ -155,10 +155,10 @@ def cost_model(
 
 
 def shipped_model() -> CostModel:
-    """Return the cost of presets on the machine that the package was made on: no measuring.
+    """Return the cost of presets that comes with the package, without measuring.
 
     Returns:
-        The model, of two cores of a server without a GPU.
+        The model, measured on two cores of a server without a GPU.
 
     Example:
         >>> "standard" in shipped_model().presets
@@ -169,13 +169,13 @@ def shipped_model() -> CostModel:
 
 
 def is_calibrated(device: str | torch.device = "auto", *, folder: Path | None = None) -> bool:
-    """Report whether the cost model of this machine is cached."""
+    """Check whether the cost model of this machine is cached."""
     key = machine_key(chosen_device(device))
     return _read_cached(_cache_path(key, folder), key) is not None
 
 
 def machine_key(device: torch.device) -> dict[str, str]:
-    """Return everything that seconds depend on."""
+    """Return the properties of machine and software that run times depend on."""
     presets = {name: SimplifyConfig.from_preset(name).model_dump(mode="json") for name in PRESETS}
     return {
         "system": f"{platform.system()} {platform.machine()}",
@@ -209,7 +209,7 @@ def _digest(value: object) -> str:
 
 
 def _read_cached(path: Path, key: Mapping[str, str]) -> CostModel | None:
-    """Read the model; None if there is none, or one that is damaged, stale, or of other things."""
+    """Read the cached model; None if it is missing, damaged, stale or made for another key."""
     try:
         record = CachedModel.model_validate_json(path.read_bytes())
     except (OSError, ValueError):
@@ -220,7 +220,7 @@ def _read_cached(path: Path, key: Mapping[str, str]) -> CostModel | None:
 
 
 def measured_seconds(device: str | torch.device) -> StageSeconds:
-    """Return a function that simplifies and measures."""
+    """Return a function that simplifies a scene and returns the seconds of each stage."""
     simplifiers: dict[SimplifyConfig, Simplifier] = {}
 
     def run(config: SimplifyConfig, scene: GaussianScene, count: int) -> Mapping[str, float]:
@@ -233,10 +233,10 @@ def measured_seconds(device: str | torch.device) -> StageSeconds:
 
 
 def undisturbed_seconds(cost: StageCost) -> float:
-    """Return the seconds of a stage without those that other programs took.
+    """Return the seconds of a stage without the time that other programs took.
 
     A stage on the CPU computes all the time and reads no file, so it cannot take longer than its
-    processor seconds; what is beyond them went to other programs.
+    CPU seconds; any time beyond them went to other programs.
     """
     if cost.peak_device_memory_bytes:
         return cost.seconds
@@ -254,11 +254,11 @@ def calibrate(
 ) -> CostModel:
     """Measure presets on generated scenes, and fit their cost.
 
-    Every preset is run once to load what it needs. Then every trial is measured up to three times,
-    once if that takes long; of each stage the fastest counts, since other programs only ever make a
-    stage slower. After 15 processor seconds nothing is repeated, and the last trials are left out.
-    Presets that use images get only a few small ones here, and those that differ in nothing but the
-    number of images are measured once.
+    Every preset is first run once to load its libraries. Then every trial is measured up to three
+    times, or once if that takes long; the fastest time of each stage counts, since other programs
+    can only slow it down. After 15 CPU seconds nothing is repeated, and the last trials are
+    skipped. Presets that use images get only a few small ones here. Presets that then have equal
+    settings are measured once.
     """
     first: dict[SimplifyConfig, str] = {}
     measured_as = {
@@ -300,7 +300,7 @@ def calibrate(
         if stages:
             work = Work.of(scene, count)
             measured[preset].append(Measurement(work=work, config=config, seconds=stages))
-    # What a new process loads: the first preset shows it, and the first with images.
+    # The loading time of a new process: from the first preset, and the first one with images.
     starts = {False: 0.0, True: 0.0}
     for preset, seconds, stages in reversed(list(zip(first.values(), loading, best, strict=False))):
         excess = min(max(seconds - sum(stages.values()), 0.0), MOST_START_SECONDS)
@@ -312,7 +312,7 @@ def calibrate(
 
 
 def _shortened(preset: str, short: Mapping[str, int]) -> SimplifyConfig:
-    """Return a preset with only a few images and steps, if it has any."""
+    """Return a preset with reduced numbers of images and steps, if it has any."""
     config = SimplifyConfig.from_preset(preset)
     changes: dict[str, Section] = {}
     if config.uses_renders:

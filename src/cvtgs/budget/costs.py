@@ -1,4 +1,4 @@
-"""CostModel: the seconds of a simplification, predicted from its size and configuration."""
+"""CostModel, which predicts the seconds of a simplification from size and configuration."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -28,19 +28,19 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     REFINE: ("images_in", "look_pixels", "looks_out"),
     NETWORK: ("once", "in", "in_values", "out", "out_values"),
 }
-"""The amounts that the seconds of a stage are linear in."""
+"""Features of each stage; its seconds are linear in their amounts."""
 
 OTHER_FEATURES = ("once", "in", "out")
-"""The same for stages that are not listed there."""
+"""Features of all other stages."""
 
 SHARE_OF_A_STEP = 0.2
-"""An image without gradients costs this share of a step."""
+"""Cost of rendering an image without gradients, as a share of a step."""
 
 STEPS_OF_A_BATCH = 8.0
-"""To find views, however many at once, costs as much as so many steps."""
+"""Cost of generating one batch of views of any size, in steps."""
 
 LEAST_SECONDS = 2e-3
-"""Seconds below which a difference does not count in a fit."""
+"""Floor of measured seconds in the relative errors of a fit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,9 +48,9 @@ class Work:
     """The size of a simplification.
 
     Attributes:
-        count: Gaussians in, N.
-        target: Gaussians out, M.
-        colors: Colour coefficients of a Gaussian: 3, 12, 27 or 48.
+        count: Number of input Gaussians, N.
+        target: Number of output Gaussians, M.
+        colors: Number of colour coefficients of a Gaussian: 3, 12, 27 or 48.
     """
 
     count: int
@@ -63,7 +63,7 @@ class Work:
 
         Args:
             scene: The scene.
-            target: Gaussians to keep.
+            target: Number of Gaussians to keep.
 
         Returns:
             The size.
@@ -76,11 +76,11 @@ class Work:
         return cls(count=len(scene), target=target, colors=3 * (scene.sh_degree + 1) ** 2)
 
     def features(self, stage: str, config: SimplifyConfig) -> dict[str, float]:
-        """Return the amounts that the seconds of a stage are linear in.
+        """Return the feature amounts of a stage; its seconds are linear in them.
 
         Args:
             stage: Name of the stage.
-            config: Every choice of the simplification.
+            config: Configuration of the simplification.
 
         Returns:
             Amounts by name.
@@ -108,7 +108,7 @@ class Work:
             "out_values": float(self.target * self.colors),
             "view_pixels": float(visibility.views * side**2),
             "views_in": float(visibility.views * self.count),
-            # Pairs of a pixel and a Gaussian: more Gaussians are smaller, and hide one another.
+            # Pairs of a pixel and a Gaussian: with more Gaussians, they are smaller and occluded.
             "view_pairs": visibility.views * side * math.sqrt(self.target),
             "view_values": float(visibility.views * self.target * self.colors),
             "images_in": float((0 if shared else heldout) + new_images) * self.count,
@@ -125,8 +125,8 @@ class Measurement:
     """The cost of one simplification.
 
     Attributes:
-        work: Its size.
-        config: Its configuration.
+        work: Size of the simplification.
+        config: Configuration of the simplification.
         seconds: Wall-clock seconds by stage.
     """
 
@@ -136,12 +136,12 @@ class Measurement:
 
 
 class CostModel(Record, allow_inf_nan=False):
-    """The cost of presets on one machine: seconds = sum of rates times amounts, stage by stage.
+    """The cost of presets on one machine: seconds = sum of rates times amounts, for each stage.
 
     Attributes:
         rates: Seconds per unit, by preset, stage and feature.
-        starts: Seconds that the first simplification of a process takes on top, by preset:
-            libraries are loaded.
+        starts: Additional seconds of the first simplification of a process, by preset, for loading
+            libraries.
     """
 
     rates: dict[str, dict[str, dict[str, pydantic.NonNegativeFloat]]]
@@ -157,7 +157,7 @@ class CostModel(Record, allow_inf_nan=False):
 
         Args:
             measured: Measurements of simplifications of different sizes, by preset.
-            starts: Seconds that the first simplification of a process takes on top.
+            starts: Additional seconds of the first simplification of a process, by preset.
 
         Returns:
             The model.
@@ -184,8 +184,8 @@ class CostModel(Record, allow_inf_nan=False):
     ) -> dict[str, float]:
         """Predict the cost of each stage.
 
-        A stage that the preset does not have, but the configuration does, costs what it costs in
-        the best preset that has it.
+        A stage that only the configuration has, but not the preset, is assumed to cost as much as
+        in the best preset that has it.
 
         Args:
             preset: Name of the preset.
@@ -241,10 +241,10 @@ class CostModel(Record, allow_inf_nan=False):
 
 
 def fit_rates(rows: Sequence[Mapping[str, float]], seconds: Sequence[float]) -> dict[str, float]:
-    """Compute the cost of each feature, so that the sums come close to what was measured.
+    """Fit the rate of each feature to measured seconds.
 
-    Non-negative least squares (Lawson and Hanson 1974) of relative errors: no rate is negative,
-    so no prediction for more work is below one for less.
+    This is non-negative least squares (Lawson and Hanson 1974) of relative errors. No rate is
+    negative, so no prediction for more work is below one for less.
     """
     from scipy.optimize import nnls  # noqa: PLC0415 (heavy, and only for a calibration)
 

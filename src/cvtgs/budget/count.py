@@ -1,4 +1,4 @@
-"""Choose a preset within a time, or a count that reaches a quality."""
+"""Choice of a preset that fits a time, and search for a count that reaches a quality."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -23,32 +23,32 @@ from cvtgs.views import automatic_views
 STAGE = "search"
 
 HELDOUT_SEED = 307
-"""Other views than those of evaluations, and than those that presets and refinements use."""
+"""Seed of views that differ from those of evaluations, presets and refinements."""
 
 VIEWS, WIDTH, HEIGHT = 8, 640, 480
-"""As many and as large as ``cvtgs evaluate`` takes: scores depend on the size of images."""
+"""Number and size of views, as in ``cvtgs evaluate``: scores depend on the size of images."""
 
 MOST_SHARE = 0.9
-"""Scenes that keep more are not worth their loss: the full scene is hardly larger."""
+"""Largest share of Gaussians to try: above it, the full scene is hardly larger."""
 
 MOST_TRIES = 16
 
 CLOSE = 1.03
-"""The search ends when a number that is enough and one that is not are closer than this factor."""
+"""The search ends when a sufficient and an insufficient count are within this factor."""
 
 _FIRST_SHARE, _STEP, _SHORTEST = 0.1, 8.0, 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tried:
-    """A number of Gaussians that was tried.
+    """A count that was tried, and its scores over the held-out views.
 
     Attributes:
-        count: The number.
-        psnr: Mean PSNR over the held-out views, dB, at most 60 each.
-        ssim: Mean SSIM over them.
-        alpha_error: Mean absolute difference of accumulated alpha over them.
-        alpha_bias: Mean difference; negative where more of the background shows through.
+        count: Number of Gaussians.
+        psnr: Mean PSNR, dB, at most 60 each.
+        ssim: Mean SSIM.
+        alpha_error: Mean absolute difference of accumulated alpha.
+        alpha_bias: Mean signed difference; negative if more of the background shows through.
     """
 
     count: int
@@ -59,16 +59,16 @@ class Tried:
 
 
 class Found(NamedTuple):
-    """The smallest scene that is good enough.
+    """The smallest scene that is good enough, and its scores over the held-out views.
 
     Attributes:
         scene: The scene.
         report: The report of its simplification.
-        psnr: Its mean PSNR over the held-out views, dB, at most 60 each.
-        ssim: Its mean SSIM over them.
-        alpha_error: Its mean absolute difference of accumulated alpha over them.
-        alpha_bias: Its mean difference; negative where more of the background shows through.
-        tried: Everything that was tried, in that order.
+        psnr: Mean PSNR, dB, at most 60 each.
+        ssim: Mean SSIM.
+        alpha_error: Mean absolute difference of accumulated alpha.
+        alpha_bias: Mean signed difference; negative if more of the background shows through.
+        tried: All counts that were tried, in order.
     """
 
     scene: GaussianScene
@@ -92,16 +92,16 @@ class Target(NamedTuple):
     value: float
 
     def of(self, tried: Tried) -> float:
-        """Return the value of the metric."""
+        """Return the score of the metric."""
         return tried.psnr if self.metric == "psnr" else tried.ssim
 
     def text(self, value: float) -> str:
-        """Write a value of the metric."""
+        """Format a value of the metric."""
         return f"{value:.2f} dB" if self.metric == "psnr" else f"SSIM {value:.4f}"
 
 
 def checked_target(psnr: float | None, *, ssim: float | None) -> Target:
-    """Return the quality to reach; refuse what no scene can have."""
+    """Return the quality to reach; raise if no scene can have it."""
     if psnr is not None and ssim is None:
         if not 0 < psnr <= MOST_PSNR:
             raise InvalidArgumentError(
@@ -127,29 +127,29 @@ def find_count(
     heldout: Cameras | None = None,
     listener: ProgressListener = silent,
 ) -> Found:
-    """Find the smallest number of Gaussians that reaches a quality, to 3 %.
+    """Find the smallest number of Gaussians that reaches a quality, to within 3 %.
 
     Quality is measured over eight automatic views that no preset uses. The full scene is
-    rendered, checked and analyzed once; a search takes six to ten simplifications. Where
-    quality does not rise with every Gaussian, a smaller number than the one that is found may
-    do by chance.
+    rendered, checked and analyzed once; a search takes six to ten simplifications. If quality
+    does not rise monotonically with the count, a smaller count may also reach it.
 
     Memory: that of a simplification, one small scene, and ``12 c h w`` bytes of images.
 
     Args:
-        scene: The full scene, which is not changed, or a file or folder of one.
+        scene: The full scene, which is not changed, or the path of its file or folder.
         psnr: Mean PSNR to reach, dB, above 0 and at most 60.
         ssim: Mean SSIM to reach instead, above 0 and below 1.
-        simplifier: Makes the small scenes; None for the standard one.
-        cameras: Views for presets that use images of the scene; None finds views.
-        heldout: Other views to measure over.
-        listener: Called after every try.
+        simplifier: Simplifier of the scene; None for the standard one.
+        cameras: Views for presets that use images of the scene; None finds or generates views.
+        heldout: Held-out views to measure over; None for the automatic ones.
+        listener: Called with progress events.
 
     Returns:
-        The scene, and what was tried.
+        The scene, and all counts that were tried.
 
     Raises:
-        GoalError: Not even nine tenths of the Gaussians reach it; the text says what they reach.
+        GoalError: Even nine tenths of the Gaussians do not reach it; the message names the best
+            result.
         InvalidArgumentError: Both or neither are given, or one is out of range.
         InvalidSceneError: The scene has no valid row.
 
@@ -207,7 +207,7 @@ def find_count(
 def heldout_scorer(
     full: GaussianScene, cameras: Cameras | None, *, listener: ProgressListener
 ) -> Scorer:
-    """Render the full scene from held-out views, automatic ones if none are given."""
+    """Return a scorer against the full scene over held-out views; None uses automatic views."""
     if cameras is None:
         cameras = automatic_views(full, VIEWS, width=WIDTH, height=HEIGHT, seed=HELDOUT_SEED)
     total = len(cameras)
@@ -235,12 +235,12 @@ def heldout_quality(scorer: Scorer, small: GaussianScene, *, count: int) -> Trie
 def smallest_enough(
     reach: Callable[[int], float], wanted: float, *, most: int
 ) -> Iterator[tuple[int, float]]:
-    """Find the smallest number whose value reaches what is wanted.
+    """Search for the smallest count whose value reaches a goal; yield each count and its value.
 
-    Values should rise with the number; about linearly with its logarithm needs the fewest tries.
-    The search starts at a tenth, steps by a factor of eight until it has an end that is enough and
-    one that is not, and then interpolates on logarithms, but never leaves more than 85 % of the
-    bracket (regula falsi held to bisection's guarantee, as Dekker 1969).
+    Values should rise with the count; it takes the fewest tries if they are about linear in its
+    logarithm. The search starts at a tenth of ``most`` and steps by a factor of eight until it has
+    a sufficient and an insufficient count. Then it interpolates on logarithms, but never leaves
+    more than 85 % of the bracket (regula falsi with the guarantee of bisection, as Dekker 1969).
     """
     low, low_value = 0, -math.inf
     high, high_value = most + 1, math.inf
@@ -268,15 +268,15 @@ def smallest_enough(
 
 
 MARGIN = 1.3
-"""Predictions are right to 30 %: a preset fits if this many times its prediction does."""
+"""Safety factor: predictions are accurate to 30 %, so a preset must fit with this margin."""
 
 
 class Choice(NamedTuple):
-    """A preset that fits.
+    """A preset that fits the time.
 
     Attributes:
-        preset: Its name.
-        seconds: How long it will take, predicted.
+        preset: Name of the preset.
+        seconds: Predicted wall-clock seconds.
     """
 
     preset: str
@@ -292,26 +292,26 @@ def choose_preset(
     settings: Mapping[str, str] | None = None,
     model: CostModel | None = None,
 ) -> Choice:
-    """Choose the best preset whose simplification ends in time.
+    """Choose the best preset whose simplification fits a time.
 
-    The presets are ordered from the fastest to the best; ``paper``, which is there to compare
-    with, is never chosen. A preset fits only if 1.3 times its predicted seconds do.
+    The presets are ordered from the fastest to the best; ``paper``, which is only for comparison,
+    is never chosen. A preset fits only if 1.3 times its predicted seconds do.
 
     Args:
-        work: The scene, or its size, which has its target and takes no ratio and no count.
+        work: The scene, with ``rho`` or ``count``; or a :class:`Work`, which has its own target.
         seconds: Wall-clock seconds from the scene in memory to the small scene in memory.
         rho: Ratio of Gaussians to keep, in (0, 1].
         count: Number of Gaussians to keep, instead of ``rho``.
-        settings: Changes of every preset, texts by dotted key, for example
+        settings: Changes to every preset: texts by dotted key, for example
             ``{"visibility.views": "0"}``.
         model: The cost of presets; None for :func:`cvtgs.budget.cost_model`, which measures it once
             on this machine.
 
     Returns:
-        The preset, and how long it will take.
+        The preset, and its predicted seconds.
 
     Raises:
-        GoalError: Not even the fastest fits; the text says how long it takes.
+        GoalError: Not even the fastest preset fits; the message says how long it takes.
         InvalidArgumentError: Seconds, ratio or count are out of range.
         ConfigError: A setting is unknown or out of range.
 

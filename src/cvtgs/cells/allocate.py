@@ -1,7 +1,7 @@
-"""Allocation: cells that are alike merge in pairs, and Gaussians move to the cell that fits them.
+"""Allocation: merge similar cells in pairs, and move Gaussians to the cell that fits them best.
 
-A Voronoi cell knows where its Gaussians lie, not what it costs to show them as one. So the
-tessellation makes more cells than are wanted, and the pairs that lose least merge.
+A Voronoi cell reflects where its Gaussians lie, not the error of replacing them by one. So the
+tessellation makes more cells than are wanted, and the cheapest pairs merge.
 """
 
 from typing import NamedTuple
@@ -19,24 +19,24 @@ from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
 CHUNK = 1 << 15
-"""Gaussians whose costs are computed together, to bound memory."""
+"""Gaussians per chunk of the cost computation, to bound memory."""
 
 SHARE_PER_ROUND = 0.5
-"""Pairs that merge before costs are computed again, as a share of the cells."""
+"""Largest number of pairs merged before costs are recomputed, as a share of the cells."""
 
 FLOOR = 1e-4
-"""Standard deviation, in robust radii, that is added to every shape: a plane has a volume too."""
+"""Standard deviation, in robust radii, added in quadrature so that flat shapes have a volume."""
 
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Row and column of the six numbers of a symmetric matrix."""
+"""Row and column of the six distinct entries of a symmetric matrix."""
 
 
 class Moments(NamedTuple):
-    """Mean, covariance and colour of Gaussians, or of groups of them; one column each, float64.
+    """Mean, covariance and colour of Gaussians or of groups, one column per item, float64.
 
     Attributes:
-        weights: ``(n,)`` what each counts in the moments of a group: its mass.
-        masses: ``(n,)`` its mass as images show it, mean 1 over all Gaussians.
+        weights: ``(n,)`` weights in the moments of a group: the masses.
+        masses: ``(n,)`` masses as seen in images, mean 1 over all Gaussians.
         means: ``(3, n)`` positions, robust radii from the centre of the scene.
         covariances: ``(6, n)`` upper triangles, squared robust radii.
         colors: ``(3, n)`` RGB of the constant band.
@@ -49,7 +49,7 @@ class Moments(NamedTuple):
     colors: Float[Tensor, "3 n"]
 
     def take(self, rows: Int[Tensor, "k"]) -> "Moments":
-        """Return some of them."""
+        """Return the moments of some rows."""
         return Moments(
             self.weights.index_select(0, rows),
             self.masses.index_select(0, rows),
@@ -59,7 +59,7 @@ class Moments(NamedTuple):
         )
 
     def to(self, device: torch.device) -> "Moments":
-        """Return them on a device; they go there in one piece."""
+        """Return the moments on a device, moved in a single copy."""
         if self.weights.device == device:
             return self
         table = torch.cat([self.weights[None], self.masses[None], *self[2:]]).to(device)
@@ -80,14 +80,14 @@ def gaussian_moments(
 
     Args:
         scene: The Gaussians.
-        rows: Which of them.
-        frame: Centre and radius of the scene, the unit of length.
+        rows: Row numbers of the Gaussians to use.
+        frame: Centre and radius of the scene; the radius is the unit of length.
         weights: Mass of each.
-        masses: Mass of each as images show it.
-        unit: What both are divided by; None for their means.
+        masses: Mass of each as seen in images.
+        unit: Divisor of weights and masses; None divides each by its own mean.
 
     Returns:
-        Their moments, in the order of the rows.
+        The moments, in the order of the rows.
     """
     count, device, center = len(rows), rows.device, frame.center.to(rows.device)
     means = torch.empty(3, count, dtype=torch.float64, device=device)
@@ -124,7 +124,7 @@ def gaussian_moments(
 
 
 def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Moments:
-    """Return the moments of groups; the spread of means is taken about the mean of the group.
+    """Return the moments of groups; the spread of means is computed about the mean of the group.
 
     Args:
         members: Moments of the members.
@@ -152,13 +152,13 @@ def merge_pairs(
 ) -> Int[Tensor, "m"]:
     """Merge neighbouring groups in pairs, cheapest first, until ``count`` are left.
 
-    The cost of a pair is Runnalls' bound (2007) on how far the mixture moves when both become one
-    Gaussian, plus the squared distance of colours, times a power of the mass that images show.
+    The cost of a pair is Runnalls' bound (2007) on the change of the mixture when both become one
+    Gaussian, plus the squared colour distance, times a power of the mass as seen in images.
 
     Args:
         groups: Moments of the groups.
-        neighbors: Groups that each may merge with.
-        count: Number of groups to leave, 1 to m.
+        neighbors: Groups that each group may merge with.
+        count: Number of groups to keep, 1 to m.
         config: Weights of the cost.
 
     Returns:
@@ -169,7 +169,7 @@ def merge_pairs(
     pairs = _distinct_pairs(labels.repeat_interleave(neighbors.shape[1]), neighbors.flatten())
     while total > count:
         wanted = min(total - count, max(1, int(SHARE_PER_ROUND * total)))
-        if len(pairs[0]) == 0:  # groups without neighbours left: any pair will do
+        if len(pairs[0]) == 0:  # no neighbouring pairs are left: merge arbitrary ones
             pairs = torch.arange(total - 1, device=device), torch.arange(1, total, device=device)
         costs = _pair_costs(groups, *pairs, config)
         first, second = _cheapest_disjoint(*pairs, costs, wanted, total)
@@ -198,7 +198,7 @@ def _distinct_pairs(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
 def _pair_costs(
     groups: Moments, first: Tensor, second: Tensor, config: AllocationConfig
 ) -> Float[Tensor, "p"]:
-    """Return what it costs to merge each pair."""
+    """Return the cost of merging each pair."""
     volumes = _log_volume(groups.covariances)
     chunk = chunk_length(CHUNK, first.device)
 
@@ -224,7 +224,7 @@ def _pair_costs(
 
 
 def _log_volume(covariances: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:
-    """Return the logarithm of the determinants, with the floor added."""
+    """Return the logarithms of the determinants, with the floor added."""
     xx, xy, xz, yy, yz, zz = covariances
     xx, yy, zz = xx + FLOOR**2, yy + FLOOR**2, zz + FLOOR**2
     minors = yy * zz - yz * yz, xy * zz - yz * xz, xy * yz - yy * xz
@@ -236,14 +236,14 @@ def _log_volume(covariances: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:
 def _cheapest_disjoint(
     first: Tensor, second: Tensor, costs: Tensor, wanted: int, total: int
 ) -> tuple[Tensor, Tensor]:
-    """Take disjoint pairs, cheapest first, at most as many as wanted.
+    """Take disjoint pairs, cheapest first, at most ``wanted``.
 
-    A pair that is the cheapest one of both its groups is taken, again and again: the same as to
-    go through all pairs in order (Preis 1999), in few steps over all of them.
+    Each round takes every pair that is the cheapest of both its groups. The result is that of
+    a greedy pass over all pairs in order (Preis 1999), in a few vectorised rounds.
     """
     order = smallest_rows(costs, 6 * wanted)
     ends = first.index_select(0, order), second.index_select(0, order)
-    ranks = torch.arange(len(order), device=order.device)  # of the pairs that are left
+    ranks = torch.arange(len(order), device=order.device)  # ranks of the remaining pairs
     left, taken = ends, []
     while len(ranks):
         best = torch.full((total,), len(order), device=order.device)
@@ -274,17 +274,17 @@ def reassign(
 ) -> Int[Tensor, "n"]:
     """Move every member once to the group that explains it best, its own or a neighbouring one.
 
-    A group explains a member by the Kullback-Leibler divergence of the two Gaussians, plus the
-    squared distance of their colours. The member that fits its group best stays, so that no group
-    with members becomes empty.
+    The fit is the Kullback-Leibler divergence of the two Gaussians plus the squared distance of
+    their colours. The best-fitting member of each group stays, so that no group with members
+    becomes empty.
 
     Args:
         members: Moments of the members.
         labels: Group of each.
-        groups: Moments of the groups; those without members stay so, or get some.
-        neighbors: Other groups that the members of each may move to.
+        groups: Moments of the groups; groups without members may gain some.
+        neighbors: Other groups that the members of each group may move to.
         config: Weight of colour.
-        must_stay: Groups of which a member stays; None for all.
+        must_stay: Groups that must keep a member; None for all.
 
     Returns:
         The new group of every member.
@@ -293,7 +293,7 @@ def reassign(
     own = torch.arange(count, device=labels.device)
     candidates = torch.cat([own[None], neighbors.T]).contiguous()
     inverse, volumes = _inverse(groups.covariances)
-    found = labels.new_empty(len(labels) + 1)  # the last is of groups without members
+    found = labels.new_empty(len(labels) + 1)  # the last is for groups without members
     own_costs = torch.empty(len(labels), dtype=torch.float64, device=labels.device)
     chunk = chunk_length(CHUNK, labels.device)
 
@@ -330,7 +330,7 @@ def reassign(
 
 
 def _inverse(covariances: Float[Tensor, "6 n"]) -> tuple[Float[Tensor, "6 n"], Float[Tensor, "n"]]:
-    """Return inverse matrices and the logarithm of determinants, with the floor added."""
+    """Return the inverse matrices and the logarithms of the determinants, with the floor added."""
     xx, xy, xz, yy, yz, zz = covariances
     xx, yy, zz = xx + FLOOR**2, yy + FLOOR**2, zz + FLOOR**2
     cofactors = torch.stack([

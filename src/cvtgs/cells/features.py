@@ -1,7 +1,7 @@
-"""Descriptors: what MergeNet sees of a cell, relative to its position, rotation, size and colour.
+"""Descriptors: the input of MergeNet, relative to a cell's position, rotation, size and colour.
 
-The values of one feature are one run of memory: sums of products over three components are then
-as fast as memory, and many times as fast as products of small matrices.
+The values of one feature are contiguous in memory: sums of products over three components are then
+limited by memory bandwidth only, and many times as fast as products of small matrices.
 """
 
 from dataclasses import dataclass, fields
@@ -19,40 +19,40 @@ from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
 MEMBER_FEATURES = 19
-"""Numbers that describe a member to its cell."""
+"""Number of features of a member relative to its cell."""
 
 PAIR_FEATURES = 18
-"""Numbers that describe a neighbour to a cell."""
+"""Number of features of a neighbour relative to a cell."""
 
 CELL_FEATURES = 19
-"""Numbers that describe a cell by itself."""
+"""Number of features of a cell itself."""
 
 LARGEST_DISTANCE = 50.0
-"""Features do not tell distances beyond this apart; in standard deviations."""
+"""Distances in features are clamped to this, in standard deviations."""
 
 LARGEST_POSITION, LARGEST_LOG = 1e4, 80.0
-"""Positions and scales are limited so that no product of them leaves float32."""
+"""Limits of positions and log scales, so that no product of them overflows float32."""
 
 LARGEST_CONTRAST = 1.0
-"""That of black and white: networks have hardly seen more, and take it for reasons to grow."""
+"""Contrast of black and white: larger values are rare in training, and make networks grow cells."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Descriptors:
-    """Some cells as a network sees them, in the dtype of the scene.
+    """The input of a network for some cells, in the dtype of the scene.
 
-    Every feature is relative to the merged Gaussian of the cell: in its frame, in its standard
-    deviations, and the same whichever way an axis points.
+    Every feature is relative to the merged Gaussian of the cell: in its frame, in units of its
+    standard deviations, and independent of the sign of each axis.
 
     Attributes:
-        members: ``(n, 19)`` features of the members, those of one cell next to one another.
+        members: ``(n, 19)`` features of the members; those of one cell are contiguous.
         pairs: ``(m, k, 18)`` features of the neighbours of every cell.
         cells: ``(m, 19)`` features of the cells.
         weights: ``(n,)`` shares of the mass of the cell; those of one cell sum to 1.
-        offsets: ``(m + 1,)`` where each cell starts, and the end of the last one.
-        positions: ``(n, 3)`` where members are, from the centre of the cell, in its frame and in
-            its standard deviations.
-        pair_positions: ``(m, k, 3)`` the same of the neighbours.
+        offsets: ``(m + 1,)`` start of each cell, and the end of the last one.
+        positions: ``(n, 3)`` positions of the members relative to the centre of the cell, in its
+            frame and its standard deviations.
+        pair_positions: ``(m, k, 3)`` the same for the neighbours.
     """
 
     members: Float[Tensor, "n d"]
@@ -68,13 +68,13 @@ class Descriptors:
         return len(self.cells)
 
     def to(self, target: torch.device | torch.dtype) -> Self:
-        """Move the descriptors to a device, or convert them to another precision.
+        """Return the descriptors on a device or in another precision.
 
         Args:
             target: A device, or a dtype for all but ``offsets``.
 
         Returns:
-            The descriptors there.
+            The moved or converted descriptors.
         """
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         moves = {
@@ -98,7 +98,7 @@ class ActivatedGaussians(NamedTuple):
 
 
 class RelativeGaussians(NamedTuple):
-    """Gaussians in the frame and the standard deviations of one merged Gaussian each."""
+    """Gaussians, each in the frame and the standard deviations of a merged Gaussian."""
 
     shifts: Tensor
     positions: Tensor
@@ -110,7 +110,7 @@ class RelativeGaussians(NamedTuple):
 class NeighborContext(NamedTuple):
     """Some merged Gaussians, the cover of both ends of their axes, and their neighbours.
 
-    ``cover_difference`` is the cover of the negative end less that of the positive one.
+    ``cover_difference`` is the cover of the negative end minus that of the positive one.
     """
 
     merged: ActivatedGaussians
@@ -128,7 +128,7 @@ class NeighborContext(NamedTuple):
 
 
 class CellTotals(NamedTuple):
-    """What the members of every cell give together; means are weighted by mass."""
+    """Totals over the members of every cell; means are weighted by mass."""
 
     counts: Tensor
     contrasts: Tensor
@@ -148,23 +148,23 @@ def describe_cells(
     sizes: Int[Tensor, "m_all"],
     visibility: Float[Tensor, "n_all"],
 ) -> Descriptors:
-    """Describe some cells to their network.
+    """Compute the descriptors of some cells.
 
-    After CVT-GS: position, size and direction of a member relative to its cell, its opacity, its
-    share of the mass, and how far its colour is from that of the cell. Ours differ: directions
-    are given by the extents along the axes of the cell (several quaternions say the same),
-    colours by their distance only; a cell knows its neighbours and which of its sides they
-    cover, and a member its ambient visibility.
+    As in CVT-GS, a member has its position, size and orientation relative to its cell, opacity,
+    share of the mass, and colour relative to the cell. Unlike there, orientation is given as
+    extents along the axes of the cell (several quaternions describe the same one), colour as a
+    distance only; cells also have features of their neighbours and of the sides that these cover,
+    and members their ambient visibility.
 
-    Memory: about ``1.5 kB`` per member and per pair of neighbours.
+    Memory: about ``1.5 kB`` per member and per pair of a cell and a neighbour.
 
     Args:
         scene: The Gaussians.
-        merged: One Gaussian per cell, of all cells.
+        merged: One Gaussian per cell, for all cells.
         part: Members of the cells to describe.
-        cells: Which cells those are.
-        neighbors: The nearest other cells of each of them.
-        sizes: Number of members of every cell, of all cells.
+        cells: Row numbers of these cells in ``merged``.
+        neighbors: The nearest other cells of each of these cells.
+        sizes: Number of members of every cell, for all cells.
         visibility: Ambient visibility of every Gaussian of the scene, 0 to 1
             (:func:`cvtgs.analysis.ambient_visibility`).
 
@@ -196,7 +196,7 @@ def neighbor_context(
     neighbors: Int[Tensor, "m k"],
     sizes: Int[Tensor, "m_all"],
 ) -> NeighborContext:
-    """Describe the neighbours of some merged Gaussians, the same way as members.
+    """Compute features of the neighbours of some merged Gaussians, in the same way as of members.
 
     Memory: about ``1 kB`` per neighbour.
     """
@@ -237,7 +237,7 @@ def describe_members(
     context: NeighborContext,
     visibility: Float[Tensor, "n_all"],
 ) -> Descriptors:
-    """Describe some cells whose neighbours are known, as :func:`describe_cells` does."""
+    """Compute the descriptors of some cells like :func:`describe_cells`, from a known context."""
     offsets, rows = part.offsets, part.order
     ids = segment_ids(offsets, len(rows))
     members = _activate(scene, rows)
@@ -297,7 +297,7 @@ def _activate(scene: GaussianScene, rows: Int[Tensor, "r"]) -> ActivatedGaussian
 def _relate(
     merged: ActivatedGaussians, ids: Int[Tensor, "n"], others: ActivatedGaussians
 ) -> RelativeGaussians:
-    """Express each Gaussian in the frame of the merged one that ``ids`` gives."""
+    """Express each Gaussian in the frame of the merged Gaussian given by ``ids``."""
     rotations = merged.rotations.permute(1, 2, 0).flatten(0, 1)
     columns = [merged.means.T, rotations, merged.log_scales.T, merged.colors.T]
     table = torch.cat([*columns, merged.log_areas[None]]).index_select(1, ids)
@@ -320,7 +320,7 @@ def _relate(
 
 
 def _local_positions(rotations: Tensor, log_scales: Tensor, shifts: Tensor) -> Tensor:
-    """Express shifts in frames and in their standard deviations."""
+    """Express each shift in a frame, in units of its standard deviations."""
     turned = project_on_axes(rotations, shifts[:, :, None])[:, :, 0]
     units = torch.exp((-log_scales).clamp(-LARGEST_LOG, LARGEST_LOG))
     return (turned * units).clamp(-LARGEST_POSITION, LARGEST_POSITION)
@@ -357,7 +357,7 @@ def _total(
 
 
 def _cell_features(context: NeighborContext, totals: CellTotals) -> Float[Tensor, "m c"]:
-    """Describe cells: cover, inner extent, count, opacity, depth, shape, contrast, visibility."""
+    """Return cover, inner extent, count, opacity, depth, shape, contrast, visibility of cells."""
     merged, log_scales = context.merged, context.merged.log_scales
     distances = context.positions.square().sum(dim=2).sqrt()
     nearest = torch.nn.functional.pad(distances, (0, 1), value=LARGEST_DISTANCE).amin(dim=1)
@@ -366,7 +366,7 @@ def _cell_features(context: NeighborContext, totals: CellTotals) -> Float[Tensor
         context.cover.amax(dim=2),
         totals.extents,
         0.2 * torch.log(totals.counts),
-        torch.sigmoid(merged.logits),  # of these cells alone: rounding goes with the length
+        torch.sigmoid(merged.logits),  # for these cells only: rounding depends on the length
         0.2 * merged.logits,
         0.3 * parameters.positive_log(totals.depths).clamp(-14, 14),
         0.5 * (log_scales[:, 0] - log_scales[:, 1]).clamp(-8, 8),
@@ -384,7 +384,7 @@ def _sum(values: Tensor, offsets: Tensor) -> Tensor:
 
 
 def _columns(*features: Tensor) -> Tensor:
-    """Join features, each a column or several, in memory column by column."""
+    """Join features of one or several columns each; the result is column-major in memory."""
     return torch.cat(list(map(torch.atleast_2d, map(torch.t, features)))).T
 
 
@@ -394,5 +394,5 @@ def _distance(positions: Tensor) -> Tensor:
 
 
 def _density(positions: Tensor) -> Tensor:
-    """Return the unnormalised density of a Gaussian at positions in its standard deviations."""
+    """Return the unnormalised density of a Gaussian; positions are in its standard deviations."""
     return torch.exp(-0.5 * positions.square().sum(dim=1).clamp_max(60.0))

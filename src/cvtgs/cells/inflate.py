@@ -1,4 +1,4 @@
-"""Axes and inflation: merged Gaussians whose neighbours decide how they turn and grow."""
+"""Axes and inflation of merged Gaussians, which depend on their neighbours."""
 
 import torch
 from jaxtyping import Float, Int
@@ -11,40 +11,40 @@ from cvtgs.math.segments import gather_columns
 from cvtgs.scene import GaussianScene
 
 EQUAL_SHARE = 1e-2
-"""Two eigenvalues that differ by less than this share leave their axes open."""
+"""The axes of two eigenvalues that differ by less than this share count as undetermined."""
 
 NEIGHBOR_PULL = 1e-4
-"""Neighbours pull at open axes as if eigenvalues differed by this share."""
+"""Neighbours pull at undetermined axes as if eigenvalues differed by this share."""
 
 PROBE_SIGMAS = 3.0
-"""An axis is probed this many standard deviations from the centre, at both ends."""
+"""Both ends of an axis are probed this many standard deviations from the centre."""
 
 FULL_COVER = 0.1
-"""Where neighbours have at least this opacity, an axis counts as covered."""
+"""An end of an axis counts as fully covered where neighbours have at least this opacity."""
 
 CHUNK = 1 << 11
-"""Cells that are probed together; each takes about ``1 kB`` for every neighbour."""
+"""Cells per chunk of probing; each takes about ``1 kB`` per neighbour."""
 
 
 def align_axes(
     merged: GaussianScene, partition: Partition, neighbors: Int[Tensor, "m k"]
 ) -> GaussianScene:
-    """Turn axes of equal length to where the neighbours are.
+    """Turn axes of equal length towards the neighbours.
 
-    Where two eigenvalues are equal, any axes in their plane are right, and rounding decides.
-    Inflation and the network grow Gaussians axis by axis, so what they add would depend on how the
-    scene lies. Axes of about equal length turn to the directions in which the neighbours lie most
-    and least; they keep their length to 1e-4, and all others their bits. Cells that neighbours
-    surround with the symmetry of a cube stay open. This is our own rule, not part of CVT-GS.
+    Where two eigenvalues are equal, any axes in their plane are valid, and rounding picks some.
+    Inflation and the network act per axis, so their result would depend on how the scene is
+    rotated. Axes of about equal length turn to the directions in which neighbours lie most and
+    least; they keep their length to 1e-4. All other axes stay bit for bit. Where neighbours have
+    the symmetry of a cube, axes stay undetermined. Our own rule, not part of CVT-GS.
 
     Args:
-        merged: One Gaussian per cell, as its moments give it: scales descend; those of the
-            partition first, others that follow are there as neighbours.
+        merged: One Gaussian per cell, from its moments, with descending scales: first those of
+            the partition, then others that serve only as neighbours.
         partition: Members of the cells; cells of one member keep their axes.
         neighbors: The nearest other cells of every cell of the partition.
 
     Returns:
-        The scene; itself if there is nothing to turn.
+        The scene; the same object if there is nothing to turn.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -62,7 +62,7 @@ def align_axes(
     logs = log_scales[rows].double()
     axes = parameters.rotation_matrices(merged.quats[rows].double())
     pulls = axes.mT @ _pulls(merged.means, rows, neighbors[rows]) @ axes
-    # Logarithms, since axes of a needle are lost beside its length.
+    # Logarithms, because the thin axes of a needle would vanish next to its length.
     pulled = torch.diag_embed(2 * (logs - logs[:, :1])) + NEIGHBOR_PULL * pulls * _open_pairs(logs)
     rotations = torch.linalg.eigh(pulled).eigenvectors.flip(-1)
     quats = parameters.matrices_to_quats(parameters.canonical_axes(axes @ rotations))
@@ -77,7 +77,7 @@ def align_axes(
 def _pulls(
     means: Float[Tensor, "m 3"], rows: Int[Tensor, "r"], neighbors: Int[Tensor, "r k"]
 ) -> Float[Tensor, "r 3 3"]:
-    """Return the mean outer product of the directions of neighbours, near ones above all."""
+    """Return the mean outer product of the directions to neighbours; near ones weigh most."""
     shifts = means[neighbors].double() - means[rows, None].double()
     lengths = torch.linalg.vector_norm(shifts, dim=2, keepdim=True)
     apart = lengths > 0
@@ -89,7 +89,7 @@ def _pulls(
 
 
 def _open_pairs(logs: Float[Tensor, "r 3"]) -> Float[Tensor, "r 3 3"]:
-    """Return 1 where two axes are of about equal length, directly or through the third, else 0."""
+    """Return 1 where two axes have about equal length, directly or via the third one, else 0."""
     near = 2 * logs.diff(dim=1).abs() < EQUAL_SHARE
     first, second = near.double().unbind(1)
     one = torch.ones_like(first)
@@ -107,21 +107,21 @@ def inflate_cells(
 ) -> GaussianScene:
     """Widen the Gaussians of opaque cells of many members beyond their moments.
 
-    The mass of an opaque cell saturates: members hide one another, so a Gaussian with the
-    moments of the cell shows less than they did, and leaves gaps between cells. The mass that
-    does not fit should spill into area, but not over a silhouette. So an axis grows by the factor
+    The mass of an opaque cell saturates: its members hide one another, so a Gaussian with the
+    moments of the cell shows less than they do and leaves gaps between cells. The excess mass
+    should become area, but not beyond a silhouette. So an axis grows by the factor
 
     ``1 + a^2 min(log10(n) / 2, 1) (everywhere + covered * min(c / 0.1, 1))``
 
-    with opacity a, n members, and c the smaller of the opacities that neighbours have at three
+    with opacity a, n members, and c the smaller of the opacities of the neighbours at three
     standard deviations on either side. This is our own rule, not part of CVT-GS.
 
     Args:
-        merged: One Gaussian per cell, those of the partition first; others that follow only cover.
+        merged: One Gaussian per cell: first those of the partition, then others that only cover.
         partition: Members of the cells; cells of one member are not inflated.
         neighbors: The nearest other cells of every cell of the partition.
         everywhere: Growth of an opaque cell of 100 members along every axis.
-        covered: Growth beyond that along an axis that is covered at both ends.
+        covered: Further growth along an axis that is covered at both ends.
 
     Returns:
         The scene with larger scales.
@@ -165,8 +165,8 @@ def side_cover(
         neighbors: Row numbers of the neighbours of each.
 
     Returns:
-        Opacities in [0, 1) at three standard deviations along each axis, on either side, in
-        float64; neighbours are composited as if seen at their densest.
+        Opacities in [0, 1) at three standard deviations along each axis, on either side, float64:
+        neighbours are composited, each with its opacity times its unnormalised density there.
 
     Example:
         >>> from cvtgs.synthetic import scene as make

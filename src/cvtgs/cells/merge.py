@@ -24,10 +24,10 @@ from cvtgs.math.segments import (
 from cvtgs.scene import GaussianScene
 
 CHUNK_MEMBERS = 1 << 15
-"""Members gathered at one time; a chunk takes about ``(60 + 6 k) * 8`` bytes for each."""
+"""Members per chunk, each of about ``(60 + 6 k) * 8`` bytes, with k coefficients in ``shN``."""
 
 OPAQUE = -math.log(0.01)
-"""The optical depth of an opacity of 0.99, the most that rasterizers paint at a pixel."""
+"""Optical depth of an opacity of 0.99, the largest that rasterizers paint at a pixel."""
 
 
 def merge_cells(
@@ -41,14 +41,14 @@ def merge_cells(
 
     A cell of one member returns that member bit for bit. Other cells get the weighted mean and
     covariance of their members (both terms: spread of the means and mean of the covariances),
-    the weighted mean of their SH coefficients, and an opacity. Extra columns of floats are
-    averaged by weight, of integers taken from the heaviest member.
+    the weighted mean of their SH coefficients, and an opacity. Extra float columns are averaged
+    by weight; extra integer columns are taken from the heaviest member.
 
     Args:
         scene: The Gaussians, with valid rows.
         partition: Row numbers of every cell.
         config: Weights and opacity rule.
-        on_cells: Called with the number of cells that are done.
+        on_cells: Called with the number of finished cells.
 
     Returns:
         A scene with one Gaussian per cell, in the order of the cells.
@@ -108,7 +108,7 @@ def merge_cells(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Members:
-    """The members of some cells, those of one cell next to one another, in float64.
+    """The members of some cells, those of one cell contiguous, in float64.
 
     Attributes:
         means: ``(n, 3)`` positions.
@@ -117,7 +117,7 @@ class Members:
         opacities: ``(n,)`` opacities.
         depths: ``(n,)`` optical depths ``-log(1 - a)``.
         areas: ``(n,)`` mean projected areas.
-        offsets: ``(m + 1,)`` where each cell starts, and the end of the last one.
+        offsets: ``(m + 1,)`` start of each cell, and the end of the last one.
         cells: ``(n,)`` cell of every member.
     """
 
@@ -131,7 +131,7 @@ class Members:
     cells: Int[Tensor, "n"]
 
     def weights(self, area_power: float) -> Float[Tensor, "n"]:
-        """Return what each member weighs in the means of its cell.
+        """Return the weight of each member in the means of its cell.
 
         Args:
             area_power: The weight is the opacity times the area to this power: 0 as in CVT-GS,
@@ -148,7 +148,7 @@ class Members:
 
 
 def gather_members(scene: GaussianScene, part: Partition) -> Members:
-    """Collect what the moments of some cells need.
+    """Gather the members of some cells, as needed for their moments.
 
     Args:
         scene: The Gaussians.
@@ -179,12 +179,12 @@ def normalized_weights(
     """Scale weights so that those of each cell sum to 1.
 
     Args:
-        weights: Weights, at least 0, members of one cell next to one another.
-        offsets: Where each cell starts, and the end of the last one.
+        weights: Weights, at least 0; members of one cell are contiguous.
+        offsets: Start of each cell, and the end of the last one.
         cells: Cell of every member.
 
     Returns:
-        Weights in float64; equal ones in cells where all are 0 or denormal.
+        Weights in float64; equal ones in cells whose weights are all 0 or denormal.
 
     Example:
         >>> weights, cells = torch.tensor([1.0, 3.0]), torch.tensor([0, 0])
@@ -201,10 +201,10 @@ def normalized_weights(
 def mean_and_covariance(
     members: Members, weights: Float[Tensor, "n"]
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3 3"]]:
-    """Match the first two moments of the mixture that each cell is.
+    """Compute the first two moments of each cell as a mixture.
 
     The covariance is the weighted mean of the members' covariances plus the weighted spread of
-    their means; the spread is taken about the mean, in two passes, so that no digits are lost
+    their means; the spread is computed about the mean, in two passes, so that no digits are lost
     far from the origin.
 
     Args:
@@ -221,7 +221,7 @@ def mean_and_covariance(
     axes = parameters.quats_to_matrices(members.quats) * members.scales[:, None, :]
     local = local - shift.index_select(1, cells)
     x, y, z = local
-    # Sums of products of columns; products of so many small matrices take ten times as long.
+    # Sums of products of columns; batched products of small matrices take ten times as long.
     products = torch.cat([x * local, y * local[1:], z * local[2:]])
     for axis in axes.permute(2, 1, 0):
         for row, part in enumerate(products.split([3, 2, 1])):
@@ -243,13 +243,13 @@ def merged_depth(
     Args:
         members: Members of the cells.
         areas: Mean projected areas of the merged Gaussians.
-        rule: ``union``: all members lie behind one another, depths add up (CVT-GS:
-            ``1 - prod(1 - a)``). ``saturating``: what each sums to over an image adds up
-            (:func:`cvtgs.math.depths.integrated_depth`), until the cell is opaque.
-        antialiased: Whether images are rendered with the compensation of mip-splatting. Then no
-            dilation closes the gaps between merged Gaussians, and ``saturating`` gives the
-            geometric mean of this depth and of that which conserves depth at the centre times
-            area: deeper, where opaque members lie side by side.
+        rule: ``union``: all members lie behind one another, so depths add up (CVT-GS:
+            ``1 - prod(1 - a)``). ``saturating``: the contributions of members to an image add
+            up (:func:`cvtgs.math.depths.integrated_depth`), until the cell is opaque.
+        antialiased: Whether images are rendered with the compensation of Mip-Splatting. Then no
+            dilation closes the gaps between merged Gaussians, and ``saturating`` returns the
+            geometric mean of this depth and of the depth that conserves central depth times area.
+            That is deeper where opaque members lie side by side.
 
     Returns:
         Optical depths; the opacity is ``1 - exp(-depth)``.
@@ -272,24 +272,23 @@ def keep_representatives(
     *,
     areas: Float[Tensor, "n"],
 ) -> tuple[GaussianScene, Partition]:
-    """Let one member stand for its cell where the members hardly touch.
+    """Replace merged Gaussians by one member of the cell where the members hardly touch.
 
-    Members that lie apart (points, needles, thin haze) have moments that are far wider than all of
-    them together: a faint veil, of which an image shows less than of any member. In an image, a
-    Gaussian of opacity a and area A removes about ``a^2 A`` of the squared error if it is a
-    member, and ``M^2 / A`` if it spreads the mass M of the cell over its area. So the member of
-    largest ``a^2 A`` stays, bit for bit, where that is more. This is our own rule, not part of
-    CVT-GS.
+    Members that lie apart (points, needles, thin haze) have moments far wider than the members
+    together: the merged Gaussian is a faint veil that shows less in an image than any member. A
+    member of opacity a and area A removes about ``a^2 A`` of the squared error of an image; a
+    Gaussian that spreads the mass M of the cell over its area A removes ``M^2 / A``. So the member
+    of largest ``a^2 A`` is kept, bit for bit, where that is more. Our own rule, not part of CVT-GS.
 
     Args:
         scene: The Gaussians.
-        merged: One Gaussian per cell, as its moments give it.
+        merged: One Gaussian per cell, from its moments.
         partition: Members of the cells.
         areas: Mean projected areas of all Gaussians of the scene.
 
     Returns:
-        The scene with such members in place of their cells, and the members that each of its
-        Gaussians stands for: one of those cells, all of the others.
+        The scene with these members in place of their cells, and the members that each of its
+        Gaussians represents: one member of such cells, all members of the others.
 
     Example:
         >>> from cvtgs.config import MergeConfig

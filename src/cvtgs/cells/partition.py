@@ -17,9 +17,9 @@ class Partition:
     """Members of every cell in compressed (CSR) form.
 
     Attributes:
-        order: ``(n,)`` row numbers, those of one cell next to one another.
-        offsets: ``(m + 1,)`` where each cell starts in ``order``, and the end of the last one.
-        singles: Cells of one member, if the host knows; what it knows it need not wait for.
+        order: ``(n,)`` row numbers; those of one cell are contiguous.
+        offsets: ``(m + 1,)`` start of each cell in ``order``, and the end of the last one.
+        singles: Number of cells of one member if the host has it, which saves a synchronization.
     """
 
     order: Int[Tensor, "n"]
@@ -47,7 +47,7 @@ class Partition:
         order, offsets = sort_by_label(labels, count)
         ends, counts = labels.aminmax() if len(labels) else (), offsets.diff()
         sums = (counts == 0).sum(), (counts == 1).sum()
-        *found, missing, singles = torch.stack([*ends, *sums]).tolist()  # asked only once
+        *found, missing, singles = torch.stack([*ends, *sums]).tolist()  # one transfer to the host
         if found and (found[0] < 0 or found[1] >= count):
             raise InvalidArgumentError(
                 f"labels must be between 0 and {count - 1}, found {found[0]} to {found[1]}."
@@ -65,11 +65,11 @@ class Partition:
 
     @property
     def counts(self) -> Int[Tensor, "m"]:
-        """Members of every cell."""
+        """The number of members of every cell."""
         return self.offsets.diff()
 
     def count_singles(self) -> int:
-        """Return how many cells have one member."""
+        """Return the number of cells of one member."""
         return int((self.counts == 1).sum()) if self.singles is None else self.singles
 
     def labels(self, count: int) -> Int[Tensor, "n"]:
@@ -100,7 +100,7 @@ class Partition:
 
         Args:
             cells: The cells to keep, ascending, or a mask of them.
-            total: How many members they have, if that is known.
+            total: Number of their members, if known.
 
         Returns:
             Their partition, in the same order.
@@ -119,11 +119,11 @@ class Partition:
         return cells, self.select(cells, len(self.order) - (len(self) - len(cells)))
 
     def keep_only(self, rows: Int[Tensor, "m"], total: int | None = None) -> Self:
-        """Keep one member of some cells.
+        """Keep only one member of some cells.
 
         Args:
-            rows: The row number of the member to keep; -1 keeps all members of a cell.
-            total: How many members are kept in all, if that is known.
+            rows: For every cell, the row number of the member to keep, or -1 to keep all.
+            total: Total number of kept members, if known.
 
         Returns:
             The partition of the same cells.
@@ -143,10 +143,10 @@ class Partition:
         """Keep some consecutive cells.
 
         Args:
-            run: From which cell to which, at least one.
+            run: Range of cells, at least one.
 
         Returns:
-            Their partition; its order is a view.
+            Their partition; its ``order`` is a view.
         """
         if run.start == 0 and run.stop >= len(self):
             return self
@@ -154,26 +154,19 @@ class Partition:
         return type(self)(order=self.order[int(ends[0]) : int(ends[-1])], offsets=ends - ends[0])
 
     def to(self, device: torch.device) -> Self:
-        """Move the partition to a device.
-
-        Args:
-            device: Where to.
-
-        Returns:
-            The partition there.
-        """
+        """Return the partition on a device."""
         order, offsets = self.order.to(device), self.offsets.to(device)
         return type(self)(order=order, offsets=offsets, singles=self.singles)
 
     def chunks(self, max_members: int, *, cell_cost: int = 0) -> Iterator[tuple[slice, Self]]:
-        """Cut the partition into runs of cells, to bound memory.
+        """Split the partition into runs of cells, to bound memory.
 
         Args:
-            max_members: Members of one run at most; a larger cell is a run of its own.
-            cell_cost: A cell counts as this many members more than it has.
+            max_members: Largest number of members per run; a larger cell is a run of its own.
+            cell_cost: Number of members that is added to the size of each cell.
 
         Yields:
-            The cells of the run, and their partition.
+            The range of cells of the run, and their partition.
         """
         if len(self) and len(self.order) + cell_cost * len(self) <= max_members:
             yield slice(0, len(self)), self

@@ -1,4 +1,4 @@
-"""Configurations: frozen, from presets, TOML files and single settings."""
+"""Frozen configurations, built from presets, TOML files and single settings."""
 
 from cvtgs.config.base import Section, explain, read_toml
 from cvtgs.config.sections import (

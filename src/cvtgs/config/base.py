@@ -1,4 +1,4 @@
-"""What configurations and reports share: strict models, TOML files, error texts."""
+"""Shared by configurations and reports: strict models, TOML reading, error texts."""
 
 import tomllib
 from pathlib import Path
@@ -10,17 +10,17 @@ from cvtgs.errors import ConfigError
 from cvtgs.text import shortened, shown
 
 MOST_PROBLEMS = 4
-"""A sentence about some settings names no more problems."""
+"""Maximum number of problems that one error message names."""
 
 
 class Record(pydantic.BaseModel):
-    """What was measured or done: frozen; infinite numbers are strings in JSON."""
+    """Base of reports and measurements: frozen; infinite numbers are strings in JSON."""
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 
 
 class Section(pydantic.BaseModel):
-    """Some settings: frozen, unknown keys and numbers that are not finite are errors."""
+    """Base of settings: frozen; unknown keys and non-finite numbers are errors."""
 
     model_config = pydantic.ConfigDict(
         frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
@@ -34,10 +34,10 @@ def read_toml(path: Path) -> dict[str, Any]:
         path: The file.
 
     Returns:
-        Its tables.
+        The tables of the file.
 
     Raises:
-        ConfigError: It cannot be read, or is not TOML.
+        ConfigError: The file cannot be read, or is not TOML.
     """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
@@ -52,13 +52,13 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def explain(error: pydantic.ValidationError) -> str:
-    """Report in one sentence what is wrong with some settings.
+    """Describe the validation errors of some settings in one sentence.
 
     Args:
-        error: What pydantic found.
+        error: The error that pydantic raised.
 
     Returns:
-        The first problems, with key and value, none at any length.
+        The first problems, each with its key and value, long ones shortened.
     """
     problems, count = [], error.error_count()
     for problem in error.errors(include_url=False, include_context=False)[:MOST_PROBLEMS]:
@@ -75,5 +75,5 @@ def explain(error: pydantic.ValidationError) -> str:
 
 
 def named(key: str) -> str:
-    """Return a key as texts show it: short, in one line."""
+    """Return a key as messages show it: short, on one line."""
     return shortened(key, 80) if key.isprintable() else shortened(repr(key), 80)

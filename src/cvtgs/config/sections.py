@@ -14,7 +14,7 @@ Less = Literal["auto", "off"]
 
 
 def _degree_of_text(value: object) -> object:
-    """Read what files and command lines hold: numbers as text, on for all bands, off for none."""
+    """Parse a degree given as text: a number, ``on`` (all bands) or ``off`` (none)."""
     names = {"on": 3, "off": 0, **{str(degree): degree for degree in range(4)}}
     return names.get(value, value) if isinstance(value, str) else value
 
@@ -23,19 +23,19 @@ Degree = Annotated[Literal["auto", 0, 1, 2, 3], pydantic.BeforeValidator(_degree
 
 
 class EffectsConfig(Section):
-    """Which effects are computed: ``auto`` leaves it to the scene (:class:`cvtgs.EffectPlan`).
+    """The effects to compute; ``auto`` decides by the scene (:class:`cvtgs.EffectPlan`).
 
     Attributes:
-        sh: Degree up to which colour depends on the direction of view; ``on`` for all, ``off``
-            for 0. Bands above come out as zeros.
-        mip: Whether images of a scene that is tagged so are taken with the compensation of
-            Mip-Splatting, and its cells merged for it. The tag stays in any case.
-        unbounded: Whether far positions are pulled in, if there are any.
-        haze: Whether faint Gaussians are kept by their mass; off leaves all of them out.
-        flat: Whether a scene of Gaussians with two scales (2DGS) stays one.
-        duplicates: Whether Gaussians that lie exactly on others, if any do, share one search.
+        sh: Highest degree of view-dependent colour; ``on`` for all bands, ``off`` for degree 0.
+            Bands above it are written as zeros.
+        mip: Whether a scene with the Mip-Splatting tag is rendered with the compensation of
+            Mip-Splatting, and its cells are merged for it. The tag is kept in any case.
+        unbounded: Whether far positions are contracted, if there are any.
+        haze: Whether faint Gaussians are kept by their mass; ``off`` drops all of them.
+        flat: Whether a scene of Gaussians with two scales (2DGS) keeps two scales.
+        duplicates: Whether Gaussians at exactly the same position share one search.
         extras: Whether columns beyond the standard ones are carried along.
-        visibility: Whether images are taken where the preset asks for them.
+        visibility: Whether images are rendered if the preset asks for them.
     """
 
     sh: Degree = "auto"
@@ -49,14 +49,14 @@ class EffectsConfig(Section):
 
 
 class FilterConfig(Section):
-    """Which Gaussians are left out before the tessellation: faint ones and flyaways.
+    """The filter that drops faint Gaussians and flyaways before the tessellation.
 
     Attributes:
-        min_opacity: Only Gaussians fainter than this may be left out.
-        max_mass_share: They are left out, faintest first, while they hold at most this share of
-            the scene's mass; 1 leaves all of them out.
-        max_flyaway_share: Gaussians beyond 100 robust radii are left out, the least first, while
-            they hold at most this share of the mass as seen from the middle.
+        min_opacity: Gaussians with an opacity below this are faint and may be dropped.
+        max_mass_share: Faint Gaussians are dropped, faintest first, as long as they hold at most
+            this share of the scene's mass; 1 drops all of them.
+        max_flyaway_share: Gaussians beyond 100 robust radii are dropped, lightest first, as long
+            as they hold at most this share of the mass as seen from the middle of the scene.
     """
 
     min_opacity: Share = 0.1
@@ -65,24 +65,25 @@ class FilterConfig(Section):
 
 
 class TessellationConfig(Section):
-    """How Gaussians are grouped into cells.
+    """The tessellation, which groups Gaussians into cells.
 
     Attributes:
-        area_power: A Gaussian weighs its opacity times its mean projected area to this power: 0
-            is the opacity alone, 1 the mass.
-        perspective: Whether areas count as they look from the middle of the scene, smaller when
-            far.
-        hidden_share: What an enclosed Gaussian counts, as a share of a free one; 1 does not look at
-            what is enclosed.
-        weight_floor: No Gaussian weighs less than this share of the mean weight.
-        color: Length of one unit of colour for 10,000 cells, in robust radii; 0 groups by position
+        area_power: The weight of a Gaussian is its opacity times its mean projected area to this
+            power: 0 gives the opacity alone, 1 the mass.
+        perspective: Whether areas shrink with the distance from the middle of the scene, as they
+            do in an image.
+        hidden_share: Factor on the area of a fully enclosed Gaussian, where a free one has 1; with
+            1, enclosure is ignored.
+        weight_floor: Smallest weight of a Gaussian, as a share of the mean weight.
+        color: Length of one unit of colour, in robust radii, at 10,000 cells; 0 groups by position
             alone.
-        color_power: The length grows with the number of cells to this power; with few cells,
-            colour counts more.
+        color_power: This length is proportional to the number of cells to this power. If it is
+            negative, colour counts more with fewer cells.
         seeding: Deterministic strata of equal weight, or weighted random draws.
-        iterations: Lloyd iterations, at most.
+        iterations: Maximum number of Lloyd iterations.
         tolerance: Lloyd stops when an iteration lowers the energy by less than this share.
-        samples_per_site: Lloyd looks at this many Gaussians per cell at most; 0 looks at all.
+        samples_per_site: Gaussians per cell that Lloyd samples; small samples are enlarged, and 0,
+            or half of the Gaussians or more, uses all.
     """
 
     area_power: float = pydantic.Field(default=0.4, ge=0.0, le=2.0)
@@ -98,17 +99,17 @@ class TessellationConfig(Section):
 
 
 class AllocationConfig(Section):
-    """How the cells of a finer tessellation become as many as are wanted.
+    """The allocation, which merges the cells of a finer tessellation down to the target count.
 
     Attributes:
-        oversampling: The tessellation makes this many times as many cells; pairs of them merge,
-            cheapest first. 1 keeps the cells of the tessellation.
-        neighbors: A cell may merge with this many of the nearest others.
-        color: Weight of squared distances of colours against distances of shape and position, for
-            as many cells as Gaussians.
-        color_power: The weight grows with the ratio of cells to Gaussians to this power; in large
-            cells colours differ anyway.
-        mass_power: The cost of a pair counts with the mass that images show to this power.
+        oversampling: The tessellation makes this many times the target number of cells; then pairs
+            of cells merge, cheapest first. 1 keeps the cells of the tessellation.
+        neighbors: Number of nearest cells that a cell may merge with.
+        color: Weight of the squared colour distance relative to the cost of shape and position,
+            at one cell per Gaussian.
+        color_power: This weight is proportional to the ratio of cells to Gaussians to this power;
+            colours differ anyway within large cells.
+        mass_power: The cost of a pair is multiplied by its apparent mass to this power.
         reassign: Whether every Gaussian then moves to the cell that explains it best.
     """
 
@@ -121,16 +122,16 @@ class AllocationConfig(Section):
 
 
 class VisibilityConfig(Section):
-    """Whether small images of the scene tell which Gaussians are seen.
+    """The small images of the scene that measure how much each Gaussian contributes.
 
     Attributes:
-        views: Images, from :func:`cvtgs.views.mixed_views`. 0 takes none: what a Gaussian
-            paints is then told by its size, opacity and place alone.
+        views: Number of images, from :func:`cvtgs.views.mixed_views`. With 0, contributions are
+            estimated from size, opacity and position alone.
         size: Side of the images, pixels.
-        stride: Distance in pixels, along rows and columns, of the pixels that are rendered, as
-            sharp as in the whole image.
-        mass_share: Share of the weight that still comes from size, opacity and place, for all
-            that no image shows.
+        stride: Only every ``stride``-th pixel is rendered, along rows and columns, as sharp as in
+            the whole image.
+        mass_share: Share of the apparent mass that still comes from size, opacity and position,
+            so that Gaussians that no image shows also count.
     """
 
     views: int = pydantic.Field(default=0, ge=0)
@@ -140,17 +141,18 @@ class VisibilityConfig(Section):
 
 
 class MatchConfig(Section):
-    """How merged Gaussians are matched to images of the full scene, without descent.
+    """Matching merged Gaussians to images of the full scene, without gradient descent.
 
     The images are those of :class:`VisibilityConfig`; without them nothing is matched.
 
     Attributes:
-        opacity_rounds: Rounds in which opacities change until every Gaussian paints what the
-            members of its cell paint in the full scene; 0 leaves opacities as they are.
-        color_iterations: Conjugate gradients for the least squares of colours; 0 leaves colours as
-            they are.
-        color_ridge: What keeps colours where they were, as a share of what weighs on them.
-        band_ridge: Bands above the constant one are kept this many times as strongly.
+        opacity_rounds: Rounds that adjust opacities so that every Gaussian contributes as much as
+            the members of its cell do in the full scene; 0 leaves opacities unchanged.
+        color_iterations: Conjugate-gradient iterations of the least-squares fit of colours; 0
+            leaves colours unchanged.
+        color_ridge: Ridge that holds colours where they were, as a share of the weight that the
+            images give them.
+        band_ridge: Factor on the ridge for SH bands above the constant one.
     """
 
     opacity_rounds: int = pydantic.Field(default=0, ge=0)
@@ -165,23 +167,23 @@ class MatchConfig(Section):
 
 
 class MergeConfig(Section):
-    """How a cell becomes one Gaussian.
+    """The merge, which turns a cell into one Gaussian.
 
     Attributes:
-        area_power: A member weighs its opacity times its mean projected area to this power: 0 is
-            the opacity alone, 1 the mass.
+        area_power: The weight of a member is its opacity times its mean projected area to this
+            power: 0 gives the opacity alone, 1 the mass.
         opacity: ``saturating`` conserves the optical depth summed over an image, until the cell is
-            opaque, with more where opaque members lie side by side in scenes tagged mip
+            opaque, and adds more where opaque members lie side by side in scenes tagged mip
             (:func:`cvtgs.cells.merged_depth`); ``union`` is the opacity of members that lie exactly
             behind one another, ``1 - prod(1 - a)``.
-        representatives: Whether a cell whose members hardly touch keeps the one that shows most,
+        representatives: Whether a cell whose members hardly touch keeps the member that shows most
             instead of their moments.
-        align_axes: Whether axes of equal length turn to where the neighbours are
+        align_axes: Whether axes of equal length turn towards the neighbours
             (:func:`cvtgs.cells.align_axes`).
-        inflation: How much wider than its moments an opaque cell of many members becomes along
-            every axis, as a share of its standard deviation.
-        covered_inflation: The share by which it becomes wider still along an axis at both ends of
-            which other cells paint.
+        inflation: Growth of an opaque cell of many members along every axis, as a share of the
+            standard deviation of its moments.
+        covered_inflation: Further growth, as such a share, along an axis with other cells at both
+            ends.
         network: Whether MergeNet corrects the merged Gaussians.
     """
 
@@ -195,15 +197,16 @@ class MergeConfig(Section):
 
 
 class Rates(Section):
-    """The first steps of every parameter where all images agree; 0 leaves it as it is.
+    """Initial step size of every parameter if all images agree; 0 leaves it unchanged.
 
     Attributes:
-        means: Positions along the axes of each Gaussian, in their standard deviations.
-        quats: Rotations about these axes, half radians; less where the other two axes differ.
+        means: Positions along the axes of each Gaussian, in standard deviations.
+        quats: Rotations about these axes, as half the angle in radians; less where the other two
+            axes differ.
         log_scales: Logarithms of the standard deviations.
         logit_opacities: Opacity logits.
         sh0: Constant colours.
-        shN: Colours that depend on the direction.
+        shN: View-dependent colours.
     """
 
     means: Rate = 0.04
@@ -215,31 +218,30 @@ class Rates(Section):
 
 
 class RefineConfig(Section):
-    """Every choice of a refinement; frozen, unknown keys are errors.
+    """The settings of a refinement; frozen, unknown keys are errors.
 
     Attributes:
-        steps: Steps, at most; 0 leaves it to ``seconds``.
-        seconds: Wall-clock seconds, at most; 0 leaves it to ``steps``. With both 0, a
+        steps: Maximum number of steps; 0 leaves the limit to ``seconds``.
+        seconds: Maximum wall-clock seconds; 0 leaves the limit to ``steps``. With both 0, a
             simplification is not refined.
-        rates: Steps at the start.
-        half_after: Steps after which they are half as long; after n times as many, 1 / (n + 1).
-        cooling: Share of the steps, or of the time, at the end, in which their length falls to
-            nothing on top of that.
+        rates: Initial step sizes.
+        half_after: Steps after which the step sizes are halved; after n times as many steps, they
+            are 1 / (n + 1) of the initial ones.
+        cooling: Share of the steps, or of the time, at the end, over which the step sizes also
+            fall linearly to zero.
         mse_weight: Weight of the logarithm of the mean squared error.
         image_weight: Weight of the logarithm of the loss of CVT-GS, ``0.8 L1 + 0.2 (1 - SSIM) +
             0.2 gradient``.
         size: Longer side of the images, pixels; a side below 11 times ``stride`` becomes that.
-        stride: Distance in pixels, along rows and columns, of the pixels that a step and a check
-            look at, as sharp as in the whole image: at 2, four times as many steps take the same
-            time.
-        batch: Views that are found together: a quarter automatic ones, half from anywhere around,
-            a quarter from anywhere near, within the scene too.
-        first_images: Steps at the start that have a new image of the full scene each.
-        steps_per_image: Later steps for every new image; the others take one that was rendered
-            before.
-        images: Images that are kept at most, 8 bytes per pixel each.
-        heldout: Views that decide what is kept, and are never learnt from.
-        check_every: Steps between two checks of them.
+        stride: Steps and checks use only every ``stride``-th pixel, along rows and columns, as
+            sharp as in the whole image: at 2, four times as many steps take the same time.
+        batch: Views that are generated together: a quarter automatic, half random from around the
+            scene, a quarter random from near it or within it.
+        first_images: Steps at the start that each render a new image of the full scene.
+        steps_per_image: Later steps per new image; the others reuse an image rendered before.
+        images: Maximum number of images to keep, 8 bytes per pixel each.
+        heldout: Number of held-out views, which decide what is kept and are never trained on.
+        check_every: Steps between two checks of the held-out views.
         patience: Checks without a new best after which the refinement ends.
 
     Example:
@@ -265,11 +267,11 @@ class RefineConfig(Section):
     patience: Count = 8
 
     def new_images(self, steps: int, *, given: int = 0) -> int:
-        """Return how many images of the full scene so many steps take, where there are enough.
+        """Return the number of images of the full scene that some steps render, if available.
 
         Args:
             steps: Number of steps.
-            given: Images to learn from that are there before.
+            given: Training images that already exist.
 
         Returns:
             Number of images to render.
@@ -279,13 +281,13 @@ class RefineConfig(Section):
         return min(steps, first) + later // self.steps_per_image
 
     def heldout_of(self, count: int) -> int:
-        """Return how many of so many views are held out: every eighth, one at least.
+        """Return the number of held-out views: an eighth, from 1 to ``heldout``.
 
         Args:
             count: Number of views.
 
         Returns:
-            Number of those that decide what is kept.
+            Number of views that decide what is kept.
         """
         return max(1, min(self.heldout, count // 8))
 

@@ -1,4 +1,4 @@
-"""SimplifyConfig: every choice that a simplification makes, and the presets."""
+"""SimplifyConfig, the configuration of a simplification, and the presets."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +22,7 @@ from cvtgs.text import shown, suggestion
 
 
 def unknown_preset(name: object) -> ConfigError:
-    """Return the error about a preset that is none."""
+    """Return the error for an unknown preset."""
     near = suggestion(name, PRESETS) if isinstance(name, str) else ""
     end = near or "."
     return ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {shown(name, 120)}{end}")
@@ -84,27 +84,27 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         },
     },
 }
-"""What each preset changes of the defaults: ``standard`` nothing.
+"""Changes of each preset to the defaults; ``standard`` has none.
 
-``paper`` is CVT-GS (Li et al. 2026) as published, with a network that was trained here; the page
-on the design lists what the publication leaves open.
+``paper`` is CVT-GS (Li et al. 2026) as published, with a network that was trained here; the design
+page lists the details that the publication leaves open.
 """
 
 
 class SimplifyConfig(Section):
-    """Every choice of a simplification; frozen, unknown keys are errors.
+    """The configuration of a simplification; frozen, unknown keys are errors.
 
     Attributes:
         preset: Name of the preset that the values started from.
-        seed: Seed of whatever is drawn at random.
-        effects: What is computed whatever the scene calls for, or not at all.
-        filter: Which Gaussians are left out.
-        visibility: Whether images tell what is seen.
-        cvt: How Gaussians are grouped.
-        allocation: How cells merge until as many are left as are wanted.
-        merge: How a group becomes one Gaussian.
-        match: Whether, and how, opacities and colours are matched to images of the scene.
-        refine: Whether, and how, the result is moved towards images of the scene.
+        seed: Seed of all random draws.
+        effects: Effects to force on or off, whatever the scene calls for.
+        filter: Gaussians to drop before the tessellation.
+        visibility: Images that measure the contribution of each Gaussian.
+        cvt: Tessellation: how Gaussians are grouped into cells.
+        allocation: How cells merge down to the target count.
+        merge: How a cell becomes one Gaussian.
+        match: How opacities and colours are matched to images of the scene, if at all.
+        refine: How the result is refined by images of the scene, if at all.
 
     Example:
         >>> SimplifyConfig.from_preset("paper").filter.max_mass_share
@@ -124,12 +124,12 @@ class SimplifyConfig(Section):
 
     @property
     def uses_renders(self) -> bool:
-        """Whether images of the scene tell what is seen."""
+        """Whether images of the scene are rendered to measure contributions."""
         return self.visibility.views > 0 and self.effects.visibility != "off"
 
     @property
     def shares_images(self) -> bool:
-        """Whether a refinement learns from the images to which opacities are matched."""
+        """Whether a refinement trains on the images that opacities are matched to."""
         ours, theirs = self.visibility, self.refine
         is_same = (ours.size, ours.stride) == (theirs.size, theirs.stride)
         return self.uses_renders and self.match.enabled and theirs.enabled and is_same
@@ -153,7 +153,7 @@ class SimplifyConfig(Section):
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a configuration from nested values on top of the preset that they name.
+        """Build a configuration from nested values and the preset that they name.
 
         Args:
             values: For example ``{"preset": "paper", "cvt": {"iterations": 10}}``.
@@ -162,7 +162,7 @@ class SimplifyConfig(Section):
             The configuration.
 
         Raises:
-            ConfigError: A key is unknown or a value out of range; the text names it.
+            ConfigError: A key is unknown or a value is out of range; the message names it.
         """
         name = values.get("preset", "standard")
         if not isinstance(name, str) or name not in PRESETS:
@@ -195,18 +195,19 @@ class SimplifyConfig(Section):
         preset: str | None = None,
         settings: Mapping[str, str] | None = None,
     ) -> Self:
-        """Put a configuration together, as the command line does.
+        """Compose a configuration from a file, a preset and single settings.
 
         Args:
-            file: A TOML file; what it leaves open comes from the preset.
-            preset: Name of the preset, instead of the one that the file names.
-            settings: Texts by dotted key, for example ``{"cvt.iterations": "10"}``; they win.
+            file: A TOML file; missing keys come from the preset.
+            preset: Name of the preset; overrides the one in the file.
+            settings: Texts by dotted key, for example ``{"cvt.iterations": "10"}``; they override
+                all others.
 
         Returns:
             The configuration.
 
         Raises:
-            ConfigError: The file cannot be read, or a key is unknown or a value out of range.
+            ConfigError: The file cannot be read, a key is unknown, or a value is out of range.
         """
         values = {} if file is None else read_toml(Path(file))
         if preset is not None:
@@ -225,10 +226,10 @@ class SimplifyConfig(Section):
             raise ConfigError(str(error) if file is None else f"{file}: {error}") from None
 
     def to_toml(self) -> str:
-        """Write the configuration as TOML text that :meth:`from_toml` reads back.
+        """Return the configuration as TOML text that :meth:`from_toml` reads back.
 
         Returns:
-            TOML text, all keys included.
+            TOML text with all keys.
         """
         import tomli_w  # noqa: PLC0415 (only those who write a file need it)
 

@@ -1,4 +1,4 @@
-"""Weighted centroidal Voronoi tessellation of Gaussians as points: embedding, weights, cells."""
+"""Weighted centroidal Voronoi tessellation of Gaussian centres: embedding, weights, cells."""
 
 from cvtgs.cvt.embedding import embed, gaussian_weights, tessellation_weights
 from cvtgs.cvt.nearest import (

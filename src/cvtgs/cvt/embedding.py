@@ -1,4 +1,4 @@
-"""Points of the tessellation: the space in which Gaussians lie, and what each of them weighs."""
+"""Points of the tessellation: the space in which Gaussians lie, and their weights."""
 
 import torch
 from jaxtyping import Float
@@ -9,13 +9,13 @@ from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import SH_C0
 
 CHUNK = 1 << 16
-"""Gaussians that are embedded together, to bound memory."""
+"""Gaussians per chunk of the embedding, to bound memory."""
 
 FARTHEST = 1e30
-"""In robust radii: flyaways beyond are placed here, so that no float32 overflows."""
+"""Coordinates are clamped to this, in robust radii, so that flyaways cannot overflow float32."""
 
 COLOR_HEADROOM = 0.5
-"""Colours brighter than 1 plus this are treated as equally bright."""
+"""Colours are clamped at 1 plus this."""
 
 
 def embed(
@@ -26,13 +26,13 @@ def embed(
     contraction: float = 0.0,
     color: float = 0.0,
 ) -> Float[Tensor, "n d"]:
-    """Embed Gaussians in the space of the tessellation: position, and a little colour.
+    """Embed Gaussians in the space of the tessellation: position, and optionally colour.
 
     Args:
         means: Positions, scene units.
         sh0: Constant SH band; None leaves colour out.
         frame: Centre and radius of the scene.
-        contraction: How much positions beyond the robust radius are pulled in, from 0 to 1.
+        contraction: Strength of the contraction of positions beyond the robust radius, 0 to 1.
         color: Length of one unit of colour in robust radii; 0 leaves colour out.
 
     Returns:
@@ -63,8 +63,8 @@ def gaussian_weights(
 ) -> Float[Tensor, "n"]:
     """Return opacity times area to a power: 0 is the opacity as in CVT-GS, 1 the mass.
 
-    The mass says how much of an image a Gaussian paints. A power below 1 gives small Gaussians,
-    which carry fine texture, more cells at the cost of large, smooth surfaces.
+    The mass estimates how much of an image a Gaussian paints. A power below 1 gives more cells to
+    small Gaussians, which carry fine texture, at the expense of large, smooth surfaces.
 
     Args:
         opacities: Opacities.
@@ -95,12 +95,12 @@ def tessellation_weights(
 
     Args:
         opacities: Opacities.
-        areas: Mean projected areas, any unit, possibly as they look from the middle.
+        areas: Mean projected areas, any unit, possibly as seen from the middle of the scene.
         area_power: The weight is the opacity times the area to this power; 0 as in CVT-GS.
         floor: No weight is below this share of the mean weight.
 
     Returns:
-        Weights in float64 with mean 1 (before the floor); all 1 if all would be 0.
+        Weights in float64 with mean 1 (before the floor); 1 everywhere if all would be 0.
 
     Example:
         >>> tessellation_weights(

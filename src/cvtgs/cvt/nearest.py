@@ -14,16 +14,16 @@ from cvtgs.devices import thread_count
 from cvtgs.math.segments import ascending_rows
 
 SEARCH = "scipy"
-"""What searches, for reports."""
+"""Name of the nearest-site search, for reports."""
 
 NearestSite = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""Takes points ``(n, d)`` and sites ``(m, d)``, returns labels and squared distances ``(n,)``."""
+"""Maps points ``(n, d)`` and sites ``(m, d)`` to labels and squared distances ``(n,)``."""
 
 CHUNK = 1 << 15
-"""Points that a thread searches together, to bound memory."""
+"""Points per chunk of a search thread, to bound memory."""
 
 TINY_SHIFT = 1e-9
-"""Coincident sites are parted by at most this share of the extent of all sites."""
+"""Coincident sites are separated by at most this share of the extent of all sites."""
 
 
 def nearest_scipy(
@@ -33,14 +33,14 @@ def nearest_scipy(
 
     Distances are computed in float64. Points along a space-filling curve take half the time of
     shuffled ones. The tree is on the host: positions from another device are copied there, and
-    the result back. Memory is ``16 n`` bytes for the result, and a chunk of points in float64.
+    the result back. Memory: ``16 n`` bytes for the result, and a chunk of points in float64.
 
     Args:
         points: Positions on any device.
         sites: Positions, at least one.
 
     Returns:
-        Labels and squared distances in float64. Of equally near sites any one may be named.
+        Labels and squared distances in float64. Ties may be resolved in any way.
 
     Example:
         >>> labels, squared = nearest_scipy(torch.tensor([[0.9]]), torch.tensor([[0.0], [1.0]]))
@@ -49,7 +49,7 @@ def nearest_scipy(
     """
     device, points, sites = points.device, points.cpu(), sites.cpu()
     distinct, runs = None, runs_of_equal(sites)
-    if runs is not None:  # a tree cannot part coincident sites: it would compare all
+    if runs is not None:  # a tree cannot separate coincident sites: it would compare all
         order, ranks = runs
         distinct = torch.sort(order[ranks == 0]).values
     tree = build_tree(sites if distinct is None else sites[distinct])
@@ -68,9 +68,9 @@ def nearest_scipy(
 
 
 def _in_threads(search: Callable[[slice], None], count: int) -> None:
-    """Search for all chunks of points, in as many threads as there are cores.
+    """Search all chunks of points, in as many threads as there are cores.
 
-    The threads are our own: an interrupt waits for them, where scipy's own would be left running.
+    The threads are our own: an interrupt waits for them, but would leave scipy's own running.
     """
     if count <= CHUNK:
         return search(slice(0, count))
@@ -92,11 +92,11 @@ def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m
 
     Args:
         sites: Positions on any device.
-        count: How many neighbours each site gets; fewer if there are not so many others.
+        count: Number of neighbours per site; fewer if there are fewer other sites.
 
     Returns:
-        Row numbers, k = min(count, m - 1); the site itself is not among them. Of equally near
-        sites any may be named.
+        Row numbers, k = min(count, m - 1); the site itself is not among them. Ties may be
+        resolved in any way.
 
     Example:
         >>> nearest_neighbors(torch.tensor([[0.0], [1.0], [9.0]]), 1).tolist()
@@ -105,7 +105,7 @@ def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m
     with_self = min(count + 1, len(sites))
     apart = _apart(sites.cpu())
     rows, _ = _by_tree(apart, apart, with_self)
-    # Among coincident sites the site itself may be anywhere, even missing: then the last one goes.
+    # With coincident sites, the site itself may be anywhere or missing: then drop the last one.
     is_self = rows == torch.arange(len(sites))[:, None]
     if bool(is_self[:, 0].all()):
         return rows[:, 1:].to(sites.device)
@@ -116,7 +116,7 @@ def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m
 def nearest_several(
     points: Float[Tensor, "n d"], sites: Float[Tensor, "m d"], count: int
 ) -> tuple[Int[Tensor, "n k"], Float[Tensor, "n k"]]:
-    """Find the nearest sites of every point, and their distances, with a k-d tree on the host."""
+    """Return the nearest sites of every point and their distances, by a k-d tree on the host."""
     apart = _apart(sites.cpu())
     more = apart.shape[1] - points.shape[1]
     padded = torch.nn.functional.pad(points.cpu().double(), (0, more))
@@ -125,9 +125,9 @@ def nearest_several(
 
 
 def _apart(sites: Float[Tensor, "m d"]) -> Float[Tensor, "m e"]:
-    """Add a coordinate that parts coincident sites, which a tree would compare all with all.
+    """Add a coordinate that separates coincident sites, which a tree would compare pairwise.
 
-    It is so small that among sites that differ, distances stay the same but for rounding.
+    It is so small that distances between distinct sites change only by rounding.
     """
     runs = runs_of_equal(sites)
     if runs is None:
@@ -156,14 +156,14 @@ def _by_tree(
 def runs_of_equal(
     sites: Float[Tensor, "m d"],
 ) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]] | None:
-    """Bring coincident sites next to one another.
+    """Return an order that makes coincident sites adjacent, and their ranks; None if all differ.
 
-    Sites are sorted by a sum of their coordinates, which is the same for equal ones. Where
+    Sites are sorted by a weighted sum of their coordinates, which is the same for equal ones. Where
     different sites share a sum, some equal ones may stay apart; that costs time, not correctness.
     """
     keys = sites.new_zeros(len(sites), dtype=torch.float64)
     for axis, column in enumerate(sites.unbind(1)):
-        keys += column.double() * math.sqrt(1 + axis)  # no common measure: sums rarely coincide
+        keys += column.double() * math.sqrt(1 + axis)  # incommensurable: sums rarely coincide
     order = ascending_rows(keys)
     repeated = torch.zeros(len(sites), dtype=torch.bool, device=sites.device)
     ascending = keys.index_select(0, order)
@@ -177,7 +177,7 @@ def runs_of_equal(
 
 
 def search_once_per_position(nearest: NearestSite) -> NearestSite:
-    """Search for each position only once, with the same answers."""
+    """Return a search that looks up runs of equal points only once, with the same results."""
 
     def search(points: Tensor, sites: Tensor) -> tuple[Tensor, Tensor]:
         is_first = first_of_each(points)
@@ -189,7 +189,7 @@ def search_once_per_position(nearest: NearestSite) -> NearestSite:
 
 
 def first_of_each(points: Float[Tensor, "n d"]) -> Bool[Tensor, "n"]:
-    """Return which points differ from the one before."""
+    """Return which points differ from their predecessor."""
     first = torch.ones(len(points), dtype=torch.bool, device=points.device)
     first[1:] = points[1:, 0] != points[:-1, 0]
     maybe = (~first).nonzero()[:, 0]

@@ -1,4 +1,4 @@
-"""Weighted centroidal Voronoi tessellation: seeds, Lloyd's algorithm, labels, no empty cell."""
+"""Weighted centroidal Voronoi tessellation: seeds, Lloyd's algorithm, labels, empty cells."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.segments import label_argmin, label_sums, smallest_rows
 
 MIN_SAMPLES = 1 << 15
-"""Lloyd never looks at fewer points than this to save time; so few cost next to nothing."""
+"""Smallest sample of points for Lloyd; fewer would save next to no time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -22,10 +22,10 @@ class Tessellation:
 
     Attributes:
         labels: ``(n,)`` cell of every point, 0 to m - 1; every cell has a point.
-        sites: ``(m, d)`` sites that the labels belong to, on the CPU.
-        energies: ``sum w |x - site|^2`` before every move of Lloyd.
+        sites: ``(m, d)`` sites that the labels refer to, on the CPU.
+        energies: ``sum w |x - site|^2`` before every Lloyd iteration.
         energy: The same for the final labels, over all points.
-        refilled: Cells that were empty and took a point from another cell.
+        refilled: Number of empty cells that received a point from another cell.
         backend: Name of the nearest-site search.
     """
 
@@ -56,9 +56,9 @@ def tessellate(
         count: Number of cells, 1 to n.
         config: Seeding and iterations.
         seed: Seed of weighted seeding.
-        has_duplicates: Whether it pays to search for equal points only once; the result is the
-            same.
-        on_iteration: Called with the number of Lloyd moves that are done.
+        has_duplicates: Whether to search for runs of equal points only once, which does not
+            change the result.
+        on_iteration: Called with the number of finished Lloyd iterations.
 
     Returns:
         Labels and sites; exactly ``count`` cells, none empty.
@@ -115,7 +115,7 @@ def tessellate(
 def to_host(
     points: Float[Tensor, "n d"], weights: Float[Tensor, "n"]
 ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n"]]:
-    """Return points and weights on the CPU; from a device they go there in one piece."""
+    """Return points and weights on the CPU; another device sends them in a single copy."""
     if points.device.type == "cpu":
         return points, weights
     table = torch.cat([points.double(), weights.double()[:, None]], dim=1).cpu()
@@ -123,14 +123,14 @@ def to_host(
 
 
 def choose_search(*, has_duplicates: bool) -> NearestSite:
-    """Choose what searches the nearest site."""
+    """Choose the nearest-site search."""
     return search_once_per_position(nearest_scipy) if has_duplicates else nearest_scipy
 
 
 def choose_seeds(
     weights: Float[Tensor, "n"], count: int, *, config: TessellationConfig, seed: int
 ) -> Int[Tensor, "m"]:
-    """Choose the points at which sites start."""
+    """Choose the points at which the sites start."""
     if config.seeding == "weighted":
         return weighted_seeds(weights, count, torch.Generator().manual_seed(seed))
     return stratified_seeds(weights, count)[0]
@@ -139,7 +139,7 @@ def choose_seeds(
 def sample_points(
     points: Float[Tensor, "n d"], weights: Float[Tensor, "n"], size: int
 ) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k"]]:
-    """Take fewer points, which stand for all by weight, if that saves at least half of them."""
+    """Return a weighted sample that represents all points, or all if it saves less than half."""
     enough = max(size, MIN_SAMPLES)
     if size == 0 or enough >= len(points) // 2:
         return points, weights
@@ -153,19 +153,19 @@ def fill_empty_cells(
     squared: Float[Tensor, "n"],
     count: int,
 ) -> tuple[Int[Tensor, "n"], Float[Tensor, "n"], int]:
-    """Move one point into every empty cell: those that cost most where they are.
+    """Move one point into every empty cell: the points of largest cost.
 
-    Each cell keeps its cheapest point, so no cell becomes empty, and a point in a cell of its
-    own costs nothing, so the energy never rises.
+    Each cell keeps its cheapest point, so no cell becomes empty. A point in a cell of its own
+    costs nothing, so the energy never rises.
 
     Args:
         labels: Cell of every point.
         weights: Weights of the points.
-        squared: Squared distances to the own site.
+        squared: Squared distance of every point to its site.
         count: Number of cells, at most n.
 
     Returns:
-        New labels, new squared distances, and how many cells were empty.
+        New labels, new squared distances, and the number of cells that were empty.
 
     Example:
         >>> labels, _, refilled = fill_empty_cells(
@@ -191,11 +191,11 @@ def fill_empty_cells(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LloydResult:
-    """Where the sites ended.
+    """The result of Lloyd's algorithm.
 
     Attributes:
-        sites: ``(m, d)`` sites.
-        energies: ``sum w |x - site|^2`` before each move, in the order of iterations.
+        sites: ``(m, d)`` final sites.
+        energies: ``sum w |x - site|^2`` before each iteration, in order.
     """
 
     sites: Float[Tensor, "m d"]
@@ -219,11 +219,11 @@ def lloyd(
     Args:
         points: Positions.
         weights: Weights, at least 0.
-        sites: Where to start.
-        nearest: Search of the nearest site.
-        iterations: Moves at most.
-        tolerance: Stops when the energy fell by less than this share since the last move.
-        on_iteration: Called with the number of moves that are done.
+        sites: Initial sites.
+        nearest: Nearest-site search.
+        iterations: Largest number of iterations.
+        tolerance: Stop when an iteration lowers the energy by no more than this share.
+        on_iteration: Called with the number of finished iterations.
 
     Returns:
         The moved sites and the energies.
@@ -256,7 +256,7 @@ def weighted_sums(
     labels: Int[Tensor, "n"],
     count: int,
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m d"]]:
-    """Return summed weights and weighted sums of the points of every label, in float64."""
+    """Return the sums of weights and of weighted points per label, in float64."""
     columns = [weights.double()]
     for column in points.unbind(1):
         columns.append(column.double() * columns[0])
@@ -267,7 +267,7 @@ def weighted_sums(
 def centroids(
     totals: Float[Tensor, "m"], sums: Float[Tensor, "m d"], fallback: Float[Tensor, "m d"]
 ) -> Float[Tensor, "m d"]:
-    """Divide sums of points by their weight; labels without weight give ``fallback``."""
+    """Divide the sums by the total weights; labels without weight return ``fallback``."""
     filled = totals > 0
     means = sums / totals.where(filled, 1.0)[:, None]
     return torch.where(filled[:, None], means, fallback)
@@ -278,16 +278,16 @@ def stratified_seeds(
 ) -> tuple[Int[Tensor, "count"], Float[Tensor, "count"]]:
     """Take points at equal steps of accumulated weight: systematic sampling, no random numbers.
 
-    Points that weigh more than one step are taken for certain, and the steps are made anew for
-    the others (Madow 1949), so every point is taken at most once.
+    Points that weigh at least one step are always taken, and the step is recomputed for the
+    others (Madow 1949), so every point is taken at most once.
 
     Args:
         weights: Weights of points along a space-filling curve, at least 0.
-        count: How many points to take, at most n.
+        count: Number of points to take, at most n.
 
     Returns:
-        Row numbers, ascending, and the weight that each taken point stands for; the latter sum
-        to the sum of ``weights``.
+        Row numbers, ascending, and the weight that each taken point represents; these weights
+        add up to the sum of ``weights``.
 
     Example:
         >>> rows, shares = stratified_seeds(torch.tensor([1.0, 1.0, 1.0, 9.0]), 2)
@@ -312,8 +312,8 @@ def stratified_seeds(
         total = weights[others].cumsum(0)
         middles = (torch.arange(free, device=weights.device) + 0.5) * (total[-1] / free)
         picks = torch.searchsorted(total, middles).clamp_max(len(others) - 1)
-        # Picks of weights below one step are distinct but for rounding and for weights of zero:
-        # equal ones move to the next free place.
+        # Weights below one step give distinct picks, except for rounding and zero weights:
+        # equal picks move to the next free place.
         places = torch.arange(free, device=weights.device)
         picks = (picks - places).cummax(0).values + places
         picks = torch.minimum(picks, len(others) - free + places)
@@ -324,14 +324,14 @@ def stratified_seeds(
 def weighted_seeds(
     weights: Float[Tensor, "n"], count: int, generator: torch.Generator
 ) -> Int[Tensor, "count"]:
-    """Draw points at random, without replacement, with probability by weight.
+    """Draw points at random without replacement, with probabilities by weight.
 
     The points with the smallest ``-log(u) / w`` are taken (Efraimidis and Spirakis 2006).
 
     Args:
         weights: Weights, at least 0; points of weight 0 are taken last.
-        count: How many points to draw, at most n.
-        generator: Source of randomness on the CPU, so that every device draws the same.
+        count: Number of points to draw, at most n.
+        generator: Random generator on the CPU, so that every device draws the same.
 
     Returns:
         Row numbers, ascending.

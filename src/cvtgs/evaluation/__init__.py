@@ -1,4 +1,4 @@
-"""How good a simplified scene looks next to the full one: views, scores, pages."""
+"""Compare simplified scenes with the full one: rendered views, scores and pages."""
 
 from cvtgs.evaluation.compare import Comparison, SceneImages, compare, evaluate
 from cvtgs.evaluation.comparison_files import write_comparison

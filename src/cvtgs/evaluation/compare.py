@@ -1,4 +1,4 @@
-"""Scores and images of simplified scenes next to the full one, and to photographs."""
+"""Scores and images of simplified scenes against the full scene and against photographs."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -24,20 +24,20 @@ from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
 
 STAGE = "evaluate"
-"""The stage of the progress events; a step is an image."""
+"""Stage name in progress events; one step per image."""
 
 LEAST_COVER = 1e-4
-"""Cameras see nothing of a scene that is beside every image and covers less of each than this."""
+"""Mean alpha that one image must reach if all Gaussian centres are outside every image."""
 
 Images = UInt8[np.ndarray, "c h w 3"]
 Alphas = UInt8[np.ndarray, "c h w"]
 
 
 class SceneImages(NamedTuple):
-    """Images of one scene, 8 bits.
+    """Images of one scene, 8 bits per channel.
 
     Attributes:
-        colors: ``(c, h, w, 3)`` over the background.
+        colors: ``(c, h, w, 3)`` colours over the background.
         alphas: ``(c, h, w)`` accumulated alpha: the share of each pixel that the scene covers.
     """
 
@@ -56,10 +56,10 @@ class Comparison:
 
     Attributes:
         evaluation: The scores, over all views.
-        shown: Numbers of the views whose images are kept, ``c`` of them.
+        shown: Indices of the ``c`` views whose images are kept.
         full: Images of the full scene.
-        small: The same of each simplified scene, by name.
-        sizes: Bytes of the files by name of the scene, the full one included; may lack some.
+        small: Images of each simplified scene, by name.
+        sizes: File sizes in bytes by name of the scene, the full one included; may be incomplete.
     """
 
     evaluation: Evaluation
@@ -74,13 +74,13 @@ class Comparison:
         return tuple(self.evaluation.views[view] for view in self.shown)
 
     def ratio(self, scores: SceneScores) -> float:
-        """Return how many times fewer Gaussians a simplified scene has.
+        """Return the factor by which a simplified scene has fewer Gaussians.
 
         Args:
-            scores: Those of the simplified scene.
+            scores: The scores of the simplified scene.
 
         Returns:
-            For example 100.
+            The factor, for example 100.
         """
         return self.evaluation.reference_count / max(1, scores.count)
 
@@ -95,18 +95,18 @@ def evaluate(
     settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
     listener: ProgressListener = silent,
 ) -> Evaluation:
-    """Score simplified scenes by images.
+    """Score the images of simplified scenes.
 
-    Every view of the full scene is rendered once, whatever the number of small ones. Memory:
-    what :func:`cvtgs.rendering.render` needs, and two images.
+    Each view of the full scene is rendered once for all simplified scenes. Memory: that of
+    :func:`cvtgs.rendering.render`, and two images.
 
     Args:
         reference: The full scene, or a file or folder of one.
         small: Simplified scenes, or files of them, by name.
-        cameras: From where to look.
+        cameras: The cameras.
         reference_name: Name of the full scene.
         photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too.
-        settings: Background, which LPIPS, and what renders.
+        settings: Background, LPIPS network and backend.
         listener: Called after each image.
 
     Returns:
@@ -114,7 +114,7 @@ def evaluate(
 
     Raises:
         InvalidArgumentError: There is no camera, or none sees anything of the full scene; two
-            scenes share a name, or the photographs have another shape than the images.
+            scenes share a name, or the photographs do not have the shape of the images.
         DeviceError: The backend does not work on a scene's device.
         MissingDependencyError: The backend's package or the chosen LPIPS is missing.
 
@@ -145,20 +145,20 @@ def compare(  # noqa: PLR0913 (options by name)
     settings: EvaluationSettings = EvaluationSettings(),  # noqa: B008 (frozen)
     listener: ProgressListener = silent,
 ) -> Comparison:
-    """Score simplified scenes by images, and keep the images.
+    """Score the images of simplified scenes, and keep the images.
 
-    Memory: ``4 c h w`` bytes per scene, and what :func:`cvtgs.evaluation.evaluate` needs.
+    Memory: ``4 c h w`` bytes per scene, and that of :func:`cvtgs.evaluation.evaluate`.
 
     Args:
         reference: The full scene, or a file or folder of one.
         small: Simplified scenes, or files of them, by name.
-        cameras: From where to look.
+        cameras: The cameras.
         reference_name: Name of the full scene.
-        sizes: Bytes of the files, by name.
-        most_images: Keep images of as many views at most, spread over their order; the scores
-            are those of all views. None keeps all.
+        sizes: File sizes in bytes, by name.
+        most_images: Keep the images of at most this many views, spread over their order; scores
+            always use all views. None keeps all.
         photographs: ``(c, h, w, 3)`` one per camera, in [0, 1], to score all scenes against too.
-        settings: Background, which LPIPS, and what renders.
+        settings: Background, LPIPS network and backend.
         listener: Called after each image.
 
     Returns:
@@ -228,7 +228,7 @@ def _score_images(
     settings: EvaluationSettings,
     listener: ProgressListener,
 ) -> Evaluation:
-    """Score all scenes against the first, view by view; hand every image to ``keep``."""
+    """Score all scenes against the first, view by view; pass every image to ``keep``."""
     if len(cameras) == 0:
         raise InvalidArgumentError("an evaluation needs at least one camera, found none.")
     wanted = (len(cameras), cameras.height, cameras.width, 3)
@@ -288,6 +288,6 @@ def _score_images(
 
 
 def _covers_any(scene: GaussianScene, cameras: Cameras, settings: EvaluationSettings) -> bool:
-    """Return whether Gaussians beside all images cover something of one."""
+    """Return whether the mean alpha of any image reaches ``LEAST_COVER``."""
     images = (render_view(scene, camera, backend=settings.backend) for camera in cameras.singles())
     return any(float(image.alpha.mean()) >= LEAST_COVER for image in images)

@@ -1,4 +1,4 @@
-"""What `cvtgs compare` writes: a page, a sheet of all images with scores, and maps of errors."""
+"""The files that `cvtgs compare` writes: a page, a sheet of images and scores, and error maps."""
 
 import base64
 import json
@@ -44,12 +44,12 @@ _RAMP = 340, 14
 _NAME, _TEXT = 20, 15
 
 MOST_BYTES = 7_500_000
-"""Pages are kept below this: images are compressed harder, and then made smaller."""
+"""Size limit of a page; to meet it, images are compressed more and then made smaller."""
 _TRIES = ((84, 1.0), (72, 1.0), (55, 1.0), (55, 0.7), (45, 0.5), (35, 0.35), (30, 0.25))
 
 
 def check_comparison_files(folder: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-    """Make the folder and check that the files could be written, before the work begins."""
+    """Make the folder and check that the files can be written, before the work starts."""
     make_folder(folder)
     for name in (PAGE, SHEET, ERRORS):
         check_output(Path(folder) / name, overwrite)
@@ -67,9 +67,9 @@ def write_comparison(
 
     Args:
         comparison: Images and scores, at least one simplified scene.
-        folder: Where to write; made if it is missing.
+        folder: The output folder; created if missing.
         overwrite: Whether existing files may be replaced.
-        viewer: Name of a page in the folder with the scenes in 3D, to link to; empty for none.
+        viewer: File name of a page with the scenes in 3D to link to, in the folder; or empty.
         listener: Called after each file.
 
     Returns:
@@ -108,7 +108,7 @@ def write_comparison(
 
 
 class _Row(NamedTuple):
-    """What one row of a sheet shows: a name with lines of text, and an image per view."""
+    """A row of a sheet: a name with lines of text, and an image per view."""
 
     name: str
     lines: Sequence[str]
@@ -117,7 +117,7 @@ class _Row(NamedTuple):
 
 
 def contact_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
-    """Draw all views of all scenes: a row per scene, the full one first, a column per view."""
+    """Draw all views of all scenes: a row per scene, the full one first; a column per view."""
     evaluation = comparison.evaluation
     size = bytes_text(comparison.sizes.get(evaluation.reference))
     full = [f"{evaluation.reference_count:,} Gaussians", size]
@@ -130,9 +130,9 @@ def contact_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
 
 
 def error_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
-    """Draw where every small image differs from the full one, with legends of the colours.
+    """Draw error maps of all simplified scenes, with legends of the colours.
 
-    A simplified scene has a row for the errors of colour and one for those of alpha.
+    Each simplified scene has a row for colour errors and one for alpha errors.
     """
     rows = []
     for scores in comparison.evaluation.scenes:
@@ -151,7 +151,7 @@ def error_sheet(comparison: Comparison) -> UInt8[np.ndarray, "y x 3"]:
 
 
 def error_maps(comparison: Comparison, name: str) -> tuple[Images, Images]:
-    """Return maps of the errors of colour and of alpha of a simplified scene."""
+    """Return maps of the colour errors and the alpha errors of a simplified scene."""
     full, small = comparison.full, comparison.small[name]
     colors = map(error_map, full.colors, small.colors)
     return np.stack(list(colors)), np.stack(list(map(alpha_error_map, full.alphas, small.alphas)))
@@ -175,7 +175,7 @@ def _small_row(comparison: Comparison, scores: SceneScores, images: Images) -> _
 def _draw_sheet(
     comparison: Comparison, rows: Sequence[_Row], *, legend: bool = False
 ) -> UInt8[np.ndarray, "y x 3"]:
-    """Draw rows of tiles with their texts, under the names of the views."""
+    """Draw rows of images with their texts, below a header of view names."""
     from PIL import Image, ImageDraw, ImageFont  # noqa: PLC0415 (takes time to load)
 
     views, height, width, _ = comparison.full.colors.shape
@@ -207,7 +207,7 @@ def _draw_sheet(
 
 
 def _draw_legends(sheet: "Image", left: int, top: int, font: "FreeTypeFont | ImageFont") -> None:
-    """Draw the two ramps of colours with their numbers, side by side."""
+    """Draw both colour ramps with their numbers, side by side."""
     from PIL import Image, ImageDraw  # noqa: PLC0415
 
     draw, (width, height) = ImageDraw.Draw(sheet), _RAMP
@@ -232,7 +232,7 @@ def _draw_legends(sheet: "Image", left: int, top: int, font: "FreeTypeFont | Ima
 
 
 def _shortened(text: str, width: int, font: "FreeTypeFont | ImageFont") -> str:
-    """Shorten a text in the middle until it fits a width."""
+    """Shorten a text in the middle to fit a width, pixels."""
     shown = text
     while len(shown) > 4 and font.getlength(shown) > width:
         keep = len(shown) - 2
@@ -245,7 +245,7 @@ def _psnr_text(value: float) -> str:
 
 
 def bytes_text(count: int | None) -> str:
-    """Return a number of bytes in decimal units; an empty text for None."""
+    """Format a number of bytes in decimal units; return "" for None."""
     if count is None:
         return ""
     value, unit = float(count), "B"
@@ -269,14 +269,13 @@ def comparison_page(
     viewer: str = "",
     most_bytes: int = MOST_BYTES,
 ) -> str:
-    """Return the page, with a summary of :func:`render_template` above the images.
+    """Return the HTML page, with ``summary`` (made by :func:`render_template`) above the images.
 
-    It links to a page with the scenes in 3D, if there is one beside it.
+    It links to the page ``viewer`` with the scenes in 3D, unless that is empty.
 
-    It has a divider between the full and a simplified scene, a chooser of scene and view, counts,
-    bytes and scores, and maps of the differences of colour and of alpha.
-    ``#view=2&small=1&split=30&error=1`` at the end of its address chooses what it shows first;
-    ``error=2`` is alpha.
+    The page has a slider between the full and a simplified scene, selectors of scene and view,
+    counts, bytes and scores, and maps of the colour and alpha errors. The URL fragment
+    ``#view=2&small=1&split=30&error=1`` sets the initial state; ``error=2`` shows alpha errors.
     """
     parts = files("cvtgs.evaluation") / "page_parts"
     texts = {
@@ -304,7 +303,7 @@ def comparison_page(
 
 
 def render_template(template: str, **values: Any) -> str:
-    """Fill in an HTML template of Jinja; values are escaped unless it marks them as safe."""
+    """Render a Jinja HTML template; values are escaped unless the template marks them as safe."""
     from jinja2 import Environment, StrictUndefined  # noqa: PLC0415 (takes time to load)
 
     environment = Environment(
@@ -315,7 +314,7 @@ def render_template(template: str, **values: Any) -> str:
 
 
 def _page_data(comparison: Comparison, quality: int, factor: float) -> dict[str, Any]:
-    """Return what the script of the page reads."""
+    """Return the data for the script of the page."""
     evaluation = comparison.evaluation
     small = []
     for scores in evaluation.scenes:
@@ -326,7 +325,7 @@ def _page_data(comparison: Comparison, quality: int, factor: float) -> dict[str,
         }
         small.append(
             {
-                **json.loads(scores.model_dump_json()),  # which writes infinity as text
+                **json.loads(scores.model_dump_json()),  # encodes infinity as a string
                 "bytes": comparison.sizes.get(scores.name),
                 "images": _data_urls(images.colors, quality, factor),
                 **{name: _data_urls(part, quality - 10, factor) for name, part in maps.items()},

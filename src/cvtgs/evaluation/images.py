@@ -1,4 +1,4 @@
-"""Images of 8 bits: encoding, resizing, colours of differences, and photographs of cameras."""
+"""8-bit images: encoding, resizing, colour maps of errors, and photographs of cameras."""
 
 import io
 import os
@@ -19,9 +19,9 @@ from cvtgs.errors import FileFormatError, InputError, InputNotFoundError, Invali
 Encoding = Literal["png", "webp"]
 
 ERROR_SCALE = 0.3
-"""The difference that gets the brightest colour; larger ones get it too."""
+"""Difference from which on the brightest colour is used."""
 
-# Ten steps of "magma" (van der Walt and Smith 2015, CC0): equal steps look equally different.
+# Ten steps of "magma" (van der Walt and Smith 2015, CC0), which is perceptually uniform.
 _MAGMA = (
     (0, 0, 4),
     (24, 15, 62),
@@ -36,9 +36,9 @@ _MAGMA = (
 )
 
 ALPHA_SCALE = 0.2
-"""The difference of alpha that gets the brightest colours."""
+"""Absolute difference of alpha from which on the brightest colours are used."""
 
-# Warm where more of the background shows through, black where equal, cold where less does.
+# Warm where more of the background shows through, black where equal, cold where less shows.
 _ALPHA = (
     (255, 246, 205),
     (250, 178, 66),
@@ -60,7 +60,7 @@ def _css_gradient(colors: tuple[tuple[int, int, int], ...]) -> str:
 
 
 CSS_GRADIENT, CSS_ALPHA_GRADIENT = _css_gradient(_MAGMA), _css_gradient(_ALPHA)
-"""The colours of differences from left to right."""
+"""CSS gradients of the colour maps, from left to right."""
 
 
 def as_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
@@ -78,7 +78,7 @@ def alpha_as_bytes(alpha: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w"]:
 
 
 def encode(image: UInt8[np.ndarray, "h w 3"], encoding: Encoding, *, quality: int = 82) -> bytes:
-    """Write an image to bytes."""
+    """Encode an image."""
     from PIL import Image  # noqa: PLC0415 (takes time to load)
 
     settings: dict[str, Any] = {"png": {}, "webp": {"quality": quality}}[encoding]
@@ -88,7 +88,7 @@ def encode(image: UInt8[np.ndarray, "h w 3"], encoding: Encoding, *, quality: in
 
 
 def resized(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> np.ndarray:
-    """Resize an image to a width and height by Lanczos interpolation."""
+    """Resize an image to a width and height with a Lanczos filter."""
     from PIL import Image  # noqa: PLC0415
 
     if (image.shape[1], image.shape[0]) == size:
@@ -97,7 +97,7 @@ def resized(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> np.ndar
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Read the width and the height of an image, without its pixels."""
+    """Read the width and height of an image without decoding its pixels."""
     from PIL import Image  # noqa: PLC0415
 
     with _opened(path), Image.open(path) as file:
@@ -108,7 +108,7 @@ def image_size(path: Path) -> tuple[int, int]:
 def read_image(
     path: Path, size: tuple[int, int], background: tuple[float, float, float]
 ) -> Float[np.ndarray, "h w 3"]:
-    """Read an image at a width and height, over a background."""
+    """Read an image, resize it to a width and height, and composite it over a background."""
     from PIL import Image  # noqa: PLC0415
 
     with _opened(path), Image.open(path) as file:
@@ -121,7 +121,7 @@ def read_image(
 
 @contextmanager
 def _opened(path: Path) -> Iterator[None]:
-    """Say in one sentence why an image cannot be read."""
+    """Convert errors on reading an image to cvtgs errors."""
     from PIL import UnidentifiedImageError  # noqa: PLC0415
 
     try:
@@ -138,32 +138,32 @@ def _opened(path: Path) -> Iterator[None]:
 def error_map(
     one: UInt8[np.ndarray, "h w 3"], other: UInt8[np.ndarray, "h w 3"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Show the root mean square difference over the channels as colours."""
+    """Map the root mean square difference over the channels to colours."""
     difference = (one.astype(np.float32) - other.astype(np.float32)) / 255
     return error_colors(np.sqrt(np.square(difference).mean(axis=2)))
 
 
 def error_colors(differences: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the colours of differences."""
+    """Map differences of colour to colours."""
     return _colors_of(differences / ERROR_SCALE, _MAGMA)
 
 
 def alpha_error_map(
     full: UInt8[np.ndarray, "h w"], small: UInt8[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Show the alpha of a small scene minus that of the full one as colours."""
+    """Map the alpha of a simplified scene minus that of the full one to colours."""
     return alpha_colors((small.astype(np.float32) - full.astype(np.float32)) / 255)
 
 
 def alpha_colors(differences: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the colours of differences of alpha: warm below zero, cold above."""
+    """Map differences of alpha to colours: warm below zero, cold above."""
     return _colors_of((differences / ALPHA_SCALE + 1) / 2, _ALPHA)
 
 
 def _colors_of(
     values: Float[np.ndarray, "h w"], colors: tuple[tuple[int, int, int], ...]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Interpolate in a row of colours, which stand for 0 to 1."""
+    """Map values in [0, 1] to colours by interpolation in a list of colours."""
     positions, steps = np.linspace(0, 1, len(colors)), np.asarray(colors, dtype=np.float32)
     channels = [np.interp(values, positions, steps[:, channel]) for channel in range(3)]
     return np.stack(channels, axis=2).round().astype(np.uint8)
@@ -177,15 +177,15 @@ def load_photographs(
 ) -> Float[Tensor, "c h w 3"]:
     """Read the photograph of every camera, at the cameras' size.
 
-    A photograph lies in the folder under the camera's name, or under the last part of that name;
-    the suffix may be another one or be missing in the name. Other files, such as masks, are left
-    alone; transparent pixels show the background. Photographs of another size are scaled to that
-    of the cameras, along rows and columns by themselves.
+    The file name in the folder is the camera's name, or the last part of that name; the suffix may
+    differ or be missing in the camera's name. Other files, such as masks, are ignored; transparent
+    pixels show the background. Photographs of another size are scaled to that of the cameras, in
+    width and height independently.
 
     Memory: ``12 c h w`` bytes.
 
     Args:
-        folder: Where the photographs are.
+        folder: The folder of the photographs.
         cameras: Cameras with names.
         background: Colour behind transparent pixels, in [0, 1].
 
@@ -214,17 +214,17 @@ def load_photographs(
 
 
 def fit_cameras(cameras: Cameras, folder: str | os.PathLike[str]) -> Cameras:
-    """Give cameras the size of their photographs if that is smaller, as in ``images_4``.
+    """Resize cameras to their photographs if those are smaller, as in ``images_4``.
 
     Args:
         cameras: Cameras with names.
-        folder: Where the photographs are, as :func:`load_photographs` finds them.
+        folder: The folder of the photographs, which are found as by :func:`load_photographs`.
 
     Returns:
-        Cameras with scaled intrinsics, or the same; of several sizes the most frequent counts.
+        Cameras with scaled intrinsics, or the same cameras; the most frequent size is used.
 
     Raises:
-        InvalidArgumentError: The cameras have no names, or the photographs another shape.
+        InvalidArgumentError: The cameras have no names, or the aspect ratios differ.
         InputNotFoundError: There is no such folder, or a camera has no photograph in it.
         FileFormatError: A photograph is no image.
 
@@ -240,7 +240,7 @@ def fit_cameras(cameras: Cameras, folder: str | os.PathLike[str]) -> Cameras:
     """
     paths = _find_all(Path(folder), cameras)
     (width, height), _ = Counter(image_size(path) for path in paths).most_common(1)[0]
-    # Sizes were rounded when the photographs were scaled.
+    # The tolerance allows for sizes that were rounded when the photographs were scaled.
     if abs(width * cameras.height - height * cameras.width) > 1.5 * max(
         cameras.width, cameras.height
     ):
@@ -252,7 +252,7 @@ def fit_cameras(cameras: Cameras, folder: str | os.PathLike[str]) -> Cameras:
 
 
 def _find_all(place: Path, cameras: Cameras) -> list[Path]:
-    """Find the photograph of every camera."""
+    """Return the path of every camera's photograph."""
     if not cameras.names:
         raise InvalidArgumentError(
             "photographs are matched by the names of the cameras, but these have none."
@@ -270,7 +270,7 @@ def _find_all(place: Path, cameras: Cameras) -> list[Path]:
 
 
 def _find(folder: Path, name: str) -> Path | None:
-    """Look for the whole name first, then for its last part; first as it is, then by suffix."""
+    """Look for the whole name, then for its last part; for each as it is, then by suffix."""
     whole = PurePosixPath(name.replace("\\", "/"))
     parts = [part for part in whole.parts if part not in ("/", ".", "..")]
     for inner in (PurePosixPath(*parts), PurePosixPath(whole.name)):

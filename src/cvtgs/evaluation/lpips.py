@@ -1,4 +1,4 @@
-"""LPIPS, the distance of images by the activations of a trained network."""
+"""LPIPS, a perceptual distance of images based on activations of a trained network."""
 
 import os
 import re
@@ -23,20 +23,20 @@ from cvtgs.io.files import open_input
 from cvtgs.losses import check_pair
 
 LPIPS_VARIABLE = "CVTGS_LPIPS_WEIGHTS"
-"""Environment variable with the path of a weights file, or of a folder of them."""
+"""Environment variable with the path of a weights file, or of a folder of weights files."""
 
 LpipsNetwork = Literal["alex", "vgg"]
 """AlexNet (Krizhevsky 2014) or VGG16 (Simonyan and Zisserman 2014)."""
 
 LEAST_PIXELS: Mapping[LpipsNetwork, int] = MappingProxyType({"alex": 31, "vgg": 16})
-"""What height and width of an image must have, so that no layer is empty."""
+"""Smallest height and width of an image in pixels, so that no layer is empty."""
 
 
 class Convolution(NamedTuple):
-    """A convolution with its ReLU, by its number in torchvision's ``features``.
+    """A convolution with its ReLU, identified by its index in torchvision's ``features``.
 
-    ``pool`` is the side of the maximum pooling before it (stride 2), 0 for none; the activations
-    of a ``tap`` are compared.
+    ``pool`` is the kernel size of the max pooling before it (stride 2), 0 for none; activations
+    are compared where ``tap`` is set.
     """
 
     number: int
@@ -80,7 +80,7 @@ NETWORKS: Mapping[LpipsNetwork, tuple[Convolution, ...]] = MappingProxyType(
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 _EPSILON = 1e-10
 
-# The file that torchvision downloads for the package ``lpips``, and the names in its state dicts.
+# The files that torchvision downloads for the package ``lpips``, and the keys in its state dicts.
 _BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 _OTHER_NAMES = (
     (re.compile(r"net\.slice\d+\.(\d+)\.(weight|bias)"), r"features.\1.\2"),
@@ -93,10 +93,10 @@ class LpipsWeights:
     """The weights of one LPIPS network, read once.
 
     Attributes:
-        network: Which network they are for.
+        network: The network that the weights belong to.
         tensors: ``features.<i>.weight``, ``features.<i>.bias`` and ``lin0.weight`` to
             ``lin4.weight``, float32 on the CPU.
-        source: The files that they came from.
+        source: The files that the weights came from.
     """
 
     network: LpipsNetwork
@@ -114,19 +114,19 @@ def lpips(
 ) -> Float[Tensor, "c"]:
     """Return the LPIPS distance, version 0.1, of each pair of images.
 
-    Zhang, Isola, Efros, Shechtman, Wang 2018, equation 1: activations after five ReLUs, scaled to
-    unit length over the channels, squared differences weighted by the trained heads, mean over
-    places, sum over layers. Images go in as they are, in [0, 1] mapped to [-1, 1]. Memory: one
-    pair of images at a time, in float32 about ``2 kB * h * w`` (vgg) or ``0.2 kB * h * w`` (alex).
-    On CUDA the convolutions obey ``torch.backends.cudnn.allow_tf32``, on by default.
+    Zhang, Isola, Efros, Shechtman, Wang 2018, equation 1: activations after five ReLUs are scaled
+    to unit length over the channels; their squared differences are weighted by the trained heads,
+    averaged over positions and summed over layers. Images are not resized; [0, 1] is mapped to
+    [-1, 1]. Memory: one pair of images at a time, in float32 about ``2 kB * h * w`` (vgg) or
+    ``0.2 kB * h * w`` (alex). On CUDA ``torch.backends.cudnn.allow_tf32`` applies (default: on).
 
     Args:
         a: ``(c, h, w, 3)`` images, clipped to [0, 1].
         b: ``(c, h, w, 3)`` images, clipped to [0, 1].
         network: ``"vgg"`` or ``"alex"``; the values of the two cannot be compared.
-        weights: What :func:`load_lpips` returns, which saves reading them for every call; or a
-            path for it. Without either it looks at the environment variable
-            ``CVTGS_LPIPS_WEIGHTS``, then for the package ``lpips``.
+        weights: The result of :func:`load_lpips`, which saves reading the weights in every call,
+            or a path for it. If None, the environment variable ``CVTGS_LPIPS_WEIGHTS`` is used,
+            else the package ``lpips``.
 
     Returns:
         ``(c,)`` distances, at least 0, 0 for equal images, without gradient.
@@ -156,8 +156,7 @@ def lpips(
     tensors = {name: tensor.to(a) for name, tensor in weights.tensors.items()}
     distances = []
     for pair in zip(a.split(1), b.split(1), strict=True):
-        # Layer by layer, and not batched: equal images go through the same sums, so that they
-        # differ by exactly 0.
+        # Not batched, so that equal images go through the same sums and differ by exactly 0.
         layers = zip(*(_unit_activations(image, network, tensors) for image in pair), strict=True)
         distance = a.new_zeros(())
         for number, (one, other) in enumerate(layers):
@@ -170,7 +169,7 @@ def lpips(
 def _unit_activations(
     image: Float[Tensor, "1 h w 3"], network: LpipsNetwork, tensors: Mapping[str, Tensor]
 ) -> Iterator[Float[Tensor, "1 k y x"]]:
-    """Yield the compared activations one by one, scaled to unit length over the channels."""
+    """Yield the compared activations layer by layer, scaled to unit length over the channels."""
     centred = image.clamp(0, 1) * 2 - 1
     scaled = (centred - centred.new_tensor(_SHIFT)) / centred.new_tensor(_SCALE)
     values = scaled.permute(0, 3, 1, 2)
@@ -202,24 +201,24 @@ def weight_shapes(network: LpipsNetwork) -> dict[str, tuple[int, ...]]:
 def load_lpips(
     network: LpipsNetwork = "vgg", path: str | os.PathLike[str] | None = None
 ) -> LpipsWeights:
-    """Read the weights of LPIPS, from the first of these that there is.
+    """Read the weights of LPIPS from the first of these sources that is present.
 
     1. ``path``; 2. the path in the environment variable ``CVTGS_LPIPS_WEIGHTS``; 3. the installed
-    package ``lpips``, with the backbone that torchvision has downloaded before. A path is that of
-    a state dict, or of a folder with ``lpips_vgg*.pth`` or ``lpips_alex*.pth``. A state dict
-    has torchvision's names (``features.0.weight``, ``lin0.weight``) or those of
-    ``lpips.LPIPS(net="vgg").state_dict()``, in any precision. Nothing is downloaded.
+    package ``lpips``, with the backbone that torchvision has already downloaded. A path leads to a
+    state dict, or to a folder with ``lpips_vgg*.pth`` or ``lpips_alex*.pth``. The keys of a state
+    dict are those of torchvision (``features.0.weight``, ``lin0.weight``) or those of
+    ``lpips.LPIPS(net="vgg").state_dict()``; any precision works. Nothing is downloaded.
 
     Args:
         network: ``"vgg"`` or ``"alex"``.
-        path: A weights file or a folder of them.
+        path: A weights file or a folder of weights files.
 
     Returns:
         The weights.
 
     Raises:
         InvalidArgumentError: There is no such network.
-        MissingDependencyError: No path was given and the package is not installed or incomplete.
+        MissingDependencyError: No path was given, and the package is missing or incomplete.
         InputNotFoundError: There is no such file.
         InputError: It cannot be read.
         FileFormatError: It does not hold the weights of this network.
@@ -257,7 +256,7 @@ def load_lpips(
 
 
 def _weight_files(network: LpipsNetwork, path: str | os.PathLike[str] | None) -> tuple[Path, ...]:
-    """Find the files of the weights, as :func:`load_lpips` says."""
+    """Find the weights files; see :func:`load_lpips`."""
     given = os.fspath(path) if path is not None else os.environ.get(LPIPS_VARIABLE, "")
     if given:
         place = Path(given)
@@ -267,7 +266,7 @@ def _weight_files(network: LpipsNetwork, path: str | os.PathLike[str] | None) ->
                 f"{place}: the folder must hold a file lpips_{network}*.pth, found none."
             )
         return (found[0],)
-    # The package is not imported: that would load torchvision, and its model would download.
+    # Not imported: that would load torchvision, and creating its model would download files.
     spec = find_spec("lpips")
     if spec is None or spec.origin is None:
         raise MissingDependencyError(
@@ -286,11 +285,11 @@ def _weight_files(network: LpipsNetwork, path: str | os.PathLike[str] | None) ->
 
 
 def _read_state(path: Path) -> dict[str, Any]:
-    """Read a state dict, and give its values torchvision's names."""
+    """Read a state dict and rename its keys to those of torchvision."""
     with open_input(path) as file:
         try:
             state = torch.load(file, map_location="cpu", weights_only=True)
-        except Exception as error:  # a damaged file makes torch.load raise nearly anything
+        except Exception as error:  # torch.load can raise nearly anything on a damaged file
             raise FileFormatError(
                 f"{path}: must be a state dict that torch.load(weights_only=True) reads, "
                 f"found none; the file may be damaged."

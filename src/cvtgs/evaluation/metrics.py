@@ -1,4 +1,4 @@
-"""Image metrics by formula: PSNR, SSIM and the error of alpha."""
+"""Closed-form image metrics: PSNR, SSIM, alpha error and alpha bias."""
 
 import torch
 from jaxtyping import Float
@@ -17,8 +17,8 @@ def psnr(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tens
         b: ``(c, h, w, 3)`` images, clipped to [0, 1].
 
     Returns:
-        ``(c,)`` decibels, at least 0, without gradient. Images that are equal after clipping
-        have ``inf``: a mean over views that holds one is ``inf`` too.
+        ``(c,)`` decibels, at least 0, without gradient. It is ``inf`` for images that are equal
+        after clipping; a mean over views with such a pair is ``inf`` too.
 
     Raises:
         InvalidArgumentError: Shape, dtype or device do not fit.
@@ -36,9 +36,9 @@ def psnr(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tens
 def ssim(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tensor, "c"]:
     """Return the structural similarity of each pair of images.
 
-    :func:`cvtgs.losses.mean_ssim` of clipped images: Gaussian window of 11 x 11 pixels and
-    1.5 pixels, border "valid" (only windows inside the image count), mean over places and
-    channels; what scikit-image gives with ``gaussian_weights=True, sigma=1.5,
+    :func:`cvtgs.losses.mean_ssim` of clipped images: a Gaussian window of 11 x 11 pixels with a
+    sigma of 1.5, border "valid" (only windows inside the image), mean over positions and channels.
+    This is scikit-image's result with ``gaussian_weights=True, sigma=1.5,
     use_sample_covariance=False``. In float32 it is within 1e-4 of float64, mostly within 1e-5.
     Memory: about 12 copies of one image.
 
@@ -68,7 +68,7 @@ def alpha_error(a: Float[Tensor, "c h w"], b: Float[Tensor, "c h w"]) -> Float[T
     """Return the mean absolute difference of accumulated alpha of each pair of images.
 
     Accumulated alpha is the share of a pixel that the scene covers; the rest is background. The
-    error is the same over every background, so holes show that a similar background hides.
+    error does not depend on the background, so it also reveals holes over a similar background.
 
     Args:
         a: ``(c, h, w)`` alpha, clipped to [0, 1].
@@ -91,9 +91,9 @@ def alpha_error(a: Float[Tensor, "c h w"], b: Float[Tensor, "c h w"]) -> Float[T
 def alpha_bias(a: Float[Tensor, "c h w"], b: Float[Tensor, "c h w"]) -> Float[Tensor, "c"]:
     """Return the mean of ``a - b`` of each pair of images of accumulated alpha.
 
-    It is negative where ``a`` lets more light of the background through than ``b``: -0.01 means
-    that 1 % more of it arrives. Holes alone have the mean ``(error - bias) / 2``, with
-    :func:`alpha_error`.
+    It is negative if ``a`` lets more of the background through than ``b``: -0.01 means an
+    additional 1 % of its light. The mean over holes alone is ``(error - bias) / 2``, with the
+    error of :func:`alpha_error`.
 
     Args:
         a: ``(c, h, w)`` alpha of the simplified scene, clipped to [0, 1].
@@ -115,7 +115,7 @@ def alpha_bias(a: Float[Tensor, "c h w"], b: Float[Tensor, "c h w"]) -> Float[Te
 def _alpha_differences(
     a: Float[Tensor, "c h w"], b: Float[Tensor, "c h w"]
 ) -> Float[Tensor, "c h w"]:
-    """Return ``a - b`` in float64, of images of alpha that fit together."""
+    """Check two images of alpha and return ``a - b`` in float64."""
     for images in (a, b):
         if images.ndim != 3 or 0 in images.shape or not images.is_floating_point():
             raise InvalidArgumentError(
@@ -131,6 +131,6 @@ def _alpha_differences(
 
 
 def pair_psnr(one: Float[Tensor, "1 h w 3"], other: Float[Tensor, "1 h w 3"]) -> Float[Tensor, ""]:
-    """Compute the PSNR of two images; the mean of the squares is taken in float64."""
+    """Compute the PSNR of two images, with the mean of squares in float64."""
     errors = one.clamp(0, 1) - other.clamp(0, 1)
     return -10 * torch.log10(errors.double().square().mean())

@@ -8,7 +8,7 @@ from cvtgs.config.base import Record
 from cvtgs.evaluation.lpips import LpipsNetwork
 
 NOT_ASKED_FOR = "not asked for"
-"""Why LPIPS is missing where that is no news."""
+"""Note for LPIPS that was not requested, which needs no explanation."""
 
 
 class Score(Record):
@@ -24,7 +24,7 @@ class Score(Record):
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Self:
-        """Average values.
+        """Make a score from the values of the views.
 
         Args:
             values: One per view, at least one.
@@ -40,23 +40,23 @@ class Score(Record):
 
 
 def mean_of(score: Score | None) -> float | None:
-    """Return the mean of a score, None where there is none."""
+    """Return the mean of a score, or None if there is no score."""
     return None if score is None else score.mean
 
 
 class SceneScores(Record):
-    """How close the images of one scene come to others.
+    """Mean and per-view scores of the images of one scene.
 
     Attributes:
         name: Name of the scene.
-        count: Its Gaussians.
+        count: Number of its Gaussians.
         psnr: Peak signal-to-noise ratio, dB; infinite where images are equal.
         ssim: Structural similarity, at most 1.
-        lpips: LPIPS distance, at least 0; None where it was not measured.
+        lpips: LPIPS distance, at least 0; None if it was not measured.
         alpha_error: Mean absolute difference of accumulated alpha, 0 to 1; None against
             photographs, which have none.
         alpha_bias: Mean of the accumulated alpha minus that of the full scene, -1 to 1; negative
-            where more of the background shows through. None against photographs.
+            if more of the background shows through. None against photographs.
     """
 
     name: str
@@ -69,17 +69,17 @@ class SceneScores(Record):
 
 
 class Evaluation(Record):
-    """Scores of simplified scenes, and how they were measured.
+    """Scores of simplified scenes, and the settings of the measurement.
 
     Attributes:
         reference: Name of the full scene.
-        reference_count: Its Gaussians.
+        reference_count: Number of its Gaussians.
         views: Names of the views.
-        width: Pixels per row.
-        height: Rows.
-        backend: What rendered.
+        width: Width of the images, pixels.
+        height: Height of the images, pixels.
+        backend: Name of the backend that rendered.
         lpips_network: The network of LPIPS; None if it was not measured.
-        lpips_note: Why it was not measured, else empty.
+        lpips_note: Why LPIPS was not measured, else empty.
         scenes: Scores of each simplified scene against images of the full one.
         photographs: Scores of the full and of each simplified scene against photographs; empty
             without photographs.
@@ -98,7 +98,7 @@ class Evaluation(Record):
 
     @property
     def lpips_sentence(self) -> str:
-        """Which network LPIPS has, or why it is missing; empty if it was turned off."""
+        """A sentence that names the LPIPS network or why LPIPS is missing; empty if turned off."""
         if self.lpips_network:
             return f"LPIPS with the network {self.lpips_network}."
         if self.lpips_note and self.lpips_note != NOT_ASKED_FOR:
@@ -106,7 +106,7 @@ class Evaluation(Record):
         return ""
 
     def to_json(self) -> str:
-        """Return the evaluation as indented JSON; infinite numbers are the string ``Infinity``.
+        """Return the evaluation as indented JSON; infinity becomes the string ``Infinity``.
 
         Returns:
             JSON text that ends with a line break.

@@ -1,4 +1,4 @@
-"""The scorer of evaluation, refinement and the search for a count: images in, metrics out."""
+"""Score images by metrics, for evaluation, refinement and the search for a count."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -18,24 +18,24 @@ from cvtgs.rendering import BackendName, render
 from cvtgs.scene import GaussianScene
 
 LpipsChoice = Literal["auto", "vgg", "alex", "off"]
-"""``auto``: VGG where its weights are, else Alex, else none."""
+"""``auto``: VGG if its weights are available, else Alex, else none."""
 
 Color = tuple[float, float, float]
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 MOST_PSNR = 60.0
-"""Where scores are compared, images that are closer than this count as equal, dB."""
+"""Upper limit of PSNR where scores are compared, dB: closer images count as equal."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationSettings:
-    """How images are rendered and scored.
+    """Settings for rendering and scoring images.
 
     Attributes:
-        background: Colour behind the scenes: red, green and blue in [0, 1].
-        lpips: Which LPIPS to measure: ``vgg``, ``alex``, ``off``, or ``auto``, which leaves it
-            out where there are no weights.
-        backend: What renders.
+        background: Background colour: red, green and blue in [0, 1].
+        lpips: LPIPS network: ``vgg``, ``alex``, ``off``, or ``auto``, which omits LPIPS if there
+            are no weights.
+        backend: The rendering backend.
 
     Example:
         >>> EvaluationSettings(lpips="off").background
@@ -54,8 +54,8 @@ class ViewImage:
     Attributes:
         camera: The single camera.
         rgb: ``(1, h, w, 3)`` colours over black.
-        alpha: ``(1, h, w)`` opacity.
-        backend: What rendered.
+        alpha: ``(1, h, w)`` accumulated alpha.
+        backend: Name of the backend that rendered.
     """
 
     camera: Cameras
@@ -69,7 +69,7 @@ class ViewImage:
         return rgb + (1 - alpha)[..., None] * background
 
     def every(self, stride: int, *, first: tuple[int, int]) -> Self:
-        """Return every ``stride``-th pixel, from a first column and row on."""
+        """Return every ``stride``-th pixel, starting at a first column and row."""
         column, row = first
         return replace(
             self,
@@ -93,7 +93,7 @@ def render_view(
 
 
 class ImageScores(NamedTuple):
-    """The metrics of one pair of images; None or, of alpha, NaN for those that are not computed."""
+    """The metrics of one pair of images; None, or NaN for alpha, if not computed."""
 
     psnr: float
     ssim: float | None
@@ -104,13 +104,13 @@ class ImageScores(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Metrics:
-    """Which metrics to compute; the weights of LPIPS are read once.
+    """The metrics to compute; LPIPS weights are kept, so they are read once.
 
     Attributes:
         ssim: Whether to compute SSIM.
-        lpips: Weights of LPIPS, None to leave it out.
-        note: Why LPIPS is left out.
-        most_psnr: Images that are closer than this count as this close, dB.
+        lpips: Weights of LPIPS; None to omit it.
+        note: Why LPIPS is omitted.
+        most_psnr: Upper limit of PSNR, dB.
     """
 
     ssim: bool = True
@@ -125,7 +125,7 @@ class Metrics:
         *,
         alphas: tuple[Float[Tensor, "1 h w"], Float[Tensor, "1 h w"]] | None = None,
     ) -> ImageScores:
-        """Score one image against what it should be; with alphas, those of both images."""
+        """Score an image against the true one; ``alphas`` are those of both, in this order."""
         truth, weights = truth.to(image), self.lpips
         return ImageScores(
             psnr=min(float(pair_psnr(image, truth)), self.most_psnr),
@@ -139,7 +139,7 @@ class Metrics:
 
 
 def chosen_metrics(choice: LpipsChoice, size: tuple[int, int]) -> Metrics:
-    """Return PSNR, SSIM and the chosen LPIPS for images of a width and height."""
+    """Choose PSNR, SSIM and an LPIPS network for images of a width and height."""
     if choice == "off":
         return Metrics()
     if choice in ("vgg", "alex"):
@@ -160,7 +160,7 @@ def chosen_metrics(choice: LpipsChoice, size: tuple[int, int]) -> Metrics:
 
 
 def scene_scores(name: str, count: int, rows: Sequence[ImageScores]) -> SceneScores:
-    """Average the scores of a scene, one row per view, of which SSIM was computed."""
+    """Average the scores of a scene, one row per view; all rows must have SSIM."""
     psnrs, ssims, distances, errors, biases = zip(*rows, strict=True)
     has_alpha = not any(map(math.isnan, errors))
     return SceneScores(
@@ -175,7 +175,7 @@ def scene_scores(name: str, count: int, rows: Sequence[ImageScores]) -> SceneSco
 
 
 class Scorer:
-    """Scores scenes against images of a full one, each of which is rendered once.
+    """Scores scenes against images of a full scene, which are rendered once.
 
     Memory: ``(12 b + 4) c h w`` bytes for ``c`` views over ``b`` backgrounds in float32.
     """
@@ -223,7 +223,7 @@ class Scorer:
 
 
 class _OverBackgrounds(NamedTuple):
-    """An image over every background, and its alpha."""
+    """An image over each background, and its alpha."""
 
     colors: list[Float[Tensor, "1 h w 3"]]
     alpha: Float[Tensor, "1 h w"]

@@ -1,4 +1,4 @@
-"""Match merged Gaussians to images of the full scene, without descent: opacities, then colours."""
+"""Match opacities, then colours, to images of the full scene, without gradient descent."""
 
 from cvtgs.matching.colors import fit_colors
 from cvtgs.matching.match import (

@@ -14,13 +14,13 @@ from cvtgs.rendering import BlendingWeights, ObservedViews, blending_weights
 from cvtgs.scene import GaussianScene
 
 HELDOUT_EVERY = 8
-"""One image of so many is held out; none of fewer."""
+"""One image in this many is held out; none if there are fewer images."""
 
 LAST_ITERATIONS = 3
-"""Conjugate gradients with all images, after those without the ones that were held out."""
+"""Conjugate-gradient iterations on all images, after those without the held-out images."""
 
 FLOOR = 0.02
-"""Share of the median weight that is added to the weight which the ridge is a share of."""
+"""Share of the median weight that is added to the weights to which the ridge is proportional."""
 
 
 class LinearView(NamedTuple):
@@ -28,8 +28,8 @@ class LinearView(NamedTuple):
 
     Attributes:
         weights: Blending weights of the scene.
-        basis: ``(m, k)`` what each coefficient adds to a colour as seen from there.
-        residual: What the image lacks.
+        basis: ``(m, k)`` SH basis in the viewing direction of each Gaussian.
+        residual: Target image minus rendered image.
     """
 
     weights: BlendingWeights
@@ -37,15 +37,15 @@ class LinearView(NamedTuple):
     residual: Float[Tensor, "h w 3"]
 
     def paint(self, changes: Float[Tensor, "m k 3"]) -> Float[Tensor, "h w 3"]:
-        """Return what changes of the coefficients add to the image."""
+        """Return the change of the image for given changes of the coefficients."""
         return self.weights.paint(self._colors(changes))
 
     def normal(self, changes: Float[Tensor, "m k 3"]) -> Float[Tensor, "m k 3"]:
-        """Return the product of the normal matrix of this image with changes."""
+        """Return the product of the normal matrix of this image and the changes."""
         return self.basis[:, :, None] * self.weights.normal(self._colors(changes))[:, None]
 
     def gradient(self) -> Float[Tensor, "m k 3"]:
-        """Return what the residual asks of every coefficient."""
+        """Return the transposed linear map applied to the residual."""
         return self.basis[:, :, None] * self.weights.collect(self.residual)[:, None]
 
     def _colors(self, changes: Float[Tensor, "m k 3"]) -> Float[Tensor, "m 3"]:
@@ -59,7 +59,7 @@ def linear_view(
 ) -> LinearView:
     """Return the image of one camera as a linear function of the colours.
 
-    Colours below 0 paint as 0, so the function is exact only where none is.
+    Colours below 0 are rendered as 0, so the function is exact only where no colour is below 0.
     """
     weights = blending_weights(small, camera)
     offsets = small.means.double() - camera.centers.to(small.device).double()
@@ -73,24 +73,25 @@ def linear_view(
 def fit_colors(
     small: GaussianScene, views: ObservedViews, *, config: MatchConfig, frozen: int = 0
 ) -> GaussianScene:
-    """Solve for the colours, all SH bands, with which images of a scene come closest to given ones.
+    """Fit the colours of a scene, all SH bands, to images by linear least squares.
 
     With the geometry fixed, an image is ``A c``: ``A`` holds the weights ``alpha * T`` times the
-    SH basis. Changes ``x`` of the coefficients minimize ``|A x - r|^2 + |L x|^2``, ``r`` what the
-    images lack; the ridge ``L`` grows with the weight of a Gaussian, and is stronger for
-    view-dependent bands. Every eighth image is held out: if the changes do not help there, they
-    are shortened to what does, else all images are used. This is our own rule, not part of CVT-GS.
+    SH basis. The changes ``x`` of the coefficients minimize ``|A x - r|^2 + |L x|^2``, where ``r``
+    is the residual of the images. The ridge ``L`` grows with the weight of a Gaussian and is
+    stronger for view-dependent bands. Every eighth image is held out: if the full changes help
+    there, all images are used, else the changes are scaled down to the best step. This is our own
+    rule, not part of CVT-GS.
 
     Memory: the blending weights of all images, and six times the colours.
 
     Args:
         small: The scene.
-        views: Images that it should look like.
+        views: Target images.
         config: Iterations and ridge.
-        frozen: So many of the first Gaussians keep their colours.
+        frozen: Number of Gaussians at the start of the scene that keep their colours.
 
     Returns:
-        The scene with other colours; itself if there are no iterations.
+        The scene with new colours; the same object if there are no iterations.
 
     Example:
         >>> from cvtgs.rendering import observe
@@ -116,7 +117,7 @@ def fit_colors(
     changes = problem.solve(config.color_iterations)
     if heldout:
         step = best_step(heldout, changes)
-        if step > 0.5:  # the whole change is better than none
+        if step > 0.5:  # the full step is better than none
             whole = LeastSquares(linear, config=config, frozen=frozen)
             changes = whole.solve(LAST_ITERATIONS, start=changes)
         else:
@@ -130,7 +131,7 @@ def _is_heldout(row: int, count: int) -> bool:
 
 
 def best_step(views: Sequence[LinearView], changes: Float[Tensor, "m k 3"]) -> float:
-    """Return the share of the changes, 0 to 1, that brings images closest to what is wanted."""
+    """Return the step along the changes, 0 to 1, of least squared error in the images."""
     along = squares = 0.0
     for view in views:
         painted = view.paint(changes).double()
@@ -142,8 +143,8 @@ def best_step(views: Sequence[LinearView], changes: Float[Tensor, "m k 3"]) -> f
 class LeastSquares:
     """The normal equations of the colours with a ridge, and their solution.
 
-    Conjugate gradients (Hestenes and Stiefel 1952) with the diagonal as preconditioner, red, green
-    and blue side by side: they share the matrix, not the step.
+    Conjugate gradients (Hestenes and Stiefel 1952) with the diagonal as preconditioner. Red, green
+    and blue are solved together: they share the matrix, but have their own step lengths.
     """
 
     def __init__(self, views: Sequence[LinearView], *, config: MatchConfig, frozen: int) -> None:
@@ -159,12 +160,12 @@ class LeastSquares:
         ridge[:, 1:] *= config.band_ridge
         self._ridge = ridge[:, :, None]
         self._inverse = 1.0 / (squares[:, :, None] + self._ridge)
-        self._inverse[:frozen] = 0.0  # which keeps every direction off these rows
+        self._inverse[:frozen] = 0.0  # so that no search direction has these rows
 
     def solve(
         self, iterations: int, *, start: Float[Tensor, "m k 3"] | None = None
     ) -> Float[Tensor, "m k 3"]:
-        """Return the changes after so many iterations, from a start or from none."""
+        """Return the changes after some iterations, from a given start or from zero."""
         residual = torch.stack([view.gradient() for view in self._views]).sum(dim=0)
         found = torch.zeros_like(residual)
         if start is not None:

@@ -1,4 +1,4 @@
-"""Opacities such that each Gaussian paints what its cell did, and colours afterwards."""
+"""Match opacities so that each Gaussian contributes what its cell did, then match colours."""
 
 import math
 from dataclasses import replace
@@ -19,16 +19,16 @@ from cvtgs.report import MatchReport
 from cvtgs.scene import GaussianScene
 
 LEAST_PIXELS = 1.0
-"""Added to what is painted and to what should be: what hardly shows keeps its opacity."""
+"""Added to actual and target contributions, so that barely visible Gaussians keep their opacity."""
 
 LARGEST_FACTOR = 3.0
-"""Optical depths change by no more than this ratio suggests, whatever is missing."""
+"""Limit of the contribution ratio, and of its inverse, in one round."""
 
 POWER = 0.7
-"""Below 1, so that rounds do not overshoot: neighbours change at the same time."""
+"""Exponent of the ratio, below 1 so that rounds do not overshoot: neighbours change as well."""
 
 LARGEST_DEPTH = 6.0
-"""Optical depth that no change exceeds."""
+"""No change raises an optical depth above this."""
 
 
 class Matched(NamedTuple):
@@ -36,7 +36,7 @@ class Matched(NamedTuple):
 
     Attributes:
         scene: The scene.
-        report: What was gained.
+        report: The gain.
     """
 
     scene: GaussianScene
@@ -46,14 +46,14 @@ class Matched(NamedTuple):
 def cell_contributions(
     contributions: Float[Tensor, "n"], partition: Partition
 ) -> Float[Tensor, "m"]:
-    """Sum what the members of every cell add to the images of the full scene.
+    """Sum the contributions of the members of every cell to the images of the full scene.
 
     Args:
-        contributions: Of every Gaussian of the full scene, pixels.
+        contributions: Contribution of every Gaussian of the full scene, pixels.
         partition: Members of every cell.
 
     Returns:
-        Pixels.
+        Contribution of every cell, pixels.
 
     Example:
         >>> cells = Partition.from_labels(torch.tensor([1, 0, 1]), 2)
@@ -73,15 +73,15 @@ def match_views(
 ) -> Matched:
     """Match a merged scene to images of the full one: opacities first, then colours.
 
-    Every eighth image decides whether the opacities stay; see :func:`fit_colors` for the colours.
+    The new opacities are kept if they lower the mean squared error of the held-out images: every
+    eighth, or all if there are fewer than eight. See :func:`fit_colors` for the colours.
 
     Args:
         small: The merged scene.
         views: Images of the full scene.
-        targets: What every Gaussian should add to them, pixels.
+        targets: Target contribution of every Gaussian to these images, pixels.
         config: Rounds, iterations and ridge.
-        frozen: So many of the first Gaussians stay as they are, bit for bit; their targets do
-            not matter.
+        frozen: Number of Gaussians at the start that stay bit for bit; their targets are ignored.
 
     Returns:
         The scene and the report.
@@ -120,20 +120,20 @@ def match_opacities(
     config: MatchConfig,
     frozen: int = 0,
 ) -> GaussianScene:
-    """Adjust opacities until every Gaussian adds to some images what it should.
+    """Adjust opacities so that the contribution of every Gaussian approaches its target.
 
-    A round multiplies the optical depth of every Gaussian by a power of the ratio of what it
-    should add to what it adds. This is our own rule, not part of CVT-GS.
+    A round multiplies the optical depth of every Gaussian by a power of the ratio of its target
+    contribution to its actual one. This is our own rule, not part of CVT-GS.
 
     Args:
         small: The scene.
-        cameras: From where to look.
-        targets: What every Gaussian should add, pixels, as :func:`cell_contributions` sums it.
+        cameras: Cameras of the images.
+        targets: Target contributions, pixels, as :func:`cell_contributions` returns them.
         config: Number of rounds.
-        frozen: So many of the first Gaussians stay as they are.
+        frozen: Number of Gaussians at the start of the scene that stay unchanged.
 
     Returns:
-        The scene with other opacities; itself if there are no rounds.
+        The scene with new opacities; the same object if there are no rounds.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -156,7 +156,7 @@ def match_opacities(
 
 
 def with_deeper_opacities(small: GaussianScene, factors: Float[Tensor, "m"]) -> GaussianScene:
-    """Multiply optical depths; a factor of 1 leaves a Gaussian as it is, bit for bit."""
+    """Multiply optical depths; a factor of 1 leaves a Gaussian unchanged, bit for bit."""
     depths = parameters.optical_depth_from_logit(small.logit_opacities.double())
     deeper = torch.minimum(depths * factors, depths.clamp_min(LARGEST_DEPTH))
     logits = parameters.logit_from_optical_depth(deeper).to(small.dtype)
@@ -165,7 +165,7 @@ def with_deeper_opacities(small: GaussianScene, factors: Float[Tensor, "m"]) -> 
 
 
 def heldout_views(views: ObservedViews) -> ObservedViews:
-    """Return every eighth view, or all of fewer than eight."""
+    """Return every eighth view, or all views if there are fewer than eight."""
     count = len(views.cameras)
     first, step = (HELDOUT_EVERY // 2, HELDOUT_EVERY) if count >= HELDOUT_EVERY else (0, 1)
     rows = torch.tensor(range(first, count, step))

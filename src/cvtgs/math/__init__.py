@@ -1,1 +1,1 @@
-"""Pure functions on tensors that know nothing of scenes, files or stages."""
+"""Pure functions on tensors, independent of scenes, files and stages."""

@@ -1,4 +1,4 @@
-"""Optical depth of a Gaussian summed over its image, from the depth at its centre and back."""
+"""Conversion between the optical depth of a Gaussian at its centre and summed over its image."""
 
 import math
 
@@ -15,9 +15,9 @@ FULL_DEPTH = math.pi**2 / 6
 def integrated_depth(depths: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Return the optical depth of Gaussians summed over an image, as a multiple of their area.
 
-    A Gaussian lets ``1 - a g(x)`` of the light through, g being 1 at its centre. The integral of
-    ``-log(1 - a g(x))`` over its projected area ``2 pi sigma_1 sigma_2`` is the dilogarithm
-    ``Li2(a)``: it grows like a, and ends at ``pi^2 / 6``, however deep the centre is.
+    A Gaussian transmits ``1 - a g(x)`` of the light, with g = 1 at its centre. The integral of
+    ``-log(1 - a g(x))``, divided by its projected area ``2 pi sigma_1 sigma_2``, is the dilogarithm
+    ``Li2(a)``: it grows like a, and ends at ``pi^2 / 6``, however large the depth at the centre.
 
     Args:
         depths: Optical depths at the centre, ``-log(1 - a)``, above 0.
@@ -41,7 +41,7 @@ def depth_from_integrated(values: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Return the optical depth at the centre (inverse of :func:`integrated_depth`).
 
     Args:
-        values: Integrated depths, at least 0; more than a Gaussian can have counts as the most.
+        values: Integrated depths, at least 0; values above the maximum of a Gaussian are clamped.
 
     Returns:
         Optical depths in [0, 13.8].

@@ -1,4 +1,4 @@
-"""Where points lie: the robust frame of a scene, and the order along a Morton curve."""
+"""The robust frame of a scene, and the order of points along a Morton curve."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ RADIUS_QUANTILE = 0.7
 """The share of points within the radius of a frame."""
 
 CHUNK = 1 << 16
-"""Points that are measured together, to bound memory."""
+"""Points per chunk, to bound memory."""
 
 BITS = 21
 """Bits per axis; three axes fill a 63-bit code."""
@@ -31,7 +31,7 @@ class RobustFrame:
 
     Attributes:
         center: ``(3,)`` median of each coordinate, float64.
-        radius: The 70 % quantile of the distance to the centre; positive.
+        radius: The 70 % quantile of the distance to the centre; always positive.
     """
 
     center: Float[Tensor, "3"]
@@ -64,19 +64,19 @@ class RobustFrame:
         return found
 
     def contract(self, points: Float[Tensor, "n 3"], strength: float = 1.0) -> Float[Tensor, "n 3"]:
-        """Express points in radii and pull in those beyond the first radius, logarithmically.
+        """Express points in radii, and contract those beyond one radius logarithmically.
 
-        A point at distance d > 1 goes to distance ``1 + log(d)`` in the same direction. Seen
-        from the middle, equal steps along and across the view then shrink alike, so a far cell
-        keeps its shape; the map ``2 - 1/d`` of mip-NeRF 360 (Barron et al. 2022) flattens it.
+        A point at distance d > 1 moves to distance ``1 + log(d)`` in the same direction. Steps
+        along and across the view from the middle then shrink alike, so a far cell keeps its shape;
+        the map ``2 - 1/d`` of mip-NeRF 360 (Barron et al. 2022) flattens it.
 
         Args:
             points: Finite positions, scene units.
-            strength: From 0, which pulls nothing in, to 1. Between them the logarithm of the
-                distance shrinks by that share.
+            strength: From 0 (no contraction) to 1. In between, the change of the logarithm of the
+                distance is scaled by this factor.
 
         Returns:
-            Positions in float64; with strength 1 a flyaway of 1e30 radii lies at 70.
+            Positions in float64; with strength 1, a flyaway at 1e30 radii moves to 70.
         """
         local = self.normalize(points)
         distance: Tensor = torch.linalg.vector_norm(local, dim=1, keepdim=True).clamp_min(1.0)
@@ -90,8 +90,8 @@ def robust_frame(points: Float[Tensor, "n 3"]) -> RobustFrame:
         points: Finite positions, at least one.
 
     Returns:
-        The frame. If more than 70 % of the points coincide, the radius is the largest distance,
-        and 1 if all do.
+        The frame. If more than 70 % of the points coincide, the radius is the largest distance;
+        if all do, it is 1.
 
     Example:
         >>> frame = robust_frame(torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
@@ -112,11 +112,11 @@ def morton_order(
 
     Args:
         points: Finite positions, best without far outliers (2^21 steps span the cube).
-        ties: Points of the same code come in ascending order of these, so that the order of the
-            rows does not decide.
+        ties: Values that order points of the same code, ascending, independently of the order of
+            the rows.
 
     Returns:
-        Row numbers; what is equal in code and ties keeps its order.
+        Row numbers; points with equal code and ties keep their order.
 
     Example:
         >>> morton_order(torch.tensor([[1.0, 1, 1], [0, 0, 0], [1, 0, 0]])).tolist()
@@ -129,7 +129,7 @@ def morton_order(
         steps = ((points[:, axis] - low[axis]) / side * (2**BITS - 1)).to(torch.int64)
         code |= _spread_bits(steps) << axis
     codes, order = torch.sort(code, stable=True)
-    if ties is not None and code.device.type != "cpu":  # longer, but no answer is waited for
+    if ties is not None and code.device.type != "cpu":  # more work, but no synchronization
         rows = torch.sort(ties, stable=True).indices
         return rows[torch.sort(code[rows], stable=True).indices]
     if ties is not None:
@@ -142,7 +142,7 @@ def morton_order(
 
 
 def _spread_bits(values: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
-    """Put two zero bits between any two of the 21 low bits."""
+    """Insert two zero bits between any two adjacent bits of the low 21."""
     for shift, mask in _SPREAD:
         values = (values | (values << shift)) & mask
     return values

@@ -16,10 +16,10 @@ LOGIT_LIMIT = math.log((1.0 - OPACITY_MARGIN) / OPACITY_MARGIN)
 """The logit of the largest opacity, about 13.8."""
 
 EIGENVALUE_FLOOR = 1e-12
-"""Eigenvalues are kept above this share of the largest one (scales: above 1e-6)."""
+"""Floor of eigenvalues as a share of the largest one (for scales: 1e-6)."""
 
 AREA_EXPONENT = 1.6075
-"""Thomsen's exponent: the ellipsoid surface formula is then within 1.1 % for every shape."""
+"""Thomsen's exponent, with which the ellipsoid surface formula is within 1.1 % for all shapes."""
 
 
 def opacity_from_logit(logits: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -39,7 +39,7 @@ def opacity_from_logit(logits: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def logit_from_opacity(opacities: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Turn opacities into the logits that files store.
+    """Convert opacities to the logits that files store.
 
     Args:
         opacities: Opacities, clamped to [1e-6, 1 - 1e-6] first.
@@ -55,7 +55,7 @@ def logit_from_opacity(opacities: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def clamp_logits(logits: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Limit logits to those of opacities 1e-6 and 1 - 1e-6.
+    """Clamp logits to those of opacities 1e-6 and 1 - 1e-6.
 
     Args:
         logits: Stored opacities; infinities are valid.
@@ -111,7 +111,7 @@ def positive_log(values: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
         values: Numbers, at least 0.
 
     Returns:
-        Logarithms; those of 0 are the logarithm of the smallest normal number of the dtype.
+        Logarithms; 0 counts as the smallest normal number of the dtype.
 
     Example:
         >>> positive_log(torch.tensor([1.0])).item()
@@ -202,8 +202,8 @@ def quats_to_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
         quats: Unit quaternions, w first.
 
     Returns:
-        Rotation matrices; column ``k`` is the image of axis ``k``. They lie in memory entry by
-        entry, so that sums of products over many of them are fast.
+        Rotation matrices; column ``k`` is the image of axis ``k``. In memory, each entry is
+        contiguous over all matrices, so that sums of products over many of them are fast.
 
     Example:
         >>> quats_to_matrices(torch.tensor([[1.0, 0.0, 0.0, 0.0]]))[0].diagonal().tolist()
@@ -229,7 +229,7 @@ def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
         quats: Non-zero, finite quaternions, w first.
 
     Returns:
-        Rotation matrices, in memory entry by entry.
+        Rotation matrices, with the memory layout of :func:`quats_to_matrices`.
 
     Example:
         >>> rotation_matrices(torch.tensor([[2.0, 0.0, 0.0, 0.0]]))[0].diagonal().tolist()
@@ -241,8 +241,8 @@ def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
 def matrices_to_quats(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
     """Return unit quaternions of rotation matrices, with w at least 0.
 
-    Of the four ways to write a quaternion by one of its components, the one with the largest
-    component is taken (Shepperd 1978), so no digits are lost near half turns.
+    A matrix gives the quaternion in four ways, each by way of one component; the largest component
+    is chosen (Shepperd 1978), so no digits are lost near half turns.
 
     Args:
         rotations: Rotation matrices with determinant +1.
@@ -272,7 +272,7 @@ def matrices_to_quats(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]
     )
     best = candidates.diagonal(dim1=1, dim2=2).argmax(dim=-1)
     quats = normalize_quats(candidates[torch.arange(len(best), device=best.device), best])
-    # Adding 0 leaves no zero with a sign, so that the same frame is the same bits.
+    # Adding 0 turns -0.0 into 0.0, so that equal frames have equal bits.
     return torch.where(quats[:, :1] < 0, -quats, quats) + 0.0
 
 
@@ -282,7 +282,7 @@ def build_covariances(
     """Build ``R diag(s)^2 R^T``.
 
     Args:
-        scales: Standard deviations along the own axes.
+        scales: Standard deviations along the axes of each Gaussian.
         quats: Unit quaternions, w first.
 
     Returns:
@@ -302,9 +302,9 @@ def decompose_covariances(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
     """Split covariances into scales and unit quaternions.
 
-    The axes are canonical: scales descend, each of the first two axes points along the positive
-    side of its largest component, the third makes the frame right-handed, and w >= 0. Scales are
-    kept above 1e-6 of the largest one; a zero matrix gives the smallest normal scale.
+    The axes are canonical: scales descend, the largest component of each of the first two axes is
+    positive, the third makes the frame right-handed, and w >= 0. Scales are at least 1e-6 times
+    the largest one; a zero matrix gives tiny positive scales.
 
     Args:
         covariances: Symmetric positive semi-definite matrices.
@@ -327,13 +327,13 @@ def decompose_covariances(
 
 
 def mean_projected_area(scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Return the area of an ellipsoid's shadow, averaged over all directions.
+    """Return the projected area of an ellipsoid, averaged over all directions.
 
     By Cauchy's theorem it is a quarter of the surface, which Thomsen's formula (2004)
     approximates: ``pi * (((s1 s2)^p + (s1 s3)^p + (s2 s3)^p) / 3)^(1/p)``, p = 1.6075.
 
     Args:
-        scales: Semi-axes, for a Gaussian its standard deviations.
+        scales: Semi-axes; for a Gaussian, its standard deviations.
 
     Returns:
         Areas, in squared units of ``scales``.
@@ -372,11 +372,10 @@ def canonical_axes(axes: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
     """Fix the signs of eigenvectors and make the frame right-handed.
 
     Args:
-        axes: Axes as columns, at right angles.
+        axes: Orthonormal axes as columns.
 
     Returns:
-        Rotations: each of the first two axes points along the positive side of its largest
-        component.
+        Rotations; the largest component of each of the first two axes is positive.
 
     Example:
         >>> canonical_axes(-torch.eye(3)[None])[0].diagonal().tolist()

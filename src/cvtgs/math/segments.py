@@ -1,4 +1,4 @@
-"""Consecutive runs of rows (CSR segments): gathering, deterministic reductions."""
+"""Segments, which are consecutive runs of rows (CSR): gathering and deterministic reductions."""
 
 import math
 from collections.abc import Sequence
@@ -12,14 +12,14 @@ from torch import Tensor
 def sort_by_label(
     labels: Int[Tensor, "n"], count: int
 ) -> tuple[Int[Tensor, "n"], Int[Tensor, "m_plus_1"]]:
-    """Bring rows of one label next to one another.
+    """Sort rows by label.
 
     Args:
         labels: Label of every row, 0 to ``count - 1``.
         count: Number of labels.
 
     Returns:
-        Row numbers, by label and then as they were, and where each label starts.
+        Row numbers, sorted by label in a stable way, and the start of each label.
 
     Example:
         >>> order, offsets = sort_by_label(torch.tensor([1, 0, 1]), 2)
@@ -32,14 +32,14 @@ def sort_by_label(
 
 
 def true_rows(mask: Bool[Tensor, "n"], count: int | None = None) -> Int[Tensor, "k"]:
-    """Return the rows where a mask is true; a device is not waited for if it is known how many."""
+    """Return the rows where a mask is true; a known count avoids a synchronization."""
     if count is None or mask.device.type == "cpu":
         return mask.nonzero()[:, 0]
     return torch.sort(~mask, stable=True).indices[:count]
 
 
 def smallest_rows(values: Float[Tensor, "n"], count: int) -> Int[Tensor, "k"]:
-    """Return rows of the smallest values, ascending, ties as they come; only those are sorted."""
+    """Return rows of the smallest values, ascending and stable; a CPU sorts only those."""
     if 2 * count >= len(values) or values.device.type != "cpu":
         return ascending_rows(values)[:count]
     most = torch.kthvalue(values, count).values
@@ -48,9 +48,9 @@ def smallest_rows(values: Float[Tensor, "n"], count: int) -> Int[Tensor, "k"]:
 
 
 def ascending_rows(values: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
-    """Return the rows of ascending values, ties as they come, and NaN at the end.
+    """Return the rows in stable ascending order of values, with NaN at the end.
 
-    On a CPU float64 is sorted by its bits as whole numbers, which torch does four times as fast.
+    On a CPU, float64 is sorted by its bits as integers, which is four times as fast in torch.
     """
     if values.device.type != "cpu" or values.dtype != torch.float64:
         return torch.sort(values, stable=True).indices
@@ -62,15 +62,15 @@ def ascending_rows(values: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
 def gather_columns(
     rows: Int[Tensor, "r"], *tables: Float[Tensor, "n c"]
 ) -> tuple[Float[Tensor, "r c"], ...]:
-    """Take rows that lie all over narrow tables.
+    """Gather scattered rows of narrow tables.
 
     Args:
         rows: Row numbers.
         tables: One or more tables of a few columns.
 
     Returns:
-        The rows of every table; the values of one column are one run of memory, so that sums of
-        products over columns are as fast as memory.
+        The rows of every table. Each column is contiguous in memory, so that sums of products over
+        columns run at the speed of memory.
 
     Example:
         >>> gather_columns(torch.tensor([2, 0]), torch.eye(3))[0].tolist()
@@ -83,16 +83,16 @@ def gather_columns(
 
 
 def running_sums(values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Return sums of all values up to each; every run on a device gives the same bits.
+    """Return the cumulative sums of values; every run on a device gives the same bits.
 
-    CUDA's own running sums of floating-point numbers add in any order. There, values are added
-    to those 1, 2, 4, ... places further on (Hillis and Steele 1986).
+    CUDA's own cumulative sums of floating-point numbers add in any order. Therefore, on devices
+    other than CPUs, values are added to those 1, 2, 4, ... places later (Hillis and Steele 1986).
 
     Args:
         values: Numbers.
 
     Returns:
-        As many sums; the last one is that of all.
+        One sum per value; the last is the total.
 
     Example:
         >>> running_sums(torch.tensor([1.0, 2.0, 4.0])).tolist()
@@ -110,7 +110,7 @@ def running_sums(values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
 def label_sums(
     columns: Sequence[Float[Tensor, "n"]], labels: Int[Tensor, "n"], count: int
 ) -> Float[Tensor, "m k"]:
-    """Sum rows of one label, in the order of the rows, in float64.
+    """Sum the rows of each label, in the order of the rows, in float64.
 
     Args:
         columns: One tensor per column.
@@ -124,7 +124,7 @@ def label_sums(
         >>> label_sums([torch.tensor([1.0, 2.0, 4.0])], torch.tensor([1, 0, 1]), 2).tolist()
         [[2.0], [5.0]]
     """
-    if labels.device.type == "cpu":  # in order; CUDA would add in any
+    if labels.device.type == "cpu":  # adds in order; CUDA would add in any order
         sums = torch.empty(count, len(columns), dtype=torch.float64)
         for number, column in enumerate(columns):
             sums[:, number] = torch.bincount(labels, column.double(), minlength=count)
@@ -163,15 +163,15 @@ def segment_sum(
     offsets: Int[Tensor, "m_plus_1"],
     weights: Float[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "m *k"]:
-    """Sum runs of rows.
+    """Sum the rows of each segment.
 
-    Bags of consecutive rows are up to ten times as fast as ``torch.segment_reduce`` in float32,
-    and up to twenty times as slow in float64.
+    ``embedding_bag`` over consecutive rows is up to ten times as fast as ``torch.segment_reduce``
+    in float32, and up to twenty times as slow in float64.
 
     Args:
-        values: Rows, those of one segment next to one another.
-        offsets: Where each segment starts, and the end of the last one.
-        weights: Numbers to multiply rows by, of the dtype of the values; constants to autograd.
+        values: Rows; those of a segment are contiguous.
+        offsets: Start of each segment, and the end of the last one.
+        weights: Factors of the rows, of the dtype of the values; constants to autograd.
 
     Returns:
         One row per segment; an empty segment gives 0.
@@ -190,7 +190,7 @@ def segment_sum(
     if flat.dtype != torch.float64:
         sums = torch.nn.functional.embedding_bag(
             torch.arange(len(flat), device=flat.device),
-            flat.contiguous(),  # columns are as slow as float64
+            flat.contiguous(),  # a column layout would be as slow as float64
             offsets,
             mode="sum",
             per_sample_weights=weights,
@@ -200,7 +200,7 @@ def segment_sum(
     flat, lengths = flat if weights is None else flat * weights[:, None], offsets.diff()
     if flat.is_contiguous():
         sums = torch.segment_reduce(flat, "sum", lengths=lengths, axis=0)
-    else:  # without a copy where columns lie in runs of memory
+    else:  # no copy if columns are contiguous
         lengths = lengths.expand(flat.shape[1], -1).contiguous()
         sums = torch.segment_reduce(flat.T.contiguous(), "sum", lengths=lengths, axis=1).T
     return sums.reshape(count, *shape)
@@ -212,13 +212,13 @@ def segment_sum_of(
     offsets: Int[Tensor, "m_plus_1"],
     weights: Float[Tensor, "n"],
 ) -> Float[Tensor, "m *k"]:
-    """Sum weighted rows of a table, which are read from there and never copied.
+    """Sum weighted rows of a table for each segment, without copying the rows.
 
     Args:
-        table: The rows that there are; a constant to autograd.
-        rows: Which rows to sum, those of one segment next to one another.
-        offsets: Where each segment starts in ``rows``, and the end of the last one.
-        weights: What each of ``rows`` counts.
+        table: Table of rows; a constant to autograd.
+        rows: Rows to sum; those of a segment are contiguous.
+        offsets: Start of each segment in ``rows``, and the end of the last one.
+        weights: Weight of each entry of ``rows``.
 
     Returns:
         One row per segment; an empty segment gives 0. Differentiable in the weights.
@@ -238,11 +238,11 @@ def segment_sum_of(
 def segment_max(
     values: Float[Tensor, "n *k"], offsets: Int[Tensor, "m_plus_1"]
 ) -> Float[Tensor, "m *k"]:
-    """Take the largest row entry of each run of rows.
+    """Return the elementwise maximum of the rows of each segment.
 
     Args:
-        values: Rows, those of one segment next to one another.
-        offsets: Where each segment starts, and the end of the last one.
+        values: Rows; those of a segment are contiguous.
+        offsets: Start of each segment, and the end of the last one.
 
     Returns:
         One row per segment; an empty segment gives minus infinity.
@@ -260,8 +260,8 @@ def segment_ids(offsets: Int[Tensor, "m_plus_1"], total: int | None = None) -> I
     """Return the segment of every row.
 
     Args:
-        offsets: Where each segment starts, and the end of the last one.
-        total: Number of rows; None is read from the offsets, for which the host waits.
+        offsets: Start of each segment, and the end of the last one.
+        total: Number of rows; None reads it from the offsets, which synchronises with the device.
 
     Returns:
         Segment numbers, ascending.
@@ -280,7 +280,7 @@ def segment_argmax(
 
     Args:
         values: One number per row, none of them NaN.
-        offsets: Where each segment starts, and the end of the last one; no segment is empty.
+        offsets: Start of each segment, and the end of the last one; no segment is empty.
 
     Returns:
         Row numbers.
@@ -298,7 +298,7 @@ def segment_argmax(
 
 
 class _SumOfRuns(torch.autograd.Function):
-    """The sum of runs whose gradient needs no more than the offsets."""
+    """The sum of segments; its gradient needs only offsets and weights."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, offsets: Tensor, weights: Tensor | None) -> Tensor:

@@ -32,11 +32,11 @@ REST_COUNTS = (0, 3, 8, 15)
 """Coefficients per colour channel above the constant band, by degree."""
 
 _ROUNDING = 1e-12
-"""Entries of a rotation of bands below this are zeros."""
+"""Entries of a rotation of SH bands below this are set to zero."""
 
 
 def degree_of(rest_count: int) -> int:
-    """Return the degree of a scene by its number of view-dependent coefficients per channel.
+    """Return the SH degree for a number of view-dependent coefficients per channel.
 
     Args:
         rest_count: Coefficients per channel above the constant one.
@@ -62,9 +62,9 @@ def degree_of(rest_count: int) -> int:
 def rest_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:
     """Evaluate the view-dependent basis functions, those above the constant one.
 
-    They are the real spherical harmonics with the Condon-Shortley phase, within a degree by
-    order ``m`` from ``-l`` to ``l``, as 3DGS (Kerbl et al. 2023) and PlenOctrees (Yu et al. 2021)
-    have them.
+    They are the real spherical harmonics with the Condon-Shortley phase, sorted within a degree by
+    order ``m`` from ``-l`` to ``l``, as in 3DGS (Kerbl et al. 2023) and PlenOctrees (Yu et al.
+    2021).
 
     Args:
         directions: Unit vectors, from the camera to the Gaussian.
@@ -93,11 +93,11 @@ def evaluate(
     shN: Float[Tensor, "n k 3"],  # noqa: N803 (the name that gsplat gives it)
     directions: Float[Tensor, "n 3"],
 ) -> Float[Tensor, "n 3"]:
-    """Evaluate colours: ``0.5`` and the spherical harmonics in the directions, not below 0.
+    """Evaluate colours: ``0.5`` plus the spherical harmonics in the directions, at least 0.
 
     Args:
         sh0: Constant band.
-        shN: View-dependent bands; without any, directions are not looked at.
+        shN: View-dependent bands; without any, directions are ignored.
         directions: Unit vectors, from the camera to the Gaussian.
 
     Returns:
@@ -121,17 +121,17 @@ def rotated_rest(
     shN: Float[Tensor, "n k 3"],  # noqa: N803 (the name that gsplat gives it)
     rotation: Float[Tensor, "3 3"],
 ) -> Float[Tensor, "n k 3"]:
-    """Return the view-dependent bands of Gaussians that turned, colours included.
+    """Return the view-dependent bands of Gaussians after a rotation.
 
-    The colour along ``R d`` is what it was along ``d``. Every band is closed under rotation, so
-    the matrix of the bands follows from the basis in a few directions, in float64.
+    The new colour along ``R d`` equals the old one along ``d``. Every band is closed under
+    rotation, so its matrix follows from the basis in a few directions, in float64.
 
     Args:
         shN: View-dependent bands.
         rotation: Rotation matrix.
 
     Returns:
-        The bands of the turned Gaussians; without any, the same.
+        The bands of the rotated Gaussians; ``shN`` itself if it is empty.
 
     Raises:
         InvalidArgumentError: ``shN`` has a number of coefficients that belongs to no degree.
@@ -153,7 +153,7 @@ def rotated_rest(
 
 
 def _rest_rotation(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "k k"]:
-    """Return the matrix of the bands, zeros where it is zero but for rounding."""
+    """Return the rotation matrix of the bands, with rounding errors set to zero."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn(64, 3, generator=generator, dtype=torch.float64)
     directions /= directions.norm(dim=1, keepdim=True)

@@ -1,4 +1,4 @@
-"""Apply MergeNet: correct every cell of a scene by the residuals that the network predicts."""
+"""Apply MergeNet: correct the cells of a scene by the residuals that the network predicts."""
 
 from collections.abc import Callable, Iterator
 
@@ -20,7 +20,7 @@ from cvtgs.mergenet.published import (
 from cvtgs.scene import GaussianScene
 
 CHUNK_MEMBERS = 1 << 15
-"""Members and neighbours that are described together; each takes about ``2 kB``."""
+"""Members and neighbours per chunk; each takes about ``2 kB``."""
 
 
 def correct_cells(
@@ -34,18 +34,18 @@ def correct_cells(
     sizes: Int[Tensor, "m_all"] | None = None,
     on_cells: Callable[[int], None] = lambda done: None,
 ) -> GaussianScene:
-    """Correct every merged Gaussian of several members by a network.
+    """Correct every merged Gaussian of several members with a network.
 
     Args:
         net: The network, on the device of the scene.
         scene: The Gaussians, with valid rows.
-        merged: One Gaussian per cell, those of the partition first; others that follow are only
-            neighbours.
+        merged: One Gaussian per cell: first those of the partition, then others that serve only
+            as neighbours.
         partition: Members of the cells; cells of one member stay as they are.
         neighbors: The nearest other cells of every cell of the partition.
         visibility: Ambient visibility of every Gaussian of the scene, 0 to 1.
         sizes: Number of members of every cell in ``merged``; None if all are in the partition.
-        on_cells: Called with the number of cells that are done.
+        on_cells: Called with the number of finished cells.
 
     Returns:
         The scene with corrected Gaussians.
@@ -165,17 +165,18 @@ def compose(
 ) -> dict[str, Tensor]:
     """Correct some merged Gaussians.
 
-    Centres move and shapes turn in the frame of each merged Gaussian; log scales and opacity
-    logits are added to; colours of every SH band mix in the differences of members and neighbours.
-    Residuals of zero give the merged Gaussians bit for bit. Differentiable in the residuals.
+    Centres move and shapes turn in the frame of each merged Gaussian; residuals are added to log
+    scales and opacity logits; every SH band gets shares of the differences of members and
+    neighbours. Zero residuals return the merged Gaussians bit for bit. Differentiable in the
+    residuals.
 
     Args:
         scene: The Gaussians.
-        merged: One Gaussian per cell, of all cells.
+        merged: One Gaussian per cell, for all cells.
         part: Members of the cells to correct.
-        cells: Which cells those are.
-        neighbors: The nearest other cells of each of them.
-        residuals: What to change of them.
+        cells: Row numbers of these cells in ``merged``.
+        neighbors: The nearest other cells of each of these cells.
+        residuals: Changes of these cells.
 
     Returns:
         The standard tensors of these cells, by name.
@@ -207,7 +208,7 @@ def compose(
         table = getattr(merged, name)
         bands = table.index_select(0, cells)
         if bands.shape[1]:
-            # What sets members and neighbours apart from the cell, each by its share.
+            # Differences of members and neighbours from the cell, each times its share.
             mixed = segment_sum_of(
                 getattr(scene, name), part.order, part.offsets, residuals.member_colors
             )
@@ -220,15 +221,15 @@ def compose(
 def compose_published(
     merged: GaussianScene, *, cells: Int[Tensor, "m"], residuals: PublishedResiduals
 ) -> dict[str, Tensor]:
-    """Correct some merged Gaussians by free residuals.
+    """Correct some merged Gaussians by unlimited residuals.
 
-    As :func:`compose`, but SH coefficients of every band are added to. Residuals of zero give the
-    merged Gaussians bit for bit. Differentiable in the residuals.
+    Like :func:`compose`, but residuals are added to the SH coefficients of every band. Zero
+    residuals return the merged Gaussians bit for bit. Differentiable in the residuals.
 
     Args:
-        merged: One Gaussian per cell, of all cells.
-        cells: Which cells to correct.
-        residuals: What to change of them.
+        merged: One Gaussian per cell, for all cells.
+        cells: Row numbers of the cells to correct.
+        residuals: Changes of these cells.
 
     Returns:
         The standard tensors of these cells, by name.
@@ -271,7 +272,7 @@ def _reshape(
 
 
 def _rotate(quats: Float[Tensor, "m 4"], rotvecs: Float[Tensor, "m 3"]) -> Float[Tensor, "m 4"]:
-    """Rotate about the own axes: the product with ``(1, v / 2)``, of the same length."""
+    """Rotate about the local axes: multiply by ``(1, v / 2)`` and keep the length."""
     half = rotvecs / 2
     factor = torch.cat([torch.ones_like(half[:, :1]), half], dim=1)
     length = torch.sqrt(1 + half.square().sum(dim=1, keepdim=True))

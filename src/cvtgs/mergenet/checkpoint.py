@@ -23,24 +23,24 @@ SHIPPED = ("standard", "paper")
 
 FORMAT = "cvtgs-mergenet"
 FORMAT_VERSION = 2
-"""Files of version 1 have no known range: their networks correct every cell."""
+"""Files of version 1 have no known range, so their networks correct every cell."""
 
 KNOWN = "known."
-"""Tensors of the known range have names that start so."""
+"""Prefix of the names of the tensors of the known range."""
 
 LARGEST_FILE = 1 << 26
-"""Files above 64 MiB are not read; a MergeNet has less than one."""
+"""Files above 64 MiB are not read; a MergeNet has less than 1 MiB."""
 
 
 class LearnedScene(pydantic.BaseModel):
-    """A scene that a training had.
+    """A scene that was used in training or validation.
 
     Attributes:
         name: Name of its file, without the suffix, or of the generated scene.
-        count: Gaussians.
-        sha256: Hash of the file, hexadecimal; empty for a generated scene, which name, count and
-            version of cvtgs determine.
-        is_validation: Whether it was for validation only.
+        count: Number of Gaussians.
+        sha256: Hash of the file, hexadecimal; empty for a generated scene, which is determined by
+            name, count and version of cvtgs.
+        is_validation: Whether it was used for validation only.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -52,11 +52,11 @@ class LearnedScene(pydantic.BaseModel):
 
 
 KINDS = {"gated": Architecture, "published": PublishedArchitecture}
-"""Shapes of the networks that there are, by their kind."""
+"""Classes of the network architectures by kind."""
 
 
 class _Kind(pydantic.BaseModel):
-    kind: str = "gated"  # files of 0.1 do not say
+    kind: str = "gated"  # files of 0.1 have no kind
 
 
 class _Described(pydantic.BaseModel):
@@ -69,13 +69,13 @@ class CheckpointInfo(pydantic.BaseModel):
     Attributes:
         architecture: Kind and shape of the network.
         preset: The preset that the network corrects.
-        training: On what and how it was trained, in words.
+        training: Free-text description of the training data and method.
         seed: Seed of the training.
-        steps: Training steps.
+        steps: Number of training steps.
         version: Version of cvtgs that trained it.
         config: The configuration of the training as JSON, without paths; empty if unknown.
-        start: Digest of the checkpoint that it started from; empty for none.
-        scenes: What it learned from and was validated with.
+        start: Digest of the checkpoint from which training started; empty for none.
+        scenes: Scenes of training and validation.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -96,7 +96,7 @@ class Checkpoint:
     """A network that is ready to use.
 
     Attributes:
-        net: The network, on the CPU, float32, without gradients.
+        net: The network on the CPU, float32, without gradients.
         info: The description in the file.
         name: Name of the shipped checkpoint, or path of the file.
         digest: SHA-256 of the weights and the description, hexadecimal.
@@ -112,14 +112,14 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
     """Load a MergeNet.
 
     Args:
-        source: ``standard`` or ``paper``, which come with the package, or a file.
+        source: ``standard`` or ``paper``, which come with the package, or the path of a file.
 
     Returns:
         The checkpoint.
 
     Raises:
-        CheckpointError: There is no such file, or it is no checkpoint, damaged, of a later
-            format or of another architecture.
+        CheckpointError: There is no such file, or it is not a checkpoint, is damaged, or has a
+            later format or another architecture.
 
     Example:
         >>> load_checkpoint("standard").info.preset
@@ -151,7 +151,7 @@ def save_checkpoint(net: MergeNet | PublishedMergeNet, info: CheckpointInfo) -> 
         info: Its description.
 
     Returns:
-        A safetensors file, to be written with :func:`cvtgs.io.atomic_output`.
+        The bytes of a safetensors file, to be written with :func:`cvtgs.io.atomic_output`.
 
     Example:
         >>> info = CheckpointInfo(architecture=Architecture(), preset="standard")
@@ -246,12 +246,6 @@ def build_network(
 ) -> MergeNet | PublishedMergeNet:
     """Build an untrained network, which changes nothing.
 
-    Args:
-        architecture: Its kind and shape.
-
-    Returns:
-        The network.
-
     Example:
         >>> type(build_network(Architecture())).__name__
         'MergeNet'
@@ -294,7 +288,7 @@ def _digest(tensors: Mapping[str, Tensor], described: str) -> str:
 def checkpoint_for(
     ckpt: str | os.PathLike[str] | None, config: SimplifyConfig | None
 ) -> Checkpoint | None:
-    """Return the checkpoint that a name or a file and a configuration choose."""
+    """Return the checkpoint for a name or file and a configuration, or None for no network."""
     if ckpt is None:
         return None
     if config is not None and not config.merge.network:

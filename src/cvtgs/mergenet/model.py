@@ -1,4 +1,4 @@
-"""MergeNet: a small network, shared by all cells, that corrects their merged Gaussians."""
+"""MergeNet: a small network that corrects merged Gaussians, shared by all cells."""
 
 import copy
 import math
@@ -16,51 +16,51 @@ from cvtgs.cells.features import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES, 
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
 
 LARGE_GROWTH = 0.6
-"""A large change of a log scale, for the cost of residuals."""
+"""Unit of changes of log scales in the cost of residuals."""
 
 LARGEST_LOGIT_CHANGE = 2.0
-"""Opacity logits change by this much at most."""
+"""Largest change of an opacity logit."""
 
 LARGEST_TURN = 0.5
-"""A cell turns by this much about each of its axes at most, in radians."""
+"""Largest rotation of a cell about each of its axes, in radians."""
 
 LARGEST_MEMBER_GATE = 2.0
 LARGEST_PAIR_GATE = 0.5
 
 SUMMARY_FEATURES = CELL_FEATURES + MEMBER_FEATURES + PAIR_FEATURES
-"""Numbers that tell whether a cell is like those of the training."""
+"""Number of features that decide whether a cell is similar to the training cells."""
 
 TAIL = 0.01
-"""A case does not stand for the cells beyond this quantile of a feature, at both ends."""
+"""Share of the cells of a case that is ignored at both ends of each feature."""
 
 MARGIN = 0.1
-"""Beyond the range, corrections vanish over this share of its width."""
+"""Corrections fade to zero beyond the range over this share of its width."""
 
 NARROWEST = 0.01
-"""Smallest width over which they vanish, for a feature that never varied."""
+"""Smallest width of this fade, for features that did not vary in training."""
 
 MEMBERS, MOST_MEMBERS = 9, 2000
-"""The feature that is a fifth of the logarithm of the number of members, and its largest known.
+"""Index of the feature ``0.2 log(members)``, and the largest number of members that is corrected.
 
-Cells of more members than this are those in the middle of an unbounded scene when most cells are
-spent on its sky, whatever a training has seen of them; they cover the cameras when they grow.
+Larger cells occur in the middle of unbounded scenes where most cells are spent on the sky. They
+cover the cameras when they grow, so the limit holds whatever the training cases contain.
 """
 
 WIDEST = 1e30
-"""Both ends of the range of a network without a fitted range."""
+"""Absolute value of both ends of the range before it is fitted."""
 
 
 class Architecture(pydantic.BaseModel):
-    """The shape of a MergeNet.
+    """The architecture of a MergeNet.
 
     Attributes:
-        kind: Tells it from the shape of the published network.
-        member_features: Numbers that describe a member.
-        pair_features: Numbers that describe a neighbour.
-        cell_features: Numbers that describe a cell.
+        kind: Distinguishes it from the published network.
+        member_features: Number of features of a member.
+        pair_features: Number of features of a neighbour.
+        cell_features: Number of features of a cell.
         width: Units of the layers of members and neighbours.
         cell_width: Units of the layers of cells.
-        largest_growth: Log scales change by this much at most.
+        largest_growth: Largest change of a log scale.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
@@ -80,11 +80,11 @@ class Residuals:
 
     Attributes:
         d_means: ``(m, 3)`` moves of the centres, in the frame and the standard deviations of each.
-        d_log_scales: ``(m, 3)`` added to the log scales.
+        d_log_scales: ``(m, 3)`` changes of the log scales.
         d_rotvecs: ``(m, 3)`` rotation vectors in the frame of each, radians.
-        d_logit_opacities: ``(m,)`` added to the opacity logits.
-        member_colors: ``(n,)`` shares of the members' differences in colour that are added.
-        pair_colors: ``(m, k)`` shares of the neighbours' differences in colour that are added.
+        d_logit_opacities: ``(m,)`` changes of the opacity logits.
+        member_colors: ``(n,)`` shares of the members' colour differences to add.
+        pair_colors: ``(m, k)`` shares of the neighbours' colour differences to add.
     """
 
     d_means: Float[Tensor, "m 3"]
@@ -95,10 +95,10 @@ class Residuals:
     pair_colors: Float[Tensor, "m k"]
 
     def cost(self) -> Float[Tensor, ""]:
-        """Return the mean square of all changes, each in units of a large one.
+        """Return the mean square of all changes but colours, each in units of a large change.
 
         Returns:
-            A number that is part of the training loss; 0 for no change.
+            A term of the training loss; 0 for no change.
         """
         parts = [
             self.d_log_scales / LARGE_GROWTH,
@@ -109,14 +109,14 @@ class Residuals:
         return torch.stack([part.square().mean() for part in parts]).mean()
 
     def scaled(self, shares: Float[Tensor, "m"], ids: Int[Tensor, "n"]) -> "Residuals":
-        """Multiply the changes of every cell by a share.
+        """Return the residuals with the changes of every cell multiplied by its share.
 
         Args:
-            shares: One number per cell; 0 changes nothing.
+            shares: One factor per cell; 0 leaves the cell unchanged.
             ids: The cell of every member.
 
         Returns:
-            The smaller residuals.
+            The scaled residuals.
         """
         by_cell = shares[:, None]
         return Residuals(
@@ -133,27 +133,19 @@ class CellNetwork(nn.Module):
     """A network that corrects merged Gaussians, cell by cell.
 
     Attributes:
-        sees_surroundings: Whether it asks for the neighbours of a cell and for the ambient
-            visibility of its members.
+        sees_surroundings: Whether it needs the neighbours of a cell and the ambient visibility of
+            its members.
     """
 
     sees_surroundings = True
 
     def copy_to(self, device: torch.device, dtype: torch.dtype) -> Self:
-        """Return a copy on a device; all parameters go there in one piece.
-
-        Args:
-            device: Where to.
-            dtype: Precision of the copy.
-
-        Returns:
-            The copy.
-        """
+        """Return a copy on a device in a given precision; all parameters move in a single copy."""
         copied = copy.deepcopy(self).to(dtype)
         if device.type == "cpu":
             return copied
         state = copied.state_dict()
-        # Each starts at a multiple of 16 numbers: matrix products want them aligned.
+        # Each tensor starts at a multiple of 16 elements, the alignment for matrix products.
         padded = [pad(values.flatten(), (0, -values.numel() % 16)) for values in state.values()]
         parts = torch.cat(padded).to(device).split([len(values) for values in padded])
         for (name, values), part in zip(state.items(), parts, strict=True):
@@ -163,18 +155,18 @@ class CellNetwork(nn.Module):
 
 
 class MergeNet(CellNetwork):
-    """Predicts residuals from descriptors.
+    """The network that predicts residuals from descriptors.
 
-    After CVT-GS: a pointwise network over members, pooled by mean, maximum and mass, and a
-    decoder whose last layer starts at zero, so that an untrained network changes nothing. Ours
-    differs: neighbours are encoded the same way as members; size and opacity come from the decoder,
-    but position, rotation and colour are sums over members and neighbours of their differences
-    from the cell, each times a gate that the network predicts. So the residuals turn with the
-    scene, mix the colours that are there, and any number of SH bands comes at no cost.
-    Cells unlike those of the training stay as they are (:class:`KnownRange`).
+    As in CVT-GS, a pointwise network over members is pooled by mean, maximum and mass, and the last
+    layer of the decoder starts at zero, so that an untrained network changes nothing. Unlike there,
+    neighbours are encoded in the same way as members; only size and opacity come from the decoder.
+    Changes of position, rotation and colour are sums over members and neighbours of their
+    differences from the cell, each times a predicted gate. So the residuals rotate with the scene,
+    mix existing colours, and support any number of SH bands at no cost.
+    Cells unlike those of the training stay unchanged (:class:`KnownRange`).
 
     Args:
-        architecture: Its shape.
+        architecture: Kind and layer sizes.
 
     Example:
         >>> sum(parameter.numel() for parameter in MergeNet(Architecture()).parameters())
@@ -226,7 +218,7 @@ class MergeNet(CellNetwork):
         pulls = segment_sum(_pulls(of_members, positions, positions.clamp(-5, 5)), offsets, weights)
         near = pair_positions / (1 + pair_positions.abs())
         others = _pulls(of_pairs, pair_positions, near).unflatten(0, shape).sum(dim=1)
-        # Twice, so that neighbours may turn a cell as a gate of 1 does.
+        # Doubled, so that neighbours can turn a cell as much as a gate of 1 does.
         twists = pulls[:, 3:] + 2 * others[:, 3:]
         residuals = Residuals(
             d_means=pulls[:, :3] + others[:, :3],
@@ -247,7 +239,7 @@ class _SiLU(nn.Module):
 
 
 class _Gates(nn.Module):
-    """Gates between -1 and 1: of position, colour and rotation about three axes; 0 at first."""
+    """Gates in [-1, 1] for position, colour and rotation about three axes; initially 0."""
 
     def __init__(self, width: int, cell_width: int) -> None:
         super().__init__()
@@ -260,9 +252,9 @@ class _Gates(nn.Module):
 
     def forward(self, inputs: Tensor, cells: Tensor, ids: Int[Tensor, "n"]) -> Tensor:
         of_cells = self.cell(cells) + self.own.bias
-        # One product that adds in place of a product and two sums over all members.
+        # One fused multiply-add instead of a product and two sums over all members.
         hidden = self.activation(of_cells.index_select(0, ids).addmm_(inputs, self.own.weight.T))
-        # Few gates of many: the product is faster with one gate of all in one run of memory.
+        # Few gates, many rows: the product is faster if each gate is contiguous over all rows.
         return torch.tanh(torch.addmm(self.gates.bias[:, None], self.gates.weight, hidden.T)).T
 
 
@@ -271,7 +263,7 @@ def _layers(features: int, width: int) -> nn.Sequential:
 
 
 def _pool_pairs(pairs: Float[Tensor, "m k w"]) -> tuple[Tensor, Tensor]:
-    """Pool over neighbours; a cell without any gives zeros."""
+    """Pool over neighbours by mean and maximum; zeros for cells without neighbours."""
     if pairs.shape[1] == 0:
         nothing = pairs.new_zeros(len(pairs), pairs.shape[2])
         return nothing, nothing
@@ -281,9 +273,9 @@ def _pool_pairs(pairs: Float[Tensor, "m k w"]) -> tuple[Tensor, Tensor]:
 def _pulls(
     gates: Float[Tensor, "n 5"], positions: Float[Tensor, "n 3"], levers: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 6"]:
-    """Return how far each moves its cell, and by how much it turns it about each axis.
+    """Return by how much each row moves its cell, and turns it about each axis.
 
-    A cell turns about an axis by the product of the other two coordinates.
+    The turn about an axis is proportional to the product of the other two coordinates.
     """
     x, y, z = levers.unbind(1)
     twists = torch.stack([y * z, x * z, x * y])
@@ -291,10 +283,10 @@ def _pulls(
 
 
 def summarize(descriptors: Descriptors) -> Float[Tensor, "m f"]:
-    """Return the features of cells, and those of members and neighbours in the mean.
+    """Return the features of cells, and the means of those of members and neighbours.
 
-    Members count by their share of the mass, so that a huge faint one shows. A cell without
-    neighbours has zeros for theirs.
+    Members are weighted by their share of the mass, so that a huge faint member counts. Features
+    of missing neighbours are 0.
     """
     pairs = descriptors.pairs
     near = pairs.mean(dim=1) if pairs.shape[1] else pairs.new_zeros(len(pairs), pairs.shape[2])
@@ -303,12 +295,12 @@ def summarize(descriptors: Descriptors) -> Float[Tensor, "m f"]:
 
 
 class KnownRange(nn.Module):
-    """The range of every feature of a cell over the training, and how far a cell is beyond it.
+    """The range of every cell feature in training; it fades out residuals of cells beyond it.
 
-    A network that extrapolates does harm: an opaque cell of a hundred thousand members, half of
-    them a far sky, grows over the cameras. So a residual is multiplied by 1 within the range, by
-    0 from ``MARGIN`` beyond it, and linearly in between. The feature that is farthest out
-    decides. The range is part of the weights of a network, so training knows of it.
+    Extrapolation does harm: an opaque cell of a hundred thousand members, half of them in a
+    distant sky, grows over the cameras. So a residual is multiplied by 1 within the range, by 0
+    from ``MARGIN`` beyond it, and linearly in between. The feature that is farthest outside
+    decides. The range is stored with the weights of the network, and is active in training.
 
     Example:
         >>> known = KnownRange()
@@ -331,13 +323,13 @@ class KnownRange(nn.Module):
         self.register_buffer("margin", torch.ones(SUMMARY_FEATURES))
 
     def forward(self, summaries: Float[Tensor, "m f"]) -> Float[Tensor, "m"]:
-        """Return the share of its residual that every cell gets, 0 to 1.
+        """Return the factor of the residual of every cell, 0 to 1.
 
         Args:
             summaries: Result of :func:`summarize`.
 
         Returns:
-            Shares, exactly 1 within the range and exactly 0 beyond the margin.
+            Factors, exactly 1 within the range and exactly 0 beyond the margin.
         """
         beyond = torch.maximum(self.low - summaries, summaries - self.high) / self.margin
         return (1 - beyond.amax(dim=1)).clamp(0, 1)
@@ -345,12 +337,12 @@ class KnownRange(nn.Module):
     def fit(self, cases: Iterable[Float[Tensor, "m f"]]) -> None:
         """Set the range from the cells of the training cases.
 
-        Each case counts by itself, however few cells it has: the range of a feature goes from
-        the least to the greatest value of all cases without their tails. Cells of more than
+        Tails are cut case by case, however few cells a case has; the range of a feature then goes
+        from the smallest to the largest remaining value of all cases. Cells of more than
         ``MOST_MEMBERS`` members are never within it.
 
         Args:
-            cases: Summaries of the cells of every case, at least one.
+            cases: Summaries of the cells of every case, at least one case.
         """
         ends = [_ends(summaries) for summaries in cases]
         low = torch.stack([end[0] for end in ends]).amin(dim=0)

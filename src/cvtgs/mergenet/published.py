@@ -1,4 +1,4 @@
-"""The MergeNet of CVT-GS as published: its descriptor, its network, its residuals."""
+"""The MergeNet of CVT-GS as published: descriptor, network and residuals."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -18,21 +18,21 @@ SH_COEFFICIENTS = 16
 """Coefficients per colour channel of degree 3; scenes of a lower degree have zeros for the rest."""
 
 PUBLISHED_FEATURES = 3 + 3 + 4 + 1 + 1 + 3 * SH_COEFFICIENTS
-"""Numbers that describe a member: position, log scale, quaternion, opacity, share, SH."""
+"""Number of features of a member: position, log scale, quaternion, opacity, share, SH."""
 
 PUBLISHED_RESIDUALS = 3 + 3 + 3 + 1 + 3 * SH_COEFFICIENTS
-"""Numbers that the decoder returns: position, log scale, rotation, opacity logit, SH."""
+"""Number of outputs of the decoder: position, log scale, rotation, opacity logit, SH."""
 
 LARGEST_FEATURE = 50.0
-"""Positions and differences of log scales are limited to this, so that all stays finite."""
+"""Positions and differences of log scales are clamped to this, so that all values stay finite."""
 
 
 class PublishedArchitecture(pydantic.BaseModel):
-    """The shape of a MergeNet as published; the publication does not give its widths.
+    """The architecture of a MergeNet as published; the publication does not give its widths.
 
     Attributes:
-        kind: Tells it from the shape of :class:`cvtgs.mergenet.MergeNet`.
-        member_features: Numbers that describe a member.
+        kind: Distinguishes it from :class:`cvtgs.mergenet.MergeNet`.
+        member_features: Number of features of a member.
         width: Units of the layers of members.
         cell_width: Units of the layers of the decoder.
     """
@@ -47,15 +47,15 @@ class PublishedArchitecture(pydantic.BaseModel):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PublishedDescriptors:
-    """Some cells as the published network sees them: their members, relative to the merged ones.
+    """The input of the published network: members of some cells, relative to the merged Gaussian.
 
     Attributes:
         members: ``(n, 60)`` position in the frame and the standard deviations of the merged
-            Gaussian (3), log scales less those of the merged one (3), the relative quaternion of
-            positive real part (4), opacity (1), its share of the sum of the opacities of the cell
-            (1), and SH coefficients of all bands less those of the merged one (48).
+            Gaussian (3), log scales minus those of the merged one (3), the relative quaternion of
+            non-negative real part (4), opacity (1), its share of the sum of opacities of the cell
+            (1), and SH coefficients of all bands minus those of the merged one (48).
         shares: ``(n,)`` the same shares; those of one cell sum to 1.
-        offsets: ``(m + 1,)`` where each cell starts, and the end of the last one.
+        offsets: ``(m + 1,)`` start of each cell, and the end of the last one.
     """
 
     members: Float[Tensor, "n 60"]
@@ -65,14 +65,14 @@ class PublishedDescriptors:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PublishedResiduals:
-    """Free changes of the merged Gaussians, without limits; zeros change nothing.
+    """Unlimited changes of the merged Gaussians; zeros change nothing.
 
     Attributes:
         d_means: ``(m, 3)`` moves of the centres, in the frame and the standard deviations of each.
-        d_log_scales: ``(m, 3)`` added to the log scales.
+        d_log_scales: ``(m, 3)`` changes of the log scales.
         d_rotvecs: ``(m, 3)`` rotation vectors in the frame of each, radians.
-        d_logit_opacities: ``(m,)`` added to the opacity logits.
-        d_sh: ``(m, 16, 3)`` added to the SH coefficients of all bands.
+        d_logit_opacities: ``(m,)`` changes of the opacity logits.
+        d_sh: ``(m, 16, 3)`` changes of the SH coefficients of all bands.
     """
 
     d_means: Float[Tensor, "m 3"]
@@ -85,15 +85,15 @@ class PublishedResiduals:
 def describe_published(
     scene: GaussianScene, merged: GaussianScene, part: Partition, *, cells: Int[Tensor, "m"]
 ) -> PublishedDescriptors:
-    """Describe some cells as CVT-GS does.
+    """Compute the descriptors of some cells as CVT-GS does.
 
     Memory: about ``1 kB`` per member.
 
     Args:
         scene: The Gaussians.
-        merged: One Gaussian per cell, of all cells.
+        merged: One Gaussian per cell, for all cells.
         part: Members of the cells to describe.
-        cells: Which cells those are.
+        cells: Row numbers of these cells in ``merged``.
 
     Returns:
         The descriptors, in the dtype of the scene.
@@ -147,13 +147,13 @@ def describe_published(
 class PublishedMergeNet(CellNetwork):
     """MergeNet as CVT-GS (Li et al. 2026) describes it.
 
-    A pointwise network shared by all members, pooled by mean, maximum and opacity, and a decoder
-    of free residuals of position, log scale, rotation, opacity and all SH coefficients, whose last
-    layer starts at zero. It sees neither neighbours nor how large a cell is.
+    A pointwise network shared by all members is pooled by mean, maximum and opacity. A decoder,
+    whose last layer starts at zero, returns unlimited residuals of position, log scale, rotation,
+    opacity and all SH coefficients. Neither neighbours nor the size of a cell are inputs.
     Widths and activations, which the publication leaves open, are ours.
 
     Args:
-        architecture: Its shape.
+        architecture: Kind and layer sizes.
 
     Example:
         >>> net = PublishedMergeNet(PublishedArchitecture())

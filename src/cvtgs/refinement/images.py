@@ -1,4 +1,4 @@
-"""The views and images of a refinement: some to learn from, and others that are held out."""
+"""The views and images of a refinement: training views and held-out views."""
 
 import random
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ from cvtgs.scene import GaussianScene
 from cvtgs.views import find_view_positions, mixed_views
 
 HELDOUT_SEED = 101
-"""Added to the seed: held-out views are others than those of evaluations and of training."""
+"""Added to the seed, so that held-out views differ from those of evaluations and of training."""
 
 TRAINING_SEED = 211
 
@@ -28,11 +28,11 @@ class RefineViews:
     """The views of a refinement.
 
     Attributes:
-        heldout: Single cameras of one size, which decide what is kept.
-        training: Single cameras to learn from.
-        endless: Whether there are always more of them.
-        heldout_images: Images that decide, too.
-        images: Images to learn from that are there before the first step.
+        heldout: Held-out cameras, single and of one size, which decide which scene is kept.
+        training: Single training cameras.
+        endless: Whether ``training`` never ends.
+        heldout_images: Further held-out views, already rendered.
+        images: Training images that are already rendered before the first step.
     """
 
     heldout: tuple[Cameras, ...]
@@ -43,7 +43,7 @@ class RefineViews:
 
 
 def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> RefineViews:
-    """Find views of a scene: a quarter automatic ones, the others from where one can stand."""
+    """Find views of a scene: a quarter automatic ones, the others from valid random positions."""
     positions = find_view_positions(full)
     side = max(config.size, SSIM_WINDOW * config.stride)
 
@@ -61,7 +61,7 @@ def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> 
 
 
 def split_views(cameras: Cameras, *, config: RefineConfig, seed: int) -> RefineViews:
-    """Split given cameras into some that are held out, spread evenly, and the others."""
+    """Split given cameras into evenly spread held-out views and training views."""
     if len(cameras) < 2:
         raise InvalidArgumentError(
             f"a refinement needs at least 2 cameras, one of them to be held out; found "
@@ -84,7 +84,7 @@ def shared_views(
     config: RefineConfig,
     seed: int,
 ) -> RefineViews:
-    """Divide images that were rendered before like :func:`split_views`; later views are others."""
+    """Split existing images like :func:`split_views`; further training views are new ones."""
     images = [
         ViewImage(camera=camera, rgb=rgb[None], alpha=alpha[None], backend=observed.backend)
         for camera, rgb, alpha in zip(
@@ -109,7 +109,7 @@ def _further(
     config: RefineConfig,
     seed: int,
 ) -> Iterator[Cameras]:
-    """Yield other views to learn from; none is looked for until the first is asked for."""
+    """Yield further training views; they are searched lazily."""
     if cameras is None:
         yield from generated_views(full, config=config, seed=seed).training
         return
@@ -120,13 +120,13 @@ def _further(
 
 
 def _heldout_rows(count: int, config: RefineConfig) -> tuple[int, ...]:
-    """Return which of some views are held out, spread evenly."""
+    """Return the row numbers of the held-out views, spread evenly."""
     number = config.heldout_of(count)
     return tuple((2 * k + 1) * count // (2 * number) for k in range(number))
 
 
 def _thinned(views: Sequence[Cameras], stride: int) -> tuple[Cameras, ...]:
-    """Return every ``stride``-th pixel of each view, from another first pixel on in each."""
+    """Return every ``stride``-th pixel of each view, with a different first pixel per view."""
     return tuple(
         view.every(stride, first=(row % stride, row // stride % stride))
         for row, view in enumerate(views)
@@ -134,13 +134,13 @@ def _thinned(views: Sequence[Cameras], stride: int) -> tuple[Cameras, ...]:
 
 
 class ImageBuffer:
-    """Images to learn from: a new one at first and then now and again, else one from before.
+    """Training images: the first are new, later ones are new at intervals and reused in between.
 
-    What was rendered before comes up in turn: it is drawn at random from the half of it that was
-    not used for longest. A step sees every ``config.stride``-th pixel, from a random one on.
+    A reused image is drawn at random from the least recently used half of the buffer. A step sees
+    every ``config.stride``-th pixel, with a random first one.
 
-    Memory: 8 bytes per pixel of at most ``config.images`` images; of one, if every step has a
-    new one.
+    Memory: 8 bytes per pixel of at most ``config.images`` images, or of one image if every step
+    renders a new one.
     """
 
     def __init__(
@@ -158,7 +158,7 @@ class ImageBuffer:
         self.rendered = 0
 
     def draw(self) -> ViewImage:
-        """Return an image to learn from, in half precision."""
+        """Return a training image, in half precision."""
         image, stride = self._next(), self._config.stride
         if image.camera.stride == stride:
             return image

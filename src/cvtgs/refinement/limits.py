@@ -1,4 +1,4 @@
-"""When a refinement stops: after so many steps, or so many seconds."""
+"""Limits of a refinement in steps and seconds."""
 
 import math
 import time
@@ -8,7 +8,7 @@ from cvtgs.errors import InvalidArgumentError
 
 
 def check_limits(seconds: float | None, *, steps: int | None) -> None:
-    """Refuse seconds and steps that are not positive."""
+    """Raise an error if seconds or steps are not positive."""
     if seconds is not None and not 0 < seconds < math.inf:
         raise InvalidArgumentError(
             f"the seconds to refine for must be above 0 and finite, found {seconds!r}."
@@ -21,7 +21,7 @@ def check_limits(seconds: float | None, *, steps: int | None) -> None:
 
 
 class Limits:
-    """Counts steps and seconds, and decides whether one more step fits."""
+    """Counters of steps and seconds, which decide whether one more step fits."""
 
     def __init__(self, seconds: float | None, *, steps: int | None) -> None:
         self._start = time.perf_counter()
@@ -33,7 +33,7 @@ class Limits:
 
     @property
     def total(self) -> int:
-        """Units of progress: steps, or thousandths of the time."""
+        """Total units of progress: steps, or thousandths of the time."""
         return 1000 if self._seconds is not None or self._steps is None else self._steps
 
     @property
@@ -42,27 +42,26 @@ class Limits:
         return max(min(int(self.share() * self.total), self.total - 1), min(self.steps, 1))
 
     def share(self) -> float:
-        """Return which share of the steps or seconds is used up."""
+        """Return the used share of the steps or seconds, whichever is larger."""
         of_steps = self.steps / self._steps if self._steps else 0.0
         elapsed = time.perf_counter() - self._start if self._seconds else 0.0
         return min(1.0, max(of_steps, elapsed / self._seconds if self._seconds else 0.0))
 
     def begin(self) -> None:
-        """Start to measure a step or check."""
+        """Start to time a step or check."""
         self._last = time.perf_counter()
 
     def end(self, kind: Literal["step", "check"]) -> None:
-        """Measure the time since the last call, and count a step."""
+        """Record the time since the last call, and count a step."""
         now = time.perf_counter()
         self._slowest[kind] = max(self._slowest[kind], now - self._last)
         self._last = now
         self.steps += kind == "step"
 
     def reached(self) -> str:
-        """Return what is used up: ``steps``, ``time``, or nothing.
+        """Return the limit that is reached: ``steps``, ``time``, or an empty string.
 
-        The time is, where one more step and one more check, as slow as the slowest so far, would
-        not fit.
+        ``time`` means that one more step and check, as slow as the slowest so far, would not fit.
         """
         if self._steps is not None and self.steps >= self._steps:
             return "steps"

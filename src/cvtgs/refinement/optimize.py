@@ -1,4 +1,4 @@
-"""The optimization of a scene: learning rates per Gaussian, steps of Adam, and what is kept."""
+"""The optimization of a scene: learning rates per Gaussian, Adam steps, and the best scene."""
 
 import math
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from cvtgs.validity import standardized, valid_rows, with_finite_opacities
 STAGE = "refine"
 
 THINNEST = 0.1
-"""Axes thinner than this share of the mean count as so thick: in images they are, too."""
+"""Axes thinner than this share of the mean axis count as this thick, as they do in images."""
 
 _BETAS = (0.6, 0.99)
 _LEAST_ROOT = 1e-15
@@ -36,10 +36,10 @@ class Optimized:
     """The result of an optimization.
 
     Attributes:
-        scene: The best scene, by held-out images; what came in if none was better.
-        before: Score of what came in, dB.
-        after: Score of the best, dB.
-        stopped: Why it ended: ``steps``, ``time``, ``patience`` or ``perfect``.
+        scene: The best scene by held-out images; the input scene if none was better.
+        before: Score of the input scene, dB.
+        after: Score of the best scene, dB.
+        stopped: Reason for the end: ``steps``, ``time``, ``patience`` or ``perfect``.
     """
 
     scene: GaussianScene
@@ -70,7 +70,7 @@ def optimize(
     while not stopped:
         factor = step_factor(limits, config)
         limits.begin()
-        # A random background: a wrong opacity shows over some color.
+        # A random background, because a wrong opacity is visible over some colors.
         target, background = images.draw(), images.draw_background()
         image = render(optimizer.scene(), target.camera, background=background).rgb
         loss = relative_loss(
@@ -99,7 +99,7 @@ def optimize(
 
 
 def step_factor(limits: Limits, config: RefineConfig) -> float:
-    """Return how long a step is, as a share of the first one."""
+    """Return the length of the next step relative to the first one."""
     left = 1.0 - limits.share()
     cooled = left / config.cooling if left < config.cooling else 1.0
     return cooled / (1 + limits.steps / config.half_after)
@@ -111,19 +111,19 @@ def heldout_psnr(scene: GaussianScene, scorer: Scorer) -> Float[Tensor, "p"]:
 
 
 def psnr_cap(first: Float[Tensor, "p"]) -> float:
-    """Return the PSNR beyond which an image counts no further: 10 dB above the median.
+    """Return the PSNR at which images are capped: 10 dB above the median.
 
-    Else the one view that shows an even wall, at 50 dB, decides for all others.
+    Otherwise a single view of a uniform wall, at 50 dB, would outweigh all others.
     """
     return min(MOST_PSNR, float(first.median()) + 10.0)
 
 
 class SceneOptimizer:
-    """A scene as a start plus changes, and the optimizer of the changes.
+    """A scene as initial values plus changes, and the optimizer of the changes.
 
     A step of Adam (Kingma and Ba 2015) moves only the Gaussians that an image shows: all others
-    have no gradient, keep their momentum for later, and stay as they are. That is
-    ``torch.optim.SparseAdam``, but any optimizer of torch imports its compiler first: a second.
+    have no gradient, keep their momentum, and stay unchanged. ``torch.optim.SparseAdam`` does the
+    same, but any torch optimizer first imports the torch compiler, which takes a second.
     Memory: five times the scene.
     """
 
@@ -131,7 +131,7 @@ class SceneOptimizer:
         self, scene: GaussianScene, rates: Rates, *, learning_rate_scale: Float[Tensor, "n"]
     ) -> None:
         self._scene = scene
-        # Finite opacities and unit quaternions, which render to the same.
+        # Finite opacities and unit quaternions, which render the same.
         start = with_finite_opacities(scene).tensors()
         self._start = start | {"quats": parameters.normalize_quats(start["quats"])}
         self._units = _units(scene, learning_rate_scale)
@@ -162,7 +162,7 @@ class SceneOptimizer:
         return self._scene.with_tensors(tensors, self._scene.extras)
 
     def step(self, loss: Tensor, *, factor: float) -> None:
-        """Move every Gaussian that has a finite gradient which is not zero."""
+        """Move every Gaussian with a finite nonzero gradient."""
         if not self._rates or not loss.requires_grad:
             return
         changes = [self._changes[name] for name in self._rates]
@@ -172,7 +172,7 @@ class SceneOptimizer:
         biases = [1 - beta**self._steps for beta in _BETAS]
         for (name, rate), gradient in zip(self._rates.items(), gradients, strict=True):
             length = factor * rate * math.sqrt(biases[1]) / biases[0]
-            largest = 0.5 * torch.finfo(gradient.dtype).max ** 0.5  # else its square overflows
+            largest = 0.5 * torch.finfo(gradient.dtype).max ** 0.5  # its square must not overflow
             some = gradient.index_select(0, rows).clamp_(-largest, largest)
             means, squares = (
                 _moved_average(values, rows, new, beta)
@@ -200,10 +200,10 @@ class SceneOptimizer:
 def _units(scene: GaussianScene, scale: Float[Tensor, "n"]) -> dict[str, Tensor]:
     """Return the length of one unit of change.
 
-    Positions and rotations change in the frame of each Gaussian, where a unit changes its density
-    equally along each axis, as in the metric of Fisher: a position by the standard deviation, a
-    rotation of two axes by ``ab / |a^2 - b^2|``, at most 1. A needle moves as far along itself as
-    a ball, and much less across.
+    Positions and rotations change in the frame of each Gaussian. As in the Fisher metric, a unit
+    changes its density equally along each axis: it is the standard deviation for a position, and
+    ``ab / |a^2 - b^2|``, at most 1, for a rotation of two axes. A needle moves as far along its
+    axis as a ball, and much less across it.
     """
     axes = torch.where((scale > 0)[:, None], torch.exp(scene.log_scales), 0.0)
     axes = torch.maximum(axes, THINNEST * axes.mean(dim=1, keepdim=True))
@@ -218,7 +218,7 @@ def _units(scene: GaussianScene, scale: Float[Tensor, "n"]) -> dict[str, Tensor]
 
 
 def _moved_average(values: Tensor, rows: Tensor, new: Tensor, beta: float) -> Tensor:
-    """Move running averages of some rows towards new values; return a copy of these rows."""
+    """Update running averages of some rows in place, and return a copy of these rows."""
     old = values.index_select(0, rows)
     moved = (new - old).mul_(1 - beta).add_(old)
     values.index_copy_(0, rows, moved)
@@ -236,19 +236,19 @@ def _rows_to_move(gradients: tuple[Tensor, ...]) -> Tensor:
 
 
 def _like(values: Float[Tensor, "n"], tensor: Tensor) -> Tensor:
-    """Give values per Gaussian as many dimensions as a tensor."""
+    """Reshape values per Gaussian to broadcast against a tensor."""
     return values.reshape(-1, *[1] * (tensor.ndim - 1))
 
 
 @torch.no_grad()
 def learning_rate_scales(small: GaussianScene, full: GaussianScene) -> Float[Tensor, "n"]:
-    """Return the factor of the learning rates of each Gaussian, from 0 to 1.
+    """Return the learning-rate factor of each Gaussian, 0 to 1.
 
-    What is enclosed moves less (:func:`cvtgs.analysis.ambient_visibility`): it may be all that is
-    visible from elsewhere. A Gaussian that is still what it was in the full scene moves by the
-    share of the mass around it that is not its own: where it represents itself alone it is right
-    from everywhere, and whatever a few images gain by moving it is lost in others. Invalid rows
-    do not move.
+    Enclosed Gaussians (:func:`cvtgs.analysis.ambient_visibility`) move less, because they may be
+    all that other views see. The factor of a Gaussian unchanged from the full scene is multiplied
+    by the share of the mass around it that is not its own: if it represents only itself, it is
+    right in every view, and any gain in a few images from moving it is lost in others. Invalid
+    rows do not move.
     """
     valid = valid_rows(small)
     some = small.select(valid)
@@ -259,7 +259,7 @@ def learning_rate_scales(small: GaussianScene, full: GaussianScene) -> Float[Ten
 
 
 def _own_mass_shares(small: GaussianScene, full: GaussianScene) -> Float[Tensor, "n"]:
-    """Return the share of the nearest mass that is the Gaussian's own; 0 if it has changed."""
+    """Return the own share of the full-scene mass nearest to each Gaussian; 0 if it has changed."""
     labels, _ = nearest_scipy(full.means, small.means)
     same = torch.ones_like(labels, dtype=torch.bool)
     for name in ("means", "log_scales", "logit_opacities", "sh0"):

@@ -1,4 +1,4 @@
-"""The public entry: a simplified scene in, one that looks more like the full scene out."""
+"""The public functions of refinement."""
 
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.validity import valid_rows
 
 DEFAULT_STEPS = 500
-"""Steps if neither a time nor a number of steps is given."""
+"""Number of steps if neither seconds nor steps are given."""
 
 
 class Refined(NamedTuple):
@@ -29,7 +29,7 @@ class Refined(NamedTuple):
 
     Attributes:
         scene: The scene.
-        report: What was gained, and what it cost.
+        report: The gain and the cost.
     """
 
     scene: GaussianScene
@@ -50,35 +50,35 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     observed: ObservedViews | None = None,
     listener: ProgressListener = silent,
 ) -> Refined:
-    """Fine-tune a simplified scene until images of it look more like those of the full one.
+    """Fine-tune a simplified scene so that its images match those of the full scene better.
 
-    One image of the full scene per step, over a random background; Adam moves the Gaussians
-    that the image shows. Views that are held out decide: the best scene by their PSNR is
-    returned, which is the one that came in if none is better. Number of Gaussians, SH degree,
-    comments, layout and extra columns stay. Gaussians that no image shows stay bit for bit, as do
-    those that represent themselves alone.
+    Each step uses one image of the full scene over a random background; Adam moves the Gaussians
+    that the image shows. The scene of highest PSNR on held-out views is returned, or the input
+    scene if none is better. Number of Gaussians, SH degree, comments, layout and extra columns
+    are kept. Gaussians that no image shows stay bit for bit, as do those that represent only
+    themselves.
 
     The same scenes, steps, configuration and seed give the same bits on a CPU; with ``seconds``
-    the clock decides how many steps there are. The time includes everything, also the compilation
-    of numba's code, some ten seconds, when it is used for the first time on a machine.
+    the number of steps depends on the clock. The time includes everything, even the compilation
+    of numba code at its first use on a machine, some ten seconds.
 
-    Memory: ten times the small scene, what rendering the full scene takes, and the images that
-    are used again, at most ``8 * size ** 2 * images`` bytes: those of given cameras.
+    Memory: ten times the small scene, the memory for rendering the full scene, and the reused
+    images (those of given cameras), at most ``8 * size ** 2 * images`` bytes.
 
     Args:
         small: The simplified scene; it is not changed.
         full: The scene that it was made from.
-        seconds: Wall-clock seconds to refine for, at most.
-        steps: Steps, at most; without either, those of the configuration, else 500.
-        cameras: The views, at least 2; every eighth is held out. None finds new views, automatic
-            ones and others from anywhere around.
-        config: Everything else; None for the defaults.
-        seed: Which views, in which order.
-        device: Where to compute: ``auto`` stays where the small scene is, but takes CUDA for
-            scenes on the CPU if there is one. The result is where the small scene was.
-        frozen: So many of the first Gaussians stay as they are, bit for bit.
-        observed: Images of the full scene that were rendered before, of the size and stride of
-            the configuration. They are the first ones, and every eighth of them is held out.
+        seconds: Largest wall-clock time, seconds.
+        steps: Largest number of steps; if neither is given, the configuration decides, else 500.
+        cameras: The views, at least 2; every eighth is held out. None finds new views: automatic
+            ones, and others from all around.
+        config: All other settings; None for the defaults.
+        seed: Seed of the choice and order of views.
+        device: Device to compute on: ``auto`` is that of the small scene, or CUDA, if available,
+            for scenes on the CPU. The result is on the device of the small scene.
+        frozen: Number of Gaussians at the start of the scene that stay bit for bit.
+        observed: Existing images of the full scene, with the size and stride of the configuration.
+            They are used first, and every eighth of them is held out.
         listener: Called after every step, with the gain so far as its note.
 
     Returns:
@@ -169,7 +169,7 @@ def join_reports(report: SimplifyReport, refined: Refined) -> SimplifyReport:
 
 
 def changed_count(before: GaussianScene, after: GaussianScene) -> int:
-    """Count the Gaussians that are not what they were."""
+    """Count the Gaussians that changed."""
     changed = torch.zeros(len(before), dtype=torch.bool, device=before.device)
     for name, old in before.tensors().items():
         new = after.tensors()[name]

@@ -1,7 +1,7 @@
-"""Images of scenes by the rules of 3DGS, differentiable, on every device.
+"""Differentiable rendering of scenes by the rules of 3DGS, on every device.
 
-``torch`` is the reference backend; ``numba`` on CPUs and ``gsplat`` on CUDA are fast ones, and are
-imported only when they are chosen.
+``torch`` is the reference backend; ``numba`` (CPU) and ``gsplat`` (CUDA) are the fast backends and
+are imported only when chosen.
 """
 
 from cvtgs.rendering.backends import BackendName, BlendingWeights, choose_backend

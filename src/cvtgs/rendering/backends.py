@@ -1,4 +1,4 @@
-"""Choose a backend by name; the interface and the output that all backends share."""
+"""The interface and output type that all backends share, and the choice of one by name."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,20 +16,20 @@ from cvtgs.progress import ProgressEvent, ProgressListener
 from cvtgs.scene import GaussianScene
 
 BackendName = Literal["auto", "torch", "numba", "gsplat"]
-"""The names that :func:`choose_backend` takes."""
+"""The names that :func:`choose_backend` accepts."""
 
 STAGE = "render"
-"""The stage of the progress events; a step is a camera."""
+"""Stage name in progress events; one step per camera."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RasterOutput:
-    """Images on black, before any background.
+    """Images on black, before any background is added.
 
     Attributes:
-        rgb: ``(c, h, w, 3)`` colours, each times its weight ``alpha * T``.
+        rgb: ``(c, h, w, 3)`` sums of the colours, weighted by ``alpha * T``.
         alpha: ``(c, h, w)`` sums of the weights, 0 to 1.
-        depth: ``(c, h, w)`` depths, each times its weight, scene units.
+        depth: ``(c, h, w)`` sums of the depths, weighted by ``alpha * T``, scene units.
     """
 
     rgb: Float[Tensor, "c h w 3"]
@@ -40,31 +40,31 @@ class RasterOutput:
 class BlendingWeights(Protocol):
     """The weights ``alpha * T`` of every Gaussian in every pixel of one image.
 
-    The image is linear in the colours: these are the products with the matrix of the weights.
+    The image is linear in the colours; the methods multiply by the matrix of these weights.
     """
 
     def paint(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-        """Return the image that Gaussians of these colours make, on black."""
+        """Return the image on black for these colours of the Gaussians."""
         ...
 
     def collect(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
-        """Return for every Gaussian the sum of the pixels times its weights."""
+        """Return, for every Gaussian, the sum of the pixels times its weights."""
         ...
 
     def normal(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Return what is collected from the image that is painted."""
+        """Return ``collect(paint(colors))``."""
         ...
 
     def powers(self) -> Float[Tensor, "n 2"]:
-        """Return the sums of every Gaussian's weights and of their squares."""
+        """Return, for every Gaussian, the sum of its weights and of their squares."""
         ...
 
 
 class Backend(Protocol):
-    """The functions of every backend's module."""
+    """The functions that every backend module defines."""
 
     def require(self, device: torch.device) -> None:
-        """Raise a DeviceError or MissingDependencyError unless the backend works on that device."""
+        """Raise DeviceError or MissingDependencyError unless the backend works on the device."""
         ...
 
     def rasterize(
@@ -75,17 +75,17 @@ class Backend(Protocol):
         sh_degree: int,
         listener: ProgressListener,
     ) -> RasterOutput:
-        """Render images on black; scene and cameras share a device."""
+        """Render images on black; scene and cameras must be on the same device."""
         ...
 
     def contributions(self, scene: GaussianScene, camera: Cameras) -> Tensor:
-        """Return every Gaussian's sum of weights ``alpha * T`` over one image."""
+        """Return the sum of each Gaussian's weights ``alpha * T`` over one image."""
         ...
 
     def observe(
         self, scene: GaussianScene, camera: Cameras, *, sh_degree: int
     ) -> tuple[RasterOutput, Tensor]:
-        """Render one image on black, and return the contributions to it."""
+        """Render one image on black; return it and the contributions to it."""
         ...
 
     def blending_weights(self, scene: GaussianScene, camera: Cameras) -> BlendingWeights:
@@ -99,14 +99,14 @@ def choose_backend(name: BackendName, device: torch.device) -> tuple[str, Backen
     Args:
         name: ``torch``, ``numba`` (CPU), ``gsplat`` (CUDA), or ``auto``: gsplat on CUDA if it
             works there, numba on the CPU if it is installed, else torch.
-        device: Where the scene is.
+        device: Device of the scene.
 
     Returns:
         The resolved name and the backend.
 
     Raises:
         InvalidArgumentError: There is no backend of that name.
-        MissingDependencyError: The backend's package is missing or does not work here.
+        MissingDependencyError: The backend's package is missing or does not work.
         DeviceError: The backend cannot work on that device.
 
     Example:
@@ -137,7 +137,7 @@ def render_each(
     empty: Float[Tensor, "0 h w 5"],
     listener: ProgressListener,
 ) -> RasterOutput:
-    """Render cameras one after the other: colours, depth and transmittance of each."""
+    """Render cameras one by one; an image holds colours, depth and transmittance."""
     listener(ProgressEvent(stage=STAGE, done=0, total=len(images)))
     found = [empty]
     for number, image in enumerate(images, start=1):
@@ -150,9 +150,9 @@ def render_each(
 def contributions_by_gradient(
     rasterize: Callable[..., RasterOutput], scene: GaussianScene, camera: Cameras
 ) -> Float[Tensor, "n"]:
-    """Compute contributions as the gradient of the image's sum with respect to the colours."""
+    """Compute contributions as the gradient of the summed image with respect to the colours."""
     with torch.enable_grad():
-        # Grey, where no colour is clipped, without the bands that do not matter here.
+        # Mid-grey, so that no colour is clipped; the higher SH bands do not matter here.
         sh0 = torch.zeros_like(scene.sh0).requires_grad_()
         gray = scene.with_tensors({"sh0": sh0, "shN": scene.shN[:, :0]}, {})
         image = rasterize(gray, camera, sh_degree=0).rgb

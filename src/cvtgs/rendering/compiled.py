@@ -1,9 +1,9 @@
-"""What the compiled kernels share: numba, which only this file imports, and their arrays.
+"""Decorators and array types of the compiled kernels; the only file that imports numba.
 
-Compiled code is kept on disk beside the source, in the user's folder for caches or in
-``NUMBA_CACHE_DIR``, so only the first call ever waits for the compiler; where none of these can be
-written, every process compiles anew. A kernel's cache notices changes of its own file only: after
-changing a function that a kernel of another file calls, clear the cache.
+Compiled code is cached on disk: beside the source, in the user's cache folder or in
+``NUMBA_CACHE_DIR``. Only the first call waits for the compiler, unless none of these folders is
+writable: then every process compiles again. A kernel's cache notices changes in its own file only:
+after changing a function that kernels in other files call, clear the cache.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from cvtgs.errors import MissingDependencyError, is_out_of_memory
 try:
     import numba
 except (ImportError, OSError) as error:
-    if is_out_of_memory(error.__context__ or error):  # another backend would give other bits
+    if is_out_of_memory(error.__context__ or error):  # another backend would give different bits
         raise MemoryError from error
     raise MissingDependencyError(
         f"backend 'numba' needs the package numba, which cannot be imported ({error}); "
@@ -26,18 +26,18 @@ except (ImportError, OSError) as error:
     ) from error
 
 Array = NDArray[Any]
-"""Floats, all of one dtype; numba works out which."""
+"""Floats, all of one dtype, which numba infers."""
 
 Ints = NDArray[Any]
 """Integers."""
 
 PixelBox = tuple[int, int, int, int]
-"""Pixels: first column, column after the last, first row, row after the last."""
+"""Half-open pixel ranges: first column, end column, first row, end row."""
 
 F = TypeVar("F", bound=Callable[..., object])
 
 prange = numba.prange
-"""A range whose steps run in parallel, in a function made by :func:`parallel`."""
+"""A range whose steps run in parallel in functions compiled by :func:`parallel`."""
 
 _SETTINGS: dict[str, Any] = {
     "cache": True,
@@ -48,7 +48,7 @@ _SETTINGS: dict[str, Any] = {
 
 
 def serial(function: F) -> F:
-    """Compile a function when it is first called."""
+    """Compile a function at its first call."""
     return _compiled(function, **_SETTINGS)
 
 
@@ -60,15 +60,15 @@ def parallel(function: F) -> F:
 def _compiled(function: F, **settings: Any) -> F:
     try:
         return cast("F", numba.njit(**settings)(function))
-    except RuntimeError:  # no folder for compiled code can be written
+    except RuntimeError:  # no cache folder is writable
         return cast("F", numba.njit(**settings | {"cache": False})(function))
 
 
 def use_threads_of_torch() -> None:
-    """Let compiled functions that are called from this thread use as many threads as torch.
+    """Make compiled functions called from this thread use as many threads as torch.
 
-    Where both share an OpenMP library, numba sets the number for torch, too, when it starts its
-    threads: so it is set back.
+    Where both share an OpenMP library, numba also changes the number for torch when it starts its
+    threads, so this restores it.
     """
     count, most = torch.get_num_threads(), vars(numba.config)["NUMBA_NUM_THREADS"]
     numba.set_num_threads(max(1, min(count, most)))
@@ -77,7 +77,7 @@ def use_threads_of_torch() -> None:
 
 
 class GaussianArrays(NamedTuple):
-    """The tensors of a scene, or gradients of them, in the order of ``GaussianScene.tensors``."""
+    """The tensors of a scene, or their gradients, in the order of ``GaussianScene.tensors``."""
 
     means: Array
     quats: Array
@@ -88,15 +88,15 @@ class GaussianArrays(NamedTuple):
 
 
 class RasterSettings(NamedTuple):
-    """One camera, and how colours and opacities are computed.
+    """One camera, and the settings for colours and opacities.
 
     Attributes:
         camera: ``(9, 3)`` rotation (rows 0 to 2), centre (3), focal lengths (4), principal point
-            (5), slope bounds along x (6) and along y (7), width and height (8); pairs end with 0,
-            the last with the variance that splats gain, squared pixels.
+            (5), slope bounds along x (6) and along y (7), width and height (8). Pairs are padded
+            with 0; row 8 ends with the dilation, squared pixels.
         size: Width and height, pixels.
-        sh_degree: Degree up to which colours depend on the direction.
-        antialiased: Whether opacities are compensated.
+        sh_degree: Highest SH degree to evaluate.
+        antialiased: Whether to compensate opacities for the dilation.
     """
 
     camera: NDArray[np.float64]
@@ -109,8 +109,8 @@ class TileArrays(NamedTuple):
     """The splats of each tile, front to back.
 
     Attributes:
-        starts: ``(t + 1,)`` where each tile's list starts.
-        lists: ``(p, 2)`` place of each intersection if they were by splat, and its splat.
+        starts: ``(t + 1,)`` start of each tile's list.
+        lists: ``(p, 2)`` for each intersection: its index in splat order, and its splat.
         side: Pixels along a tile's edge.
     """
 
@@ -123,9 +123,9 @@ class SplatArrays(NamedTuple):
     """The splats in view, front to back.
 
     Attributes:
-        rows: ``(m,)`` which Gaussian each is.
-        starts: ``(m + 1,)`` where its intersections start, if they are by splat.
-        packed: ``(m, 10)`` as :func:`cvtgs.rendering.projection.pack` describes.
+        rows: ``(m,)`` row of the Gaussian in the scene.
+        starts: ``(m + 1,)`` start of each splat's intersections, in splat order.
+        packed: ``(m, 10)`` as returned by :func:`cvtgs.rendering.projection.pack`.
     """
 
     rows: Ints

@@ -1,8 +1,8 @@
 """The fast backend on CUDA: gsplat (Ye et al. 2024); the only file that imports it.
 
-Written against the documentation of gsplat 1.5.3. The tests have no GPU: they run it against a
-stand-in of the documented signature and arithmetic (tests/gsplat_stand_in.py). It differs from the
-rules of 3DGS in this: alpha is at most 0.999 instead of 0.99.
+Written against the documentation of gsplat 1.5.3. The tests have no GPU: they run against a
+stand-in with the documented signature and arithmetic (tests/gsplat_stand_in.py). One rule differs
+from 3DGS: alpha is limited to 0.999 instead of 0.99.
 """
 
 from collections.abc import Callable
@@ -28,17 +28,17 @@ from cvtgs.rendering.projection import DILATION, NEAR_PLANE, to_pinholes
 from cvtgs.scene import GaussianScene
 
 PROBE_TOLERANCE = 0.02
-"""Share of the largest value by which the image of the probe, and its gradient, may be off.
+"""Largest error of the probe's image and gradient, relative to their largest value.
 
-Pixels where alpha is near 1/255, the cut-off, may differ; a shift by half a pixel changes a third.
+Pixels with alpha near the cut-off of 1/255 may differ; a shift by half a pixel changes a third.
 """
 
 
 def require(device: torch.device) -> None:
-    """Check that this backend works on a device: it renders a Gaussian as the torch backend does.
+    """Check that this backend works on a device by rendering a Gaussian and comparing with torch.
 
-    gsplat imports without CUDA and without a compiler, and fails only when it is used; it may
-    also compile its kernels then, which takes minutes, once. The outcome is remembered.
+    gsplat can be imported without CUDA and without a compiler, and fails only on use. Its first
+    use may also compile its kernels, which takes minutes. The outcome is cached.
     """
     if device.type != "cuda":
         raise DeviceError(
@@ -60,11 +60,11 @@ def rasterize(
     sh_degree: int,
     listener: ProgressListener = silent,
 ) -> RasterOutput:
-    """Render with gsplat, in float32, all cameras at once.
+    """Render all cameras at once with gsplat, in float32.
 
-    Memory: gsplat's, linear in cameras times Gaussians, and in intersections.
+    Memory: that of gsplat, linear in cameras times Gaussians and in intersections.
     """
-    to_pinholes(cameras)  # checks them
+    to_pinholes(cameras)  # validates the cameras
     listener(ProgressEvent(stage=STAGE, done=0, total=len(cameras)))
     if len(scene) and len(cameras):
         layers, alpha = _rasterize_all(scene, cameras, sh_degree)
@@ -77,24 +77,24 @@ def rasterize(
 
 
 def contributions(scene: GaussianScene, camera: Cameras) -> Tensor:
-    """Return every Gaussian's sum of weights ``alpha * T`` over one image."""
+    """Return the sum of each Gaussian's weights ``alpha * T`` over one image."""
     return contributions_by_gradient(rasterize, scene, camera)
 
 
 def observe(
     scene: GaussianScene, camera: Cameras, *, sh_degree: int
 ) -> tuple[RasterOutput, Tensor]:
-    """Render one image, and return every Gaussian's sum of weights over it."""
+    """Render one image; return it and the sum of each Gaussian's weights over it."""
     return rasterize(scene, camera, sh_degree=sh_degree), contributions(scene, camera)
 
 
 def blending_weights(scene: GaussianScene, camera: Cameras) -> BlendingWeights:
-    """Return the weights of every Gaussian in every pixel, which gsplat does not give, by torch."""
+    """Return the weights by the torch backend, since gsplat does not return them."""
     return torch_backend.blending_weights(scene, camera)
 
 
 def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tuple[Tensor, Tensor]:
-    """Return colours with depths, times what they hide, and alpha."""
+    """Return weighted sums of colours and depths, and alpha."""
     rest = scene.shN[:, : REST_COUNTS[sh_degree]]
     if sh_degree:
         colors = torch.cat([scene.sh0, rest], dim=1)
@@ -122,9 +122,9 @@ def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tu
 
 
 def _about_cameras(scene: GaussianScene, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Return means and view matrices about the middle of the cameras, in float64.
+    """Return means and view matrices relative to the mean camera position, in float64.
 
-    Far from the origin float32, in which gsplat works, holds neither.
+    gsplat works in float32, which is too coarse for either far from the origin.
     """
     viewmats = cameras.viewmats.double().clone()
     middle = cameras.centers.double().mean(dim=0)
@@ -138,9 +138,9 @@ def _gsplat() -> Any:
 
 @cache
 def _failure(device: str) -> str:
-    """Say why gsplat does not render as the torch backend does; nothing if it does.
+    """Return why gsplat does not render as the torch backend does, or "" if it does.
 
-    The caller may have switched gradients off, so they are switched on here.
+    Enables gradients, since the caller may have disabled them.
     """
     with torch.inference_mode(mode=False), torch.enable_grad():
         image, gradient = _probe(_rasterize_by_torch, "cpu")
@@ -149,14 +149,14 @@ def _failure(device: str) -> str:
             found_image, found_gradient = _probe(_rasterize_all, device)
         except ImportError as error:
             return f"it cannot be imported ({_first_line(error)})"
-        except Exception as error:  # whatever a build or a driver may raise
+        except Exception as error:  # a build or a driver may raise anything
             return f"it failed to render ({type(error).__name__}: {_first_line(error)})"
     for name, found, wanted in (
         ("image", found_image, image),
         ("gradient", found_gradient, gradient),
     ):
         apart = float((found - wanted).abs().amax() / wanted.abs().amax())
-        if not apart < PROBE_TOLERANCE:  # also where it is not a number
+        if not apart < PROBE_TOLERANCE:  # also true for NaN
             return f"its {name} of one Gaussian differs by {apart:.0%} from that of backend 'torch'"
     return ""
 
@@ -165,10 +165,10 @@ def _probe(
     rasterize_all: Callable[[GaussianScene, Cameras, int], tuple[Tensor, Tensor]],
     device: str,
 ) -> tuple[Tensor, Tensor]:
-    """Return an image of a Gaussian and a gradient of its mean, on the CPU.
+    """Return an image of one Gaussian and a gradient with respect to its mean, on the CPU.
 
-    Nothing in it is symmetric, so that shifted pixels, exchanged axes and another order of the
-    harmonics or the quaternion all show.
+    Nothing in the scene is symmetric, so shifted pixels, swapped axes and a different order of SH
+    coefficients or quaternion components all show up.
     """
     scene = GaussianScene(
         means=torch.tensor([[0.05, -0.02, 1.0]]),
@@ -200,5 +200,5 @@ def _rasterize_by_torch(
 
 
 def _first_line(error: Exception) -> str:
-    """Shorten the message of a failed build, which may hold the compiler's whole output."""
+    """Return the first line of a message, which may hold a compiler's whole output."""
     return next(iter(str(error).splitlines()), "no reason given")

@@ -1,7 +1,7 @@
-"""List the splats of each tile and composite them, forward and backward, in compiled loops.
+"""Compiled loops that list the splats of each tile and composite them, forward and backward.
 
-The lists are those of ``torch_backend``; compositing goes splat by splat over the pixels that
-each reaches, and its gradient goes front to back like compositing itself.
+The lists are those of ``torch_backend``. Compositing visits the pixels that each splat reaches,
+splat by splat; its gradient also runs front to back.
 """
 
 import math
@@ -15,12 +15,12 @@ from cvtgs.rendering.projection import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 SLACK = 1e-3
 LOG_MIN_ALPHA = math.log(MIN_ALPHA)
 STRIDE = 1009
-"""Neighbouring tiles cost alike; strides by this prime give every thread some of each kind."""
+"""Prime step between tiles. Neighbouring tiles cost alike, so this balances the threads."""
 
 
 @serial
 def pixel_range(low: float, high: float, count: int) -> tuple[int, int]:
-    """Return the first and the last of ``count`` pixels whose centres lie in an interval."""
+    """Return the first and last of ``count`` pixels whose centres lie in an interval."""
     slack = SLACK + 1e-6 * (high - low)
     first = math.ceil(min(max(low - 0.5 - slack, 0.0), float(count)))
     last = math.floor(min(max(high - 0.5 + slack, -1.0), count - 1.0))
@@ -31,7 +31,7 @@ def pixel_range(low: float, high: float, count: int) -> tuple[int, int]:
 def strip(
     splat: Array, reach: float, size: tuple[int, int], rows: tuple[int, int]
 ) -> tuple[int, int]:
-    """Return the first and the last pixel column that a splat reaches within some pixel rows."""
+    """Return the first and last pixel column that a splat reaches within a range of rows."""
     x, y = float(splat[0]), float(splat[1])
     steep, shear, flat = -2.0 * splat[2], float(splat[3]), -2.0 * splat[4]
     upper, lower = rows[0] + 0.5 - y, rows[1] + 0.5 - y
@@ -46,7 +46,7 @@ def strip(
 
 @serial
 def tiles_of(splat: Array, size: tuple[int, int], side: int, out: Ints, start: int) -> int:
-    """Count the tiles of a splat; write their numbers too, unless ``start`` is negative."""
+    """Count the tiles of a splat; also write their indices unless ``start`` is negative."""
     reach = max(0.0, 2.0 * (splat[5] - LOG_MIN_ALPHA))
     half = math.sqrt(reach / (-2.0 * splat[4]))
     top, bottom = pixel_range(splat[1] - half, splat[1] + half, size[1])
@@ -68,7 +68,7 @@ def tiles_of(splat: Array, size: tuple[int, int], side: int, out: Ints, start: i
 
 @parallel
 def count_tiles(packed: Array, size: tuple[int, int], side: int, counts: Ints) -> None:
-    """Write how many tiles each splat touches."""
+    """Write the number of tiles that each splat touches."""
     for i in prange(len(packed)):
         counts[i] = tiles_of(packed[i], size, side, counts, -1)
 
@@ -77,14 +77,14 @@ def count_tiles(packed: Array, size: tuple[int, int], side: int, counts: Ints) -
 def write_tiles(
     packed: Array, size: tuple[int, int], side: int, starts: Ints, tile_ids: Ints
 ) -> None:
-    """Write the tiles that each splat touches."""
+    """Write the indices of the tiles that each splat touches."""
     for i in prange(len(packed)):
         tiles_of(packed[i], size, side, tile_ids, starts[i])
 
 
 @serial
 def sort_by_tile(tile_ids: Ints, splat_starts: Ints, tile_starts: Ints, lists: Ints) -> None:
-    """Write the lists of the tiles by counting: place of the intersection, and its splat."""
+    """Write the tiles' lists by counting sort: index in splat order, and splat."""
     for tile_id in tile_ids:
         tile_starts[tile_id + 1] += 1
     for tile in range(len(tile_starts) - 1):
@@ -100,7 +100,7 @@ def sort_by_tile(tile_ids: Ints, splat_starts: Ints, tile_starts: Ints, lists: I
 
 @serial
 def span(low: float, high: float, begin: int, end: int) -> tuple[int, int]:
-    """Return the range of pixels from ``begin`` to ``end`` whose centres lie in an interval."""
+    """Return the half-open range of pixels in [begin, end) whose centres lie in an interval."""
     first = math.ceil(max(low - 0.5 - SLACK, float(begin)))
     last = math.floor(min(high - 0.5 + SLACK, end - 1.0))
     return int(first), int(last) + 1
@@ -108,14 +108,14 @@ def span(low: float, high: float, begin: int, end: int) -> tuple[int, int]:
 
 @serial
 def tile_at(step: int, count: int) -> int:
-    """Return the tile of a step; all tiles come up once."""
-    number = np.int64(step)  # numba's parallel loops count in uint64, which % turns into floats
+    """Return the tile of a step; each tile occurs once."""
+    number = np.int64(step)  # numba counts parallel loops in uint64, which % turns into floats
     return int(number * STRIDE % count if count % STRIDE else number)
 
 
 @serial
 def box_of(tile: int, side: int, size: tuple[int, int]) -> PixelBox:
-    """Return the pixels of a tile."""
+    """Return the pixels of a tile, cropped to the image."""
     across = (size[0] + side - 1) // side
     x, y = tile % across * side, tile // across * side
     return x, min(x + side, size[0]), y, min(y + side, size[1])
@@ -125,10 +125,10 @@ def box_of(tile: int, side: int, size: tuple[int, int]) -> PixelBox:
 def composite_all(
     packed: Array, tiles: TileArrays, centers: Array, image: Array, weights: Array
 ) -> None:
-    """Write red, green, blue and depth, times what they hide, and transmittance of each pixel.
+    """Write weighted sums of red, green, blue and depth, and the transmittance, of each pixel.
 
-    Where ``weights`` is not empty, it gets the sum of ``alpha * T`` over the pixels of every
-    intersection of a splat and a tile, by its place.
+    If ``weights`` is not empty, also write the sum of ``alpha * T`` over the pixels of every
+    intersection of a splat and a tile, in splat order.
     """
     starts, lists, side = tiles
     height, width = image.shape[:2]
@@ -162,7 +162,7 @@ def blend(
     layers: Array,
     is_open: NDArray[np.bool_],
 ) -> tuple[int, float]:
-    """Blend one splat into a tile; return how many pixels it finished, and its summed weight."""
+    """Blend one splat into a tile; return the number of pixels finished, and its summed weight."""
     finished, total = 0, 0.0
     x0, x1, y0, y1 = box
     one, least = centers.dtype.type(1), centers.dtype.type(MIN_TRANSMITTANCE)
@@ -206,7 +206,7 @@ def composite_all_gradient(
     grad: Array,
     per_intersection: Array,
 ) -> None:
-    """Write the gradient with respect to the packed splat of every intersection."""
+    """Write the gradient by the packed splat of every intersection, in splat order."""
     starts, lists, side = tiles
     height, width = image.shape[:2]
     for step in prange(len(starts) - 1):
@@ -237,10 +237,10 @@ def blend_gradient(
     state: tuple[Array, Array],
     out: Array,
 ) -> int:
-    """Write the gradient of one splat in a tile; return how many pixels it finished.
+    """Write the gradient of one splat in a tile; return the number of pixels it finished.
 
-    ``state`` is the transmittance of each pixel in front of this splat, 0 where it is finished, and
-    the gradient times everything that lies behind the splat. ``out`` is 0 before.
+    ``state`` holds for each pixel the transmittance in front of this splat (0 where finished), and
+    the gradient times all light from this splat and behind it. ``out`` must be 0 on entry.
     """
     finished = 0
     transmittance, behind = state
@@ -280,7 +280,7 @@ def blend_row_gradient(
     row: tuple[Array, Array, Array],
     out: Array,
 ) -> tuple[int, float, float, float]:
-    """Add the gradients by colour and depth; return pixels finished, and the exponent's moments."""
+    """Add gradients by colour and depth; return pixels finished and moments for the exponent."""
     finished = 0
     one, zero = ways.dtype.type(1), ways.dtype.type(0)
     least, most = ways.dtype.type(MIN_TRANSMITTANCE), ways.dtype.type(MAX_ALPHA)

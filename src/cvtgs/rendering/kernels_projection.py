@@ -1,4 +1,4 @@
-"""Project Gaussians, forward and backward, in compiled loops: ``projection.py`` in float64."""
+"""Compiled loops that project Gaussians, forward and backward: ``projection.py`` in float64."""
 
 import math
 
@@ -64,7 +64,7 @@ def rest_basis_at(x: float, y: float, z: float, degree: int, out: Array) -> None
 
 @serial
 def axes_of(rotation: Array, log_scales: Array, camera: Array, local: Array, out: Array) -> None:
-    """Write the own axes of a Gaussian in the camera (rows 0 to 2) and in the image (3, 4)."""
+    """Write a Gaussian's unit axes in camera space (rows 0 to 2) and its image axes (3, 4)."""
     x_slope = min(max(local[0] / local[2], camera[6, 0]), camera[6, 1])
     y_slope = min(max(local[1] / local[2], camera[7, 0]), camera[7, 1])
     for k in range(3):
@@ -81,7 +81,7 @@ def axes_of(rotation: Array, log_scales: Array, camera: Array, local: Array, out
 
 @serial
 def covariance_of(axes: Array, dilation: float) -> tuple[float, float, float, float]:
-    """Return a, b, d of the dilated covariance ``(a b; b d)``, and the bare determinant over d."""
+    """Return a, b, d of the dilated covariance ``(a b; b d)``, and the undilated determinant/d."""
     a, b, d = dilation, 0.0, dilation
     for k in range(3):
         a += axes[3, k] * axes[3, k]
@@ -118,7 +118,7 @@ def color_of(
 
 @serial
 def local_of(mean: Array, camera: Array, offset: Array, local: Array) -> None:
-    """Write the way from the camera to a point, along the world's and the camera's axes."""
+    """Write the offset of a point from the camera, in world axes and in camera axes."""
     for k in range(3):
         offset[k] = mean[k] - camera[3, k]
     for j in range(3):
@@ -127,7 +127,7 @@ def local_of(mean: Array, camera: Array, offset: Array, local: Array) -> None:
 
 @serial
 def normalize_in_place(vector: Array) -> float:
-    """Scale a vector to unit length; return its length before."""
+    """Scale a vector to unit length in place; return its original length."""
     norm = math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
     for k in range(3):
         vector[k] /= norm
@@ -136,13 +136,13 @@ def normalize_in_place(vector: Array) -> float:
 
 @serial
 def sigmoid(logit: float) -> float:
-    """Activate a logit within the limits of ``math.parameters``."""
+    """Return the opacity of a logit, clamped to the limits of ``math.parameters``."""
     return 1 / (1 + math.exp(-min(max(logit, -LOGIT_LIMIT), LOGIT_LIMIT)))
 
 
 @serial
 def splat_of(axes: Array, local: Array, camera: Array, opacity: float, out: Array) -> bool:
-    """Write all of a packed splat but its colour; return whether it touches the image."""
+    """Write a packed splat except its colour; return whether it touches the image."""
     dilation = camera[8, 2]
     a, b, d, bare = covariance_of(axes, dilation)
     schur = bare + dilation * (a + d - dilation) / d
@@ -164,7 +164,7 @@ def splat_of(axes: Array, local: Array, camera: Array, opacity: float, out: Arra
 def project_all(
     gaussians: GaussianArrays, settings: RasterSettings, packed: Array, visible: NDArray[np.bool_]
 ) -> None:
-    """Write a packed splat for every Gaussian, and which of them are in view."""
+    """Write the packed splat of every Gaussian, and whether it is in view."""
     means, quats, log_scales, logits, sh0, rest = gaussians
     camera, _, degree, antialiased = settings
     for i in prange(len(means)):
@@ -225,7 +225,7 @@ def color_gradient(
     out: tuple[Array, Array],
     toward: Array,
 ) -> None:
-    """Write the gradient by the coefficients, and add that by the way from the camera."""
+    """Write the gradient by the SH coefficients; add that by the offset from the camera."""
     direction, basis, slopes = offset.copy(), np.empty(15), np.empty((15, 3))
     color, kept = np.empty(3), np.empty(3)
     norm = normalize_in_place(direction)
@@ -272,7 +272,7 @@ def covariance_gradient(
 
 @serial
 def quaternion_gradient(quat: Array, length: float, of_rotation: Array, out: Array) -> None:
-    """Write the gradient by a quaternion of any length from that by its rotation matrix."""
+    """Convert the gradient by a rotation matrix to that by its quaternion of any length."""
     w, x, y, z = quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length
     g = of_rotation
     of_w = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
@@ -301,7 +301,7 @@ def axes_gradient(
     place: tuple[Array, Array],
     out: tuple[Array, Array, Array],
 ) -> None:
-    """Write the gradient by axes in the camera and log scales; add that by the position there."""
+    """Write the gradients by camera-space axes and log scales; add that by the local position."""
     of_a, of_b, of_d = covariance
     camera, local = place
     of_axes, of_log_scales, of_local = out
@@ -335,7 +335,7 @@ def axes_gradient(
 def rotate_back(
     camera: Array, of_axes: Array, of_local: Array, of_rotation: Array, of_offset: Array
 ) -> None:
-    """Write gradients by rotation and position along the world's axes."""
+    """Convert gradients by rotation and position from camera to world axes."""
     for j in range(3):
         of_offset[j] = 0
         for k in range(3):
@@ -355,7 +355,7 @@ def project_all_gradient(
     per_intersection: Array,
     gradients: GaussianArrays,
 ) -> None:
-    """Sum the gradients of each splat's intersections and write those by the scene's tensors."""
+    """Sum the gradients of each splat's intersections; write those by the scene's tensors."""
     means, quats, log_scales, logits, sh0, rest = gaussians
     of_means, of_quats, of_log_scales, of_logits, of_sh0, of_rest = gradients
     camera, _, degree, antialiased = settings

@@ -1,4 +1,4 @@
-"""The blending weights of an image, kept by tile and splat in compiled loops: 5 bytes each."""
+"""The blending weights of one image, stored per tile and splat at 5 bytes each, compiled."""
 
 import math
 from typing import NamedTuple
@@ -27,9 +27,9 @@ class WeightArrays(NamedTuple):
     """Weights ``alpha * T`` of the splats of each tile, in the order of the tiles' lists.
 
     Attributes:
-        starts: ``(p + 1,)`` where each intersection's weights start.
-        counts: ``(p,)`` how many each has.
-        pixels: Pixel of each weight within its tile.
+        starts: ``(p + 1,)`` start of each intersection's weights.
+        counts: ``(p,)`` number of weights of each intersection.
+        pixels: Index of the weight's pixel within its tile.
         values: The weights.
     """
 
@@ -41,14 +41,14 @@ class WeightArrays(NamedTuple):
 
 @serial
 def rows_of(splat: Array, box: PixelBox) -> tuple[int, int]:
-    """Return the pixel rows of a tile that a splat reaches."""
+    """Return the range of pixel rows of a tile that a splat reaches."""
     half = math.sqrt(max(0.0, (LOG_MIN_ALPHA - splat[5]) / splat[4]))
     return span(splat[1] - half, splat[1] + half, box[2], box[3])
 
 
 @serial
 def columns_of(splat: Array, box: PixelBox, down: float) -> tuple[int, int, float, float]:
-    """Return the pixel columns that a splat reaches in a row, where it is, and its exponent."""
+    """Return the columns that a splat reaches in a row, and the x and log alpha of its peak."""
     middle = splat[0] - splat[3] * down
     exponent = splat[5] + splat[4] * down * down
     half = math.sqrt(max(0.0, (LOG_MIN_ALPHA - exponent) / splat[2]))
@@ -60,7 +60,7 @@ def columns_of(splat: Array, box: PixelBox, down: float) -> tuple[int, int, floa
 def count_pixels(
     packed: Array, tiles: TileArrays, size: tuple[int, int], centers: Array, counts: Ints
 ) -> None:
-    """Write how many pixels of its tile each intersection reaches at most."""
+    """Write an upper bound of the number of pixels that each intersection reaches."""
     starts, lists, side = tiles
     for step in prange(len(starts) - 1):
         tile = tile_at(step, len(starts) - 1)
@@ -83,7 +83,7 @@ def write_weights(
     centers: Array,
     weights: WeightArrays,
 ) -> None:
-    """Blend without colours, and write the weight of every splat in every pixel."""
+    """Blend without colours; write the weight of every splat in every pixel."""
     starts, lists, side = tiles
     begins, counts, pixels, values = weights
     for step in prange(len(starts) - 1):
@@ -116,9 +116,9 @@ def blend_weights(
     out: tuple[NDArray[np.uint8], NDArray[np.float32]],
     side: int,
 ) -> tuple[int, int]:
-    """Blend one splat into a tile; return how many weights there are, and pixels it finished.
+    """Blend one splat into a tile; return the number of weights and of pixels that it finished.
 
-    ``through`` is the transmittance of each pixel, negative where it is finished.
+    ``through`` is the transmittance of each pixel, negative where the pixel is finished.
     """
     found, finished = 0, 0
     one, least = centers.dtype.type(1), centers.dtype.type(MIN_TRANSMITTANCE)
@@ -150,7 +150,7 @@ def blend_weights(
 
 @parallel
 def sum_powers(tiles: TileArrays, weights: WeightArrays, sums: Array) -> None:
-    """Write the sum of the weights and of their squares of every intersection, by its place."""
+    """Write the sums of weights and of squared weights of every intersection, in splat order."""
     starts, lists, _ = tiles
     for tile in prange(len(starts) - 1):
         for entry in range(starts[tile], starts[tile + 1]):
@@ -167,7 +167,7 @@ def sum_powers(tiles: TileArrays, weights: WeightArrays, sums: Array) -> None:
 def paint_tile(
     tiles: TileArrays, tile: int, weights: WeightArrays, colors: Array, canvas: Array
 ) -> None:
-    """Add the colours of the splats of a tile, each times its weight."""
+    """Add the weighted colours of a tile's splats to its canvas."""
     starts, lists, _ = tiles
     for entry in range(starts[tile], starts[tile + 1]):
         splat, begin = lists[entry, 1], weights.starts[entry]
@@ -183,7 +183,7 @@ def paint_tile(
 def collect_tile(
     tiles: TileArrays, tile: int, weights: WeightArrays, canvas: Array, sums: Array
 ) -> None:
-    """Write the sums over a tile of weights times pixels, by place of the intersection."""
+    """Write each intersection's sum of weights times pixels of a tile, in splat order."""
     starts, lists, _ = tiles
     for entry in range(starts[tile], starts[tile + 1]):
         place, begin = lists[entry, 0], weights.starts[entry]
@@ -198,7 +198,7 @@ def collect_tile(
 
 @parallel
 def paint_all(tiles: TileArrays, weights: WeightArrays, colors: Array, image: Array) -> None:
-    """Write the image of some colours."""
+    """Write the image for these colours of the splats."""
     side = tiles.side
     height, width = image.shape[:2]
     for tile in prange(len(tiles.starts) - 1):
@@ -213,7 +213,7 @@ def paint_all(tiles: TileArrays, weights: WeightArrays, colors: Array, image: Ar
 
 @parallel
 def collect_all(tiles: TileArrays, weights: WeightArrays, image: Array, sums: Array) -> None:
-    """Write the sums of weights times pixels of every intersection."""
+    """Write each intersection's sum of weights times pixels, in splat order."""
     side = tiles.side
     height, width = image.shape[:2]
     for tile in prange(len(tiles.starts) - 1):
@@ -228,7 +228,7 @@ def collect_all(tiles: TileArrays, weights: WeightArrays, image: Array, sums: Ar
 
 @parallel
 def normal_all(tiles: TileArrays, weights: WeightArrays, colors: Array, sums: Array) -> None:
-    """Paint colours and collect the image at once, tile by tile."""
+    """Paint colours and collect the image tile by tile, in one pass."""
     for tile in prange(len(tiles.starts) - 1):
         canvas = np.zeros((tiles.side * tiles.side, 3), np.float32)
         paint_tile(tiles, tile, weights, colors, canvas)
@@ -237,7 +237,7 @@ def normal_all(tiles: TileArrays, weights: WeightArrays, colors: Array, sums: Ar
 
 @parallel
 def sum_places(starts: Ints, rows: Ints, per_place: Array, out: Array) -> None:
-    """Write the sum over the intersections of every splat to the row of its Gaussian."""
+    """Sum over the intersections of each splat; write the sum to the row of its Gaussian."""
     for splat in prange(len(rows)):
         for column in range(per_place.shape[1]):
             total = 0.0
@@ -249,7 +249,7 @@ def sum_places(starts: Ints, rows: Ints, per_place: Array, out: Array) -> None:
 class TileWeights:
     """The blending weights of one image; see :class:`cvtgs.rendering.BlendingWeights`.
 
-    Memory: 5 bytes per splat and pixel that it reaches, and 20 per intersection of splat and tile.
+    Memory: 5 bytes per pair of splat and reached pixel, and 20 per intersection of splat and tile.
     """
 
     def __init__(
@@ -274,26 +274,26 @@ class TileWeights:
         write_weights(packed, tiles, size, centers, self._weights)
 
     def paint(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-        """Return the image that Gaussians of these colours make."""
+        """Return the image for these colours of the Gaussians."""
         image = np.empty((self._size[1], self._size[0], 3), np.float32)
         paint_all(self._tiles, self._weights, self._of_splats(colors), image)
         return torch.from_numpy(image).to(colors.dtype)
 
     def collect(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
-        """Return for every Gaussian the sum of the pixels times its weights."""
+        """Return, for every Gaussian, the sum of the pixels times its weights."""
         sums = np.empty((len(self._tiles.lists), 3), np.float32)
         pixels = image.detach().contiguous().numpy().astype(np.float32, copy=False)
         collect_all(self._tiles, self._weights, pixels, sums)
         return self._of_gaussians(sums).to(image.dtype)
 
     def normal(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Return what is collected from the image that is painted."""
+        """Return ``collect(paint(colors))``."""
         sums = np.empty((len(self._tiles.lists), 3), np.float32)
         normal_all(self._tiles, self._weights, self._of_splats(colors), sums)
         return self._of_gaussians(sums).to(colors.dtype)
 
     def powers(self) -> Float[Tensor, "n 2"]:
-        """Return the sums of every Gaussian's weights and of their squares."""
+        """Return, for every Gaussian, the sum of its weights and of their squares."""
         sums = np.empty((len(self._tiles.lists), 2), np.float32)
         sum_powers(self._tiles, self._weights, sums)
         return self._of_gaussians(sums)

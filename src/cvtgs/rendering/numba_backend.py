@@ -38,7 +38,7 @@ SIDE = 16
 
 
 def require(device: torch.device) -> None:
-    """Check that this backend can work on a device."""
+    """Raise unless the device is a CPU."""
     if device.type != "cpu":
         raise DeviceError(
             f"backend 'numba' works on the CPU only, found a scene on {device}; "
@@ -55,10 +55,10 @@ def rasterize(
 ) -> RasterOutput:
     """Render with compiled loops, on as many threads as torch uses.
 
-    The first call compiles for some five seconds per dtype, and as long again in the first
-    backward pass; the code is kept on disk, and a later process loads it in half a second. No
-    result depends on the number of threads. OpenMP's idle threads spin for a while after each
-    loop; ``OMP_WAIT_POLICY=PASSIVE``, set before Python starts, saves that processor time.
+    For each dtype the first call compiles for about five seconds, and the first backward pass for
+    as long again. The code is cached on disk, from where a later process loads it in half a second.
+    Results do not depend on the number of threads. Idle OpenMP threads spin for a while after each
+    loop; setting ``OMP_WAIT_POLICY=PASSIVE`` before Python starts saves that CPU time.
 
     Memory: ``11 n`` numbers for n Gaussians, ``12 p`` bytes for p intersections of splats and
     tiles, and the image. The backward pass needs ``10 p`` numbers at a time.
@@ -74,14 +74,14 @@ def rasterize(
 
 
 def contributions(scene: GaussianScene, camera: Cameras) -> Float[Tensor, "n"]:
-    """Return every Gaussian's sum of weights ``alpha * T`` over one image, by one forward pass."""
+    """Return the sum of each Gaussian's weights ``alpha * T`` over one image, in a forward pass."""
     return observe(scene, camera, sh_degree=0)[1]
 
 
 def observe(
     scene: GaussianScene, camera: Cameras, *, sh_degree: int
 ) -> tuple[RasterOutput, Float[Tensor, "n"]]:
-    """Render one image, and return every Gaussian's sum of weights over it, in the same pass."""
+    """Render one image and sum each Gaussian's weights over it in the same pass."""
     (pinhole,) = to_pinholes(camera)
     settings = _settings(pinhole, sh_degree, scene.antialiased)
     splats, tiles = _splats_by_tile(_arrays(scene), settings)
@@ -112,7 +112,7 @@ def _arrays(scene: GaussianScene) -> GaussianArrays:
 
 
 class _Render(torch.autograd.Function):
-    """One image. The backward pass uses the lists of the forward pass, and blends once more."""
+    """Render one image; the backward pass reuses the tile lists and blends again."""
 
     @staticmethod
     def forward(ctx: Any, settings: RasterSettings, *tensors: Tensor) -> Float[Tensor, "h w 5"]:
@@ -144,7 +144,7 @@ class _Render(torch.autograd.Function):
 def _splats_by_tile(
     gaussians: GaussianArrays, settings: RasterSettings
 ) -> tuple[SplatArrays, TileArrays]:
-    """Project, sort by depth and list the tiles."""
+    """Project Gaussians, sort them by depth and list the splats of each tile."""
     count = len(gaussians.means)
     packed, visible = np.empty((count, 10), gaussians.means.dtype), np.empty(count, np.bool_)
     project_all(gaussians, settings, packed, visible)

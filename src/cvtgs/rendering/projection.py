@@ -13,38 +13,38 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.scene import GaussianScene
 
-# The numbers of the rasterizer of 3DGS (Kerbl et al. 2023, section 6 and their renderer).
+# Constants of the 3DGS rasterizer (Kerbl et al. 2023, section 6 and their renderer).
 
 NEAR_PLANE = 0.01
-"""Gaussians whose centre is nearer to the camera's plane are not rendered; scene units."""
+"""Gaussians whose centre is at a smaller depth are not rendered; scene units."""
 
 DILATION = 0.3
-"""Variance that every projected Gaussian gains, squared pixels."""
+"""Variance added to every projected Gaussian, squared pixels."""
 
 FRUSTUM_MARGIN = 0.3
-"""The Jacobian is taken no farther outside the image than this share of half its size."""
+"""Slopes in the Jacobian are clamped to the image plus this share of half its size."""
 
 MAX_ALPHA = 0.99
-"""No single Gaussian hides more than this."""
+"""Largest alpha of one Gaussian in a pixel."""
 
 MIN_ALPHA = 1 / 255
-"""What would hide less than this is skipped."""
+"""Gaussians of lower alpha in a pixel are skipped there."""
 
 MIN_TRANSMITTANCE = 1e-4
-"""A pixel is finished before the Gaussian that would let less light than this through."""
+"""A pixel is finished before the Gaussian that would lower its transmittance below this."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pinhole:
-    """A pinhole camera as plain numbers, so that projection is arithmetic only.
+    """A pinhole camera as plain Python numbers.
 
     Attributes:
-        rotation: Rows of the linear part of the view matrix.
-        center: Position of the camera in the world.
+        rotation: Rows of the 3 x 3 linear part of the view matrix.
+        center: Position of the camera in world space.
         focal: Focal lengths along x and y, pixels.
         principal: Principal point, pixels.
         size: Width and height, pixels.
-        dilation: Variance that every projected Gaussian gains, squared pixels.
+        dilation: Variance added to every projected Gaussian, squared pixels.
     """
 
     rotation: tuple[tuple[float, float, float], ...]
@@ -56,10 +56,10 @@ class Pinhole:
 
     @property
     def slopes(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Bounds of x/z and of y/z, within which the Jacobian of the projection is taken.
+        """Bounds to which x/z and y/z are clamped in the Jacobian of the projection.
 
-        With the principal point in the middle they are 1.3 times the tangent of half the field of
-        view, as in 3DGS; elsewhere they move with the edges of the image, as in gsplat.
+        With a centred principal point they are 1.3 times the tangent of half the field of view, as
+        in 3DGS; otherwise they move with the edges of the image, as in gsplat.
         """
         (x_low, x_high), (y_low, y_high) = (
             (
@@ -72,7 +72,7 @@ class Pinhole:
 
 
 class CameraTensors(NamedTuple):
-    """Numbers of a camera beside the Gaussians that it sees; bounds are those of ``slopes``."""
+    """A pinhole camera as tensors on the scene's device; the bounds are those of ``slopes``."""
 
     rotation: Float[Tensor, "3 3"]
     center: Float[Tensor, "3"]
@@ -83,7 +83,7 @@ class CameraTensors(NamedTuple):
 
     @classmethod
     def of(cls, camera: Pinhole, like: Tensor) -> "CameraTensors":
-        """Return the numbers in the dtype of a tensor, the centre in float64; one copy for all."""
+        """Convert a camera to the device and dtype of a tensor (centre: float64), in one copy."""
         low, high = zip(*camera.slopes, strict=True)
         numbers = *camera.center, *chain(*camera.rotation), *camera.focal, *camera.principal
         table = torch.tensor([*numbers, *low, *high], dtype=torch.float64, device=like.device)
@@ -92,7 +92,7 @@ class CameraTensors(NamedTuple):
 
 
 def to_pinholes(cameras: Cameras) -> list[Pinhole]:
-    """Return plain numbers of each camera, after checks."""
+    """Check cameras and convert them to plain numbers."""
     both = cameras.viewmats.flatten(1).double(), cameras.Ks.flatten(1).double()
     table = torch.cat(both, dim=1).detach().cpu()
     viewmats, Ks = table[:, :16].view(-1, 4, 4), table[:, 16:].view(-1, 3, 3)  # noqa: N806 (as gsplat)
@@ -130,16 +130,16 @@ def _check(viewmats: Tensor, Ks: Tensor) -> None:  # noqa: N803 (the name that g
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Splats:
-    """Gaussians as they lie in one image, front to back.
+    """Gaussians projected to one image, front to back.
 
-    With ``(u, v)`` the way from the centre to a pixel, the squared distance in standard deviations
-    is ``steep (u + shear v)^2 + flat v^2``. That is the conic of 3DGS, ``A u^2 + 2 B u v + C v^2``,
-    as ``L D L^T``: it is never negative and keeps its digits for needles of any length.
+    With ``(u, v)`` the offset of a pixel from the centre, the squared Mahalanobis distance is
+    ``steep (u + shear v)^2 + flat v^2``. This is the conic of 3DGS, ``A u^2 + 2 B u v + C v^2``,
+    as ``L D L^T``: it is never negative and stays accurate for needles of any length.
 
     Attributes:
-        rows: ``(m,)`` which Gaussian of the scene each is.
+        rows: ``(m,)`` row of the Gaussian in the scene.
         centers: ``(m, 2)`` pixels.
-        ellipses: ``(m, 3)`` steep, shear, flat; per squared pixel, one, per squared pixel.
+        ellipses: ``(m, 3)`` steep and flat (1 / squared pixels), shear (no unit) between them.
         opacities: ``(m,)`` at the centre, above 1/255.
         colors: ``(m, 3)`` red, green, blue, at least 0.
         depths: ``(m,)`` along the view axis, scene units, ascending.
@@ -154,14 +154,14 @@ class Splats:
 
 
 def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
-    """Project a scene: EWA splatting (Zwicker et al. 2001) by the rules of 3DGS.
+    """Project a scene by EWA splatting (Zwicker et al. 2001) with the rules of 3DGS.
 
-    The covariance is ``M M^T + 0.3 I`` with ``M = J W R S``; its determinant comes from the minors
-    of ``M`` (Cauchy-Binet), which needs no difference of large numbers. Gaussians behind the near
-    plane, outside the image, too faint, or with values that are not finite, are left out.
+    The covariance is ``M M^T + 0.3 I`` with ``M = J W R S``. Its determinant comes from the minors
+    of ``M`` (Cauchy-Binet), which avoids subtracting large numbers. Gaussians behind the near
+    plane, outside the image, too faint, or with non-finite values are left out.
 
-    Memory with gradients: about ``(150 + 6 k) n`` numbers for n Gaussians in view with k rest
-    coefficients.
+    Memory with gradients: about ``(150 + 6 k) n`` numbers for n Gaussians in view with k SH
+    coefficients beyond degree 0.
     """
     beside = CameraTensors.of(camera, scene.means)
     rows = _candidates(scene, camera, beside)
@@ -186,7 +186,7 @@ def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
 
 
 def pack(splats: Splats) -> Float[Tensor, "m 10"]:
-    """Return what compositing needs of each splat, side by side."""
+    """Return x, y, -steep/2, shear, -flat/2, log opacity, red, green, blue, depth of each splat."""
     steep, shear, flat = splats.ellipses.unbind(1)
     columns = [-0.5 * steep, shear, -0.5 * flat, parameters.positive_log(splats.opacities)]
     exponents = torch.stack(columns, dim=1)
@@ -195,7 +195,7 @@ def pack(splats: Splats) -> Float[Tensor, "m 10"]:
 
 @torch.no_grad()
 def reach_of(opacities: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
-    """Return how far Gaussians reach: the squared distance at which alpha falls to 1/255."""
+    """Return the squared Mahalanobis distance at which alpha falls to 1/255."""
     return (2 * parameters.positive_log(opacities / MIN_ALPHA)).clamp_min(0)
 
 
@@ -203,28 +203,28 @@ def reach_of(opacities: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
 def half_sizes(
     ellipses: Float[Tensor, "m 3"], reach: Float[Tensor, "m"]
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
-    """Return half the width and height of the boxes around ellipses."""
+    """Return half the width and half the height of the bounding boxes of ellipses, pixels."""
     steep, shear, flat = ellipses.unbind(1)
     return (reach / steep + reach * shear * shear / flat).sqrt(), (reach / flat).sqrt()
 
 
 def _offsets(means: Float[Tensor, "n 3"], beside: CameraTensors) -> Float[Tensor, "n 3"]:
-    """Return ways from the camera; far from the origin float32 holds them, but not the camera."""
+    """Return offsets from the camera, whose position float32 cannot hold far from the origin."""
     return (means.double() - beside.center).to(means.dtype)
 
 
 @torch.no_grad()
 def _candidates(scene: GaussianScene, camera: Pinhole, beside: CameraTensors) -> Tensor:
-    """Return the rows whose bounding ball touches the image, without faint and invalid ones."""
+    """Return the rows whose bounding sphere touches the image, except faint and invalid ones."""
     rotation = beside.rotation
     x, y, z = (_offsets(scene.means, beside) @ rotation.T).unbind(1)
     steepest = sum(max(abs(low), abs(high)) ** 2 for low, high in camera.slopes)
     stretch = rotation.norm() * max(camera.focal) * (1 + steepest) ** 0.5 / z
     deviation = stretch * scene.log_scales.amax(dim=1).exp()
-    # 3.33 standard deviations is where even an opacity of 1 falls to 1/255.
+    # At 3.33 standard deviations even an opacity of 1 falls to 1/255.
     radius = 3.34 * deviation + 3.34 * camera.dilation**0.5
     quats = scene.quats.abs().amax(dim=1)
-    # The squares of larger ones would overflow.
+    # Squares of larger deviations would overflow.
     keep: Tensor = deviation < torch.finfo(scene.dtype).max ** 0.5 / 4
     keep &= (z >= NEAR_PLANE) & torch.isfinite(z) & torch.isfinite(quats) & (quats > 0)
     for way, focal, principal, size in zip(
@@ -239,7 +239,7 @@ def _candidates(scene: GaussianScene, camera: Pinhole, beside: CameraTensors) ->
 def _image_axes(
     scene: GaussianScene, rows: Tensor, local: Tensor, beside: CameraTensors
 ) -> Float[Tensor, "m 2 3"]:
-    """Return ``M = J W R S``: the own axes of each Gaussian, to first order in the image."""
+    """Return ``M = J W R S``: the axes of each Gaussian projected to first order."""
     quats = parameters.normalize_quats(scene.quats.index_select(0, rows))
     turned = beside.rotation @ parameters.quats_to_matrices(quats)
     slopes = torch.minimum(torch.maximum(local[:, :2] / local[:, 2:], beside.low), beside.high)
@@ -249,10 +249,10 @@ def _image_axes(
 
 
 def _ellipses(axes: Float[Tensor, "m 2 3"], dilation: float) -> tuple[Tensor, Tensor]:
-    """Return ellipses, and what share of its opacity an antialiased Gaussian keeps.
+    """Return the ellipses, and the share of its opacity that an antialiased Gaussian keeps.
 
-    With the covariance ``(a b; b d)``: steep is ``d / det``, shear ``-b / d``, flat ``1 / d``.
-    Dividing one row of ``M`` by ``sqrt(d)`` first keeps the determinant within float32.
+    For a covariance ``(a b; b d)``, steep is ``d / det``, shear ``-b / d`` and flat ``1 / d``.
+    Dividing one row of ``M`` by ``sqrt(d)`` first keeps the determinant within float32 range.
     """
     across, down = axes.unbind(1)
     bare_a = (across * across).sum(dim=1)
@@ -269,7 +269,7 @@ def _ellipses(axes: Float[Tensor, "m 2 3"], dilation: float) -> tuple[Tensor, Te
 def _front_to_back(
     centers: Tensor, ellipses: Tensor, opacities: Tensor, depths: Tensor, camera: Pinhole
 ) -> Tensor:
-    """Order what touches the image by depth."""
+    """Return the indices of the splats that touch the image, sorted by depth."""
     keep = (opacities >= MIN_ALPHA) & torch.isfinite(ellipses).all(dim=1)
     halves = half_sizes(ellipses, reach_of(opacities))
     for place, half, size in zip(centers.unbind(1), halves, camera.size, strict=True):

@@ -1,4 +1,4 @@
-"""Images of a scene, differentiable in all its tensors, and what each Gaussian adds to them."""
+"""Differentiable rendering of scenes, and the contribution of each Gaussian to the images."""
 
 from dataclasses import dataclass
 
@@ -21,10 +21,10 @@ class Rendering:
     Attributes:
         rgb: ``(c, h, w, 3)`` red, green, blue over the background; at least 0, and above 1 where
             the scene's colours are.
-        alpha: ``(c, h, w)`` what the Gaussians hide of the background, 0 to 1.
-        depth: ``(c, h, w)`` mean depth of what is seen along the view axis, scene units, 0 where
-            nothing is; None unless requested.
-        backend: Name of what rendered.
+        alpha: ``(c, h, w)`` share of the background that the Gaussians hide, 0 to 1.
+        depth: ``(c, h, w)`` mean depth along the view axis, weighted by ``alpha * T``, scene
+            units; 0 in empty pixels; None unless requested.
+        backend: Name of the backend that rendered.
     """
 
     rgb: Float[Tensor, "c h w 3"]
@@ -45,26 +45,25 @@ def render(
 ) -> Rendering:
     """Render a scene by the rules of 3DGS (Kerbl et al. 2023).
 
-    EWA projection with a dilation of 0.3 squared pixels, alpha at most 0.99, contributions under
-    1/255 skipped, front to back until the transmittance would fall under 1e-4. Scenes tagged
-    ``SplatRenderMode: mip`` get the opacity compensation of Mip-Splatting (Yu et al. 2024). Where
-    3DGS cuts a Gaussian at three standard deviations, rounded up to tiles, this ends where alpha
-    falls under 1/255, so that no image depends on tiles.
+    EWA projection dilates Gaussians by 0.3 squared pixels. Alpha is at most 0.99, alpha under 1/255
+    is skipped, and blending runs front to back until the transmittance would fall under 1e-4.
+    Scenes tagged ``SplatRenderMode: mip`` get the opacity compensation of Mip-Splatting (Yu et al.
+    2024). 3DGS cuts Gaussians at three standard deviations, rounded up to tiles; here they end
+    where alpha falls under 1/255, so images do not depend on tiles.
 
-    The result is differentiable in means, quats, log scales, opacity logits, sh0, shN and in the
-    background; cameras are constants. Gaussians whose place, shape or opacity is not
-    finite contribute nothing.
+    Images are differentiable with respect to means, quats, log scales, opacity logits, sh0, shN and
+    the background; cameras are constants. Gaussians with a non-finite position, shape or opacity
+    contribute nothing.
 
     Memory: cameras are rendered one by one; each backend's ``rasterize`` states its formula.
 
     Args:
-        scene: The Gaussians, or a file or folder of them; their device and dtype are those of the
-            images.
-        cameras: From where to look, any dtype and device.
+        scene: The Gaussians, or a file or folder of them. Images get the scene's device and dtype.
+        cameras: The cameras, any dtype and device.
         backend: ``torch``, ``numba`` (CPU), ``gsplat`` (CUDA) or ``auto``, the fastest of them
             that works on the scene's device.
-        background: Colour behind everything, for all cameras or for each; black if None.
-        sh_degree: Degree up to which colours depend on the direction; the scene's if None.
+        background: Background colour, one for all cameras or one for each; black if None.
+        sh_degree: Highest SH degree to evaluate; that of the scene if None.
         depth: Whether to return depths too.
         listener: Called before the first camera and after each.
 
@@ -107,20 +106,20 @@ def render(
 def contributions(
     scene: GaussianScene, cameras: Cameras, *, backend: BackendName = "auto"
 ) -> Float[Tensor, "n"]:
-    """Sum what every Gaussian adds to the pixels of some images: ``alpha * T``.
+    """Sum each Gaussian's blending weights ``alpha * T`` over all pixels of some images.
 
-    ``T`` is the transmittance of what lies in front (Kerbl et al. 2023, equation 3). Colours do
-    not matter. The sums of all Gaussians add up to the alpha of the images.
+    ``T`` is the transmittance in front of the Gaussian (Kerbl et al. 2023, equation 3). Colours do
+    not matter. The contributions of all Gaussians add up to the summed alpha of the images.
 
     Memory: that of rendering one image, with its gradient for backends other than ``numba``.
 
     Args:
         scene: The Gaussians.
-        cameras: From where to look.
-        backend: What renders, as in :func:`cvtgs.rendering.render`.
+        cameras: The cameras.
+        backend: The backend, as in :func:`cvtgs.rendering.render`.
 
     Returns:
-        Pixels, float64: 0 for what no image shows.
+        Contributions in pixels, float64; 0 for Gaussians that no image shows.
 
     Raises:
         InvalidArgumentError: A camera is no pinhole camera, or there is no such backend.
@@ -146,14 +145,14 @@ def contributions(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ObservedViews:
-    """Images of a scene, and what every Gaussian adds to them.
+    """Images of a scene, and the contribution of each Gaussian to them.
 
     Attributes:
-        cameras: From where the images are.
+        cameras: The cameras of the images.
         rgb: ``(c, h, w, 3)`` colours over black.
-        alpha: ``(c, h, w)`` what the Gaussians hide of a background, 0 to 1.
+        alpha: ``(c, h, w)`` share of a background that the Gaussians hide, 0 to 1.
         contributions: ``(n,)`` summed weights ``alpha * T`` over all images, pixels, float64.
-        backend: Name of what rendered.
+        backend: Name of the backend that rendered.
     """
 
     cameras: Cameras
@@ -167,15 +166,15 @@ class ObservedViews:
 def observe(
     scene: GaussianScene, cameras: Cameras, *, backend: BackendName = "auto"
 ) -> ObservedViews:
-    """Render a scene and sum what every Gaussian adds, in one pass where the backend can.
+    """Render a scene and sum each Gaussian's contribution, in one pass where the backend can.
 
     Args:
         scene: The Gaussians.
-        cameras: From where to look, at least one.
-        backend: What renders, as in :func:`cvtgs.rendering.render`.
+        cameras: The cameras, at least one.
+        backend: The backend, as in :func:`cvtgs.rendering.render`.
 
     Returns:
-        What :func:`cvtgs.rendering.render` and :func:`cvtgs.rendering.contributions` return,
+        The results of :func:`cvtgs.rendering.render` and :func:`cvtgs.rendering.contributions`,
         without gradients.
 
     Raises:
@@ -212,12 +211,12 @@ def blending_weights(
 ) -> BlendingWeights:
     """Compute the weights ``alpha * T`` of every Gaussian in every pixel of one image.
 
-    Memory: 5 bytes per Gaussian and pixel that it reaches with backend ``numba``, else 40.
+    Memory: 5 bytes per pair of a Gaussian and a pixel that it reaches with ``numba``, else 40.
 
     Args:
         scene: The Gaussians.
         camera: A single camera.
-        backend: What renders, as in :func:`cvtgs.rendering.render`; torch where gsplat would.
+        backend: The backend, as in :func:`cvtgs.rendering.render`; gsplat falls back to torch.
 
     Returns:
         The weights, as a matrix to multiply with.

@@ -1,4 +1,4 @@
-"""The reference backend: splats listed per tile and composited in torch operations, anywhere."""
+"""The reference backend: tiled compositing in torch operations, on every device."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -30,12 +30,12 @@ from cvtgs.rendering.projection import (
 from cvtgs.scene import GaussianScene
 
 TILE = {"cpu": 8}
-"""Pixels along a tile's edge, by type of device: small tiles waste fewer operations."""
+"""Pixels along a tile's edge, by device type; small tiles waste fewer operations."""
 
 _TILE_ELSEWHERE = 16
 
 CELLS = {"cpu": 1 << 18}
-"""Pairs of splat and pixel in one batch, by type of device: few stay in a CPU's caches."""
+"""Pairs of splat and pixel per batch, by device type; small batches fit a CPU's caches."""
 
 _CELLS_ELSEWHERE = 1 << 23
 
@@ -43,7 +43,7 @@ _DEPTH = 32
 """Splats of each tile in one batch."""
 
 _SLACK = 1e-3
-"""Pixels by which boxes are enlarged, so that rounding leaves nothing out."""
+"""Pixels by which boxes are enlarged, so that rounding omits nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -51,10 +51,10 @@ class TileLists:
     """The splats of each tile, front to back.
 
     Attributes:
-        splats: ``(p,)`` splat of each intersection; by tile, then by depth.
-        starts: ``(t + 1,)`` where each tile's list starts; tiles run along the rows.
-        ranks: ``(p,)`` place of each intersection if they were by splat, then by tile.
-        splat_starts: ``(m + 1,)`` where each splat's intersections start in that other order.
+        splats: ``(p,)`` splat of each intersection; sorted by tile, then by depth.
+        starts: ``(t + 1,)`` start of each tile's list; tiles are in row-major order.
+        ranks: ``(p,)`` index of each intersection in splat order (by splat, then by tile).
+        splat_starts: ``(m + 1,)`` start of each splat's intersections in splat order.
         side: Pixels along a tile's edge.
         across: Tiles per row.
     """
@@ -68,7 +68,7 @@ class TileLists:
 
 
 def require(device: torch.device) -> None:
-    """Check that this backend can work on a device: it can on every one."""
+    """Accept every device."""
 
 
 def rasterize(
@@ -82,7 +82,7 @@ def rasterize(
 
     Memory: for p intersections of splats and tiles, ``60 p`` bytes while they are listed, and
     about ``10 * CELLS`` numbers while a batch is composited.
-    With gradients each camera also keeps what its projection keeps, ``30 p`` bytes and the
+    With gradients each camera also keeps the tensors of its projection, ``30 p`` bytes and the
     image; its backward pass needs ``10 p`` numbers at a time.
     """
     empty = scene.means.new_zeros(0, cameras.height, cameras.width, 5)
@@ -91,14 +91,14 @@ def rasterize(
 
 
 def contributions(scene: GaussianScene, camera: Cameras) -> Tensor:
-    """Return every Gaussian's sum of weights ``alpha * T`` over one image."""
+    """Return the sum of each Gaussian's weights ``alpha * T`` over one image."""
     return contributions_by_gradient(rasterize, scene, camera)
 
 
 def observe(
     scene: GaussianScene, camera: Cameras, *, sh_degree: int
 ) -> tuple[RasterOutput, Tensor]:
-    """Render one image, and return every Gaussian's sum of weights over it."""
+    """Render one image; return it and the sum of each Gaussian's weights over it."""
     return rasterize(scene, camera, sh_degree=sh_degree), contributions(scene, camera)
 
 
@@ -134,7 +134,7 @@ def _render_one(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Float[
 def _assemble(
     tiles: Float[Tensor, "t side side 5"], lists: TileLists, size: tuple[int, int]
 ) -> Float[Tensor, "h w 5"]:
-    """Join tiles to an image, without what lies beyond its edges."""
+    """Join tiles to an image, cropped to its size."""
     down = len(tiles) // lists.across
     grid = tiles.unflatten(0, (down, lists.across)).transpose(1, 2)
     overhanging: Tensor = grid.reshape(down * lists.side, lists.across * lists.side, -1)
@@ -142,10 +142,10 @@ def _assemble(
 
 
 class _Composite(torch.autograd.Function):
-    """Compositing, with a backward pass that goes over the same batches once more.
+    """Compositing, with a backward pass that recomputes the same batches.
 
-    Nothing per pixel and splat is kept. Gradients are summed per intersection, then over the
-    intersections of each splat in their order, so they do not depend on any race.
+    Nothing is kept per pixel and splat. Gradients are summed per intersection, then over the
+    intersections of each splat in a fixed order, so no race can change them.
     """
 
     @staticmethod
@@ -165,7 +165,7 @@ class _Composite(torch.autograd.Function):
 
 @torch.no_grad()
 def intersect(splats: Splats, size: tuple[int, int], side: int) -> TileLists:
-    """List the tiles that hold a pixel on which a splat's alpha reaches 1/255.
+    """List, for each splat, the tiles with a pixel where its alpha reaches 1/255.
 
     The test is exact up to rounding, which only ever adds tiles: each splat is cut into the rows
     of tiles that it crosses, and the ellipse's extent within each row gives the tiles.
@@ -195,7 +195,7 @@ def intersect(splats: Splats, size: tuple[int, int], side: int) -> TileLists:
 def _strips(
     splats: Splats, size: tuple[int, int], side: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Cut splats into rows of tiles; return splat, row, first and last column of tiles of each."""
+    """Cut splats at rows of tiles; return splat, tile row, first and last tile column of each."""
     width, height = size
     reach = reach_of(splats.opacities)
     half_height = half_sizes(splats.ellipses, reach)[1]
@@ -214,10 +214,10 @@ def _strips(
 
 
 def _extent(ellipses: Tensor, reach: Tensor, upper: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
-    """Return how far ellipses go left and right between two heights, all relative to the centre.
+    """Return the left and right extent of ellipses between two heights, relative to the centre.
 
-    The right edge is a concave function of the height: it is largest at the ellipse's rightmost
-    point, or at the end that is nearest to it.
+    The right edge is a concave function of the height: its maximum is at the ellipse's rightmost
+    point, or at the end of the interval that is nearest to it.
     """
     steep, shear, flat = ellipses.unbind(1)
     half_width = half_sizes(ellipses, reach)[0]
@@ -232,7 +232,7 @@ def _extent(ellipses: Tensor, reach: Tensor, upper: Tensor, lower: Tensor) -> tu
 
 
 def _pixels(low: Tensor, high: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the first and the last of ``count`` pixels whose centres lie in an interval."""
+    """Return the first and last of ``count`` pixels whose centres lie in an interval."""
     slack = _SLACK + 1e-6 * (high - low)
     first = (low - 0.5 - slack).ceil().clamp(0, count)
     last = (high - 0.5 + slack).floor().clamp(-1, count - 1)
@@ -240,7 +240,7 @@ def _pixels(low: Tensor, high: Tensor, count: int) -> tuple[Tensor, Tensor]:
 
 
 def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Repeat row numbers ``counts`` times; return them, and the number of each repetition."""
+    """Repeat each row number ``counts`` times; also return the index of each repetition."""
     starts = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
     rows = segments.segment_ids(starts)
     return rows, torch.arange(len(rows), device=rows.device) - starts[rows]
@@ -248,17 +248,17 @@ def _expand(counts: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TileBatch:
-    """The next splats of some tiles, and what they do to the tiles' pixels.
+    """The next splats of some tiles, and their weights in the tiles' pixels.
 
     Attributes:
-        tiles: ``(b,)`` numbers of the tiles.
-        entries: ``(b, k)`` places in the lists; any place where there is none.
-        valid: ``(b, k)`` whether there is one.
+        tiles: ``(b,)`` indices of the tiles.
+        entries: ``(b, k)`` indices into the lists; 0 for padding.
+        valid: ``(b, k)`` False for padding.
         params: ``(b, k, 10)`` packed splats.
-        along: ``(b, k, s, s)`` sheared way along x from the centre, pixels.
-        down: ``(b, k, s)`` way along y from the centre, pixels.
-        alpha: ``(b, k, q)`` opacity of each in each pixel, 0 where it is skipped.
-        transmittance: ``(b, k, q)`` in front of each, 0 where the pixel is finished.
+        along: ``(b, k, s, s)`` offset along x from the centre plus shear times ``down``, pixels.
+        down: ``(b, k, s)`` offset along y from the centre, pixels.
+        alpha: ``(b, k, q)`` alpha of each splat in each pixel, 0 where it is skipped.
+        transmittance: ``(b, k, q)`` in front of each splat, 0 where the pixel is finished.
         remaining: ``(b, q)`` transmittance behind the last splat of a pixel; infinite if none.
     """
 
@@ -295,8 +295,8 @@ def composite_gradient(
 ) -> Float[Tensor, "m 10"]:
     """Return the gradient of :func:`composite`, front to back over the same batches.
 
-    Going forward again gives the same transmittances as before, bit for bit; what lies behind a
-    splat is the whole minus what lies in front of it. (3DGS goes backward and divides.)
+    Running forward again gives bit-identical transmittances; the light from behind a splat is the
+    total minus that up to and including the splat. (3DGS runs back to front and divides.)
 
     Memory: ten numbers per intersection, and about fifteen arrays of ``CELLS`` numbers.
     """
@@ -318,7 +318,7 @@ def composite_gradient(
 def _exponent_gradient(
     batch: TileBatch, of_log_alpha: Float[Tensor, "b k q"]
 ) -> Float[Tensor, "b k 6"]:
-    """Return the gradient by centres, ellipses and log opacities from that by the exponents."""
+    """Convert the gradient by log alpha to that by centres, ellipses and log opacities."""
     _, _, square, shear, rest = batch.params[:, :, :5].unbind(2)
     per_row = of_log_alpha.unflatten(2, batch.along.shape[2:])
     zeroth, moments = per_row.sum(dim=3), per_row * batch.along
@@ -337,7 +337,7 @@ def _exponent_gradient(
 
 
 def _batches(packed: Tensor, lists: TileLists) -> Iterator[TileBatch]:
-    """Composite tiles with lists of similar length together, until all pixels are finished."""
+    """Yield batches of tiles with lists of similar length until all their pixels are finished."""
     counts = lists.starts.diff()
     order = torch.sort(counts, descending=True, stable=True).indices
     cells = CELLS.get(packed.device.type, _CELLS_ELSEWHERE)
@@ -357,7 +357,7 @@ def _batches(packed: Tensor, lists: TileLists) -> Iterator[TileBatch]:
 def _composite_batch(
     packed: Tensor, lists: TileLists, tiles: Tensor, start: int, transmittance: Tensor
 ) -> TileBatch:
-    """Composite the splats number ``start`` and following of tiles."""
+    """Composite the next ``_DEPTH`` splats of each tile from number ``start`` on."""
     places = torch.arange(_DEPTH, device=packed.device) + start + lists.starts[tiles][:, None]
     valid = places < lists.starts[tiles + 1][:, None]
     entries = torch.where(valid, places, 0)
@@ -386,9 +386,9 @@ def _composite_batch(
 def _scan(
     values: Float[Tensor, "b k q"], combine: Callable[[Tensor, Tensor], Tensor]
 ) -> Float[Tensor, "b k q"]:
-    """Combine each row with all before it, by doubling (Hillis and Steele 1986).
+    """Compute an inclusive scan along axis 1 by doubling (Hillis and Steele 1986).
 
-    That is several times faster than ``cumprod`` along an axis that is not the last.
+    This is several times faster than ``cumprod`` along an axis other than the last.
     """
     reach = 1
     while reach < values.shape[1]:

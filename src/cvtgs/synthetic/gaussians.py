@@ -1,9 +1,9 @@
-"""From surfaces and textures to Gaussians shaped as training shapes them; haze and floaters.
+"""Cover surfaces with Gaussians shaped like trained ones; make haze and floaters.
 
-The shapes follow what trained scenes have in common: the longest axis about as long as the
-spacing, the second a third of it, the third a twentieth; elongated along edges of the texture
-and small where it is detailed; a quarter nearly opaque, the rest of every opacity; larger ones
-hidden behind the surface.
+The shapes follow common properties of trained scenes. The longest axis is about as long as the
+spacing, the second a third and the third a twentieth of it. Gaussians are elongated along texture
+edges and small where the texture is detailed. A quarter is nearly opaque, the rest have any
+opacity. Larger ones are hidden behind the surface.
 """
 
 import math
@@ -27,20 +27,20 @@ _SUN_COLOR = (1.0, 0.93, 0.8)
 _SKY_COLOR = (0.55, 0.7, 1.0)
 _BACKING_EVERY = 12
 _HAZE_OPACITY = 0.022
-_MANY_FLOATERS = 1000  # more than these are smaller, so that they hide no more of the scene
+_MANY_FLOATERS = 1000  # above this count floaters shrink, so that they hide no more of the scene
 _BANDS = (1.0, 0.9, 0.72, 0.5)
-"""Weight of each SH band of a highlight: falling, so that it does not ring."""
+"""Weight of each SH band of a highlight; decreasing weights avoid ringing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chunk:
-    """Rows ``start`` to ``stop`` of a part of a scene, and the source of their randomness.
+    """Rows ``start`` to ``stop`` of a part of a scene, and their random numbers.
 
     Attributes:
         start: First row.
         stop: Row after the last one.
-        total: Gaussians of the whole part, which sets their spacing.
-        rest_count: View-dependent SH coefficients per channel.
+        total: Number of Gaussians of the whole part, which sets their spacing.
+        rest_count: Number of view-dependent SH coefficients per channel.
         shift: ``(2,)`` offset of the part's low-discrepancy sequence.
         generator: Source of the random numbers.
     """
@@ -65,22 +65,22 @@ class Chunk:
         return torch.randn(len(self), *shape, generator=self.generator)
 
     def lognormals(self, median: float, spread: float) -> Float[Tensor, "n"]:
-        """Draw positive numbers with this median, whose logarithms have this deviation."""
+        """Draw log-normal numbers; ``spread`` is the standard deviation of their logarithms."""
         return median * torch.exp(spread * self.normals())
 
     def square_points(self) -> Float[Tensor, "n 2"]:
         """Return evenly spread points of the unit square.
 
-        The R2 sequence (Roberts 2018), each point moved at random by a part of the spacing.
+        The R2 sequence (Roberts 2018), with each point jittered by a part of the spacing.
         """
         rows = torch.arange(self.start, self.stop, dtype=torch.float64)
         steps = torch.tensor([1 / _PLASTIC_NUMBER, 1 / _PLASTIC_NUMBER**2], dtype=torch.float64)
         jitter = (self.uniforms(2) - 0.5) * (_JITTER / math.sqrt(self.total))
-        # rounding to float32 may give 1.0, which is outside
+        # Rounding to float32 may give 1.0, which is outside.
         return ((rows[:, None] * steps + self.shift + jitter) % 1.0).float().clamp_max(1 - 1e-7)
 
     def directions(self) -> Float[Tensor, "n 3"]:
-        """Draw unit vectors of uniform direction."""
+        """Draw unit vectors, uniform over the sphere."""
         return torch.nn.functional.normalize(self.normals(3), dim=1)
 
     def rotations(self) -> Float[Tensor, "n 3 3"]:
@@ -88,7 +88,7 @@ class Chunk:
         return rotations_from_axes(self.directions(), self.directions())
 
     def opacities(self, faintness: float) -> Float[Tensor, "n"]:
-        """Draw opacities: some nearly opaque, the others of every value."""
+        """Draw opacities: some nearly 1, the others of any value."""
         opaque = self.uniforms() < 0.22 * math.exp(-0.5 * faintness)
         spread = 1.6 / (1 + 0.2 * faintness)
         others = spread * self.normals() - 0.1 - faintness
@@ -101,14 +101,14 @@ Draw = Callable[[Chunk], GaussianScene]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Material:
-    """How a surface is made of Gaussians.
+    """Parameters of the Gaussians that cover a surface.
 
     Attributes:
         overlap: Median length of the Gaussians, in spacings.
-        faintness: How much fainter than usual; see :meth:`Chunk.opacities`.
+        faintness: Lowers opacities; see :meth:`Chunk.opacities`.
         specular: Brightness of the highlights.
-        thickness: Deviation from the surface, in spacings.
-        lit: Whether sun and sky light it; else its colours are as its texture has them.
+        thickness: Standard deviation of the distance from the surface, in spacings.
+        lit: Whether sun and sky light the surface; if not, its colours are those of the texture.
     """
 
     overlap: float = 1.25
@@ -207,7 +207,7 @@ def _scales(
 
 
 def diffuse_light(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Return the light that falls on a surface: sun, and sky from above."""
+    """Return the irradiance of a surface from the sun, and from the sky above."""
     sun = (normals @ _toward_sun()).clamp_min(0.0)[:, None] * torch.tensor(_SUN_COLOR)
     sky = (0.5 - 0.5 * normals[:, 1:2]) * torch.tensor(_SKY_COLOR)
     return 0.24 + 0.72 * sun + 0.42 * sky
@@ -218,7 +218,7 @@ def specular_colors(
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n k 3"]]:
     """Return the mean colour and the SH coefficients of reflections of sun and sky.
 
-    The coefficients have some noise, as trained ones do.
+    The coefficients have some noise, like trained ones.
     """
     rest = (0.015 + 0.02 * strength) * chunk.normals(chunk.rest_count, 3)
     if strength == 0.0:
@@ -240,10 +240,10 @@ def specular_colors(
 def highlights(
     directions: Float[Tensor, "n 3"], peaks: Float[Tensor, "n 3"], rest_count: int
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n k 3"]]:
-    """Project round highlights on spherical harmonics.
+    """Project round highlights onto spherical harmonics.
 
     A lobe around direction ``d`` has coefficients ``w_l Y_lm(d)`` (Funk-Hecke theorem); the
-    weights ``w_l`` are scaled so that the highlight has the wanted colour at its peak.
+    weights ``w_l`` are scaled so that the highlight has the given colour at its peak.
     """
     degree = degree_of(rest_count)
     if degree == 0:
@@ -270,7 +270,7 @@ def haze(
 ) -> Draw:
     """Fill a soft ellipsoid with many faint Gaussians.
 
-    Their size follows from their number, so that the haze is equally dense at every count.
+    Their size depends on their number, so that the haze is equally dense at every count.
     """
     rgb = torch.tensor(color, dtype=torch.float32)
     shadow = 2 * math.pi * float(extent.prod()) ** (2 / 3)

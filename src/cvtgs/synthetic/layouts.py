@@ -25,7 +25,7 @@ class Part:
 
     Attributes:
         share: Share of the count, relative to the other parts.
-        draw: Makes its Gaussians.
+        draw: Function that makes its Gaussians.
     """
 
     share: float
@@ -115,7 +115,7 @@ def landscape(rng: Random) -> list[Part]:
 
 
 def hazy(rng: Random) -> list[Part]:
-    """Lay out a scene that is faint for the most part, as some trained scenes are."""
+    """Lay out a mostly faint scene, like some trained scenes."""
     faint = Material(overlap=2.6, faintness=3.2, specular=0.1)
     columns = [
         _covered(
@@ -255,7 +255,7 @@ def _objects_on_pedestals(
 
 
 def _furniture(rng: Random) -> list[Part]:
-    """Put a table with a vase and a ball, stools and a lamp in the middle."""
+    """Put a table with a vase and a ball, stools and a lamp in the middle of the room."""
     wood = rng.stone(rng.similar((0.55, 0.37, 0.23)), 0.8)
     turn = rng.uniform(-0.3, 0.3)
     cord = wire(torch.tensor([0.0, -2.5, 0.0]), torch.tensor([0.0, -1.95, 0.0]), 0.0)

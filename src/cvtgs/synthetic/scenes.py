@@ -1,4 +1,4 @@
-"""Generated scenes: a kind, a count and a seed give a scene, drawn chunk by chunk."""
+"""Generate a scene from a kind, a count and a seed, chunk by chunk."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,24 +18,24 @@ KINDS = tuple(LAYOUTS)
 """The kinds of scenes that can be made."""
 
 _CHUNK = 1 << 15
-"""Rows that are drawn together: few enough to stay in the cache of one core."""
+"""Rows that are drawn together; this many fit into the cache of one core."""
 
 
 def scene(kind: str, count: int, *, sh_degree: int = 3, seed: int = 0) -> GaussianScene:
-    """Make a scene that looks as if it had been trained.
+    """Make a scene that resembles a trained one.
 
-    The seed sets layout, colours and textures; the count only sets how finely they are covered.
-    The same arguments give the same bits. Scenes are y-down: what is above has the smaller y.
+    The seed determines layout, colours and textures; the count only sets how finely Gaussians
+    cover them. The same arguments give the same bits. Scenes are y-down (up is -y).
 
     Memory: the scene and about 150 MB.
 
     Args:
         kind: One of ``KINDS``. ``"object"``: one textured object without surroundings;
             ``"room"``: walls and furniture around the origin; ``"landscape"``: hills and trees
-            under a far sky; ``"haze"``: a scene that is faint for the most part; ``"thin"``:
+            under a far sky; ``"haze"``: a mostly faint scene; ``"thin"``:
             rails, wires, trees and grass; ``"courtyard"``: a bit of everything.
-        count: Gaussians, at least 1.
-        sh_degree: Degree of the colours, 0 to 3.
+        count: Number of Gaussians, at least 1.
+        sh_degree: SH degree of the colours, 0 to 3.
         seed: Any integer from 0 to 2**63 - 1.
 
     Returns:
@@ -72,12 +72,12 @@ def scene(kind: str, count: int, *, sh_degree: int = 3, seed: int = 0) -> Gaussi
 def demo_scene(count: int = 200_000, *, sh_degree: int = 3, seed: int = 0) -> GaussianScene:
     """Make the courtyard that ``cvtgs demo`` simplifies.
 
-    Paving, walls, textured and shiny objects, railings, wires, a tree, grass, a body of haze, a
-    far sky, floaters, and Gaussians hidden behind the surfaces. It is y-down.
+    It has paving, walls, textured and shiny objects, railings, wires, a tree, grass, a body of
+    haze, a far sky, floaters, and Gaussians hidden behind the surfaces. It is y-down.
 
     Args:
-        count: Gaussians, at least 1.
-        sh_degree: Degree of the colours, 0 to 3.
+        count: Number of Gaussians, at least 1.
+        sh_degree: SH degree of the colours, 0 to 3.
         seed: Any integer from 0 to 2**63 - 1.
 
     Returns:
@@ -95,7 +95,7 @@ def demo_scene(count: int = 200_000, *, sh_degree: int = 3, seed: int = 0) -> Ga
 
 @contextmanager
 def _settings() -> Iterator[None]:
-    """Set torch to float32 on the CPU with one thread; chunks are too small for more threads."""
+    """Set torch to float32, the CPU and one thread; chunks are too small for more."""
     dtype = torch.get_default_dtype()
     torch.set_default_dtype(torch.float32)
     try:
@@ -108,7 +108,7 @@ def _settings() -> Iterator[None]:
 def _draw_parts(
     parts: Sequence[Part], count: int, rest: int, generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """Draw the tensors of all parts; temporaries take about ``_CHUNK * 1 kB``."""
+    """Draw the tensors of all parts. Temporaries take about ``_CHUNK * 1 kB``."""
     shapes: dict[str, tuple[int, ...]] = {
         "means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": (),
         "sh0": (1, 3), "shN": (rest, 3),

@@ -1,6 +1,6 @@
-"""Parametric surfaces: functions from points of the unit square to points, frames and areas.
+"""Parametric surfaces: functions from the unit square to points, frames and areas.
 
-Up is -y. Surfaces are made at the origin; :func:`placed` moves them.
+Up is -y. Surfaces are built at the origin; :func:`placed` moves them.
 """
 
 import math
@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 FACE_STEP = 32.0
-"""Texture coordinates of one quad lie this far from those of the next."""
+"""Offset between the texture coordinates of consecutive quads."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,7 +26,7 @@ class SurfacePoints:
         tangents: ``(n, 3)`` unit directions of the first texture coordinate.
         bitangents: ``(n, 3)`` unit directions of the second one.
         coords: ``(n, 2)`` texture coordinates, scene units.
-        areas: ``(n,)`` area of the whole surface at the point density found here.
+        areas: ``(n,)`` area that the surface would have at the local point density throughout.
         rims: ``(n, 2)`` distance to the border along each texture coordinate.
     """
 
@@ -47,7 +47,7 @@ _FACES = (
     ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
     ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
 )
-"""Faces of the unit cube: a corner, and the directions right and down, seen from outside."""
+"""Faces of the unit cube: a corner, and the directions right and down as seen from outside."""
 
 Surface = Callable[[Float[Tensor, "n 2"]], SurfacePoints]
 """Function from points of the unit square to points of the surface."""
@@ -98,7 +98,7 @@ def placed(
 def quads(corners: Float[Tensor, "k 3"], sides: Float[Tensor, "k 2 3"]) -> Surface:
     """Build parallelograms; their normals are ``sides[:, 1] x sides[:, 0]``.
 
-    Seen from outside, texture coordinates go right and down if the sides do.
+    Seen from outside, texture coordinates run right and down if the sides do.
     """
     crosses = torch.linalg.cross(sides[:, 1], sides[:, 0])
     areas = torch.linalg.vector_norm(crosses, dim=1)
@@ -134,7 +134,7 @@ def boxes(lows: Float[Tensor, "k 3"], sizes: Float[Tensor, "k 3"]) -> Surface:
 
 
 def revolution(profile: Float[Tensor, "k 2"]) -> Surface:
-    """Build a surface of revolution of a profile of (radius, height) about the vertical."""
+    """Build a surface of revolution about the vertical from a profile of (radius, height)."""
     steps = profile.diff(dim=0)
     lengths = torch.linalg.vector_norm(steps, dim=1)
     bands = math.pi * (profile[1:, 0] + profile[:-1, 0]) * lengths
@@ -184,7 +184,7 @@ def torus(radius: float, thickness: float) -> Surface:
 
 
 def ground(heights: Heights, *, core: float, radius: float, hole: float = 0.0) -> Surface:
-    """Build a disc of ground, sampled densely inside ``core`` and ever sparser outside."""
+    """Build a disc of ground, sampled densely inside ``core`` and more sparsely farther out."""
     start = core**2 + hole**2
     growth = math.log((core**2 + radius**2) / start)
 
@@ -238,7 +238,7 @@ def dome(radius: float, lowest: float) -> Surface:
 
 
 def box(width: float, height: float, depth: float) -> Surface:
-    """Build a box that stands on the origin."""
+    """Build a box that stands at the origin."""
     size = torch.tensor([[width, height, depth]])
     return boxes(size * torch.tensor([-0.5, -1.0, -0.5]), size)
 

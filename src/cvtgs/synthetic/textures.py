@@ -1,4 +1,4 @@
-"""Textures: the colour of a surface at its texture coordinates, and random ones of them."""
+"""Textures, which map texture coordinates to colours, and a source of random textures."""
 
 import colorsys
 import math
@@ -59,7 +59,7 @@ def bricks(brick: Texture, mortar: Texture, size: float) -> Texture:
         along = coords[:, 0] / (2.4 * size) + 0.5 * row.remainder(2)
         column = torch.floor(along)
         joint = ((along - column) < 0.04) | ((coords[:, 1] / size - row) < 0.1)
-        # a hash of the cell: numbers in [0, 1) that look random
+        # A hash of the brick: pseudo-random numbers in [0, 1).
         mixed = torch.stack([row, column], dim=1) @ torch.tensor([12.9898, 78.233])
         hashed = (torch.sin(mixed.remainder(2 * math.pi)) * 4375.85).remainder(1.0)
         return torch.where(
@@ -70,7 +70,7 @@ def bricks(brick: Texture, mortar: Texture, size: float) -> Texture:
 
 
 def letters(paper: Texture, ink: Texture, size: float) -> Texture:
-    """Print CVTGS again and again; ``size`` is the width of one letter."""
+    """Print CVTGS repeatedly; ``size`` is the width of one letter."""
     rows = [[[float(bit) for bit in line] for line in _FONT[c].split()] for c in "CVTGS"]
     glyphs = torch.nn.functional.pad(torch.tensor(rows), (1, 0, 2, 0))  # (5, 9, 6)
 
@@ -93,7 +93,7 @@ def color_per_box(colors: Float[Tensor, "k 3"]) -> Texture:
 
 
 def round_shadows(lit: Texture, centers: Float[Tensor, "k 2"], radius: float) -> Texture:
-    """Darken a texture softly around some points."""
+    """Darken a texture softly around the given points."""
 
     def colors(coords: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
         distance = torch.cdist(coords, centers).amin(1)
@@ -104,7 +104,7 @@ def round_shadows(lit: Texture, centers: Float[Tensor, "k 2"], radius: float) ->
 
 
 def noise_tile(generator: torch.Generator) -> Float[Tensor, "k k"]:
-    """Draw periodic noise whose amplitudes fall as the power 1.5 of the frequency."""
+    """Draw periodic noise whose amplitudes fall with the frequency to the power 1.5."""
     n = _NOISE_TEXELS
     wave = torch.fft.fftfreq(n) * n
     fall = (wave[:, None] ** 2 + wave[None, :] ** 2).sqrt().clamp_min(1.0) ** 1.5
@@ -130,7 +130,7 @@ class Random:
         return low + (high - low) * float(torch.rand((), generator=self.generator))
 
     def permutation(self, count: int) -> list[int]:
-        """Shuffle the numbers below ``count``."""
+        """Return a random permutation of 0 to ``count - 1``."""
         return [int(k) for k in torch.randperm(count, generator=self.generator)]
 
     def ring_positions(self, count: int, ring: tuple[float, float]) -> list[tuple[float, float]]:
@@ -150,14 +150,14 @@ class Random:
         )
 
     def similar(self, color: Color) -> Color:
-        """Draw a colour near another one."""
+        """Draw a colour close to another one."""
         shift = self.uniform(-0.06, 0.06)
         moved = [c + shift + self.uniform(-0.04, 0.04) for c in color]
         red, green, blue = (min(1.0, max(0.0, value)) for value in moved)
         return red, green, blue
 
     def noise(self, size: float, contrast: float) -> Mask:
-        """Make a mask of noise that repeats after ``size``."""
+        """Make a noise mask with period ``size``."""
         shift = torch.rand(2, generator=self.generator)
         n = len(self.tile)
         table = (0.5 + contrast * self.tile).clamp(0.0, 1.0).reshape(-1).contiguous()
@@ -175,11 +175,11 @@ class Random:
         return mask
 
     def clouds(self, low: Color, high: Color, size: float) -> Texture:
-        """Mix two colours by noise that repeats after ``size``."""
+        """Mix two colours by noise with period ``size``."""
         return blend(plain(low), plain(high), self.noise(size, 0.25))
 
     def stone(self, color: Color, size: float) -> Texture:
-        """Make a spotted stone of about this colour."""
+        """Make a texture of spotted stone of about this colour."""
         red, green, blue = color
         return self.clouds((0.7 * red, 0.7 * green, 0.68 * blue), self.similar(color), size)
 

@@ -18,7 +18,7 @@ from cvtgs.synthetic.gaussians import (
 )
 from cvtgs.synthetic.textures import Texture
 
-_MANY_BLADES = 12_000  # more blades than these are slimmer, so that the ground still shows
+_MANY_BLADES = 12_000  # above this count blades are slimmer, so that the ground still shows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,9 +26,9 @@ class Strands:
     """Straight pieces of round rods.
 
     Attributes:
-        starts: ``(k, 3)`` first end of each.
+        starts: ``(k, 3)`` one end of each.
         ends: ``(k, 3)`` other end of each.
-        radii: ``(k,)`` their radii.
+        radii: ``(k,)`` radius of each.
     """
 
     starts: Float[Tensor, "k 3"]
@@ -46,7 +46,7 @@ def joined(*strands: Strands) -> Strands:
 
 
 def railing(start: Float[Tensor, "3"], along: Float[Tensor, "3"], height: float) -> Strands:
-    """Build posts every 0.15 units, with a rail above and one below."""
+    """Build posts every 0.15 units, and three rails along them."""
     up = torch.tensor([0.0, -height, 0.0])
     count = max(2, round(float(along.norm()) / 0.15))
     feet = start + torch.linspace(0, 1, count)[:, None] * along
@@ -69,7 +69,7 @@ def wire(start: Float[Tensor, "3"], end: Float[Tensor, "3"], sag: float) -> Stra
 def tree(
     foot: Float[Tensor, "3"], height: float, generator: torch.Generator
 ) -> tuple[Strands, Float[Tensor, "k 3"]]:
-    """Grow a tree, four thinner branches on each for four levels; return it and its tips."""
+    """Grow a trunk and four levels of branches, four on each parent; return them and the tips."""
     starts, directions = foot[None, :], torch.tensor([[0.0, -1.0, 0.0]])
     length, radius = 0.38 * height, 0.028 * height
     levels = []
@@ -90,11 +90,11 @@ def tree(
 
 
 def rods(strands: Strands, texture: Texture, specular: float) -> Draw:
-    """Cover strands with Gaussians: needles where they are thinner than the spacing."""
+    """Cover strands with Gaussians: needles where a strand is thinner than the spacing."""
     axes = strands.ends - strands.starts
     lengths = torch.linalg.vector_norm(axes, dim=1).clamp_min(1e-6)
     axes = axes / lengths[:, None]
-    weights = lengths * strands.radii.sqrt()  # thin pieces get more than their area
+    weights = lengths * strands.radii.sqrt()  # thin pieces get more than in proportion to area
     ends = (weights / weights.sum()).double().cumsum(0)
 
     def draw(chunk: Chunk) -> GaussianScene:
@@ -132,7 +132,7 @@ def rods(strands: Strands, texture: Texture, specular: float) -> Draw:
 
 
 def grass(roots: Float[Tensor, "k 3"], height: float, colors: tuple[Texture, Texture]) -> Draw:
-    """Make blades of grass: one needle each, leaning in any direction."""
+    """Make blades of grass: one needle per blade, leaning in any direction."""
 
     def draw(chunk: Chunk) -> GaussianScene:
         tuft = (chunk.uniforms() * len(roots)).long()
@@ -161,7 +161,7 @@ def grass(roots: Float[Tensor, "k 3"], height: float, colors: tuple[Texture, Tex
 
 
 def leaves(tips: Float[Tensor, "k 3"], spread: float, texture: Texture) -> Draw:
-    """Make leaves around the tips of branches, nearly opaque together."""
+    """Make leaves around the tips of branches; together they are nearly opaque."""
 
     def draw(chunk: Chunk) -> GaussianScene:
         tip = (chunk.uniforms() * len(tips)).long()

@@ -1,4 +1,4 @@
-"""What more time buys: every preset on one scene, seconds against quality."""
+"""Seconds and quality of every preset on one scene."""
 
 from cvtgs.tradeoff.files import write_tradeoff
 from cvtgs.tradeoff.measure import Measured, measure_tradeoff

@@ -1,4 +1,4 @@
-"""The files of a tradeoff: tables for programs, a plot, and a page to look at."""
+"""The files of a tradeoff: machine-readable tables, a plot and a page."""
 
 import base64
 import math
@@ -24,7 +24,7 @@ WIDTH, HEIGHT = 1200, 560
 
 DIGITS = ((1, 2, 3, 5, 7), (1, 2, 5), (1,))
 MOST_TICKS = 12
-"""More numbers run into each other."""
+"""Largest number of tick labels that do not overlap."""
 
 MARK = "*"
 MARK_MEANS = "* no other preset is as good in less time, with as many Gaussians"
@@ -63,7 +63,7 @@ class Written(NamedTuple):
 
     Attributes:
         paths: The files.
-        note: Which file is missing and why; empty if none is.
+        note: Which file is missing and why; empty if none is missing.
     """
 
     paths: tuple[Path, ...]
@@ -73,7 +73,7 @@ class Written(NamedTuple):
 def check_tradeoff_files(
     folder: str | os.PathLike[str], *, more: tuple[str, ...] = (), overwrite: bool = False
 ) -> None:
-    """Make the folder and check that the files could be written, before the work begins."""
+    """Make the folder and check that the files can be written, before the work starts."""
     make_folder(folder)
     for name in (CSV, JSON, PLOT, PAGE, *more):
         check_output(Path(folder) / name, overwrite)
@@ -86,18 +86,18 @@ def write_tradeoff(
     overwrite: bool = False,
     listener: ProgressListener = silent,
 ) -> Written:
-    """Write ``tradeoff.csv``, ``.json``, ``.png`` and ``index.html``, each completely or not.
+    """Write ``tradeoff.csv``, ``.json``, ``.png`` and ``index.html``, each atomically.
 
-    Without matplotlib, the plot is left out.
+    Without matplotlib there is no plot.
 
     Args:
         measured: The measurements.
-        folder: Where to write; made if it is missing.
+        folder: The output folder; created if missing.
         overwrite: Whether existing files may be replaced.
         listener: Called after each file.
 
     Returns:
-        The paths of the files, and which is missing.
+        The paths of the files, and a note on a missing one.
 
     Raises:
         OutputExistsError: A file exists and may not be replaced.
@@ -126,7 +126,7 @@ def write_tradeoff(
 
 
 def tradeoff_chart(tradeoff: Tradeoff) -> bytes:
-    """Draw PSNR and SSIM over seconds, a line per ratio through the runs that none beats."""
+    """Plot PSNR and SSIM over seconds, with a line per ratio through the runs on the front."""
     seconds = [result.seconds for result in tradeoff.results]
     panels = []
     for metric in ("psnr", "ssim"):
@@ -158,7 +158,7 @@ def tradeoff_chart(tradeoff: Tradeoff) -> bytes:
 
 
 def ticks(low: float, high: float) -> Sequence[float]:
-    """Return round numbers for a logarithmic axis: 1, 2, 3, 5, 7 and their tenfolds, or fewer."""
+    """Return ticks for a logarithmic axis: 1, 2, 3, 5, 7 times powers of ten, or fewer."""
     for digits in DIGITS:
         found = _round_numbers(max(low, 1e-3), max(high, 1e-3), digits)
         if len(found) <= MOST_TICKS:
@@ -195,7 +195,7 @@ def page_summary(tradeoff: Tradeoff, chart: bytes | None) -> str:
 
 
 def cells(tradeoff: Tradeoff, result: TradeoffResult) -> Mapping[str, str]:
-    """Return a result as texts, by the headings of the table."""
+    """Return the table cells of a result as text, by heading."""
     stages = {f"{name}, s": _seconds(result.stage_seconds.get(name)) for name in tradeoff.stages}
     measured = tradeoff.evaluation.lpips_network is not None
     distance = {"LPIPS": _score(result, "lpips", result.lpips, 4)} if measured else {}
@@ -217,13 +217,13 @@ def cells(tradeoff: Tradeoff, result: TradeoffResult) -> Mapping[str, str]:
 
 
 def heading(tradeoff: Tradeoff, rho: float) -> str:
-    """Return the heading of a ratio."""
+    """Return the table heading of a ratio."""
     count = max(result.count for result in tradeoff.results if result.rho == rho)
     return f"rho {rho:g}: {count:,} of {tradeoff.source_count:,} Gaussians"
 
 
 def how_measured(tradeoff: Tradeoff) -> str:
-    """Report where and how this was measured."""
+    """Return a text on where and how this was measured."""
     evaluation = tradeoff.evaluation
     against = next(
         (
@@ -242,7 +242,7 @@ def how_measured(tradeoff: Tradeoff) -> str:
 
 
 def _against_photograph(tradeoff: Tradeoff, name: str) -> Mapping[str, str]:
-    """Return the columns of scores against photographs, if there were any."""
+    """Return the columns of scores against photographs, if there are any."""
     scores = {scores.name: scores for scores in tradeoff.evaluation.photographs}
     if name not in scores:
         return {}

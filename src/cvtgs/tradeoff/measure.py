@@ -28,10 +28,10 @@ from cvtgs.views import automatic_views
 RATIOS = (0.1, 0.01, 0.001)
 
 CameraChoice = Callable[[GaussianScene], Cameras]
-"""Returns the views of a scene."""
+"""Function that returns the views of a scene."""
 
 PhotographChoice = Callable[[Cameras], Float[Tensor, "c h w 3"]]
-"""Returns the photograph of every camera, at the size of the cameras."""
+"""Function that returns the photograph of every camera, at the size of the cameras."""
 
 
 class Measured(NamedTuple):
@@ -59,25 +59,25 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
     trust_sizes: bool = False,
     listener: ProgressListener = silent,
 ) -> Measured:
-    """Simplify a file by several presets, and measure cost and quality of each.
+    """Simplify a file with several presets, and measure cost and quality of each.
 
-    Every run is a process of its own, ``cvtgs simplify``, so that seconds and memory are those
-    that users see. Then all results are rendered from the same views. A run that fails is
-    warned about and listed; the others go on.
+    Each run is a separate process, ``cvtgs simplify``, so that seconds and memory are those that
+    users see. Then all results are rendered from the same views. A run that fails causes a warning
+    and is listed; the others go on.
 
-    Memory: here, what :func:`cvtgs.evaluation.compare` needs; the processes need theirs one after
-    the other.
+    Memory: that of :func:`cvtgs.evaluation.compare` in this process, plus that of one run at a
+    time.
 
     Args:
         source: The full scene.
-        presets: Names; None for all, from the fastest to the best.
+        presets: Names of presets; None for all, from the fastest to the best.
         ratios: Ratios of Gaussians to keep, each in (0, 1].
-        cameras: Returns the views of it.
+        cameras: Returns the views of the scene.
         photographs: Returns their photographs, to score all scenes against too; None for none.
-        settings: Background, which LPIPS, and what renders.
-        device: Where to compute: ``auto``, ``cpu`` or ``cuda``.
-        folder: Keep the results there, as ``fast_0.01.ply``, replacing what has that name; None
-            keeps none.
+        settings: Background, LPIPS network and backend.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        folder: Folder to keep the results in, as ``fast_0.01.ply``; files of the same name are
+            replaced. None keeps no results.
         trust_sizes: Whether to believe a compressed source that claims far more Gaussians than its
             bytes can hold.
         listener: Called after each run and image.
@@ -86,7 +86,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         Costs, scores and images.
 
     Raises:
-        CvtgsError: The scene cannot be read, or a preset or ratio is none.
+        CvtgsError: The scene cannot be read, or a preset or ratio is invalid.
         RunError: All runs failed.
 
     Example:

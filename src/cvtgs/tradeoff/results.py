@@ -14,20 +14,20 @@ class TradeoffResult(Record):
     """Cost and quality of one run of one preset.
 
     Attributes:
-        name: Preset and ratio, for example ``fast 0.01``; the name in the evaluation, too.
+        name: Preset and ratio, for example ``fast 0.01``; also its name in the evaluation.
         preset: Name of the preset.
-        rho: Ratio that was given.
-        count: Gaussians that came out.
-        bytes: Size of the file that came out.
+        rho: Requested ratio.
+        count: Number of Gaussians in the result.
+        bytes: Size of the output file.
         seconds: Wall-clock seconds of the whole process, from its start to its end.
-        peak_memory_bytes: Its largest resident size; 0 where the system does not tell.
+        peak_memory_bytes: Its peak resident size; 0 where the system does not report it.
         psnr: Mean over the views, dB; infinite if images are equal.
         ssim: Mean over the views.
         lpips: Mean over the views; None if it was not measured.
         alpha_error: Mean absolute difference of accumulated alpha over the views.
-        alpha_bias: Mean of accumulated alpha minus that of the full scene; negative where more of
+        alpha_bias: Mean of accumulated alpha minus that of the full scene; negative if more of
             the background shows through.
-        fronts: Metrics by which no other run of this ratio beats it: ``psnr``, ``ssim``, ``lpips``.
+        fronts: Metrics by which no run of this ratio beats it: of ``psnr``, ``ssim``, ``lpips``.
         report: The report of the simplification, with seconds and peak memory per stage.
     """
 
@@ -57,7 +57,7 @@ class Failure(Record):
 
     Attributes:
         name: Preset and ratio.
-        reason: Why, one sentence.
+        reason: Why it failed, one sentence.
     """
 
     name: str
@@ -69,11 +69,11 @@ class Tradeoff(Record):
 
     Attributes:
         source: Name of the file of the full scene.
-        source_count: Its Gaussians.
-        source_bytes: Its size.
-        start_seconds: Seconds of every process before it reads: Python, torch and cvtgs start.
-        machine: Where this was measured.
-        evaluation: From where images were taken, and the scores per view.
+        source_count: Number of Gaussians of the full scene.
+        source_bytes: Size of that file.
+        start_seconds: Start-up seconds of every process: Python and the imports of torch and cvtgs.
+        machine: The machine of the measurement.
+        evaluation: The views, and the scores per view.
         results: One per ratio and preset, ratio by ratio.
         failures: Runs that failed.
     """
@@ -105,7 +105,7 @@ class Tradeoff(Record):
         return tuple(names)
 
     def rest_seconds(self, result: TradeoffResult) -> float:
-        """Return what is left of a run beyond start and stages: reading and writing.
+        """Return the seconds of a run outside start-up and stages: reading and writing.
 
         Args:
             result: One of the results.
@@ -116,7 +116,7 @@ class Tradeoff(Record):
         return max(0.0, result.seconds - self.start_seconds - sum(result.stage_seconds.values()))
 
     def to_json(self) -> str:
-        """Return everything as indented JSON; infinite numbers are the string ``Infinity``.
+        """Return everything as indented JSON; infinity becomes the string ``Infinity``.
 
         Returns:
             JSON text that ends with a line break.
@@ -127,7 +127,7 @@ class Tradeoff(Record):
         """Return one line per run, with seconds per stage.
 
         Returns:
-            Comma-separated values under a line of headings; what was not measured is empty.
+            Comma-separated values with a header line; values not measured are empty.
         """
         rows = [self._row(result) for result in self.results]
         file = io.StringIO()
@@ -158,16 +158,16 @@ class Tradeoff(Record):
 
 
 def on_front(costs: Sequence[float], gains: Sequence[float]) -> tuple[bool, ...]:
-    """Report which of several choices are on the Pareto front: those that no other beats.
+    """Return which of several choices are on the Pareto front: those that no other beats.
 
     One beats another if it costs no more and gains no less, and is better in one of the two.
 
     Args:
         costs: Less is better.
-        gains: As many; more is better, and NaN is never on the front.
+        gains: One per cost; more is better, and NaN is never on the front.
 
     Returns:
-        Whether each is on the front.
+        Whether each choice is on the front.
 
     Example:
         >>> on_front([1.0, 2.0, 3.0], [20.0, 19.0, 25.0])
@@ -182,7 +182,7 @@ def on_front(costs: Sequence[float], gains: Sequence[float]) -> tuple[bool, ...]
 
 
 def with_fronts(results: Sequence[TradeoffResult]) -> Iterator[TradeoffResult]:
-    """Mark the results that no other of the same ratio beats in seconds and a metric."""
+    """Yield the results with ``fronts`` set, from the Pareto fronts of each ratio."""
     fronts: dict[str, list[str]] = {result.name: [] for result in results}
     for rho in dict.fromkeys(result.rho for result in results):
         same = [result for result in results if result.rho == rho]

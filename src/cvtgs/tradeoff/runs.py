@@ -1,4 +1,4 @@
-"""One process per preset and ratio, so that seconds and memory are those that a user sees."""
+"""Run each preset and ratio in its own process, to measure the seconds and memory of users."""
 
 import os
 import subprocess
@@ -20,11 +20,11 @@ STAGE = "simplify"
 WARNING = "cvtgs: warning: "
 
 START = "import cvtgs.cli.main, cvtgs.config, cvtgs.io, cvtgs.mergenet, cvtgs.simplifier"
-"""What every process does before it reads a scene."""
+"""Imports of every process before it reads a scene."""
 
-# A process inherits the peak of the one that starts it, so a small one must start it. It hears of
-# an interrupt and waits for its child, which hears of it too. When the one that started it ends
-# or closes the pipe, however that happens, it ends its child.
+# A process inherits the peak memory of its parent, so this small launcher starts the command. On an
+# interrupt, which the child receives too, it keeps waiting for the child. When its own parent ends
+# or closes the pipe, for whatever reason, it terminates the child.
 LAUNCHER = """
 import os, signal, subprocess, sys, threading, time
 signal.signal(signal.SIGINT, lambda *_: None)
@@ -52,11 +52,11 @@ class ProcessCost:
     """The cost and the output of one process.
 
     Attributes:
-        wall_seconds: Time from its start to its end.
-        user_seconds: Processor time outside the kernel.
-        peak_memory_bytes: Its largest resident size; 0 where the system does not tell (Windows).
-        output: What it wrote to stdout.
-        errors: What it wrote to stderr.
+        wall_seconds: Wall-clock time from its start to its end.
+        user_seconds: User CPU time.
+        peak_memory_bytes: Peak resident size; 0 where the system does not report it (Windows).
+        output: Its stdout.
+        errors: Its stderr.
     """
 
     wall_seconds: float
@@ -85,7 +85,7 @@ class Task:
 
     @property
     def file_name(self) -> str:
-        """Name of the file that comes out."""
+        """Name of the output file."""
         return f"{self.preset}_{self.rho:g}.ply"
 
 
@@ -95,7 +95,7 @@ class Run:
 
     Attributes:
         task: Its preset and ratio.
-        path: The file that it wrote.
+        path: The output file.
         cost: The cost of its process.
         report: The report of the simplification.
     """
@@ -107,7 +107,7 @@ class Run:
 
 
 def tasks_of(presets: Sequence[str] | None, ratios: Sequence[float]) -> tuple[Task, ...]:
-    """List what to run, ratio by ratio."""
+    """Check presets and ratios, and list the runs, ratio by ratio."""
     names = list(PRESETS) if presets is None else list(presets)
     for name in names:
         if name not in PRESETS:
@@ -134,7 +134,7 @@ def run_tasks(
     trust_sizes: bool,
     listener: ProgressListener,
 ) -> Iterator[Run | Failure]:
-    """Run every task in a process of its own, one after the other."""
+    """Run every task in its own process, one after another."""
     warned: set[str] = set()
     for done, task in enumerate(tasks):
         listener(ProgressEvent(stage=STAGE, done=done, total=len(tasks), note=task.name))
@@ -156,7 +156,7 @@ def run_task(
     device: str = "auto",
     trust_sizes: bool = False,
 ) -> Run:
-    """Run one task as ``cvtgs simplify`` does, in a process of its own."""
+    """Run one task by ``cvtgs simplify`` in its own process."""
     path, report = folder / task.file_name, folder / f".{task.file_name}.json"
     words = ["--rho", repr(task.rho), "--preset", task.preset, "--device", device]
     words += ["--report", str(report), "--overwrite", "--quiet"]
@@ -172,12 +172,12 @@ def run_task(
 
 
 def start_seconds() -> float:
-    """Measure the seconds of a process before it reads a scene."""
+    """Measure the seconds that a process takes before it reads a scene."""
     return run_process([sys.executable, "-c", START]).wall_seconds
 
 
 def pass_warnings_on(errors: str, warned: set[str]) -> None:
-    """Repeat the warnings of a process, each once for all processes."""
+    """Repeat the warnings of a process, except those in ``warned``, which is updated."""
     for line in errors.splitlines():
         if line.startswith(WARNING) and line not in warned:
             warned.add(line)
@@ -187,7 +187,7 @@ def pass_warnings_on(errors: str, warned: set[str]) -> None:
 def run_process(command: Sequence[str]) -> ProcessCost:
     r"""Run a command to its end and measure it.
 
-    If this call is interrupted, the process is ended first.
+    If this call is interrupted, the process is terminated first.
     """
     launcher = [sys.executable, "-S", "-c", LAUNCHER, *command]
     reading, writing = os.pipe()

@@ -1,4 +1,4 @@
-"""Training of MergeNet: scenes, cases, losses, and a loop that can be resumed."""
+"""Training of MergeNet: scenes, cases, losses, and a resumable loop."""
 
 from cvtgs.train.config import DataConfig, LossConfig, TrainConfig, ViewsConfig
 from cvtgs.train.loop import TrainFiles, train

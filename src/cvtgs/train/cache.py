@@ -1,4 +1,4 @@
-"""Cached training data: the images and cases of each scene, in files that are mapped."""
+"""Cached training data: the images and cases of each scene, in memory-mapped files."""
 
 import hashlib
 import json
@@ -23,7 +23,7 @@ from cvtgs.train.sources import Source
 Content = TypeVar("Content", TargetViews, Case)
 
 CACHE_VERSION = 6
-"""Part of the name of every file; to be raised when the meaning of the content changes."""
+"""Part of every cache key; increment it when the meaning of the content changes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -32,7 +32,7 @@ class TrainingScene:
 
     Attributes:
         name: Name of the scene.
-        views: Images, one entry for each size.
+        views: Images, one entry per size.
         cases: The scene at several ratios.
     """
 
@@ -42,16 +42,16 @@ class TrainingScene:
 
 
 def prepare_scene(source: Source, config: TrainConfig, folder: Path) -> TrainingScene:
-    """Return the data of a scene, from the cache if it is there.
+    """Return the data of a scene, from the cache if possible.
 
     Images and cases are in separate files, so that trainings for other presets share images.
-    Memory: that of one scene while it is prepared; cached tensors are mapped.
+    Memory: one scene during its preparation; cached tensors are memory-mapped.
     """
     simplify = SimplifyConfig.from_preset(config.preset)
     ratios = config.data.validation_ratios if source.is_validation else config.data.ratios
     sizes = (config.views.validation_size,) if source.is_validation else config.views.sizes
     if config.kind == "published" and not source.is_validation:
-        sizes = ()  # it learns from images of single cells
+        sizes = ()  # it trains on images of single cells
     count = config.views.validation_count if source.is_validation else config.views.count
     scene, file = cache(source.make), source.cameras
     seen_from = config.seed if file is None else hashlib.sha256(file.read_bytes()).hexdigest()
@@ -81,7 +81,7 @@ def _cached(
     make: Callable[[], dict[str, Tensor]],
     unpack: Callable[[Mapping[str, Tensor]], tuple[Content, ...]],
 ) -> tuple[Content, ...]:
-    """Read a file; write it first if it is missing or damaged."""
+    """Read a cache file; write it first if it is missing or damaged."""
     if path.is_file():
         try:
             return unpack(map_tensors(path)[0])
@@ -137,7 +137,7 @@ def _unpacked_cases(name: str, tensors: Mapping[str, Tensor]) -> tuple[Case, ...
     count = _entry_count(tensors)
     if count == 0:
         return ()
-    # Merged Gaussians must be rendered as their scene is.
+    # Merged Gaussians must be rendered in the same way as their scene.
     comments = (ANTIALIASED_TAG,) if "antialiased" in tensors else ()
     scene = GaussianScene(**under_prefix("scene/", tensors), comments=comments)
     visibility = tensors["visibility"]

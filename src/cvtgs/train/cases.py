@@ -1,4 +1,4 @@
-"""Training cases: scenes at a ratio, and images of full scenes as targets."""
+"""Training cases: scenes simplified to a ratio, and images of full scenes as targets."""
 
 from collections import OrderedDict
 from dataclasses import dataclass, fields, is_dataclass
@@ -33,7 +33,7 @@ from cvtgs.validity import check_rows
 from cvtgs.views import mixed_views
 
 DEVICE_BYTES = 10**9
-"""Memory for copies on a device that does not say how much it has."""
+"""Memory for copies on devices that do not report their free memory, bytes."""
 
 
 class MergedScene(NamedTuple):
@@ -47,7 +47,7 @@ class MergedScene(NamedTuple):
 
 
 def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> MergedScene:
-    """Run all stages before the network, with fewer cells than valid Gaussians."""
+    """Run all stages before the network; ``target`` must be below the number of valid Gaussians."""
     valid = check_rows(scene).scene
     if target >= len(valid):
         raise InvalidArgumentError(
@@ -82,7 +82,7 @@ class Case:
     Attributes:
         scene_name: Name of the scene.
         ratio: Share of Gaussians kept.
-        reference: Scene, merged Gaussians, cells, neighbours.
+        reference: Scene, merged Gaussians, cells, neighbours, visibility.
         cells: ``(r,)`` cells of several members, which the network corrects.
         part: Members of these cells.
         descriptors: Input of the network for these cells.
@@ -97,11 +97,11 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Return scene and ratio."""
+        """The scene name and ratio as text."""
         return f"{self.scene_name} at {self.ratio:g}"
 
     def select(self, rows: Int[Tensor, "s"]) -> "Case":
-        """Return the case of some of the cells."""
+        """Return the case restricted to some of its cells."""
         part, cells = self.part.select(rows), self.cells[rows]
         return describe_case(self.scene_name, self.ratio, self.reference, cells, part)
 
@@ -117,7 +117,7 @@ class Case:
         )
 
     def correct_by(self, net: MergeNet | PublishedMergeNet) -> GaussianScene:
-        """Return the whole small scene with its cells corrected by a network."""
+        """Return the whole simplified scene with its cells corrected by a network."""
         if isinstance(net, MergeNet):
             return self.correct_scene(net(self.descriptors))
         scene, merged, _, _, _ = self.reference
@@ -126,7 +126,7 @@ class Case:
         return self._with_cells(changed)
 
     def correct_scene(self, residuals: Residuals) -> GaussianScene:
-        """Return the whole small scene with its cells corrected, differentiably."""
+        """Return the whole simplified scene with its cells corrected, differentiably."""
         return self._with_cells(self.correct_cells(residuals))
 
     def _with_cells(self, changed: dict[str, Tensor]) -> GaussianScene:
@@ -140,7 +140,7 @@ class Case:
         )
 
     def to(self, device: torch.device) -> "Case":
-        """Move the case to a device."""
+        """Return the case on a device."""
         reference, part = self.reference, self.part
         if reference.scene.device == device:
             return self
@@ -164,7 +164,7 @@ class Case:
 def describe_case(
     scene_name: str, ratio: float, reference: MergedScene, cells: Tensor, part: Partition
 ) -> Case:
-    """Compute the descriptors of some cells."""
+    """Return the case of some cells, with their descriptors."""
     descriptors = describe_cells(
         reference.scene,
         reference.merged,
@@ -218,7 +218,7 @@ class TargetViews:
 
     def select(self, row: int) -> "TargetViews":
         """Return one of the images."""
-        rows = torch.full((1,), row, device=self.cameras.Ks.device)  # without a copy
+        rows = torch.full((1,), row, device=self.cameras.Ks.device)  # no copy to the device
         return TargetViews(
             cameras=self.cameras.select(rows),
             rgb=self.rgb[row : row + 1],
@@ -226,7 +226,7 @@ class TargetViews:
         )
 
     def to(self, device: torch.device) -> "TargetViews":
-        """Move the images to a device."""
+        """Return the images on a device."""
         return TargetViews(
             cameras=self.cameras.to(device), rgb=self.rgb.to(device), alpha=self.alpha.to(device)
         )
@@ -236,11 +236,11 @@ Item = TypeVar("Item", Case, TargetViews)
 
 
 class DeviceCopies:
-    """Copies of cases and images on a device; those that were asked for last stay there.
+    """A cache of copies of cases and images on a device; the least recently used are evicted.
 
     Args:
-        device: Where to.
-        room: Bytes that the copies may take together; None is half of what is free on CUDA, and
+        device: Device of the copies.
+        room: Largest total size of the copies, bytes; None is half of the free memory on CUDA, and
             1 GB elsewhere.
     """
 
@@ -248,12 +248,12 @@ class DeviceCopies:
         self.device, self._room = device, room or DEVICE_BYTES
         if room is None and device.type == "cuda":
             self._room = torch.cuda.mem_get_info(device)[0] // 2
-        # The originals are kept beside the copies, so that their numbers stay theirs.
+        # The originals are kept with the copies, so that their ids are not reused.
         self._copies: OrderedDict[int, tuple[Any, Any]] = OrderedDict()
         self._taken = 0
 
     def get(self, item: Item) -> Item:
-        """Return a copy on the device; the item itself if it is there."""
+        """Return a copy on the device, or the item itself on a CPU."""
         if self.device.type == "cpu":
             return item
         if id(item) not in self._copies:
@@ -267,7 +267,7 @@ class DeviceCopies:
 
 
 def _byte_count(value: Any) -> int:
-    """Return the bytes of all tensors in a value."""
+    """Return the total size of all tensors in a value, bytes."""
     if isinstance(value, Tensor):
         return value.nbytes
     if is_dataclass(value):
@@ -279,9 +279,9 @@ def _byte_count(value: Any) -> int:
 def render_views(
     scene: GaussianScene, count: int, *, size: int, seed: int, file: Path | None = None
 ) -> TargetViews:
-    """Render a full scene from cameras of a file, spread evenly, or from mixed views.
+    """Render a full scene from evenly spread cameras of a file, or from mixed views.
 
-    Blurred views are learned from as well: the shipped networks were.
+    Mixed views include blurred ones, as in the training of the shipped networks.
     """
     if file is None:
         cameras = mixed_views(scene, count, size=size, seed=seed, sharp=False)

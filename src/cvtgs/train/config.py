@@ -1,4 +1,4 @@
-"""TrainConfig: the settings of a training, from a TOML file."""
+"""TrainConfig: the settings of a training, read from a TOML file."""
 
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -10,27 +10,27 @@ from cvtgs.errors import ConfigError
 
 Ratio = Annotated[float, pydantic.Field(gt=0.0, lt=1.0)]
 Count = Annotated[int, pydantic.Field(ge=1)]
-Side = Annotated[int, pydantic.Field(ge=11)]  # of a window of SSIM, pixels
+Side = Annotated[int, pydantic.Field(ge=11)]  # at least an SSIM window, pixels
 
 
 class DataConfig(Section):
-    """Scenes to train on, and scenes that decide when to stop.
+    """Training scenes, and validation scenes that decide when to stop.
 
     Attributes:
-        folders: Folders of PLY files; relative ones start at the configuration file.
-        validation: Names of files (without .ply) for validation only; every fifth file, from the
-            second on, if none is named. They are looked at from the cameras of
-            ``NAME.transforms.json``, if it lies beside the file.
-        generated: Generated training scenes of each kind.
-        generated_validation: Generated scenes of each kind for validation only.
-        generated_counts: Gaussians of generated scenes, in turn.
-        blocks: Compact pieces that are cut from each file that is larger than a piece.
-        block_count: Gaussians of a piece.
-        copies: Perturbed copies of each scene or piece: thinned, stretched, with other contrast
-            and opacity.
-        ratios: Ratios to train at.
-        validation_ratios: Ratios to validate at.
-        largest_scene: Files with more Gaussians are used in pieces only, to bound the time of a
+        folders: Folders of PLY files; relative paths start at the folder of the configuration file.
+        validation: Names of files (without .ply) for validation only; if none is named, every
+            fifth file, starting with the second. They are rendered with the cameras of
+            ``NAME.transforms.json`` if it is in the same folder.
+        generated: Number of generated training scenes of each kind.
+        generated_validation: Number of generated validation scenes of each kind.
+        generated_counts: Numbers of Gaussians of generated scenes, used cyclically.
+        blocks: Number of compact pieces cut from each file that is larger than a piece.
+        block_count: Number of Gaussians in a piece.
+        copies: Number of perturbed copies of each scene or piece: thinned, stretched, with
+            different contrast and opacity.
+        ratios: Ratios for training.
+        validation_ratios: Ratios for validation.
+        largest_scene: Files with more Gaussians are used only in pieces, to bound the time of a
             step.
     """
 
@@ -48,15 +48,15 @@ class DataConfig(Section):
 
 
 class ViewsConfig(Section):
-    """Images to train on: a quarter from automatic cameras, the others from random positions.
+    """Training images: a quarter from automatic cameras, the others from random positions.
 
     Attributes:
-        count: Images of each scene at each size.
-        sizes: Sides of the square images, pixels; like those below at least 11, the window of SSIM.
-        per_step: Images that one step renders.
-        crop: Side of the random crop of each that is compared, pixels.
-        validation_count: Images of each validation scene.
-        validation_size: Side of their images, pixels.
+        count: Number of images of each scene at each size.
+        sizes: Sides of the square images, pixels; all sides are at least 11, the SSIM window.
+        per_step: Number of images that one step renders.
+        crop: Side of the random crop that is compared in each image, pixels.
+        validation_count: Number of images of each validation scene.
+        validation_size: Side of the validation images, pixels.
     """
 
     count: Count = 16
@@ -72,7 +72,7 @@ class LossConfig(Section):
 
     ``mse_weight log(mse) + image_weight log(loss of CVT-GS) + ssim_weight log(1 - SSIM)
     + residual_weight * size of the residuals``.
-    Logarithms give every scene, ratio and view the same weight, as a mean of PSNR does.
+    With logarithms, every scene, ratio and view has the same weight, as in a mean of PSNR.
 
     Attributes:
         mse_weight: Weight of the logarithm of the mean squared error.
@@ -89,27 +89,27 @@ class LossConfig(Section):
 
 
 class TrainConfig(Section):
-    """The settings of a training; frozen, unknown keys are errors.
+    """The settings of a training. The class is frozen, and unknown keys are errors.
 
     Attributes:
         kind: ``scene``: whole simplified scenes are rendered; ``local``: single cells;
             ``published``: the network and the training of CVT-GS on crops of single cells.
         preset: The preset whose merged Gaussians the network learns to correct.
-        start: Checkpoint to start from; its widths and largest growth must be the same.
+        start: Checkpoint to start from, of the same kind, widths and largest growth.
         seed: Seed of all random numbers.
-        steps: Training steps.
+        steps: Number of training steps.
         learning_rate: Largest learning rate of AdamW; it falls to zero along a cosine.
         width: Units of the layers for members and neighbours.
         cell_width: Units of the layers for cells.
         largest_growth: Largest change of a log scale; the published network has no limit.
         validate_every: Steps between validations.
-        patience: Validations without a new best before training stops.
-        averaged_steps: The network that is kept is a running mean of the weights over about this
-            many steps, and over a ninth of all steps before it at most.
-        cells: Cells in one step of a ``local`` or ``published`` training.
-        members: Members of all cells in one step of a ``published`` training.
+        patience: Number of validations without a new best after which training stops.
+        averaged_steps: The saved network is a running mean of the weights over about this many
+            steps, and over at most a ninth of all steps so far.
+        cells: Largest number of cells in one step of a ``local`` or ``published`` training.
+        members: Largest total number of members in one step of a ``published`` training.
         tile: Side of the crop that shows a cell in a ``published`` training, pixels.
-        note: Sentence about the training data, for the checkpoint.
+        note: Sentence about the training data, stored in the checkpoint.
         data: Scenes.
         views: Images.
         loss: Loss.
@@ -147,10 +147,10 @@ class TrainConfig(Section):
             path: A TOML file with the keys of this class; missing keys keep their defaults.
 
         Returns:
-            The configuration; relative paths are made relative to the file.
+            The configuration; relative paths are resolved against the folder of the file.
 
         Raises:
-            ConfigError: The file cannot be read, is not TOML, or holds a bad key or value.
+            ConfigError: The file cannot be read, is not TOML, or has an invalid key or value.
         """
         path = Path(path)
         try:

@@ -1,4 +1,4 @@
-"""The training loop: steps, validations, files; the same result whether interrupted or not."""
+"""The resumable training loop: steps, validations and output files."""
 
 import copy
 import math
@@ -34,10 +34,10 @@ from cvtgs.train.sources import Source, find_sources
 from cvtgs.train.state import Gain, History, TrainState, Validation
 
 WARM_UP = 50
-"""Steps in which the learning rate rises."""
+"""Number of steps in which the learning rate rises."""
 
 LARGEST_GRADIENT = 1.0
-"""Gradients are scaled down to this norm."""
+"""Gradients are clipped to this norm."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +47,7 @@ class TrainFiles:
     Attributes:
         checkpoint: The best network so far.
         state: State to resume from.
-        curves: An image of the history; there is none without matplotlib.
+        curves: Plot of the history; not written without matplotlib.
         cache: Folder of prepared scenes.
     """
 
@@ -58,14 +58,14 @@ class TrainFiles:
 
     @classmethod
     def beside(cls, checkpoint: Path, cache: Path | None = None) -> "TrainFiles":
-        """Return the usual names.
+        """Return the default paths for a checkpoint.
 
         Args:
-            checkpoint: The best network so far.
-            cache: Folder of prepared scenes; beside the checkpoint if None.
+            checkpoint: Path of the checkpoint.
+            cache: Folder of prepared scenes; None puts it beside the checkpoint.
 
         Returns:
-            Names that start like that of the checkpoint.
+            Paths with the stem of the checkpoint.
 
         Example:
             >>> TrainFiles.beside(Path("net.safetensors")).curves.name
@@ -91,14 +91,13 @@ def train(
     """Train a MergeNet.
 
     Each step takes one scene at one ratio. The choice of scene, ratio and cameras depends only on
-    the seed and the number of the step, so a resumed training gives the same bits as an
-    uninterrupted one. The network that is kept is a running mean over steps, at the validation
-    where it gained most.
+    the seed and the step number, so a resumed training gives the same bits as an uninterrupted
+    one. The saved network is a running mean over steps, from the validation of largest gain.
 
     Args:
         config: The settings.
-        files: Where to write; checkpoint, state and curves are replaced as training goes on.
-        resume: Whether to resume from ``files.state``, if there is one.
+        files: Output files; checkpoint, state and curves are replaced during training.
+        resume: Whether to resume from ``files.state`` if it exists.
         device: Device to train on.
         listener: Called for each prepared scene and each step.
         on_validation: Called after each validation.
@@ -108,7 +107,7 @@ def train(
 
     Raises:
         ConfigError: There are no scenes to train on or to validate with.
-        CheckpointError: The start, or the state to resume, cannot be used.
+        CheckpointError: The start checkpoint or the state to resume from cannot be used.
         TrainingError: The loss is not finite; the message names the scene and the last good file.
         OutputError: A file cannot be written.
 
@@ -278,13 +277,13 @@ def _validate(
     try:
         curves = history.curves()
     except MissingDependencyError:
-        return  # hours of training are not lost for an image
+        return  # do not lose hours of training for a plot
     with atomic_output(files.curves, overwrite=True) as file:
         file.write(curves)
 
 
 def _description(state: TrainState, config: TrainConfig) -> CheckpointInfo:
-    # Without paths, and without the note, which is told by itself.
+    # Without paths, and without the note, which has its own field.
     told = config.model_dump_json(exclude={"start": True, "note": True, "data": {"folders"}})
     return CheckpointInfo(
         architecture=state.net.architecture,

@@ -1,4 +1,4 @@
-"""Losses of a training step: images of whole scenes, of single cells in a grid, or in crops."""
+"""Losses of a training step: images of whole scenes, of cells in a grid, or of crops of cells."""
 
 import math
 import random
@@ -28,16 +28,16 @@ from cvtgs.train.cases import Case, MergedScene, TargetViews
 from cvtgs.train.config import LossConfig, TrainConfig
 
 BLACK_SHARE = 0.5
-"""Share of the images of whole scenes that are over black."""
+"""Share of the images of whole scenes that have a black background."""
 
 TILE = 32
-"""Pixels of the side of a tile, which shows one cell."""
+"""Side of a tile, which shows one cell, pixels."""
 
 DISTANCE = 50.0
-"""Distance of the camera in image widths, so far that all cells are projected alike."""
+"""Distance of the camera in image widths, so large that all cells are projected alike."""
 
 TILE_WIDTH = 7.0
-"""Width of a tile in largest standard deviations of its cell, before the random zoom."""
+"""Width of a tile in units of the largest standard deviation of its cell, before random zoom."""
 
 
 def scene_loss(
@@ -45,7 +45,7 @@ def scene_loss(
 ) -> Float[Tensor, ""]:
     """Compare random crops of images of the corrected scene, over black or a random background.
 
-    Whole images are rendered: a camera that sees the crop only would project Gaussians beside it
+    Whole images are rendered, because a camera of the crop alone would project Gaussians beside it
     differently.
     """
     residuals: Residuals = net(case.descriptors)
@@ -66,7 +66,7 @@ def scene_loss(
 def local_loss(
     net: MergeNet, case: Case, *, config: TrainConfig, rng: random.Random
 ) -> Float[Tensor, ""]:
-    """Compare images of single cells in a grid: members against the corrected Gaussian."""
+    """Compare images of single cells in a grid, members against the corrected Gaussian."""
     number = min(config.cells, len(case.cells))
     drawn = sorted(rng.sample(range(len(case.cells)), number))
     rows = torch.tensor(drawn, device=case.cells.device)
@@ -86,8 +86,8 @@ def published_loss(
 ) -> Float[Tensor, ""]:
     """Compare crops of single cells, members against the corrected Gaussian, as CVT-GS does.
 
-    ``0.8 L1 + 0.2 (1 - SSIM) + 0.2 gradient`` of each crop by itself, with all SH bands. Each
-    cell is seen from a random direction, larger or smaller at random, over a random background.
+    The loss is ``0.8 L1 + 0.2 (1 - SSIM) + 0.2 gradient`` per crop, with all SH bands. Each cell is
+    seen from a random direction, at a random zoom, over a random background.
     """
     scene, merged, _, _, _ = case.reference
     rows = _draw_cells(case.part.counts, config, rng)
@@ -105,7 +105,7 @@ def published_loss(
 
 
 def _draw_cells(counts: Int[Tensor, "r"], config: TrainConfig, rng: random.Random) -> Tensor:
-    """Draw cells until they are enough, or have enough members; ascending."""
+    """Draw random cells within the limits of cells and members; row numbers ascending."""
     rows = rng.sample(range(len(counts)), min(config.cells, len(counts)))
     drawn = torch.tensor(rows, device=counts.device)
     fitting = counts[drawn].cumsum(0) <= config.members
@@ -117,7 +117,7 @@ def _draw_cells(counts: Int[Tensor, "r"], config: TrainConfig, rng: random.Rando
 def cut_crops(
     image: Float[Tensor, "1 h w 3"], count: int, tile: int, apart: int
 ) -> Float[Tensor, "m t t 3"]:
-    """Cut the tiles of the first cells out of the image of a grid, one image each."""
+    """Cut the tiles of the first ``count`` cells out of the image of a grid."""
     side, step = image.shape[1] // (tile * apart), tile * apart
     grid = image[0].reshape(side, step, side, step, 3).permute(0, 2, 1, 3, 4).flatten(0, 1)
     margin = (step - tile) // 2
@@ -159,7 +159,7 @@ def _residual_penalty(residuals: Residuals, config: LossConfig) -> Float[Tensor,
 
 
 def _background(rng: random.Random, case: Case) -> Float[Tensor, "3"]:
-    """Return black, as most viewers have it, where faint haze shows most, or a random colour."""
+    """Return a random colour, or black: most viewers have it, and it shows faint haze best."""
     color = _random_color(rng, case)
     return color * 0.0 if rng.random() < BLACK_SHARE else color
 
@@ -198,8 +198,8 @@ def lay_out_cells(
 ) -> CellGrid:
     """Put cells in the tiles of a grid, each rotated, zoomed and shifted at random.
 
-    Tiles are ``tile`` pixels wide and ``apart`` widths from one another. Colours are those of
-    the constant band, or those of all bands as seen by the camera.
+    Tiles are ``tile`` pixels wide; their centres are ``apart`` tile widths apart. Colours are those
+    of the constant band, or of all bands as seen by the camera.
     """
     count = len(cells)
     side = math.ceil(math.sqrt(count))
@@ -262,7 +262,7 @@ class _Placement:
         rotated = torch.einsum("nij,nj->ni", rotations, local)
         sh0 = tensors["sh0"]
         if all_bands and tensors["shN"].shape[1]:
-            # The camera looks along z, which is the last row in the frame of the scene.
+            # The camera looks along z; in the frame of the scene, that is the last row.
             colors = spherical_harmonics.evaluate(sh0, tensors["shN"], rotations[:, 2])
             sh0 = ((colors - 0.5) / spherical_harmonics.SH_C0)[:, None]
         return GaussianScene(

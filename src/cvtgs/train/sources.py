@@ -1,4 +1,4 @@
-"""Scenes to train on and to validate with: files, pieces of them, copies, generated ones."""
+"""Scenes for training and validation: files, pieces of them, perturbed copies, generated scenes."""
 
 import hashlib
 import random
@@ -20,20 +20,20 @@ from cvtgs.train.config import DataConfig
 from cvtgs.validity import valid_rows
 
 VALIDATION_SEED = 1_000_000
-"""First seed of generated scenes for validation."""
+"""First seed of generated validation scenes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """A named scene that is made when it is needed.
+    """A named scene that is made lazily.
 
     Attributes:
         name: Unique name.
-        identity: Text that changes when the scene does, part of the name of its cache.
+        identity: Text that changes when the scene does; part of the key of its cache.
         is_validation: Whether it is for validation only.
-        origin: The file or generated scene that it is, or was cut from.
+        origin: The file or generated scene that it is or is derived from.
         make: Function that makes the scene.
-        cameras: File of cameras to validate from; None finds views.
+        cameras: File of cameras for validation; None finds views.
     """
 
     name: str
@@ -48,7 +48,7 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
     """List the scenes of a training without making them.
 
     Args:
-        config: Which scenes.
+        config: Settings of the scenes.
         seed: Seed of pieces, copies and generated scenes.
 
     Returns:
@@ -58,7 +58,7 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
     Raises:
         ConfigError: A folder or a validation file is missing, or there is nothing to train on
             or to validate with.
-        FileFormatError: A file is no PLY file with Gaussians, or damaged.
+        FileFormatError: A file is not a PLY file with Gaussians, or is damaged.
 
     Example:
         >>> config = DataConfig(generated=1, generated_validation=1, generated_counts=(1000,))
@@ -171,7 +171,7 @@ def _generated(config: DataConfig, seed: int) -> Iterator[Source]:
 
 
 def cut_block(scene: GaussianScene, count: int, *, seed: int) -> GaussianScene:
-    """Cut a compact piece out of a scene: a random Gaussian and its nearest ones."""
+    """Cut a compact piece out of a scene: a random Gaussian and its nearest neighbours."""
     if len(scene) <= count:
         return scene
     middle = scene.means[random.Random(seed).randrange(len(scene))]
@@ -182,8 +182,7 @@ def cut_block(scene: GaussianScene, count: int, *, seed: int) -> GaussianScene:
 def perturb(scene: GaussianScene, rng: random.Random) -> GaussianScene:
     """Thin, stretch and recolour a scene.
 
-    Rotations, translations and uniform scales would add nothing: they leave descriptors as they
-    are.
+    Rotations, translations and uniform scales would add nothing: descriptors are invariant to them.
     """
     generator = torch.Generator().manual_seed(rng.getrandbits(62))
     share = rng.uniform(0.4, 1.0)

@@ -1,4 +1,4 @@
-"""The state of a training, to be saved and resumed: networks, optimiser, and its validations."""
+"""The state of a training, which can be saved and resumed: networks, optimiser, validations."""
 
 import copy
 import json
@@ -22,11 +22,11 @@ CURVES: tuple[tuple[Callable[[list[float]], float], str], ...] = (
     (mean, "mean gain, validation scenes"),
     (min, "gain of the worst validation scene"),
 )
-"""Statistics of the gains of all scenes that are drawn, and their titles."""
+"""Plotted statistics of the gains over all scenes, and their titles."""
 
 
 class Gain(NamedTuple):
-    """What the network gained on one validation scene at one ratio.
+    """The gain of the network on one validation scene at one ratio.
 
     Attributes:
         scene: Name of the scene.
@@ -43,7 +43,7 @@ class Validation(NamedTuple):
     """Gains of the running mean of the network on the validation scenes.
 
     Attributes:
-        step: Number of steps before it.
+        step: Number of steps before this validation.
         loss: Mean training loss since the last validation; NaN before the first step.
         gains: Gains by scene and ratio.
     """
@@ -61,7 +61,7 @@ class Validation(NamedTuple):
         """Return the gains of all scenes, by ratio.
 
         Returns:
-            Decibels by ratio, the largest ratio first.
+            Decibels by ratio, largest ratio first.
         """
         ratios = sorted({gain.ratio for gain in self.gains}, reverse=True)
         return {
@@ -96,11 +96,7 @@ class History:
         return max(self.validations, key=lambda entry: entry.mean_gain, default=None)
 
     def since_best(self) -> int:
-        """Count the validations after the best one.
-
-        Returns:
-            Their number.
-        """
+        """Count the validations after the best one."""
         best = self.best()
         return 0 if best is None else len(self.validations) - 1 - self.validations.index(best)
 
@@ -108,7 +104,7 @@ class History:
         """Return the validations as plain values.
 
         Returns:
-            Lists, numbers and texts, for :meth:`from_json`.
+            Lists, numbers and strings, for :meth:`from_json`.
         """
         values: list[Any] = _VALIDATIONS.dump_python(self.validations, mode="json")
         return values
@@ -120,20 +116,17 @@ class History:
         Args:
             values: Result of :meth:`to_json`.
 
-        Returns:
-            The history.
-
         Raises:
-            ValueError: The values are not those of a history.
+            ValueError: The values do not describe a history.
         """
         history = cls()
         history.validations = _VALIDATIONS.validate_python(values)
         return history
 
     def curves(self) -> bytes:
-        """Draw the training loss, and the gains by ratio: their mean, and the smallest.
+        """Plot the training loss, and the mean and smallest gains by ratio.
 
-        There must have been a validation.
+        There must be at least one validation.
 
         Returns:
             A PNG file.
@@ -185,7 +178,7 @@ class TrainState:
         self.averaged_steps = config.averaged_steps
 
     def learn_range(self, cases: Iterable[Tensor]) -> None:
-        """Set the known range of both networks from the summaries of all cases."""
+        """Fit the known range of both networks to the summaries of all cases."""
         if isinstance(self.net, MergeNet) and isinstance(self.mean_net, MergeNet):
             self.net.known.fit(cases)
             self.mean_net.known.load_state_dict(self.net.known.state_dict())
@@ -223,7 +216,7 @@ class TrainState:
                     f"remove it, or train to another output."
                 )
             self._check_origin(path, record["version"], record["scenes"])
-            # Mapped tensors must not be written to: load_state_dict copies, the optimiser does not.
+            # Mapped tensors must not be written to, and the optimiser does not copy them: clone.
             self._load_tensors({name: values.clone() for name, values in tensors.items()})
             self.step = int(record["step"])
             self.history = History.from_json(record["history"])
@@ -233,7 +226,7 @@ class TrainState:
             raise CheckpointError(f"{path}: the state of the training is damaged.") from error
 
     def _check_origin(self, path: Path, version: str, scenes: list[dict[str, Any]]) -> None:
-        """Refuse a state of another version or other scenes: the checkpoint names one of each."""
+        """Raise an error for another version or other scenes: a checkpoint names one of each."""
         if version != cvtgs.__version__:
             raise CheckpointError(
                 f"{path}: the state was made by cvtgs {version}, this is {cvtgs.__version__}; "
@@ -258,5 +251,5 @@ class TrainState:
 
 
 def _fingerprint(config: TrainConfig) -> dict[str, Any]:
-    """Return the settings that must be the same to resume."""
+    """Return the settings that must not change between start and resume."""
     return config.model_dump(mode="json", exclude={"note", "patience"})

@@ -1,4 +1,4 @@
-"""Automatic views: candidates around a scene or inside of a room, and the best of them."""
+"""Automatic views: candidates around a scene or inside a room, and the choice of the best."""
 
 import math
 from collections.abc import Sequence
@@ -50,14 +50,14 @@ OUTSIDE_FIELD = 45.0
 """Field of view around a scene along the shorter side of the image, degrees."""
 
 INSIDE_FIELD = 62.0
-"""The same inside a room."""
+"""Field of view inside a room along the shorter side of the image, degrees."""
 
 _PLACE_RADIUS = 0.95
 _OBJECT_RADIUS = 1.0
 _INSIDE_PITCH = -10.0
 _PATH_RADIUS = 0.15
 _WALL_QUANTILE = 0.8
-"""Of the surfaces in a direction, the nearest are furniture and the farthest stray."""
+"""Quantile of surface distances taken as a wall: the nearest are furniture, the farthest stray."""
 
 _FARTHEST = 1.5
 _FOUND = 2
@@ -65,12 +65,12 @@ _FOUND = 2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CandidateCameras:
-    """Cameras in rounds: the first choice of every view, then its alternates.
+    """Cameras in rounds: first the preferred camera of every view, then its alternates.
 
     Attributes:
-        inside: Whether they are inside a room.
-        rounds: Cameras of one round; all rounds have one camera per view.
-        distances: From each camera to what it should show, scene units, one tensor per round.
+        inside: Whether the cameras are inside a room.
+        rounds: Cameras of each round, one per view.
+        distances: Distance from each camera to its subject, scene units, one tensor per round.
     """
 
     inside: bool
@@ -81,7 +81,7 @@ class CandidateCameras:
 def outside_candidates(
     layout: SceneLayout, count: int, *, size: tuple[int, int], turn: float
 ) -> CandidateCameras:
-    """Return cameras around the scene at several heights that look at its middle."""
+    """Return cameras around the scene at several elevations, looking at its middle."""
     right, ahead = _level_axes(layout.up)
     shown = layout.radius * (_OBJECT_RADIUS if layout.bounded else _PLACE_RADIUS)
     distance = shown / math.sin(math.radians(0.5 * OUTSIDE_FIELD))
@@ -116,7 +116,7 @@ def inside_candidates(
     size: tuple[int, int],
     turn: float,
 ) -> CandidateCameras:
-    """Return cameras in a room, back from its middle, that look across."""
+    """Return cameras in a room, moved back from its middle and looking across it."""
     right, ahead = _level_axes(layout.up)
     pitch = math.radians(_INSIDE_PITCH)
     rounds, distances = [], []
@@ -134,7 +134,7 @@ def inside_candidates(
 def found_candidates(
     positions: CameraPositions, count: int, *, size: tuple[int, int], seed: int
 ) -> CandidateCameras:
-    """Return cameras at positions that were found to be good, to take where others are not."""
+    """Return cameras at known good positions, as alternates to the other candidates."""
     layout = positions.layout
     inside = layout.room is not None
     reach = REACH if inside else (1.4, REACH[1])
@@ -155,7 +155,7 @@ def found_candidates(
 def _distances_to_walls(
     layout: SceneLayout, start: Float[Tensor, "3"], directions: Float[Tensor, "c 3"]
 ) -> Float[Tensor, "c"]:
-    """Return the distances to the walls behind the furniture, scene units."""
+    """Return the distance to the wall in each direction, scene units."""
     points = layout.frame.center + layout.frame.radius * layout.voxels.points - start
     along = directions @ points.T
     aside = (points.square().sum(dim=1) - along.square()).clamp_min(0).sqrt()
@@ -185,27 +185,27 @@ def automatic_views(
     height: int = 480,
     seed: int = 0,
 ) -> Cameras:
-    """Choose cameras that show a scene of which nothing else is known.
+    """Choose cameras for a scene of which nothing else is known.
 
-    Where the scene is, how large and which way is up comes from robust statistics of what is
-    visible (:func:`cvtgs.views.up.find_up`), so flyaways, sky shells and haze do not matter. The
-    cameras stand around the scene at several heights; if its middle is free, surfaces are all
-    around and above, and larger Gaussians lie behind these than before them, they stand inside and
-    look across. They stand only where :class:`cvtgs.views.CameraPositions` says they may.
-    Every camera is scored by an image of 64 pixels: one that is inside of a Gaussian, has
-    something near in its image, or sees nothing is replaced by the first good alternate, or by the
+    Position, size and up direction of the scene come from robust statistics of its visible
+    Gaussians (:func:`cvtgs.views.up.find_up`), so flyaways, sky shells and haze do not matter. The
+    cameras stand around the scene at several elevations. They stand inside and look across if the
+    middle is free, surfaces are all around and above, and the Gaussians behind these surfaces are
+    larger than those before them. They stand only where :class:`cvtgs.views.CameraPositions`
+    admits them. Every camera is scored by an image of 64 pixels. If it is inside a Gaussian, has
+    a near obstacle in its image, or sees nothing, the first good alternate replaces it, or the
     best of them.
 
     The same scene, count, size and seed give the same cameras. Memory: a sample of at most
     30,000 Gaussians, and masks of the scene.
 
     Args:
-        scene: Any scene with at least one valid Gaussian, a file or folder of one, or what
-            :func:`cvtgs.views.find_view_positions` found of it.
+        scene: Any scene with at least one valid Gaussian, a file or folder of one, or the result
+            of :func:`cvtgs.views.find_view_positions`.
         count: Number of views, at least 1.
-        width: Pixels per row.
-        height: Rows.
-        seed: Turns the cameras around the scene: another seed, other views.
+        width: Width of the images, pixels.
+        height: Height of the images, pixels.
+        seed: Turns the cameras around the scene, so that another seed gives other views.
 
     Returns:
         The cameras, float64 on the CPU, named ``view 1`` and so on.
@@ -234,14 +234,14 @@ def automatic_views(
 def choose_candidates(
     layout: SceneLayout, count: int, *, size: tuple[int, int], turn: float
 ) -> CandidateCameras:
-    """Return candidates inside a room if the scene is one."""
+    """Return candidates inside the scene if it is a room, else around it."""
     if layout.room is None:
         return outside_candidates(layout, count, size=size, turn=turn)
     return inside_candidates(layout, layout.room, count, size=size, turn=turn)
 
 
 def _best(positions: CameraPositions, candidates: Sequence[CandidateCameras]) -> Cameras:
-    """Return the first good candidate of every view, else the one with the least penalty."""
+    """Return the first good candidate of every view, or else that of lowest penalty."""
     first = candidates[0].rounds[0]
     viewmats = first.viewmats.clone()
     waiting = torch.arange(len(first))

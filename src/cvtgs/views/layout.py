@@ -1,4 +1,4 @@
-"""The layout of a scene: where its content is, how large, which way is up, if it is a room."""
+"""The layout of a scene: position and size of its content, up direction, floor and room."""
 
 import math
 from dataclasses import dataclass
@@ -16,24 +16,24 @@ from cvtgs.validity import valid_rows, with_finite_opacities
 from cvtgs.views.up import VOXEL_SIZE, Voxels, among_others, find_floor, find_up, voxelize
 
 ENCLOSED = 0.7
-"""A room hides this share of the upper half of what a camera in its middle could see."""
+"""Least share of the upper hemisphere that a room hides from a camera in its middle."""
 
 FREE = 0.12
 """Clearance that a camera needs, in robust radii."""
 
 _NEAR = 2.2
-"""Surfaces farther than this are not walls, in robust radii."""
+"""Surfaces farther away than this, in robust radii, are not walls."""
 
 _GROWS = 0.1
-"""In a room the sizes of Gaussians grow with their distance by this correlation: what lies behind
-the surfaces, where no image was taken, is large. In a hollow object they shrink."""
+"""Least correlation of size and distance of Gaussians in a room: Gaussians behind the surfaces,
+where no image was taken, are large. In a hollow object, sizes shrink with distance."""
 
 _HIDDEN = 0.18
-"""In a room at most this share of surfaces is behind others, seen from its middle: some 0.1 were
-measured. Around a hollow object there are outer sides, a base, things beside it: 0.25 and more."""
+"""Largest share of the surfaces of a room that is behind others, seen from its middle; about 0.1
+was measured. Hollow objects have outer sides, a base and things beside them: 0.25 and more."""
 
 _BEHIND = 1.3
-"""So many times as far as the nearest surface in the same direction is behind it."""
+"""A surface is behind another in its direction if over this many times as far, plus one voxel."""
 
 _FARTHEST = 6.0
 _MOST_POINTS = 10_000
@@ -44,14 +44,14 @@ _SECTORS = 12
 
 
 class SizedPoints(NamedTuple):
-    """The positions and mean log scales of the Gaussians that are not faint, float64."""
+    """Positions and mean log scales of Gaussians that are not faint, float64."""
 
     means: Float[Tensor, "n 3"]
     log_sizes: Float[Tensor, "n"]
 
 
 def sized_points(sample: GaussianScene) -> SizedPoints:
-    """Return every k-th Gaussian that is not faint, at most 10,000."""
+    """Return every k-th Gaussian that is not faint, at most 10,000 in total."""
     rows = (sample.opacities > _VISIBLE).nonzero()[:, 0]
     rows = rows[:: max(1, -(-len(rows) // _MOST_POINTS))]
     return SizedPoints(sample.means[rows].double(), sample.log_scales[rows].double().mean(dim=1))
@@ -65,7 +65,7 @@ def find_room(
     middle: Float[Tensor, "3"],
     up: Float[Tensor, "3"],
 ) -> Float[Tensor, "3"] | None:
-    """Return the middle at the height of the eyes if there is room and surfaces are all around."""
+    """Return the eye point in the middle of a room, in robust radii; None if it is not a room."""
     points = voxels.points
     if len(points) == 0:
         return None
@@ -91,7 +91,7 @@ def find_room(
 def enclosure(
     eye: Float[Tensor, "3"], points: Float[Tensor, "v 3"], up: Float[Tensor, "3"]
 ) -> float:
-    """Return the share of the upper half of all directions in which there is a surface."""
+    """Return the share of the upper hemisphere of directions in which there is a surface."""
     offsets = points - eye
     offsets = offsets[torch.linalg.vector_norm(offsets, dim=1) < _NEAR]
     directions = torch.nn.functional.normalize(offsets, dim=1)
@@ -106,7 +106,7 @@ def enclosure(
 
 
 def hidden_share(eye: Float[Tensor, "3"], points: Float[Tensor, "v 3"]) -> float:
-    """Return the share of the surfaces around a point that are behind others, seen from it."""
+    """Return the share of the surfaces around a point that are behind others as seen from it."""
     offsets = points - eye
     distances = torch.linalg.vector_norm(offsets, dim=1)
     around = distances < _NEAR
@@ -118,7 +118,7 @@ def hidden_share(eye: Float[Tensor, "3"], points: Float[Tensor, "v 3"]) -> float
 
 
 def size_growth(sized: SizedPoints, eye: Float[Tensor, "3"], radius: float) -> float:
-    """Return the mean correlation of sizes with distances from a point, direction by direction."""
+    """Return the correlation of sizes with distances from a point, as a mean over directions."""
     offsets = sized.means - eye
     distances = torch.linalg.vector_norm(offsets, dim=1)
     near = (distances < _FARTHEST * radius) & (distances > 0)
@@ -139,7 +139,7 @@ def size_growth(sized: SizedPoints, eye: Float[Tensor, "3"], radius: float) -> f
 
 
 def _cells_of_cube(offsets: Float[Tensor, "n 3"]) -> Tensor:
-    """Return the cell that each direction has on a cube around the point."""
+    """Return the cell of each direction on a cube around the point."""
     axes = offsets.abs().argmax(dim=1)
     depth = offsets.gather(1, axes[:, None])[:, 0]
     others = torch.stack(
@@ -154,7 +154,7 @@ def _cells_of_cube(offsets: Float[Tensor, "n 3"]) -> Tensor:
 
 
 SAMPLE_SIZE = 30_000
-"""Larger scenes are reduced to a sample of at most this many Gaussians."""
+"""Largest number of Gaussians of a sample; larger scenes are reduced to it."""
 
 _HEAVIEST = 5_000
 _MOST_POSITIONS = 100_000
@@ -167,21 +167,21 @@ _HEIGHTS = (0.02, 0.98)
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SceneLayout:
-    """Where the content of a scene is.
+    """Position, extent and orientation of the content of a scene.
 
     Attributes:
-        sample: The scene, or a sample of it that covers the same; SH degree 0, on the CPU.
-        frame: Robust centre and radius of what is visible.
+        sample: The scene, or a sample of it that covers the same area; SH degree 0, on the CPU.
+        frame: Robust centre and radius of the visible Gaussians.
         sized: Positions and sizes of Gaussians of the sample.
         voxels: The surfaces near the middle.
-        up: Unit vector, float64.
-        bounded: Whether nearly all lies within about three robust radii: an object, not a place.
-        center: Middle of what views should show, scene units, float64.
-        radius: Radius of what views should show, scene units.
-        height: Extent along ``up`` of what is near the middle, scene units.
-        floor: Height of the floor along ``up``, scene units; None without one.
-        room: Where somebody in the middle of a room would have the eyes; None if the scene is not
-            seen from inside.
+        up: Up direction, unit length, float64.
+        bounded: Whether nearly all content is within about three robust radii: an object, not a
+            place.
+        center: Middle of the content that views should show, scene units, float64.
+        radius: Radius of the content that views should show, scene units.
+        height: Extent along ``up`` of the content near the middle, scene units.
+        floor: Height of the floor along ``up``, scene units; None without a floor.
+        room: Eye point in the middle of a room; None if the scene is not seen from inside.
     """
 
     sample: GaussianScene
@@ -198,7 +198,7 @@ class SceneLayout:
 
 
 def find_layout(scene: GaussianScene) -> SceneLayout:
-    """Return the layout of a scene, from robust statistics of what is visible.
+    """Return the layout of a scene, from robust statistics of its visible Gaussians.
 
     Memory: a mask per attribute, and a sample of at most 30,000 Gaussians.
     """
@@ -217,7 +217,7 @@ def find_layout(scene: GaussianScene) -> SceneLayout:
     middle = 0.5 * (low + high) if bounded else torch.zeros_like(low)
     spread = torch.linalg.vector_norm(positions - middle, dim=1)
     radius = float(spread.amax()) if bounded else 1.0
-    width = 2 * float(sample.scales.amax(dim=1).median())  # where all centres are one, all there is
+    width = 2 * float(sample.scales.amax(dim=1).median())  # the extent if all centres coincide
     center = frame.center + frame.radius * middle
     floor = find_floor(voxels, up)
     sized = sized_points(sample)
@@ -247,7 +247,7 @@ def _valid(scene: GaussianScene) -> GaussianScene:
 
 
 def _visible_positions(scene: GaussianScene) -> Float[Tensor, "k 3"]:
-    """Return the positions of every k-th Gaussian that is not faint; of any if all are."""
+    """Return positions of every k-th Gaussian, without faint ones unless all are faint."""
     step = -(-len(scene) // _MOST_POSITIONS)
     means = scene.means[::step].cpu()
     visible = means[(scene.opacities[::step] > _VISIBLE).cpu()]
@@ -263,7 +263,7 @@ def _far_directions(
 
 
 def _sample(scene: GaussianScene) -> GaussianScene:
-    """Return the heaviest Gaussians and every k-th of the others, enlarged by what is missing."""
+    """Return the heaviest Gaussians and every k-th other, enlarged to cover for omitted ones."""
     plain = scene.with_tensors({"shN": scene.shN[:, :0]}, {})
     if len(scene) > SAMPLE_SIZE:
         heaviest_first = torch.sort(scene.masses, descending=True, stable=True).indices

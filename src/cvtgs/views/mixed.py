@@ -1,4 +1,4 @@
-"""Random views of a scene, and a mixture of them with automatic ones."""
+"""Random views of a scene, and a mixture of random and automatic views."""
 
 import math
 from collections.abc import Sequence
@@ -14,17 +14,17 @@ from cvtgs.views.positions import CameraPositions, as_positions
 from cvtgs.views.scoring import SMOOTH, splat_sizes
 
 TRIED = 3
-"""Views that are tried for each that is returned."""
+"""Number of candidate views per returned view."""
 
 TOO_NEAR = 2.0
-"""Views are too near what they show at less than half the distance of the farthest quarter."""
+"""A view is too close if the upper-quartile viewing distance is over this many times its own."""
 
 FOGGY = 1.4
-"""Views show fog whose splats are so many times as large in the scene, in radii, as in the sharpest
-tenth, and larger than those of smooth sides."""
+"""A view shows fog if its splats, in robust radii, are larger than this many times those of the
+sharpest tenth of the candidates, and larger than those of smooth sides."""
 
 NEAR = (0.2, 1.4)
-"""Distances of near views, robust radii: some are within the scene."""
+"""Range of distances of near views, robust radii; some views are inside the scene."""
 
 _AROUND = (1.1, 3.0)
 _FIELD = 50.0
@@ -41,22 +41,22 @@ def random_views(
     seed: int,
     reach: tuple[float, float] = _AROUND,
 ) -> Cameras:
-    """Return cameras at random positions from which somebody would look, near ones too.
+    """Return cameras at random plausible viewpoints, including near ones.
 
-    A scene optimized on automatic views alone gets worse on all other sides. None is beneath a
-    floor or inside matter (:class:`cvtgs.views.CameraPositions`); where there is
-    no floor, some look from below.
+    A scene optimized on automatic views alone gets worse on all other sides. No camera is beneath
+    a floor or inside matter (:class:`cvtgs.views.CameraPositions`); without a floor, some look
+    from below.
 
     Args:
-        scene: The scene, or what :func:`find_view_positions` found of it.
+        scene: The scene, or the result of :func:`find_view_positions`.
         count: Number of views.
         size: Side of the square images, pixels.
-        seed: Of the random numbers.
+        seed: Seed of the random numbers.
         reach: Smallest and largest distance, robust radii.
 
     Returns:
         Cameras, float64, upright. They look at points up to a quarter of a radius from the middle,
-        with a field of view of 50 degrees; in a room at any surface, with 65 degrees.
+        with a field of view of 50 degrees; in a room at random surfaces, with 65 degrees.
 
     Raises:
         InvalidSceneError: The scene has no valid row.
@@ -83,7 +83,7 @@ def random_views(
 def _targets(
     positions: CameraPositions, eyes: Float[Tensor, "c 3"], seed: int
 ) -> Float[Tensor, "c 3"]:
-    """Return points near the middle; in a room, points on surfaces that are not too near."""
+    """Return points near the middle; in a room, points on surfaces that are far enough away."""
     layout = positions.layout
     center, radius = layout.frame.center, layout.frame.radius
     generator = torch.Generator().manual_seed(seed + 1)
@@ -100,22 +100,23 @@ def mixed_views(
 ) -> Cameras:
     """Return automatic and random views together.
 
-    A quarter are automatic views, a quarter random views from near, within the scene too, and
-    half random views from around it. Of each kind three times as many are tried, and those that
-    show large splats come last: where no image was taken, a scene is a fog from which nobody looks.
-    So do those that are much nearer than others. Of the rest, views from all around are taken.
+    A quarter are automatic views, a quarter random near views, some inside the scene, and half
+    random views from around it. With ``sharp``, each kind has three candidates per view.
+    Candidates that show large splats are used last, because a scene is fog where no image was
+    taken, and nobody looks from there. Candidates much nearer than others are also used last.
+    Among the remaining ones, views from all around are chosen.
 
     Args:
-        scene: A scene with at least one valid Gaussian, or what :func:`find_view_positions` found
-            of it.
+        scene: A scene with at least one valid Gaussian, or the result of
+            :func:`find_view_positions`.
         count: Number of views, at least 1.
         size: Side of the square images, pixels.
-        seed: Of the random numbers.
-        sharp: Whether views of large splats come last; not where parts of a scene were merged,
-            nor in trainings.
+        seed: Seed of the random numbers.
+        sharp: Whether views of large splats are used last; not for scenes with merged parts, nor
+            in training.
 
     Returns:
-        The cameras, in this order.
+        The cameras: automatic, near, then other random views.
 
     Raises:
         InvalidArgumentError: Count or size is below 1.
@@ -146,7 +147,7 @@ def mixed_views(
 
 
 def _sharp_ones(positions: CameraPositions, tried: Sequence[tuple[Cameras, int]]) -> list[Cameras]:
-    """Return as many views of each kind as are wanted; worse ones only if need be."""
+    """Return the wanted number of views of each kind, faulty ones only if necessary."""
     sizes = [splat_sizes(positions.layout, cameras) for cameras, _ in tried]
     in_scene = torch.cat([size.in_scene for size in sizes])
     largest = max(SMOOTH, FOGGY * float(in_scene.quantile(0.1)))
@@ -155,7 +156,7 @@ def _sharp_ones(positions: CameraPositions, tried: Sequence[tuple[Cameras, int]]
         closeness = size.in_image / size.in_scene
         too_near = closeness / (TOO_NEAR * closeness.quantile(0.25))
         faults = torch.maximum(too_near, size.in_scene / largest).clamp_min(1.0)
-        # Automatic views come in the order of a turn: of each three one, then the others.
+        # Automatic views are ordered by angle: take one of each three first, then the others.
         spread = torch.arange(len(cameras)).view(wanted, TRIED).T.flatten()
         best = faults[spread].sort(stable=True).indices[:wanted]
         chosen.append(cameras.select(spread[best].sort().values))

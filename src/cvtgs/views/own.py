@@ -1,4 +1,4 @@
-"""The cameras of a capture, where the folder of its model has them."""
+"""The cameras of a capture, if they are in the folder of its model."""
 
 import os
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from cvtgs.errors import CvtgsError
 from cvtgs.scene import GaussianScene
 
 _LEAST_SEEN = 0.01
-"""A camera looks at a scene if it has so much of what is visible in its image."""
+"""A camera looks at a scene if its image contains this share of the visible Gaussians."""
 
 _LEAST_LOOKING = 0.5
 _MOST_POINTS = 2000
@@ -29,19 +29,19 @@ class OwnCameras(NamedTuple):
 
 
 def find_own_cameras(scene: GaussianScene, path: str | os.PathLike[str]) -> OwnCameras | None:
-    """Read the cameras that lie beside a scene, if they look at it.
+    """Read the cameras stored beside a scene, if they look at it.
 
-    The folder of the model is searched, of INRIA's layout the one above ``point_cloud``, then the
-    folder of the file, for what :func:`cvtgs.io.load_cameras` reads. Cameras that are in another
-    world than the scene, as those of captures that were moved or scaled since, are left out: at
-    least half of them must have a hundredth of the scene in their images.
+    The folder of the model (in INRIA's layout the one above ``point_cloud``) and then the folder of
+    the file are searched for formats that :func:`cvtgs.io.load_cameras` reads. Cameras of another
+    world frame, as after a capture was moved or scaled, are rejected: at least half of the cameras
+    must have a hundredth of the visible Gaussians in their images.
 
     Args:
         scene: The scene, as it was read.
-        path: The file or the folder it was read from.
+        path: The file or folder that it was read from.
 
     Returns:
-        The cameras, at least two; None if there are none, or none that fit.
+        The cameras, at least two; None if there are none that fit.
 
     Example:
         >>> import tempfile
@@ -65,7 +65,7 @@ def find_own_cameras(scene: GaussianScene, path: str | os.PathLike[str]) -> OwnC
 
 
 def _sources(path: Path) -> Iterator[Path]:
-    """Return where cameras may be: files of INRIA's code first, which are in the scene's world."""
+    """Yield possible sources of cameras: first INRIA's files, which share the scene's frame."""
     from cvtgs.io import scene_file  # noqa: PLC0415
 
     file = scene_file(path)

@@ -1,4 +1,4 @@
-"""Positions from which somebody would look at a scene: above its floor, and not inside matter."""
+"""Plausible camera positions in a scene: above its floor, and not inside matter."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from cvtgs.views.layout import ENCLOSED, FREE, SceneLayout, enclosure, find_layo
 from cvtgs.views.scoring import PIXELS, SMOOTH, cameras_at, splat_sizes
 
 REACH = (0.2, 3.0)
-"""Distances of the positions that are tried, in robust radii from the centre of the frame."""
+"""Range of distances of candidate positions, in robust radii from the centre of the frame."""
 
 _TRIED = 384
 _SEED = 17
@@ -20,30 +20,30 @@ _ABOVE = 0.1
 """Least height above a floor, in robust radii."""
 
 _BURIED = 0.75
-"""A position is inside matter if this share of the directions up, and of those down, is hidden."""
+"""A position is inside matter if this share of the upper and of the lower hemisphere is hidden."""
 
 _SLACK = 0.25
-"""Growth may be this much less than where it is largest."""
+"""Accepted difference from (nearly) the largest growth of all candidates."""
 
 _TOP = 0.98
 
 _SIDES = 32
 _OUTSIDE = 1.1
-"""Positions at least so many robust radii away look at a side of the scene."""
+"""Positions at least this many robust radii away see a side of the scene from outside."""
 
 _SIDE_DISTANCE, _SIDE_FIELD = 2.2, 50.0
-"""From where sides are looked at, robust radii, and the field of view, degrees."""
+"""Distance of the cameras that check sides, robust radii, and their field of view, degrees."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraPositions:
-    """Where cameras may be.
+    """Valid camera positions.
 
     Attributes:
-        layout: Of the scene.
-        least_growth: The least mean correlation of sizes with distances of a position.
-        sharp_sides: ``(32,)`` from which of 32 directions spread evenly the scene is sharp.
-        eyes: ``(p, 3)`` positions that were tried and found good, scene units; at least one.
+        layout: Layout of the scene.
+        least_growth: Least mean correlation of Gaussian size with distance at a good position.
+        sharp_sides: ``(32,)`` whether the scene is sharp from each of 32 evenly spread directions.
+        eyes: ``(p, 3)`` good positions among the candidates, scene units; at least one.
         distances: ``(p,)`` their distances from the centre of the frame, in robust radii.
     """
 
@@ -54,16 +54,15 @@ class CameraPositions:
     distances: Float[Tensor, "p"]
 
     def admit(self, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, "c"]:
-        """Return which of some positions are good.
+        """Return a mask of the good positions.
+
+        A good position is free, above the floor if there is one, and inside the room if the scene
+        is one, else not enclosed. Near Gaussians must also be smaller than distant ones, as is
+        usual where images were taken, unless the position faces, from outside, a side of small
+        Gaussians: the smooth back of an object.
 
         Args:
             eyes: Positions, scene units.
-
-        Returns:
-            A mask. A good position is above the floor, if there is one, and free; it is within
-            the room if the scene is one, else not enclosed; and what is near has smaller
-            Gaussians than what is far, as it has where images were taken, or it looks from outside
-            at a side of small Gaussians: the smooth back of an object.
         """
         free = stand_free(self.layout, eyes)
         unsure = free & ~_sees_sharp_sides(self.layout, eyes, self.sharp_sides)
@@ -71,15 +70,16 @@ class CameraPositions:
         return free
 
     def near(self, count: int, reach: tuple[float, float], seed: int) -> Float[Tensor, "c 3"]:
-        """Return positions at random within some distances.
+        """Return random positions within a range of distances.
 
         Args:
-            count: How many.
-            reach: Smallest and largest distance; the nearest to it are taken if none is within.
-            seed: Of the random numbers.
+            count: Number of positions.
+            reach: Smallest and largest distance, robust radii; if no position is within, the
+                nearest to this range are used.
+            seed: Seed of the random numbers.
 
         Returns:
-            Good positions, moved by up to a twentieth of a radius where that stays good.
+            Good positions, moved by up to a twentieth of a radius along each axis if still good.
         """
         generator = torch.Generator().manual_seed(seed)
         low, high = reach
@@ -93,14 +93,14 @@ class CameraPositions:
 
 
 def find_view_positions(scene: SceneLike) -> CameraPositions:
-    """Find where cameras may be, once for many sets of views.
+    """Find valid camera positions, once for many sets of views.
 
     Args:
         scene: A scene with at least one valid Gaussian, or a file or folder of one.
 
     Returns:
-        The positions, which functions of views take instead of a scene; if none that was tried is
-        good, one that is above the floor.
+        The positions, which view functions accept instead of a scene; if no candidate is good,
+        one that is above the floor.
 
     Raises:
         InvalidSceneError: The scene has no valid row.
@@ -138,12 +138,12 @@ def find_view_positions(scene: SceneLike) -> CameraPositions:
 
 
 def as_positions(scene: SceneLike | CameraPositions) -> CameraPositions:
-    """Return positions that were found before, or find those of a scene."""
+    """Return the argument if it holds positions, or find those of a scene."""
     return scene if isinstance(scene, CameraPositions) else find_view_positions(scene)
 
 
 def lifted(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Float[Tensor, "c 3"]:
-    """Return positions with those beneath the floor mirrored at what is just above it."""
+    """Return positions, with those too low mirrored at the least height above the floor."""
     if layout.floor is None:
         return eyes
     least = layout.floor + _ABOVE * layout.frame.radius
@@ -171,10 +171,10 @@ def stand_free(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, 
 
 
 def _sharp_sides(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, "d"]:
-    """Return which sides are sharp, not from below, of those that some positions look at.
+    """Return which of the sides that some positions face are sharp; sides from below are not.
 
-    The back of an object may be all smooth: its Gaussians are larger than those of the front, and
-    shrink with the distance from behind, though images were taken there.
+    The back of an object may be all smooth: its Gaussians are larger than those of the front, so
+    sizes shrink with distance from behind, even though images were taken there.
     """
     directions = _side_directions()
     sides, is_outside = _sides(layout, eyes)
@@ -206,14 +206,14 @@ def _sees_sharp_sides(
 def _sides(
     layout: SceneLayout, eyes: Float[Tensor, "c 3"]
 ) -> tuple[Int[Tensor, "c"], Bool[Tensor, "c"]]:
-    """Return which side each position is before, and whether it is outside."""
+    """Return the side that each position faces, and whether the position is outside."""
     offsets = (eyes - layout.frame.center) / layout.frame.radius
     is_outside = torch.linalg.vector_norm(offsets, dim=1) >= _OUTSIDE
     return (offsets @ _side_directions().T).argmax(dim=1), is_outside
 
 
 def _side_directions() -> Float[Tensor, "d 3"]:
-    """Return unit vectors that are spread evenly (a Fibonacci lattice, Gonzalez 2010)."""
+    """Return evenly spread unit vectors (a Fibonacci lattice, Gonzalez 2010)."""
     steps = torch.arange(_SIDES, dtype=torch.float64) + 0.5
     heights, angles = 1 - 2 * steps / _SIDES, steps * math.pi * (3 - math.sqrt(5))
     widths = (1 - heights.square()).sqrt()

@@ -1,4 +1,4 @@
-"""Score candidate cameras by small images of what they see."""
+"""Score candidate cameras by small rendered images."""
 
 import math
 from dataclasses import dataclass
@@ -19,18 +19,18 @@ PIXELS = 64
 
 _SOLID = 0.5
 _NEAR = 0.3
-"""What is nearer than this share of the distance to what should be shown is an obstacle."""
+"""A surface nearer than this share of the distance to the subject is an obstacle."""
 
 _MOST_NEAR = 0.08
 _MOST_BLOCKED = 0.3
 _LEAST_FILLED = {False: 0.12, True: 0.8}
 _VISIBLE = 0.25
 SMOOTH = 0.05
-"""Smooth sides that images were taken of have splats up to this share of the robust radius. The
-sample makes scenes of any number of Gaussians comparable."""
+"""Largest splats of smooth sides that images were taken of, in robust radii. Sampling makes scenes
+of any number of Gaussians comparable."""
 
 _ENCLOSING = 2.5
-"""Standard deviations within which a camera is inside of a Gaussian."""
+"""A camera within this many standard deviations of a Gaussian is inside it."""
 
 
 def cameras_at(
@@ -41,7 +41,7 @@ def cameras_at(
     size: tuple[int, int],
     field: float,
 ) -> Cameras:
-    """Return cameras of one size and field of view, degrees, along the shorter side."""
+    """Return cameras of one size; ``field`` is the field of view of the shorter side, degrees."""
     width, height = size
     focal = 0.5 * min(size) / math.tan(math.radians(0.5 * field))
     intrinsics = [[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]]
@@ -55,12 +55,12 @@ def cameras_at(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraScores:
-    """How good cameras are.
+    """Scores of cameras.
 
     Attributes:
-        good: ``(c,)`` which cameras have an unobstructed view of the scene.
-        penalties: ``(c,)`` to choose among bad cameras; 0 is best.
-        visible: ``(c, v)`` which voxels of the layout each camera sees.
+        good: ``(c,)`` whether each camera has an unobstructed view of the scene.
+        penalties: ``(c,)`` penalties to choose among bad cameras; 0 is best.
+        visible: ``(c, v)`` whether each camera sees each voxel of the layout.
     """
 
     good: Bool[Tensor, "c"]
@@ -73,8 +73,8 @@ def score_cameras(
 ) -> CameraScores:
     """Render small images and score the cameras by them.
 
-    A camera is bad if it is inside of a Gaussian, if something near fills part of the image or
-    hides the middle, or if the image is empty.
+    A camera is bad if it is inside a Gaussian, if something near fills too much of the image or
+    hides its middle, or if too little of the image is filled.
     """
     small = _small(cameras)
     images = render(layout.sample, small, depth=True)
@@ -104,11 +104,11 @@ def _small(cameras: Cameras) -> Cameras:
 
 
 class SplatSizes(NamedTuple):
-    """Median sizes of the Gaussians that paint images: half of each image is by smaller ones.
+    """Median sizes of the Gaussians in images, weighted by their contributions.
 
     Attributes:
-        in_image: ``(c,)`` projected standard deviations, as a share of the image, float64.
-        in_scene: ``(c,)`` standard deviations, as a share of the robust radius, float64.
+        in_image: ``(c,)`` projected standard deviations as a share of the image, float64.
+        in_scene: ``(c,)`` standard deviations as a share of the robust radius, float64.
     """
 
     in_image: Float[Tensor, "c"]
@@ -116,7 +116,7 @@ class SplatSizes(NamedTuple):
 
 
 def splat_sizes(layout: SceneLayout, cameras: Cameras) -> SplatSizes:
-    """Return how large the splats are that each camera, of at least one, shows."""
+    """Return the median size of the splats that each camera shows, for at least one camera."""
     sample, small = layout.sample, _small(cameras)
     widths = sample.log_scales.double().sort(dim=1).values[:, 1:].mean(dim=1).exp()
     in_image, in_scene = [], []
@@ -136,7 +136,7 @@ def _weighted_median(values: Float[Tensor, "n"], weights: Float[Tensor, "n"]) ->
 
 
 def _inside_gaussians(layout: SceneLayout, cameras: Cameras) -> Bool[Tensor, "c"]:
-    """Return which cameras are inside of a Gaussian that hides something."""
+    """Return which cameras are inside a Gaussian that is not faint."""
     sample = layout.sample.select(layout.sample.opacities > _VISIBLE)
     means = sample.means.double()
     largest = sample.scales.amax(dim=1)
@@ -158,7 +158,7 @@ def _visible_voxels(
     *,
     depth: Float[Tensor, "c h w"],
 ) -> Bool[Tensor, "c v"]:
-    """Return which voxels are in the images and not behind what the images show."""
+    """Return which voxels are in the images and not occluded there."""
     points = layout.frame.center + layout.frame.radius * layout.voxels.points
     rotations, shifts = cameras.viewmats[:, :3, :3].double(), cameras.viewmats[:, :3, 3].double()
     local = points @ rotations.transpose(1, 2) + shifts[:, None]

@@ -1,4 +1,4 @@
-"""The surfaces of a scene as voxels, and which way is up among them."""
+"""The surfaces of a scene as voxels, and the up direction and floor found from them."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -17,13 +17,13 @@ VOXEL_SIZE = 0.1
 """Edge of a voxel, in robust radii."""
 
 _EXTENT = 3.0
-"""Gaussians farther than this from the middle, in robust radii, are left out of the voxels."""
+"""Gaussians farther than this from the middle along an axis, in robust radii, get no voxel."""
 
 _OPAQUE = 0.3
-"""A voxel whose Gaussians together hide less than this is empty."""
+"""A voxel is empty if its Gaussians together cover less than this share of a face."""
 
 _FAINT_SHARE = 0.1
-"""In faint scenes a voxel is empty below this share of what voxels hide on average, by mass."""
+"""In faint scenes, a voxel is empty below this share of the mass-weighted mean cover of voxels."""
 
 _GUESSES = 256
 _REFINED = 24
@@ -31,45 +31,45 @@ _MOST_VOXELS = 6000
 _THICKNESS = VOXEL_SIZE
 _ALIGNED = 0.85
 _LEAST_SCORE = 0.12
-"""Least score of a ground: its share of all voxels, times how round and how wide it is."""
+"""Least score of a ground plane: its share of all voxels times its roundness and width."""
 
 _USUAL = ((0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _USUAL_EVIDENCE = (0.5, 0.3, 0.3)
-"""What captures have as up, and how much that counts beside what the scene shows."""
+"""Usual up directions of captures, and their weight relative to evidence in the scene."""
 
 _USUAL_BONUS = (1.5, 1.5, 1.25)
 _USUAL_COSINE = 0.85
 _SNAP_COSINE = 0.99  # 8 degrees
 
 _COLUMN = 0.15
-"""Width of the columns whose lowest voxels may be a floor, in robust radii."""
+"""Width of the columns in which a floor is searched, in robust radii."""
 
 _BARE = 0.25
-"""A column of less than this height shows a floor on which nothing stands."""
+"""Columns lower than this show a bare floor, in robust radii."""
 
 _LEVEL = 0.7
 _BENEATH = 3.0
-"""What lies beneath a floor counts this many times against it."""
+"""Penalty factor of the share of voxels beneath a floor."""
 
 _LEAST_FLOOR = 0.25
-"""The least share of all columns that end on a floor."""
+"""Least share of all columns that end on a floor."""
 
 _GROWTH_WEIGHT = 0.5
 _MOST_GROWTH = 0.4
 _SKY = 0.12
-"""What is far away is a sky if it lies this far above the middle on average, of its distance."""
+"""Distant content is a sky if it is this far above the middle on average, relative to distance."""
 
 _SKY_WEIGHT = 0.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Voxels:
-    """Points on the surfaces of a scene; each stands for about the same area.
+    """Points on the surfaces of a scene; each represents about the same area.
 
     Attributes:
         points: ``(v, 3)`` mean positions, in robust radii from the middle, float64.
-        normals: ``(v, 3)`` directions in which the Gaussians there are thinnest, unit length.
-        log_sizes: ``(v,)`` mean log scale of the Gaussians there.
+        normals: ``(v, 3)`` mean thinnest axes of the Gaussians in each voxel, unit length.
+        log_sizes: ``(v,)`` mean log scales of the Gaussians in each voxel.
     """
 
     points: Float[Tensor, "v 3"]
@@ -78,7 +78,7 @@ class Voxels:
 
 
 def voxelize(scene: GaussianScene, frame: RobustFrame) -> Voxels:
-    """Return the voxels of the Gaussians near the middle that are not empty."""
+    """Return the non-empty voxels of the Gaussians near the middle."""
     points = frame.normalize(scene.means)
     near = (points.abs() < _EXTENT).all(dim=1)
     part, points = scene.select(near), points[near]
@@ -130,9 +130,9 @@ class Floor(NamedTuple):
     """The level on which most columns of voxels end.
 
     Attributes:
-        height: Along up, in robust radii from the middle.
-        share: Share of all columns that end on it, less what lies beneath it.
-        bare: The same of the columns in which nothing stands on it.
+        height: Height along ``up``, in robust radii from the middle.
+        share: Share of all columns that end on it, reduced if there are voxels beneath it.
+        bare: The same for columns with nothing on the floor.
     """
 
     height: float
@@ -141,13 +141,13 @@ class Floor(NamedTuple):
 
 
 def find_up(voxels: Voxels, far: Float[Tensor, "k 3"]) -> Float[Tensor, "3"]:
-    """Return the direction that is up, as a unit vector.
+    """Return the up direction as a unit vector.
 
-    Both senses of the axes, and of the normal of the largest plane, are compared by how
-    usual they are in captures (-y most, then +y and +z); a bare floor with nothing beneath it; a
-    large plane; and the sky, if what is far away lies on one side. Where no
-    floor lies bare, the sizes of Gaussians count too: captures seldom see a scene from below, and
-    what no image has seen is left with larger Gaussians.
+    The candidates are both directions of the axes and of the normal of the largest plane. Their
+    scores add up: how usual they are in captures (-y most, then +y and +z), a bare floor with
+    nothing beneath it, a large plane, and a sky, if distant content is on one side. If there is no
+    bare floor, the sizes of Gaussians count too: captures seldom see a scene from below, and
+    unseen parts have larger Gaussians.
     """
     usual = voxels.points.new_tensor(_USUAL)
     if len(voxels.points) < 8:
@@ -172,7 +172,7 @@ def find_up(voxels: Voxels, far: Float[Tensor, "k 3"]) -> Float[Tensor, "3"]:
 
 
 def find_floor(voxels: Voxels, up: Float[Tensor, "3"]) -> float | None:
-    """Return how high the floor lies along ``up``, in robust radii from the middle, if any."""
+    """Return the height of the floor along ``up``, in robust radii from the middle, or None."""
     if len(voxels.points) < 8:
         return None
     level = _lowest_level(_thinned(voxels), up)
@@ -180,7 +180,7 @@ def find_floor(voxels: Voxels, up: Float[Tensor, "3"]) -> float | None:
 
 
 def _lowest_level(voxels: Voxels, up: Float[Tensor, "3"]) -> Floor:
-    """Return the level on which most columns end that are level where they do."""
+    """Return the level on which most columns end; shares count columns with a level end."""
     heights = voxels.points @ up
     columns = ((voxels.points @ torch.linalg.svd(up[None]).Vh[1:].T) / _COLUMN).floor().long()
     columns -= columns.amin(dim=0)
@@ -203,7 +203,7 @@ def _lowest_level(voxels: Voxels, up: Float[Tensor, "3"]) -> Floor:
 
 
 def _growth(voxels: Voxels) -> Float[Tensor, "3"]:
-    """Return how the sizes of Gaussians fall with each coordinate, as correlations."""
+    """Return the negative correlation of the sizes of Gaussians with each coordinate."""
     sizes = voxels.log_sizes - voxels.log_sizes.mean()
     points = voxels.points - voxels.points.mean(dim=0)
     spread = sizes.square().sum().sqrt() * points.square().sum(dim=0).sqrt()
@@ -220,7 +220,7 @@ def _thinned(voxels: Voxels) -> Voxels:
 
 
 def _ground(voxels: Voxels) -> _Plane | None:
-    """Find the largest plane by guessing from single voxels and refining the best guesses."""
+    """Return the largest plane, or None: guess from single voxels and refine the best guesses."""
     step = -(-len(voxels.points) // _GUESSES)
     normals, through = voxels.normals[::step], voxels.points[::step]
     heights = (normals * through).sum(dim=1)
