@@ -117,8 +117,8 @@ def chart(
 
 def main() -> None:
     parser = scoring_parser(__doc__)
-    parser.add_argument("--png", type=Path, help="draw the presets there")
-    parser.add_argument("--table", choices=TABLES, help="this one alone")
+    parser.add_argument("--png", type=Path, help="draw the presets to this file")
+    parser.add_argument("--table", choices=TABLES, help="print only this table")
     options = parser.parse_args()
     for name in [options.table] if options.table else TABLES:
         title, rows = TABLES[name]

@@ -109,16 +109,16 @@ def parser() -> argparse.ArgumentParser:
         help="one configuration; may be repeated",
     )  # fmt: skip
     found.add_argument(
-        "--base", nargs="+", default=[], metavar="KEY=VALUE", help="settings of all of them"
+        "--base", nargs="+", default=[], metavar="KEY=VALUE", help="settings of all configurations"
     )
-    found.add_argument("--automatic", action="store_true", help="automatic views instead")
+    found.add_argument("--automatic", action="store_true", help="use automatic views")
     found.add_argument("--size", type=int, help="longer side of the images, pixels")
     found.add_argument(
-        "--lpips", default="off", choices=("off", "auto", "vgg", "alex"), help="measure LPIPS too"
+        "--lpips", default="off", choices=("off", "auto", "vgg", "alex"), help="also measure LPIPS"
     )
-    found.add_argument("--cache", type=Path, default=CACHE, help=f"images are kept here ({CACHE})")
-    found.add_argument("--json", type=Path, help="write the rows to this file, too")
-    found.add_argument("--pages", type=Path, metavar="DIR", help="write pages of images, too")
+    found.add_argument("--cache", type=Path, default=CACHE, help=f"cache of images ({CACHE})")
+    found.add_argument("--json", type=Path, help="also write the rows to this file")
+    found.add_argument("--pages", type=Path, metavar="DIR", help="also write pages of images")
     return found
 
 

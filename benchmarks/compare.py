@@ -102,9 +102,11 @@ def parser() -> argparse.ArgumentParser:
         "--tool", action="append", default=[], metavar="NAME=COMMAND",
         help="an external tool; {IN}, {OUT}, {RHO} and {COUNT} are filled in; may be repeated",
     )  # fmt: skip
-    found.add_argument("--clock", choices=("wall", "cpu"), default="wall", help="whose seconds")
+    found.add_argument(
+        "--clock", choices=("wall", "cpu"), default="wall", help="wall-clock or CPU seconds"
+    )
     found.add_argument("--results", type=Path, metavar="FILE", help="add results to this file")
-    found.add_argument("--outputs", type=Path, metavar="DIR", help="keep the methods' files there")
+    found.add_argument("--outputs", type=Path, metavar="DIR", help="keep the files of the methods")
     found.add_argument("-o", "--output", type=Path, help="folder for compare.md and compare.png")
     return found
 

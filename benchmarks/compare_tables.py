@@ -161,7 +161,9 @@ def wrong_counts(table: Table) -> str:
         for rho, found in row.items()
         if found is not None and found.count != found.wanted
     ]
-    return "\n".join(["Not the number of Gaussians that was asked for:\n", *lines] if lines else [])
+    return "\n".join(
+        ["Runs with another number of Gaussians than requested:\n", *lines] if lines else []
+    )
 
 
 def failures(table: Table) -> str:

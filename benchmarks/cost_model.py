@@ -61,9 +61,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--presets", nargs="+", choices=CANDIDATES, default=list(CANDIDATES))
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--most", type=int, default=1_000_000, help="largest generated scene")
-    parser.add_argument("--clock", choices=CLOCKS, default="wall", help="whose seconds")
-    parser.add_argument("--recalibrate", action="store_true", help="not what is remembered")
-    parser.add_argument("--ship", action="store_true", help="write the rates of --shipped-rates")
+    parser.add_argument("--clock", choices=CLOCKS, default="wall", help="kind of seconds")
+    parser.add_argument("--recalibrate", action="store_true", help="ignore the stored rates")
+    parser.add_argument(
+        "--ship", action="store_true", help="write the rates that --shipped-rates uses"
+    )
     options = parser.parse_args(arguments)
     model = cost_model(recalibrate=options.recalibrate)
     if options.ship:

@@ -146,7 +146,7 @@ def find_captures(root: Path, datasets: Sequence[Dataset] = DATASETS) -> Found:
         }
         if not any(there.values()):
             notes.append(
-                f"{dataset.name}: no scene of it was found in {root}; it is to be had from "
+                f"{dataset.name}: none of its scenes were found in {root}; get it from "
                 f"{dataset.source}."
             )
             continue
@@ -160,7 +160,7 @@ def find_captures(root: Path, datasets: Sequence[Dataset] = DATASETS) -> Found:
                     f"nerfstudio or gsplat is in it or in another folder named {name}."
                 )
             else:
-                notes.append(f"{name}: of {dataset.name}, was not found in {root}.")
+                notes.append(f"{name}: this scene of {dataset.name} was not found in {root}.")
     return Found(tuple(captures), tuple(notes))
 
 

@@ -203,7 +203,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--counts", type=int, nargs="+", default=[20_000, 200_000, 1_000_000])
     parser.add_argument("--axes", type=int, choices=(3, 6), default=6, help="6 with colours")
-    parser.add_argument("--share", type=float, default=0.02, help="sites for each point")
+    parser.add_argument("--share", type=float, default=0.02, help="sites per point")
     options = parser.parse_args()
     print(
         "\n".join(table(torch.device(options.device), options.counts, options.axes, options.share))

@@ -100,7 +100,7 @@ CASES: Mapping[str, Case] = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("-o", "--output", type=Path, help="page whose tables are renewed")
+    parser.add_argument("-o", "--output", type=Path, help="page whose tables are updated")
     parser.add_argument("--effect", nargs="+", default=list(CASES), choices=list(CASES))
     parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--rho", type=float, default=0.05)

@@ -90,7 +90,7 @@ def parser() -> argparse.ArgumentParser:
     )
     found.add_argument("dataset", nargs="?", type=Path, metavar="FOLDER")
     found.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
-    found.add_argument("--points", type=Path, help="scene whose centres are the first ones")
+    found.add_argument("--points", type=Path, help="scene whose centres the training starts from")
     found.add_argument("--count", type=int, default=10_000, help="Gaussians to train")
     found.add_argument("--steps", type=int, default=2000)
     found.add_argument("--size", type=int, default=200, help="longer side of pictures, pixels")

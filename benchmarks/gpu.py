@@ -45,7 +45,7 @@ def main() -> None:
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="Gaussians")
     parser.add_argument("--rho", type=float, default=0.01)
-    parser.add_argument("--runs", type=int, default=3, help="runs that count, after one more")
+    parser.add_argument("--runs", type=int, default=3, help="measured runs, after one warm-up")
     parser.add_argument("--size", type=int, default=400, help="pixels along both edges")
     parser.add_argument("--steps", type=int, default=20, help="training steps")
     parser.add_argument("--page", type=Path, default=PAGE)
@@ -89,7 +89,7 @@ def stage_table(device: torch.device, counts: Sequence[int], *, rho: float, runs
         lines.append(row(count, "all", all_seconds, 0, report.seconds))
         same = all(equal(small[0], one) for one in small[1:])
         notes.append(
-            f"{count:,}: runs give {'the same' if same else 'OTHER'} bits; "
+            f"{count:,}: runs give {'the same' if same else 'DIFFERENT'} bits; "
             f"{different_rows(small[0], on_cpu):,} of {len(on_cpu):,} Gaussians differ from the "
             f"CPU's by more than 1e-3. {reports[0].device_note}".rstrip()
         )
@@ -122,7 +122,7 @@ def renderer_table(device: torch.device, count: int, *, size: int, runs: int) ->
         try:
             choose_backend(name, device)
         except CvtgsError as error:
-            lines.append(f"| {name} | not here: {error} | | |")
+            lines.append(f"| {name} | not available: {error} | | |")
             continue
 
         def image(name: str = name) -> torch.Tensor:

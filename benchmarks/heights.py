@@ -28,8 +28,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("variants", nargs="+", help="FILES.ply, then presets with settings")
     parser.add_argument("--rho", type=float, default=0.1)
-    parser.add_argument("--views", type=int, default=12, help="at each height")
-    parser.add_argument("--size", type=int, default=256, help="of the images, pixels")
+    parser.add_argument("--views", type=int, default=12, help="views at each height")
+    parser.add_argument("--size", type=int, default=256, help="side of the images, pixels")
     parser.add_argument("--count", type=int, default=60_000, help="size of generated scenes")
     options = parser.parse_intermixed_args()
     files = [Path(word) for word in options.variants if word.endswith(".ply")]

@@ -37,16 +37,20 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=200_000, help="Gaussians of generated scenes")
     parser.add_argument("--kinds", default=",".join(KINDS), help="kinds of generated scenes")
     parser.add_argument("--blocks", default="4,16", help="numbers of blocks to compare")
-    parser.add_argument("--memory", default="2GB", help="of each worker: all make the same blocks")
+    parser.add_argument(
+        "--memory",
+        default="2GB",
+        help="memory of each worker, so that all runs make the same blocks",
+    )
     parser.add_argument(
         "--workers",
         type=int,
         nargs="+",
         default=[1],
-        help="processes, each with a core, one row each; their user CPU is counted",
+        help="numbers of processes, with a core each; one row per number, user CPU summed",
     )
     parser.add_argument("--rho", type=float, default=0.01)
-    parser.add_argument("--folder", type=Path, help="where large files are written")
+    parser.add_argument("--folder", type=Path, help="folder for large files")
     options = parser.parse_intermixed_args()
     load = os.getloadavg()[0]
     print(f"{machine()}, torch {torch.__version__}; load {load:.1f} when this started\n")
@@ -131,7 +135,7 @@ def blocks(options: argparse.Namespace) -> None:
             said, digest = json.loads(report.read_text()), hashlib.sha256(output.read_bytes())
             if workers == options.workers[0]:
                 wall, first = cost.wall_seconds, digest.digest()
-            same = "same" if digest.digest() == first else "OTHER"
+            same = "same" if digest.digest() == first else "DIFFERENT"
             print(
                 f"| {file.stem}, {file.stat().st_size / 1e9:.2f} GB | {options.memory} | {workers} "
                 f"| {cost.user_seconds:.1f} | {cost.wall_seconds:.1f} "

@@ -46,11 +46,11 @@ class Figures(NamedTuple):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("-o", "--output", type=Path, help="page whose tables are renewed")
-    parser.add_argument("--case", nargs="+", help="some of the cases; all if none")
+    parser.add_argument("-o", "--output", type=Path, help="page whose tables are updated")
+    parser.add_argument("--case", nargs="+", help="cases to measure; all by default")
     parser.add_argument("--count", type=int, default=COUNT)
     parser.add_argument(
-        "--timed", type=int, default=TIMED, help="size for times; 0 leaves them out"
+        "--timed", type=int, default=TIMED, help="Gaussians of the timed scenes; 0 for no times"
     )
     options = parser.parse_args()
     cases = {name: make for name, make in catalogue().items() if name in (options.case or [name])}

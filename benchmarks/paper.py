@@ -95,8 +95,8 @@ def keep_network(path: Path, network: str) -> None:
     before = path.read_text(encoding="utf-8") if path.is_file() else network
     if before != network:
         raise SystemExit(
-            f"{path.parent}: its results were scored with LPIPS {before}, now it would be "
-            f"{network}; choose it with --lpips, or another folder."
+            f"{path.parent}: its results were scored with LPIPS {before}, but this run would "
+            f"use {network}; choose the network with --lpips, or use another folder."
         )
     write_file(path, network.encode())
 

@@ -98,21 +98,23 @@ def scoring_parser(description: str | None) -> argparse.ArgumentParser:
     parser.add_argument("files", nargs="*", type=Path, help="scenes; generated ones if none")
     parser.add_argument("--rho", type=float, nargs="+", default=list(RATIOS))
     parser.add_argument("--count", type=int, default=100_000, help="size of generated scenes")
-    parser.add_argument("--means", action="store_true", help="leave out the single scenes")
+    parser.add_argument("--means", action="store_true", help="print means only")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     judges = parser.add_mutually_exclusive_group()
     judges.add_argument(
         "--scorer", help="command with {full} and {small}; prints a JSON list with psnr and ssim"
     )
-    judges.add_argument("--lpips", type=Path, help="weights file: measure LPIPS too")
+    judges.add_argument("--lpips", type=Path, help="weights file; also measure LPIPS")
     parser.add_argument(
-        "--cameras", type=Path, help="cameras of the one scene, as cvtgs reads them"
+        "--cameras", type=Path, help="cameras of a single scene, as cvtgs reads them"
     )
-    parser.add_argument("--split", choices=("train", "test"), help="some of --cameras")
+    parser.add_argument("--split", choices=("train", "test"), help="part of --cameras to use")
     parser.add_argument(
         "--images", type=Path, metavar="DIR", help="photographs of --cameras, to score against"
     )
-    parser.add_argument("--white", action="store_true", help="white behind scenes and --images")
+    parser.add_argument(
+        "--white", action="store_true", help="white background for scenes and --images"
+    )
     return parser
 
 
@@ -170,7 +172,7 @@ def make_scorer(options: argparse.Namespace, file: Path | None) -> Scorer:
 def given_scorer(options: argparse.Namespace, weights: LpipsWeights | None) -> Scorer:
     """Return a scorer from given cameras, against the full scene or against photographs."""
     if len(options.files) != 1:
-        raise SystemExit(f"--cameras are those of one scene, found {len(options.files)} scenes.")
+        raise SystemExit(f"--cameras needs exactly one scene, found {len(options.files)} scenes.")
     try:
         cameras = cvtgs.load_cameras(options.cameras, split=options.split)
         if options.images is None:

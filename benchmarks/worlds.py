@@ -75,7 +75,7 @@ def place_cameras(capture: Capture, scene: cvtgs.GaussianScene, cameras: Cameras
     means = scene.means[scene.opacities > 0.1].double()
     means = means[torch.isfinite(means).all(dim=1)]
     if not len(means):
-        raise SystemExit(f"{capture.model.path}: must hold Gaussians that show, found none.")
+        raise SystemExit(f"{capture.model.path}: must hold visible Gaussians, found none.")
     worlds = [World()]
     if capture.model.layout == "nerfstudio":
         worlds = [nerfstudio_world(capture.model.path)]
@@ -132,7 +132,7 @@ def read_points(folder: Path) -> Points:
                 return np.array(list(read(path.read_bytes())), dtype=float).reshape(-1, 3)
             except (struct.error, ValueError):
                 raise SystemExit(
-                    f"{path}: must be the points of a model of COLMAP, found a record that is none."
+                    f"{path}: must be the points of a COLMAP model, found an invalid record."
                 ) from None
     return np.empty((0, 3))
 
@@ -165,10 +165,10 @@ def _nearest_world(
         distances.append(float(np.median(tree.query(moved)[0]) / spread))
     if not min(distances) <= FARTHEST:
         raise SystemExit(
-            f"{capture.model.path}: must be a model of {capture.folder}, but the points of COLMAP "
-            f"there lie {min(distances):.2f} of their spread from its Gaussians (at most "
-            f"{FARTHEST:g}); it is the model of another scene, or its world was moved in a way "
-            f"that is not known."
+            f"{capture.model.path}: must be a model of {capture.folder}, but the COLMAP points "
+            f"there are {min(distances):.2f} of their spread away from its Gaussians (at most "
+            f"{FARTHEST:g}); it is the model of another scene, or its coordinates were "
+            f"transformed in an unknown way."
         )
     return worlds[distances.index(min(distances))]
 

@@ -1,4 +1,4 @@
-"""Pages in a real browser, where one is installed."""
+"""Run pages in a real browser, if one is installed."""
 
 import re
 import shutil
@@ -35,7 +35,7 @@ needs_browser = pytest.mark.skipif(
 
 
 def layout_on_a_phone(path: Path) -> str:
-    """A window cannot be as narrow as a phone, a frame can."""
+    """Return the layout in a frame of a phone's width, since a window cannot be that narrow."""
     holder = path.parent / "phone.html"
     holder.write_text(
         f'<iframe id="phone" src="{path.name}" style="width:390px;height:800px;border:0"></iframe>'

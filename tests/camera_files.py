@@ -1,4 +1,4 @@
-"""A rig of ten cameras, and its files in every format, made without cvtgs."""
+"""A rig of ten cameras and its files in every format, written without cvtgs."""
 
 import json
 import struct
@@ -24,7 +24,7 @@ CENTERS = np.array([_center(row) for row in range(len(NAMES))])
 
 
 def pose(row: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation from camera (right, down, forward) to world, and position; z is up."""
+    """Return the rotation from camera (right, down, forward) to world and the centre; z is up."""
     center = _center(row)
     forward = -center / np.linalg.norm(center)
     right = np.cross(forward, [0, 0, 1])
@@ -37,7 +37,7 @@ def poses() -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def expected_pixels() -> np.ndarray:
-    """Similar triangles: how far right and down per distance ahead."""
+    """Return pixels by similar triangles: offsets right and down per unit of depth."""
     pixels = []
     for rotation, center in poses():
         right, down, forward = (axis @ (POINT - center) for axis in rotation.T)
@@ -52,7 +52,7 @@ def write_json(path: Path, content: Any) -> Path:
 
 
 def transforms(rows: Iterable[int] = range(10)) -> dict[str, Any]:
-    """OpenGL axes: right, up, backward."""
+    """Return the content of transforms.json, with OpenGL axes: right, up, backward."""
     frames = []
     for row in rows:
         rotation, center = pose(row)
@@ -80,7 +80,7 @@ def inria() -> list[dict[str, Any]]:
 
 
 def _quaternion(matrix: np.ndarray) -> np.ndarray:
-    """The eigenvector of Bar-Itzhack's matrix to the eigenvalue 1; w first."""
+    """Return the eigenvector of Bar-Itzhack's matrix for the eigenvalue 1; w comes first."""
     m = matrix
     k = np.array([
         [m[0, 0] - m[1, 1] - m[2, 2], m[1, 0] + m[0, 1], m[2, 0] + m[0, 2], m[2, 1] - m[1, 2]],

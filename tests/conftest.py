@@ -6,7 +6,7 @@ import signal
 if "PYTEST_XDIST_WORKER" in os.environ:  # before torch is imported
     os.environ["OMP_NUM_THREADS"] = "1"
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in what a shell runs in the background
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in background jobs of a shell
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 from importlib import import_module
@@ -16,5 +16,5 @@ import pytest
 
 @pytest.fixture
 def coarse_light(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Look through a grid of 16 voxels a side, not 128, which takes most of the time there."""
+    """Compute visibility on a grid of 16 voxels a side; 128 would take most of the test time."""
     monkeypatch.setattr(import_module("cvtgs.analysis.visibility"), "HALF_GRID", 8)

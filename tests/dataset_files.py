@@ -1,4 +1,4 @@
-"""Small datasets of posed photographs, and models of them, as each training code lays them out."""
+"""Small datasets of posed photographs and their models, in the layout of each trainer."""
 
 import math
 from pathlib import Path
@@ -17,11 +17,11 @@ from cvtgs.errors import CvtgsError
 from cvtgs.evaluation.scorer import Metrics
 
 HALF = (32, 24)
-"""Pixels of the photographs, of cameras of twice the size."""
+"""Size of the photographs in pixels; the cameras have twice this size."""
 
 
 def ball() -> cvtgs.GaussianScene:
-    """Gaussians about the point that the cameras look at."""
+    """Return Gaussians around the point that the cameras look at."""
     g = torch.Generator().manual_seed(0)
     made = cvtgs.synthetic.scene("object", 600, sh_degree=0, seed=0)
     return made.with_tensors(
@@ -34,7 +34,7 @@ def ball() -> cvtgs.GaussianScene:
 
 
 def shoot(scene: cvtgs.GaussianScene, cameras: Cameras, folder: Path, *, alpha: bool = False):
-    """Write a photograph of every camera, by the last part of its name."""
+    """Write a photograph for every camera, named by the last part of the camera name."""
     cameras = cameras.resized(*HALF)
     images = cvtgs.render(scene, cameras)
     folder.mkdir(parents=True, exist_ok=True)
@@ -53,7 +53,7 @@ def colmap_dataset(scene: cvtgs.GaussianScene, folder: Path, images: str = "imag
 
 
 def nerf_dataset(scene: cvtgs.GaussianScene, folder: Path) -> Path:
-    """Transparent pictures, and the split of NeRF-Synthetic."""
+    """Write transparent photographs and the split of NeRF-Synthetic."""
     for split, rows in (("train", range(2, 10)), ("test", range(2))):
         told = transforms(rows)
         for row, frame in zip(rows, told["frames"], strict=True):
@@ -84,7 +84,7 @@ SHIFT, SCALE = torch.tensor([0.5, -0.25, 1.0]), 0.4
 
 
 def nerfstudio_model(scene: cvtgs.GaussianScene, folder: Path) -> Path:
-    """A scene that was turned, moved and then scaled, and the file that says so."""
+    """Write a turned, moved and scaled scene, and the file with the transform."""
     moved = scene.with_tensors(
         {
             "means": (scene.means @ TURN.T + SHIFT) * SCALE,

@@ -1,4 +1,4 @@
-"""What every way of simplifying gives, as digests: a change of structure must not change a bit.
+"""Digests of the results of every way of simplifying: refactoring must not change a bit.
 
 ``python tests/digests.py`` compares with ``digests.json``; with ``--record`` it writes that file.
 """
@@ -134,7 +134,7 @@ def columns(scene: cvtgs.GaussianScene) -> list[torch.Tensor]:
 
 
 def measure(name: str) -> dict[str, object]:
-    """Return digest and rough figures of what a case gives."""
+    """Return the digest and rough figures of the result of a case."""
     scenes = list(CASES[name]())
     return {
         "digest": digest(tensor for scene in scenes for tensor in columns(scene)),

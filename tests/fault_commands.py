@@ -1,19 +1,19 @@
-"""The commands that ``faults.py`` kills and starves, and what they need."""
+"""The commands that ``faults.py`` interrupts and limits, and their inputs."""
 
 from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """A command that writes.
+    """A command that writes files.
 
     Attributes:
-        words: Its words; ``{}`` is the folder.
-        blocks: Number of blocks, as if there were little memory; 0 for one piece.
-        varies: Files that say how long something took, so bits differ from run to run.
-        continues: Whether a file may be that of an earlier moment: a training replaces its own.
-        leaves_none: Whether also a kill leaves nothing in the folder for temporary files.
-        rounds: How often it is chosen, compared with others; less for those that take long.
+        words: The arguments; ``{}`` is the folder.
+        blocks: Number of blocks, as if memory were short; 0 for no division into blocks.
+        varies: Files that record durations, so their bytes differ between runs.
+        continues: Whether a file may be an earlier state: training replaces its own files.
+        leaves_none: Whether even a kill leaves nothing in the folder for temporary files.
+        rounds: Relative frequency of choice; lower for slow commands.
     """
 
     words: tuple[str, ...]

@@ -1,10 +1,10 @@
 """Faults: kills at any moment, two runs at once, full disks, too little memory.
 
 ``python tests/faults.py --kills 500 --pairs 100`` (the nox session ``faults``) runs every command
-that writes in forks of this process, and checks how each ends: with its status and one sentence at
-most, its files whole or absent, and after the same command ran again the same bits as ever, and
-nothing else in the folder. It ends with a line of counts, after ``--seconds`` with those that it
-had time for, or with the first failure. Needs POSIX.
+that writes files in forks of this process. It checks that each ends with its status and at most one
+sentence, that its files are complete or absent, and that a second run of the command gives the
+usual bytes and leaves nothing else in the folder. It prints a line of counts at the end or after
+``--seconds``, and stops at the first failure. Needs POSIX.
 """
 
 import argparse
@@ -30,21 +30,21 @@ from cvtgs.cli.main import run_process
 from fault_commands import CLUSTER, COMMANDS, TRAINING, Command
 
 SIGNALS = {"SIGINT": 130, "SIGTERM": 143, "SIGKILL": -9}
-"""Status after each signal, by name: Windows lacks one."""
+"""Exit status after each signal, by name, since Windows lacks one of them."""
 
 EARLY = 75
-"""Status of a fork that a signal ends before ``main`` takes signals over, and touches anything."""
+"""Exit status of a fork that a signal ends before ``main`` handles signals or writes files."""
 
-BUSY = ("one run at a time may work on it", "must not exist yet", "must be")
+BUSY = ("only one run at a time may work on it", "must not exist yet", "must be")
 MOST_SECONDS = 300.0
 
 
 class FaultError(Exception):
-    """Something did not end as it is promised."""
+    """A command did not end as promised."""
 
 
 def started(command: Command, folder: Path, *, limit: Callable[[], None] | None = None) -> int:
-    """Fork a run of a command; what it prints goes to a file of its process."""
+    """Fork a run of a command; its output goes to a file named after its process."""
     sys.stdout.flush()
     numbers = (signal.SIGINT, signal.SIGTERM)
     signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
@@ -62,7 +62,7 @@ def started(command: Command, folder: Path, *, limit: Callable[[], None] | None 
         os.dup2(errors, 2)
         os.dup2(errors, 1)
         tempfile.tempdir = os.environ["TMPDIR"] = str(temporary(folder))
-        # Any optimizer of torch makes this folder, in that for temporary files unless it is told.
+        # Optimizers of torch create this folder, by default in that for temporary files.
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(folder.parent / "torch")
         if command.blocks:
             cvtgs.outofcore.block_count = lambda *_: command.blocks  # type: ignore[assignment]
@@ -78,7 +78,7 @@ def started(command: Command, folder: Path, *, limit: Callable[[], None] | None 
         run_process()
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
-    except BaseException:  # what the process would print as a traceback
+    except BaseException:  # the process would print a traceback
         with suppress(MemoryError):
             traceback.print_exc()
     finally:
@@ -89,7 +89,7 @@ def started(command: Command, folder: Path, *, limit: Callable[[], None] | None 
 
 
 def ended(process: int, folder: Path) -> tuple[int, str]:
-    """Wait for a fork; return its status and what it printed."""
+    """Wait for a fork; return its status and its output."""
     code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
     path = folder.parent / f"errors-{process}"
     text = path.read_text(errors="replace") if path.exists() else ""
@@ -126,7 +126,7 @@ def fresh(home: Path) -> Path:
 
 
 def same(command: Command, found: dict[str, bytes], wanted: dict[str, bytes]) -> bool:
-    """Return whether files are those of a whole run."""
+    """Return whether files are those of an undisturbed run."""
     if found.keys() != wanted.keys():
         return False
     return all(found[name] == wanted[name] or Path(name).name in command.varies for name in wanted)
@@ -139,22 +139,22 @@ def check_whole(command: Command, folder: Path, wanted: dict[str, bytes]) -> Non
     if code or not same(command, found, wanted):
         differs = [name for name in wanted if found.get(name) != wanted[name]]
         more = sorted(found.keys() - wanted.keys())
-        raise FaultError(f"the run after it: status {code}, differs {differs}, left {more}: {text}")
+        raise FaultError(f"the next run: status {code}, differs {differs}, left {more}: {text}")
     if command.leaves_none and (left := [*temporary(folder).iterdir()]):
         raise FaultError(f"temporary files are left: {left}")
 
 
 def check_part(command: Command, folder: Path, wanted: dict[str, bytes]) -> None:
-    """Check that every file that has its name is whole."""
+    """Check that every file under its final name is complete."""
     for name, content in contents(folder).items():
         hidden = any(part.startswith(".") for part in Path(name).parts)
         varies = command.continues or Path(name).name in command.varies
         if not hidden and not varies and content != wanted.get(name):
-            raise FaultError(f"{name} is not whole")
+            raise FaultError(f"{name} is not complete")
 
 
 def references(home: Path, names: list[str]) -> Iterator[tuple[str, float, dict[str, bytes]]]:
-    """Run commands to their end, twice, for their files and their seconds."""
+    """Run commands twice without faults; yield their names, durations and files."""
     for name in names:
         command = COMMANDS[name]
         folder = fresh(home)
@@ -172,7 +172,7 @@ def kill(command: Command, folder: Path, seconds: float, name: str) -> int:
     before = contents(folder)
     process = started(command, folder)
     time.sleep(seconds)
-    with suppress(ProcessLookupError):  # it has ended
+    with suppress(ProcessLookupError):  # it has already ended
         os.kill(process, signal.Signals[name])
     code, text = ended(process, folder)
     if code == EARLY and contents(folder) == before:
@@ -181,12 +181,12 @@ def kill(command: Command, folder: Path, seconds: float, name: str) -> int:
         raise FaultError(f"status {code} after {name}: {text}")
     sentences = [line for line in text.splitlines() if not line.startswith("cvtgs: warning: ")]
     if len(sentences) > 1:
-        raise FaultError(f"more than a sentence after {name}: {text}")
+        raise FaultError(f"more than one sentence after {name}: {text}")
     return code
 
 
 def starved(share: float) -> Callable[[], None]:
-    """Return what leaves a process a share of half a gigabyte."""
+    """Return a function that limits further memory to a share of 512 MiB."""
 
     def limit() -> None:
         import resource  # noqa: PLC0415 (not on Windows)
@@ -200,7 +200,7 @@ def starved(share: float) -> Callable[[], None]:
 
 
 def full(share: float) -> Callable[[], None]:
-    """Return what lets no file grow beyond a share of 100 kB."""
+    """Return a function that limits files to a share of 100 kB."""
 
     def limit() -> None:
         import resource  # noqa: PLC0415
@@ -228,11 +228,11 @@ def cluster(names: list[str]) -> Iterator[None]:
     with place:
         os.environ["FAULTS_SCHEDULER"] = place.stdout.readline().strip()  # type: ignore[union-attr]
         yield
-        place.communicate()  # closes its input, so it ends
+        place.communicate()  # closes its input, which ends it
 
 
 def write_inputs(home: Path, count: int) -> None:
-    """Write what commands read: a scene, a small one, and scenes to train on."""
+    """Write the inputs of commands: a scene, a small scene, and scenes to train on."""
     scene = cvtgs.synthetic.scene("object", count, sh_degree=1, seed=3)
     cvtgs.save(scene, home / "in.ply")
     cvtgs.save(cvtgs.Simplifier(device="cpu").simplify(scene, 0.1), home / "small.ply")
@@ -244,14 +244,14 @@ def write_inputs(home: Path, count: int) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Do all faults, and say how they ended."""
+    """Run all faults, and print the outcomes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=500)
     parser.add_argument("--pairs", type=int, default=100)
-    parser.add_argument("--limits", type=int, default=50, help="of memory, and of the disk")
+    parser.add_argument("--limits", type=int, default=50, help="of memory, and as many of the disk")
     parser.add_argument("--count", type=int, default=6000, help="Gaussians of the scene")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="after which to end")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="end after this time")
     parser.add_argument("--commands", nargs="*", choices=[*COMMANDS], default=[*COMMANDS])
     options = parser.parse_args(arguments)
     dice, ends, begun = random.Random(options.seed), Counter[str](), time.monotonic()
@@ -294,7 +294,7 @@ def one_fault(
     wanted: dict[str, bytes],
     dice: random.Random,
 ) -> str:
-    """Do one fault, check what is left, run the command again; return how it ended."""
+    """Run one fault, check the files, run the command again; return the exit statuses."""
     if kind == "kill":
         sent = dice.choice([*SIGNALS])
         codes = [kill(command, folder, dice.uniform(0, 1.1 * seconds), sent)]
@@ -305,10 +305,10 @@ def one_fault(
         found = [ended(process, folder) for process in both]
         for code, text in found:
             if code not in (0, 1) or (code == 1 and not any(word in text for word in BUSY)):
-                raise FaultError(f"status {code} of two: {text}")
+                raise FaultError(f"status {code} of one of two runs: {text}")
         codes = [code for code, _ in found]
         if 0 not in codes:
-            raise FaultError(f"neither of two ended well: {found}")
+            raise FaultError(f"neither of two runs succeeded: {found}")
     else:
         limit = (starved if kind == "memory" else full)(dice.random())
         code, text = ended(started(command, folder, limit=limit), folder)

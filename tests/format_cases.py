@@ -1,4 +1,4 @@
-"""What the tests of formats share: scenes, comparisons with oracles and within error bounds."""
+"""Common parts of format tests: scenes, comparisons with oracles and within error bounds."""
 
 import math
 import struct
@@ -20,7 +20,7 @@ DATA = Path(__file__).parent / "data" / "formats"
 
 
 def storable_scene(count: int, *, seed: int = 0, degree: int = 3) -> GaussianScene:
-    """Return a scene that no format cuts off, whatever the degree it holds."""
+    """Return a scene whose values no format clamps."""
     scene = random_scene(count, seed=seed, degree=degree)
     tensors = {"sh0": scene.sh0.clamp(-1.7, 1.7), "shN": scene.shN.clamp(-0.9, 0.9)}
     return replace(scene.with_tensors(tensors, {}), comments=(ANTIALIASED_TAG,))
@@ -36,7 +36,7 @@ def with_extension(content: bytes, kind: int, payload: bytes) -> bytes:
 
 
 def refusal(path: Path) -> str | None:
-    """Load a scene; give the text of the error if it cannot be."""
+    """Load a scene; return the text of the error if this fails."""
     try:
         assert len(load(path)) > 0
     except CvtgsError as error:
@@ -45,7 +45,7 @@ def refusal(path: Path) -> str | None:
 
 
 def camera_refusal(path: Path, error: type[CvtgsError] = FileFormatError, **arguments: Any) -> str:
-    """Return what reading damaged cameras says."""
+    """Return the error message about damaged cameras."""
     with pytest.raises(error) as caught:
         load_cameras(path, **arguments)
     assert type(caught.value) is error
@@ -60,7 +60,7 @@ def nearest_rows(scene: GaussianScene, other: GaussianScene) -> GaussianScene:
 
 
 def assert_as_oracle(scene: GaussianScene, splats: list[Splat], tolerance: float = 2e-6) -> None:
-    """Compare every number with what an oracle read, in the order of the file."""
+    """Compare every number with that of an oracle, in the order of the file."""
     assert len(scene) == len(splats)
     wanted = {
         "means": [splat.mean for splat in splats],
@@ -90,7 +90,7 @@ def angles(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
 
 
 def half_turn(scene: GaussianScene) -> GaussianScene:
-    """Turn a scene about x by an oracle, and name the axes of each Gaussian as Niantic does."""
+    """Turn a scene by pi about x with an oracle; Gaussians keep the axes of Niantic."""
     turned = moved(scene, quat=(0, 1, 0, 0))
     quats = [oracles.quaternion_product(quat, (0, -1, 0, 0)) for quat in turned.quats.tolist()]
     return turned.with_tensors({"quats": torch.tensor(quats)}, {})

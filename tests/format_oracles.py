@@ -1,6 +1,6 @@
-"""Slow readers of compact formats, one Gaussian after the other, that share nothing with cvtgs.
+"""Slow readers of compact formats, one Gaussian at a time, without code of cvtgs.
 
-Each gives a list of Gaussians in the order of the file, in the axes of the file.
+Each returns a list of Gaussians in the order and the axes of the file.
 """
 
 import gzip
@@ -58,7 +58,7 @@ def read_splat(content: bytes) -> list[Splat]:
 
 
 def unpacked_spz(content: bytes) -> bytes:
-    """Return header and blocks of any version, as those before 4 have them."""
+    """Return the header and blocks of any version, in the layout before version 4."""
     if content[:2] == b"\x1f\x8b":
         return gzip.decompress(content)
     (streams,), (start,) = content[15:16], struct.unpack_from("<I", content, 16)
@@ -74,7 +74,7 @@ def unpacked_spz(content: bytes) -> bytes:
 
 
 def read_spz(content: bytes) -> list[Splat]:
-    """Read any version, without turning any axis."""
+    """Read any version, without a change of axes."""
     data = unpacked_spz(content)
     magic, version, count, degree, bits, _, _ = struct.unpack_from("<IIIBBBB", data)
     assert magic == int.from_bytes(b"NGSP", "little")
@@ -170,7 +170,7 @@ def rest_value(byte: int) -> float:
 
 
 def read_sog(path: Path) -> list[Splat]:
-    """Read version 2, bundled."""
+    """Read a bundled SOG of version 2."""
     archive = zipfile.ZipFile(path)
     meta = json.loads(archive.read("meta.json"))
     pixels = {}
@@ -218,7 +218,7 @@ def sog_rest(rest, at, pixels) -> list[list[float]]:
 
 
 def read_glb(content: bytes) -> list[Splat]:
-    """Read a ``.glb`` of one mesh of floats, without turning any axis."""
+    """Read a ``.glb`` of one mesh of floats, without a change of axes."""
     size = struct.unpack_from("<I", content, 12)[0]
     document, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
     primitive = document["meshes"][0]["primitives"][0]

@@ -1,10 +1,10 @@
 """Fuzz the readers: scenes of every format, networks and configurations, damaged in every way.
 
-``python tests/fuzz_files.py --count 100000`` (the nox session ``fuzz``) ends with a line of counts,
-and with the inputs that did not end in a result or in one clear sentence: they are made small and
-put into ``tests/data/fuzz``, which the tests read. Inputs that end in a way not seen before are
-damaged further. Each input has a limit of CPU time, and the process one of memory, so hangs and
-lying headers are found.
+``python tests/fuzz_files.py --count 100000`` (the nox session ``fuzz``) prints a line of counts,
+and the inputs that gave neither a result nor one clear sentence: these are reduced and stored in
+``tests/data/fuzz``, which the tests read. Inputs with an outcome not seen before are damaged
+further. The CPU time of each input and the memory of the process are limited, so hangs and
+false headers are found.
 """
 
 import argparse
@@ -35,10 +35,10 @@ Dice = random.Random
 CORPUS = Path(__file__).parent / "data" / "fuzz"
 CPU_SECONDS = 2.0
 MEMORY = 1 << 30
-"""A GiB more than the process has when it starts; no seed has more than 100 kB."""
+"""Memory limit above that of the process at its start; no seed has more than 100 kB."""
 
 MOST_GROWN, MOST_FAILURES, MOST_TRIES = 300, 10, 400
-"""Inputs that a kind may add to its seeds, failures before the end, tries to make one small."""
+"""Most inputs added to the seeds of a kind, failures before the end, tries to reduce one."""
 
 LIES = (b"-1", b"0", b"1", b"7", b"4294967296", b"999999999999999999", b"9" * 40, b"1e3", b"0x10")
 WORDS = (
@@ -52,7 +52,7 @@ WORDS = (
 
 
 class HangError(Exception):
-    """An input took too long."""
+    """Reading an input takes too long."""
 
 
 def mutant(seed: bytes, dice: Dice) -> bytes:
@@ -71,20 +71,20 @@ def flip(data: bytearray, dice: Dice) -> bytes:
 
 
 def cut(data: bytearray, dice: Dice) -> bytes:
-    """Cut the end off, or a piece out."""
+    """Cut off the end, or cut out a piece."""
     start = dice.randrange(len(data) + 1)
     stop = dice.choice((len(data), min(len(data), start + dice.randrange(40))))
     return data[:start] + data[stop:]
 
 
 def insert(data: bytearray, dice: Dice) -> bytes:
-    """Put a word anywhere, instead of a few bytes or between them."""
+    """Insert a word anywhere, or replace a few bytes by it."""
     at = dice.randrange(len(data) + 1)
     return data[:at] + dice.choice(WORDS) + data[at + dice.randrange(8) :]
 
 
 def lie(data: bytearray, dice: Dice) -> bytes:
-    """Change a number of the text."""
+    """Replace a number of the text."""
     numbers = list(re.finditer(rb"\d+", bytes(data[:4000])))
     if not numbers:
         return data
@@ -107,7 +107,7 @@ def swap_lines(data: bytearray, dice: Dice) -> bytes:
 
 
 def swap_words(data: bytearray, dice: Dice) -> bytes:
-    """Put one word of the text in the place of another."""
+    """Replace one word of the text by another."""
     words = list(re.finditer(rb"[\w.+-]+", bytes(data[:4000])))
     if not words:
         return data
@@ -116,7 +116,7 @@ def swap_words(data: bytearray, dice: Dice) -> bytes:
 
 
 def inside(data: bytearray, dice: Dice) -> bytes:
-    """Damage what is packed, and pack it again with the right checksums."""
+    """Damage compressed content, and compress it again with correct checksums."""
     whole = bytes(data)
     try:
         if whole[:2] == b"\x1f\x8b":
@@ -153,19 +153,19 @@ DAMAGES: Sequence[Callable[[bytearray, Dice], bytes]] = (
 
 
 class Verdict(NamedTuple):
-    """How reading ended: ``read``, ``refused``, or what is wrong; and what tells it from others."""
+    """The outcome of reading: ``read``, ``refused`` or the fault; and a signature of its text."""
 
     end: str
     signature: str
 
 
 def verdict(read: Callable[[Path], object], path: Path) -> str:
-    """Read a file: ``read``, ``refused``, or what is wrong with how it ended."""
+    """Read a file; return ``read``, ``refused`` or the fault."""
     return judged(read, path).end
 
 
 def judged(read: Callable[[Path], object], path: Path) -> Verdict:
-    """Read a file, and judge how it ended."""
+    """Read a file and return the verdict on the outcome."""
     text = "read"
     before = sorted(path.parent.iterdir())
     set_timer(CPU_SECONDS)
@@ -178,12 +178,12 @@ def judged(read: Callable[[Path], object], path: Path) -> Verdict:
         result = f"more than {MEMORY >> 20} MiB"
     except CvtgsError as error:
         text = str(error)
-        own = (f"{path}: ", f"{path.parent}: ", f"{path.parent}{os.sep}")  # or one beside it
+        own = (f"{path}: ", f"{path.parent}: ", f"{path.parent}{os.sep}")  # or a file beside it
         clear = text.startswith(own) and text.endswith((".", "?")) and "\n" not in text
         result = "refused" if clear and len(text) < 1000 else f"unclear: {text!r}"
     except HangError:
         result = f"more than {CPU_SECONDS:g} s"
-    except Exception as error:  # whatever is not ours is what is looked for
+    except Exception as error:  # any error that is not of cvtgs is a fault
         result = f"{type(error).__name__}: {error}"
     finally:
         set_timer(0)
@@ -195,13 +195,13 @@ def judged(read: Callable[[Path], object], path: Path) -> Verdict:
 
 
 def set_timer(seconds: float) -> None:
-    """Ask for a signal after some seconds of processor time; Windows has none."""
+    """Request a signal after some seconds of CPU time, where the system supports it."""
     if hasattr(signal, "setitimer"):
         signal.setitimer(signal.ITIMER_PROF, seconds)
 
 
 def limit() -> None:
-    """Let nothing take much memory or time."""
+    """Limit the memory of the process, and stop inputs that take too long."""
     import resource  # noqa: PLC0415 (not on Windows)
 
     def stop(number: int, frame: object) -> None:
@@ -215,7 +215,7 @@ def limit() -> None:
 
 
 def made_small(data: bytes, fails: Callable[[bytes], bool]) -> bytes:
-    """Drop pieces of an input, long ones first, as long as it fails."""
+    """Drop pieces of an input, long ones first, while it still fails."""
     tries, size = 0, max(1, len(data) // 2)
     while tries < MOST_TRIES:
         for start in range(0, len(data), size):
@@ -234,12 +234,12 @@ def made_small(data: bytes, fails: Callable[[bytes], bool]) -> bytes:
 
 
 def chosen(pool: Sequence[bytes], whole: int, dice: Dice) -> bytes:
-    """Choose a seed: a whole file, the first ones of the pool, twice as often as a damaged one."""
+    """Choose a seed: an undamaged file (first in the pool) twice as often as a damaged one."""
     return dice.choice(pool[:whole] if dice.random() < 2 / 3 else pool)
 
 
 def corpus(kind: str) -> list[Path]:
-    """Return the inputs of a kind that are kept with the tests."""
+    """Return the stored inputs of a kind."""
     return sorted((CORPUS / kind).glob("*"))
 
 
@@ -249,7 +249,7 @@ def suffix_of(kind: str) -> str:
 
 
 def keep(kind: str, data: bytes) -> Path:
-    """Keep an input with the tests."""
+    """Store an input with the tests."""
     path = CORPUS / kind / f"{hashlib.sha256(data).hexdigest()[:12]}{suffix_of(kind)}"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
@@ -257,13 +257,15 @@ def keep(kind: str, data: bytes) -> Path:
 
 
 def main() -> None:
-    """Fuzz all readers, and say how it ended."""
+    """Fuzz all readers, and print the outcomes."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=100_000, help="inputs of all kinds together")
+    parser.add_argument("--count", type=int, default=100_000, help="total number of inputs")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="after which to end")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="end after this time")
     parser.add_argument("--kinds", nargs="*", choices=[*READERS], help="kinds of files (all)")
-    parser.add_argument("--grow", type=int, default=0, help="new ends per kind to keep with tests")
+    parser.add_argument(
+        "--grow", type=int, default=0, help="new outcomes per kind to store with the tests"
+    )
     options = parser.parse_args()
     dice, ends = random.Random(options.seed), Counter[str]()
     kinds = options.kinds or [*READERS]
@@ -277,7 +279,7 @@ def main() -> None:
             for number, seed in enumerate(pool):
                 paths[kind].write_bytes(seed)
                 if verdict(READERS[kind].read, paths[kind]) != "read":
-                    sys.exit(f"{kind} {number} cannot be read before it is damaged.")
+                    sys.exit(f"{kind} {number} must be readable before it is damaged.")
             pool += [path.read_bytes() for path in corpus(kind)]
         limit()
         begun = time.monotonic()

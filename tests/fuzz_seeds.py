@@ -1,4 +1,4 @@
-"""What the fuzzer damages: small files of every kind that cvtgs reads, and what reads them."""
+"""Seeds of the fuzzer: small files of every kind that cvtgs reads, with their readers."""
 
 import io
 import json
@@ -31,13 +31,13 @@ Files = dict[str, bytes]
 
 @dataclass(frozen=True, kw_only=True)
 class Kind:
-    """A kind of files.
+    """A kind of file.
 
     Attributes:
-        name: The name of a file, or the end of one.
-        seeds: Makes whole ones.
-        read: What reads them.
-        beside: Makes what lies beside them, by name.
+        name: The name of a file, or its suffix.
+        seeds: Makes undamaged files.
+        read: Reads a file.
+        beside: Makes the other files of its folder, by name.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Kind:
 
 
 def seeds_of_ply() -> list[bytes]:
-    """Small files of every layout: binary of both orders, ASCII, with lists, faces, 2DGS."""
+    """Return small files of every layout: both byte orders, ASCII, lists, faces, 2DGS."""
     plain = gaussian_properties()
     flat = [(name, kind) for name, kind in gaussian_properties(9) if name != "scale_2"]
     lists = [*plain, ("seen_by", "list uchar uint")]
@@ -67,20 +67,20 @@ def seeds_of_ply() -> list[bytes]:
 
 
 def seeds_of_checkpoints() -> list[bytes]:
-    """One small checkpoint."""
+    """Return one small checkpoint."""
     shape = Architecture(width=2, cell_width=3)
     info = CheckpointInfo(architecture=shape, preset="paper")
     return [save_checkpoint(lively_net(torch.float32, architecture=shape), info)]
 
 
 def seeds_of_configs() -> list[bytes]:
-    """Both presets in full, and a short file."""
+    """Return both presets in full, and a short file."""
     full = [SimplifyConfig.from_preset(name).to_toml().encode() for name in ("standard", "paper")]
     return [*full, b'preset = "paper"\nseed = 3\n[cvt]\niterations = 7\n']
 
 
 def seeds_of_scenes(suffix: str) -> Callable[[], list[bytes]]:
-    """Return what makes small files of a compact format, of SH degree 0 and 1."""
+    """Return a function that makes small files of a compact format, of SH degree 0 and 1."""
 
     def seeds() -> list[bytes]:
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
@@ -97,7 +97,7 @@ def seeds_of_scenes(suffix: str) -> Callable[[], list[bytes]]:
 
 
 def seeds_of_states() -> list[bytes]:
-    """What gsplat and Splatfacto save, with a learning rate of numpy."""
+    """Return checkpoints as of gsplat and Splatfacto, with a learning rate of numpy."""
     tensors = cvtgs.to_dict(random_scene(3, degree=1))
     older = {f"_model.{name}": values for name, values in tensors.items()}
     seeds = []
@@ -112,12 +112,12 @@ def seeds_of_states() -> list[bytes]:
 
 
 def seeds_of_cameras() -> list[bytes]:
-    """Small files of cameras: of nerfstudio and instant-ngp, and of INRIA's code."""
+    """Return small camera files: of nerfstudio and instant-ngp, and of INRIA's code."""
     return [json.dumps(found).encode() for found in (transforms(range(3)), inria()[:3])]
 
 
 def seeds_of_ksplat() -> list[bytes]:
-    """Two Gaussians in a section of its own, without compression and with SH as bytes."""
+    """Return files of two Gaussians in one section, of each compression level."""
     seeds = []
     for level, degree in ((0, 0), (1, 1), (2, 2)):
         sizes = ((12, 28, 4), (6, 14, 2), (6, 14, 1))[level]
@@ -135,7 +135,7 @@ def sog_files() -> Files:
 
 
 def seeds_of_streams() -> list[bytes]:
-    """Two chunks of one SOG, in two levels, and an environment."""
+    """Return streams of two chunks of one SOG, in two levels, one with an environment."""
     near = {"0": {"file": 0, "offset": 0, "count": 3}, "1": {"file": 0, "offset": 3, "count": 2}}
     far = {"0": {"file": 0, "offset": 5, "count": 4}}
     bound = {"min": [-1, -1, -1], "max": [1, 1, 1]}
@@ -149,18 +149,18 @@ def seeds_of_streams() -> list[bytes]:
 
 
 def seeds_of_boxes() -> list[bytes]:
-    """A box, and a list of two."""
+    """Return a box, and a list of two."""
     boxes = [{"min": [0, -1.5, 2], "max": [1, 1e3, 2]}, {"min": [0, 0, 0], "max": [1, 2, 3]}]
     return [json.dumps(found).encode() for found in (boxes[0], boxes)]
 
 
 def seeds_of_trainings() -> list[bytes]:
-    """The recipes, which have most settings."""
+    """Return the recipes, which have most settings."""
     return [path.read_bytes() for path in sorted((HERE.parent / "recipes").glob("*.toml"))]
 
 
 def seeds_of_levels() -> list[bytes]:
-    """The index of two levels."""
+    """Return the index of two levels."""
     scene = random_scene(20, degree=0)
     made = cvtgs.Simplifier(preset="draft", device="cpu").levels(scene, [0.5, 0.1])
     with tempfile.TemporaryDirectory() as folder:
@@ -176,7 +176,7 @@ def colmap_files(write: Callable[[Path], object]) -> Files:
 
 
 def colmap(name: str, write: Callable[[Path], object]) -> Kind:
-    """Return the kind of one file of a COLMAP model; the other ones are whole."""
+    """Return the kind of one file of a COLMAP model; the other files are undamaged."""
 
     def beside() -> Files:
         return {other: data for other, data in colmap_files(write).items() if other != name}
@@ -223,7 +223,7 @@ READERS: dict[str, Kind] = {
 
 
 def place(kind: str, folder: Path) -> Path:
-    """Put what lies beside a kind of file into a folder; return the path of such a file."""
+    """Write the other files of a kind to a folder; return the path for its own file."""
     home = folder / kind
     home.mkdir(exist_ok=True)
     path = home / (

@@ -1,4 +1,4 @@
-"""Files of glTF in parts, for tests."""
+"""Functions that take glTF files apart and change them, for tests."""
 
 import json
 import struct
@@ -24,7 +24,7 @@ def joined(document: dict[str, Any], binary: bytes) -> bytes:
 
 
 def changed(path: Path, change: Change) -> Path:
-    """Change the document of a ``.glb``."""
+    """Change the JSON document of a ``.glb`` in place."""
     document, binary = parts(path.read_bytes())
     change(document)
     path.write_bytes(joined(document, binary))

@@ -14,7 +14,7 @@ MIN_ALPHA = 1 / 255
 MIN_TRANSMITTANCE = 1e-4
 MAX_ALPHA = 0.999
 CENTER = 0.5
-"""Where in a pixel it is sampled; tests move it."""
+"""Position of the sample within a pixel; tests move it."""
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 
@@ -155,7 +155,7 @@ def _matrices(quats: Tensor) -> Tensor:
 
 
 def _radii(splat, width, height, near_plane, far_plane, radius_clip) -> Tensor:
-    """Half sizes in whole pixels of what reaches an alpha of 1/255; 0 for what no image shows."""
+    """Half sizes in whole pixels of the area with an alpha of 1/255 or more; 0 if not visible."""
     reach = (2 * (splat["opacities"].detach() / MIN_ALPHA).clamp_min(1).log()).sqrt()
     sizes = splat["covariances"].detach().diagonal(dim1=1, dim2=2).sqrt()
     radii = (reach[:, None] * sizes).ceil()
@@ -168,7 +168,7 @@ def _radii(splat, width, height, near_plane, far_plane, radius_clip) -> Tensor:
 
 
 def _colors(away: Tensor, sh: Tensor, degree: int) -> Tensor:
-    """Clamp 0.5 and the harmonics of degrees up to 3, in the order and signs of 3DGS."""
+    """Clamp the sum of 0.5 and the harmonics of degrees up to 3, in the order and signs of 3DGS."""
     x, y, z = (away / away.norm(dim=1, keepdim=True)).unbind(1)
     one = torch.ones_like(x)
 

@@ -1,9 +1,9 @@
-"""Scenes that are hard on numbers, a function per case, each with the thread or file it is from.
+"""Numerically hard scenes: one function per case, with its source.
 
-The threads are those that users opened elsewhere; "awkward input" is the list of what the other
-tools were given, and failed on. Every function takes how many Gaussians there are to be and their
-dtype, and gives a scene, of which :func:`valid_rows` tells what a renderer can draw. "The limits
-of the format" has no thread: these are numbers that a file may hold.
+Sources are issue threads of other projects; "awkward input" is a list of inputs on which other
+tools failed; "the limits of the format" are numbers that a file may hold. Every function takes the
+number of Gaussians and their dtype, and returns a scene; :func:`valid_rows` is the mask of its rows
+that a renderer can draw.
 """
 
 import math
@@ -47,18 +47,18 @@ def giants(count: int, dtype: torch.dtype) -> GaussianScene:
 
 
 def points_amid_giants(count: int, dtype: torch.dtype) -> GaussianScene:
-    """Every third Gaussian has scales of e^-40, the others of e^20. Source: as both of them."""
+    """Every third Gaussian has scales of e^-40, the others of e^20. Source: as of both cases."""
     scene = ball(count, dtype)
     return changed(scene, log_scales=every(3, count, (-40.0, 20.0))[:, None].expand(-1, 3))
 
 
 def tiny_world(count: int, dtype: torch.dtype) -> GaussianScene:
-    """A whole scene in a unit of e^-40. Source: the limits of the format."""
+    """A whole scene scaled by e^-40. Source: the limits of the format."""
     return measured_in(ball(count, dtype), -40.0)
 
 
 def huge_world(count: int, dtype: torch.dtype) -> GaussianScene:
-    """A whole scene in a unit of e^20. Source: the limits of the format."""
+    """A whole scene scaled by e^20. Source: the limits of the format."""
     return measured_in(ball(count, dtype), 20.0)
 
 
@@ -82,26 +82,26 @@ def isotropic_cells(count: int, dtype: torch.dtype) -> GaussianScene:
 
 
 def coincident(count: int, dtype: torch.dtype) -> GaussianScene:
-    """All centres are one. Source: hang on coincident points, splat-transform PR 272."""
+    """All centres coincide. Source: hang on coincident points, splat-transform PR 272."""
     scene = ball(count, dtype)
     return changed(scene, means=torch.full((count, 3), 3.0))
 
 
 def on_a_line(count: int, dtype: torch.dtype) -> GaussianScene:
-    """All centres on a line askew. Source: awkward input (a flat tree, a flat bounding box)."""
+    """Centres are on an oblique line. Source: awkward input (a flat tree, a flat bounding box)."""
     scene = ball(count, dtype)
     askew = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
     return changed(scene, means=scene.means[:, :1].double() * askew)
 
 
 def on_a_plane(count: int, dtype: torch.dtype) -> GaussianScene:
-    """All centres on the plane z = 0. Source: awkward input (a flat bounding box)."""
+    """All centres are on the plane z = 0. Source: awkward input (a flat bounding box)."""
     scene = ball(count, dtype)
     return changed(scene, means=scene.means * torch.tensor([1.0, 1.0, 0.0]))
 
 
 def duplicates(count: int, dtype: torch.dtype) -> GaussianScene:
-    """Every Gaussian five times, bit for bit. Source: splat-transform PR 272, merged captures."""
+    """Every Gaussian is there five times. Source: splat-transform PR 272, merged captures."""
     return ball(count, dtype).select(torch.arange(count) // 5)
 
 
@@ -122,7 +122,7 @@ def far_flyaways(count: int, dtype: torch.dtype) -> GaussianScene:
 
 
 def georeferenced(count: int, dtype: torch.dtype) -> GaussianScene:
-    """Detail of 1e-2 at 6e6, as on a map in metres; float32 steps by 0.5 there.
+    """Detail of 1e-2 at 6e6, as on a map in metres; float32 resolves 0.5 there.
 
     Source: UTM northings of non-standard PLYs, MetalSplatter 69 and splat-transform PR 119.
     """
@@ -193,7 +193,7 @@ def nan_logit_opacities(count: int, dtype: torch.dtype) -> GaussianScene:
 
 
 def nan_sh0(count: int, dtype: torch.dtype) -> GaussianScene:
-    """NaN colours. Source: awkward input (another tool loops for ever)."""
+    """NaN colours. Source: awkward input (another tool never ends)."""
     return spoiled(count, dtype, "sh0")
 
 
@@ -209,7 +209,7 @@ def huge_colours(count: int, dtype: torch.dtype) -> GaussianScene:
 
 
 def crowd_beside_loners(count: int, dtype: torch.dtype) -> GaussianScene:
-    """Nearly all Gaussians in one speck, beside (at most) ten large ones that stand far apart.
+    """Nearly all Gaussians are in a small cluster, beside at most ten large ones far apart.
 
     Source: 5.3 M became 1, LightGaussian 27; memory by scene, not chunk, splat-transform PR 276.
     """

@@ -1,4 +1,4 @@
-"""An easy scene, ways to spoil it, and what every result of a hard one is checked for."""
+"""An easy scene, functions that make it hard, and the simplifiers of the hard tests."""
 
 import math
 from collections.abc import Callable
@@ -19,28 +19,28 @@ presets = pytest.mark.parametrize("preset", PRESETS)
 
 @cache
 def simplifier(preset: str, device: str = "cpu") -> Simplifier:
-    """A simplifier that loads its network once for all tests.
+    """Return a simplifier that loads its network once for all tests.
 
-    ``paper`` is without its network, which has no bounds, as published: it corrects clipped
-    colours and axes that rounding decides. ``test_merge`` has it in all cases.
+    ``paper`` is used without its network, which has no bounds, as published: it also corrects
+    clipped colours, and axes that rounding decides. ``test_merge`` tests it in all cases.
     """
     return Simplifier(None if preset == "paper" else "auto", config=preset, device=device)
 
 
 @cache
 def with_network(preset: str) -> Simplifier:
-    """A simplifier with the network of its preset."""
+    """Return a simplifier with the network of its preset."""
     return Simplifier(config=preset, device="cpu")
 
 
 def valid_case(make: Callable[..., GaussianScene], count: int, dtype: torch.dtype) -> GaussianScene:
-    """The rows of a case that a renderer can draw."""
+    """Return the rows of a case that a renderer can draw."""
     scene = make(count, dtype)
     return scene.select(valid_rows(scene))
 
 
 def ball(count: int, dtype: torch.dtype, *, seed: int = 0) -> GaussianScene:
-    """A ball of smooth colours, SH degree 1, of flat and mostly opaque Gaussians: easy."""
+    """Return an easy scene: a ball of flat, mostly opaque Gaussians, smooth colours, degree 1."""
     g = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -62,18 +62,18 @@ def ball(count: int, dtype: torch.dtype, *, seed: int = 0) -> GaussianScene:
 
 
 def changed(scene: GaussianScene, **tensors: Tensor) -> GaussianScene:
-    """The scene with some of its tensors replaced, in its own dtype."""
+    """Return the scene with some of its tensors replaced, in its own dtype."""
     cast = {name: values.to(scene.dtype) for name, values in tensors.items()}
     return scene.with_tensors(cast, scene.extras)
 
 
 def every(step: int, count: int, values: tuple[float, float]) -> Tensor:
-    """The first value in every ``step``-th row, the second in all others."""
+    """Return the first value in every ``step``-th row, the second in all others."""
     return torch.where(torch.arange(count) % step == 0, *values).double()
 
 
 def flown(count: int, dtype: torch.dtype, far: float) -> GaussianScene:
-    """A ball with (at most) five Gaussians far away, each in another direction."""
+    """Return a ball with at most five Gaussians far away, each in another direction."""
     scene = ball(count, dtype)
     away = torch.zeros(count, 3, dtype=torch.float64)
     ways = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, -1], [1, 1, 1]])
@@ -83,7 +83,7 @@ def flown(count: int, dtype: torch.dtype, far: float) -> GaussianScene:
 
 
 def spoiled(count: int, dtype: torch.dtype, name: str) -> GaussianScene:
-    """A ball with NaN in one property of the second and of every ninth row."""
+    """Return a ball with NaN in one property of the second row and of every ninth row."""
     scene = ball(count, dtype)
     values = getattr(scene, name).clone()
     values.view(count, -1)[1:2, 0], values.view(count, -1)[4::9, -1] = math.nan, math.nan
@@ -91,13 +91,13 @@ def spoiled(count: int, dtype: torch.dtype, name: str) -> GaussianScene:
 
 
 def measured_in(scene: GaussianScene, exponent: float) -> GaussianScene:
-    """The scene with all lengths times ``e^exponent``."""
+    """Return the scene with all lengths multiplied by ``e^exponent``."""
     means, log_scales = scene.means.double() * math.exp(exponent), scene.log_scales + exponent
     return changed(scene, means=means, log_scales=log_scales)
 
 
 def valid_rows(scene: GaussianScene) -> Tensor:
-    """Return which rows a renderer can draw: finite, a rotation, a scale that float32 holds."""
+    """Return a mask of drawable rows: finite, with a rotation and a scale that float32 holds."""
     rows = torch.cat([scene.means, scene.quats, scene.log_scales, scene.sh.flatten(1)], dim=1)
     return (
         rows.isfinite().all(dim=1)

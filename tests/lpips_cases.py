@@ -8,7 +8,7 @@ import torch
 
 from cvtgs.evaluation import LpipsWeights
 
-# What torchvision's feature extractors hold: (layer, out, in, kernel, stride, padding), pools as
+# Layers of torchvision's feature extractors: (layer, out, in, kernel, stride, padding), pools as
 # (side,), and "tap" after a ReLU that LPIPS compares.
 ALEX = [
     (0, 64, 3, 11, 4, 2), "tap", (3,), (3, 192, 64, 5, 1, 2), "tap", (3,),

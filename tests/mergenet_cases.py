@@ -147,7 +147,7 @@ def fields_of(residuals: Residuals) -> dict[str, Tensor]:
 
 
 def features_of(seen: Descriptors) -> dict[str, Tensor]:
-    """What must not change when the scene moves: all but positions, whose signs follow the axes."""
+    """Features that a motion must not change: all but positions, whose signs follow the axes."""
     return {name: getattr(seen, name) for name in ("members", "pairs", "cells", "weights")}
 
 

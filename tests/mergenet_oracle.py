@@ -39,7 +39,7 @@ class Gaussian:
         )
 
     def extents(self, other: "Gaussian") -> list[float]:
-        """Logs of the standard deviations of another along the axes of this one, in its own."""
+        """Logs of another's standard deviations along these axes, relative to one's own."""
         lengths = [math.sqrt(axis @ other.covariance @ axis) for axis in self.axes.T]
         return [
             clamp(math.log(length / scale), 9.0)
@@ -129,7 +129,7 @@ def distances(position: Array) -> list[float]:
 
 
 def uncovered(cell: Cell, position: Sequence[float]) -> list[float]:
-    """On the less (positive) or on the more covered side (negative), by axis and in all."""
+    """Positive on the less covered side, negative on the other: by axis, and in total."""
     sides = [
         0.5 * (minus - plus) * x for (plus, minus), x in zip(cell.cover, position, strict=True)
     ]

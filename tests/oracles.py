@@ -17,7 +17,7 @@ AREA_EXPONENT = 1.6075
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gaussian:
-    """One Gaussian, activated but for the optical depth ``-log(1 - a)``."""
+    """One activated Gaussian, with its optical depth ``-log(1 - a)`` instead of its opacity."""
 
     mean: Array
     covariance: Array
@@ -133,7 +133,7 @@ def member_weights(cell: Sequence[Gaussian], *, area_power: float) -> list[float
 def merge(
     cell: Sequence[Gaussian], *, area_power: float, opacity: str, antialiased: bool = False
 ) -> Gaussian:
-    """One Gaussian with the moments of the mixture that the cell is; nothing is widened."""
+    """Return one Gaussian with the moments of the mixture in a cell, without inflation."""
     shares = member_weights(cell, area_power=area_power)
     mean = sum(w * g.mean for w, g in zip(shares, cell, strict=True))
     matrix = np.zeros((3, 3))
@@ -161,7 +161,7 @@ def merge(
 def side_cover(
     means: Array, quats: Array, scales: Array, opacities: Array, row: int, others: Sequence[int]
 ) -> list[list[float]]:
-    """How opaquely others paint at both ends, three sigmas out, of each axis of a Gaussian."""
+    """Opacity of the others at both ends of each axis of a Gaussian, three sigmas out."""
     axes = rotation(quats[row])
     cover = []
     for axis in range(3):
@@ -180,13 +180,13 @@ def side_cover(
 def inflation(
     opacity: float, members: int, cover: float, *, everywhere: float, covered: float
 ) -> float:
-    """Factor on one scale of a merged Gaussian, ``cover`` being that of its barer side."""
+    """Factor on one scale of a merged Gaussian; ``cover`` is that of its less covered side."""
     crowding = min(math.log10(members) / 2.0, 1.0)
     return 1.0 + opacity**2 * crowding * (everywhere + covered * min(cover / 0.1, 1.0))
 
 
 def nearest(points: Array, sites: Array) -> tuple[list[int], list[float]]:
-    """First nearest site of every point, and the squared distance, one by one."""
+    """First nearest site of every point and its squared distance, found one by one."""
     labels, squared = [], []
     for point in points.tolist():
         best, name = math.inf, -1
@@ -209,7 +209,7 @@ def morton_code(steps: Sequence[int], bits: int) -> int:
 
 
 def sh_basis(directions: Array, degree: int) -> Array:
-    """Basis of 3DGS files at unit directions: ``(n, (degree + 1)^2)``, signs as INRIA's."""
+    """Basis of 3DGS files at unit directions: ``(n, (degree + 1)^2)``, with INRIA's signs."""
     columns = []
     for x, y, z in directions:
         row = [0.28209479177387814]

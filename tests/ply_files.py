@@ -1,4 +1,4 @@
-"""PLY files written by hand, byte by byte, for tests; nothing here knows cvtgs."""
+"""PLY files for tests, written byte by byte, without cvtgs."""
 
 import struct
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ Properties = Sequence[tuple[str, str]]
 
 
 def gaussian_properties(rest: int = 0, *, kind: str = "float", normals: bool = True) -> Properties:
-    """Give INRIA's properties, in INRIA's order."""
+    """Return the properties of INRIA's files in their order."""
     names = [*"xyz", *(["nx", "ny", "nz"] if normals else [])]
     names += [f"f_dc_{i}" for i in range(3)] + [f"f_rest_{i}" for i in range(rest)]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
@@ -69,7 +69,7 @@ def ply_bytes(
     comments: Sequence[str] = (),
     newline: str = "\n",
 ) -> bytes:
-    """Write a whole PLY file with a vertex element between others."""
+    """Return a whole PLY file with a vertex element between others."""
     elements = {**(before or {}), "vertex": (properties, rows), **(after or {})}
     lines = ["ply", f"format {encoding} 1.0", *(f"comment {text}" for text in comments)]
     for name, (columns, values) in elements.items():
@@ -86,12 +86,12 @@ def ply_bytes(
 def write_ply_file(
     path: Path, properties: Properties, rows: Sequence[Row], **options: object
 ) -> Path:
-    """Write a PLY file and give its path."""
+    """Write a PLY file and return its path."""
     path.write_bytes(ply_bytes(properties, rows, **options))  # type: ignore[arg-type]
     return path
 
 
 def parse_header(data: bytes) -> tuple[list[str], int]:
-    """Return the header lines of a file that cvtgs wrote, and where its data starts."""
+    """Return the header lines of a file that cvtgs wrote, and the offset of its data."""
     end = data.index(b"end_header\n") + len(b"end_header\n")
     return data[:end].decode().splitlines(), end

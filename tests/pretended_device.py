@@ -2,9 +2,9 @@
 
 ``pretended_cuda()`` lets code that runs inside believe that there is a GPU ``cuda:0``. A tensor
 there wraps one on the CPU. Operations that mix devices, ``numpy()`` and generators of the CPU raise
-what CUDA raises; whatever makes the host wait for the device, and every copy between both, is
-counted, with the line of the library that caused it. Tensors above a limit do not fit. Sums that
-CUDA adds in any order are refused too, but in gradients, which torch makes of such sums.
+the errors of CUDA. Every wait of the host for the device and every copy between them is counted,
+with the line of cvtgs that caused it. Tensors above a limit do not fit. Sums that CUDA adds in
+arbitrary order are refused too, except in gradients, where torch uses such sums.
 """
 
 import sys
@@ -43,21 +43,21 @@ WAITS = {
 INDEXING = {"aten::index", "aten::index_put_", "aten::index_put", "aten::_index_put_impl_"}
 
 ANY_ORDER = {"cumsum", "cumprod", "logcumsumexp", "index_add", "scatter_add", "histc"}
-"""Operations that add floating-point numbers in any order on CUDA; ``check_order`` knows others."""
+"""Operations that add floats in arbitrary order on CUDA; ``check_order`` handles others."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Traffic:
-    """What went between host and device, by line of the library and operation."""
+    """Waits and copies between host and device, by line of cvtgs and operation."""
 
     waits: Counter[str] = field(default_factory=Counter)
     copies: Counter[str] = field(default_factory=Counter)
 
 
 class DeviceTensor(Tensor):
-    """A tensor that says it is on CUDA; ``host`` is what it is.
+    """A tensor that claims to be on CUDA; ``host`` is the real tensor.
 
-    The wrapper is on the meta device, since a build of torch without CUDA makes none on CUDA.
+    The wrapper is on the meta device, since torch without CUDA cannot make one on CUDA.
     """
 
     host: Tensor
@@ -93,7 +93,7 @@ class DeviceTensor(Tensor):
 
 
 class Device(TorchDispatchMode):
-    """Computes on what is wrapped, refuses what CUDA refuses, and counts."""
+    """Computes on the wrapped tensors, refuses what CUDA refuses, and counts waits and copies."""
 
     def __init__(self, traffic: Traffic, largest: int | None) -> None:
         super().__init__()
@@ -104,7 +104,7 @@ class Device(TorchDispatchMode):
         name, leaves = func._schema.name, tree_flatten((args, kwargs))[0]
         wrapped = [leaf for leaf in leaves if isinstance(leaf, DeviceTensor)]
         target = kwargs.get("device")
-        # Without CUDA, torch takes the device of a wrapper for meta where it copies options.
+        # Without CUDA, torch takes the device of a wrapper to be meta when it copies options.
         is_there = (
             bool(wrapped) if target is None else torch.device(target).type in ("cuda", "meta")
         )
@@ -134,7 +134,7 @@ class Device(TorchDispatchMode):
         found = func(*tree_map(unwrapped, args), **tree_map(unwrapped, kwargs))
         if not is_there:
             return found
-        known = {id(tensor.host): tensor for tensor in wrapped}  # an operation in place returns it
+        known = {id(tensor.host): tensor for tensor in wrapped}  # in-place operations return it
 
         def wrap(leaf: Any) -> Any:
             if not isinstance(leaf, Tensor):
@@ -144,13 +144,13 @@ class Device(TorchDispatchMode):
         return tree_map(wrap, found)
 
     def placed(self, host: Tensor) -> DeviceTensor:
-        """Put what was computed on the device, if it fits."""
+        """Wrap a result as a tensor on the device, if it fits."""
         if self.largest is not None and not host.is_sparse and host.nbytes > self.largest:
             raise torch.OutOfMemoryError(f"CUDA out of memory. Tried to allocate {host.nbytes} B.")
         return DeviceTensor(host)
 
     def check(self, name: str, args: tuple[Any, ...], leaves: list[Any]) -> None:
-        """Refuse tensors of the CPU, but for single numbers, and indices, which are copied."""
+        """Refuse CPU tensors except single numbers and indices, which are copied."""
         strangers = [
             leaf
             for leaf in leaves
@@ -169,7 +169,7 @@ class Device(TorchDispatchMode):
 
 
 def check_order(name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-    """Refuse sums that CUDA adds in any order, so that two runs would give different bits."""
+    """Refuse sums that CUDA adds in arbitrary order, since two runs would give different bits."""
     if torch._C._current_graph_task_id() >= 0:  # a gradient
         return
     kind = name.removeprefix("aten::").removesuffix("_")
@@ -187,7 +187,7 @@ def check_order(name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Non
 
 
 class Constructors(TorchFunctionMode):
-    """Makes tensors of Python's numbers, which torch copies to a device out of dispatch's sight."""
+    """Makes tensors from Python numbers, which torch copies to a device without dispatch."""
 
     def __init__(self, traffic: Traffic) -> None:
         super().__init__()
@@ -201,7 +201,7 @@ class Constructors(TorchFunctionMode):
             func, args = torch.tensor, args[1:]
         if func is Tensor.coalesce and isinstance(args[0], DeviceTensor):
             return DeviceTensor(args[0].host.coalesce())  # torch would ask the wrapper's layout
-        if func is Tensor.new and isinstance(args[0], DeviceTensor):  # so SparseAdam makes them
+        if func is Tensor.new and isinstance(args[0], DeviceTensor):  # as SparseAdam does
             return torch.sparse_coo_tensor(*args[1:], check_invariants=True)
         if func is Tensor.tolist and isinstance(args[0], DeviceTensor):
             self.traffic.waits[f"{caller()} tolist"] += 1
@@ -218,7 +218,7 @@ class Constructors(TorchFunctionMode):
 
 
 def numbered(argument: Any) -> Any:
-    """Return the device that ``cuda`` means; torch asks a driver for its number otherwise."""
+    """Return ``cuda`` with its number, for which torch would ask a driver."""
     is_name = isinstance(argument, (str, torch.device)) and str(argument) == "cuda"
     return CUDA if is_name else argument
 
@@ -228,7 +228,7 @@ def unwrapped(leaf: Any) -> Any:
 
 
 def caller() -> str:
-    """Return the line of the library that is running."""
+    """Return the line of cvtgs that is running."""
     frame = sys._getframe(1)
     while frame.f_back and "/cvtgs/" not in frame.f_code.co_filename:
         frame = frame.f_back
@@ -237,7 +237,7 @@ def caller() -> str:
 
 @contextmanager
 def pretended_cuda(*, largest: int | None = None) -> Iterator[Traffic]:
-    """Pretend a CUDA device, and count what goes between it and the host.
+    """Pretend that there is a CUDA device; count waits for it, and copies.
 
     ``largest`` is the number of bytes above which a tensor does not fit.
     """

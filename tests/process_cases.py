@@ -1,4 +1,4 @@
-"""What processes do in the tests of them, where they can import it."""
+"""Functions that worker processes run in tests; a module, so that they can import them."""
 
 import os
 import time

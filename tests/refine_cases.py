@@ -25,7 +25,7 @@ def small_scene(full: GaussianScene, rho: float = 0.1) -> GaussianScene:
 
 
 def discolored(scene: GaussianScene, shift: float = 0.5) -> GaussianScene:
-    """The same scene with colours that are easily mended."""
+    """The same scene with colours that are easy to correct."""
     return scene.with_tensors({"sh0": scene.sh0 + shift}, scene.extras)
 
 

@@ -1,7 +1,7 @@
 """Golden outputs of the shipped checkpoints: ``python tests/regenerate_golden.py`` renews them.
 
-To be run, looked at and committed whenever a checkpoint in ``src/cvtgs/mergenet/data`` or what it
-does is changed on purpose; ``test_mergenet_golden.py`` compares with the table.
+Run it, check the table and commit it whenever a checkpoint in ``src/cvtgs/mergenet/data`` or its
+effect is changed on purpose; ``mergenet/test_correct.py`` compares with the table.
 """
 
 import json
@@ -22,12 +22,12 @@ CASES = [
 
 
 def digests() -> dict[str, str]:
-    """What the table was made with."""
+    """Return the digests of the shipped checkpoints."""
     return {name: load_checkpoint(name).digest for name in SHIPPED}
 
 
 def figures(case: str) -> dict[str, float]:
-    """What a shipped checkpoint makes of a generated scene, and what it changes of the moments."""
+    """Return figures of a generated scene after a checkpoint, and its changes to merged moments."""
     name, kind, rho = case.split()
     scene, config = make(kind, 4000, sh_degree=1, seed=11), SimplifyConfig.from_preset(name)
     small, report = Simplifier(name, config=config, device="cpu").run(scene, float(rho))

@@ -22,7 +22,7 @@ def random_scene(
     spread: float = 1.0,
     size: float = 0.1,
 ) -> GaussianScene:
-    """Give Gaussians strewn over a box, of various shapes, with quaternions of any length."""
+    """Return Gaussians scattered over a box, of various shapes, with quaternions of any length."""
     g = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -46,7 +46,7 @@ def moved(
     shift: Sequence[float] = (0.0, 0.0, 0.0),
     scale: float = 1.0,
 ) -> GaussianScene:
-    """Turn, then scale, then shift a scene, colours included, with the oracles' arithmetic."""
+    """Rotate, then scale, then shift a scene, colours included, with the oracles' arithmetic."""
     matrix = oracles.rotation(quat)
     length = math.hypot(*quat)
     unit = [part / length for part in quat]
@@ -65,7 +65,7 @@ def moved(
 
 
 def oracle_rows(scene: GaussianScene, rows: Sequence[int]) -> list[oracles.Gaussian]:
-    """Return some Gaussians to the oracles."""
+    """Return some Gaussians in the form that the oracles take."""
     return [
         oracles.gaussian(
             scene.means[row].tolist(),
@@ -117,7 +117,7 @@ def assert_same_gaussians(
 
 
 def assert_standard(scene: GaussianScene) -> None:
-    """Everything finite, unit quaternions, opacities strictly between 0 and 1."""
+    """Check for finite values, unit quaternions and opacities strictly between 0 and 1."""
     for name, tensor in scene.tensors().items():
         assert bool(tensor.isfinite().all()), name
     norms = torch.linalg.vector_norm(scene.quats.double(), dim=1)

@@ -1,4 +1,4 @@
-"""Cameras: what cannot be a camera is refused; every ``stride``-th pixel."""
+"""Cameras: invalid ones are refused; selection of every ``stride``-th pixel."""
 
 import pytest
 import torch
@@ -30,14 +30,14 @@ GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "h
         ({"names": ("a", "b")}, "names must hold one name per camera, 1; found 2."),
     ],
 )
-def test_what_is_no_camera(changes, text):
+def test_invalid_cameras_are_refused(changes, text):
     with pytest.raises(InvalidArgumentError) as caught:
         Cameras(**GOOD | changes)
     assert str(caught.value) == text
 
 
 def test_every_second_pixel_by_hand():
-    """Pixel 3 of a row, the second of those from 1 on, is where it was: at 3.5, now at 1.5."""
+    """Pixel 3 of a row, the second of those kept from 1 on, keeps its place: at 3.5, now at 1.5."""
     Ks = torch.tensor([[[10.0, 0, 4], [0, 12, 3], [0, 0, 1]]])  # noqa: N806
     found = Cameras(viewmats=torch.eye(4)[None], Ks=Ks, width=8, height=5).every(2, first=(1, 0))
     assert (found.width, found.height, found.stride) == (4, 3, 2)
@@ -47,7 +47,7 @@ def test_every_second_pixel_by_hand():
     assert found.every(2).stride == 4
 
 
-def test_interleaved_pixels_are_those_of_each_camera_from_its_own_first_one():
+def test_interleaved_cameras_start_at_their_own_first_pixels():
     Ks = torch.tensor([[[10.0, 0, 4], [0, 12, 3], [0, 0, 1]]])  # noqa: N806
     one = Cameras(viewmats=torch.eye(4)[None], Ks=Ks, width=8, height=5)
     five = one.select(torch.zeros(5, dtype=torch.int64))

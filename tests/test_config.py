@@ -1,4 +1,4 @@
-"""SimplifyConfig: frozen, with presets; what is unknown is an error."""
+"""SimplifyConfig: frozen, with presets; unknown keys and values are errors."""
 
 import pydantic
 import pytest
@@ -20,12 +20,12 @@ def compose_error(**arguments: object) -> str:
     return str(caught.value)
 
 
-def test_standard_is_what_no_choice_gives():
+def test_standard_is_the_default():
     assert SimplifyConfig.from_preset("standard") == SimplifyConfig()
     assert SimplifyConfig.from_mapping({}) == SimplifyConfig()
 
 
-def test_paper_is_cvt_gs():
+def test_the_paper_preset_is_cvt_gs():
     paper = SimplifyConfig.from_preset("paper")
     assert paper.preset == "paper"
     assert paper.filter == FilterConfig(min_opacity=0.1, max_mass_share=1.0, max_flyaway_share=0.0)
@@ -50,7 +50,7 @@ def test_every_preset_is_valid_and_keeps_its_name(name):
     assert SimplifyConfig.from_preset(name).preset == name
 
 
-def test_values_win_over_their_preset():
+def test_values_override_their_preset():
     config = SimplifyConfig.from_mapping({"preset": "paper", "cvt": {"iterations": 9}})
     assert config.cvt.iterations == 9
     assert config.cvt.area_power == 0.0
@@ -82,7 +82,7 @@ def test_a_partial_file_takes_the_rest_from_its_preset(tmp_path):
     assert config.cvt == SimplifyConfig.from_preset("paper").cvt
 
 
-def test_settings_win_over_preset_and_preset_over_file(tmp_path):
+def test_settings_override_the_preset_and_the_preset_the_file(tmp_path):
     path = tmp_path / "config.toml"
     path.write_text('preset = "standard"\n[cvt]\niterations = 3\ncolor = 0.5\n', encoding="utf-8")
     config = SimplifyConfig.compose(
@@ -105,13 +105,13 @@ def test_settings_win_over_preset_and_preset_over_file(tmp_path):
         ("filter.max_mass_share", "1e-3", 1e-3),
     ],
 )
-def test_settings_are_texts(key, text, value):
+def test_settings_are_parsed_from_text(key, text, value):
     config = SimplifyConfig.compose(settings={key: text})
     section, name = key.split(".")
     assert getattr(getattr(config, section), name) == value
 
 
-def test_frozen():
+def test_configurations_are_frozen():
     config = SimplifyConfig()
     with pytest.raises(pydantic.ValidationError):
         config.seed = 1
@@ -119,7 +119,7 @@ def test_frozen():
         config.cvt.iterations = 1
 
 
-def test_sections_stand_alone():
+def test_sections_can_be_used_on_their_own():
     assert TessellationConfig(iterations=0).iterations == 0
     with pytest.raises(pydantic.ValidationError):
         TessellationConfig(iteration=0)
@@ -188,7 +188,7 @@ def test_unknown_settings_are_errors(settings, message):
     assert compose_error(settings=settings) == message
 
 
-def test_a_setting_of_another_kind_is_an_error():
+def test_a_setting_of_the_wrong_type_is_an_error():
     assert compose_error(settings={"cvt.iterations": "many"}) == (
         "cvt.iterations: input should be a valid integer, unable to parse string as an integer, "
         "found 'many'."
@@ -212,13 +212,13 @@ ENDLESS = {
     "a preset": (f'preset = "{"x" * 1_000_000}"', "xxx...."),
     "a list as preset": (f"preset = [{'1, ' * 100_000}]", ", 1,...."),
     "a key twice": (f"a = {{{2 * ('x' * 100_000 + ' = 1, ')}}}", "xxx...."),
-    "brackets": ("seed = " + 3000 * "[" + 3000 * "]", "its values are nested too deeply."),
-    "keys": ("\n".join(f"k{i} = 1" for i in range(2000)), "; and 1,996 more."),
+    "nested brackets": ("seed = " + 3000 * "[" + 3000 * "]", "its values are nested too deeply."),
+    "many keys": ("\n".join(f"k{i} = 1" for i in range(2000)), "; and 1,996 more."),
 }
 
 
 @pytest.mark.parametrize(("text", "end"), ENDLESS.values(), ids=ENDLESS)
-def test_sentences_about_endless_files_are_short(tmp_path, text, end):
+def test_errors_about_huge_files_are_short(tmp_path, text, end):
     path = tmp_path / "config.toml"
     path.write_text(text, encoding="utf-8")
     message = compose_error(file=path)
@@ -228,13 +228,13 @@ def test_sentences_about_endless_files_are_short(tmp_path, text, end):
     assert len(message) < len(str(path)) + 400
 
 
-def test_sentences_about_endless_settings_are_short():
+def test_errors_about_huge_settings_are_short():
     long = "x" * 1_000_000
     messages = [compose_error(settings={key: long}) for key in (long, "seed", "seed." + long)]
     assert all(len(message) < 400 for message in messages)
 
 
-def test_a_file_that_is_not_there_or_not_toml_is_an_error(tmp_path):
+def test_a_file_that_is_missing_or_not_toml_is_an_error(tmp_path):
     missing, broken, binary = (tmp_path / name for name in ("a.toml", "b.toml", "c.toml"))
     broken.write_text("cvt = [", encoding="utf-8")
     binary.write_bytes(b"\xff\xfe\x00")
@@ -243,7 +243,7 @@ def test_a_file_that_is_not_there_or_not_toml_is_an_error(tmp_path):
         assert compose_error(file=path).startswith(f"{path}: is not a TOML file: ")
 
 
-def test_settings_reach_sections_within_sections():
+def test_settings_reach_nested_sections():
     config = SimplifyConfig.compose(settings={"refine.rates.sh0": "0.5", "refine.steps": "3"})
     assert (config.refine.rates.sh0, config.refine.steps) == (0.5, 3)
     with pytest.raises(ConfigError, match=r"refine\.rates\.colour: is not a known setting"):

@@ -1,4 +1,4 @@
-"""Devices: which one is chosen, and what it is called."""
+"""Devices: choice, names, memory and threads."""
 
 import os
 import platform
@@ -26,7 +26,7 @@ from cvtgs.errors import DeviceError, OutOfMemoryError
 from scenes import same_bits
 
 
-def test_a_name_is_taken_at_its_word():
+def test_a_named_device_is_used_as_given():
     assert chosen_device("cpu", "meta") == usable_device("cpu") == torch.device("cpu")
 
 
@@ -34,14 +34,14 @@ def test_a_name_is_taken_at_its_word():
     ("has_cuda", "home", "found"),
     [(False, "cpu", "cpu"), (True, "cpu", "cuda"), (True, "meta", "meta"), (False, "meta", "meta")],
 )
-def test_auto_is_cuda_for_what_is_on_the_cpu(monkeypatch, has_cuda, home, found):
+def test_auto_is_cuda_for_data_on_the_cpu(monkeypatch, has_cuda, home, found):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: has_cuda)
     assert resolve_device("auto") is None
     assert chosen_device("auto", home) == torch.device(found)
 
 
 @pytest.mark.parametrize(("gigabytes", "factor"), [(0.1, 1), (2, 8), (8, 32), (80, 32)])
-def test_chunks_are_longer_where_launches_cost(monkeypatch, gigabytes, factor):
+def test_chunks_are_longer_where_launches_are_expensive(monkeypatch, gigabytes, factor):
     found = SimpleNamespace(total_memory=int(gigabytes * 2**30))
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: found)
     assert chunk_length(7, torch.device("cpu")) == 7
@@ -50,7 +50,7 @@ def test_chunks_are_longer_where_launches_cost(monkeypatch, gigabytes, factor):
 
 
 @pytest.mark.parametrize("may_leave", [True, False])
-def test_memory_that_ends(may_leave):
+def test_running_out_of_memory_leads_to_short_chunks_then_the_cpu(may_leave):
     tried = []
 
     def compute(device: torch.device, note: str) -> str:
@@ -88,13 +88,13 @@ def test_other_errors_are_raised_at_once(where):
 
 
 @pytest.mark.parametrize("name", ["tpu9", "cpu:seven"])
-def test_a_device_that_is_not_there(name):
+def test_a_missing_device_is_an_error(name):
     for choose in (usable_device, resolve_device, chosen_device):
         with pytest.raises(DeviceError, match=f"device '{name}' cannot be used here: "):
             choose(name)
 
 
-def test_names(monkeypatch):
+def test_names_of_devices(monkeypatch):
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "some GPU")
     assert device_name(torch.device("cuda")) == "some GPU"
     assert device_name(torch.device("meta")) == "meta"
@@ -113,7 +113,7 @@ def test_searches_use_the_cores_that_the_process_may_use(monkeypatch):
         assert thread_count() == found
 
 
-def test_cores(monkeypatch):
+def test_the_number_of_cores(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {1, 4}, raising=False)
     assert core_count() == 2
     monkeypatch.delattr(os, "sched_getaffinity")
@@ -121,7 +121,7 @@ def test_cores(monkeypatch):
     assert core_count() == 1
 
 
-def test_threads_come_back_after_an_error():
+def test_the_number_of_threads_is_restored_after_an_error():
     before = torch.get_num_threads()
     with pytest.raises(ZeroDivisionError), one_thread():
         divmod(torch.get_num_threads(), 0)
@@ -142,7 +142,7 @@ def test_chunks_are_computed_by_one_thread_each_and_stay_in_order(two_threads):
 
     def function(number):
         if number < 2:
-            together.wait()  # only two that run at the same time get past this
+            together.wait()  # passes only if two calls run at the same time
         return number, torch.get_num_threads(), torch.is_grad_enabled()
 
     with torch.no_grad():
@@ -154,7 +154,7 @@ def test_chunks_are_computed_by_one_thread_each_and_stay_in_order(two_threads):
     assert torch.get_num_threads() == 2
 
 
-def test_one_thread_computes_where_it_is():
+def test_one_thread_computes_in_the_calling_thread():
     with one_thread():
         found = in_threads(lambda _: threading.get_ident(), range(3), torch.device("cpu"))
         assert set(found) == {threading.get_ident()}

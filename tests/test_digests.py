@@ -1,7 +1,7 @@
-"""Every way of simplifying gives what ``digests.json`` holds; ``python tests/digests.py`` says so.
+"""Every way of simplifying gives the results in ``digests.json``, as ``tests/digests.py`` checks.
 
-The same bits, where processor and libraries compute as those of the table did; elsewhere as many
-Gaussians, and sums of every tensor that are nearly the same.
+The bits are the same if processor and libraries round like those of the table; otherwise the counts
+are the same, and the sums of every tensor nearly so.
 """
 
 import json
@@ -28,13 +28,13 @@ def one_thread():
 
 
 def assert_nearly(found, wanted):
-    """Where one seed is another, one cell in a hundred may be."""
+    """Compare roughly: if one seed differs, one cell in a hundred may differ."""
     assert found["counts"] == wanted["counts"]
     assert found["figures"] == pytest.approx(wanted["figures"], rel=0.05, abs=0.1)
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_every_way_gives_what_it_gave(name):
+def test_every_way_gives_the_recorded_result(name):
     found, wanted = digests.measure(name), RECORDED["cases"][name]
     assert_nearly(found, wanted)
     if digests.canary() == RECORDED["canary"]:

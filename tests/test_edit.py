@@ -22,7 +22,7 @@ def labelled(count: int, *, seed: int = 0, degree: int = 2) -> GaussianScene:
     return replace(scene.with_tensors({}, {"label": labels}), comments=("kept",))
 
 
-def test_crop_keeps_rows_as_they_are() -> None:
+def test_crop_keeps_the_rows_inside_unchanged() -> None:
     scene = labelled(200)
     box, ball = Box(min=(-1, -1, -1), max=(0, 1, 1)), Sphere(center=(1.0, 0.0, 0.0), radius=0.7)
     found = crop(scene, [box, ball])
@@ -39,12 +39,12 @@ def test_crop_keeps_rows_as_they_are() -> None:
         crop(scene, [])
 
 
-def test_surface_belongs_to_a_sphere() -> None:
+def test_points_on_its_surface_belong_to_a_sphere() -> None:
     scene = random_scene(2).with_tensors({"means": torch.tensor([[3.0, 4, 0], [3.001, 4, 0]])}, {})
     assert len(crop(scene, [Sphere(center=(0.0, 0.0, 0.0), radius=5.0)])) == 1
 
 
-def test_drop_by_opacity_and_by_size() -> None:
+def test_faint_and_large_gaussians_are_dropped() -> None:
     scene = labelled(200)
     logits, sizes = scene.logit_opacities.tolist(), scene.log_scales.tolist()
     faint = [row for row, logit in enumerate(logits) if 1 / (1 + math.exp(-logit)) >= 0.3]
@@ -63,7 +63,7 @@ def test_full_opacity_is_not_dropped() -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_motion_is_that_of_the_oracle(degree: int) -> None:
+def test_motion_equals_that_of_the_oracle(degree: int) -> None:
     scene = labelled(20, degree=degree)
     quat, shift = (0.3, -0.8, 0.2, 0.5), (1.0, -2.0, 3.0)
     found = move(scene, Motion(quat=quat, scale=0.4, shift=shift))
@@ -85,7 +85,7 @@ def test_motion_is_that_of_the_oracle(degree: int) -> None:
         (Motion(quat=(-2.0, 0.0, 0.0, 0.0)), set()),
     ],
 )
-def test_what_a_motion_does_not_concern_keeps_its_bits(motion: Motion, touched: set[str]) -> None:
+def test_a_motion_leaves_unrelated_tensors_bit_identical(motion: Motion, touched: set[str]) -> None:
     scene = labelled(20)
     found = move(scene, motion)
     changed = {
@@ -96,7 +96,7 @@ def test_what_a_motion_does_not_concern_keeps_its_bits(motion: Motion, touched: 
     assert changed == touched
 
 
-def test_there_and_back_again() -> None:
+def test_a_motion_and_its_inverse_cancel() -> None:
     scene = random_scene(50, degree=3, dtype=torch.float64)
     there = Motion(quat=(0.3, -0.8, 0.2, 0.5), scale=3.0)
     back = Motion(quat=(0.3, 0.8, -0.2, -0.5), scale=1 / 3)
@@ -108,18 +108,18 @@ def test_there_and_back_again() -> None:
 def test_angles_are_about_x_then_y_then_z() -> None:
     quat = Motion.of_angles((90, 0, 90)).quat
     point = oracles.rotation(quat) @ [0, 1, 0]
-    assert point.round(12).tolist() == [0, 0, 1]  # y to z about x, which stays about z
+    assert point.round(12).tolist() == [0, 0, 1]  # y turns to z about x, and z stays about z
     assert Motion.of_angles((180, 0, 0)).quat == (0.0, 1.0, 0.0, 0.0)
     assert Motion.of_angles((0, 0, -90)).quat == pytest.approx((0.5**0.5, 0, 0, -(0.5**0.5)))
 
 
-def test_quarter_turns_round_nothing_to_nonzero() -> None:
+def test_a_half_turn_is_exact() -> None:
     scene = random_scene(5).with_tensors({"means": torch.eye(3)[[0, 1, 2, 0, 1]]}, {})
     means = move(scene, Motion.of_angles((0, 0, 180))).means
     assert torch.equal(means.abs(), scene.means)
 
 
-def test_bands_do_not_mix() -> None:
+def test_rotation_does_not_mix_sh_bands() -> None:
     turn = torch.tensor(oracles.rotation((0.3, -0.8, 0.2, 0.5)) / 1.0)
     rest = torch.zeros(1, 15, 3, dtype=torch.float64)
     rest[:, 3:8] = 1.0
@@ -138,7 +138,7 @@ def test_merge_keeps_all_rows() -> None:
     assert same_bits(merge([first]), first)
 
 
-def test_merge_of_unlike_scenes() -> None:
+def test_merge_widens_unlike_scenes_and_warns() -> None:
     first = replace(labelled(4, degree=0), comments=("SplatRenderMode: mip",))
     second = random_scene(3, degree=3, dtype=torch.float64)
     with pytest.warns(DroppedDataWarning) as said:
@@ -146,7 +146,7 @@ def test_merge_of_unlike_scenes() -> None:
     assert [str(one.message) for one in said] == [
         "left out column 'label', which not all of the scenes to merge have.",
         "some of the scenes to merge were trained with anti-aliasing and others were not; viewers "
-        "will show those that were not too soft.",
+        "will show the latter too soft.",
     ]
     assert {one.filename for one in said} == {__file__}
     assert (both.sh_degree, both.dtype, dict(both.extras)) == (3, torch.float64, {})
@@ -165,13 +165,13 @@ def test_merge_of_unlike_scenes() -> None:
             "needs a scale above 0 and a quaternion other than 0, found 0.0",
         ),
         (lambda: Motion(quat=(0.0,) * 4), "a quaternion other than 0, found 1.0 and"),
-        (lambda: Motion(shift=(math.nan, 0, 0)), "must be of finite numbers"),
-        (lambda: Motion.of_angles((math.inf, 0, 0)), "must be of finite numbers"),
+        (lambda: Motion(shift=(math.nan, 0, 0)), "must consist of finite numbers"),
+        (lambda: Motion.of_angles((math.inf, 0, 0)), "must consist of finite numbers"),
         (lambda: Sphere(center=(0.0, 0.0, 0.0), radius=-1), "a radius of at least 0"),
         (lambda: drop_faint(random_scene(2), 1.5), "from 0 to 1, found 1.5"),
         (lambda: drop_large(random_scene(2), 0.0), "above 0, found 0.0"),
     ],
 )
-def test_wrong_arguments(make, text: str) -> None:
+def test_invalid_arguments_are_refused(make, text: str) -> None:
     with pytest.raises(InvalidArgumentError, match=text):
         make()

@@ -1,4 +1,4 @@
-"""The examples, run as their users run them, on files like those of the other tools."""
+"""The examples, run as users run them, on files like those of other tools."""
 
 import os
 import subprocess
@@ -19,7 +19,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
 def run(name: str, *words: object) -> str:
-    """Run an example in a process of its own, and give what it prints."""
+    """Run an example in a separate process and return its output."""
     done = subprocess.run(
         [sys.executable, str(EXAMPLES / name), *map(str, words)],
         check=True,
@@ -132,7 +132,7 @@ def test_tradeoff(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_every_example_is_run_and_short() -> None:
+def test_every_example_is_tested_and_short() -> None:
     text = Path(__file__).read_text(encoding="utf-8")
     for path in EXAMPLES.glob("*.py"):
         assert f'run("{path.name}"' in text

@@ -1,4 +1,4 @@
-"""Which Gaussians enter the tessellation."""
+"""Choice of the Gaussians that enter the tessellation."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ def changed(name: str, row: int, value: float, *, degree: int = 1):
     return scene.with_tensors({name: tensor}, {})
 
 
-def test_the_faintest_go_while_they_hold_little_mass():
+def test_the_faintest_are_dropped_while_they_hold_little_mass():
     opacities = torch.tensor([0.05, 0.5, 0.01, 0.09, 0.02])
     masses = torch.tensor([3.0, 90.0, 1.0, 5.0, 1.0])
     for share, kept in (
@@ -31,7 +31,7 @@ def test_the_faintest_go_while_they_hold_little_mass():
         assert keep.nonzero()[:, 0].tolist() == kept
 
 
-def test_the_heaviest_come_back_where_too_few_stay():
+def test_the_heaviest_are_kept_if_too_few_would_remain():
     opacities = torch.tensor([0.05, 0.5, 0.01, 0.09, 0.02])
     masses = torch.tensor([3.0, 90.0, 4.0, 5.0, 1.0])
     keep = visible_rows(opacities, masses, min_opacity=0.1, max_mass_share=1.0, at_least=3)
@@ -46,8 +46,8 @@ def test_opacities_at_the_threshold_stay():
 
 @pytest.mark.parametrize("at_least", [1, 2, 500, 1000])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_all_faint(at_least, dtype):
-    """With share 1 all may go, whatever the rounding of their summed mass."""
+def test_a_scene_of_faint_gaussians_keeps_the_heaviest(at_least, dtype):
+    """With share 1 all may be dropped, however their summed mass is rounded."""
     for seed in range(20):
         g = torch.Generator().manual_seed(seed)
         opacities = 0.09 * torch.rand(1000, generator=g, dtype=dtype)
@@ -60,7 +60,7 @@ def test_all_faint(at_least, dtype):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.01, 0.1, 0.5])
-def test_the_mass_that_is_left_out_is_bounded(share):
+def test_the_mass_of_dropped_gaussians_is_bounded(share):
     scene = random_scene(2000)
     keep = visible_rows(
         scene.opacities, scene.masses, min_opacity=0.5, max_mass_share=share, at_least=1
@@ -124,7 +124,7 @@ def test_standard_rows_stay_bit_for_bit():
     assert torch.equal(once.means, scene.means)
 
 
-def test_standard_rows_have_opacities_inside():
+def test_standard_rows_have_opacities_strictly_between_0_and_1():
     scene = random_scene(3)
     logits = torch.tensor([INF, -700.0, 2.0])
     small = standardized(scene.with_tensors({"logit_opacities": logits}, {}))
@@ -132,7 +132,7 @@ def test_standard_rows_have_opacities_inside():
     assert small.logit_opacities[2].item() == 2.0
 
 
-def test_flyaways_are_far_and_paint_nothing():
+def test_flyaways_are_far_and_hold_little_mass():
     distances = torch.tensor([1.0, 30.0, 1e6, 1e3, 200.0])
     masses = torch.tensor([1.0, 5.0, 1e-9, 1e-8, 3.0])
     found = flyaway_rows(distances, masses, max_share=1e-3)
@@ -140,6 +140,6 @@ def test_flyaways_are_far_and_paint_nothing():
     assert not bool(flyaway_rows(distances, masses, max_share=0.0).any())
 
 
-def test_a_crowd_of_flyaways_stays_when_its_mass_is_real():
+def test_flyaways_are_dropped_only_up_to_their_share_of_mass():
     distances, masses = torch.full((10,), 1e3), torch.ones(10)
     assert int(flyaway_rows(distances, masses, max_share=0.35).sum()) == 3

@@ -15,9 +15,9 @@ FILES = sorted(SOURCE.rglob("*.py"))
 TEXTS = {path: path.read_text(encoding="utf-8") for path in FILES}
 
 # A file imports only from lower levels, or from inside its own package: the ranks of the design,
-# refined where one of a rank needs another. `math` raises the errors of `errors`, `report` shows
-# the effect plan of `analysis`, so each stands above what it needs; `devices` (names of devices)
-# and `cameras` (data) stand as low as their imports allow.
+# split where one module of a rank needs another. `math` raises the errors of `errors` and `report`
+# shows the effect plan of `analysis`, so each stands above the module it needs; `devices` (names of
+# devices) and `cameras` (data) stand as low as their imports allow.
 LEVELS = [
     {"errors", "progress", "text"},
     {"math", "clock", "devices", "plots", "counts", "boxes"},
@@ -76,7 +76,7 @@ def is_for_types(node: ast.AST) -> bool:
 
 
 def imports_in(node: ast.AST) -> Iterator[str]:
-    """Return the dotted names that run-time imports name, wherever in the file they are."""
+    """Yield the dotted names of all run-time imports, wherever they are in the file."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.Import):
             yield from (alias.name for alias in child.names)
@@ -99,7 +99,7 @@ def broken_ranks(path: Path, text: str) -> list[str]:
 
 
 def strangers_in(path: Path, text: str) -> list[str]:
-    """Return the packages from elsewhere that a file imports and does not own."""
+    """Return the third-party packages that a file imports but does not own."""
     packages = {name.split(".")[0] for name in imports_in(ast.parse(text))}
     foreign = packages - set(sys.stdlib_module_names) - EVERYWHERE - {"cvtgs"}
     return sorted(
@@ -114,7 +114,7 @@ def in_fresh_process(code: str) -> list[str]:
     return done.stdout.split()
 
 
-def test_rank_test_can_fail():
+def test_the_rank_check_finds_violations():
     """A sideways import, an upward one, an unknown module and a downward one."""
     path = SOURCE / "cvt" / "new.py"
     text = """
@@ -144,12 +144,12 @@ def test_imports_go_down_the_ranks():
     assert broken == []
 
 
-def test_the_front_page_imports_nothing_of_the_house():
+def test_the_front_page_imports_no_cvtgs_module():
     text = (SOURCE / "__init__.py").read_text(encoding="utf-8")
     assert not [name for name in imports_in(ast.parse(text)) if name.startswith("cvtgs")]
 
 
-def test_owner_test_can_fail():
+def test_the_owner_check_finds_violations():
     text = "import scipy.spatial\nimport attrs, torch, rich\nfrom cvtgs import math\nimport ast"
     assert strangers_in(SOURCE / "cvt" / "nearest.py", text) == ["attrs", "rich"]
     assert strangers_in(SOURCE / "cli" / "main.py", text) == ["attrs", "scipy"]
@@ -173,9 +173,9 @@ POSIX_NAMES |= {"signal.SIGALRM", "signal.SIGKILL", "signal.SIGPROF", "signal.se
 
 
 def run_at_import(node: ast.AST) -> Iterator[ast.AST]:
-    """Return what runs when a file is imported: no bodies of functions, but their decorators.
+    """Yield what runs on import: not the bodies of functions, but their decorators and defaults.
 
-    What follows an ``if`` or a ``try`` may be meant for some systems only.
+    Code under an ``if`` or a ``try`` is skipped, since it may be for some systems only.
     """
     for child in ast.iter_child_nodes(node):
         yield child
@@ -198,7 +198,7 @@ def missing_on_windows(text: str) -> list[str]:
 
 
 def test_every_file_can_be_imported_on_windows():
-    """Of tests also: one that cannot ends the collection of all."""
+    """Test files too: one that cannot be imported stops the collection of all tests."""
     text = """
 import os, resource
 @mark.parametrize("sign", [signal.SIGKILL])
@@ -253,7 +253,7 @@ def test_no_two_classes_share_a_name():
     assert {name: paths for name, paths in classes.items() if len(paths) > 1} == {}
 
 
-def test_no_name_that_means_everything():
+def test_no_file_has_a_vague_name():
     vague = {"utils", "util", "helpers", "common", "misc"}
     assert not [path for path in FILES if vague & set(path.with_suffix("").parts)]
 
@@ -268,9 +268,9 @@ def test_imports_are_light(statement):
     assert in_fresh_process(f"import sys; {statement}; {heavy}") == []
 
 
-def test_the_front_page_does_not_even_load_torch():
+def test_the_front_page_does_not_load_torch():
     assert in_fresh_process("import sys, cvtgs; print('torch' in sys.modules)") == ["False"]
 
 
-def test_the_package_says_that_it_is_typed():
+def test_the_package_is_marked_as_typed():
     assert (SOURCE / "py.typed").is_file()

@@ -1,4 +1,4 @@
-"""What is known of a scene before anything is done to it."""
+"""Statistics of a scene."""
 
 import math
 
@@ -26,8 +26,8 @@ def spheres(opacities: list[float], radii: list[float]) -> GaussianScene:
     )
 
 
-def test_known_scene():
-    """Masses pi * (0.05, 0.5, 0.8, 3.6)."""
+def test_statistics_equal_those_by_hand():
+    """The masses are pi * (0.05, 0.5, 0.8, 3.6)."""
     info = describe(spheres([0.05, 0.5, 0.2, 0.9], [1.0, 1.0, 2.0, 2.0]))
     assert info.count == 4
     assert info.bounds == ((0.0, 0.0, 0.0), (3.0, 0.0, 0.0))
@@ -44,7 +44,7 @@ def test_known_scene():
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("count", [1, 2, 500])
-def test_any_scene(degree, count):
+def test_statistics_of_any_scene_are_consistent(degree, count):
     info = describe(random_scene(count, degree=degree))
     assert (info.count, info.sh_degree) == (count, degree)
     assert info.invalid_count == 0
@@ -55,14 +55,14 @@ def test_any_scene(degree, count):
     assert math.isfinite(info.mass)
 
 
-def test_quantiles():
+def test_opacity_quantiles_equal_those_by_hand():
     opacities = [(i + 0.5) / 101 for i in range(101)]
     info = describe(spheres(opacities, [1.0] * 101))
     wanted = [opacities[i] for i in (0, 5, 25, 50, 75, 95, 100)]
     assert info.opacity_quantiles == pytest.approx(wanted)
 
 
-def test_tags_columns_and_comments():
+def test_tags_columns_and_comments_are_listed():
     scene = GaussianScene(
         **random_scene(5).tensors(),
         extras={"label": torch.arange(5)},
@@ -87,7 +87,7 @@ def test_invalid_rows_are_counted_and_left_out():
     assert info.mass == pytest.approx(math.pi)
 
 
-def test_mass_that_underflows_is_no_share():
+def test_shares_are_0_if_the_mass_underflows():
     scene = random_scene(5)
     tiny = scene.with_tensors({"log_scales": scene.log_scales * 0 - 400.0}, {})
     info = describe(tiny)

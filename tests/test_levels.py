@@ -1,4 +1,4 @@
-"""Several sizes of one scene: exact counts, the finest as if it were alone, nested cells, files."""
+"""Several sizes of one scene: exact counts, the finest as in a single run, nested cells, files."""
 
 import json
 
@@ -40,18 +40,18 @@ def test_counts_are_exact_and_in_the_order_of_the_ratios(scene, simplifier, rhos
 
 
 @pytest.mark.parametrize("config", ["standard", "paper", "draft"])
-def test_the_finest_is_that_of_a_run_of_its_own(scene, config):
+def test_the_finest_level_equals_a_single_run(scene, config):
     simplifier = Simplifier(config=config, device="cpu")
     assert same_bits(simplifier.levels(scene, RHOS)[0].scene, simplifier.simplify(scene, RHOS[0]))
 
 
-def test_sizes_that_are_close_get_tessellations_of_their_own(scene, simplifier):
+def test_close_sizes_get_separate_tessellations(scene, simplifier):
     levels = simplifier.levels(scene, [0.2, 0.1, 0.05])
     assert [level.nested for level in levels] == [False, False, True]
     assert same_bits(levels[1].scene, simplifier.simplify(scene, 0.1))
 
 
-def test_errors_grow_and_all_rows_have_none(scene, simplifier):
+def test_errors_grow_and_are_zero_at_a_ratio_of_one(scene, simplifier):
     errors = [level.geometric_error for level in simplifier.levels(scene, [1.0, *RHOS])]
     assert errors[0] == 0.0
     assert errors == sorted(errors)
@@ -92,7 +92,7 @@ def test_no_ratio_and_bad_ratios_are_refused(scene, simplifier):
         simplifier.levels(scene, [0.1, 2.0])
 
 
-def test_the_index_says_what_lies_there(scene, simplifier, tmp_path):
+def test_the_index_describes_the_files(scene, simplifier, tmp_path):
     folder = tmp_path / "levels"
     index = write_levels(
         simplifier.levels(scene, RHOS), folder, rhos=RHOS, source="scene.ply", suffix=".ply"
@@ -113,7 +113,7 @@ def test_the_index_says_what_lies_there(scene, simplifier, tmp_path):
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
 @pytest.mark.parametrize("axes", ["rdf", "luf"])
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".splat", ".sog"])
-def test_boxes_counts_and_errors_are_those_of_the_files(scene, simplifier, tmp_path, suffix, axes):
+def test_boxes_counts_and_errors_match_the_files(scene, simplifier, tmp_path, suffix, axes):
     levels = simplifier.levels(scene, RHOS)
     write_levels(levels, tmp_path / "out", rhos=RHOS, source="a.ply", suffix=suffix, axes=axes)
     index = json.loads((tmp_path / "out" / "levels.json").read_text())
@@ -128,12 +128,12 @@ def test_boxes_counts_and_errors_are_those_of_the_files(scene, simplifier, tmp_p
         level = levels[RHOS.index(entry["rho"])]
         assert entry["geometric_error"] == level.geometric_error
         wanted, found = (mean_distance(scene, other) for other in (level.scene, small))
-        assert found == pytest.approx(wanted, rel=0.02)  # so the error is that of the file, too
+        assert found == pytest.approx(wanted, rel=0.02)  # so the error also holds for the file
         assert 0.5 < found / entry["geometric_error"] < 1.1
 
 
-def test_scores_are_those_of_the_files(scene, tmp_path):
-    """A .splat drops the view-dependent colours, and its score says so."""
+def test_scores_are_measured_on_the_files(scene, tmp_path):
+    """A .splat file drops the view-dependent colours, which its score shows."""
     cvtgs.save(scene, tmp_path / "in.ply")
     words = ["levels", str(tmp_path / "in.ply"), "--rho", "0.1", "--views", "2", "--size", "32"]
     psnr = {}
@@ -149,12 +149,12 @@ def test_scores_are_those_of_the_files(scene, tmp_path):
 
 
 def mean_distance(scene, small):
-    """Return the root mean square distance to the nearest small one, weighted by mass."""
+    """Return the RMS distance to the nearest Gaussian of the small scene, weighted by mass."""
     squares = torch.cdist(scene.means, small.means).amin(dim=1).double() ** 2
     return float(((scene.masses * squares).sum() / scene.masses.sum()).sqrt())
 
 
-def test_command(scene, tmp_path, capsys):
+def test_the_command_writes_levels(scene, tmp_path, capsys):
     cvtgs.save(scene, tmp_path / "in.ply")
     words = ["levels", str(tmp_path / "in.ply"), "-o", str(tmp_path / "out"), "--rho", "0.1,0.01"]
     assert main([*words, "--views", "2", "--size", "32"]) == 0

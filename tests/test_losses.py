@@ -38,7 +38,7 @@ def test_gradient_by_hand() -> None:
     assert loss.item() == pytest.approx(dx + dy, rel=1e-15)
 
 
-def test_gradient_does_not_see_an_offset() -> None:
+def test_the_gradient_loss_ignores_an_offset() -> None:
     first, _ = pair()
     assert gradient_loss(first, first + 0.125).item() == pytest.approx(0.0, abs=1e-15)
 
@@ -52,7 +52,7 @@ def test_ssim_of_flat_images_by_hand() -> None:
 
 
 def test_ssim_of_one_bright_pixel_by_hand() -> None:
-    """One window, and one pixel of it at the centre: the moments are the weight of that pixel."""
+    """In the only window one pixel, the centre, is bright: its weight gives the moments."""
     taps = [math.exp(-0.5 * (i / 1.5) ** 2) for i in range(-5, 6)]
     weight = (1 / sum(taps)) ** 2
     image = torch.zeros(1, 11, 11, 3, dtype=torch.float64)
@@ -79,7 +79,7 @@ def test_image_loss_is_the_sum_of_its_terms() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("loss", LOSSES)
-def test_a_scalar_of_the_dtype_that_is_zero_for_equal_images(loss, dtype) -> None:
+def test_losses_are_scalars_that_are_zero_for_equal_images(loss, dtype) -> None:
     first, second = (images.to(dtype) for images in pair(count=3))
     value = loss(first, second)
     assert value.shape == ()
@@ -89,7 +89,7 @@ def test_a_scalar_of_the_dtype_that_is_zero_for_equal_images(loss, dtype) -> Non
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (7, 1), (10, 40)])
-def test_images_smaller_than_the_window(size) -> None:
+def test_images_smaller_than_the_window_are_refused_by_ssim(size) -> None:
     first, second = pair(*size)
     assert l1_loss(first, second).item() > 0
     assert gradient_loss(first, second).item() >= 0
@@ -103,13 +103,13 @@ def test_images_smaller_than_the_window(size) -> None:
         )
 
 
-def test_one_column_has_no_dx() -> None:
+def test_the_gradient_of_one_column_has_no_x_part() -> None:
     first, second = pair(5, 1)
     wanted = (first - second).diff(dim=1).abs().mean()
     torch.testing.assert_close(gradient_loss(first, second), wanted)
 
 
-def test_nothing_is_mutated() -> None:
+def test_the_images_are_not_changed() -> None:
     first, second = pair()
     copies = first.clone(), second.clone()
     image_loss(first, second)
@@ -119,11 +119,11 @@ def test_nothing_is_mutated() -> None:
 
 ZEROS = torch.zeros(1, 12, 12, 3)
 WRONG = {
-    "no floats": (
+    "not floats": (
         (ZEROS.int(), ZEROS),
         "images must be tensors of floats, found torch.int32.",
     ),
-    "no tensor": (([0.0], ZEROS), "images must be tensors of floats, found list."),
+    "not a tensor": (([0.0], ZEROS), "images must be tensors of floats, found list."),
     "one image": (
         (ZEROS[0], ZEROS[0]),
         "images must have shape (c, h, w, 3) with nothing empty, found (12, 12, 3).",
@@ -157,7 +157,7 @@ def test_error_texts(loss, case) -> None:
     assert str(error.value) == text
 
 
-def test_weights_out_of_range() -> None:
+def test_weights_out_of_range_are_refused() -> None:
     for weight in (-0.1, 1.5, math.nan):
         with pytest.raises(InvalidArgumentError, match="ssim_weight must be from 0 to 1, found"):
             image_loss(ZEROS, ZEROS, ssim_weight=weight)
@@ -167,7 +167,7 @@ def test_weights_out_of_range() -> None:
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_gradients_against_finite_differences(loss) -> None:
+def test_gradients_match_finite_differences(loss) -> None:
     first, second = (images.requires_grad_() for images in pair(11, 12))
     assert torch.autograd.gradcheck(loss, (first, second), fast_mode=True)
 

@@ -1,4 +1,4 @@
-"""What every library raises without memory is one sentence, with what to do."""
+"""Out-of-memory errors of every library become one sentence that says what to do."""
 
 import errno
 from pathlib import Path
@@ -14,7 +14,7 @@ from scenes import random_scene
 
 
 def torch_error() -> RuntimeError:
-    """Return what torch really raises."""
+    """Return the error that torch really raises."""
     try:
         torch.empty(1 << 60, dtype=torch.uint8)
     except RuntimeError as error:
@@ -37,23 +37,23 @@ NO_MEMORY = {
 
 
 @pytest.mark.parametrize("name", NO_MEMORY)
-def test_known_signs(name: str) -> None:
+def test_known_memory_errors_are_recognised(name: str) -> None:
     assert is_out_of_memory(NO_MEMORY[name])
     with pytest.raises(OutOfMemoryError) as caught, memory_errors("the work", "rest"):
         raise NO_MEMORY[name]
-    assert str(caught.value) == "the work needs more memory than there is; rest."
+    assert str(caught.value) == "the work needs more memory than is available; rest."
 
 
 @pytest.mark.parametrize(
     "error", [RuntimeError("shapes differ"), KeyError("out of memory"), ValueError(), OSError()]
 )
-def test_other_errors_stay(error: Exception) -> None:
+def test_other_errors_are_not_changed(error: Exception) -> None:
     assert not is_out_of_memory(error)
     with pytest.raises(type(error)), memory_errors("the work", "rest"):
         raise error
 
 
-def test_causes_count_and_sentences_are_not_wrapped_twice() -> None:
+def test_causes_are_recognised_and_errors_are_not_wrapped_twice() -> None:
     outer, inner = memory_errors("two", "rest"), memory_errors("one", "rest")
     with pytest.raises(OutOfMemoryError, match="one needs"), outer, inner:
         raise MemoryError
@@ -68,7 +68,9 @@ def without_memory(*_: object, **__: object) -> None:
 
 
 @pytest.mark.parametrize("reader", ["ply:read_ply", "splat:read_splat"])
-def test_at_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: str) -> None:
+def test_memory_errors_while_loading(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: str
+) -> None:
     module, name = reader.split(":")
     path = tmp_path / f"a.{module}"
     io.save(random_scene(2, degree=0), path)
@@ -76,13 +78,13 @@ def test_at_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: str) -
     with pytest.raises(OutOfMemoryError) as caught:
         io.load(path)
     assert str(caught.value) == (
-        f"{path}: reading the scene needs more memory than there is; free some, or simplify a "
-        f"binary .ply block by block: cvtgs simplify IN OUT --memory AMOUNT."
+        f"{path}: reading the scene needs more memory than is available; free some, or simplify "
+        f"a binary .ply block by block: cvtgs simplify IN OUT --memory AMOUNT."
     )
     assert isinstance(caught.value, MemoryError)
 
 
-def test_at_the_command_line(
+def test_memory_errors_at_the_command_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "a.ply"
@@ -91,8 +93,8 @@ def test_at_the_command_line(
     words = ["simplify", str(path), str(tmp_path / "b.ply"), "--rho", "0.5", "--quiet"]
     assert main([*words, "--preset", "fast"]) == 1
     assert capsys.readouterr().err == (
-        "cvtgs: error: cvtgs simplify needs more memory than there is; free some, or give simplify "
-        "less to hold at once: a binary .ply with --memory AMOUNT, for example 2GB, and --device "
-        "cpu if a GPU ran out.\n"
+        "cvtgs: error: cvtgs simplify needs more memory than is available; free some, or let "
+        "simplify process a binary .ply in blocks with --memory AMOUNT, for example 2GB, and use "
+        "--device cpu if a GPU ran out.\n"
     )
     assert not (tmp_path / "b.ply").exists()

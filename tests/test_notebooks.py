@@ -1,4 +1,4 @@
-"""What scenes and results show in a notebook."""
+"""Scenes and results as shown in a notebook."""
 
 import base64
 import io
@@ -27,7 +27,7 @@ def test_a_scene_shows_an_image_and_its_facts():
         assert fact in text
 
 
-def test_a_result_shows_what_was_done():
+def test_a_result_shows_counts_and_settings():
     scene = cvtgs.synthetic.scene("object", 500, sh_degree=0, seed=0)
     result = cvtgs.Simplifier(None, preset="draft", device="cpu").run(scene, 0.1)
     assert ">500 &rarr; 50<" in result._repr_html_()
@@ -41,7 +41,7 @@ def test_a_result_shows_what_was_done():
     )
 
 
-def test_large_scenes_are_drawn_in_part(monkeypatch: pytest.MonkeyPatch):
+def test_only_the_heaviest_gaussians_of_large_scenes_are_drawn(monkeypatch: pytest.MonkeyPatch):
     scene = cvtgs.synthetic.scene("object", 500, sh_degree=0, seed=0)
     whole = image_of(scene._repr_html_())
     monkeypatch.setattr("cvtgs.notebooks.MOST_DRAWN", 200)
@@ -51,7 +51,7 @@ def test_large_scenes_are_drawn_in_part(monkeypatch: pytest.MonkeyPatch):
     assert not np.array_equal(image_of(text), whole)
 
 
-def test_what_cannot_be_drawn_says_why():
+def test_a_scene_without_an_image_says_why():
     scene = random_scene(3)
     broken = scene.with_tensors(means=torch.full((3, 3), float("nan")))
     assert "<img" not in broken._repr_html_()

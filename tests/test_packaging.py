@@ -1,4 +1,4 @@
-"""The files that other programs build and test the package by agree with pyproject.toml."""
+"""The files for other build and test programs agree with pyproject.toml."""
 
 import re
 import tomllib
@@ -10,7 +10,7 @@ import cvtgs
 ROOT = Path(__file__).parent.parent
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 CONDA_NAMES = {"torch": "pytorch", "matplotlib": "matplotlib-base"}
-"""Packages that have another name at conda-forge."""
+"""Packages that have another name on conda-forge."""
 
 
 def read(name: str) -> str:
@@ -23,7 +23,7 @@ def spaced(requirement: str) -> str:
     return f"{CONDA_NAMES.get(name, name)} {version}"
 
 
-def test_one_version_everywhere():
+def test_all_files_state_the_same_version():
     assert PROJECT["version"] == cvtgs.__version__
     assert f"\nversion: {cvtgs.__version__}\n" in read("CITATION.cff")
 
@@ -40,7 +40,7 @@ def test_the_workflow_checks_every_supported_python_as_ci_does():
     assert [name for name in sessions if f"\ndef {name}(" not in read("noxfile.py")] == []
 
 
-def test_the_conda_recipe_needs_what_the_package_needs():
+def test_the_conda_recipe_has_the_dependencies_of_the_package():
     needs = re.search(r"  run:\n(.*?)  run_constrained:\n", read("conda/meta.yaml"), re.DOTALL)[1]
     listed = re.findall(r"    - (.*)\n", needs)
     assert listed[0] == f"python {PROJECT['requires-python']}"
@@ -48,7 +48,7 @@ def test_the_conda_recipe_needs_what_the_package_needs():
     assert sorted(listed[1:]) == sorted(needed)
 
 
-def test_the_docker_context_holds_what_is_copied():
+def test_the_docker_context_holds_the_copied_files():
     files = re.findall(r"^COPY (.*) \S+$", read("Dockerfile"), re.MULTILINE)
     copied = [name for line in files for name in line.split()]
     assert sorted(copied) == sorted(re.findall(r"^!(\S+)$", read(".dockerignore"), re.MULTILINE))

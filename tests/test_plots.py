@@ -44,7 +44,7 @@ def test_same_arguments_give_the_same_bytes():
 
 @needs_matplotlib
 def test_a_name_has_one_colour_in_every_panel():
-    """The second panel alone would draw in the first colour."""
+    """On its own, the second panel would use the first colour."""
     both = line_chart([Panel(series=[LOSS]), Panel(series=[GAIN])], width=800, height=300)
     left, right = np.split(pixels(both)[:240], 2, axis=1)
     assert shows(left, COLORS[0])
@@ -54,7 +54,7 @@ def test_a_name_has_one_colour_in_every_panel():
 
 
 @needs_matplotlib
-def test_what_is_not_finite_is_a_gap():
+def test_values_that_are_not_finite_leave_a_gap():
     gappy = Series(name="loss", x=[1, 2, 3, 4], y=[1.0, float("nan"), float("inf"), 2.0])
     assert line_chart([Panel(series=[gappy], log_y=True)])
     nothing = Series(name="loss", x=[1], y=[float("nan")])
@@ -62,14 +62,14 @@ def test_what_is_not_finite_is_a_gap():
 
 
 @needs_matplotlib
-def test_more_series_than_colours_and_fewer_panels_than_places():
+def test_more_series_than_colours_and_fewer_panels_than_cells():
     many = [Series(name=str(number), x=[0.1, 0.01], y=[number, 1]) for number in range(20)]
     panel = Panel(series=many, x_ticks=[0.1, 0.01], log_x=True)
     assert line_chart([panel] * 3, columns=2, share_y=True, height=900)
 
 
 @needs_matplotlib
-def test_a_place_without_a_panel_stays_empty():
+def test_a_grid_cell_without_a_panel_stays_empty():
     image = pixels(line_chart([Panel(series=[LOSS])] * 3, columns=2, width=400, height=400))
     assert (image[:200, 200:] != 255).any()
     assert (image[220:, 220:] == 255).all()
@@ -109,21 +109,21 @@ def test_a_missing_package_is_one_clear_error(monkeypatch):
         ),
     ],
 )
-def test_what_cannot_be_drawn_is_an_error(panels, text):
+def test_invalid_panels_and_series_are_refused(panels, text):
     with pytest.raises(InvalidArgumentError) as caught:
         line_chart(panels)
     assert str(caught.value) == text
 
 
 @pytest.mark.parametrize("wrong", [{"columns": 0}, {"width": 99}, {"height": 0}])
-def test_a_size_that_cannot_be_is_an_error(wrong):
+def test_invalid_sizes_and_columns_are_refused(wrong):
     with pytest.raises(InvalidArgumentError, match="at least 1 column and 100 pixels"):
         line_chart([Panel(series=[LOSS])], **wrong)
 
 
 @needs_matplotlib
 def test_more_names_than_colours_and_styles_still_look_different():
-    """The 25th line has the first colour and style again, but marks in another shape."""
+    """The 25th line repeats the first colour and style, but with another marker shape."""
     names = [str(number) for number in range(25)]
     panel = Panel(series=[Series(name=name, x=[0, 1], y=[1, 1]) for name in names])
     styles = _styles([panel])
@@ -157,7 +157,7 @@ def test_hollow_points_are_left_out_of_the_line():
 
 
 @needs_matplotlib
-def test_labels_stand_next_to_their_points_and_not_on_one_another():
+def test_labels_are_drawn_and_avoid_overlap():
     labelled = Series(
         name="a", x=[1, 1.01, 5], y=[1, 1, 1], markers=True, labels=["one", "two", ""]
     )
@@ -177,7 +177,7 @@ def test_labels_stand_next_to_their_points_and_not_on_one_another():
         ({"hollow": [True]}, "must have hollow flags for all points or none; found 1 for 3."),
     ],
 )
-def test_labels_for_some_points_are_an_error(more, text):
+def test_labels_for_only_some_points_are_refused(more, text):
     with pytest.raises(InvalidArgumentError) as caught:
         line_chart([Panel(series=[Series(name="loss", x=[0, 1, 2], y=[0, 1, 2], **more)])])
     assert str(caught.value) == f"series 'loss' {text}"

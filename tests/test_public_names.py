@@ -278,7 +278,7 @@ ERRORS = {
 
 
 def names_for_type_checkers() -> dict[str, str]:
-    """Read what the TYPE_CHECKING block of the front page imports: name to module."""
+    """Read the imports in the TYPE_CHECKING block of the front page: name to module."""
     tree = ast.parse(Path(cvtgs.__file__).read_text(encoding="utf-8"))
     block = next(
         node
@@ -305,7 +305,7 @@ def test_every_name_resolves_and_is_listed():
     assert set(dir(cvtgs.io)) == set(cvtgs.io.__all__)
 
 
-def test_tables_agree_with_what_type_checkers_see():
+def test_tables_agree_with_the_imports_for_type_checkers():
     wanted = dict(cvtgs._HOME) | dict.fromkeys(cvtgs._MODULES, "cvtgs")
     assert names_for_type_checkers() == wanted
     assert set(wanted) == NAMES

@@ -19,7 +19,7 @@ def report_of(**changes: object) -> SimplifyReport:
     return SimplifyReport(**{**values, "config": SimplifyConfig(), **changes})
 
 
-def test_seconds_are_those_of_all_stages():
+def test_seconds_are_the_sum_over_the_stages():
     stages = tuple(
         StageCost(stage=name, seconds=seconds, cpu_seconds=0.0, peak_memory_bytes=0)
         for name, seconds in (("plan", 0.5), ("merge", 1.25))
@@ -28,7 +28,7 @@ def test_seconds_are_those_of_all_stages():
     assert report_of().seconds == 0
 
 
-def test_the_clock_tells_start_steps_and_end():
+def test_the_clock_reports_start_steps_and_end():
     events: list[ProgressEvent] = []
     clock = StageClock(events.append, CPU)
     with clock.stage("merge", 3) as advance:
@@ -43,8 +43,8 @@ def test_the_clock_tells_start_steps_and_end():
     assert clock.costs[0].peak_device_memory_bytes == 0
 
 
-def test_every_stage_has_its_own_peak_on_a_device(monkeypatch):
-    """The clock of a device that a test moves by hand; its memory peak is 50, then 20."""
+def test_every_stage_has_its_own_device_memory_peak(monkeypatch):
+    """On a simulated device, the memory peaks of the two stages are 50 and 20."""
     memory = {"now": 0, "peak": 0}
 
     def reset(device: torch.device) -> None:
@@ -77,14 +77,14 @@ def test_a_stage_that_fails_has_no_cost_and_no_end():
     assert [event.done for event in events] == [0]
 
 
-def test_memory_only_rises():
+def test_peak_memory_never_falls():
     first = peak_memory_bytes()
     ballast = torch.ones(1_000_000)
     assert peak_memory_bytes() >= first
     assert len(ballast) == 1_000_000
 
 
-def test_json_holds_everything():
+def test_json_holds_every_field():
     report = Simplifier(device="cpu").run(random_scene(200), 0.1).report
     values = json.loads(report.to_json())
     assert set(values) == set(SimplifyReport.model_fields)
@@ -100,7 +100,7 @@ def test_json_reads_back():
     assert SimplifyReport.model_validate_json(report.to_json()) == report
 
 
-def test_frozen_and_closed():
+def test_reports_are_frozen_and_refuse_unknown_fields():
     report = report_of()
     with pytest.raises(pydantic.ValidationError):
         report.rho = 0.5
@@ -108,6 +108,6 @@ def test_frozen_and_closed():
         report_of(colour="red")
 
 
-def test_the_silent_listener_is_silent(capsys):
+def test_the_silent_listener_prints_nothing(capsys):
     assert silent(ProgressEvent(stage="plan", done=0, total=1)) is None
     assert capsys.readouterr().out == ""

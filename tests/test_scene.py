@@ -1,4 +1,4 @@
-"""GaussianScene: the only thing that travels between stages."""
+"""GaussianScene: the only data that is passed between stages."""
 
 import copy
 import dataclasses
@@ -49,7 +49,7 @@ def test_sh_puts_the_constant_band_first():
 
 
 @pytest.mark.parametrize(("rest", "degree"), [(0, 0), (3, 1), (8, 2), (15, 3)])
-def test_degree(rest, degree):
+def test_the_sh_degree_follows_from_the_coefficients(rest, degree):
     assert GaussianScene(**tensors_of(rest=rest)).sh_degree == degree
 
 
@@ -66,7 +66,7 @@ def test_bands_above_a_degree_are_dropped():
         scene.with_sh_degree(4)
 
 
-def test_rows_are_taken_as_of_a_tensor():
+def test_scenes_are_indexed_like_tensors():
     scene = random_scene(9, degree=1)
     scene = scene.with_tensors({}, {"label": torch.arange(9)})
     mask = torch.arange(9) % 2 == 0
@@ -91,7 +91,7 @@ def test_rows_are_taken_as_of_a_tensor():
         scene[mask[:8]]
 
 
-def test_a_scene_saves_itself(tmp_path):
+def test_a_scene_can_be_saved(tmp_path):
     scene = random_scene(9)
     scene.save(tmp_path / "a.ply")
     assert same_bits(cvtgs.load(tmp_path / "a.ply"), scene)
@@ -101,13 +101,13 @@ def test_a_scene_saves_itself(tmp_path):
     assert same_bits(cvtgs.load(tmp_path / "a.ply", axes="rub"), scene)
 
 
-def test_an_empty_scene_is_a_scene():
+def test_an_empty_scene_is_valid():
     scene = GaussianScene(**tensors_of(0, 0))
     assert len(scene) == 0
     assert scene.masses.shape == (0,)
 
 
-def test_masses_in_chunks(monkeypatch):
+def test_masses_do_not_depend_on_chunks(monkeypatch):
     scene = random_scene(50)
     whole = scene.masses
     monkeypatch.setattr("cvtgs.scene._CHUNK", 7)
@@ -155,7 +155,7 @@ def test_to_another_device_and_back():
     assert same_bits(there.to("cpu"), scene)
 
 
-def test_frozen():
+def test_scenes_are_frozen():
     scene = random_scene(3)
     with pytest.raises(dataclasses.FrozenInstanceError):
         scene.means = torch.zeros(3, 3)
@@ -188,7 +188,7 @@ def test_values_are_not_checked():
     assert len(GaussianScene(**tensors)) == 4
 
 
-def test_repr_tells_no_values():
+def test_repr_shows_no_values():
     scene = random_scene(1234, degree=3)
     assert repr(scene) == "GaussianScene(1,234 Gaussians, SH degree 3, float32, cpu)"
 
@@ -211,7 +211,7 @@ def test_wrong_shapes_are_errors(name, shape, wanted):
     assert message == f"{name} must have shape {wanted}, found {shape}."
 
 
-def test_a_number_of_coefficients_of_no_degree_is_an_error():
+def test_a_coefficient_count_that_fits_no_degree_is_an_error():
     assert error_of(shN=torch.zeros(4, 5, 3)) == (
         "shN must hold 0, 3, 8 or 15 coefficients per channel, found 5."
     )
@@ -229,13 +229,13 @@ def test_other_dtypes_are_errors():
     )
 
 
-def test_what_is_no_tensor_is_an_error():
+def test_an_array_instead_of_a_tensor_is_an_error():
     assert error_of(quats=torch.zeros(4, 4).numpy()) == (
         "quats must be a torch.Tensor, found ndarray; use cvtgs.from_dict for numpy arrays."
     )
 
 
-def test_extra_columns_of_other_shapes_are_errors():
+def test_extra_columns_of_the_wrong_shape_are_errors():
     assert error_of(extras={"heat": torch.zeros(4, 1)}) == (
         "extra column 'heat' must have shape (4,) on cpu, found (4, 1) on cpu."
     )
@@ -257,7 +257,7 @@ def test_scenes_are_joined_in_their_order():
     assert cvtgs.concatenate(parts[:1]) is parts[0]
 
 
-def test_scenes_that_do_not_fit_are_not_joined():
+def test_scenes_that_do_not_match_are_not_joined():
     scene = random_scene(3)
     labelled = scene.with_tensors({}, {"label": torch.arange(3)})
     with pytest.raises(InvalidSceneError, match="same extra columns"):

@@ -1,4 +1,4 @@
-"""Generated scenes: exact, repeatable, varied, and as trained scenes are."""
+"""Generated scenes: exact, repeatable, varied, and similar to trained scenes."""
 
 import math
 
@@ -21,7 +21,7 @@ def robust_frame(scene):
 
 
 def test_allocation_by_hand():
-    # quotas 0.6, 2.4, 7.0: the largest remainder gets the one that is left
+    # quotas 0.6, 2.4, 7.0: the largest remainder gets the last one
     assert allocate(10, [6.0, 24.0, 70.0]) == [1, 2, 7]
     assert allocate(1, [1.0, 1.0, 2.0]) == [0, 0, 1]
     assert allocate(0, [1.0, 2.0]) == [0, 0]
@@ -36,7 +36,7 @@ def test_allocation_adds_up(count):
         assert abs(have - count * share / sum(shares)) < 1
 
 
-def test_highlight_peaks_where_it_should():
+def test_a_highlight_is_brightest_in_its_own_direction():
     peak = torch.nn.functional.normalize(torch.tensor([[0.3, -0.8, 0.5]]), dim=1)
     color = torch.tensor([[0.5, 0.4, 0.3]])
     average, rest = gaussians.highlights(peak, color, 15)
@@ -48,7 +48,7 @@ def test_highlight_peaks_where_it_should():
     x, y, z = peak[0].tolist()
     scale_1 = float(rest[0, 1, 0]) / z
     assert rest[0, :3, 0].tolist() == pytest.approx([scale_1 * v for v in (-y, z, -x)])
-    # seen from any direction, by the basis that is left when the weights are divided out
+    # the colour in any direction, with the basis found by dividing out the weights
     weights = torch.tensor([0.9] * 3 + [0.72] * 5 + [0.5] * 7)
     scale = (1 + 2.7 + 3.6 + 3.5) / (4 * math.pi)
     basis = gaussians.highlights(views, torch.ones(len(views), 3), 15)[1][:, :, 0] / weights * scale
@@ -61,7 +61,7 @@ def test_highlight_peaks_where_it_should():
 def test_reflected_light_by_hand():
     up = torch.tensor([[0.0, -1.0, 0.0]])
     light = torch.tensor([0.6, -0.8, 0.0])
-    # light comes from +x and above; who looks along +x and down sees it in the floor
+    # light comes from +x and above; a view along +x and down sees it reflected in the floor
     assert torch.allclose(gaussians.reflected(light, up), torch.tensor([[0.6, 0.8, 0.0]]))
 
 
@@ -111,7 +111,7 @@ def test_counts_are_exact_and_values_sane(kind, count):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_degree(degree):
+def test_scenes_have_the_requested_sh_degree(degree):
     scene = synthetic.demo_scene(500, sh_degree=degree)
     assert scene.sh_degree == degree
     assert degree == 0 or scene.shN.std() > 0.01
@@ -126,7 +126,7 @@ def test_same_seed_same_bits_other_seed_other_scene(kind):
     assert not any(torch.equal(first[name], other[name]) for name in first)
 
 
-def test_other_randomness_is_left_alone():
+def test_the_global_random_state_is_not_changed():
     torch.manual_seed(0)
     state, threads = torch.get_rng_state(), torch.get_num_threads()
     synthetic.demo_scene(100)
@@ -145,7 +145,7 @@ def test_default_dtype_does_not_matter():
     assert torch.equal(scene.means, expected.means)
 
 
-def test_courtyard_has_what_it_promises():
+def test_the_courtyard_has_a_sky_faint_gaussians_and_needles():
     scene = synthetic.demo_scene(40_000)
     center, radius = robust_frame(scene)
     assert torch.linalg.vector_norm(center) < 1.5
@@ -188,13 +188,13 @@ def test_up_is_negative_y():
         ({"seed": -1}, "seed must be from 0 to .*, found -1"),
     ],
 )
-def test_bad_arguments(arguments, text):
+def test_bad_arguments_are_refused(arguments, text):
     valid = {"kind": "room", "count": 10, "sh_degree": 0, "seed": 0}
     with pytest.raises(InvalidArgumentError, match=text):
         synthetic.scene(**{**valid, **arguments})
 
 
 @pytest.mark.parametrize("shares", [[], [1.0, 0.0]])
-def test_bad_shares(shares):
+def test_bad_shares_are_refused(shares):
     with pytest.raises(InvalidArgumentError, match="shares must be positive"):
         allocate(3, shares)

@@ -1,4 +1,4 @@
-"""Other people's texts: escapes, odd names, consoles of other encodings."""
+"""Untrusted texts: escape sequences, unusual names, consoles with other encodings."""
 
 import ast
 import json
@@ -35,7 +35,9 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="names of files that 
         ("\u00e9 \U0001f600", "ascii", r"\u00e9 \ud83d\ude00"),
     ],
 )
-def test_printable(text: str, encoding: str, wanted: str | None) -> None:
+def test_printable_escapes_control_and_unencodable_characters(
+    text: str, encoding: str, wanted: str | None
+) -> None:
     found = printable(text, encoding)
     assert found == (text if wanted is None else wanted)
     assert found.encode(encoding)
@@ -43,7 +45,7 @@ def test_printable(text: str, encoding: str, wanted: str | None) -> None:
         assert json.loads(f'"{found}"') == text
 
 
-def test_shown() -> None:
+def test_shown_escapes_and_shortens_values() -> None:
     assert shown("a\x1b") == r"'a\x1b'"
     assert len(shown("x" * 1000)) == 60
     assert len(shown("x" * 1000, 80)) == 80
@@ -73,7 +75,7 @@ def write_hostile(path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["info", "convert", "wrong"])
-def test_nothing_reaches_the_terminal_raw(
+def test_control_characters_do_not_reach_the_terminal(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     path = tmp_path / f"a{CLEAR}.ply"
@@ -89,7 +91,9 @@ def test_nothing_reaches_the_terminal_raw(
     assert all(letter.isprintable() or letter == "\n" for letter in text)
 
 
-def test_json_of_info_stays_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_of_info_keeps_control_characters(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "a.ply"
     write_hostile(path)
     assert main(["info", str(path), "--json"]) == 0
@@ -108,7 +112,7 @@ def run(encoding: str, *words: str | bytes) -> subprocess.CompletedProcess[bytes
 
 @pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
-def test_consoles_of_other_encodings(tmp_path: Path, encoding: str) -> None:
+def test_consoles_with_other_encodings_work(tmp_path: Path, encoding: str) -> None:
     path = tmp_path / "caf\u00e9 \u4e2d.ply"
     write_hostile(path)
     done = run(encoding, "info", str(path))
@@ -124,7 +128,7 @@ def test_consoles_of_other_encodings(tmp_path: Path, encoding: str) -> None:
 
 @pytest.mark.slow
 @linux
-def test_names_that_are_not_utf_8(tmp_path: Path) -> None:
+def test_file_names_that_are_not_utf_8_work(tmp_path: Path) -> None:
     path = os.fsencode(tmp_path) + b"/sc\xe9ne.ply"
     write_hostile(Path(os.fsdecode(path)))
     levels, page = tmp_path / "levels", tmp_path / "page"

@@ -1,4 +1,4 @@
-"""The public types, from outside: a program that embeds cvtgs passes mypy in strict mode."""
+"""The public types seen from outside: a program that embeds cvtgs passes mypy in strict mode."""
 
 import subprocess
 import sys
@@ -12,7 +12,7 @@ PROGRAM = Path(typed_embedding.__file__)
 
 
 def check(path: Path, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run mypy as somebody else's project would: strict, and without our configuration."""
+    """Run mypy like another project would: strict, and without our configuration."""
     pytest.importorskip("mypy")
     words = ["--strict", "--config-file=", f"--cache-dir={folder / 'cache'}", str(path)]
     return subprocess.run(
@@ -27,14 +27,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.long
-def test_an_embedding_program_is_typed(folder: Path) -> None:
+def test_an_embedding_program_passes_mypy(folder: Path) -> None:
     done = check(PROGRAM, folder)
     assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.slow
 def test_wrong_calls_are_found(folder: Path) -> None:
-    """The check could fail: three mistakes give three errors."""
+    """The check can fail: three mistakes give three errors."""
     program = folder / "wrong.py"
     program.write_text(
         "import cvtgs\n"

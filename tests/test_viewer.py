@@ -1,4 +1,4 @@
-"""The page that shows a scene while its size is chosen, without a browser."""
+"""The page of ``cvtgs view`` without a browser, on a stand-in for viser."""
 
 import math
 import sys
@@ -33,7 +33,7 @@ def without_viser(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def page(scene: GaussianScene) -> Iterator[Any]:
-    """Return a page at its first result, with another scene beside."""
+    """Yield a page that shows its first result, with one additional scene."""
     other = random_scene(7, degree=0)
     viewer = SceneViewer(scene, {"other.ply": other}, device="cpu")
     server = ViewerServer(viewer, preset="draft", rho=0.1)
@@ -58,7 +58,7 @@ def visible(page: Any) -> list[int]:
     return [node.count for node in page.stand.scene.nodes.values() if node.visible]
 
 
-def test_the_first_page(page: Any) -> None:
+def test_the_page_starts_with_the_simplified_scene(page: Any) -> None:
     assert page.server.address == "http://127.0.0.1:8080"
     assert page.stand.scene.up == "-y"
     assert visible(page) == [50]
@@ -66,7 +66,7 @@ def test_the_first_page(page: Any) -> None:
     assert control(page, "show").options == ("simplified", "full scene", "other.ply")
 
 
-def test_a_moved_slider_shows_what_the_simplifier_makes(page: Any, scene: GaussianScene) -> None:
+def test_moving_the_slider_shows_the_simplified_scene(page: Any, scene: GaussianScene) -> None:
     control(page, "log10 of rho").value = -2.0
     until(lambda: visible(page) == [5])
     until(lambda: control(page, FACTS).content.startswith("5 of 500 Gaussians"))
@@ -74,7 +74,7 @@ def test_a_moved_slider_shows_what_the_simplifier_makes(page: Any, scene: Gaussi
     assert same_bits(page.viewer.scenes["simplified"].scene, wanted)
 
 
-def test_what_sizes_share_is_computed_before_the_slider_moves(
+def test_data_shared_by_all_sizes_is_computed_in_advance(
     scene: GaussianScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     warm: list[str] = []
@@ -85,7 +85,7 @@ def test_what_sizes_share_is_computed_before_the_slider_moves(
     server.close()
 
 
-def test_presets_and_flipping(page: Any) -> None:
+def test_presets_and_scenes_can_be_switched(page: Any) -> None:
     control(page, "preset").value = "fast"
     until(lambda: control(page, FACTS).content.endswith("with fast"))
     control(page, "show").value = "full scene"
@@ -95,7 +95,7 @@ def test_presets_and_flipping(page: Any) -> None:
     assert visible(page) == [7]
 
 
-def test_scores_of_the_present_view(page: Any) -> None:
+def test_the_current_view_is_scored(page: Any) -> None:
     camera = SimpleNamespace(wxyz=(1, 0, 0, 0), position=(0, 0, -4), fov=0.8, aspect=1.5)
     control(page, "PSNR of this view").call(SimpleNamespace(camera=camera))
     assert control(page, NOTES).content.startswith("simplified: ")
@@ -104,24 +104,24 @@ def test_scores_of_the_present_view(page: Any) -> None:
     assert page.viewer.score("full scene", view) > 60
 
 
-def test_what_is_shown_is_saved(page: Any, tmp_path: Path) -> None:
+def test_the_shown_scene_is_saved(page: Any, tmp_path: Path) -> None:
     path = tmp_path / "out.ply"
     control(page, "file").value = str(path)
     for said in (f"{path}: 50 Gaussians.", "must not exist yet, found a file"):
-        control(page, "save what is shown").call()
+        control(page, "save this scene").call()
         assert said in control(page, NOTES).content
     assert same_bits(load(path), page.viewer.scenes["simplified"].scene)
     control(page, "file").value = "  "
-    control(page, "save what is shown").call()
+    control(page, "save this scene").call()
     assert control(page, NOTES).content == "**a file name is needed to save a scene, found none.**"
 
 
-def test_a_page_of_its_own_shows_every_scene(page: Any) -> None:
+def test_the_standalone_page_shows_every_scene(page: Any) -> None:
     assert page.server.page() == "<html>[[500], [50], [7]] True</html>"
     assert visible(page) == [50]
 
 
-def test_a_page_starts_where_the_scene_is_seen(scene: GaussianScene) -> None:
+def test_a_standalone_page_starts_in_view_of_the_scene(scene: GaussianScene) -> None:
     assert scene_page({"a": scene, "b": random_scene(7)}) == "<html>[[500], [7]] True</html>"
     stand = viser_stand_in.ViserServer.latest
     assert not stand.is_open
@@ -152,11 +152,11 @@ def test_compare_and_levels_write_a_page(
     assert main([*words, "--preset", "draft"]) == 0
     assert (folder / "viewer.html").read_text() == "<html>[[500], [50], [10]] True</html>"
     assert main([*words, "--stream", "sog"]) == 1
-    assert "--viewer cannot go with --stream" in capsys.readouterr().err
+    assert "--viewer cannot be used with --stream" in capsys.readouterr().err
 
 
-def test_camera_of_a_view() -> None:
-    """Half a turn about y looks back along z; the point in front is in the middle."""
+def test_the_camera_of_a_view_equals_that_by_hand() -> None:
+    """A half turn about y looks back along z; a point in front projects to the centre."""
     cameras = camera_of((0, 0, 1, 0), (1, 2, 3), fov=math.pi / 2, aspect=2.0)
     assert (cameras.width, cameras.height) == (480, 240)
     point = cameras.viewmats[0].double() @ torch.tensor([1, 2, -1, 1], dtype=torch.float64)
@@ -164,12 +164,12 @@ def test_camera_of_a_view() -> None:
     assert cameras.Ks[0].tolist() == [[120, 0, 240], [0, 120, 120], [0, 0, 1]]
 
 
-def test_names_of_its_own_are_taken(scene: GaussianScene) -> None:
+def test_names_reserved_by_the_viewer_are_refused(scene: GaussianScene) -> None:
     with pytest.raises(InvalidArgumentError, match="must not be named 'simplified'; rename it"):
         SceneViewer(scene, {"simplified": scene})
 
 
-def test_command_writes_a_page(
+def test_the_command_writes_a_page(
     tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save(scene, tmp_path / "a.ply")
@@ -181,7 +181,7 @@ def test_command_writes_a_page(
     assert "a.html: the output must not exist yet" in capsys.readouterr().err
 
 
-def test_without_viser(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_missing_viser_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'cvtgs\[view\]'"):
         ViewerServer(SceneViewer(random_scene(3)))

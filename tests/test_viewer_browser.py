@@ -1,7 +1,7 @@
-"""The page of ``cvtgs view`` and the page of its own, by viser, in headless Chromium.
+"""The page of ``cvtgs view`` and the standalone page, with viser, in headless Chromium.
 
-``nox -s viewers`` runs this. The browser finds no host but this one, so what it shows was fetched
-from nowhere else.
+``nox -s viewers`` runs this. The browser can resolve no host but this one, so the page loads
+nothing from elsewhere.
 """
 
 import subprocess
@@ -24,7 +24,7 @@ SECONDS = 120.0
 WIDTH, HEIGHT = 1000, 700
 PICTURE = 300
 MOST = 1.5
-"""Mean difference from our picture, of 255 levels: 0.5 was seen, and 3 for another size."""
+"""Largest mean difference from our image, of 255 levels; we measured 0.5, and 3 at another size."""
 
 pytestmark = [needs_browser, pytest.mark.long, pytest.mark.filterwarnings("ignore")]
 pytest.importorskip("viser", reason="needs viser: pip install 'cvtgs[view]'")
@@ -54,7 +54,7 @@ def until(condition: Callable[[], bool], what: str) -> None:
 
 
 def difference(small: cvtgs.GaussianScene, client: Any) -> float:
-    """Return the mean difference of the page's picture of a scene to ours."""
+    """Return the mean difference between the page's image of a scene and ours."""
     camera, width = client.camera, round(PICTURE * client.camera.aspect)
     cameras = camera_of(
         tuple(camera.wxyz), tuple(camera.position), fov=camera.fov, aspect=width / PICTURE
@@ -64,7 +64,7 @@ def difference(small: cvtgs.GaussianScene, client: Any) -> float:
     return float(np.abs(client.get_render(PICTURE, width) - wanted).mean())
 
 
-def test_a_moved_slider_changes_the_picture(tmp_path: Path, scene: cvtgs.GaussianScene) -> None:
+def test_moving_the_slider_changes_the_picture(tmp_path: Path, scene: cvtgs.GaussianScene) -> None:
     server = ViewerServer(SceneViewer(scene, {}, device="cpu"), preset="draft", rho=0.1)
     clients, simplifier = server._server.get_clients, cvtgs.Simplifier(preset="draft", device="cpu")
     first, second = (simplifier.simplify(scene, 10**power) for power in (-1.0, -2.5))
@@ -82,7 +82,7 @@ def test_a_moved_slider_changes_the_picture(tmp_path: Path, scene: cvtgs.Gaussia
         server.close()
 
 
-def test_the_page_of_its_own_shows_a_scene(tmp_path: Path, scene: cvtgs.GaussianScene) -> None:
+def test_the_standalone_page_shows_a_scene(tmp_path: Path, scene: cvtgs.GaussianScene) -> None:
     page, picture = tmp_path / "page.html", tmp_path / "picture.png"
     page.write_text(scene_page({"full": scene, "a tenth": scene}), encoding="utf-8")
     words = (
@@ -94,6 +94,6 @@ def test_the_page_of_its_own_shows_a_scene(tmp_path: Path, scene: cvtgs.Gaussian
         until(picture.is_file, "no picture was taken")
     with Image.open(picture) as image:
         pixels = np.asarray(image.convert("RGB"), dtype=np.float32)
-    right = pixels[:-60, WIDTH // 2 :]  # beside what viser says about WebGL
+    right = pixels[:-60, WIDTH // 2 :]  # without viser's message about WebGL
     colored = np.ptp(right, axis=2) > 30
     assert 0.01 < float(colored.mean()) < 0.9

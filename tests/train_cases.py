@@ -27,7 +27,7 @@ def small_scene(count: int = 600, *, kind: str = "object", seed: int = 0) -> Gau
 
 
 def write_scenes(folder: Path, names: Sequence[str], count: int = 600) -> Path:
-    """Save one scene per name; the seed is the place of the name."""
+    """Save one scene per name; the seed is the index of the name."""
     for seed, name in enumerate(names):
         path = folder / f"{name}.ply"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -50,7 +50,7 @@ def tiny_data(folder: Path, **changes: Any) -> DataConfig:
 
 
 def tiny_config(data: DataConfig, **changes: Any) -> TrainConfig:
-    """A training of a second: a small network, images of 32 pixels, few cells."""
+    """Settings for a training of a second: a small network, images of 32 pixels, few cells."""
     values: dict[str, Any] = {
         "data": data,
         "steps": 6,
@@ -66,12 +66,12 @@ def tiny_config(data: DataConfig, **changes: Any) -> TrainConfig:
 
 
 def run(config: TrainConfig, name: Path, cache: Path | None = None, **options: Any) -> History:
-    """Train to files that are called like ``name``."""
+    """Train to files that are named after ``name``."""
     return train(config, TrainFiles.beside(name, cache), **options)
 
 
 def source_of(scene: GaussianScene, *, name: str = "made", is_validation: bool = False) -> Source:
-    """A source that is there already."""
+    """A source of a scene that is already made."""
     return Source(
         name=name,
         identity=f"identity of {name}",
@@ -110,7 +110,7 @@ def bits_of(tensors: dict[str, Tensor]) -> dict[str, Any]:
 
 
 def bits_of_case(case: Case) -> dict[str, Any]:
-    """All that a case holds, to be compared bit for bit."""
+    """All contents of a case, for comparison bit for bit."""
     reference, seen = case.reference, case.descriptors
     return {
         "names": (case.scene_name, case.ratio, reference.merged.antialiased),

@@ -1,6 +1,6 @@
 """A program that embeds cvtgs, as a type checker in strict mode sees it; test_typing.py checks it.
 
-``assert_type`` fixes what callers get. Nothing here is run but ``main``, on a small scene.
+``assert_type`` pins the types that callers get. Only ``main`` is run, on a small scene.
 """
 
 import io
@@ -91,7 +91,7 @@ def polish(small: cvtgs.GaussianScene, full: cvtgs.GaussianScene) -> float:
 
 
 def main(folder: Path) -> int:
-    """Run what needs no more than a second."""
+    """Run the calls that take no more than a second."""
     scene = cvtgs.synthetic.scene("object", 300, sh_degree=1, seed=0)
     bar = Bar()
     small, report = make_small(scene, bar)

@@ -1,14 +1,14 @@
 """A stand-in for the parts of viser 1.1 that the viewer uses: no browser, no network.
 
-Setting the value of a control calls its callbacks, as a hand in the browser does; values that
-code sets do so in viser, too.
+Setting the value of a control calls its callbacks, as viser does for values that users or code
+set.
 """
 
 from types import SimpleNamespace
 
 
 class Handle:
-    """A control or a scene node: attributes, and callbacks."""
+    """A control or a scene node with attributes and callbacks."""
 
     def __init__(self, server, kind, **values):
         self.__dict__.update(server=server, kind=kind, calls=[], **values)

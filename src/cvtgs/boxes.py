@@ -46,8 +46,8 @@ def checked_box(low: Sequence[float], high: Sequence[float], name: str) -> Box:
         return Box.model_validate({"min": tuple(low), "max": tuple(high)})
     except pydantic.ValidationError as error:
         raise InvalidArgumentError(
-            f"{name} must be six finite numbers, the least x, y, z and then the largest, "
-            f"found {', '.join(f'{number:g}' for number in (*low, *high))}."
+            f"{name} must be six finite numbers, the smallest x, y, z and then the "
+            f"largest, found {', '.join(f'{number:g}' for number in (*low, *high))}."
         ) from error
 
 
@@ -81,7 +81,7 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
         reason = (error.strerror or str(error)).lower()
         raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
     except (ValueError, RecursionError) as error:  # RecursionError: lists nested too deeply
-        raise InvalidArgumentError(f"{path}: must be JSON, found none: {error}.") from None
+        raise InvalidArgumentError(f"{path}: must be valid JSON, found: {error}.") from None
     listed = values if isinstance(values, list) else [values]
     try:
         boxes = tuple(Box.model_validate(value) for value in listed)
@@ -142,6 +142,6 @@ def check_room(kept: int, *, target: int, total: int) -> None:
     needed = kept + (1 if kept < total else 0)
     if kept and min(target, total) < needed:
         raise InvalidArgumentError(
-            f"{kept} Gaussians are to be kept as they are, so at least {needed} of the {total} "
-            f"must be left (rho {needed / total:.4g} or more); asked for {target}."
+            f"{kept} Gaussians are protected, so the target must be at least {needed} of the "
+            f"{total} Gaussians (rho {needed / total:.4g} or more), found {target}."
         )

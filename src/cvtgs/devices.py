@@ -135,7 +135,7 @@ def within_memory(
             torch.cuda.empty_cache()
     if not may_leave:
         raise OutOfMemoryError(
-            f"{work} needs more memory than {device} has, in short chunks too; free some there, "
+            f"{work} needs more memory than {device} has, even in short chunks; free some of it, "
             f"or compute with device='cpu' (--device cpu)."
         )
     return compute(torch.device("cpu"), f"{device} ran out of memory; computed on the CPU")

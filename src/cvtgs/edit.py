@@ -81,7 +81,7 @@ class Motion:
     def __post_init__(self) -> None:
         numbers = (*self.quat, self.scale, *self.shift)
         if len(numbers) != 8 or not all(map(math.isfinite, numbers)):
-            raise InvalidArgumentError(f"a motion must be of finite numbers, found {self}.")
+            raise InvalidArgumentError(f"a motion must consist of finite numbers, found {self}.")
         if self.scale <= 0 or not any(self.quat):
             raise InvalidArgumentError(
                 f"a motion needs a scale above 0 and a quaternion other than 0, "
@@ -171,7 +171,9 @@ def drop_faint(scene: GaussianScene, least: float) -> GaussianScene:
         True
     """
     if not 0 <= least <= 1:
-        raise InvalidArgumentError(f"the least opacity must be from 0 to 1, found {least!r}.")
+        raise InvalidArgumentError(
+            f"the lowest opacity to keep must be from 0 to 1, found {least!r}."
+        )
     # Opacities are not clamped here: clamped ones end at 1 - 1e-6 and never reach 1.
     return _kept(scene, ~(torch.sigmoid(scene.logit_opacities.double()) < least))
 
@@ -196,7 +198,7 @@ def drop_large(scene: GaussianScene, largest: float) -> GaussianScene:
         100
     """
     if not largest > 0:
-        raise InvalidArgumentError(f"the largest size must be above 0, found {largest!r}.")
+        raise InvalidArgumentError(f"the largest size to keep must be above 0, found {largest!r}.")
     return _kept(scene, ~(scene.log_scales.double() > math.log(largest)).any(dim=1))
 
 
@@ -276,7 +278,7 @@ def merge(scenes: Sequence[GaussianScene]) -> GaussianScene:
     if len({scene.antialiased for scene in scenes}) > 1:
         warnings.warn(
             "some of the scenes to merge were trained with anti-aliasing and others were not; "
-            "viewers will show those that were not too soft.",
+            "viewers will show the latter too soft.",
             DroppedDataWarning,
             stacklevel=2,
         )

@@ -104,4 +104,4 @@ def memory_errors(work: str, advice: str) -> Iterator[None]:
         cause = error.__cause__ if isinstance(error, CvtgsError) else error
         if isinstance(error, OutOfMemoryError) or cause is None or not is_out_of_memory(cause):
             raise
-        raise OutOfMemoryError(f"{work} needs more memory than there is; {advice}.") from error
+        raise OutOfMemoryError(f"{work} needs more memory than is available; {advice}.") from error

@@ -164,8 +164,8 @@ def check_levels(
     for name in names:
         if name.endswith(".usda"):  # the only write-only format
             raise InvalidArgumentError(
-                "levels need a format that can be read again, found '.usda'; write them as .ply, "
-                "and convert these."
+                "levels need a format that cvtgs can also read, found '.usda'; write them as "
+                ".ply and convert those files."
             )
     place = Path(folder)
     if not place.exists():

@@ -197,9 +197,10 @@ def warn_of_lost_digits(scene: GaussianScene) -> None:
         step = 2.0 ** (math.floor(math.log2(far)) - 23)
         shift = ",".join(f"{-round(value)}" for value in middle.tolist())
         warnings.warn(
-            f"positions lie {far:.3g} from the origin, where float32 keeps steps of {step:.3g} "
-            f"only: digits are lost already. Write the scene anew from its source, with positions "
-            f"shifted by {shift} before they become float32, and keep that shift beside it.",
+            f"positions lie {far:.3g} from the origin, where float32 only resolves steps of "
+            f"{step:.3g}: precision is already lost. Write the scene again from its source, with "
+            f"positions shifted by {shift} before they become float32, and keep a record of the "
+            f"shift.",
             UserWarning,
             stacklevel=3,
         )

@@ -1,4 +1,4 @@
-"""What a scene calls for: the figures and the decisions."""
+"""The effects that a scene needs: figures and decisions."""
 
 import math
 from dataclasses import replace
@@ -86,7 +86,7 @@ def test_loss_of_a_known_band():
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_no_colour_changes_by_more_than_the_loss(degree):
-    """A contrast of 1 and more leaves losses as they are."""
+    """A contrast of at least 1 does not scale losses."""
     sizes = [0.0] * (degree - 1) + [1.0]
     scene = with_bands(*sizes)
     scene = scene.with_tensors({"sh0": 20 * scene.sh0.sign()}, {})
@@ -127,7 +127,7 @@ def test_a_scene_of_one_colour_keeps_its_bands():
         ((1e-7, 1e-7, 1e-7), 0),
     ],
 )
-def test_degree_by_the_energy_of_the_bands(sizes, degree):
+def test_the_degree_depends_on_the_energy_of_the_bands(sizes, degree):
     effect = plan_of(with_bands(*sizes)).sh
     assert (effect.active, effect.degree) == (degree > 0, degree)
     assert sum(effect.bands[degree:]) <= BAND_LOSS
@@ -159,14 +159,14 @@ def test_a_sky_makes_a_scene_unbounded(far):
 
 
 @pytest.mark.parametrize("share", [0.06, 0.075, 0.09])
-def test_between_bounded_and_unbounded_are_degrees(share):
+def test_scenes_between_bounded_and_unbounded_get_a_partial_strength(share):
     effect = plan_of(with_sky(share)).unbounded
     assert effect.active
     assert effect.strength == pytest.approx((effect.figure - 0.05) / 0.05)
     assert 0.05 < effect.strength < 0.95
 
 
-def test_little_that_is_far_is_not_pulled_in():
+def test_a_small_far_share_is_not_contracted():
     effect = plan_of(with_sky(0.03), unbounded="on").unbounded
     assert effect.active
     assert effect.strength == 0.0
@@ -178,7 +178,7 @@ def test_an_object_is_bounded():
     assert 0 <= plan.unbounded.figure < UNBOUNDED_SHARE
 
 
-def test_a_choice_overrides_the_figure_but_not_its_value():
+def test_a_choice_overrides_the_decision_but_not_the_figure():
     scene = with_sky(0.5)
     on, off, auto = (plan_of(scene, unbounded=choice).unbounded for choice in ("on", "off", "auto"))
     assert (on.active, off.active, auto.active) == (True, False, True)
@@ -186,7 +186,7 @@ def test_a_choice_overrides_the_figure_but_not_its_value():
     assert on.figure == off.figure == auto.figure
 
 
-def test_nothing_far_away_cannot_be_pulled_in():
+def test_without_far_gaussians_unbounded_cannot_be_forced_on():
     near = random_scene(100)
     near = near.with_tensors({"means": near.means.clamp(-1, 1)}, {})
     assert plan_of(near).unbounded.figure == 0.0
@@ -195,7 +195,7 @@ def test_nothing_far_away_cannot_be_pulled_in():
 
 @pytest.mark.parametrize("tagged", [True, False])
 @pytest.mark.parametrize("choice", ["auto", "on", "off"])
-def test_antialiasing_by_tag(tagged, choice):
+def test_antialiasing_depends_on_the_tag(tagged, choice):
     comments = (ANTIALIASED_TAG,) if tagged else ("nothing",)
     scene = GaussianScene(**random_scene(50).tensors(), comments=comments)
     effect = plan_of(scene, mip=choice).mip
@@ -204,7 +204,7 @@ def test_antialiasing_by_tag(tagged, choice):
 
 
 @pytest.mark.parametrize("share", [0.005, 0.02])
-def test_haze_by_the_mass_of_the_faint(share):
+def test_haze_depends_on_the_mass_of_faint_gaussians(share):
     """Of 100 spheres of one size, 40 are faint."""
     scene = random_scene(100)
     opacities = torch.full((100,), 0.5)
@@ -222,7 +222,7 @@ def test_haze_by_the_mass_of_the_faint(share):
 
 
 @pytest.mark.parametrize("two_scales", [False, True])
-def test_flat_where_a_file_has_two_scales(two_scales):
+def test_flat_is_on_for_files_with_two_scales(two_scales):
     layout = (("scale_0", "float"), ("scale_1", "float")) if two_scales else ()
     scene = replace(random_scene(50), layout=layout)
     for choice in ("auto", "off"):
@@ -237,7 +237,7 @@ def test_flat_where_a_file_has_two_scales(two_scales):
 @pytest.mark.parametrize("count", [1, 50, 100_000])
 @pytest.mark.parametrize("copies", [1, 2, 4])
 def test_share_of_duplicates(count, copies, dtype):
-    """Large scenes are judged by a sample of some hundredths, wherever the copies stand."""
+    """Large scenes are judged by a sample of a few percent, wherever the copies are."""
     scene = random_scene(count, degree=0, dtype=dtype)
     rows = torch.arange(count).repeat(copies)
     found = duplicate_share(scene.means[rows], scene.sh0[rows])
@@ -250,7 +250,7 @@ def test_duplicates_have_one_colour():
     assert duplicate_share(scene.means * 0, scene.sh0 * 0) == 49 / 50
 
 
-def test_few_duplicates_do_not_pay():
+def test_few_duplicates_are_not_worth_merging():
     scene = random_scene(1000, degree=0)
     for few, active in ((5, False), (30, True)):
         rows = torch.cat([torch.arange(1000 - few), torch.arange(few)])
@@ -259,7 +259,7 @@ def test_few_duplicates_do_not_pay():
         assert effect.active is active is (few / 1000 > DUPLICATE_SHARE)
 
 
-def test_extras_by_columns():
+def test_extras_depend_on_the_columns():
     scene = random_scene(50)
     assert not plan_of(scene).extras.active
     effect = plan_of(scene.with_tensors({}, {"a": torch.zeros(50), "b": torch.zeros(50)})).extras
@@ -268,7 +268,7 @@ def test_extras_by_columns():
 
 
 @pytest.mark.parametrize(("views", "choice"), [(0, "auto"), (4, "auto"), (4, "off")])
-def test_images_only_where_they_are_asked_for(views, choice):
+def test_images_are_planned_only_if_requested(views, choice):
     config = SimplifyConfig.from_mapping(
         {"visibility": {"views": views}, "effects": {"visibility": choice}}
     )
@@ -300,7 +300,7 @@ def test_every_effect_says_what_its_figure_means():
         assert "on " in effect.meaning, name
 
 
-def test_frozen():
+def test_a_plan_is_frozen():
     plan = plan_of(random_scene(50))
     with pytest.raises(pydantic.ValidationError):
         plan.extras = plan.unbounded

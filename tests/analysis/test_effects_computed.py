@@ -1,4 +1,4 @@
-"""What a scene does not call for is not computed, and forcing it on changes nothing."""
+"""Effects that a scene does not need are not computed; forcing them on changes nothing."""
 
 import math
 from importlib import import_module
@@ -44,7 +44,7 @@ def tagged(scene: GaussianScene) -> GaussianScene:
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("above", [0, 1, 2])
 def test_empty_bands_are_neither_merged_nor_predicted(above, preset, monkeypatch):
-    """The same as of a scene that never had them, but for zeros in the output."""
+    """The result is that of a scene without these bands, apart from zeros in the output."""
     scene = with_zero_bands(random_scene(400, degree=3), above)
     bare = scene.with_tensors({"shN": scene.shN[:, : REST_COUNTS[above]]}, {})
     seen = []
@@ -64,7 +64,7 @@ def test_empty_bands_are_neither_merged_nor_predicted(above, preset, monkeypatch
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_bands_that_are_forced_on_change_nothing(preset):
+def test_forcing_empty_bands_on_changes_nothing(preset):
     """Without the network of ``paper``, which corrects every band that it is given."""
     merge = {"network": preset != "paper"}
     scene = with_zero_bands(random_scene(400, degree=3), 1)
@@ -86,7 +86,7 @@ def test_faint_bands_change_no_image():
     assert 0 < float((first - second).abs().amax()) < 1e-5
 
 
-def test_a_lower_degree_than_the_scene_has():
+def test_a_lower_degree_than_that_of_the_scene():
     scene = random_scene(400, degree=3)
     full, low = (run_with(scene, effects={"sh": sh}).scene for sh in ("auto", 1))
     assert low.sh_degree == 3
@@ -122,8 +122,8 @@ def test_refinement_leaves_empty_bands_alone():
     assert not small.shN[:, 3:].any()
 
 
-def test_the_bounded_are_not_contracted(monkeypatch):
-    """The Morton curve always is; the points that are searched are not."""
+def test_bounded_scenes_are_not_contracted(monkeypatch):
+    """Points are contracted for the Morton curve, but not for the nearest-site search."""
     scene, calls = without_far_ones(random_scene(400)), []
     original = RobustFrame.contract
     monkeypatch.setattr(RobustFrame, "contract", lambda *given: calls.append(1) or original(*given))
@@ -137,7 +137,7 @@ def test_the_bounded_are_not_contracted(monkeypatch):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_forcing_a_sky_upon_what_has_hardly_one_changes_nothing(preset):
+def test_forcing_unbounded_on_with_few_far_gaussians_changes_nothing(preset):
     scene = random_scene(400)
     means = torch.where(torch.arange(400)[:, None] < 4, 40.0, 1.0) * scene.means
     scene = scene.with_tensors({"means": means}, {})
@@ -161,7 +161,7 @@ def test_faint_gaussians_without_mass_are_not_sorted(monkeypatch):
     assert same_bits(planned.scene, forced.scene)
 
 
-def test_haze_that_is_off_is_left_out_as_in_the_paper():
+def test_with_haze_off_all_faint_gaussians_are_filtered_as_in_the_paper():
     scene = random_scene(400)
     on, off = (run_with(scene, effects={"haze": haze}).report for haze in ("auto", "off"))
     assert on.plan.haze.active
@@ -169,7 +169,7 @@ def test_haze_that_is_off_is_left_out_as_in_the_paper():
     assert on.filtered_count < faint == off.filtered_count
 
 
-def test_too_many_faint_gaussians_come_back():
+def test_faint_gaussians_are_kept_if_the_target_needs_them():
     scene = random_scene(100)
     faint = scene.with_tensors({"logit_opacities": scene.logit_opacities * 0 - 4.0}, {})
     small, _ = run_with(faint, 0.5, effects={"haze": "off"})
@@ -177,7 +177,7 @@ def test_too_many_faint_gaussians_come_back():
 
 
 def test_duplicates_are_searched_once(monkeypatch):
-    """And the result is the same, also where there are more cells than places."""
+    """The result is the same, also with more cells than distinct places."""
     scene = random_scene(300).select(torch.arange(300).repeat(3))
     searched = []
     home = import_module("cvtgs.cvt.tessellate")
@@ -201,14 +201,14 @@ def test_duplicates_are_searched_once(monkeypatch):
 
 def test_without_duplicates_nothing_is_compared(monkeypatch):
     scene = random_scene(400)
-    scene = scene.select(torch.cat([torch.arange(400), torch.arange(2)]))  # too few to pay
+    scene = scene.select(torch.cat([torch.arange(400), torch.arange(2)]))  # too few to be worth it
     forced = run_with(scene, effects={"duplicates": "on"})
     assert forced.report.plan.duplicates.active
     monkeypatch.setattr("cvtgs.cvt.nearest.first_of_each", refuse)
     assert same_bits(run_with(scene).scene, forced.scene)
 
 
-def test_columns_only_where_there_are_some():
+def test_extra_columns_are_kept_unless_the_effect_is_off():
     scene = random_scene(100).with_tensors({}, {"label": torch.arange(100)})
     small, report = run_with(scene)
     assert report.plan.extras.active
@@ -218,7 +218,7 @@ def test_columns_only_where_there_are_some():
     assert not small.extras
 
 
-def test_no_image_is_taken_unless_the_preset_asks(monkeypatch):
+def test_no_image_is_rendered_unless_the_preset_asks(monkeypatch):
     monkeypatch.setattr("cvtgs.prepared.measure_visibility", refuse)
     scene = random_scene(100)
     run_with(scene)
@@ -246,7 +246,7 @@ def test_images_are_compensated_as_planned_and_the_tag_stays(is_tagged, choice, 
     assert small.comments == scene.comments
 
 
-def test_without_images_the_tag_deepens_merged_cells_unless_it_is_off():
+def test_without_images_the_tag_changes_opacities_unless_mip_is_off():
     scene, plain = tagged(random_scene(200)), random_scene(200)
     small = run_with(scene).scene
     assert same_bits(small, run_with(scene, effects={"mip": "on"}).scene)
@@ -277,8 +277,8 @@ def test_nothing_is_described_without_a_network(monkeypatch):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_all_forced_on_is_what_is_planned_for_a_plain_scene(preset):
-    """Nothing far away, no haze, no bands: an effect finds nothing to do.
+def test_forcing_all_effects_on_changes_nothing_for_a_plain_scene(preset):
+    """Without far Gaussians, haze and bands, the effects have nothing to do.
 
     Without the network of ``paper``, which corrects every band that it is given.
     """

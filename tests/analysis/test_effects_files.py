@@ -1,4 +1,4 @@
-"""Effects on the command line, and what is not read of files."""
+"""Effects on the command line, and parts of files that are not read."""
 
 from importlib import import_module
 
@@ -23,7 +23,7 @@ def source(tmp_path):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_bands_above_come_as_zeros(source, degree):
+def test_bands_above_the_requested_degree_are_zero(source, degree):
     full, part = cvtgs.load(source), cvtgs.load(source, sh_degree=degree)
     kept = min((degree + 1) ** 2 - 1, 8)
     assert part.sh_degree == full.sh_degree == 2
@@ -75,7 +75,7 @@ def test_other_formats_give_the_same(source, suffix, tmp_path):
 
 
 @pytest.mark.parametrize("degree", [-1, 4])
-def test_a_degree_that_no_scene_has(source, degree):
+def test_an_invalid_degree_is_refused(source, degree):
     with pytest.raises(InvalidArgumentError, match=f"must be from 0 to 3, found {degree}"):
         cvtgs.load(source, sh_degree=degree)
 
@@ -93,7 +93,7 @@ def test_simplify_takes_effects(source, tmp_path):
     assert (plan.sh.degree, plan.sh.forced, plan.mip.forced) == (1, True, True)
 
 
-def test_settings_win_over_effects(source, tmp_path):
+def test_settings_override_effects(source, tmp_path):
     report = tmp_path / "report.json"
     words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.2"]
     words += ["--effects", "sh=1", "--set", "effects.sh=2", "--report", str(report)]
@@ -125,7 +125,9 @@ def test_info_lists_every_effect_with_its_evidence(source, capsys):
     ],
 )
 @pytest.mark.parametrize("command", ["simplify", "info"])
-def test_unknown_effects_are_one_sentence(source, tmp_path, capsys, command, effects, message):
+def test_unknown_effects_are_refused_in_one_sentence(
+    source, tmp_path, capsys, command, effects, message
+):
     words = [command, str(source), "--effects", effects]
     words += [str(tmp_path / "out.ply"), "--rho", "0.1"] if command == "simplify" else []
     assert main(words) == 1
@@ -166,7 +168,7 @@ def test_surfels_are_written_without_a_third_scale(tmp_path):
 
 
 def test_flat_gaussians_of_a_file_with_three_scales_may_become_thick():
-    """That is closer to what they were."""
+    """Thick ones are closer to the merged members."""
     scene = GaussianScene(**surfels(400).tensors())
     small, report = simplified(scene, "auto")
     assert not report.plan.flat.active

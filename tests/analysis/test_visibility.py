@@ -1,4 +1,4 @@
-"""How freely Gaussians can be seen: boxes, haze, rooms, and what must not matter."""
+"""Ambient visibility of Gaussians: boxes, haze, rooms, and invariances."""
 
 import math
 
@@ -33,7 +33,7 @@ def light(points: Tensor, others: Tensor, *, mass: float, frame: RobustFrame = U
     return ambient_visibility(means, masses, frame)[: len(points)]
 
 
-def test_one_wall_takes_its_own_direction_only():
+def test_one_wall_blocks_only_its_own_direction():
     """One heavy voxel two voxels to the right: five of six directions stay open."""
     points = torch.tensor([[0.02, 0.02, 0.02]], dtype=torch.float64)
     wall = points + torch.tensor([0.08, 0.0, 0.0])
@@ -42,7 +42,7 @@ def test_one_wall_takes_its_own_direction_only():
     assert found.item() == pytest.approx((5 + math.exp(-depth)) / 6, rel=1e-5)
 
 
-def test_what_is_further_than_the_reach_is_not_looked_at():
+def test_matter_beyond_the_reach_is_ignored():
     points = torch.tensor([[0.02, 0.02, 0.02]], dtype=torch.float64)
     assert light(points, points + torch.tensor([6 * 0.04, 0, 0]), mass=1.0).item() < 0.9
     assert light(points, points + torch.tensor([7 * 0.04, 0, 0]), mass=1.0).item() == 1.0
@@ -88,7 +88,7 @@ def test_the_order_does_not_change_a_bit():
 
 
 @pytest.mark.parametrize("far", [1e6, 3e38])
-def test_flyaways_are_free_and_hide_nothing(far):
+def test_flyaways_are_fully_visible_and_hide_nothing(far):
     points = torch.zeros(3, 3)
     points[1:, 0] = far
     found = ambient_visibility(points, torch.tensor([1.0, 1e30, 1.0]).double(), UNIT)

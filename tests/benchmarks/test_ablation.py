@@ -39,7 +39,7 @@ def _small_images(monkeypatch):
 
 
 def groups_one_by_one(places: np.ndarray, seeds: list[int]) -> list[int]:
-    """Every seed takes its nearest free points in turn; what is left joins its nearest seed."""
+    """Every seed takes its nearest free points in turn; the rest join their nearest seed."""
     labels = {row: group for group, row in enumerate(seeds)}
     for group, seed in enumerate(seeds):
         free = [row for row in range(len(places)) if row not in labels]
@@ -65,7 +65,7 @@ def test_grouping_by_hand():
 
 
 @pytest.mark.parametrize("count", [1, 7, 20, 100, 119, 240])
-def test_grouping_is_what_its_words_say(count):
+def test_grouping_equals_the_scalar_oracle(count):
     points = torch.randn(240, 3, generator=torch.Generator().manual_seed(1))
     seeds = torch.randperm(240, generator=torch.Generator().manual_seed(3))[:count].tolist()
     labels = nearest_groups(points, count, seed=3)
@@ -97,7 +97,7 @@ def test_groups_are_merged_as_the_stages_merge_cells(scene, preset):
         assert torch.equal(getattr(small, name), values), name
 
 
-def test_grouping_leaves_out_what_the_filter_leaves_out(scene):
+def test_grouping_ignores_filtered_gaussians(scene):
     faint = torch.full_like(scene.logit_opacities, -5.0)
     faint[:300] = 1.0
     mostly_faint = scene.with_tensors({"logit_opacities": faint}, scene.extras)
@@ -107,7 +107,7 @@ def test_grouping_leaves_out_what_the_filter_leaves_out(scene):
 
 
 @pytest.mark.slow
-def test_the_table_has_its_rows_and_the_folder_its_files(file, tmp_path, capsys):
+def test_the_table_and_the_files_are_complete(file, tmp_path, capsys):
     ablation.main([str(file), "--rho", "0.05", "-o", str(tmp_path / "new")])
     text = capsys.readouterr().out
     head, _, *rows = rows_of(text)

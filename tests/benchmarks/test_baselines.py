@@ -67,7 +67,7 @@ def test_the_same_seed_gives_the_same_bits(name):
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_invalid_rows_are_never_kept_and_too_many_cannot_be(name):
+def test_invalid_rows_are_never_kept_and_bad_counts_are_refused(name):
     scene = cvtgs.synthetic.scene("object", 60, sh_degree=0, seed=4)
     scene.means[:20] = math.nan
     scene.logit_opacities[20:25] = math.inf
@@ -125,7 +125,7 @@ def test_volume_factor_by_hand():
 
 
 @pytest.mark.parametrize("name", ["LightGaussian", "PUP 3D-GS"])
-def test_what_lies_inside_of_an_opaque_ball_is_not_kept(name):
+def test_gaussians_inside_an_opaque_ball_are_not_kept(name):
     """Forty small Gaussians inside, as opaque as the shell, and cheaper to find by opacity."""
     if name == "PUP 3D-GS":
         pytest.xfail("a closed shell is taken for a room, and some views look from inside")
@@ -188,7 +188,7 @@ def test_one_probe_per_pixel_gives_the_exact_fisher_sum(smooth):
 
 
 def test_random_signs_estimate_the_sum_without_bias(smooth):
-    """The mean of 600 probes is as near as their spread promises: some 6 %."""
+    """The mean of 600 probes is as close as their spread implies: about 6 %."""
     cameras = one_camera(6, 4)
     exact = pup_3dgs.projected_fisher(
         smooth,

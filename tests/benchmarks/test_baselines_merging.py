@@ -59,7 +59,7 @@ def test_blocks_are_halves_along_the_widest_axis():
     assert sorted(everything.tolist()) == list(range(100))
 
 
-def test_divergences_and_moments_are_those_of_the_formulas():
+def test_divergences_and_moments_equal_the_formulas():
     scene = standardized(random_scene(12, dtype=torch.float64))
     shapes = covariance_list(scene)
     stacked = torch.tensor(np.array(shapes))
@@ -162,7 +162,7 @@ def test_merging_a_pair_by_hand():
     assert small.scales.tolist()[0] == pytest.approx(axes)
 
 
-def test_like_neighbours_merge_first_and_the_rest_stay_bit_for_bit():
+def test_similar_neighbours_merge_first_and_the_rest_stay_bit_for_bit():
     """Of three equally spaced ones, those of one colour merge."""
     scene = gaussians(
         [[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]],
@@ -175,7 +175,7 @@ def test_like_neighbours_merge_first_and_the_rest_stay_bit_for_bit():
     assert torch.equal(small.sh0[0], scene.sh0[0])
 
 
-def test_faint_ones_are_dropped_first_unless_they_are_needed():
+def test_faint_gaussians_are_dropped_first_unless_they_are_needed():
     """One of four is visible; where two are to stay, the heaviest faint one is the second."""
     scene = gaussians(
         [[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0], [3.0, 0, 0]],

@@ -63,7 +63,7 @@ def test_full_scenes_are_rendered_once_and_then_read(file, tmp_path, monkeypatch
     assert all(torch.equal(one, other) for one, other in zip(first, images(), strict=True))
 
 
-def test_a_scene_without_cameras_is_named(tmp_path):
+def test_a_scene_without_cameras_is_refused_by_name(tmp_path):
     with pytest.raises(SystemExit, match=r"other\.ply: needs cameras beside it"):
         camera_files.cameras_beside(tmp_path / "other.ply")
 

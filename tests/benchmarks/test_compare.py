@@ -80,7 +80,7 @@ def test_methods_and_a_tool_are_run_judged_and_reported(file, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_table_has_what_the_baseline_itself_gives(file, capsys):
+def test_the_table_has_the_scores_of_the_baseline(file, capsys):
     compare.main([str(file), "--rho", "0.1", "--methods", "mass pruning"])
     full = cvtgs.load(file)
     (found,) = quality.own_scorer(None)(full, [baseline("mass pruning")(full, 100)])
@@ -123,7 +123,7 @@ def test_another_judge_and_lpips(file, tmp_path, capsys):
     assert "Judge: the command of --scorer" in text
 
 
-def test_settings_reach_cvtgs_and_every_method_is_there_unless_chosen():
+def test_settings_reach_cvtgs_and_all_methods_run_by_default():
     options = compare.parser().parse_args(["--set", "cvt.iterations=1"])
     commands = compare.commands_of(options)
     assert list(commands) == [*cvtgs.PRESETS, "standard, no network", *BASELINES]
@@ -132,12 +132,12 @@ def test_settings_reach_cvtgs_and_every_method_is_there_unless_chosen():
 
 
 @pytest.mark.parametrize("tool", ["name", "name=tool {IN}", "name=tool {OUT}"])
-def test_a_tool_without_places_is_refused(tool):
+def test_a_tool_without_placeholders_is_refused(tool):
     with pytest.raises(SystemExit, match="NAME=COMMAND"):
         compare.commands_of(compare.parser().parse_args(["--tool", tool]))
 
 
-def test_a_tool_must_have_a_name_of_its_own():
+def test_a_tool_must_have_a_unique_name():
     options = compare.parser().parse_args(["--tool", "NanoGS=other {IN} {OUT}"])
     with pytest.raises(SystemExit, match="'NanoGS' already"):
         compare.commands_of(options)
@@ -155,7 +155,7 @@ def test_results_are_shown_without_running_anything(tmp_path, capsys):
     assert rows_of(capsys.readouterr().out)[2] == ["x", "20.00", "0.5000", "2.0"]
 
 
-def test_places_are_filled_and_other_braces_stay():
+def test_placeholders_are_filled_and_other_braces_stay():
     places = {"{IN}": "{OUT}.ply", "{OUT}": "b", "{COUNT}": "12"}
     assert compare.filled("--x={COUNT},{other}{{}}", places) == "--x=12,{other}{{}}"
     assert compare.filled("{IN}:{OUT}", places) == "{OUT}.ply:b"
@@ -188,7 +188,7 @@ def test_means_are_over_scenes_and_a_failure_leaves_a_dash():
     assert compare_tables.wrong_counts(table) == ""
 
 
-def test_results_are_joined_and_come_back_from_their_file(tmp_path):
+def test_results_are_joined_and_read_back_from_their_file(tmp_path):
     first = {"a": {"x": {0.1: result(20.0)}, "y": {0.1: result(10.0, lpips=0.5)}}}
     second = {"a": {"x": {0.1: None, 0.01: result(30.0)}}, "b": {"z": {0.1: result(1.0)}}}
     both = compare_tables.joined(first, second)
@@ -201,7 +201,7 @@ def test_results_are_joined_and_come_back_from_their_file(tmp_path):
 
 
 @pytest.mark.slow
-def test_kept_files_are_not_made_again_and_results_add_up(file, tmp_path, capsys):
+def test_kept_files_are_not_made_again_and_results_accumulate(file, tmp_path, capsys):
     (tmp_path / "first_rows.py").write_text(COPY)
     common = [str(file), "--rho", "0.05", "--results", str(tmp_path / "results.json")]
     common += ["--outputs", str(tmp_path / "kept"), "--methods"]
@@ -215,7 +215,7 @@ def test_kept_files_are_not_made_again_and_results_add_up(file, tmp_path, capsys
     assert rows[3][0] == "opacity pruning"
 
 
-def test_the_plot_shows_what_succeeded_everywhere(monkeypatch):
+def test_the_plot_omits_what_failed_on_a_scene(monkeypatch):
     table = {
         "a": {
             "x": {0.1: result(20.0), 0.01: result(10.0)},
@@ -233,7 +233,7 @@ def test_the_plot_shows_what_succeeded_everywhere(monkeypatch):
 
 
 def test_photographs_judge_instead_of_the_full_scene(file, tmp_path, capsys):
-    """The photographs are images of the copy that the tool makes: it is as good as equal."""
+    """The photographs are images of the copy that the tool makes, which is nearly perfect."""
     full = cvtgs.load(file)
     cameras = automatic_views(full, 2, width=48, height=36)
     folder = tmp_path / "capture"
@@ -263,9 +263,9 @@ def test_photographs_judge_instead_of_the_full_scene(file, tmp_path, capsys):
     ("words", "text"),
     [
         (["--images", "."], "--images needs the cameras of the photographs: --cameras."),
-        (["--cameras", "."], "--cameras are those of one scene, found 0 scenes."),
+        (["--cameras", "."], "--cameras needs exactly one scene, found 0 scenes."),
     ],
 )
-def test_cameras_and_photographs_that_cannot_be_used(words, text):
+def test_unusable_cameras_and_photographs_are_refused(words, text):
     with pytest.raises(SystemExit, match=re.escape(text)):
         compare.main([*words, "--count", "50", "--rho", "0.5", "--methods", "mass pruning"])

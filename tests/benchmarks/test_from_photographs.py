@@ -25,7 +25,7 @@ def dataset(tmp_path_factory):
     return folder
 
 
-def test_pictures_are_those_of_nerf_with_an_eighth_for_testing(dataset):
+def test_pictures_are_laid_out_as_nerf_s_with_an_eighth_for_testing(dataset):
     train, test = (read_split(dataset, split, SIZE) for split in ("train", "test"))
     assert (len(train[0]), len(test[0])) == (14, 2)
     assert tuple(test[1].shape) == (2, SIZE, SIZE, 3)
@@ -38,14 +38,14 @@ def test_pictures_are_those_of_nerf_with_an_eighth_for_testing(dataset):
 
 
 def test_cameras_and_pictures_belong_together(dataset):
-    """The generated scene itself is as good as its pictures, from the cameras of the files."""
+    """The generated scene, seen by the cameras of the files, matches its pictures."""
     cameras, photographs = read_split(dataset, "test", SIZE)
     scene = cvtgs.synthetic.scene("object", 60_000, sh_degree=1, seed=0)
     judge = PhotographJudge(cameras, photographs, (1.0, 1.0, 1.0), Metrics())
     assert judge.score(scene).psnr > 40
 
 
-def test_what_cameras_look_at_by_hand(tmp_path):
+def test_the_region_that_cameras_look_at_by_hand(tmp_path):
     """Ten cameras about 4 from the origin that all look at it, 64 pixels wide at a focal 55."""
     path = tmp_path / "transforms.json"
     path.write_text(json.dumps(transforms()))
@@ -57,7 +57,7 @@ def test_what_cameras_look_at_by_hand(tmp_path):
     assert radius == pytest.approx(0.4 * distance * 64 / 55, rel=1e-5)
 
 
-def test_the_first_scene_is_of_balls_that_touch(dataset):
+def test_the_first_scene_has_touching_balls(dataset):
     cameras, _ = read_split(dataset, "train", SIZE)
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     scene = first_scene(cameras, 4, points=points, seed=0)
@@ -86,20 +86,20 @@ def test_training_learns_what_test_pictures_show(dataset):
     assert torch.equal(again.means, same.means)
 
 
-def test_what_is_lost_stands_in_the_table():
+def test_the_table_shows_the_loss_of_quality():
     rows = {"trained": Quality(psnr=25.0, ssim=0.9), "small": Quality(psnr=22.5, ssim=0.8)}
     lines = from_photographs.table(rows).splitlines()
     assert lines[2] == "| trained | 25.00 | 0.9000 | - | +0.00 |"
     assert lines[3] == "| small | 22.50 | 0.8000 | - | -2.50 |"
 
 
-def test_a_folder_without_a_split_is_one_sentence(tmp_path):
+def test_a_folder_without_a_split_is_refused_in_one_sentence(tmp_path):
     with pytest.raises(SystemExit, match=r"must hold transforms_train\.json, found none\."):
         from_photographs.main([str(tmp_path), "-o", str(tmp_path / "out")])
 
 
 @pytest.mark.slow
-def test_from_end_to_end_and_trained_once(dataset, tmp_path, monkeypatch, capsys):
+def test_end_to_end_with_a_single_training(dataset, tmp_path, monkeypatch, capsys):
     words = [str(dataset), "-o", str(tmp_path), "--count", "300", "--steps", "60", "--rho", "0.1"]
     from_photographs.main(words)
     text = capsys.readouterr().out

@@ -34,7 +34,7 @@ def test_the_page(tmp_path, monkeypatch, capsys):
     for stage in ("copy", "check", "plan", "filter", "tessellate", "merge", "network", "all"):
         assert f"| 300 | {stage} | " in text
     assert "300: runs give the same bits; 0 of 30 Gaussians differ" in text
-    assert "| gsplat | not here: " in text
+    assert "| gsplat | not available: " in text
     for name in ("torch", "numba", "scene", "local"):
         assert f"\n| {name} | " in text
     assert capsys.readouterr().out.strip() in text
@@ -63,7 +63,7 @@ def test_the_page_of_the_pretended_device(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("axes", [1, 3, 6])
 @pytest.mark.parametrize("count", [1, 5, 9, 100, 1000])
-def test_the_search_for_devices_finds_the_nearest(count, axes):
+def test_the_device_search_finds_the_nearest(count, axes):
     generator = torch.Generator().manual_seed(count)
     sites, points = (torch.randn(n, axes, generator=generator) for n in (count, 300))
     points = torch.cat([2 * points, sites[:50]])  # many lie outside, some are sites
@@ -73,12 +73,12 @@ def test_the_search_for_devices_finds_the_nearest(count, axes):
     torch.testing.assert_close(found.squared, squared)
 
 
-def test_the_search_for_devices_compares_with_few():
+def test_the_device_search_makes_few_comparisons():
     points = sample(8000, 6, torch.device("cpu"))
-    assert nearest_by_boxes(points, points[::10]).compared < 200 * len(points)  # of 800
+    assert nearest_by_boxes(points, points[::10]).compared < 200 * len(points)  # of 800 each
 
 
-def test_the_search_for_devices_names_the_first_of_equal_sites():
+def test_the_device_search_returns_the_first_of_equal_sites():
     sites = torch.tensor([[1.0, 0.0], [0.0, 1.0]]).repeat(20, 1)
     with pretended_cuda():
         found = nearest_by_boxes(sites.to("cuda"), sites.to("cuda"))
@@ -100,17 +100,17 @@ def test_errors_are_those_of_float32():
     assert found.images < 1e-4
 
 
-def test_coarse_coordinates_show():
+def test_coarse_coordinates_increase_errors():
     near, far = (numerics.figures(CASES[name], 200).means for name in ("ball", "two_clusters"))
     assert far > 1000 * near
 
 
 @pytest.mark.parametrize("name", ["nan_means", "one", "coincident", "tiny_world"])
-def test_hard_cases_give_numbers(name):
+def test_hard_cases_give_finite_figures(name):
     assert all(torch.isfinite(torch.tensor(numerics.figures(CASES[name], 60))))
 
 
-def test_the_tables_of_a_page_are_renewed(tmp_path, monkeypatch, capsys):
+def test_the_tables_of_a_page_are_updated(tmp_path, monkeypatch, capsys):
     page = tmp_path / "page.md"
     page.write_text(f"before\n{MARKS[0]}\nold\n{MARKS[1]}\nafter\n")
     words = ["numerics", "--case", "ball", "three", "--count", "60", "--timed", "0"]
@@ -125,7 +125,7 @@ def test_the_tables_of_a_page_are_renewed(tmp_path, monkeypatch, capsys):
     assert "| three |" in capsys.readouterr().out
 
 
-def test_times_are_told_beside_those_of_the_easy_scene():
+def test_times_are_compared_with_those_of_the_easy_scene():
     text = numerics.time_table({"coincident": CASES["coincident"]}, 300)
     assert "| case | standard | / ball | paper | / ball |" in text
     assert text.splitlines()[-1].startswith("| coincident |")

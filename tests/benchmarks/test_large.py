@@ -30,5 +30,5 @@ def test_workers_are_compared(tmp_path, monkeypatch, capsys):
     assert lines == [
         f"{start} 1 | 1.0 | 8.0 | 1.00, same bytes {end}",
         f"{start} 2 | 1.0 | 4.0 | 2.00, same bytes {end}",
-        f"{start} 3 | 1.0 | 2.7 | 3.00, OTHER bytes {end}",
+        f"{start} 3 | 1.0 | 2.7 | 3.00, DIFFERENT bytes {end}",
     ]

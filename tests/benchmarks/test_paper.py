@@ -45,7 +45,7 @@ def root(tmp_path, scene) -> Path:
     return root
 
 
-def test_every_layout_is_found_and_shows_what_was_photographed(root):
+def test_every_layout_is_found_and_matches_its_photographs(root):
     found = find_captures(root)
     assert [(one.dataset.name, one.name, one.model.layout) for one in found.captures] == [
         ("NeRF-Synthetic", "lego", "nerfstudio"),
@@ -77,12 +77,12 @@ def test_the_published_folder_of_photographs_sets_the_size(root):
     assert read_test_views(garden).folder.name == "images_8"
 
 
-def test_pictures_of_nerf_are_over_white(root):
+def test_pictures_of_nerf_have_a_white_background(root):
     photographs = read_test_views(capture_of(root, "lego")).photographs
     assert photographs[:, 0, 0].tolist() == [[1.0] * 3] * 2
 
 
-def test_what_is_missing_is_one_sentence_each(root):
+def test_each_missing_part_is_noted_in_one_sentence(root):
     for path in (root / "db" / "playroom" / "output", root / "tandt"):
         path.rename(path.with_name("gone"))
     (root / "gone" / "truck").rename(root / "gone" / "lorry")
@@ -93,18 +93,18 @@ def test_what_is_missing_is_one_sentence_each(root):
     notes = find_captures(root).notes
     source = DATASETS[2].source
     assert (
-        f"Tanks and Temples: no scene of it was found in {root}; it is to be had from {source}."
+        f"Tanks and Temples: none of its scenes were found in {root}; get it from {source}."
         in notes
     )
     assert (
         f"playroom: {playroom} has cameras, but no trained model of INRIA's code, nerfstudio or "
         f"gsplat is in it or in another folder named playroom." in notes
     )
-    assert f"chair: of NeRF-Synthetic, was not found in {root}." in notes
+    assert f"chair: this scene of NeRF-Synthetic was not found in {root}." in notes
     assert all("\n" not in note and note.endswith(".") for note in notes)
 
 
-def test_a_dataset_without_a_test_split(root):
+def test_a_dataset_without_a_test_split_is_refused(root):
     lego = capture_of(root, "lego")
     (lego.folder / "transforms_test.json").unlink()
     assert refusal(lego) == (
@@ -113,7 +113,7 @@ def test_a_dataset_without_a_test_split(root):
     )
 
 
-def test_photographs_without_a_camera_and_cameras_without_a_photograph(root):
+def test_a_camera_without_a_photograph_is_refused(root):
     garden = capture_of(root, "garden")
     photograph = garden.folder / "images_4" / "frame_08.png"
     photograph.rename(photograph.with_name("another.png"))
@@ -123,24 +123,24 @@ def test_photographs_without_a_camera_and_cameras_without_a_photograph(root):
     )
 
 
-def test_photographs_of_another_shape(root):
+def test_photographs_of_another_shape_are_refused(root):
     garden = capture_of(root, "garden")
     for path in (garden.folder / "images_4").iterdir():
         Image.fromarray(np.zeros((24, 40, 3), np.uint8)).save(path)
     assert refusal(garden) == (
-        f"{garden.folder / 'images_4'}: photographs must have the shape of the cameras' "
+        f"{garden.folder / 'images_4'}: photographs must have the aspect ratio of the cameras' "
         f"images, 64 x 48 or smaller, found 40 x 24."
     )
 
 
-def test_no_folder_and_nothing_in_it(tmp_path):
+def test_a_missing_and_an_empty_folder_are_refused(tmp_path):
     with pytest.raises(SystemExit, match="must be a folder of datasets, found none"):
         find_captures(tmp_path / "none")
     with pytest.raises(SystemExit, match="no scene with a trained model was found in it"):
         paper.main([str(tmp_path), "-o", str(tmp_path / "out")])
 
 
-def test_gains_stand_beside_the_published_ones():
+def test_gains_are_shown_beside_the_published_ones():
     def result(psnr: float):
         found = Quality(psnr=psnr, ssim=0.5)
         return paper.Result(quality=found, wall_seconds=1, cpu_seconds=1, count=1, wanted=1)
@@ -163,13 +163,13 @@ def test_results_of_two_networks_of_lpips_are_not_mixed(tmp_path):
     with pytest.raises(SystemExit) as caught:
         paper.keep_network(tmp_path / "lpips.txt", "alex")
     assert str(caught.value) == (
-        f"{tmp_path}: its results were scored with LPIPS vgg, now it would be alex; choose it with "
-        f"--lpips, or another folder."
+        f"{tmp_path}: its results were scored with LPIPS vgg, but this run would use alex; "
+        f"choose the network with --lpips, or use another folder."
     )
 
 
 @pytest.mark.long
-def test_from_end_to_end_and_on_after_an_interruption(root, tmp_path, monkeypatch, capsys):
+def test_end_to_end_with_an_interruption(root, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     colmap_dataset(cvtgs.load(capture_of(root, "garden").model.path), root / "360_v2" / "room")
     arguments = [str(root), "-o", str(out), "--rho", "0.1", "--lpips", "off"]

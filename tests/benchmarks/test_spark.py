@@ -26,7 +26,7 @@ pytestmark = [
 
 @pytest.mark.parametrize("mode", ["bhatt", "tiny"])
 @pytest.mark.parametrize("degree", [0, 3])
-def test_the_cut_of_everything_is_the_scene_and_a_small_one_looks_like_it(tmp_path, mode, degree):
+def test_a_full_cut_equals_the_scene_and_a_small_one_resembles_it(tmp_path, mode, degree):
     scene = cvtgs.synthetic.scene("object", 800, sh_degree=degree, seed=0)
     cvtgs.save(scene, tmp_path / "full.ply")
 

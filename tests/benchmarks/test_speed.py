@@ -28,7 +28,7 @@ def test_the_seconds_of_all_stages_are_their_sum(scene_file):
 @pytest.mark.skipif(core_count() < 2, reason="needs two cores")
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be given")
 def test_one_core_is_compared_with_all(monkeypatch, capsys):
-    """One core takes three times as long as all; afterwards all are there again."""
+    """One core takes three times as long as all; afterwards all are available again."""
     before = core_count()
 
     def run_child(what: str, arguments: list[str]) -> dict[str, float]:

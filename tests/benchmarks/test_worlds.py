@@ -53,7 +53,7 @@ Poses = list[tuple[np.ndarray, np.ndarray]]
 
 
 def gsplat_matrix(poses: Poses, points: np.ndarray, signs: tuple[int, int, int]) -> np.ndarray:
-    """What gsplat's trainer multiplies cameras and points with, step by step, one camera a time."""
+    """The matrix that gsplat's trainer applies to cameras and points, computed step by step."""
     up = sum(-rotation[:, 1] for rotation, _ in poses)
     up /= np.linalg.norm(up)
     axis = np.cross(up, [0, -1, 0])
@@ -95,7 +95,7 @@ def write_points(points: np.ndarray, folder: Path, *, text: bool) -> None:
 
 
 def lopsided_ball() -> cvtgs.GaussianScene:
-    """A scene that is another one when it is turned by 180 degrees about any axis."""
+    """A scene that changes when it is turned by 180 degrees about any axis."""
     means = ball().means * torch.tensor([1.4, 0.9, 0.5])
     return ball().with_tensors({"means": means + 0.3 * means[:, :1].square()}, {})
 
@@ -147,20 +147,20 @@ def test_normalization_is_one_of_four(signs):
 @pytest.mark.parametrize(
     ("signs", "text"), [(signs, row % 2 == 1) for row, signs in enumerate(SIGNS)]
 )
-def test_a_world_that_gsplat_normalized(tmp_path, signs, text):
+def test_a_world_normalized_by_gsplat_is_recognized(tmp_path, signs, text):
     normalized_dataset(tmp_path, signs=signs, text=text)
     assert score_of(capture_of(tmp_path, "room")) > 35
 
 
-def test_a_world_that_gsplat_left_as_it_is(tmp_path):
+def test_a_world_left_unchanged_by_gsplat_is_recognized(tmp_path):
     """The checkpoint of a training with --no-normalize-world-space."""
     path = normalized_dataset(tmp_path, signs=(1, 1, 1))
     torch.save({"step": 29999, "splats": cvtgs.to_dict(lopsided_ball())}, path)
     assert score_of(capture_of(tmp_path, "room")) > 35
 
 
-def test_a_model_in_another_world_that_gsplat_normalized(tmp_path):
-    """Any two such models meet: both are about the origin, and about as large."""
+def test_a_normalized_model_of_another_scene_is_refused(tmp_path):
+    """Any two such models overlap: both are centred and of about the same size."""
     path = normalized_dataset(tmp_path, signs=(1, 1, 1))
     other = cvtgs.load(path)
     rings = torch.nn.functional.normalize(other.means * torch.tensor([1.0, 1, 0])) + 0.2
@@ -170,14 +170,14 @@ def test_a_model_in_another_world_that_gsplat_normalized(tmp_path):
     folder = tmp_path / "360_v2" / "room"
     text = refusal(capture_of(tmp_path, "room"))
     assert re.sub(r"0\.\d\d", "0.21", text, count=1) == (
-        f"{path}: must be a model of {folder}, but the points of COLMAP there lie 0.21 of their "
-        f"spread from its Gaussians (at most 0.05); it is the model of another scene, or its world "
-        f"was moved in a way that is not known."
+        f"{path}: must be a model of {folder}, but the COLMAP points there are 0.21 of their "
+        f"spread away from its Gaussians (at most 0.05); it is the model of another scene, or its "
+        f"coordinates were transformed in an unknown way."
     )
 
 
 @pytest.mark.parametrize("shift", [(40.0, 0.0, 0.0), (0.0, 0.0, 9.0)])
-def test_the_model_of_another_scene(tmp_path, shift):
+def test_a_model_of_another_scene_is_refused(tmp_path, shift):
     folder = colmap_dataset(ball(), tmp_path / "360_v2" / "garden")
     path = inria_model(move(ball(), Motion(shift=shift)), tmp_path / "models" / "garden")
     assert refusal(capture_of(tmp_path, "garden")) == (
@@ -187,19 +187,19 @@ def test_the_model_of_another_scene(tmp_path, shift):
 
 
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
-def test_points_that_end_too_early(tmp_path, text):
+def test_truncated_points_are_refused(tmp_path, text):
     normalized_dataset(tmp_path, signs=(1, 1, 1), text=text)
     path = tmp_path / "360_v2" / "room" / "sparse" / "0" / f"points3D.{'txt' if text else 'bin'}"
     path.write_bytes(path.read_bytes()[:-40])
     assert refusal(capture_of(tmp_path, "room")) == (
-        f"{path}: must be the points of a model of COLMAP, found a record that is none."
+        f"{path}: must be the points of a COLMAP model, found an invalid record."
     )
 
 
-def test_a_model_that_shows_nothing(tmp_path):
+def test_a_model_without_visible_gaussians_is_refused(tmp_path):
     path = normalized_dataset(tmp_path, signs=(1, 1, 1))
     faint = lopsided_ball().with_tensors({"logit_opacities": torch.full((600,), -9.0)}, {})
     torch.save({"step": 29999, "splats": cvtgs.to_dict(faint)}, path)
     assert refusal(capture_of(tmp_path, "room")) == (
-        f"{path}: must hold Gaussians that show, found none."
+        f"{path}: must hold visible Gaussians, found none."
     )

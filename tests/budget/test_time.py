@@ -1,4 +1,4 @@
-"""The cost model and what is chosen by it; all seconds are made up."""
+"""The cost model and the choices made with it; all seconds are made up."""
 
 import json
 import math
@@ -32,7 +32,7 @@ SPEEDS = dict(zip(CANDIDATES, (1.0, 2.0, 4.0, 10.0, 50.0), strict=True))
 
 
 def made_up(config, scene, count) -> dict[str, float]:
-    """Seconds that are exactly what the features say."""
+    """Return seconds that follow the features exactly."""
     speed = SPEEDS[config.preset] * 1e-6
     seconds = {
         "check": speed * len(scene),
@@ -55,7 +55,7 @@ def model() -> CostModel:
     return calibrate(made_up, trials=TRIALS)
 
 
-def test_rates_are_found_and_never_negative():
+def test_rates_are_fitted_and_never_negative():
     rows = [{"once": 1.0, "n": n} for n in (1.0, 2.0, 4.0)]
     assert fit_rates(rows, [5.0, 7.0, 11.0]) == pytest.approx({"once": 3.0, "n": 2.0})
     falling = fit_rates(rows, [11.0, 7.0, 5.0])
@@ -63,21 +63,21 @@ def test_rates_are_found_and_never_negative():
     assert falling["n"] == 0.0
 
 
-def test_large_errors_weigh_as_shares():
-    """One second more on a hundred matters as little as a tenth on ten."""
+def test_errors_are_weighted_relative_to_the_seconds():
+    """One second in a hundred counts as little as a tenth of a second in ten."""
     rates = fit_rates([{"n": 1.0}, {"n": 10.0}], [1.0, 11.0])
     assert 1.0 < rates["n"] < 1.1
 
 
 @pytest.mark.parametrize("preset", ["draft", "fast", "standard"])
-def test_what_follows_the_features_is_predicted_exactly(model, preset):
+def test_seconds_that_follow_the_features_are_predicted_exactly(model, preset):
     work = Work(count=1_000_000, target=10_000, colors=12)
     wanted = 0.1 + SPEEDS[preset] * (3 + 0.03 + 0.01)
     assert model.seconds(preset, work) == pytest.approx(wanted, rel=1e-3)
     assert set(model.stage_seconds(preset, work)) == {"check", "merge", "something new"}
 
 
-def test_few_images_stand_for_many(model):
+def test_the_cost_of_many_images_is_extrapolated_from_few(model):
     high = cvtgs.SimplifyConfig.from_preset("high")
     work = Work(count=100_000, target=1000)
     stages = model.stage_seconds("high", work)
@@ -87,7 +87,7 @@ def test_few_images_stand_for_many(model):
     assert model.seconds("high", work) > model.seconds("matched", work)
 
 
-def test_images_to_match_stand_for_many(model):
+def test_the_cost_of_matching_is_extrapolated_from_few_images(model):
     matched = cvtgs.SimplifyConfig.from_preset("matched")
     work = Work(count=100_000, target=1000)
     stages = model.stage_seconds("matched", work)
@@ -99,7 +99,7 @@ def test_images_to_match_stand_for_many(model):
     assert "match" not in model.stage_seconds("matched", work, config=unmatched)
 
 
-def test_pairs_of_pixels_and_gaussians_grow_as_the_roots_of_both():
+def test_pixel_gaussian_pairs_grow_with_the_square_root_of_both():
     matched = cvtgs.SimplifyConfig.from_preset("matched")
     few, many = (
         Work(count=10**6, target=count).features("match", matched)["view_pairs"]
@@ -109,8 +109,8 @@ def test_pairs_of_pixels_and_gaussians_grow_as_the_roots_of_both():
     assert many == pytest.approx(10 * few)
 
 
-def test_settings_count(model):
-    """Stages that are left out cost nothing, those asked for cost what they cost elsewhere."""
+def test_settings_change_the_predicted_cost(model):
+    """Omitted stages cost nothing; added stages cost the same as in other presets."""
     work = Work(count=100_000, target=1000)
 
     def stages(preset: str, **settings: str) -> dict[str, float]:
@@ -128,11 +128,11 @@ def test_settings_count(model):
     refine = cvtgs.SimplifyConfig.from_preset("high").refine.model_dump(exclude={"rates"})
     added = stages("standard", **{f"refine_{name}": str(text) for name, text in refine.items()})
     assert set(added) - set(model.stage_seconds("standard", work)) == {"refine"}
-    assert 1.0 < added["refine"] / high["refine"] < 1.1  # it finds and renders all its images
+    assert 1.0 < added["refine"] / high["refine"] < 1.1  # it renders all its own images
     assert stages("draft", refine_seconds="7")["refine"] == 7.0
 
 
-def test_a_setting_makes_room_for_a_better_preset(model):
+def test_a_cheaper_setting_allows_a_better_preset(model):
     work = Work(count=1_000_000, target=10_000)
     budget = 1.3 * model.seconds("high", work) - 1
     assert choose_preset(work, budget, model=model).preset == "matched"
@@ -186,7 +186,7 @@ def test_a_slow_machine_measures_once():
 
 
 def test_nothing_is_repeated_after_15_processor_seconds():
-    """A start, four measurements and one that is repeated take 3 s each."""
+    """A start, four measurements and one repetition take 3 s each."""
     calls, events = [], []
 
     def run(config, scene, count):
@@ -206,8 +206,8 @@ def test_nothing_is_repeated_after_15_processor_seconds():
     assert events[1].note == "preset draft, 50 to 5 Gaussians"
 
 
-def test_the_last_trials_are_left_out_where_time_is_up():
-    """Each preset is measured on a small and a large scene, whatever that takes."""
+def test_the_last_trials_are_skipped_when_time_is_up():
+    """Each preset is measured on a small and a large scene, however long that takes."""
     calls = []
 
     def run(config, scene, count):
@@ -235,13 +235,13 @@ def test_real_seconds_come_from_the_report():
     assert all(value >= 0 for value in seconds.values())
 
 
-def test_refinements_by_time_take_that_time(model, monkeypatch):
+def test_refinement_for_a_given_time_costs_that_time(model, monkeypatch):
     changed = {**cvtgs.PRESETS, "high": {"refine": {"seconds": 7.0}}}
     monkeypatch.setattr("cvtgs.config.simplify.PRESETS", changed)
     assert model.stage_seconds("high", Work(count=1000, target=10))["refine"] == 7.0
 
 
-def test_the_best_that_fits_is_chosen(model):
+def test_the_best_preset_that_fits_is_chosen(model):
     work = Work(count=1_000_000, target=10_000)
     costs = [model.seconds(name, work) for name in CANDIDATES]
     assert costs == sorted(costs)
@@ -250,7 +250,7 @@ def test_the_best_that_fits_is_chosen(model):
     assert choose_preset(work, 1e9, model=model).preset == CANDIDATES[-1]
 
 
-def test_a_scene_tells_its_size(model):
+def test_a_scene_is_accepted_in_place_of_work(model):
     scene = cvtgs.synthetic.scene("object", 300, sh_degree=2, seed=0)
     assert Work.of(scene, 3) == Work(count=300, target=3, colors=27)
     by_ratio = choose_preset(scene, 1e9, rho=0.01, model=model)
@@ -258,17 +258,17 @@ def test_a_scene_tells_its_size(model):
     assert by_ratio == choose_preset(Work.of(scene, 3), 1e9, model=model)
 
 
-def test_no_preset_fits(model):
+def test_a_time_too_short_for_every_preset_is_an_error(model):
     work = Work(count=1_000_000, target=10_000)
     with pytest.raises(GoalError) as caught:
         choose_preset(work, 0.5, model=model)
     assert str(caught.value) == (
         "no preset fits into 0.5 s: the fastest, draft, takes about 3.1 s to make 10,000 of "
-        "1,000,000 Gaussians, and is given 1.3 times that."
+        "1,000,000 Gaussians, and 1.3 times that is reserved."
     )
 
 
-def test_what_cannot_be_chosen_by(model):
+def test_invalid_arguments_of_the_choice_are_refused(model):
     work = Work(count=100, target=10)
     for seconds in (0.0, -1.0, math.inf, math.nan):
         with pytest.raises(InvalidArgumentError, match="the time must be above 0 and finite"):
@@ -280,7 +280,7 @@ def test_what_cannot_be_chosen_by(model):
 
 
 class Calibration:
-    """Counts how often it is asked."""
+    """Counts how often it is called."""
 
     def __init__(self, model: CostModel) -> None:
         self.model, self.calls = model, 0
@@ -290,7 +290,7 @@ class Calibration:
         return self.model
 
 
-def test_it_is_measured_once_and_remembered(model, tmp_path):
+def test_the_cost_model_is_measured_once_and_cached(model, tmp_path):
     calibration = Calibration(model)
     folder = tmp_path / "cache"
     assert not is_calibrated("cpu", folder=folder)
@@ -334,7 +334,7 @@ def changed(key: str, value: object):
         changed("model", {"rates": {"draft": {"check": {"in": -1.0}}}}),
     ],
 )
-def test_what_cannot_be_used_is_measured_anew(model, tmp_path, change):
+def test_an_unusable_cache_is_measured_again(model, tmp_path, change):
     calibration = Calibration(model)
     cost_model("cpu", calibration=calibration, folder=tmp_path)
     (path,) = tmp_path.iterdir()
@@ -345,7 +345,7 @@ def test_what_cannot_be_used_is_measured_anew(model, tmp_path, change):
     assert calibration.calls == 2
 
 
-def test_presets_that_changed_are_measured_anew(model, tmp_path, monkeypatch):
+def test_changed_presets_are_measured_again(model, tmp_path, monkeypatch):
     calibration = Calibration(model)
     cost_model("cpu", calibration=calibration, folder=tmp_path)
     other = {**cvtgs.PRESETS, "draft": {"cvt": {"iterations": 1}}}
@@ -354,7 +354,7 @@ def test_presets_that_changed_are_measured_anew(model, tmp_path, monkeypatch):
     assert calibration.calls == 2
 
 
-def test_where_nothing_can_be_written_it_is_measured_in_memory(model, tmp_path):
+def test_without_a_writable_cache_the_model_is_still_measured(model, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("no folder")
     calibration = Calibration(model)
@@ -363,7 +363,7 @@ def test_where_nothing_can_be_written_it_is_measured_in_memory(model, tmp_path):
     assert blocked.read_text() == "no folder"
 
 
-def test_where_the_cache_is(monkeypatch, tmp_path):
+def test_the_cache_folder_follows_the_environment(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache_folder() == tmp_path / "cvtgs"
     monkeypatch.delenv("XDG_CACHE_HOME")
@@ -373,6 +373,6 @@ def test_where_the_cache_is(monkeypatch, tmp_path):
         assert cache_folder().parent.parent in (tmp_path, tmp_path / "Library")
 
 
-def test_a_device_that_is_not_there(tmp_path):
+def test_a_missing_device_is_an_error(tmp_path):
     with pytest.raises(DeviceError):
         cost_model("abacus", folder=tmp_path)

@@ -47,7 +47,7 @@ def scene_moments(scene):
 
 
 def divergence(members, labels, count):
-    """Sum what is lost when members become Gaussians: log-volumes and squared colours."""
+    """Sum the losses of merging members: log-volumes and squared colours."""
     groups = group_moments(members, labels, count)
 
     def matrices(moments):
@@ -74,7 +74,7 @@ def test_unlike_colours_stay_apart():
     assert merge_pairs(moments, all_others(3), 2, blind).tolist() == [0, 0, 1]
 
 
-def test_what_images_hardly_show_merges_first():
+def test_a_pair_that_images_hardly_show_merges_first():
     """The pair on the right lies a little farther apart, and is hardly seen."""
     moments = points([0.0, 1.0, 9.0, 10.1])
     moments = moments._replace(masses=torch.tensor([1.0, 1.0, 1e-4, 1e-4]).double())
@@ -83,7 +83,7 @@ def test_what_images_hardly_show_merges_first():
     assert merge_pairs(moments, all_others(4), 3, equal).tolist() == [0, 0, 1, 2]
 
 
-def test_the_cost_by_hand():
+def test_the_cost_of_a_pair_by_hand():
     """Two round Gaussians of variance s^2, a apart: log-volume grows by log(1 + a^2 / 4 s^2)."""
     groups, config = points([0.0, 0.3], size=0.1, colors=[0.2, 0.4]), AllocationConfig(mass_power=1)
     costs = merge_pairs.__globals__["_pair_costs"](
@@ -110,7 +110,7 @@ def test_groups_without_neighbours_merge_too():
     assert labels.tolist() == [0, 0, 0, 0]
 
 
-def test_disjoint_pairs_are_those_of_a_loop_over_all_pairs():
+def test_disjoint_pairs_equal_those_of_a_loop_over_all_pairs():
     g = torch.Generator().manual_seed(0)
     first, second = torch.combinations(torch.arange(40)).T
     costs = torch.rand(len(first), generator=g).double()
@@ -125,7 +125,7 @@ def test_disjoint_pairs_are_those_of_a_loop_over_all_pairs():
     assert found == wanted
 
 
-def test_each_pair_is_there_once_in_ascending_order():
+def test_each_pair_appears_once_in_ascending_order():
     pairs_of = merge_pairs.__globals__["_distinct_pairs"]
     first, second = torch.tensor([4, 2, 9, 2, 3, 0]), torch.tensor([2, 4, 0, 9, 3, 9])
     found = pairs_of(first, second)
@@ -135,16 +135,16 @@ def test_each_pair_is_there_once_in_ascending_order():
 
 
 @pytest.mark.parametrize("count", [1, 30, 49, 60, 200])
-def test_only_the_cheapest_are_sorted(count: int) -> None:
-    """Ties at the threshold come in the order of the pairs, as a sort of all gives them."""
+def test_only_the_cheapest_pairs_are_sorted(count: int) -> None:
+    """Ties at the threshold keep the order of the pairs, as in a sort of all pairs."""
     costs = torch.randint(0, 12, (100,), generator=torch.Generator().manual_seed(3)).double()
     found = smallest_rows(costs, count)
     wanted = sorted(range(100), key=lambda pair: (float(costs[pair]), pair))[:count]
     assert found.tolist() == wanted
 
 
-def test_moments_of_groups_are_those_of_the_merge():
-    """Two passes about the mean: also where the scene lies far from its centre."""
+def test_moments_of_groups_equal_those_of_the_merge():
+    """Two passes about the mean keep precision far from the origin, too."""
     members = points([100.0, 100.5, 300.0], weights=[1.0, 3.0, 2.0], size=0.1)
     groups = group_moments(members, torch.tensor([0, 0, 1]), 2)
     assert groups.weights.tolist() == [4.0, 2.0]
@@ -153,7 +153,7 @@ def test_moments_of_groups_are_those_of_the_merge():
     assert groups.covariances[0].tolist() == pytest.approx([spread, 0.01])
 
 
-def test_members_move_to_the_group_that_explains_them():
+def test_members_move_to_the_group_that_fits_them_best():
     members = points([0.0, 0.1, 0.9, 1.0, 1.1], size=0.1)
     labels = torch.tensor([0, 0, 0, 1, 1])
     groups = group_moments(members, labels, 2)
@@ -179,7 +179,7 @@ def test_no_group_becomes_empty():
 
 
 @pytest.mark.parametrize("kind", ["object", "courtyard"])
-def test_moving_members_explains_them_better(kind):
+def test_moving_members_lowers_the_divergence(kind):
     members = scene_moments(make(kind, 2000, sh_degree=0, seed=1))
     near = cvt.nearest_neighbors(members.means.T, 12)
     labels = merge_pairs(members, near, 200, DEFAULT)
@@ -205,7 +205,7 @@ def test_merged_cells_lose_less_than_those_of_the_tessellation():
     assert losses[0] < losses[1]
 
 
-def test_cells_of_the_tessellation_stay_where_allocation_is_off():
+def test_without_allocation_the_cells_of_the_tessellation_are_kept():
     off = AllocationConfig(oversampling=1.0, reassign=False)
     members, labels = points([0.0, 1.0, 2.0]), torch.tensor([0, 1, 0])
     assert allocate(members, labels, 2, 2, off) is labels

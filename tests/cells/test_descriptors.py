@@ -1,4 +1,4 @@
-"""Descriptors: against the oracle, hand-computed, and blind to what gives a scene away."""
+"""Descriptors: against the oracle, hand-computed, and their invariances."""
 
 import math
 
@@ -98,8 +98,8 @@ def test_shapes_and_dtypes(dtype):
     assert seen.offsets.dtype == torch.int64
 
 
-def test_some_cells_are_described_as_among_all():
-    """Cells by number, with the neighbours and sizes of all."""
+def test_a_subset_of_cells_gets_the_same_descriptors():
+    """Cells are given by number, with the neighbours and sizes of all cells."""
     case = some_case(60, 12)
     whole, keep = case.describe(), torch.tensor([1, 4, 5, 11])
     mask = torch.zeros(12, dtype=torch.bool)
@@ -119,7 +119,7 @@ def test_some_cells_are_described_as_among_all():
     torch.testing.assert_close(some.members, whole.members[members])
 
 
-def test_another_precision_and_device():
+def test_moving_to_another_dtype_and_device():
     seen = some_case().describe()
     single = seen.to(torch.float32).to(torch.device("cpu"))
     assert {values.dtype for values in features_of(single).values()} == {torch.float32}
@@ -138,7 +138,7 @@ MOTIONS = {
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS)
 @pytest.mark.parametrize("degree", [0, 2])
-def test_where_how_large_and_which_way_up_does_not_show(motion, degree):
+def test_descriptors_do_not_depend_on_place_size_or_orientation(motion, degree):
     case = some_case(degree=degree)
     there = case_of(moved(case.scene, **motion), some_labels(60, 12))
     assert_same_features(case.describe(), there.describe())
@@ -147,7 +147,7 @@ def test_where_how_large_and_which_way_up_does_not_show(motion, degree):
 
 
 @pytest.mark.parametrize("axis", HALF_TURNS)
-def test_which_way_axes_point_does_not_show(axis):
+def test_descriptors_do_not_depend_on_the_signs_of_axes(axis):
     case = some_case()
     quats = case.merged.quats.clone()
     quats[::2] = turned_about_own_axis(quats[::2], axis)
@@ -157,7 +157,7 @@ def test_which_way_axes_point_does_not_show(axis):
 
 
 @pytest.mark.parametrize("factor", [-1.0, 1e-3, 1e3])
-def test_length_and_sign_of_quaternions_do_not_show(factor):
+def test_descriptors_do_not_depend_on_length_or_sign_of_quaternions(factor):
     case = some_case()
     other = case._replace(
         merged=case.merged.with_tensors({"quats": factor * case.merged.quats}, {}),
@@ -166,8 +166,8 @@ def test_length_and_sign_of_quaternions_do_not_show(factor):
     assert_same_features(case.describe(), other.describe())
 
 
-def test_colours_show_by_their_distance_only():
-    """An offset does not show, nor a permutation of the channels, nor exchanging dark for light."""
+def test_descriptors_depend_only_on_distances_of_colours():
+    """Offsets, permuted channels, and swapping dark and light have no effect."""
     case = some_case()
     offset = torch.tensor([5.0, -1.0, 0.3]).double()
     for change in (lambda c: c + offset, lambda c: c.flip(-1), lambda c: -c):
@@ -178,7 +178,7 @@ def test_colours_show_by_their_distance_only():
         assert_same_features(case.describe(), other.describe())
 
 
-def test_view_dependent_colours_are_not_looked_at():
+def test_view_dependent_colours_are_ignored():
     case = some_case(degree=3)
     blank = case._replace(
         scene=case.scene.with_tensors({"shN": case.scene.shN * math.nan}, {}),
@@ -213,13 +213,13 @@ def test_order_of_neighbours_does_not_matter():
     torch.testing.assert_close(first.pairs[:, shuffle], second.pairs)
 
 
-def test_the_other_side_shows():
-    """A mirrored cell differs by nothing that is seen; light from the other end does show."""
+def test_inverted_visibility_matters_and_mirroring_does_not():
+    """Mirrored cells have the same descriptors; light from the other side changes them."""
     case = some_case()
     dark = case._replace(visibility=1 - case.visibility)
     assert not torch.allclose(case.describe().members, dark.describe().members)
     mirror = torch.tensor([-1.0, 1, 1]).double()
-    flip = torch.tensor([1.0, 1, -1, -1]).double()  # of a quaternion, in the mirror x -> -x
+    flip = torch.tensor([1.0, 1, -1, -1]).double()  # of a quaternion, for the mirror x -> -x
 
     def mirrored(scene: GaussianScene) -> GaussianScene:
         return scene.with_tensors(

@@ -1,4 +1,4 @@
-"""Merges that are hard on numbers."""
+"""Merges that are numerically hard."""
 
 import pytest
 import torch
@@ -103,7 +103,7 @@ def test_two_clusters_far_apart(dtype, far, config):
 
 
 @each_config
-def test_far_from_the_origin_keeps_its_detail(config):
+def test_detail_far_from_the_origin_is_kept(config):
     scene = random_scene(60, dtype=torch.float64, spread=1e-2, size=1e-3)
     labels = torch.arange(60) // 5
     near = merged(scene, labels, config)
@@ -140,7 +140,7 @@ def test_huge_colours(dtype, config):
 
 
 @dtypes
-def test_masses_that_underflow_weigh_the_same(dtype):
+def test_members_with_underflowing_masses_weigh_the_same(dtype):
     """exp(-400)^2 is below the smallest float64."""
     scene = random_scene(4, dtype=dtype)
     scene = changed(scene, log_scales=scene.log_scales * 0 - 400.0)

@@ -1,4 +1,4 @@
-"""Inflation and aligned axes: against the oracle, by hand, and what they leave alone."""
+"""Inflation and aligned axes: against the oracle, by hand, and what they leave unchanged."""
 
 import math
 
@@ -42,7 +42,7 @@ def widened(scene: GaussianScene, counts: list[int], **growth: float) -> Gaussia
     return inflate_cells(scene, crowded(counts), neighbors, **{**GROWTH, **growth})
 
 
-def test_an_opaque_cell_of_a_hundred_grows_by_a_tenth_where_nothing_is_near():
+def test_an_isolated_opaque_cell_of_a_hundred_grows_by_a_tenth():
     scene = random_scene(2, dtype=torch.float64)
     far = torch.tensor([[0.0, 0, 0], [1e6, 0, 0]]).double()
     logits = torch.full((2,), 20.0).double()
@@ -97,7 +97,7 @@ def test_inflation_equals_the_oracle():
         assert ratio[row].tolist() == pytest.approx(wanted, rel=1e-9)
 
 
-def test_only_scales_change_and_only_of_cells_of_several():
+def test_only_scales_of_cells_with_several_members_change():
     scene = opaque_scene(40)
     wide = widened(scene, [1] * 20 + [50] * 20)
     assert same_bits(wide.select(torch.arange(20)), scene.select(torch.arange(20)))
@@ -198,7 +198,7 @@ def test_other_cells_keep_their_bits():
     assert changed.nonzero()[:, 0].tolist() == [3]
 
 
-def test_where_neighbours_coincide_nothing_breaks():
+def test_coincident_neighbours_do_no_harm():
     scene = cells_of(SHAPES["balls"])
     scene = scene.with_tensors({"means": torch.ones_like(scene.means)}, {})
     assert bool(settled(scene).quats.isfinite().all())
@@ -206,7 +206,7 @@ def test_where_neighbours_coincide_nothing_breaks():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["32", "64"])
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
-def test_shapes_stay(shape, dtype):
+def test_aligning_axes_keeps_covariances(shape, dtype):
     scene = cells_of(shape, dtype=dtype)
     small = settled(scene)
     before, after = covariances_of(scene), covariances_of(small)
@@ -217,10 +217,10 @@ def test_shapes_stay(shape, dtype):
 
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 def test_axes_turn_with_the_scene(shape):
-    """But for their signs, which nothing sees."""
+    """Up to their signs, which have no effect."""
     scene = cells_of(shape)
     spun = scene.select(torch.arange(len(scene)))
-    if shape == SHAPES["balls"]:  # which come with any axes
+    if shape == SHAPES["balls"]:  # whose axes are arbitrary
         spun = spun.with_tensors({"quats": spun.quats[torch.randperm(len(spun))]}, {})
     first, second = moved(settled(scene), **TURN), settled(moved(spun, **TURN))
     cosines = (axes_of(first) * axes_of(second)).sum(dim=1).abs()
@@ -239,6 +239,6 @@ def test_corrected_pairs_move_with_the_scene(exponent):
     assert_same_gaussians(second, moved(first, **TURN))
 
 
-def test_same_input_same_bits():
+def test_results_are_deterministic():
     scene = cells_of(SHAPES["balls"])
     assert same_bits(settled(scene), settled(scene))

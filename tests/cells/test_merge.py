@@ -47,7 +47,7 @@ def area_of_needle(long: float, thin: float) -> float:
     return math.pi * ((2 * (long * thin) ** p + thin ** (2 * p)) / 3) ** (1 / p)
 
 
-def test_two_gaussians_in_the_paper():
+def test_two_gaussians_merged_as_in_the_paper():
     """Weights 1/4 and 3/4 by opacity: mean 3, variance along x 1 + 3/16 * 16 = 4, else 1."""
     small = merged(pair((0.25, 0.75), (1.0, 1.0)), [0, 0], PAPER)
     torch.testing.assert_close(small.means, torch.tensor([[3.0, 0, 0]]).double())
@@ -56,7 +56,7 @@ def test_two_gaussians_in_the_paper():
     assert small.opacities.item() == pytest.approx(1 - 0.75 * 0.25)
 
 
-def test_two_gaussians_by_mass():
+def test_two_gaussians_merged_by_mass():
     """Areas pi and 4 pi, opacities 0.8 and 0.2: equal weights, mean 2, variances 6.5 and 2.5."""
     config = MergeConfig(area_power=1.0, opacity="saturating")
     small = merged(pair((0.8, 0.2), (1.0, 2.0)), [0, 0], config)
@@ -92,7 +92,7 @@ def test_shapes_and_dtypes(degree, dtype, config):
 
 
 @each_config
-def test_identical_members_change_neither_place_nor_shape_nor_colour(config):
+def test_merging_identical_members_keeps_place_shape_and_colour(config):
     one = random_scene(1, dtype=torch.float64)
     small = merged(one.select(torch.zeros(5, dtype=torch.int64)), [0] * 5, config)
     torch.testing.assert_close(small.means, one.means)
@@ -112,7 +112,7 @@ def test_chunks_do_not_change_a_bit(monkeypatch, limit, config):
     assert same_bits(merged(scene, labels, config), whole)
 
 
-def test_extra_columns_of_floats_are_averaged_and_of_integers_taken_from_the_heaviest():
+def test_extra_floats_are_averaged_and_integers_come_from_the_heaviest():
     scene = pair((0.25, 0.75), (1.0, 1.0))
     extras = {
         "heat": torch.tensor([1.0, 5.0]),
@@ -130,7 +130,7 @@ def test_extra_columns_of_floats_are_averaged_and_of_integers_taken_from_the_hea
     }
 
 
-def test_integers_come_from_the_heaviest_not_the_most_opaque():
+def test_extra_integers_come_from_the_heaviest_not_the_most_opaque():
     scene = pair((0.9, 0.1), (1.0, 10.0)).with_tensors({}, {"label": torch.tensor([7, 9])})
     assert merged(scene, [0, 0], STANDARD).extras["label"].item() == 9
 
@@ -146,7 +146,7 @@ def test_comments_and_layout_are_kept(config):
     assert small.layout == tagged.layout
 
 
-def test_done_cells_are_told(monkeypatch):
+def test_progress_counts_the_finished_cells(monkeypatch):
     monkeypatch.setitem(merge_cells.__globals__, "CHUNK_MEMBERS", 4)
     scene, told = random_scene(10), []
     cells = Partition.from_labels(torch.tensor([0, 0, 1, 2, 2, 2, 3, 3, 4, 0]), 5)
@@ -175,7 +175,7 @@ def balls(distance: float, *, size: float = 1.0) -> GaussianScene:
     return scene.with_tensors({"means": means, "log_scales": log_scales}, {})
 
 
-def test_of_two_points_far_apart_the_one_that_shows_more_stays():
+def test_of_two_distant_members_the_more_visible_one_is_kept():
     scene = random_scene(6, dtype=torch.float64)
     means = 1e3 * torch.cat([torch.eye(3), -torch.eye(3)]).double()
     sizes = torch.tensor([1.0, 2.0, 1.0, 1.1, 1.0, 2.0]).double().log()[:, None].expand(-1, 3)
@@ -189,7 +189,7 @@ def test_of_two_points_far_apart_the_one_that_shows_more_stays():
 
 
 @pytest.mark.parametrize("unit", [1e-30, 1.0, 1e3, 1e30])
-def test_two_balls_part_where_their_merged_area_is_four_times_one(unit):
+def test_one_ball_is_kept_of_two_if_merging_would_quadruple_its_area(unit):
     """(2 m)^2 / 4 A is m^2 / A. The shadow of an ellipsoid of axes (s, 1, 1) is four times
     that of a ball at s = 5.01: half the surface of a prolate spheroid, over 2 pi."""
     s = 5.0075
@@ -214,7 +214,7 @@ def test_cells_whose_members_touch_and_cells_of_one_are_left_alone():
     assert members is part
 
 
-def test_some_cells_of_many():
+def test_only_cells_of_distant_members_get_a_representative():
     near, far = balls(0.5), balls(1e3)
     tensors = {
         name: torch.cat([values, far.tensors()[name], values])
@@ -246,7 +246,7 @@ def test_points_stay_points(network):
     assert report.single_member_cells == int(inside.sum())
 
 
-def test_paper_keeps_moments():
+def test_the_paper_preset_merges_without_representatives():
     scene, paper = CASES["points"](200, torch.float32), SimplifyConfig.from_preset("paper")
     assert not paper.merge.representatives
     small = Simplifier(None, config=paper, device="cpu").simplify(scene, 0.2)

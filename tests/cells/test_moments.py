@@ -1,4 +1,4 @@
-"""Merged cells against the scalar oracle, and what a merge conserves."""
+"""Merged cells against the scalar oracle, and conserved quantities."""
 
 import math
 from dataclasses import replace
@@ -96,7 +96,7 @@ def test_moments_of_the_mixture_are_conserved(config):
 
 
 @pytest.mark.parametrize("shift", [-7.0, 0.0])
-def test_saturating_conserves_what_depth_sums_to_over_an_image(shift: float):
+def test_saturating_conserves_the_sum_of_depth_over_an_image(shift: float):
     """By quadrature of -log(1 - a g) over the image, where no cell is opaque."""
     scene, cells = random_scene(400, dtype=torch.float64), random_cells(400, 150)
     scene = scene.with_tensors({"logit_opacities": 0.3 * scene.logit_opacities + shift}, {})
@@ -130,7 +130,7 @@ def test_saturating_never_gains_mass_and_never_exceeds_one():
     assert bool((small.masses <= areas).all())
 
 
-def test_saturating_takes_the_mean_of_two_depths_where_images_are_compensated():
+def test_saturating_averages_two_depths_for_antialiased_scenes():
     """The square root of both depths' product, which is computed here member by member."""
     scene, cells = random_scene(400, dtype=torch.float64), random_cells(400, 150)
     plain = merged(scene, cells, RULES["standard"])

@@ -51,7 +51,7 @@ def test_cells_of_several_members():
         assert lists_of(several) == lists_of(partition)[::2]
 
 
-def test_a_device_is_not_waited_for_where_sizes_are_known():
+def test_no_device_synchronization_where_sizes_are_known():
     partition = partition_of([2, 1, 3, 1])
     first = partition.order[partition.offsets[2]]
     rows = torch.tensor([-1, -1, int(first), -1])
@@ -65,7 +65,7 @@ def test_a_device_is_not_waited_for_where_sizes_are_known():
 
 
 @pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
-def test_labels_of_other_integers(dtype):
+def test_labels_of_every_integer_dtype(dtype):
     assert lists_of(Partition.from_labels(torch.tensor([1, 0], dtype=dtype), 2)) == [[1], [0]]
 
 
@@ -83,18 +83,18 @@ def test_chunks_hold_every_cell_once_and_whole(limit):
     assert found == wanted
 
 
-def test_chunks_are_as_large_as_they_may_be():
+def test_chunks_are_as_large_as_the_limit_allows():
     runs = [part.counts.tolist() for _, part in partition_of([2, 2, 1, 5, 1, 1]).chunks(5)]
     assert runs == [[2, 2, 1], [5], [1, 1]]
 
 
-def test_a_cell_larger_than_a_chunk_is_a_run_of_its_own():
+def test_a_cell_larger_than_a_chunk_gets_a_chunk_of_its_own():
     runs = [part.counts.tolist() for _, part in partition_of([1, 50, 1, 1]).chunks(10)]
     assert runs == [[1], [50], [1, 1]]
 
 
-def test_cells_cost_more_than_their_members():
-    """Each counts 3 members more: 5, 5, 4, 8, 4, 4 for runs of 10."""
+def test_each_cell_adds_a_cost_to_that_of_its_members():
+    """Each cell costs as much as 3 more members: 5, 5, 4, 8, 4, 4 in chunks of 10."""
     partition = partition_of([2, 2, 1, 5, 1, 1])
     runs = [part.counts.tolist() for _, part in partition.chunks(10, cell_cost=3)]
     assert runs == [[2, 2], [1], [5], [1, 1]]
@@ -102,14 +102,14 @@ def test_cells_cost_more_than_their_members():
     assert runs == [[2, 2], [1, 5], [1, 1]]
 
 
-def test_a_cell_that_costs_more_than_a_chunk_is_a_run_of_its_own():
+def test_a_cell_that_costs_more_than_a_chunk_gets_a_chunk_of_its_own():
     runs = [part.counts.tolist() for _, part in partition_of([1, 2, 1]).chunks(3, cell_cost=100)]
     assert runs == [[1], [2], [1]]
 
 
 @pytest.mark.parametrize("cost", [0, 1, 8])
 @pytest.mark.parametrize("limit", [1, 7, 20])
-def test_costly_cells_come_once_and_whole(limit, cost):
+def test_chunks_by_cost_hold_every_cell_once_and_whole(limit, cost):
     partition = partition_of([1, 2, 3, 1, 1, 9, 1, 2])
     found: list[list[int]] = []
     for run, part in partition.chunks(limit, cell_cost=cost):
@@ -119,7 +119,7 @@ def test_costly_cells_come_once_and_whole(limit, cost):
     assert found == lists_of(partition)
 
 
-def test_consecutive_cells_are_cut_out():
+def test_a_slice_of_cells_is_cut_out():
     partition = partition_of([2, 1, 3, 1])
     assert lists_of(partition.cut(slice(1, 3))) == lists_of(partition)[1:3]
     assert lists_of(partition.cut(slice(2, 99))) == lists_of(partition)[2:]

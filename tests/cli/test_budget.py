@@ -1,4 +1,4 @@
-"""Goals on the command line: what goes together, times, and what is said."""
+"""Goals on the command line: valid combinations, time budgets, and printed notes."""
 
 import argparse
 from contextlib import nullcontext
@@ -35,7 +35,7 @@ def scene() -> cvtgs.GaussianScene:
 
 @pytest.fixture
 def measured(monkeypatch) -> list[bool]:
-    """Replace the calibration; the list tells for each call whether it was asked for anew."""
+    """Replace the calibration; the list records for each call whether it was to recalibrate."""
     asked: list[bool] = []
 
     def known(device, *, recalibrate, listener):
@@ -52,17 +52,17 @@ def measured(monkeypatch) -> list[bool]:
     ("text", "seconds"),
     [("20s", 20.0), ("20", 20.0), (" 2m", 120.0), ("1.5min", 90.0), ("0.5h", 1800.0)],
 )
-def test_times(text, seconds):
+def test_time_budgets_are_read_in_seconds(text, seconds):
     assert read_seconds(text) == seconds
 
 
 @pytest.mark.parametrize("text", ["", "s", "-3s", "0", "20 parsecs", "nan", "inf", "1:30"])
-def test_no_times(text):
+def test_invalid_time_budgets_are_refused(text):
     with pytest.raises(InvalidArgumentError, match="--time-budget must be a time above 0"):
         read_seconds(text)
 
 
-def test_a_target_takes_the_place_of_the_ratio(capsys):
+def test_a_target_and_a_size_exclude_each_other(capsys):
     for words in (["--rho", "0.1", "--target-psnr", "30"], ["--target-psnr", "3", "--count", "5"]):
         with pytest.raises(SystemExit):
             options(*words)
@@ -74,23 +74,24 @@ def test_a_target_takes_the_place_of_the_ratio(capsys):
     [
         (["--target-psnr", "99"], "the PSNR to reach must be above 0 and at most 60 dB, found"),
         (["--target-ssim", "30"], "the SSIM to reach must be above 0 and below 1, found 30.0."),
-        (["--rho", "0.1", "--recalibrate"], "--recalibrate goes with --time-budget."),
-        (["--rho", "0.1", "--shipped-rates"], "--shipped-rates goes with --time-budget."),
+        (["--rho", "0.1", "--recalibrate"], "--recalibrate needs --time-budget."),
+        (["--rho", "0.1", "--shipped-rates"], "--shipped-rates needs --time-budget."),
         (
             ["--rho", "0.1", "--time-budget", "2m", "--shipped-rates", "--recalibrate"],
-            "give --recalibrate or --shipped-rates, found both.",
+            "give either --recalibrate or --shipped-rates, found both.",
         ),
         (
             ["--rho", "0.1", "--time-budget", "2m", "--preset", "fast", "--refine", "3"],
-            "--time-budget chooses the preset and cannot go with --preset, --refine.",
+            "--time-budget chooses the preset and cannot be used with --preset, --refine.",
         ),
         (
             ["--target-psnr", "30", "--time-budget", "2m"],
-            "--time-budget chooses the preset and cannot go with --target-psnr and --target-ssim.",
+            "--time-budget chooses the preset and cannot be used with --target-psnr and "
+            "--target-ssim.",
         ),
     ],
 )
-def test_what_does_not_go_together(words, text):
+def test_invalid_combinations_of_goals_are_refused(words, text):
     with pytest.raises(InvalidArgumentError) as caught:
         check_goals(options(*words))
     assert str(caught.value).startswith(text)
@@ -118,7 +119,7 @@ def simplified(source: Path, *words: str) -> cvtgs.GaussianScene:
     return cvtgs.load(output)
 
 
-def test_without_goals_nothing_is_said(source, capsys, shown):
+def test_without_goals_no_notes_are_printed(source, capsys, shown):
     check_goals(options("--rho", "0.1"))
     assert len(simplified(source, "--rho", "0.1")) == 30
     lines = capsys.readouterr().out.splitlines()
@@ -128,7 +129,7 @@ def test_without_goals_nothing_is_said(source, capsys, shown):
 
 
 @pytest.mark.usefixtures("measured")
-def test_a_budget_chooses_a_preset_and_says_so(scene):
+def test_a_time_budget_chooses_a_preset_and_explains_it(scene):
     chosen = choose_preset(options("--rho", "0.1", "--time-budget", "5s"), scene, {}, silent)
     assert chosen.name == "high"
     assert chosen.reason.startswith("Preset high, the best that fits into 5 s: expected to take 3")
@@ -144,7 +145,7 @@ def test_a_budget_chooses_a_preset_and_says_so(scene):
         (["--ckpt", "none"], {"refine.seconds": "200"}, None),
     ],
 )
-def test_a_budget_knows_what_else_is_set(scene, monkeypatch, words, settings, preset):
+def test_a_time_budget_accounts_for_the_other_settings(scene, monkeypatch, words, settings, preset):
     nothing = {"check": {"in": 0.0}}
     slow = {"network": {"once": 9.0}, "refine": {"look_pixels": 0.0}}
     rates = {"fast": nothing, "standard": nothing | slow}
@@ -161,11 +162,11 @@ def test_a_budget_knows_what_else_is_set(scene, monkeypatch, words, settings, pr
         assert choose_preset(budget, scene, settings, silent).name == preset
 
 
-def test_the_machine_is_measured_once_or_when_asked(scene, measured, capsys):
+def test_the_machine_is_measured_once_or_on_request(scene, measured, capsys):
     words = ["--rho", "0.1", "--time-budget", "5s"]
     choose_preset(options(*words), scene, {}, silent)
     assert capsys.readouterr().err == (
-        "cvtgs: measuring this machine once, about 20 seconds (--shipped-rates does without)\n"
+        "cvtgs: measuring this machine once, about 20 seconds (--shipped-rates skips this)\n"
     )
     choose_preset(options(*words), scene, {}, silent)
     assert capsys.readouterr().err == ""
@@ -175,24 +176,24 @@ def test_the_machine_is_measured_once_or_when_asked(scene, measured, capsys):
 
 
 @pytest.mark.usefixtures("measured")
-def test_a_budget_that_is_too_short(scene, monkeypatch):
+def test_a_budget_shorter_than_start_up_is_refused(scene, monkeypatch):
     monkeypatch.setattr("cvtgs.cli.time_budget.time.perf_counter", lambda: STARTED + 60)
     with pytest.raises(GoalError, match=r"fits into 5 s: starting and reading took 60\.0 s\."):
         choose_preset(options("--count", "10", "--time-budget", "5s"), scene, {}, silent)
 
 
 @pytest.mark.slow
-def test_a_target_is_searched_and_said(source, capsys, shown):
+def test_a_target_is_searched_and_reported(source, capsys, shown):
     small = simplified(source, "--target-psnr", "15")
     lines = capsys.readouterr().out.splitlines()
     text = " ".join(" ".join(lines).split())
     assert f"300 -> {len(small)} Gaussians, " in text
     assert len(small) < 300
-    assert "over views that were held out; found in" in text
+    assert "over held-out views; found in" in text
     assert "tessellate" not in shown
 
 
-def test_shipped_rates_measure_nothing(scene, measured, capsys):
+def test_shipped_rates_need_no_measurement(scene, measured, capsys):
     words = ["--rho", "0.1", "--time-budget", "2m", "--shipped-rates"]
     chosen = choose_preset(options(*words), scene, {}, silent)
     assert chosen.name in CANDIDATES
@@ -205,6 +206,6 @@ def test_shipped_rates_measure_nothing(scene, measured, capsys):
     assert 1 < seconds[0] < seconds[-1] < 3600
 
 
-def test_protected_regions_need_a_size():
+def test_keep_needs_a_size():
     with pytest.raises(InvalidArgumentError, match=r"--keep needs --rho, --count or --max-count\."):
         check_goals(options("--target-psnr", "30", "--keep", "box.json"))

@@ -1,4 +1,4 @@
-"""``cvtgs convert``, and other formats in other commands."""
+"""``cvtgs convert``, and formats other than PLY in other commands."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from scenes import same_bits
 FORMATS = ("ply", "compressed.ply", "spz", "splat", "sog", "glb", "spz.glb")
 
 
-def test_what_is_lost_is_said_before_it_is_written(
+def test_losses_are_printed_before_writing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source, target = DATA / "source.ply", tmp_path / "a.splat"
@@ -36,7 +36,7 @@ def test_what_is_lost_is_said_before_it_is_written(
     assert max(map(len, lines)) <= 80
 
 
-def test_nothing_is_lost_in_a_ply(
+def test_a_ply_loses_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source, target = DATA / "source.ply", Path("a.ply")
@@ -48,7 +48,7 @@ def test_nothing_is_lost_in_a_ply(
     assert target.read_bytes() == source.read_bytes()
 
 
-def test_quiet_warns_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_quiet_prints_only_warnings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["convert", str(DATA / "source.ply"), "--quiet"]
     assert main([*words, str(tmp_path / "a.spz")]) == 0
     assert capsys.readouterr() == ("", "")
@@ -58,7 +58,7 @@ def test_quiet_warns_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert printed.err.startswith("cvtgs: warning: ")
 
 
-def test_outputs_are_not_replaced_unasked(
+def test_outputs_are_replaced_only_with_overwrite(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["convert", str(DATA / "source.ply"), str(tmp_path / "a.sog"), "--quiet"]
@@ -67,7 +67,7 @@ def test_outputs_are_not_replaced_unasked(
 
 
 @pytest.mark.parametrize("name", ["a.ckpt", "a.xyz"])
-def test_what_cannot_be_written_is_refused_first(
+def test_unwritable_formats_are_refused_before_reading(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     assert main(["convert", str(tmp_path / "missing.ply"), str(tmp_path / name)]) == 1
@@ -77,7 +77,7 @@ def test_what_cannot_be_written_is_refused_first(
 
 @pytest.mark.parametrize("first", FORMATS)
 @pytest.mark.parametrize("second", FORMATS)
-def test_every_format_into_every_other(tmp_path: Path, first: str, second: str) -> None:
+def test_every_format_converts_to_every_other(tmp_path: Path, first: str, second: str) -> None:
     scene = replace(storable_scene(30, degree=0), comments=())
     save(scene, tmp_path / f"a.{first}")
     words = ["convert", str(tmp_path / f"a.{first}"), str(tmp_path / f"b.{second}"), "--quiet"]
@@ -89,7 +89,7 @@ def test_every_format_into_every_other(tmp_path: Path, first: str, second: str) 
 
 
 @pytest.mark.parametrize("end", FORMATS[1:])
-def test_simplify_and_info_take_every_format(
+def test_simplify_and_info_accept_every_format(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], end: str
 ) -> None:
     scene = replace(storable_scene(300, degree=0), comments=())
@@ -101,7 +101,7 @@ def test_simplify_and_info_take_every_format(
     assert "Gaussians        20" in capsys.readouterr().out
 
 
-def test_losses_of_a_ply_are_none() -> None:
+def test_losses_depend_on_the_format() -> None:
     scene = storable_scene(3)
     assert losses(scene, "a.ply") == Losses(dropped=(), changed=(), count=3, sh_degree=3)
     assert losses(scene, "A.SPLAT").sh_degree == 0
@@ -110,8 +110,10 @@ def test_losses_of_a_ply_are_none() -> None:
     assert losses(other, "a.spz").dropped == ()
 
 
-def test_axes_of_both_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Niantic's file comes out as the PLY that it was made of, and goes back to its axes."""
+def test_axes_apply_to_the_input_and_the_output(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Niantic's file converts to the PLY that it was made from, and back to its own axes."""
     source, small = load(DATA / "source.ply"), tmp_path / "a.spz"
     words = ["convert", str(DATA / "niantic-v3.spz"), "--quiet"]
     assert main([*words, str(tmp_path / "a.ply"), "--axes", "rub"]) == 0
@@ -129,10 +131,10 @@ def test_axes_of_both_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert_within(source, load(tmp_path / "c.spz", axes="rub"), {"means": 1e-3})
     capsys.readouterr()
     assert main([*words, str(tmp_path / "d.ply"), "--axes", "up"]) == 1
-    assert "axes must be three letters" in capsys.readouterr().err
+    assert "axes must be the directions of x, y and z" in capsys.readouterr().err
 
 
-def test_simplify_and_levels_take_axes(tmp_path: Path) -> None:
+def test_simplify_and_levels_accept_axes(tmp_path: Path) -> None:
     scene = replace(storable_scene(300, degree=1), comments=())
     save(scene, tmp_path / "a.spz", axes="rub")
     words = ["--axes", "rub:luf", "--quiet"]
@@ -151,7 +153,7 @@ def test_simplify_and_levels_take_axes(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
 @pytest.mark.parametrize("end", FORMATS)
-def test_dropped_bands_make_files_smaller(
+def test_sh_degree_drops_the_bands_above_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], end: str
 ) -> None:
     source = tmp_path / "a.ply"

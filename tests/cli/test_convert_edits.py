@@ -25,7 +25,7 @@ def converted(folder: Path, *words: str) -> GaussianScene:
     return load(target)
 
 
-def test_each_edit_is_that_of_the_api(tmp_path: Path, scene: GaussianScene) -> None:
+def test_each_edit_equals_that_of_the_api(tmp_path: Path, scene: GaussianScene) -> None:
     box, ball = Box(min=(-1, -1, -1), max=(0, 1, 1)), Sphere(center=(1.0, 0.0, 0.0), radius=0.7)
     regions = ["--crop-box=-1,-1,-1,0,1,1", "--crop-sphere", "1,0,0,0.7"]
     assert same_bits(converted(tmp_path, *regions), crop(scene, [box, ball]))
@@ -37,7 +37,7 @@ def test_each_edit_is_that_of_the_api(tmp_path: Path, scene: GaussianScene) -> N
     assert same_bits(converted(tmp_path), scene)
 
 
-def test_scenes_of_several_files_and_formats(tmp_path: Path, scene: GaussianScene) -> None:
+def test_merge_accepts_several_files_and_formats(tmp_path: Path, scene: GaussianScene) -> None:
     save(random_scene(7, seed=1, degree=2), tmp_path / "b.ply")
     save(random_scene(5, seed=2, degree=0), tmp_path / "c.glb")
     others = [load(tmp_path / "b.ply"), load(tmp_path / "c.glb")]
@@ -47,7 +47,7 @@ def test_scenes_of_several_files_and_formats(tmp_path: Path, scene: GaussianScen
     assert (len(found), found.sh_degree) == (212, 2)
 
 
-def test_what_is_printed(
+def test_dropped_gaussians_and_bands_are_printed(
     tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--crop-sphere", "0,0,0,2", "--min-opacity", "0.5", "--sh-degree", "0"]
@@ -55,14 +55,14 @@ def test_what_is_printed(
     inside = crop(merge([scene, scene]), [Sphere(center=(0.0, 0.0, 0.0), radius=2.0)])
     printed = " ".join(capsys.readouterr().out.split())
     assert (
-        f"Lost: {400 - len(inside)} Gaussians (outside of --crop-box and --crop-sphere); "
+        f"Lost: {400 - len(inside)} Gaussians (outside --crop-box and --crop-sphere); "
         f"{len(inside) - len(found)} Gaussians (below --min-opacity); SH bands above degree 0 "
         f"(--sh-degree)."
     ) in printed
     assert 0 < len(found) < len(inside) < 400
 
 
-def test_edits_are_in_the_axes_of_a_ply(tmp_path: Path, scene: GaussianScene) -> None:
+def test_edits_use_the_axes_of_a_ply(tmp_path: Path, scene: GaussianScene) -> None:
     save(scene, tmp_path / "turned.ply", axes="rub")
     words = [str(tmp_path / "turned.ply"), str(tmp_path / "out.ply"), "--axes", "rub", "--quiet"]
     assert main(["convert", *words, "--crop-box=-9,0,-9,9,9,9"]) == 0
@@ -72,19 +72,22 @@ def test_edits_are_in_the_axes_of_a_ply(tmp_path: Path, scene: GaussianScene) ->
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--crop-box", "1,2,3"], "--crop-box must be six numbers x,y,z,X,Y,Z, the least and the"),
-        (["--crop-box", "1,0,0,0,1,1"], "--crop-box must be six finite numbers, the least"),
+        (
+            ["--crop-box", "1,2,3"],
+            "--crop-box must be six numbers x,y,z,X,Y,Z, the minimum and max",
+        ),
+        (["--crop-box", "1,0,0,0,1,1"], "--crop-box must be six finite numbers, the small"),
         (["--crop-sphere", "0,0,0,-1"], "a radius of at least 0"),
-        (["--crop-sphere", "0,0,0,0"], "at least one Gaussian must be left to be written, found n"),
+        (["--crop-sphere", "0,0,0,0"], "at least one Gaussian must be left to write, found n"),
         (["--min-opacity", "2"], "--min-opacity must be from 0 to 1, found 2.0."),
         (["--max-size", "0"], "--max-size must be above 0, found 0.0."),
         (["--scale", "-1"], "--scale must be above 0, found -1.0."),
         (["--rotate", "90"], "--rotate must be three numbers x,y,z, degrees about each axis, fou"),
-        (["--translate", "nan,0,0"], "a motion must be of finite numbers"),
+        (["--translate", "nan,0,0"], "a motion must consist of finite numbers"),
         (["--merge", "missing.ply"], "missing.ply: the file to read must exist, found none."),
     ],
 )
-def test_wrong_edits_write_nothing(
+def test_invalid_edits_write_nothing(
     tmp_path: Path,
     scene: GaussianScene,
     capsys: pytest.CaptureFixture[str],
@@ -98,7 +101,7 @@ def test_wrong_edits_write_nothing(
     assert not target.exists()
 
 
-def test_older_spz_on_request(tmp_path: Path, scene: GaussianScene) -> None:
+def test_older_spz_versions_are_written_on_request(tmp_path: Path, scene: GaussianScene) -> None:
     source, target = tmp_path / "a.ply", tmp_path / "a.spz"
     words = ["convert", str(source), str(target), "--overwrite", "--quiet"]
     starts = {}

@@ -1,4 +1,4 @@
-"""``cvtgs doctor`` and ``cvtgs --version``: what is there, and does it work."""
+"""``cvtgs doctor`` and ``cvtgs --version``: which packages are installed, and do they work."""
 
 import platform
 import subprocess
@@ -14,7 +14,7 @@ from cvtgs.cli.doctor import BACKENDS, version_lines, version_of
 from cvtgs.cli.main import main
 
 
-def test_version_names_what_computes(capsys):
+def test_version_lists_the_packages_used_for_computation(capsys):
     with pytest.raises(SystemExit) as stopped:
         main(["--version"])
     lines = capsys.readouterr().out.splitlines()
@@ -25,12 +25,12 @@ def test_version_names_what_computes(capsys):
     assert lines == version_lines()
 
 
-def test_version_of_what_is_there_and_what_is_not():
+def test_versions_of_installed_and_missing_packages():
     assert version_of("torch") == metadata.version("torch")
     assert version_of("no-such-package") == "not installed"
 
 
-def test_version_loads_nothing():
+def test_version_imports_none_of_the_packages():
     code = (
         "import sys; from cvtgs.cli.doctor import version_lines; version_lines();"
         "print([name for name in ('torch', 'numpy', 'numba') if name in sys.modules])"
@@ -46,13 +46,13 @@ def _small(monkeypatch):
 
 
 @pytest.mark.usefixtures("_small")
-def test_a_healthy_machine(capsys):
+def test_doctor_reports_a_working_machine(capsys):
     assert main(["doctor", "--device", "cpu"]) == 0
     printed = capsys.readouterr().out
     assert "images by torch   yes" in printed
     assert "images by gsplat  no: " in printed
     used = "numba" if version_of("numba") != "not installed" else "torch"
-    assert f"images by {used:<7} yes (used: the fastest of those that work here)\n" in printed
+    assert f"images by {used:<7} yes (used: the fastest that works here)\n" in printed
     assert printed.count("(used: the fastest") == 1
     assert "nearest site by scipy (a k-d tree on the host" in printed
     assert "300 generated Gaussians to 10%" in printed
@@ -62,7 +62,7 @@ def test_a_healthy_machine(capsys):
 
 
 @pytest.mark.usefixtures("_small")
-def test_every_device_is_looked_at(capsys):
+def test_every_device_is_checked(capsys):
     assert main(["doctor"]) == 0
     printed = capsys.readouterr().out
     assert "\ncpu: " in printed
@@ -70,7 +70,7 @@ def test_every_device_is_looked_at(capsys):
 
 
 @pytest.mark.usefixtures("_small")
-def test_a_default_path_that_fails_ends_with_1(capsys, monkeypatch):
+def test_a_failing_default_path_exits_with_1(capsys, monkeypatch):
     def broken(*words: object, **settings: object) -> None:
         raise RuntimeError("no kernel image is available\nand much more")
 
@@ -85,10 +85,10 @@ def test_a_default_path_that_fails_ends_with_1(capsys, monkeypatch):
 
 
 @pytest.mark.usefixtures("_small")
-def test_a_wrong_image_is_noticed(capsys, monkeypatch):
+def test_a_black_image_is_an_error(capsys, monkeypatch):
     monkeypatch.setattr("cvtgs.synthetic.demo_scene", all_black)
     assert main(["doctor", "--device", "cpu"]) == 1
-    assert "a mean colour of 0 came out" in capsys.readouterr().err
+    assert "Gaussians and a mean colour of 0; try" in capsys.readouterr().err
 
 
 def all_black(count: int, *, sh_degree: int) -> cvtgs.GaussianScene:
@@ -96,6 +96,6 @@ def all_black(count: int, *, sh_degree: int) -> cvtgs.GaussianScene:
     return scene.with_tensors({"sh0": torch.full_like(scene.sh0, -9.0)}, {})
 
 
-def test_a_device_that_is_not_there(capsys):
+def test_an_unknown_device_is_refused(capsys):
     assert main(["doctor", "--device", "nowhere"]) == 1
     assert "device 'nowhere' cannot be used here" in capsys.readouterr().err

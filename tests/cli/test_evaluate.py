@@ -84,14 +84,14 @@ def test_downscaled_photographs_are_found_without_a_size(folder, scenes, capsys)
     assert (evaluation.width, evaluation.height) == (64, 48)
 
 
-def test_photographs_of_another_shape_are_one_sentence(folder, scenes, tmp_path, capsys):
+def test_another_aspect_ratio_is_refused_in_one_sentence(folder, scenes, tmp_path, capsys):
     for number in range(9):
         (tmp_path / f"{number}.png").write_bytes(encode(np.zeros((48, 48, 3), np.uint8), "png"))
     words = ["--cameras", str(folder), "--images", str(tmp_path)]
     assert main(["evaluate", *scenes[:2], *words]) == 1
     assert capsys.readouterr().err == (
-        f"cvtgs: error: {tmp_path}: photographs must have the shape of the cameras' images, "
-        f"64 x 48 or smaller, found 48 x 48.\n"
+        f"cvtgs: error: {tmp_path}: photographs must have the aspect ratio of the cameras' "
+        f"images, 64 x 48 or smaller, found 48 x 48.\n"
     )
 
 
@@ -120,14 +120,14 @@ def test_tradeoff_against_photographs(folder, scenes, tmp_path, capsys):
         (["--cameras", "nowhere.json"], "nowhere.json: "),
     ],
 )
-def test_bad_arguments_get_one_sentence(scenes, capsys, words, text):
+def test_invalid_arguments_are_refused_in_one_sentence(scenes, capsys, words, text):
     assert main(["evaluate", *scenes[:2], *words]) == 1
     errors = capsys.readouterr().err
     assert errors.startswith(f"cvtgs: error: {text}")
     assert errors.count("\n") == 1
 
 
-def test_photographs_that_are_missing_are_named(folder, scenes, tmp_path, capsys):
+def test_missing_photographs_are_counted_and_named(folder, scenes, tmp_path, capsys):
     words = ["--cameras", str(folder), "--images", str(tmp_path)]
     assert main(["evaluate", *scenes[:2], *words]) == 1
     assert "9 of 9 cameras have none, the first is 'images/" in capsys.readouterr().err
@@ -138,7 +138,7 @@ def test_a_scene_given_twice_is_refused(scenes, capsys):
     assert "every scene must be given once" in capsys.readouterr().err
 
 
-def test_scenes_of_the_same_name_are_told_apart(scenes, tmp_path, capsys):
+def test_scenes_of_the_same_name_are_printed_with_their_paths(scenes, tmp_path, capsys):
     (tmp_path / "full.ply").write_bytes((tmp_path / scenes[1]).read_bytes())
     words = [scenes[0], str(tmp_path / "full.ply"), *SMALL, "--lpips", "off"]
     assert main(["evaluate", *words]) == 0
@@ -185,7 +185,7 @@ def test_evaluate_and_compare_print_the_same_scores(folder, scenes, tmp_path, ca
         assert capsys.readouterr().out.startswith(evaluated)
 
 
-def test_compare_takes_eight_of_many_cameras(folder, scenes, tmp_path, capsys):
+def test_compare_shows_at_most_eight_cameras(folder, scenes, tmp_path, capsys):
     words = ["--cameras", str(folder / "transforms.json"), "--lpips", "off"]
     assert main(["compare", *scenes[:2], "-o", str(tmp_path), *words]) == 0
     page = (tmp_path / "index.html").read_text(encoding="utf-8")

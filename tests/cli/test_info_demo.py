@@ -14,7 +14,7 @@ from cvtgs.mergenet import (
 )
 
 
-def test_info_shows_what_the_file_holds(tmp_path, capsys):
+def test_info_prints_counts_and_statistics(tmp_path, capsys):
     path = tmp_path / "in.ply"
     scene = cvtgs.synthetic.scene("landscape", 2000, sh_degree=2, seed=0)
     cvtgs.save(scene, path)
@@ -24,7 +24,7 @@ def test_info_shows_what_the_file_holds(tmp_path, capsys):
         assert text in printed
 
 
-def test_info_as_json_is_the_scene_info(tmp_path, capsys):
+def test_info_as_json_equals_describe(tmp_path, capsys):
     path = tmp_path / "in.ply"
     scene = cvtgs.synthetic.scene("room", 300, sh_degree=0, seed=0)
     cvtgs.save(scene, path)
@@ -51,8 +51,8 @@ def test_info_shows_how_a_checkpoint_was_trained(tmp_path, capsys):
         "seed, steps      7, 1,200",
         f"started from     {'cd' * 32}",
         'configuration    {"seed":7}',
-        f"learned from     yard, 1,500, {'ab' * 32}",
-        "validated with   generated-room-3, 20,000, generated",
+        f"trained on       yard, 1,500, {'ab' * 32}",
+        "validated on     generated-room-3, 20,000, generated",
     ):
         assert line in printed
     assert main(["info", str(path), "--json"]) == 0
@@ -65,10 +65,10 @@ def test_info_of_a_shipped_checkpoint_and_of_a_damaged_one(tmp_path, capsys):
     assert f"digest           {digest}" in capsys.readouterr().out.splitlines()
     (tmp_path / "bad.safetensors").write_bytes(b"nothing")
     assert main(["info", str(tmp_path / "bad.safetensors")]) == 1
-    assert "no safetensors file, or damaged" in capsys.readouterr().err
+    assert "not a safetensors file, or it is damaged" in capsys.readouterr().err
 
 
-def test_demo_writes_three_scenes_and_a_page_and_says_what_is_next(tmp_path, capsys, monkeypatch):
+def test_demo_writes_three_scenes_and_a_page_and_prints_next_steps(tmp_path, capsys, monkeypatch):
     for name, value in (("VIEWS", 2), ("WIDTH", 64), ("HEIGHT", 48)):
         monkeypatch.setattr(demo, name, value)
     folder = tmp_path / "demo"
@@ -90,10 +90,10 @@ def test_demo_writes_three_scenes_and_a_page_and_says_what_is_next(tmp_path, cap
     assert capsys.readouterr().out == ""
 
 
-def test_demo_names_the_folder_it_cannot_make(tmp_path, capsys):
+def test_demo_refuses_a_folder_that_cannot_be_created(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert main(["demo", "-o", str(tmp_path / "file" / "demo"), "--count", "10"]) == 1
-    assert "must become a folder" in capsys.readouterr().err
+    assert "must be a folder or a new path" in capsys.readouterr().err
 
 
 def test_size_text():

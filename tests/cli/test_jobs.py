@@ -33,7 +33,7 @@ def wrong_usage(*words: str) -> int:
 
 
 @pytest.mark.parametrize("given", [NAMES, ("*",), ("a.ply", "[bc].*")])
-def test_many_scenes_get_a_line_each(
+def test_each_of_many_scenes_gets_a_line(
     scenes: Path, capsys: pytest.CaptureFixture[str], given: tuple[str, ...]
 ) -> None:
     assert main(["simplify", *given, "--rho", "10%", "-o", "out", *SMALL]) == 0
@@ -50,11 +50,11 @@ def test_many_scenes_get_a_line_each(
     assert printed.err == ""
 
 
-def test_a_folder_stands_for_the_scenes_in_it(
+def test_a_folder_is_expanded_to_the_scenes_in_it(
     scenes: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (scenes / "notes.txt").write_text("not a scene")
-    (scenes / "model").mkdir()  # of a trained model: one scene
+    (scenes / "model").mkdir()  # the folder of a trained model is one scene
     cvtgs.save(cvtgs.load("a.ply"), "model/point_cloud.ply")
     (scenes / "model" / "other.ply").write_text("not read")
     assert main(["convert", ".", "model", "-o", "out", "--suffix", ".splat", "--quiet"]) == 0
@@ -66,7 +66,7 @@ def test_a_folder_stands_for_the_scenes_in_it(
     assert "none: must be a file or the folder of a trained model" in capsys.readouterr().err
 
 
-def test_one_suffix_for_all(scenes: Path) -> None:
+def test_suffix_applies_to_all_scenes(scenes: Path) -> None:
     assert main(["convert", *NAMES, "-o", "deep/out", "--suffix", "splat", "--quiet"]) == 0
     names = {path.name for path in Path("deep/out").iterdir()}
     assert names == {"a.splat", "b.splat", "c.splat"}
@@ -80,7 +80,7 @@ def test_paths_may_stand_between_options(scenes: Path) -> None:
     assert len(cvtgs.load("z.ply")) == 10
 
 
-def test_smaller_scenes_stay_as_they_are(scenes: Path) -> None:
+def test_max_count_leaves_smaller_scenes_unchanged(scenes: Path) -> None:
     assert main(["simplify", *NAMES, "-o", "out", "--max-count", "0.15k", "--quiet", *SMALL]) == 0
     assert [len(cvtgs.load(Path("out") / name)) for name in NAMES] == [100, 150, 150]
     assert Path("out/a.ply").read_bytes() == Path("a.ply").read_bytes()
@@ -109,11 +109,11 @@ def test_a_scene_that_fails_does_not_stop_the_others(
             "the same name in ., found a.ply and a.spz.",
         ),
         (["nothing*", "-o", "out"], "nothing*: the pattern must match a file, found none."),
-        (["a.ply", "-o", "a.ply"], "a.ply: must become a folder, found: "),
+        (["a.ply", "-o", "a.ply"], "a.ply: must be a folder or a new path, found: "),
         (["a.ply", "c.spz", "-o", "out", "--suffix", "xyz"], "the file name must end in "),
     ],
 )
-def test_wrong_jobs_are_refused_before_the_work(
+def test_invalid_jobs_are_refused_before_the_work(
     scenes: Path, capsys: pytest.CaptureFixture[str], words: list[str], text: str
 ) -> None:
     Path("a.spz").write_bytes(Path("c.spz").read_bytes())
@@ -124,26 +124,24 @@ def test_wrong_jobs_are_refused_before_the_work(
     assert not list(Path().glob("out/*"))
 
 
-def test_a_report_is_for_one_scene(scenes: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_report_needs_exactly_one_scene(scenes: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["simplify", *NAMES, "-o", "out", "--rho", "0.1", "--report", "r.json", *SMALL]
     assert main(words) == 1
-    assert capsys.readouterr().err == "cvtgs: error: --report is for one scene, found 3.\n"
+    assert capsys.readouterr().err == "cvtgs: error: --report needs exactly one scene, found 3.\n"
 
 
 @pytest.mark.parametrize(
     "words",
     [["a.ply"], ["a.ply", "b.ply", "c.ply"], ["-", "-o", "out"], ["a", "b.ply", "--suffix", "spz"]],
 )
-def test_paths_that_do_not_go_together_are_wrong_usage(
+def test_invalid_combinations_of_paths_are_usage_errors(
     scenes: Path, capsys: pytest.CaptureFixture[str], words: list[str]
 ) -> None:
     assert wrong_usage("convert", *words) == 2
     assert "usage: cvtgs convert IN OUT " in capsys.readouterr().err
 
 
-def test_the_last_line_says_where_the_output_is(
-    scenes: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_last_line_names_the_output(scenes: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simplify", "a.ply", "z.ply", "--rho", "0.1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1].startswith("z.ply: 100 -> 10 Gaussians, 7.3 kB -> ")
@@ -155,7 +153,7 @@ def test_the_last_line_says_where_the_output_is(
     assert max(map(len, lines)) <= 80
 
 
-def test_sizes_are_of_before_and_after_in_place(
+def test_sizes_before_and_after_are_right_in_place(
     scenes: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = Path("a.ply").stat().st_size
@@ -167,14 +165,14 @@ def test_sizes_are_of_before_and_after_in_place(
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_standard_streams(
+def test_standard_input_and_output_hold_scenes(
     scenes: Path,
     capsysbinary: pytest.CaptureFixture[bytes],
     monkeypatch: pytest.MonkeyPatch,
     name: str,
 ) -> None:
     class Stream(io.TextIOWrapper):
-        """Standard input of these bytes."""
+        """Standard input with given bytes."""
 
     monkeypatch.setattr(sys, "stdin", Stream(io.BytesIO(Path(name).read_bytes())))
     assert main(["simplify", "-", "-", "--count", "7", "--suffix", ".spz", *SMALL]) == 0
@@ -191,13 +189,13 @@ def test_standard_streams(
         (
             b"what?",
             "standard input: the first bytes must be those of a .ply, .spz, .sog, .glb or .pt, "
-            "found b'what'; write a scene of another format to a file, whose name says which it "
-            "is.",
+            "found b'what'; save a scene in another format as a file, whose suffix gives the "
+            "format.",
         ),
         (b"ply\nx", "standard input: the PLY header must end with a line 'end_header'"),
     ],
 )
-def test_standard_input_that_is_no_scene(
+def test_standard_input_without_a_scene_is_refused(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
@@ -211,7 +209,7 @@ def test_standard_input_that_is_no_scene(
 
 
 @pytest.mark.slow
-def test_a_pipe_of_two_commands(scenes: Path) -> None:
+def test_two_commands_work_in_a_pipe(scenes: Path) -> None:
     program = f"{sys.executable} -m cvtgs"
     line = f"cat a.ply | {program} simplify - - --rho 10% | {program} convert - z.splat"
     done = subprocess.run(line, shell=True, capture_output=True, text=True, check=True)
@@ -219,20 +217,20 @@ def test_a_pipe_of_two_commands(scenes: Path) -> None:
     assert done.stdout.splitlines()[-1].startswith("z.splat: 10 Gaussians of SH degree 0, ")
 
 
-def test_nothing_binary_goes_to_a_terminal(
+def test_a_scene_is_not_written_to_a_terminal(
     scenes: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     assert main(["convert", "a.ply", "-"]) == 1
     assert capsys.readouterr().err == (
-        "cvtgs: error: the OUT - must be a pipe or a file, found a terminal.\n"
+        "cvtgs: error: standard output must be a pipe or a file, found a terminal.\n"
     )
 
 
 def test_a_plain_run_makes_no_temporary_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A kill would leave it in the system's folder for ever."""
+    """A killed process would leave it in the system's temporary folder for ever."""
     cvtgs.save(cvtgs.synthetic.scene("object", 100, sh_degree=0), tmp_path / "in.ply")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
     assert main(["convert", str(tmp_path / "in.ply"), str(tmp_path / "out.ply"), "--quiet"]) == 0

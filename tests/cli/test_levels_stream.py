@@ -19,7 +19,7 @@ def words(tmp_path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("kind", ["sog", "3dtiles"])
-def test_a_stream(
+def test_a_stream_holds_every_level(
     tmp_path: Path, words: list[str], kind: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*words, "--stream", kind, "--chunk", "300", "--rho", "1,0.1,0.01"]) == 0
@@ -42,20 +42,23 @@ def test_a_small_stream_is_one_chunk(words: list[str], capsys: pytest.CaptureFix
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (["--stream", "sog", "--suffix", ".spz"], "--suffix cannot go with --stream"),
-        (["--chunk", "300"], "--chunk goes with --stream."),
-        (["--stream", "3dtiles", "--environment", "9"], "and goes with --stream sog; found 9."),
+        (["--stream", "sog", "--suffix", ".spz"], "--suffix cannot be used with --stream"),
+        (["--chunk", "300"], "--chunk needs --stream."),
+        (["--stream", "3dtiles", "--environment", "9"], "and needs --stream sog; found 9."),
         (["--stream", "sog", "--environment", "-1"], "--environment must be above 0"),
-        (["--memory", "2GB"], "--memory goes with --stream."),
-        (["--stream", "sog", "--place", "8,47"], "goes with --stream 3dtiles."),
-        (["--stream", "3dtiles", "--place", "8"], "--place must be 2 or 3 numbers with commas"),
+        (["--memory", "2GB"], "--memory needs --stream."),
+        (["--stream", "sog", "--place", "8,47"], "and it needs --stream 3dtiles."),
+        (
+            ["--stream", "3dtiles", "--place", "8"],
+            "--place must be 2 or 3 numbers separated by commas",
+        ),
         (["--stream", "3dtiles", "--place", "8,97"], "a latitude from -90 to 90"),
         (["--stream", "3dtiles", "--transform", "1,2"], "--transform must be 16 numbers"),
         (["--stream", "3dtiles", "--workers", "0"], "--workers must be at least 1"),
         (["--stream", "sog", "--chunk", "0"], "--chunk must be at least 1, found 0."),
     ],
 )
-def test_options_that_do_not_fit(
+def test_invalid_options_are_refused_before_the_work(
     tmp_path: Path,
     words: list[str],
     more: list[str],
@@ -67,7 +70,7 @@ def test_options_that_do_not_fit(
     assert not (tmp_path / "out").exists()
 
 
-def test_blocks(
+def test_a_large_scene_is_streamed_in_blocks(
     tmp_path: Path,
     words: list[str],
     capsys: pytest.CaptureFixture[str],
@@ -85,7 +88,7 @@ def test_blocks(
 
 
 def first_bytes(folder: Path) -> int:
-    """Bytes that a viewer must fetch before it can show all of the scene, at its coarsest."""
+    """Return the bytes that a viewer must fetch to show the whole scene at its coarsest level."""
 
     def files_of(node: dict[str, Any]) -> set[str]:
         if "content" in node:
@@ -104,7 +107,7 @@ def first_bytes(folder: Path) -> int:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sog", "3dtiles"])
-def test_the_first_image_takes_a_twentieth_of_the_bytes(tmp_path: Path, kind: str) -> None:
+def test_the_first_image_needs_a_twentieth_of_the_bytes(tmp_path: Path, kind: str) -> None:
     source, out = tmp_path / "a.ply", tmp_path / "out"
     save(synthetic.scene("courtyard", 20_000, sh_degree=1, seed=1), source)
     words = ["levels", str(source), "-o", str(out), "--preset", "draft", "--quiet"]

@@ -37,13 +37,13 @@ def test_help_names_every_format():
     assert read == {*READABLE_SUFFIXES, "meta.json", "lod-meta.json"}
 
 
-def test_version(capsys):
+def test_version_starts_with_that_of_cvtgs(capsys):
     with pytest.raises(SystemExit):
         main(["--version"])
     assert capsys.readouterr().out.startswith(f"cvtgs {cvtgs.__version__}\n")
 
 
-def test_help_loads_neither_torch_nor_numpy():
+def test_help_imports_no_heavy_package():
     code = (
         "import sys; from cvtgs.cli.main import build_parser; build_parser().format_help();"
         "print([name for name in ('torch', 'numpy', 'scipy', 'rich') if name in sys.modules])"
@@ -126,7 +126,7 @@ def test_an_error_is_one_sentence_on_stderr(tmp_path, capsys):
     assert captured.err.count("\n") == 1
 
 
-def test_the_parser_is_made_anew():
+def test_each_call_builds_a_new_parser():
     assert build_parser() is not build_parser()
 
 
@@ -149,7 +149,7 @@ def test_a_signal_leaves_no_output_behind(tmp_path, number, code):
 
 
 def wait_for_handler(pid: int, number: int) -> None:
-    """Wait until the process catches the signal, and then until it computes."""
+    """Wait until the process handles the signal and its computation has started."""
     status = Path(f"/proc/{pid}/status")
     if not status.exists():
         pytest.skip("needs /proc to see when a process catches signals")
@@ -166,7 +166,7 @@ def wait_for_handler(pid: int, number: int) -> None:
 
 
 @pytest.mark.slow
-def test_python_m_cvtgs_and_broken_pipe_do_not_trace_back():
+def test_an_error_of_python_m_cvtgs_prints_no_traceback():
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     result = run_cvtgs("info", "missing.ply", env=environment)
     assert result.returncode == 1
@@ -179,7 +179,7 @@ full_disk = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /de
 @pytest.mark.slow
 @full_disk
 @pytest.mark.parametrize("words", [["info", "a.ply"], ["--version"], ["info", "--help"]])
-def test_a_full_disk_behind_stdout_is_one_sentence(tmp_path, words):
+def test_a_full_disk_behind_stdout_is_reported_in_one_sentence(tmp_path, words):
     cvtgs.save(cvtgs.synthetic.scene("object", 20, sh_degree=0, seed=0), tmp_path / "a.ply")
     with Path("/dev/full").open("w") as full:
         done = run_into(full, tmp_path, *words)
@@ -198,7 +198,7 @@ def run_into(stdout, folder: Path, *words: str) -> subprocess.CompletedProcess[s
 
 @pytest.mark.slow
 @full_disk
-def test_what_cannot_be_said_on_stderr_changes_no_exit_code(tmp_path):
+def test_an_unwritable_stderr_does_not_change_the_exit_status(tmp_path):
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
             [sys.executable, "-m", "cvtgs", "info", "no.ply"], stderr=full, check=False
@@ -207,7 +207,7 @@ def test_what_cannot_be_said_on_stderr_changes_no_exit_code(tmp_path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="closes pipes as POSIX does")
-def test_a_reader_that_leaves_is_no_error(tmp_path):
+def test_a_closed_pipe_exits_with_141_and_no_message(tmp_path):
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, "w") as closed:
@@ -215,13 +215,13 @@ def test_a_reader_that_leaves_is_no_error(tmp_path):
     assert (done.returncode, done.stderr) == (141, "")
 
 
-def test_a_signal_lost_where_nothing_can_be_raised_is_sent_again(tmp_path, monkeypatch, capsys):
+def test_a_signal_ignored_in_a_destructor_is_sent_again(tmp_path, monkeypatch, capsys):
     class Deaf:
         def __del__(self):
             signal.raise_signal(signal.SIGINT)
 
     def run(options):
-        Deaf()  # its exception is lost
+        Deaf()  # Python ignores exceptions in __del__
         deadline = time.monotonic() + 30
         while time.monotonic() < deadline:
             time.sleep(0.01)
@@ -232,7 +232,7 @@ def test_a_signal_lost_where_nothing_can_be_raised_is_sent_again(tmp_path, monke
     assert capsys.readouterr().err == "cvtgs: interrupted; no incomplete file is left.\n"
 
 
-def test_an_interrupt_that_becomes_another_error_is_an_interrupt(monkeypatch, capsys):
+def test_an_interrupt_turned_into_another_error_stays_one(monkeypatch, capsys):
     def run(options):
         try:
             signal.raise_signal(signal.SIGTERM)
@@ -245,8 +245,8 @@ def test_an_interrupt_that_becomes_another_error_is_an_interrupt(monkeypatch, ca
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends signals as POSIX does")
-def test_an_interrupt_while_the_code_is_loaded_is_no_traceback(tmp_path):
-    """The first import of the command line sends it."""
+def test_an_interrupt_during_import_prints_no_traceback(tmp_path):
+    """An import hook sends the signal at the first import of the command line."""
     (tmp_path / "cvtgs_stop.py").write_text(
         "import signal, sys\n"
         "class Stop:\n"
@@ -262,7 +262,7 @@ def test_an_interrupt_while_the_code_is_loaded_is_no_traceback(tmp_path):
 
 
 def completed(script: str, *words: str) -> list[str]:
-    """Return what bash offers for the last of the words."""
+    """Return the completions that bash offers for the last word."""
     given = " ".join(f"'{word}'" for word in words)
     line = f"{script}\nCOMP_WORDS=({given}); COMP_CWORD={len(words) - 1}; _cvtgs\n"
     line += 'printf "%s\\n" "${COMPREPLY[@]}"'
@@ -305,8 +305,8 @@ def test_every_option_of_every_command_is_in_every_script(capsys):
     assert "__fish_seen_subcommand_from completion' -x -a 'bash zsh fish'" in script
 
 
-def test_zsh_completes_also_where_compinit_was_not_called(capsys):
+def test_zsh_completion_calls_compinit_if_necessary(capsys):
     assert main(["completion", "zsh"]) == 0
     first, second, *_ = capsys.readouterr().out.splitlines()
     assert first == "(( $+functions[compdef] )) || { autoload -U compinit && compinit }"
-    assert "bashcompinit" in second  # which calls compdef
+    assert "bashcompinit" in second  # bashcompinit calls compdef

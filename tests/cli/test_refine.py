@@ -1,4 +1,4 @@
-"""``cvtgs simplify --refine``: options, report, summary, and what an interrupt leaves."""
+"""``cvtgs simplify --refine``: options, report, summary and interrupts."""
 
 import io
 import json
@@ -21,7 +21,7 @@ def source(tmp_path) -> Path:
     return path
 
 
-def test_steps_in_the_report_and_the_summary(source, tmp_path, capsys):
+def test_steps_are_in_the_report_and_the_summary(source, tmp_path, capsys):
     output, report = tmp_path / "out.ply", tmp_path / "report.json"
     words = ["simplify", str(source), str(output), "--rho", "0.1", "--report", str(report)]
     assert main([*words, "--refine-steps", "5"]) == 0
@@ -36,14 +36,14 @@ def test_steps_in_the_report_and_the_summary(source, tmp_path, capsys):
     assert " refine " in " ".join(printed.split())
 
 
-def test_seconds(source, tmp_path):
+def test_refine_stops_at_its_time_limit_or_earlier(source, tmp_path):
     report = tmp_path / "report.json"
     words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.1"]
     assert main([*words, "--refine", "1", "--report", str(report)]) == 0
     assert json.loads(report.read_text())["refinement"]["stopped"] in ("time", "patience")
 
 
-def test_it_is_off_by_default(source, tmp_path):
+def test_refinement_is_off_by_default(source, tmp_path):
     report = tmp_path / "report.json"
     words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.1"]
     assert main([*words, "--report", str(report)]) == 0
@@ -64,13 +64,13 @@ def test_it_is_off_by_default(source, tmp_path):
         ),
     ],
 )
-def test_bad_numbers_are_found_before_the_work(tmp_path, capsys, words, text):
+def test_invalid_limits_are_refused_before_the_work(tmp_path, capsys, words, text):
     missing = str(tmp_path / "missing.ply")
     assert main(["simplify", missing, str(tmp_path / "out.ply"), "--rho", "0.1", *words]) == 1
     assert capsys.readouterr().err == f"cvtgs: error: {text}\n"
 
 
-def test_an_interrupt_leaves_nothing(source, tmp_path, capsys, monkeypatch):
+def test_an_interrupt_leaves_no_output(source, tmp_path, capsys, monkeypatch):
     module = import_module("cvtgs.refinement.optimize")
     honest, calls = module.relative_loss, []
 
@@ -94,13 +94,13 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_the_bar_shows_the_gain(monkeypatch):
+def test_the_progress_bar_shows_the_gain(monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setattr("sys.stderr", Terminal())
     with progress_bars(quiet=False) as listener:
         for done, note in ((0, ""), (1, "+0.50 dB"), (2, "+1.25 dB"), (2, "")):
             listener(ProgressEvent(stage="refine", done=done, total=2, note=note))
-        import sys  # noqa: PLC0415 (the one that is patched)
+        import sys  # noqa: PLC0415 (after sys.stderr is patched)
 
         stream = sys.stderr
     assert "refine +1.25 dB" in stream.getvalue()

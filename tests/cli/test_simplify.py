@@ -1,4 +1,4 @@
-"""``cvtgs simplify``: options, files, reports, and what bad input gets."""
+"""``cvtgs simplify``: options, files, reports and invalid input."""
 
 import json
 import math
@@ -18,7 +18,7 @@ def source(tmp_path) -> Path:
     return path
 
 
-def test_the_count_is_exact_and_the_summary_says_so(source, tmp_path, capsys):
+def test_the_count_is_exact_and_printed(source, tmp_path, capsys):
     output = tmp_path / "out.ply"
     assert main(["simplify", str(source), str(output), "--rho", "0.07"]) == 0
     assert len(cvtgs.load(output)) == 35
@@ -27,13 +27,13 @@ def test_the_count_is_exact_and_the_summary_says_so(source, tmp_path, capsys):
     assert printed.err == ""
 
 
-def test_count_instead_of_rho(source, tmp_path):
+def test_count_sets_the_number_of_gaussians(source, tmp_path):
     output = tmp_path / "out.ply"
     assert main(["simplify", str(source), str(output), "--count", "123"]) == 0
     assert len(cvtgs.load(output)) == 123
 
 
-def test_rho_1_returns_the_rows_of_the_file(source, tmp_path):
+def test_rho_1_writes_an_identical_file(source, tmp_path):
     output = tmp_path / "out.ply"
     assert main(["simplify", str(source), str(output), "--rho", "1"]) == 0
     assert output.read_bytes() == source.read_bytes()
@@ -58,7 +58,7 @@ def test_the_report_is_json_with_counts_costs_and_configuration(source, tmp_path
     assert all(stage["seconds"] >= 0 for stage in facts["stages"])
 
 
-def test_settings_win_over_the_file_and_the_file_over_the_preset(source, tmp_path):
+def test_settings_override_the_file_which_overrides_the_preset(source, tmp_path):
     config = tmp_path / "config.toml"
     config.write_text('preset = "paper"\n[cvt]\niterations = 2\ncolor = 0.2\n')
     report = tmp_path / "report.json"
@@ -97,7 +97,7 @@ def test_invalid_rows_are_dropped_and_counted(tmp_path, capsys):
     assert captured.err == (
         "cvtgs: warning: dropped 3 of 100 Gaussians with NaN, infinite or zero values (means 3).\n"
     )
-    assert "Fewer than the 98 asked for: only 97 of 100 Gaussians are valid." in captured.out
+    assert "Fewer than the requested 98: only 97 of 100 Gaussians are valid." in captured.out
     assert captured.out.count("\n") <= 5
     assert len(cvtgs.load(output)) == 97
 
@@ -124,7 +124,9 @@ def test_invalid_rows_are_dropped_and_counted(tmp_path, capsys):
         (["--rho", "0.1", "--device", "abacus"], "device 'abacus' cannot be used here: "),
     ],
 )
-def test_bad_arguments_get_one_sentence_and_no_output(source, tmp_path, capsys, words, text):
+def test_invalid_arguments_print_one_sentence_and_write_nothing(
+    source, tmp_path, capsys, words, text
+):
     output = tmp_path / "out.ply"
     assert main(["simplify", str(source), str(output), *words]) == 1
     errors = capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""``cvtgs tradeoff``: presets in processes of their own, tables and files."""
+"""``cvtgs tradeoff``: presets in separate processes, tables and files."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ def source(tmp_path) -> Path:
 
 
 @pytest.mark.slow
-def test_table_and_files(source, tmp_path, capsys):
+def test_the_table_is_printed_and_the_files_are_written(source, tmp_path, capsys):
     pytest.importorskip("matplotlib")
     words = ["tradeoff", str(source), "--presets", "draft,standard", "--rho", "0.1", *LOOK]
     assert main([*words, "-o", str(tmp_path / "out"), "--save"]) == 0
@@ -39,8 +39,8 @@ def test_table_and_files(source, tmp_path, capsys):
 
 
 @pytest.mark.long
-def test_a_run_that_fails_is_told_and_the_others_go_on(source, tmp_path, capsys, monkeypatch):
-    from cvtgs.tradeoff import runs  # noqa: PLC0415 (to be changed here)
+def test_a_failed_run_is_reported_and_the_others_continue(source, tmp_path, capsys, monkeypatch):
+    from cvtgs.tradeoff import runs  # noqa: PLC0415 (patched below)
 
     real = runs.run_process
 
@@ -65,14 +65,14 @@ def test_a_run_that_fails_is_told_and_the_others_go_on(source, tmp_path, capsys,
     [
         (
             ["--rho", "0.1,many"],
-            "--rho must be different numbers with commas, ",
+            "--rho must be different numbers separated by commas, ",
         ),
         (["--rho", "2"], "rho must be above 0 and at most 1; found 2.0."),
         (["--presets", "best"], "preset must be one of "),
         (["--views", "0"], "--views must be at least 1, found 0."),
     ],
 )
-def test_bad_arguments_get_one_sentence(source, tmp_path, capsys, words, text):
+def test_invalid_arguments_are_refused_in_one_sentence(source, tmp_path, capsys, words, text):
     assert main(["tradeoff", str(source), "-o", str(tmp_path / "out"), *words]) == 1
     errors = capsys.readouterr().err
     assert errors.startswith(f"cvtgs: error: {text}")

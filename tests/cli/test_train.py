@@ -1,4 +1,4 @@
-"""``cvtgs train`` from end to end, and ``cvtgs simplify --ckpt`` with what it made."""
+"""``cvtgs train`` from end to end, and ``cvtgs simplify --ckpt`` with its checkpoint."""
 
 import json
 from pathlib import Path
@@ -45,7 +45,7 @@ def write_config(folder: Path, *, preset: str = "standard", folders: str = '"sce
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
-    """A folder with scenes, a configuration, and what a training made of them."""
+    """A folder with scenes, a configuration, and the files that a training wrote."""
     folder = tmp_path_factory.mktemp("made")
     write_scenes(folder / "scenes", ["exam", "lesson"])
     words = ["train", str(write_config(folder)), "-o", str(folder / "net.safetensors"), "--quiet"]
@@ -55,13 +55,13 @@ def made(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def again(made, tmp_path) -> list[str]:
-    """The words of the same training to another output, with the cache that there is."""
+    """The arguments of the same training with another output and the existing cache."""
     words = ["train", str(made / "tiny.toml"), "-o", str(tmp_path / "net.safetensors")]
     return [*words, "--cache", str(made / "net.cache")]
 
 
 @pytest.mark.slow
-def test_everything_is_beside_the_checkpoint(made):
+def test_all_files_are_beside_the_checkpoint(made):
     names = {path.name for path in made.iterdir()}
     assert names == {
         "scenes",
@@ -75,7 +75,7 @@ def test_everything_is_beside_the_checkpoint(made):
     assert load_checkpoint(made / "net.safetensors").info.preset == "standard"
 
 
-def test_without_matplotlib_the_summary_says_so(again, tmp_path, capsys, monkeypatch):
+def test_the_summary_says_that_matplotlib_is_missing(again, tmp_path, capsys, monkeypatch):
     def curves(history: History) -> bytes:
         raise MissingDependencyError("charts need matplotlib")
 
@@ -83,30 +83,30 @@ def test_without_matplotlib_the_summary_says_so(again, tmp_path, capsys, monkeyp
     assert main(again) == 0
     last = capsys.readouterr().out.splitlines()[-1]
     assert last == (
-        f"{tmp_path / 'net.safetensors'}, no image of its curves: that needs "
+        f"{tmp_path / 'net.safetensors'}, no image of its curves, which needs "
         "pip install 'cvtgs[plots]'"
     )
 
 
-def test_a_line_per_validation_and_a_summary(again, made, tmp_path, capsys):
+def test_each_validation_gets_a_line_before_the_summary(again, made, tmp_path, capsys):
     assert main(again) == 0
     printed = capsys.readouterr()
     lines = printed.out.splitlines()
-    zero = "+0.00 (least +0.00)"
-    assert lines[0] == f"step 0: loss -, dB gained: {zero} at 0.06, {zero} at 0.03"
+    zero = "+0.00 (lowest +0.00)"
+    assert lines[0] == f"step 0: loss -, gain in dB: {zero} at 0.06, {zero} at 0.03"
     assert [line.split(",")[0].rsplit(" ", 1)[0] for line in lines[1:3]] == [
         "step 2: loss",
         "step 3: loss",
     ]
     assert lines[3].startswith("best at step ")
-    assert lines[3].endswith(" dB on scenes left out of training")
+    assert lines[3].endswith(" dB on held-out scenes")
     assert lines[4:] == [f"{tmp_path / 'net.safetensors'}, curves in {tmp_path / 'net.png'}"]
     assert printed.err == ""
     assert (tmp_path / "net.safetensors").read_bytes() == (made / "net.safetensors").read_bytes()
     assert not (tmp_path / "net.cache").exists()
 
 
-def test_the_worst_scene_is_told(capsys):
+def test_the_lowest_gain_is_printed(capsys):
     from cvtgs.cli.train import print_validation  # noqa: PLC0415
 
     history = History()
@@ -114,7 +114,8 @@ def test_the_worst_scene_is_told(capsys):
     history.validations.append(Validation(step=7, loss=-1.23456, gains=gains))
     print_validation(history)
     assert capsys.readouterr().out == (
-        "step 7: loss -1.235, dB gained: +0.25 (least -0.50) at 0.1, +3.00 (least +3.00) at 0.01\n"
+        "step 7: loss -1.235, gain in dB: +0.25 (lowest -0.50) at 0.1, "
+        "+3.00 (lowest +3.00) at 0.01\n"
     )
 
 
@@ -136,7 +137,7 @@ def test_an_existing_checkpoint_is_replaced_only_when_asked(again, made, tmp_pat
 
 
 @pytest.mark.slow
-def test_resume_goes_on_where_a_training_stopped(again, made, tmp_path, capsys, monkeypatch):
+def test_resume_continues_an_interrupted_training(again, made, tmp_path, capsys, monkeypatch):
     true_step = train_loop._step
 
     def breaking(state, *arguments) -> float:
@@ -157,13 +158,13 @@ def test_resume_goes_on_where_a_training_stopped(again, made, tmp_path, capsys, 
 
 
 @pytest.mark.slow
-def test_resume_of_nothing_starts(again, made, tmp_path):
+def test_resume_without_a_state_starts_a_training(again, made, tmp_path):
     assert main([*again, "--resume", "--quiet"]) == 0
     assert (tmp_path / "net.state").read_bytes() == (made / "net.state").read_bytes()
 
 
 @pytest.mark.slow
-def test_scenes_from_the_command_line(made, tmp_path, capsys):
+def test_scenes_can_be_given_on_the_command_line(made, tmp_path, capsys):
     config = write_config(tmp_path, folders="")
     words = ["train", str(config), "-o", str(tmp_path / "net.safetensors"), "--quiet"]
     assert main(words) == 1
@@ -188,7 +189,9 @@ def test_scenes_from_the_command_line(made, tmp_path, capsys):
     ],
     ids=["suffix", "config", "scenes", "device", "folder"],
 )
-def test_bad_arguments_get_one_sentence_and_no_output(again, tmp_path, capsys, change, text):
+def test_invalid_arguments_print_one_sentence_and_write_nothing(
+    again, tmp_path, capsys, change, text
+):
     assert main(change(again)) == 1
     errors = capsys.readouterr().err
     assert errors.startswith(f"cvtgs: error: {text}")
@@ -205,7 +208,7 @@ def test_wrong_usage_exits_with_2(made, capsys):
 
 @pytest.fixture
 def lively(made, tmp_path) -> Path:
-    """The checkpoint that was made, for the preset paper."""
+    """The checkpoint of the training, relabelled for the preset paper."""
     checkpoint = load_checkpoint(made / "net.safetensors")
     path = tmp_path / "paper-like.safetensors"
     info = checkpoint.info.model_copy(update={"preset": "paper"})
@@ -221,14 +224,14 @@ def simplified(made: Path, tmp_path: Path, *words: str) -> tuple[dict, cvtgs.Gau
     return json.loads(report.read_text()), cvtgs.load(output)
 
 
-def test_simplify_with_a_file(made, tmp_path):
+def test_simplify_uses_a_checkpoint_file(made, tmp_path):
     path = str(made / "net.safetensors")
     report, small = simplified(made, tmp_path, "--ckpt", path)
     assert (report["checkpoint"], report["config"]["preset"]) == (path, "standard")
     assert len(small) == 60
 
 
-def test_simplify_takes_the_preset_of_its_checkpoint(made, tmp_path, lively):
+def test_simplify_uses_the_preset_of_its_checkpoint(made, tmp_path, lively):
     for words, preset in (
         (["--ckpt", str(lively)], "paper"),
         (["--ckpt", "paper"], "paper"),
@@ -250,7 +253,7 @@ def test_simplify_without_a_network(made, tmp_path):
     assert len(small) == 60
 
 
-def test_simplify_with_a_bad_checkpoint(made, tmp_path, capsys):
+def test_simplify_refuses_bad_checkpoints_in_one_sentence(made, tmp_path, capsys):
     source, output = made / "scenes" / "exam.ply", tmp_path / "out.ply"
     bad = tmp_path / "bad.safetensors"
     bad.write_bytes((made / "net.safetensors").read_bytes()[:-1])

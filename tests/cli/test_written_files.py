@@ -1,4 +1,4 @@
-"""Files that commands write: none replaces another, and one run at a time works on a folder."""
+"""Files that commands write: no accidental replacement, and one run at a time per folder."""
 
 import errno
 import os
@@ -21,11 +21,11 @@ def source(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("other", ["IN", "OUT", "--config", "--keep", "--cameras"])
 @pytest.mark.parametrize("spelling", ["same", "dots", "symlink", "hard link"])
-def test_the_report_replaces_nothing(
+def test_the_report_never_replaces_another_file(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], other: str, spelling: str
 ) -> None:
     if other == "OUT" and spelling == "hard link":
-        return  # OUT is not there yet
+        return  # OUT does not exist yet
     taken = {"IN": source, "OUT": tmp_path / "out.ply"}.get(other, tmp_path / "given.file")
     words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.1", "--overwrite"]
     if other.startswith("--"):
@@ -48,12 +48,12 @@ def test_the_report_replaces_nothing(
         before = taken.read_bytes()
     assert main([*words, "--report", str(report)]) == 1
     assert capsys.readouterr().err == (
-        f"cvtgs: error: --report must be another file than {other}, found {report} for both.\n"
+        f"cvtgs: error: --report and {other} must be different files, found {report} for both.\n"
     )
     assert (taken.read_bytes() if taken.exists() else None) == before
 
 
-def test_the_output_may_be_the_input_but_no_other_file(
+def test_the_output_may_replace_the_input_but_no_other_file(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["simplify", str(source), str(source), "--rho", "0.1", "--overwrite", "--quiet"]
@@ -62,14 +62,14 @@ def test_the_output_may_be_the_input_but_no_other_file(
     boxes = tmp_path / "boxes.ply"
     boxes.write_text("[]")
     assert main(["simplify", str(source), str(boxes), *words[3:], "--keep", str(boxes)]) == 1
-    assert "OUT must be another file than --keep" in capsys.readouterr().err
+    assert "OUT and --keep must be different files" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("number", "text"),
     [(errno.ENOSPC, "needs more space than the disk has left"), (errno.EIO, "must be writable")],
 )
-def test_a_report_that_fails_leaves_the_scene_and_says_so(
+def test_a_failed_report_keeps_the_scene_and_is_reported(
     source: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -118,13 +118,14 @@ def test_a_second_run_is_refused_before_it_writes(scene, capsys, name):
     with folder_lock(output):
         assert main(words) == 1
     error = capsys.readouterr().err
-    assert error.startswith(f"cvtgs: error: {output}: one run at a time may work on it, found ")
+    start = f"cvtgs: error: {output}: only one run at a time may work on it, found "
+    assert error.startswith(start)
     assert error.count("\n") == 1
     assert sorted(path.name for path in scene.iterdir()) == ["in.ply"]
 
 
 @pytest.mark.parametrize("name", ["levels", "stream", "render"])
-def test_no_lock_is_left(scene, name):
+def test_no_lock_file_is_left(scene, name):
     assert main(COMMANDS[name].replace("{}", str(scene)).split()) == 0
     assert sorted(path.name for path in scene.iterdir()) == ["in.ply", "out"]
     assert not list((scene / "out").rglob(".*"))
@@ -135,7 +136,7 @@ def test_every_command_with_a_lock_has_an_output():
         assert "-o" in build_parser()._subparsers._group_actions[0].choices[command].format_help()
 
 
-def test_a_folder_in_one_that_cannot_be_written_is_locked_inside(tmp_path, monkeypatch):
+def test_the_lock_is_inside_if_the_parent_is_not_writable(tmp_path, monkeypatch):
     home = tmp_path / "home"
     (home / "out").mkdir(parents=True)
     allowed = os.access
@@ -149,7 +150,7 @@ def test_a_folder_in_one_that_cannot_be_written_is_locked_inside(tmp_path, monke
     assert list((home / "out").iterdir()) == []
 
 
-def test_where_nothing_can_be_written_the_command_says_so(tmp_path):
+def test_a_missing_parent_is_left_to_the_command_to_report(tmp_path):
     with folder_lock(tmp_path / "missing" / "out"):
         assert list(tmp_path.iterdir()) == []
     assert lock_path(tmp_path / "out") == tmp_path / ".out.lock"

@@ -1,4 +1,4 @@
-"""What a Gaussian weighs, and where it lies, in the tessellation."""
+"""Weights and embedded positions of Gaussians in the tessellation."""
 
 import math
 
@@ -72,7 +72,7 @@ def test_colour_is_scaled():
     torch.testing.assert_close(points[1, 3:] - points[0, 3:], wanted)
 
 
-def test_extreme_colours_do_not_tear_points_apart():
+def test_extreme_colours_hardly_separate_points():
     sh0 = torch.tensor([[[1e4, -1e4, 0.0]], [[-1e30, 1e30, 0.0]]])
     points = embed(torch.zeros(2, 3), sh0, frame=FRAME, color=0.05)
     assert float((points[0] - points[1]).abs().amax()) < 0.2
@@ -92,12 +92,12 @@ def test_no_weight_is_below_the_floor():
     assert weights.tolist() == pytest.approx([0.01, 0.01, 1.0, 3.0])
 
 
-def test_opacities_and_areas_of_zero_weigh_the_same():
+def test_gaussians_without_opacity_and_area_weigh_the_same():
     zero = torch.zeros(3)
     assert tessellation_weights(zero, zero, area_power=1.0, floor=0.0).tolist() == [1.0, 1.0, 1.0]
 
 
-def test_flyaways_weigh_nothing_from_the_middle():
+def test_flyaways_have_almost_no_weight():
     means = torch.randn(100, 3, generator=torch.Generator().manual_seed(0))
     means[0] = 1e30
     factors = perspective_falloff(robust_frame(means).distances(means))

@@ -47,7 +47,7 @@ def test_energies_of_three_points_on_a_line():
     assert result.energies == (12.0, 3.0, 3.0)
 
 
-def test_no_iterations_leave_the_sites():
+def test_zero_iterations_keep_the_sites():
     points, weights = weighted_cloud(50)
     result = lloyd(points, weights, points[:5], nearest=nearest_scipy, iterations=0, tolerance=0.0)
     assert torch.equal(result.sites, points[:5])
@@ -94,7 +94,7 @@ def test_stops_when_the_energy_stalls():
     assert counts[0] < counts[1] < counts[2]
 
 
-def test_weight_draws_the_site():
+def test_sites_move_towards_heavy_points():
     points = torch.tensor([[0.0], [1.0]], dtype=torch.float64)
     result = lloyd(
         points, torch.tensor([1.0, 1e6], dtype=torch.float64), points[:1],
@@ -103,7 +103,7 @@ def test_weight_draws_the_site():
     assert result.sites.item() == pytest.approx(1.0, abs=2e-6)
 
 
-def test_the_dearest_point_moves_and_the_cheapest_stays():
+def test_the_most_expensive_point_fills_the_empty_cell():
     labels = torch.tensor([0, 0, 0, 2, 2])
     squared = torch.tensor([1.0, 9.0, 4.0, 6.0, 8.0])
     weights = torch.tensor([1.0, 1.0, 3.0, 1.0, 1.0])
@@ -113,12 +113,12 @@ def test_the_dearest_point_moves_and_the_cheapest_stays():
     assert refilled == 1
 
 
-def test_a_cell_of_one_keeps_its_point_however_dear():
+def test_a_cell_of_one_keeps_its_point_whatever_its_cost():
     labels, squared = torch.tensor([0, 1, 1]), torch.tensor([100.0, 1.0, 2.0])
     assert fill_empty_cells(labels, torch.ones(3), squared, 3)[0].tolist() == [0, 1, 2]
 
 
-def test_nothing_to_fill_gives_the_input():
+def test_without_empty_cells_the_input_is_returned():
     labels, squared = torch.tensor([1, 0]), torch.ones(2)
     found = fill_empty_cells(labels, torch.ones(2), squared, 2)
     assert found[0] is labels
@@ -128,7 +128,7 @@ def test_nothing_to_fill_gives_the_input():
 
 @pytest.mark.parametrize("count", [2, 40, 199, 200])
 @pytest.mark.parametrize("filled", [1, 2, 20])
-def test_no_cell_is_empty_and_no_energy_is_gained(count, filled):
+def test_no_cell_is_empty_and_the_energy_does_not_rise(count, filled):
     g = torch.Generator().manual_seed(count + filled)
     labels = torch.randint(0, min(filled, count), (200,), generator=g)
     labels[: min(filled, count)] = torch.arange(min(filled, count))
@@ -140,7 +140,7 @@ def test_no_cell_is_empty_and_no_energy_is_gained(count, filled):
     assert refilled == count - min(filled, count)
     assert float((weights * cost).sum()) <= float((weights * squared).sum())
     assert int((new != labels).sum()) == refilled
-    for cell in range(min(filled, count)):  # the cheapest point of each cell is still there
+    for cell in range(min(filled, count)):  # each cell keeps its cheapest point
         rows = (labels == cell).nonzero()[:, 0]
         cheapest = rows[(weights[rows] * squared[rows]).argmin()]
         assert new[cheapest] == cell

@@ -78,7 +78,7 @@ def test_shapes(backend, d, dtype, subtests):
 @both
 @dtypes
 @pytest.mark.parametrize("kind", ["clusters", "far-flung", "line", "lattice"])
-def test_kinds_of_clouds(backend, kind, dtype):
+def test_clouds_of_every_kind(backend, kind, dtype):
     points, sites = cloud(kind, 2000, 3).to(dtype), cloud(kind, 300, 3, seed=1).to(dtype)
     assert_nearest(points, sites, backend(points, sites))
 
@@ -99,7 +99,7 @@ def test_coincident_points_and_sites(backend):
 
 
 @both
-def test_same_bits_twice_and_input_unchanged(backend):
+def test_results_are_deterministic_and_the_input_is_unchanged(backend):
     points, sites = cloud("clusters", 1500, 3), cloud("normal", 200, 3)
     before = points.clone(), sites.clone()
     first, second = backend(points, sites), backend(points, sites)
@@ -125,7 +125,7 @@ def test_neighbours_are_the_nearest_others(m, count):
     torch.testing.assert_close(distances.gather(1, found), wanted)
 
 
-def test_coincident_sites_never_name_themselves():
+def test_a_coincident_site_is_never_its_own_neighbour():
     sites = torch.zeros(50, 3)
     found = nearest_neighbors(sites, 4)
     assert found.shape == (50, 4)

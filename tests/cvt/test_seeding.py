@@ -34,24 +34,24 @@ def test_equal_weights_are_taken_at_equal_steps():
     assert shares.tolist() == [3.0] * 4
 
 
-def test_heavy_points_are_certain_and_the_rest_is_stratified():
+def test_heavy_points_are_always_taken_and_the_rest_is_stratified():
     rows, shares = stratified_seeds(torch.tensor([1.0, 50.0, 1.0, 1.0, 20.0, 1.0]), 4)
     assert rows.tolist() == [0, 1, 3, 4]
     assert shares.tolist() == [2.0, 50.0, 2.0, 20.0]
 
 
-def test_a_point_of_one_and_a_half_steps_is_certain_and_stands_for_itself():
+def test_a_point_of_one_and_a_half_steps_is_always_taken_for_itself():
     rows, shares = stratified_seeds(torch.tensor([1.0, 3.0, 1.0, 1.0, 1.0, 1.0]), 4)
     assert rows.tolist() == [0, 1, 3, 5]
     assert shares.tolist() == pytest.approx([5 / 3, 3.0, 5 / 3, 5 / 3])
 
 
-def test_all_weight_zero_takes_points_evenly():
+def test_points_without_weight_are_taken_evenly():
     assert stratified_seeds(torch.zeros(9), 3)[0].tolist() == [1, 4, 7]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_seeds_are_distinct_and_exactly_as_many(kind, subtests):
+def test_seeds_are_distinct_and_of_the_exact_count(kind, subtests):
     for total, count in SIZES:
         weights = weights_of(kind, total)
         for rows in (stratified_seeds(weights, count)[0], drawn(weights, count)):
@@ -63,7 +63,7 @@ def test_seeds_are_distinct_and_exactly_as_many(kind, subtests):
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("zero", "denormal")])
-def test_shares_sum_to_all_weight(kind, subtests):
+def test_shares_sum_to_the_total_weight(kind, subtests):
     for total, count in SIZES:
         weights = weights_of(kind, total)
         _, shares = stratified_seeds(weights, count)
@@ -100,13 +100,13 @@ def test_draws_follow_the_weights():
     assert hits / 2000 == pytest.approx(0.75, abs=0.04)
 
 
-def test_same_seed_same_draw():
+def test_the_same_seed_gives_the_same_draw():
     weights = weights_of("uniform", 1000)
     assert torch.equal(drawn(weights, 50, 7), drawn(weights, 50, 7))
     assert not torch.equal(drawn(weights, 50, 7), drawn(weights, 50, 8))
 
 
-def test_strata_need_no_randomness():
+def test_stratified_seeds_are_deterministic():
     weights = weights_of("uniform", 1000)
     first, second = stratified_seeds(weights, 50), stratified_seeds(weights, 50)
     assert torch.equal(first[0], second[0])

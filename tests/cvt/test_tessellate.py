@@ -135,7 +135,7 @@ def test_points_in_any_order_give_a_complete_partition(config):
 
 
 @each_config
-def test_same_bits_twice(config):
+def test_results_are_deterministic(config):
     points, weights = weighted_cloud(700)
     first, second = (tessellate(points, weights, 50, config=config, seed=3) for _ in range(2))
     assert torch.equal(first.labels, second.labels)
@@ -143,7 +143,7 @@ def test_same_bits_twice(config):
     assert first.energies == second.energies
 
 
-def test_the_seed_is_for_weighted_seeding_only():
+def test_only_weighted_seeding_uses_the_seed():
     points, weights = weighted_cloud(700)
     for name, equal in (("standard", True), ("paper", False)):
         first, second = (
@@ -160,7 +160,7 @@ def test_input_is_not_changed():
     assert torch.equal(weights, before[1])
 
 
-def test_steps_are_told():
+def test_iterations_are_reported():
     told: list[int] = []
     points, weights = weighted_cloud(300)
     config = TessellationConfig(iterations=4, tolerance=0.0)

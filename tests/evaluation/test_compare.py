@@ -71,7 +71,7 @@ def comparison(scene, small, cameras):
     return compare(scene, small, cameras, sizes={"full": 123_456, "0.1": 12_345}, settings=OFF)
 
 
-def test_scores_are_those_of_the_metrics(scene, small, cameras):
+def test_scores_equal_those_of_the_metrics(scene, small, cameras):
     evaluation = evaluate(scene, small, cameras, settings=OFF)
     truth, image = (render(s, cameras).rgb.clamp(0, 1) for s in (scene, small["0.1"]))
     scores = evaluation.scenes[0]
@@ -90,7 +90,7 @@ def test_scores_are_those_of_the_metrics(scene, small, cameras):
 
 
 def test_the_full_scene_is_rendered_once_per_view(scene, small, cameras, monkeypatch):
-    from cvtgs.evaluation import scorer  # noqa: PLC0415 (to be changed here)
+    from cvtgs.evaluation import scorer  # noqa: PLC0415 (patched below)
 
     seen = []
 
@@ -110,7 +110,7 @@ def test_progress_counts_images(scene, small, cameras):
     assert [(event.done, event.total) for event in events] == [(k, 9) for k in range(10)]
 
 
-def test_an_equal_scene_is_infinitely_close_and_survives_json(scene, cameras):
+def test_an_equal_scene_has_infinite_psnr_also_in_json(scene, cameras):
     evaluation = evaluate(scene, {"same": scene}, cameras, settings=OFF)
     assert math.isinf(evaluation.scenes[0].psnr.mean)
     assert evaluation.scenes[0].ssim.mean == pytest.approx(1)
@@ -118,7 +118,9 @@ def test_an_equal_scene_is_infinitely_close_and_survives_json(scene, cameras):
     assert Evaluation.model_validate_json(evaluation.to_json()) == evaluation
 
 
-def test_missing_lpips_weights_are_named_not_fatal(scene, small, cameras, monkeypatch, tmp_path):
+def test_missing_lpips_weights_are_fatal_only_if_requested(
+    scene, small, cameras, monkeypatch, tmp_path
+):
     monkeypatch.setenv("CVTGS_LPIPS_WEIGHTS", str(tmp_path))
     evaluation = evaluate(scene, small, cameras)
     assert evaluation.lpips_network is None
@@ -139,8 +141,8 @@ def test_photographs_are_scored_for_every_scene(scene, small, cameras):
         evaluate(scene, small, cameras, settings=OFF, photographs=photographs[:2])
 
 
-def test_evaluate_refuses_what_makes_no_sense(scene, cameras):
-    with pytest.raises(ValueError, match="'full' is that of the full scene"):
+def test_evaluate_refuses_invalid_arguments(scene, cameras):
+    with pytest.raises(ValueError, match="'full' is the name of the full scene"):
         evaluate(scene, {"full": scene}, cameras, settings=OFF)
     with pytest.raises(ValueError, match="at least one camera"):
         evaluate(scene, {"a": scene}, cameras.select(torch.tensor([], dtype=torch.long)))
@@ -148,14 +150,14 @@ def test_evaluate_refuses_what_makes_no_sense(scene, cameras):
         evaluate(scene, {"a": scene}, cameras, settings=EvaluationSettings(lpips="x"))
 
 
-def test_cameras_of_another_scene_are_refused(scene, cameras):
+def test_cameras_that_miss_the_scene_are_refused(scene, cameras):
     away = cameras.viewmats.clone()
     away[:, 0, 3] += 1e4  # the scene lies far to the right of every image
     elsewhere, events = replace(cameras, viewmats=away), []
     for score in (evaluate, compare):
         with pytest.raises(ValueError, match=r"must see full, found nothing of it in any of 3"):
             score(scene, {"a": scene}, elsewhere, settings=OFF, listener=events.append)
-    assert not events  # before anything is scored
+    assert not events  # refused before anything is scored
     mixed = replace(cameras, viewmats=torch.cat([away[:2], cameras.viewmats[2:]]))
     assert evaluate(scene, {"a": scene}, mixed, settings=OFF).scenes
 
@@ -173,7 +175,7 @@ def test_the_background_shows_through(scene, small, cameras):
         assert one.alpha_error == other.alpha_error
 
 
-def test_photographs_are_found_by_name_suffix_and_last_part(tmp_path, cameras):
+def test_photographs_are_found_by_stem_suffix_and_last_part(tmp_path, cameras):
     names = ("train/a", "b.jpg", "images/c.png")
     named = cvtgs.Cameras(
         viewmats=cameras.viewmats, Ks=cameras.Ks, width=48, height=36, names=names
@@ -200,7 +202,7 @@ def test_transparent_pixels_show_the_background(tmp_path, cameras):
     ]
 
 
-def test_photographs_that_do_not_match_are_named(tmp_path, cameras):
+def test_missing_and_damaged_photographs_are_named(tmp_path, cameras):
     with pytest.raises(FileNotFoundError, match="3 of 3 cameras have none, the first is 'view 1'"):
         load_photographs(tmp_path, cameras)
     with pytest.raises(FileNotFoundError, match="the folder of photographs must exist"):
@@ -224,7 +226,7 @@ def test_error_maps_grow_brighter_with_the_error():
     assert error_map(black[:, :1], limit).tolist()[0][0] == pytest.approx([252, 253, 191], abs=6)
 
 
-def test_maps_of_alpha_are_warm_where_the_background_shows_and_cold_where_less_does():
+def test_alpha_maps_are_warm_for_more_background_and_cold_for_less():
     full = np.full((1, 3), 100, np.uint8)
     holes, equal, cover = alpha_error_map(full, np.array([[75, 100, 125]], np.uint8))[0].astype(int)
     assert holes[0] > holes[2] + 100
@@ -234,7 +236,7 @@ def test_maps_of_alpha_are_warm_where_the_background_shows_and_cold_where_less_d
     assert alpha_colors(ends)[0].tolist() == [[255, 246, 205], [255, 246, 205], [214, 240, 255]]
 
 
-def test_scores_are_of_all_views_where_images_of_few_are_kept(scene, small, cameras):
+def test_all_views_are_scored_even_if_few_images_are_kept(scene, small, cameras):
     names = ("a", "b", "c")
     few = compare(scene, small, replace(cameras, names=names), most_images=2, settings=OFF)
     assert few.evaluation == evaluate(scene, small, replace(cameras, names=names), settings=OFF)
@@ -265,7 +267,7 @@ def data_of(page: str) -> dict:
     return json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL).group(1))
 
 
-def test_the_page_holds_everything_and_needs_nothing(comparison):
+def test_the_page_is_self_contained(comparison):
     page = comparison_page(comparison)
     data = data_of(page)
     assert data["reference"] == {"name": "full", "count": 3000, "bytes": 123_456}
@@ -277,7 +279,7 @@ def test_the_page_holds_everything_and_needs_nothing(comparison):
     assert "{{" not in without_images
 
 
-def test_hostile_names_stay_text(scene, cameras):
+def test_hostile_names_are_escaped(scene, cameras):
     name = '</script><b onclick="x">{{ script }}'
     page = comparison_page(
         compare(scene, {name: scene}, cameras, reference_name="<i>&", settings=OFF)
@@ -289,12 +291,12 @@ def test_hostile_names_stay_text(scene, cameras):
     assert data["small"][0]["psnr"]["mean"] == "Infinity"
 
 
-def test_pages_are_kept_small(comparison):
+def test_a_size_limit_makes_the_page_smaller(comparison):
     large, tight = comparison_page(comparison), comparison_page(comparison, most_bytes=1)
     assert len(tight) < len(large)
 
 
-def test_files_are_replaced_only_when_asked(comparison, tmp_path):
+def test_files_are_replaced_only_with_overwrite(comparison, tmp_path):
     folder = tmp_path / "new" / "page"
     paths = write_comparison(comparison, folder)
     assert sorted(path.name for path in folder.iterdir()) == [
@@ -308,11 +310,11 @@ def test_files_are_replaced_only_when_asked(comparison, tmp_path):
     write_comparison(comparison, folder, overwrite=True)
     assert paths[-1].read_bytes() == first
     (tmp_path / "file").write_text("")
-    with pytest.raises(cvtgs.errors.OutputError, match="must become a folder"):
+    with pytest.raises(cvtgs.errors.OutputError, match="must be a folder or a new path"):
         write_comparison(comparison, tmp_path / "file" / "page")
 
 
-def test_lpips_is_a_third_number_where_there_are_weights():
+def test_lpips_is_added_if_there_are_weights():
     weights = random_weights("alex")
     image, truth = random_images(64, 64)
     found = Metrics(lpips=weights).compare(image, truth)
@@ -320,7 +322,7 @@ def test_lpips_is_a_third_number_where_there_are_weights():
     assert found == Metrics().compare(image, truth)._replace(lpips=float(wanted))
 
 
-def test_templates_escape_what_they_show():
+def test_templates_escape_their_values():
     assert render_template("<b>{{ name }}</b>", name="<i>&'\"") == (
         "<b>&lt;i&gt;&amp;&#39;&#34;</b>"
     )
@@ -329,13 +331,13 @@ def test_templates_escape_what_they_show():
     assert json.loads(shown) == {"name": "</script>&"}
 
 
-def test_cameras_without_names_have_no_photographs(tmp_path):
+def test_photographs_need_named_cameras(tmp_path):
     camera = cvtgs.Cameras(viewmats=torch.eye(4)[None], Ks=torch.eye(3)[None], width=4, height=3)
     with pytest.raises(InvalidArgumentError, match="matched by the names of the cameras"):
         load_photographs(tmp_path, camera)
 
 
-def test_a_photograph_that_cannot_be_opened_is_an_error(tmp_path):
+def test_an_unreadable_photograph_is_an_error(tmp_path):
     with pytest.raises(InputError, match="the file must be readable, found: is a directory"):
         read_image(tmp_path, (4, 3), (0.0, 0.0, 0.0))
 
@@ -343,5 +345,5 @@ def test_a_photograph_that_cannot_be_opened_is_an_error(tmp_path):
 @pytest.mark.parametrize(
     ("count", "text"), [(999, "999 B"), (250_000_000, "250 MB"), (5 * 10**12, "5000 GB")]
 )
-def test_bytes_in_words(count, text):
+def test_byte_counts_as_text(count, text):
     assert bytes_text(count) == text

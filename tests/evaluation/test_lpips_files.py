@@ -1,4 +1,4 @@
-"""Where the weights of LPIPS come from, and what bad files get."""
+"""Sources of LPIPS weights, and errors for invalid files."""
 
 import math
 import os
@@ -26,7 +26,7 @@ def save(state: Mapping[str, torch.Tensor], path: Path) -> Path:
     return path
 
 
-def test_weights_from_path_folder_and_environment(tmp_path, monkeypatch) -> None:
+def test_weights_are_found_by_path_folder_and_environment(tmp_path, monkeypatch) -> None:
     state = random_state("alex")
     path = save({k: v.half() for k, v in state.items()}, tmp_path / "lpips_alex_fp16.pth")
     first, second = random_images(31, 31)
@@ -42,8 +42,8 @@ def test_weights_from_path_folder_and_environment(tmp_path, monkeypatch) -> None
     assert load_lpips("alex", path).network == "alex"
 
 
-def test_names_of_the_lpips_package_are_understood(tmp_path) -> None:
-    """lpips.LPIPS(net="alex").state_dict() keeps torchvision's layer numbers inside slices."""
+def test_names_of_the_lpips_package_are_accepted(tmp_path) -> None:
+    """lpips.LPIPS(net="alex").state_dict() keeps torchvision's layer numbers within slices."""
     slices = {0: 1, 3: 2, 6: 3, 8: 4, 10: 5}
     state: dict[str, torch.Tensor] = {"scaling_layer.shift": torch.zeros(1, 3, 1, 1)}
     for name, tensor in random_state("alex").items():
@@ -61,7 +61,7 @@ def test_names_of_the_lpips_package_are_understood(tmp_path) -> None:
 
 
 def fake_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
-    """A package as pip installs it: heads inside, the backbone in torch's download cache."""
+    """Fake the package lpips as pip installs it; its backbone is in torch's download cache."""
     site, hub = tmp_path / "site", tmp_path / "hub"
     (site / "lpips").mkdir(parents=True)
     (site / "lpips" / "__init__.py").write_text("raise RuntimeError('must not be imported')\n")
@@ -72,7 +72,7 @@ def fake_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path,
     return backbone, site / "lpips" / "weights" / "v0.1" / "alex.pth"
 
 
-def test_weights_from_the_package(tmp_path, monkeypatch) -> None:
+def test_weights_are_found_in_the_lpips_package(tmp_path, monkeypatch) -> None:
     backbone, heads = fake_package(tmp_path, monkeypatch)
     state = random_state("alex")
     features = {k: v for k, v in state.items() if k.startswith("features")}
@@ -84,7 +84,7 @@ def test_weights_from_the_package(tmp_path, monkeypatch) -> None:
     assert all(torch.equal(weights.tensors[name], state[name]) for name in state)
 
 
-def test_a_package_without_backbone_says_how_to_get_it(tmp_path, monkeypatch) -> None:
+def test_a_missing_backbone_is_an_error_with_advice(tmp_path, monkeypatch) -> None:
     backbone, _ = fake_package(tmp_path, monkeypatch)
     with pytest.raises(MissingDependencyError) as error:
         load_lpips("alex")
@@ -94,7 +94,7 @@ def test_a_package_without_backbone_says_how_to_get_it(tmp_path, monkeypatch) ->
     )
 
 
-def test_without_weights(monkeypatch) -> None:
+def test_missing_weights_are_an_error_with_advice(monkeypatch) -> None:
     monkeypatch.delenv(LPIPS_VARIABLE, raising=False)
     monkeypatch.setattr(sys.modules["cvtgs.evaluation.lpips"], "find_spec", lambda name: None)
     first, second = random_images(31, 31)
@@ -106,7 +106,7 @@ def test_without_weights(monkeypatch) -> None:
     )
 
 
-def test_argument_errors() -> None:
+def test_invalid_arguments_are_refused() -> None:
     images = random_images(30, 40)
     with pytest.raises(InvalidArgumentError) as error:
         lpips(*images, network="alex", weights=random_weights("alex"))
@@ -121,7 +121,7 @@ def test_argument_errors() -> None:
     assert str(error.value) == "network must be 'alex' or 'vgg', found 'squeeze'."
 
 
-def test_file_errors(tmp_path) -> None:
+def test_invalid_files_are_refused(tmp_path) -> None:
     def text(error: type[Exception], path: Path, network: str = "alex") -> str:
         with pytest.raises(error) as caught:
             load_lpips(network, path)
@@ -164,7 +164,7 @@ def test_file_errors(tmp_path) -> None:
         assert text(InputError, good) == "the file must be readable, found: permission denied."
 
 
-def test_the_published_weights() -> None:
+def test_distances_with_published_weights_grow_with_distortion() -> None:
     folder = Path(os.environ.get("CVTGS_SHARED", "")) / "weights"
     if not list(folder.glob("lpips_alex*.pth")):
         pytest.skip("set CVTGS_SHARED to a folder with weights/lpips_alex*.pth")

@@ -1,4 +1,4 @@
-"""PSNR, SSIM and the error of alpha against hand-computed values and scipy."""
+"""PSNR, SSIM and alpha error against hand-computed values and scipy."""
 
 import math
 
@@ -21,7 +21,7 @@ def noisy_pair(size: tuple[int, int], noise: float, seed: int = 0) -> tuple[np.n
 
 
 def ssim_by_scipy(first: np.ndarray, second: np.ndarray) -> float:
-    """Wang et al. 2004 with scipy's filters: windows inside the image only."""
+    """SSIM of Wang et al. 2004 with scipy's filters, over windows inside the image only."""
     taps = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
     taps /= taps.sum()
 
@@ -39,7 +39,7 @@ def ssim_by_scipy(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.mean(values))
 
 
-def test_psnr_by_hand() -> None:
+def test_psnr_equals_that_by_hand() -> None:
     first = torch.zeros(2, 5, 4, 3, dtype=torch.float64)
     second = torch.stack([first[0] + 0.1, first[1] + 1.0])
     torch.testing.assert_close(psnr(first, second), torch.tensor([20.0, 0.0]).double())
@@ -63,7 +63,7 @@ def test_images_are_clipped() -> None:
 
 @pytest.mark.parametrize("noise", [0.01, 0.1, 0.5])
 @pytest.mark.parametrize("size", [(11, 11), (12, 30), (41, 37)])
-def test_ssim_against_scipy(size, noise) -> None:
+def test_ssim_equals_that_by_scipy(size, noise) -> None:
     first, second = noisy_pair(size, noise)
     wanted = ssim_by_scipy(first, second)
     images = [torch.from_numpy(image)[None] for image in (first, second)]
@@ -71,12 +71,12 @@ def test_ssim_against_scipy(size, noise) -> None:
     assert ssim(*[image.float() for image in images]).item() == pytest.approx(wanted, abs=1e-5)
 
 
-def test_ssim_of_nearly_equal_flat_images_survives_float32() -> None:
+def test_ssim_of_nearly_equal_flat_images_is_1_in_float32() -> None:
     first = torch.full((1, 40, 40, 3), 0.9)
     assert ssim(first, first + 1e-3).item() == pytest.approx(1.0, abs=1e-4)
 
 
-def test_each_image_by_itself() -> None:
+def test_each_image_is_scored_by_itself() -> None:
     pairs = [noisy_pair((20, 14), noise, seed) for seed, noise in enumerate((0.05, 0.2, 0.4))]
     first, second = (
         torch.from_numpy(np.stack(images)).float() for images in zip(*pairs, strict=True)
@@ -112,7 +112,7 @@ def test_cuda_gives_the_same_values() -> None:
         torch.testing.assert_close(found.cpu(), metric(first, second), rtol=1e-5, atol=1e-5)
 
 
-def test_error_texts() -> None:
+def test_images_that_do_not_fit_are_refused() -> None:
     image = torch.zeros(1, 10, 12, 3)
     with pytest.raises(InvalidArgumentError) as error:
         ssim(image, image)
@@ -121,7 +121,7 @@ def test_error_texts() -> None:
         psnr(image, image[:, :5])
 
 
-def test_error_and_bias_of_alpha_by_hand() -> None:
+def test_alpha_error_and_bias_equal_those_by_hand() -> None:
     small = torch.tensor([[[0.5, 1.0], [0.0, 0.25]], [[1.0, 1.0], [1.0, 1.0]]])
     full = torch.tensor([[[1.0, 0.75], [0.0, 0.75]], [[1.0, 1.0], [1.0, 0.0]]])
     assert alpha_error(small, full).tolist() == [1.25 / 4, 1 / 4]

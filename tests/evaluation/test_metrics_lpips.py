@@ -1,4 +1,4 @@
-"""LPIPS against a numpy formulation with random weights, and with the real ones if there are."""
+"""LPIPS against a numpy implementation with random weights."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def lpips_by_numpy(network: str, first: np.ndarray, second: np.ndarray) -> float
     ("network", "size"),
     [("alex", (31, 31)), ("alex", (50, 37)), ("vgg", (16, 16)), ("vgg", (19, 34))],
 )
-def test_against_numpy(network, size) -> None:
+def test_lpips_equals_that_by_numpy(network, size) -> None:
     first, second = random_images(*size)
     wanted = lpips_by_numpy(network, first[0].numpy(), second[0].numpy())
     weights = random_weights(network)
@@ -59,7 +59,7 @@ def test_against_numpy(network, size) -> None:
 
 
 @pytest.mark.parametrize("network", ["alex", "vgg"])
-def test_equal_images_noise_and_symmetry(network) -> None:
+def test_lpips_is_0_for_equal_images_symmetric_and_grows_with_noise(network) -> None:
     side = {"alex": 31, "vgg": 16}[network]
     first, noise = (images.float() for images in random_images(side, side, count=2))
     weights = random_weights(network)
@@ -86,7 +86,7 @@ def test_cuda_gives_the_same_values(network) -> None:
     torch.testing.assert_close(found.cpu(), wanted, rtol=1e-2, atol=1e-4)  # TF32 convolutions
 
 
-def test_images_are_clipped_and_not_mutated() -> None:
+def test_images_are_clipped_but_not_mutated() -> None:
     first, second = random_images(31, 31)
     wide = second.clone().round() * 2 - 0.5
     copy = wide.clone()
@@ -96,7 +96,7 @@ def test_images_are_clipped_and_not_mutated() -> None:
     assert torch.equal(found, lpips(first, second.round(), network="alex", weights=weights))
 
 
-def test_no_gradient() -> None:
+def test_lpips_has_no_gradient() -> None:
     first, second = random_images(31, 31)
     first.requires_grad_()
     assert not lpips(first, second, network="alex", weights=random_weights("alex")).requires_grad

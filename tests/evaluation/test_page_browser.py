@@ -1,4 +1,4 @@
-"""The page in a real browser: does its script run, does it fit a phone, is it quiet."""
+"""The page in a real browser: its script, its layout on a phone, and no network requests."""
 
 import re
 import subprocess
@@ -72,7 +72,7 @@ def test_the_address_chooses_scene_view_and_divider(page):
 
 
 @pytest.mark.slow
-def test_differences_and_equal_scenes_are_shown(page):
+def test_colour_errors_and_equal_scenes_are_shown(page):
     path, _ = page
     html = dom(path, "#view=3&small=3&error=1")
     assert attribute(html, "error") == "1"
@@ -85,7 +85,7 @@ def test_differences_and_equal_scenes_are_shown(page):
 
 
 @pytest.mark.slow
-def test_errors_of_alpha_have_a_map_and_a_scale_of_their_own(page):
+def test_alpha_errors_have_their_own_map_and_scale(page):
     path, _ = page
     html = dom(path, "#view=3&small=2&error=2")
     assert attribute(html, "error") == "2"
@@ -111,8 +111,8 @@ def test_the_page_fits_a_phone(page):
 
 
 @pytest.mark.slow
-def test_the_page_asks_for_nothing(page):
-    """Its policy allows images inside the page only, and Chromium reports no breach of it."""
+def test_the_page_loads_nothing_from_the_network(page):
+    """Its policy allows only embedded images, and Chromium reports no violation of it."""
     path, _ = page
     content = path.read_text(encoding="utf-8")
     assert "default-src 'none'; img-src data:" in content

@@ -1,4 +1,4 @@
-"""The catalogue of hard cases itself, and the stages that only look at rows: io and filters."""
+"""The catalogue of hard cases, and the stages that treat rows separately: io and filters."""
 
 import re
 import warnings
@@ -20,7 +20,7 @@ COUNT = 60
 pytestmark = pytest.mark.usefixtures("coarse_light")
 
 
-def test_every_case_is_in_the_catalogue_and_says_where_it_is_from():
+def test_every_case_is_in_the_catalogue_and_states_its_source():
     own = {
         name: value
         for name, value in vars(hard_cases).items()
@@ -35,28 +35,28 @@ def test_every_case_is_in_the_catalogue_and_says_where_it_is_from():
 @dtypes
 @each_case
 def test_each_case(make, dtype, subtests, tmp_path):
-    """Files keep it, filters find what is wrong with it, and results go through files."""
+    """Files keep the case, filters find its faults, and its results can be saved and loaded."""
     scene = make(COUNT, dtype)
-    with subtests.test("cases are what they say"):
-        check_that_it_is_what_it_says(make, scene, dtype)
+    with subtests.test("the case is as described"):
+        check_that_the_case_is_as_described(make, scene, dtype)
     with subtests.test("files keep every bit"):
         check_that_files_keep_every_bit(scene, tmp_path)
-    with subtests.test("results go through files"):
+    with subtests.test("results can be saved and loaded"):
         preset = "standard" if dtype == torch.float32 else "paper"
-        check_that_results_go_through_files(make, scene, preset, tmp_path)
+        check_that_results_can_be_saved_and_loaded(make, scene, preset, tmp_path)
     valid = scene.select(valid_rows(scene))
-    with subtests.test("only what flew away is a flyaway"):
-        check_that_only_what_flew_away_is_a_flyaway(make, valid)
+    with subtests.test("only flyaways are found as flyaways"):
+        check_that_only_flyaways_are_found(make, valid)
     for device in DEVICES:
         with subtests.test("invalid rows are found by their property", device=device):
             check_that_invalid_rows_are_found(make, scene, device)
-        with subtests.test("what the filter leaves out is bounded", device=device):
-            check_that_what_the_filter_leaves_out_is_bounded(valid.to(device))
-        with subtests.test("valid rows become standard and keep what they are", device=device):
+        with subtests.test("the filtered mass is bounded", device=device):
+            check_that_the_filtered_mass_is_bounded(valid.to(device))
+        with subtests.test("valid rows become standard without other changes", device=device):
             check_that_valid_rows_become_standard(valid.to(device))
 
 
-def check_that_it_is_what_it_says(make, scene, dtype):
+def check_that_the_case_is_as_described(make, scene, dtype):
     assert scene.dtype == dtype
     assert len(scene) == {"one": 1, "two": 2, "three": 3}.get(make.__name__, COUNT)
     spoiled = make.__name__.startswith("nan_") or make.__name__ == "zero_quaternions"
@@ -76,8 +76,8 @@ def check_that_files_keep_every_bit(scene, tmp_path):
     assert (tmp_path / "again.ply").read_bytes() == before
 
 
-def check_that_results_go_through_files(make, scene, preset, tmp_path):
-    """Results of 2DGS files lose their third scale, with a warning, for the file has none."""
+def check_that_results_can_be_saved_and_loaded(make, scene, preset, tmp_path):
+    """Results of 2DGS files lose their third scale, with a warning: the file has none."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DroppedDataWarning)
         small = simplifier(preset).simplify(scene, 0.2)
@@ -91,7 +91,7 @@ def check_that_results_go_through_files(make, scene, preset, tmp_path):
     assert same_bits(read, small)
 
 
-def test_a_file_without_a_third_scale_stays_one(tmp_path):
+def test_a_file_without_a_third_scale_is_written_without_one(tmp_path):
     cvtgs.save(CASES["flat_file"](COUNT, torch.float32), tmp_path / "flat.ply")
     header = (tmp_path / "flat.ply").read_bytes().split(b"end_header")[0]
     assert b"scale_1" in header
@@ -121,7 +121,7 @@ def check_that_invalid_rows_are_found(make, scene, device):
     assert list(found) == names
 
 
-def check_that_what_the_filter_leaves_out_is_bounded(scene):
+def check_that_the_filtered_mass_is_bounded(scene):
     opacities, masses = scene.opacities, scene.masses
     for share, at_least in ((1.0, 1), (1.0, len(scene)), (0.01, 1), (0.01, len(scene) // 2 + 1)):
         keep = visible_rows(
@@ -133,7 +133,7 @@ def check_that_what_the_filter_leaves_out_is_bounded(scene):
             assert float(masses[~keep].sum()) <= share * float(masses.sum())
 
 
-def check_that_only_what_flew_away_is_a_flyaway(make, scene):
+def check_that_only_flyaways_are_found(make, scene):
     distances = robust_frame(scene.means).distances(scene.means)
     assert bool(distances.isfinite().all())
     seen = scene.masses * distances.clamp_min(1).pow(-2)
@@ -141,7 +141,7 @@ def check_that_only_what_flew_away_is_a_flyaway(make, scene):
     assert rows == ([0, 1, 2, 3, 4] if "flyaways" in make.__name__ else [])
 
 
-def test_equally_faint_gaussians_go_by_mass_not_by_row():
+def test_equally_faint_gaussians_are_filtered_by_mass_not_by_row():
     scene = CASES["all_faint"](COUNT, torch.float32)
     shuffle = torch.randperm(COUNT, generator=torch.Generator().manual_seed(0))
     keeps = [

@@ -1,4 +1,4 @@
-"""Damaged files and faults, a few of each; ``nox -s fuzz`` and ``nox -s faults`` do far more."""
+"""A few damaged files and faults; ``nox -s fuzz`` and ``nox -s faults`` run far more."""
 
 import gzip
 import io
@@ -36,7 +36,7 @@ def run_limited(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.slow
 @linux
-def test_damaged_files_end_in_a_result_or_one_clear_sentence():
+def test_damaged_files_give_a_result_or_one_clear_sentence():
     done = run_limited(str(HERE / "fuzz_files.py"), "--count", "3300", "--seed", "1")
     assert (done.returncode, done.stderr) == (0, "")
     ends = {end: int(count) for count, end in re.findall(r"(\d+) ([\w.]+ \w+)", done.stdout)}
@@ -44,14 +44,14 @@ def test_damaged_files_end_in_a_result_or_one_clear_sentence():
     assert min(ends["ply read"], ends["ply refused"], ends["config read"]) >= 10
 
 
-def test_the_same_seed_damages_the_same_way():
+def test_the_same_seed_gives_the_same_damage():
     data = fuzz_seeds.seeds_of_ply()[0]
     first, second = ([fuzz_files.mutant(data, random.Random(s)) for s in range(50)] for _ in "ab")
     assert first == second
     assert len(set(first)) > 40
 
 
-def test_kept_inputs_end_in_a_result_or_one_clear_sentence(tmp_path):
+def test_kept_inputs_give_a_result_or_one_clear_sentence(tmp_path):
     ends = {}
     for kind, found in fuzz_seeds.READERS.items():
         path = fuzz_seeds.place(kind, tmp_path)
@@ -62,7 +62,7 @@ def test_kept_inputs_end_in_a_result_or_one_clear_sentence(tmp_path):
     assert {kept: end for kept, end in ends.items() if end not in ("read", "refused")} == {}
 
 
-def test_boxes_nested_without_end_are_refused(tmp_path):
+def test_damaged_boxes_files_are_refused(tmp_path):
     path = tmp_path / "boxes.json"
     path.write_bytes(b"[" * 100_000)
     assert fuzz_files.verdict(fuzz_seeds.READERS["boxes"].read, path) == "refused"
@@ -76,7 +76,7 @@ def test_a_damaged_index_of_levels_is_refused(tmp_path):
     assert fuzz_files.verdict(fuzz_seeds.READERS["levels"].read, path) == "refused"
 
 
-def test_failing_inputs_are_made_small():
+def test_failing_inputs_are_reduced():
     assert fuzz_files.made_small(b"a" * 500 + b"bug" + b"c" * 300, lambda d: b"bug" in d) == b"bug"
     assert fuzz_files.made_small(b"", lambda data: True) == b""
 
@@ -92,7 +92,7 @@ def test_failing_inputs_are_made_small():
         (lambda path: cvtgs.load("elsewhere.ply"), "unclear: "),
     ],
 )
-def test_the_fuzzer_can_fail(tmp_path, read, wanted):
+def test_the_fuzzer_recognises_every_kind_of_end(tmp_path, read, wanted):
     path = tmp_path / "a.ply"
     path.write_bytes(b"ply")
     assert fuzz_files.verdict(read, path).startswith(wanted)
@@ -122,7 +122,7 @@ LYING = {
 
 @pytest.mark.slow
 @linux
-def test_lying_headers_take_no_memory_and_hangs_are_noticed(tmp_path):
+def test_false_headers_take_no_memory_and_hangs_are_found(tmp_path):
     for name, data in LYING.items():
         (tmp_path / f"{name}.ply").write_bytes(data)
     program = (
@@ -141,7 +141,7 @@ def test_lying_headers_take_no_memory_and_hangs_are_noticed(tmp_path):
     assert hang == "more than 0.2 s"
 
 
-def test_lying_headers_of_checkpoints_take_no_memory(tmp_path):
+def test_false_headers_of_checkpoints_take_no_memory(tmp_path):
     (content,) = fuzz_seeds.seeds_of_checkpoints()
     length = int.from_bytes(content[:8], "little")
     header = json.loads(content[8 : 8 + length])
@@ -163,7 +163,7 @@ def test_lying_headers_of_checkpoints_take_no_memory(tmp_path):
     ],
     ids=["a thousand elements", "a long name", "a long name twice"],
 )
-def test_sentences_about_endless_headers_are_short(tmp_path, lines):
+def test_errors_about_very_long_headers_are_short(tmp_path, lines):
     path = tmp_path / "many.ply"
     path.write_text("\n".join(["ply", "format ascii 1.0", *lines, "end_header", ""]))
     with pytest.raises(FileFormatError) as caught:
@@ -172,7 +172,7 @@ def test_sentences_about_endless_headers_are_short(tmp_path, lines):
 
 
 @pytest.mark.parametrize("kind", ["sog", "spz", "state"])
-def test_what_is_packed_is_damaged_inside(kind):
+def test_compressed_content_is_damaged_inside(kind):
     seeds = [seed for seed in fuzz_seeds.READERS[kind].seeds() if seed[:2] in (b"PK", b"\x1f\x8b")]
     dice = random.Random(3)
     for seed in seeds:
@@ -188,7 +188,7 @@ def test_what_is_packed_is_damaged_inside(kind):
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="forks and limits as Linux does")
 def test_every_fault_leaves_whole_files_or_none():
-    """By another process: forks of one that runs tests would inherit its threads."""
+    """Runs in another process, because forks of a test process would inherit its threads."""
     words = ["--kills", "6", "--pairs", "2", "--limits", "1", "--count", "2000"]
     words += ["--commands", "plain", "blocks", "convert", "--seed", "7"]
     path = os.pathsep.join([str(HERE), *filter(None, sys.path)])

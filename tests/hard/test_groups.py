@@ -1,4 +1,4 @@
-"""The tessellation of hard scenes: its space, weights, seeds, searches and cells."""
+"""The tessellation of hard scenes: space, weights, seeds, nearest-site search and cells."""
 
 from importlib import import_module
 from itertools import pairwise
@@ -26,7 +26,7 @@ COUNT = 60
 
 
 def squared_distances(points, sites):
-    """All of them, in float64, by numpy alone."""
+    """Return all squared distances, in float64, computed by numpy alone."""
     a, b = (x.double().numpy() for x in (points, sites))
     return np.square(a[:, None] - b[None]).sum(axis=2)
 
@@ -34,7 +34,7 @@ def squared_distances(points, sites):
 @dtypes
 @each_case
 def test_each_case(make, dtype, subtests):
-    """Its space and weights are finite, its cells not empty, and what is nearest is the nearest."""
+    """Space and weights are finite, cells are not empty, and the nearest sites are found."""
     scene = valid_case(make, COUNT, dtype)
     for device in DEVICES:
         with subtests.test("space and weights are finite", device=device):
@@ -43,16 +43,16 @@ def test_each_case(make, dtype, subtests):
             with subtests.test("cells have members, energies fall", device=device, preset=preset):
                 check_that_cells_have_members_and_energies_fall(scene.to(device), preset)
     points = embed(scene.means, frame=robust_frame(scene.means))
-    with subtests.test("the nearest site is the nearest"):
-        check_that_the_nearest_site_is_the_nearest(points)
-    with subtests.test("neighbours are the nearest others"):
-        check_that_neighbours_are_the_nearest_others(points)
+    with subtests.test("the nearest site is found"):
+        check_that_the_nearest_site_is_found(points)
+    with subtests.test("the nearest neighbours are found"):
+        check_that_the_nearest_neighbours_are_found(points)
 
 
 def check_that_space_and_weights_are_finite(scene):
     frame = robust_frame(scene.means)
     assert frame.radius > 0
-    if scene.dtype == torch.float32:  # it is the same in float64, and takes longest
+    if scene.dtype == torch.float32:  # float64 gives the same and takes longest
         light = ambient_visibility(scene.means, scene.masses, frame)
         assert bool(((light >= 0) & (light <= 1)).all())
     far = perspective_falloff(frame.distances(scene.means))
@@ -86,7 +86,7 @@ def check_that_cells_have_members_and_energies_fall(scene, preset):
         assert all(after <= before + rounding for before, after in pairwise(energies))
 
 
-def check_that_the_nearest_site_is_the_nearest(points):
+def check_that_the_nearest_site_is_found(points):
     sites = points[::3]
     labels, squared = nearest_scipy(points, sites)
     every = squared_distances(points, sites)
@@ -95,7 +95,7 @@ def check_that_the_nearest_site_is_the_nearest(points):
     np.testing.assert_allclose(squared.numpy(), own, rtol=1e-12, atol=0)
 
 
-def check_that_neighbours_are_the_nearest_others(sites):
+def check_that_the_nearest_neighbours_are_found(sites):
     found = nearest_neighbors(sites, 8)
     assert found.shape == (len(sites), min(8, len(sites) - 1))
     assert not bool((found == torch.arange(len(sites))[:, None]).any())
@@ -107,8 +107,8 @@ def check_that_neighbours_are_the_nearest_others(sites):
     np.testing.assert_allclose(own, wanted, rtol=1e-9, atol=0)
 
 
-def test_coincident_sites_are_searched_once(monkeypatch):
-    """A tree cannot part them, and would compare every point with every site."""
+def test_coincident_sites_are_searched_as_one(monkeypatch):
+    """A tree cannot separate them, and would compare every point with every site."""
     sites = torch.tensor([[1.0, 2.0, 3.0]]).repeat(1000, 1)
     sites[700] = 0.0
     home, seen = import_module("cvtgs.cvt.nearest"), []
@@ -120,7 +120,7 @@ def test_coincident_sites_are_searched_once(monkeypatch):
     assert not bool(squared.any())
 
 
-def test_coincident_sites_are_apart_for_the_tree_of_neighbours(monkeypatch):
+def test_coincident_sites_are_separated_in_the_neighbour_tree(monkeypatch):
     home, seen = import_module("cvtgs.cvt.nearest"), []
     honest = home.build_tree
     monkeypatch.setattr(home, "build_tree", lambda sites: seen.append(sites) or honest(sites))
@@ -145,7 +145,7 @@ def test_equal_rows_are_found(width):
     assert runs_of_equal(sites[sorted(first.values())]) is None
 
 
-def test_seeds_of_equal_points_are_different_points():
+def test_seeds_among_equal_points_are_different_rows():
     for name in ("coincident", "duplicates", "all_transparent"):
         scene = CASES[name](COUNT, torch.float32)
         for count in (1, 7, COUNT - 1, COUNT):
@@ -154,7 +154,7 @@ def test_seeds_of_equal_points_are_different_points():
             assert float(shares.sum()) == pytest.approx(float(scene.masses.sum()))
 
 
-def test_coincident_points_come_in_the_order_of_ties():
+def test_ties_decide_the_order_of_coincident_points():
     points = torch.tensor([[0.0, 0, 0], [1, 1, 1], [0, 0, 0], [1, 1, 1], [0, 0, 0]])
     ties = torch.tensor([3.0, 2.0, 1.0, 1.0, 1.0])
     assert morton_order(points).tolist() == [0, 2, 4, 1, 3]

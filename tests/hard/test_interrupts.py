@@ -31,7 +31,7 @@ WRITERS: dict[str, Callable[[Path, bool], None]] = {
     "tensors": lambda path, overwrite: save_tensors(path, {"a": torch.arange(99.0)}, {"by": "me"}),
 }
 STEPS = {"scene": 23, "tensors": 5}
-"""Every so many lines there is a signal: a few dozen of each."""
+"""Number of lines between the moments of signals, for a few dozen signals per writer."""
 
 
 def leave(number: int, frame: FrameType | None) -> NoReturn:
@@ -39,9 +39,9 @@ def leave(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def in_child(action: Callable[[], None], *, moment: int, number: int) -> int:
-    """Fork, send a signal at the given line of the code that writes, and give how it ended."""
+    """Fork, send a signal at a given line of the writing code, and return the exit status."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # the child uses no thread
+        warnings.simplefilter("ignore", DeprecationWarning)  # the child starts no threads
         process = os.fork()
     if process:
         return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
@@ -62,7 +62,7 @@ def in_child(action: Callable[[], None], *, moment: int, number: int) -> int:
         signal.signal(signal.SIGTERM, leave)
         sys.settrace(trace)
         action()
-    except BaseException:  # what it is does not matter here, and pytest must not see it
+    except BaseException:  # of any kind; pytest must not see it
         os._exit(1)
     os._exit(0)
 
@@ -75,7 +75,7 @@ def old(request) -> bytes | None:
 @pytest.mark.long
 @pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM", "SIGKILL"])  # Windows lacks one
 @pytest.mark.parametrize("name", WRITERS)
-def test_any_moment_leaves_the_old_file_or_none_or_the_new_one(tmp_path, name, sent, old):
+def test_an_interrupt_leaves_the_old_file_no_file_or_the_new_file(tmp_path, name, sent, old):
     write, number = WRITERS[name], signal.Signals[sent]
     write(tmp_path / "whole.ply", False)
     new, path, ends, litter = (tmp_path / "whole.ply").read_bytes(), tmp_path / "a.ply", set(), 0
@@ -91,20 +91,20 @@ def test_any_moment_leaves_the_old_file_or_none_or_the_new_one(tmp_path, name, s
         assert all(p.name.startswith(".a.ply.") and p.suffix == ".tmp" for p in rest)
         litter += len(rest)
         if rest:
-            write(path, True)  # the next run removes what is left
+            write(path, True)  # the next run removes leftovers
             assert {*tmp_path.iterdir()} == {path, tmp_path / "whole.ply"}
         if code == 0:
             break
-    assert code == 0  # in the end there was no such line any more
+    assert code == 0  # the last moment was after the last line
     assert moment > 8 * STEPS[name]
     assert ends == {old, new}
-    # A kill leaves its temporary file; others only where they hit the lines that open or remove it.
+    # A kill leaves its temporary file; other signals only at the lines that open or remove it.
     assert litter > 0 if sent == "SIGKILL" else litter <= 4
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the file size as Linux does")
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
-def test_a_disk_that_is_full_at_any_byte_leaves_the_old_file_or_none(tmp_path, write, old):
+def test_a_full_disk_leaves_the_old_file_or_no_file(tmp_path, write, old):
     import resource  # noqa: PLC0415 (not on Windows)
 
     write(tmp_path / "whole.ply", False)
@@ -125,14 +125,14 @@ def test_a_disk_that_is_full_at_any_byte_leaves_the_old_file_or_none(tmp_path, w
     assert path.read_bytes() == (tmp_path / "whole.ply").read_bytes()
 
 
-def test_a_scene_that_cannot_be_written_leaves_nothing(tmp_path):
+def test_an_invalid_scene_leaves_no_file(tmp_path):
     bad = cvtgs.GaussianScene(**scene().tensors(), comments=("two\nlines",))
     with pytest.raises(cvtgs.errors.InvalidSceneError):
         cvtgs.save(bad, tmp_path / "a.ply")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_two_writers_of_one_name_do_not_mix(tmp_path):
+def test_two_writers_of_the_same_file_do_not_mix(tmp_path):
     path = tmp_path / "a.bin"
     with (
         atomic_output(path, overwrite=True) as one,

@@ -1,4 +1,4 @@
-"""Hard cases that are hard by their size; time is compared with that of an easy scene."""
+"""Large hard cases; their time is compared with that of an easy scene."""
 
 import time
 import warnings
@@ -26,7 +26,7 @@ def timed(run, scene, count):
 
 @pytest.fixture(scope="module")
 def easy():
-    """An easy scene, and the CPU seconds of the second run with it."""
+    """Return the CPU seconds of the faster of two runs with an easy scene."""
     scene, runs = ball(LARGE, torch.float32), Simplifier(None, device="cpu")
     return min(timed(runs.run, scene, 10_000)[1] for _ in range(2))
 
@@ -34,8 +34,8 @@ def easy():
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["standard", "paper"])
 @pytest.mark.parametrize("name", ["coincident", "far_flyaways", "duplicates"])
-def test_no_case_takes_much_longer_than_an_easy_scene(name, preset, easy):
-    """Ten times is the limit here; benchmarks/numerics.py measures. All with all: 30 and more."""
+def test_hard_cases_take_at_most_ten_times_an_easy_scene(name, preset, easy):
+    """Comparing all pairs takes 30 times and more; benchmarks/numerics.py measures times."""
     scene = CASES[name](LARGE, torch.float32)
     run = Simplifier(None, config=preset, device="cpu").run
     (small, report), seconds = timed(run, scene, 10_000)
@@ -45,8 +45,8 @@ def test_no_case_takes_much_longer_than_an_easy_scene(name, preset, easy):
 
 
 @pytest.mark.slow
-def test_a_hundred_thousand_equal_gaussians():
-    """Equal in everything, colours too: not even those can part them."""
+def test_a_hundred_thousand_equal_gaussians_are_simplified():
+    """They are equal in every property, so nothing can separate them."""
     scene = ball(1, torch.float32).select(torch.zeros(LARGE, dtype=torch.int64))
     small, report = simplifier("paper").run(scene, count=1000)
     assert len(small) == 1000
@@ -56,8 +56,8 @@ def test_a_hundred_thousand_equal_gaussians():
 
 
 @pytest.mark.slow
-def test_a_cell_of_a_million_beside_cells_of_one():
-    """Its moments are those of float64 sums; the others keep their member bit for bit."""
+def test_a_cell_of_a_million_members_is_merged_accurately():
+    """Its moments match float64 sums; cells of one member keep it bit for bit."""
     million = 1_000_000
     scene = ball(1000, torch.float32)
     scene = scene.with_tensors({"shN": scene.shN[:, :0]}, {})
@@ -79,7 +79,7 @@ def test_a_cell_of_a_million_beside_cells_of_one():
 
 
 @pytest.mark.slow
-def test_a_million_in_one_cell_by_the_whole_way():
+def test_a_scene_with_one_huge_cell_is_simplified():
     scene = CASES["crowd_beside_loners"](1_000_000, torch.float32)
     scene = scene.with_tensors({"shN": scene.shN[:, :0]}, {})
     small, report = simplifier("standard").run(scene, count=11)
@@ -95,7 +95,7 @@ def moved(shift: tuple[float, float, float], dtype: torch.dtype = torch.float32)
 
 
 @pytest.mark.parametrize("where", [(0.0, 0.0, 0.0), (9e5, 0.0, -9e5)])
-def test_near_scenes_are_not_warned_of(where):
+def test_scenes_near_the_origin_give_no_warning(where):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         cvtgs.validity.warn_of_lost_digits(moved(where))
@@ -103,9 +103,10 @@ def test_near_scenes_are_not_warned_of(where):
         cvtgs.validity.warn_of_lost_digits(moved(where)[:0])
 
 
-def test_far_scenes_are(tmp_path, capsys):
+def test_scenes_far_from_the_origin_are_warned_about(tmp_path, capsys):
     scene = moved((500_000.0, 5_400_000.0, 0.0))
-    with pytest.warns(UserWarning, match=r"keeps steps of 0\.5 only: digits are lost") as caught:
+    match = r"resolves steps of 0\.5: precision is already lost"
+    with pytest.warns(UserWarning, match=match) as caught:
         cvtgs.validity.warn_of_lost_digits(scene)
     assert "shifted by -500000,-5400000," in str(caught[0].message).replace("-5399999", "-5400000")
     cvtgs.save(scene, tmp_path / "a.ply")
@@ -113,7 +114,7 @@ def test_far_scenes_are(tmp_path, capsys):
     assert "cvtgs: warning: positions lie 5.4e+06 from the origin" in capsys.readouterr().err
 
 
-def test_a_few_flyaways_are_no_far_scene():
+def test_a_few_flyaways_give_no_warning_of_a_far_scene():
     scene = moved((0.0, 0.0, 0.0))
     means = scene.means.clone()
     means[:5] = 1e9

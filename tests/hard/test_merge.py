@@ -1,4 +1,4 @@
-"""Merging given cells of hard scenes, with and without a network, and the network's gradients."""
+"""Merging given cells of hard scenes with and without a network, and network gradients."""
 
 import math
 from copy import deepcopy
@@ -23,7 +23,7 @@ EPSILON = {torch.float32: 1.2e-7, torch.float64: 2.3e-16}
 
 
 def labels_of(scene):
-    """Cells of four rows, which lie anywhere, and two cells of one."""
+    """Return labels of cells of four unrelated rows, and of two cells of one row."""
     labels = torch.arange(len(scene)) // 4
     labels[:2] = labels[-1] + 1 + torch.arange(2)[: len(scene)]
     return torch.unique(labels, return_inverse=True)[1].to(scene.device)
@@ -63,9 +63,10 @@ def test_each_case_without_a_network(make, dtype, subtests):
 
 
 def check_that_cells_equal_the_oracle(make, scene, config):
-    """To what float32 and float64 hold: of positions, of the cell's own size, of colours.
+    """Compare to the precision of the dtype, relative to positions, cell size and colours.
 
-    The oracle takes areas from eigenvalues, and so loses needles to 1e-4, and cells of 1e30.
+    The oracle computes areas from eigenvalues, so it is accurate to 1e-4 for needles only, and
+    fails for cells of 1e30.
     """
     small, labels = merged(scene, config).to("cpu"), labels_of(scene).cpu()
     scene, matrices = scene.to("cpu"), covariances_of(small)
@@ -101,7 +102,7 @@ def check_that_merged_cells_are_standard(scene, config):
 
 
 def check_that_moments_move_with_the_scene(scene, config):
-    """Any turn, a shift by twice the size of the scene and another unit, to 1e-4, in float64."""
+    """Turn, shift by twice the scene size and change the unit, to 1e-4, in float64."""
     extent = float((scene.means - scene.means.median(dim=0).values).abs().median()) or 1.0
     motion = {"quat": (0.9, 0.1, -0.3, 0.2), "scale": 1e3, "shift": (2e3 * extent, 0.0, -extent)}
     small = merged(scene, config)
@@ -109,7 +110,7 @@ def check_that_moments_move_with_the_scene(scene, config):
 
 
 def check_that_the_order_of_members_changes_nothing(scene, config):
-    """To 1e-4 of the size of each cell: sums of other orders round otherwise."""
+    """Compare to 1e-4 of the cell size: sums in another order round differently."""
     labels = labels_of(scene)
     shuffle = torch.randperm(len(scene), generator=torch.Generator().manual_seed(3))
     other = scene.select(shuffle)
@@ -133,17 +134,19 @@ def test_each_case_with_a_network(make, dtype, subtests):
     scene = valid_case(make, COUNT, dtype)
     for device in DEVICES:
         case = case_of_cells(scene, device)
-        with subtests.test("what the network sees is bounded", device=device):
-            check_that_what_the_network_sees_is_bounded(case)
+        with subtests.test("network inputs are bounded", device=device):
+            check_that_network_inputs_are_bounded(case)
         for preset in PRESETS:
-            with subtests.test("corrected cells are near", device=device, preset=preset):
+            with subtests.test(
+                "corrected cells are near the reference", device=device, preset=preset
+            ):
                 net = deepcopy(load_checkpoint(preset).net).to(device, dtype)
                 check_that_corrected_cells_are_finite_and_near_the_reference(case, net)
         with subtests.test("gradients are finite", device=device):
             check_that_gradients_are_finite(case, lively_net(dtype).to(device))
 
 
-def check_that_what_the_network_sees_is_bounded(case):
+def check_that_network_inputs_are_bounded(case):
     seen = case.describe()
     for name, values in {**features_of(seen), "positions": seen.positions}.items():
         assert bool(values.isfinite().all()), name
@@ -151,9 +154,9 @@ def check_that_what_the_network_sees_is_bounded(case):
 
 
 def check_that_corrected_cells_are_finite_and_near_the_reference(case, net):
-    """Log scales change by as much as the network promises at most, logits by 2.
+    """Log-scales change at most by the bound of the network, logits by 2.
 
-    The network of CVT-GS as published promises no bounds.
+    The network of CVT-GS as published has no bounds.
     """
     small = case.correct(net)
     several = case.part.counts > 1
@@ -172,7 +175,7 @@ def check_that_corrected_cells_are_finite_and_near_the_reference(case, net):
 
 
 def check_that_gradients_are_finite(case, net):
-    """Through network and images."""
+    """Check gradients through the network and the rendered images."""
     middle = case.merged.means.median(dim=0).values.cpu().double()
     cameras = around(1, 16, 12, 16.0)
     viewmats = cameras.viewmats.clone()
@@ -189,8 +192,8 @@ def check_that_gradients_are_finite(case, net):
     assert moves or not seen
 
 
-def test_corrected_cells_of_equal_eigenvalues_move_with_the_scene():
-    """Neighbours decide about axes that equal eigenvalues leave open."""
+def test_corrected_cells_of_equal_eigenvalues_turn_with_the_scene():
+    """Neighbours determine the axes that equal eigenvalues leave undefined."""
     scene = CASES["isotropic_cells"](COUNT, torch.float64)
     labels = torch.arange(COUNT) // 6
     turn = {"quat": (0.9, 0.1, -0.3, 0.2)}

@@ -33,19 +33,19 @@ from scenes import assert_standard, same_bits
 
 COUNT = 60
 BLANK = {
-    "tiny_world": "the near plane of 3DGS is at 0.01 units, behind all there is",
-    "denormals": "the cameras are taken into the hollow ball, and it is nearer than 0.01 units",
-    "all_transparent": "there is nothing to see",
+    "tiny_world": "the near plane of 3DGS, at 0.01 units, is behind the whole scene",
+    "denormals": "the cameras are inside the hollow ball, which is nearer than 0.01 units",
+    "all_transparent": "nothing is visible",
 }
 CHANCE = {
     **BLANK,
-    "needles": "thinner than a pixel, they paint by the dilation of 3DGS alone; see below",
-    "points": "thinner than a pixel, they paint by the dilation of 3DGS alone; see below",
-    "points_amid_giants": "every giant is everywhere: the order in depth decides",
-    "giants": "every giant is everywhere: the order in depth decides",
-    "coincident": "at one depth, the order of the rows decides what hides what",
-    "two_clusters": "seen whole, each ball is less than a pixel",
-    "huge_colours": "all colours are clipped: chance; see below",
+    "needles": "thinner than a pixel, only the dilation of 3DGS makes them visible; see below",
+    "points": "thinner than a pixel, only the dilation of 3DGS makes them visible; see below",
+    "points_amid_giants": "every giant covers every pixel: the depth order decides",
+    "giants": "every giant covers every pixel: the depth order decides",
+    "coincident": "at one depth, the order of the rows decides which Gaussian is in front",
+    "two_clusters": "seen from far, each ball is smaller than a pixel",
+    "huge_colours": "all colours are clipped, so the score is chance; see below",
 }
 
 
@@ -53,7 +53,7 @@ pytestmark = pytest.mark.usefixtures("coarse_light")
 
 
 def ring(scene, count=3):
-    """Cameras around the middle of a scene, whose precision is that of the scene's numbers."""
+    """Return float64 cameras around the median centre of a scene."""
     middle = scene.means.double().median(dim=0).values
     turns = 2.1 * torch.arange(count, dtype=torch.float64)
     ways = torch.stack([turns.cos(), 0.3 * turns.sin() - 0.4, turns.sin()], dim=1)
@@ -82,12 +82,12 @@ def scores(scene, small, cameras):
 )
 @each_case
 def test_each_case(make, dtype, subtests):
-    """Its views, its images by every backend, its scores, and two steps of refinement."""
+    """Check the views, images of every backend, scores, and two steps of refinement."""
     scene = make(COUNT, dtype)
-    with subtests.test("views look at what is there"):
-        check_that_views_look_at_what_is_there(make, scene)
+    with subtests.test("views show the scene"):
+        check_that_views_show_the_scene(make, scene)
     for device, backend in product(DEVICES, BACKENDS):
-        if device == "cpu" or backend != "numba":  # which renders on the CPU
+        if device == "cpu" or backend != "numba":  # numba renders on the CPU
             with subtests.test("images and gradients are finite", device=device, backend=backend):
                 check_that_images_and_gradients_are_finite(make, scene, device, backend)
     with subtests.test("scores are numbers for both presets"):
@@ -97,7 +97,7 @@ def test_each_case(make, dtype, subtests):
             check_that_refinement_leaves_a_standard_scene(make, scene.to(device), device)
 
 
-def check_that_views_look_at_what_is_there(make, scene):
+def check_that_views_show_the_scene(make, scene):
     cameras = automatic_views(scene, 3, width=32, height=24)
     assert len(cameras) == 3
     assert bool(cameras.viewmats.isfinite().all())
@@ -107,8 +107,8 @@ def check_that_views_look_at_what_is_there(make, scene):
     assert bool((images.alpha.mean(dim=(1, 2)) > 1e-3).any()) or make.__name__ in BLANK
 
 
-def test_views_of_one_place_stand_back():
-    """Where all centres are one, what there is to see is as large as the Gaussians."""
+def test_views_of_coincident_centres_keep_their_distance():
+    """If all centres coincide, the size of the Gaussians is the size of the scene."""
     for scene in (CASES["coincident"](COUNT, torch.float32), ball(1, torch.float32)):
         eyes = automatic_views(scene, 4, width=32, height=32).centers
         widths = scene.scales.amax(dim=1)
@@ -123,14 +123,14 @@ def check_that_images_and_gradients_are_finite(make, scene, device, backend):
     shown = replace(scene.to(device), **leaves, extras={})
     found = render(shown, cameras, backend=backend, depth=True)
     painted = bool(found.alpha.detach().any())
-    if make.__name__ not in ("nan_sh0", "nan_shN"):  # a colour of NaN is a pixel of NaN
+    if make.__name__ not in ("nan_sh0", "nan_shN"):  # a NaN colour gives a NaN pixel
         assert bool(found.rgb.isfinite().all())
     assert bool((found.alpha.isfinite() & (found.alpha >= 0) & (found.alpha <= 1)).all())
     assert bool(found.depth.isfinite().all())
     (found.rgb.nan_to_num(0).square().mean() + found.alpha.mean()).backward()
     fine = valid_rows(scene).to(device)
     for name, values in leaves.items():
-        steep = name == "quats" and make.__name__ == "denormals"  # the slope is beyond the dtype
+        steep = name == "quats" and make.__name__ == "denormals"  # the slope overflows the dtype
         if make.__name__ not in ("nan_sh0", "nan_shN") and not steep:
             assert values.grad is None or bool(values.grad[fine].isfinite().all()), name
     assert not painted or bool(leaves["sh0"].grad.any())
@@ -145,7 +145,7 @@ def check_that_scores_are_numbers(scene):
 @pytest.mark.slow
 @each_case
 def test_images_are_no_worse_than_mass_pruning(make, subtests):
-    """By automatic views, at a fifth; PSNR is capped at 50 dB."""
+    """Compared by automatic views, at a fifth of the count; PSNR is capped at 50 dB."""
     if make.__name__ in CHANCE:
         pytest.skip(CHANCE[make.__name__])
     scene = valid_case(make, 200, torch.float32)
@@ -159,10 +159,10 @@ def test_images_are_no_worse_than_mass_pruning(make, subtests):
 
 
 @pytest.mark.parametrize("name", ["needles", "points"])
-def test_what_is_thinner_than_a_pixel_is_shown_right_without_dilation(name):
-    """Antialiased scenes paint no more than their area: then the images are as good.
+def test_subpixel_gaussians_are_as_good_as_pruned_without_dilation(name):
+    """Gaussians of antialiased scenes cover only their own area: images are as good as pruned.
 
-    Not those of ``paper``, whose opacity knows no area: its needles become opaque balls.
+    Not with ``paper``, whose opacity ignores the area: its needles become opaque balls.
     """
     scene = replace(valid_case(CASES[name], 200, torch.float32), comments=("SplatRenderMode: mip",))
     ours = simplifier("standard").simplify(scene, 0.2)
@@ -172,11 +172,11 @@ def test_what_is_thinner_than_a_pixel_is_shown_right_without_dilation(name):
 
 
 @pytest.mark.parametrize(("name", "gap"), [("needles", 0.5), ("points", 0.5)])
-def test_what_is_thinner_than_a_pixel_is_hardly_worse_than_pruned(name, gap):
-    """Members that hardly touch stand for their cells; moments lose 1.6 to 2.3 dB to pruning.
+def test_subpixel_gaussians_are_hardly_worse_than_pruned(name, gap):
+    """Members that hardly overlap represent their cells; moments are 1.6 to 2.3 dB worse.
 
-    Pruning keeps the largest of all, a cell its own largest, and areas weigh to the power 0.5: that
-    is the rest. ``paper`` keeps the moments.
+    The rest of the gap: pruning keeps the largest Gaussians of all, a cell only its own largest,
+    and areas are weighted with the power 0.5. ``paper`` keeps the moments.
     """
     scene = valid_case(CASES[name], 200, torch.float32)
     ours = simplifier("standard").simplify(scene, 0.2)
@@ -186,8 +186,8 @@ def test_what_is_thinner_than_a_pixel_is_hardly_worse_than_pruned(name, gap):
 
 
 @presets
-def test_each_of_two_clusters_is_no_worse_than_pruned(preset):
-    """Seen from nearby, one of them at a time."""
+def test_two_clusters_seen_from_nearby_are_no_worse_than_pruned(preset):
+    """Each cluster is viewed separately, from nearby."""
     scene = valid_case(CASES["two_clusters"], 400, torch.float64)
     ours, pruned = simplifier(preset).simplify(scene, 0.2), keep_most_mass(scene, 80)
     for start in (0, 1):
@@ -197,17 +197,17 @@ def test_each_of_two_clusters_is_no_worse_than_pruned(preset):
 
 
 @presets
-def test_georeferenced_scenes_are_no_worse_by_cameras_in_float64(preset):
+def test_georeferenced_scenes_are_better_than_pruned_in_float64(preset):
     scene = valid_case(CASES["georeferenced"], 200, torch.float64)
     ours, pruned = simplifier(preset).simplify(scene, 0.2), keep_most_mass(scene, 40)
     found = scores(scene, {"ours": ours, "pruned": pruned}, ring(scene))
     assert found[0] >= found[1] + 3, found
 
 
-def test_huge_colours_hide_no_worse():
-    """Clipped colours are chance; what hides the background is not.
+def test_the_alpha_of_huge_colours_is_no_worse_than_pruned():
+    """Clipped colours depend on chance; alpha does not.
 
-    ``standard`` alone: the network of ``paper`` has no bounds, as published, and hides more.
+    Only for ``standard``: the published network of ``paper`` has no bounds, and hides more.
     """
     scene = valid_case(CASES["huge_colours"], 200, torch.float32)
     cameras = ring(scene)
@@ -233,7 +233,7 @@ def check_that_refinement_leaves_a_standard_scene(make, scene, device):
         assert same_bits(refined.to("cpu"), small.to("cpu"))
 
 
-def test_the_tag_of_antialiasing_reaches_the_small_scene():
+def test_the_antialiasing_tag_is_kept_in_the_result():
     scene = CASES["antialiased"](COUNT, torch.float32)
     small = simplifier("standard").simplify(scene, 0.2)
     assert small.antialiased

@@ -33,7 +33,7 @@ pytestmark = pytest.mark.usefixtures("coarse_light")
 
 @st.composite
 def mixed_scenes(draw: st.DrawFn) -> GaussianScene:
-    """Some rows of one to four cases, in any order, some of them more than once."""
+    """Draw rows of one to four cases, in any order, possibly repeated."""
     dtype = draw(st.sampled_from([torch.float32, torch.float64]))
     names = draw(st.lists(st.sampled_from(sorted(CASES)), min_size=1, max_size=4))
     pool = [CASES[name](draw(st.integers(1, 30)), dtype) for name in names]
@@ -49,7 +49,7 @@ def mixed_scenes(draw: st.DrawFn) -> GaussianScene:
 @presets
 @hypothesis.given(scene=mixed_scenes(), share=st.floats(0.01, 1.0))
 @SETTINGS
-def test_mixed_scenes_come_out_standard_and_exactly_as_many(preset, scene, share):
+def test_mixed_scenes_become_standard_with_the_exact_count(preset, scene, share):
     valid, count = int(valid_rows(scene).sum()), max(1, int(share * len(scene)))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -1,14 +1,14 @@
 """Whole simplifications of hard scenes: count, report, warnings, stability, and no giant blobs.
 
-What cannot hold to 1e-4, and why (docs/numerics.md says more):
+Invariances that cannot hold to 1e-4 (docs/numerics.md says more):
 
-- Turns move the axes that the Morton curve, the median and the light know, so seeds are others and
-  cells are others, as good: here the energy is compared, in test_hard_merge.py given cells.
-- In ``isotropic_cells`` points lie just between two sites, so rounding decides which cell they
-  join. There images are compared.
-- Where a handful of Gaussians holds all the distance (``LUCK``), one seed more or less among them
+- The Morton curve, the median and the ambient visibility depend on the axes, so a turn gives other
+  seeds and cells of equal quality: energies are compared here, given cells in test_merge.py.
+- In ``isotropic_cells``, points are midway between two sites, so rounding decides which cell they
+  join: images are compared.
+- If a few Gaussians hold nearly all the distance (``LUCK``), one seed more or less among them
   decides the energy.
-- Denormal coordinates have no digits that could survive another unit.
+- Denormal coordinates lose their digits in another unit.
 """
 
 import math
@@ -51,7 +51,7 @@ def moments_only(preset):
 
 
 def run_and_watch(scene, preset, device, count):
-    """Return scene and report, and what was warned about."""
+    """Return the scene, the report and the categories of warnings."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         small, report = simplifier(preset, device).run(scene, count=count)
@@ -61,7 +61,7 @@ def run_and_watch(scene, preset, device, count):
 @pytest.mark.slow
 @dtypes
 @each_case
-def test_each_case_to_every_count_and_in_another_order(make, dtype, subtests):
+def test_each_case_at_every_count_and_in_another_order(make, dtype, subtests):
     scene = make(COUNT, dtype)
     fifth = max(1, len(scene) // 5)
     for device in DEVICES:
@@ -90,7 +90,7 @@ def check_result(scene, small, report, count):
     assert (report.shortfall == "") == (count <= valid)
     if count < len(scene):
         assert_standard(small)
-    else:  # the scene's own rows
+    else:  # the rows of the input
         assert torch.equal(small.means, scene.means[valid_rows(scene)])
     masses = report.mass_in, report.mass_out, report.energy, *report.energies
     assert all(math.isfinite(mass) and mass >= 0 for mass in masses)
@@ -98,7 +98,7 @@ def check_result(scene, small, report, count):
 
 
 def check_another_order(scene, preset, count, small):
-    """Not even where all rows tie: of coincident, equal and equally faint ones mass decides."""
+    """Ties between coincident, equal or equally faint rows are broken by mass."""
     shuffle = torch.randperm(len(scene), generator=torch.Generator().manual_seed(1))
     other = run_and_watch(scene.select(shuffle), preset, "cpu", count)[0]
     assert_same_gaussians(small, other)
@@ -106,15 +106,15 @@ def check_another_order(scene, preset, count, small):
 
 @pytest.mark.slow
 @each_case
-def test_each_case_moved(make, subtests):
-    """In float64: in another unit, shifted by twice the size of the scene, and turned."""
+def test_each_case_in_another_unit_shifted_and_turned(make, subtests):
+    """Check float64 scenes in another unit, shifted by twice their size, and turned."""
     scene = valid_case(make, COUNT, torch.float64)
     count = max(1, len(scene) // 5)
     extent = float((scene.means - scene.means.median(dim=0).values).abs().median()) or 1.0
     motions = [{"scale": 1e3}, {"shift": (2 * extent, -extent, 0.3 * extent)}]
-    if make.__name__ != "denormals":  # below the smallest normal number digits are lost
+    if make.__name__ != "denormals":  # denormal numbers lose digits
         motions.append({"scale": 1e-3})
-    # Equally near sites: see the next test.
+    # Sites are equally near: see test_scenes_with_equal_distances_give_the_same_image.
     if make.__name__ in ("isotropic_cells", "duplicates", "coincident"):
         motions = []
     for preset in PRESETS:
@@ -124,7 +124,7 @@ def test_each_case_moved(make, subtests):
             with subtests.test("unit and shift change nothing", preset=preset, **motion):
                 found = run.simplify(moved(scene, **motion), count=count)
                 assert_same_gaussians(found, moved(small, **motion))
-        with subtests.test("a turn gives cells as good", preset=preset):
+        with subtests.test("a turn gives cells of equal quality", preset=preset):
             check_a_turn(make, preset)
 
 
@@ -142,8 +142,8 @@ def check_a_turn(make, preset):
 
 @presets
 @pytest.mark.parametrize("name", ["isotropic_cells", "giants"])
-def test_even_cells_give_the_same_image(name, preset):
-    """To 25 dB, while single Gaussians differ by as much as the network may change them."""
+def test_scenes_with_equal_distances_give_the_same_image(name, preset):
+    """Compare images to 25 dB; single Gaussians differ as much as the network can change them."""
     scene = valid_case(CASES[name], 300, torch.float64)
     there = moved(scene, shift=(1.0, 2.0, -3.0))
     views = automatic_views(scene, 2, width=32, height=32, seed=0)
@@ -156,8 +156,8 @@ def test_even_cells_give_the_same_image(name, preset):
 @dtypes
 @devices
 @pytest.mark.parametrize("name", ["flyaways", "far_flyaways"])
-def test_flyaways_neither_grow_nor_spoil_the_rest(name, device, dtype):
-    """Nothing larger than the scene comes out, and the ball is as if they were not there."""
+def test_flyaways_do_not_affect_the_rest_of_the_scene(name, device, dtype):
+    """No Gaussian is larger than the scene, and the mass is as without flyaways."""
     scene = CASES[name](300, dtype).to(device)
     small, report = simplifier("standard", device).run(scene, count=60)
     assert report.filtered_count >= 5
@@ -168,8 +168,8 @@ def test_flyaways_neither_grow_nor_spoil_the_rest(name, device, dtype):
 
 
 @dtypes
-def test_flyaways_of_the_paper_come_out_alone(dtype):
-    """The paper's filter keeps them; their cell is theirs, and no Gaussian spans the way."""
+def test_flyaways_stay_in_their_own_cells_with_paper(dtype):
+    """The filter of the paper keeps them, but no Gaussian spans the distance to them."""
     small = simplifier("paper").simplify(CASES["flyaways"](300, dtype), count=60)
     near = small.means.abs().amax(dim=1) < 2
     assert int(near.sum()) >= 50
@@ -178,8 +178,8 @@ def test_flyaways_of_the_paper_come_out_alone(dtype):
 
 @presets
 @dtypes
-def test_equal_gaussians_merge_into_themselves(dtype, preset):
-    """Of each Gaussian five copies: as many cells as there are places have one place each."""
+def test_copies_of_a_gaussian_merge_into_it(dtype, preset):
+    """There are five copies of each Gaussian, and as many cells as different Gaussians."""
     scene = CASES["duplicates"](COUNT, dtype)
     small = simplifier(preset).simplify(scene, count=COUNT // 5)
     places = scene.means[::5]
@@ -188,7 +188,7 @@ def test_equal_gaussians_merge_into_themselves(dtype, preset):
     assert_standard(small)
 
 
-def test_a_report_counts_what_was_filtered_of_faint_and_transparent_scenes():
+def test_the_report_counts_filtered_faint_and_transparent_rows():
     for name in ("all_faint", "all_transparent"):
         scene = CASES[name](COUNT, torch.float32)
         faint = simplifier("standard").run(scene, count=6).report
@@ -199,7 +199,7 @@ def test_a_report_counts_what_was_filtered_of_faint_and_transparent_scenes():
 
 
 @dtypes
-def test_half_a_million_units_of_colour_do_not_leave_their_hull(dtype):
+def test_huge_colours_stay_within_the_range_of_the_input(dtype):
     scene = CASES["huge_colours"](COUNT, dtype)
     small = moments_only("standard").simplify(scene, count=12)
     assert float(small.sh0.amax()) <= float(scene.sh0.amax()) * (1 + 1e-6)

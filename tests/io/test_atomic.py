@@ -1,4 +1,4 @@
-"""Files appear complete or not at all, and an old one is replaced only when asked."""
+"""Files appear complete or not at all, and an old one is replaced only on request."""
 
 import errno
 import os
@@ -35,7 +35,7 @@ def mode_of(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
 
 
-def test_a_new_file(tmp_path: Path) -> None:
+def test_a_new_file_is_written(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     with atomic_output(path) as file:
         file.write(b"new")
@@ -44,7 +44,7 @@ def test_a_new_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_an_old_file_stays_until_the_new_one_is_complete(tmp_path: Path) -> None:
+def test_an_old_file_is_kept_until_the_new_one_is_complete(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(b"old")
     with atomic_output(path, overwrite=True) as file:
@@ -56,7 +56,7 @@ def test_an_old_file_stays_until_the_new_one_is_complete(tmp_path: Path) -> None
 
 
 @pytest.mark.skipif(os.name == "nt", reason="permissions are those of POSIX")
-def test_permissions(tmp_path: Path) -> None:
+def test_a_replaced_file_keeps_its_permissions(tmp_path: Path) -> None:
     old, new = tmp_path / "old", tmp_path / "new"
     old.write_bytes(b"old")
     old.chmod(0o640)
@@ -72,7 +72,7 @@ def test_permissions(tmp_path: Path) -> None:
     assert mode_of(old) == 0o604
 
 
-def test_symbolic_links_stay_links(tmp_path: Path) -> None:
+def test_symbolic_links_are_followed_and_kept(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     target, link = tmp_path / "real" / "a.bin", tmp_path / "link.bin"
     link.symlink_to(target)
@@ -89,7 +89,7 @@ def refuse(*args: object) -> NoReturn:
 
 @pytest.fixture(params=["rename", "claim"])
 def last_resort(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is left without hard links: a rename that never replaces, or not even that."""
+    """The fallbacks without hard links: a rename that never replaces, or not even that."""
     if request.param == "claim":
         monkeypatch.setattr(atomic, "_rename", refuse)
 
@@ -112,9 +112,7 @@ def test_without_hard_links_the_result_is_the_same(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.bin", "b.bin"]
 
 
-def test_where_nothing_can_be_renamed_nothing_is_left(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_rename_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "link", refuse)
     monkeypatch.setattr(atomic, "_rename", refuse)
     monkeypatch.setattr(Path, "replace", refuse)
@@ -123,13 +121,13 @@ def test_where_nothing_can_be_renamed_nothing_is_left(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_name_that_no_file_can_have(tmp_path: Path) -> None:
+def test_a_too_long_file_name_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="file name too long"):
         check_output(tmp_path / ("n" * 300))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the rename of Linux")
-def test_without_hard_links_no_empty_file_takes_the_name(
+def test_without_hard_links_no_empty_file_is_created(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "link", refuse)
@@ -140,13 +138,13 @@ def test_without_hard_links_no_empty_file_takes_the_name(
 
 @pytest.mark.parametrize("error", [OSError(errno.EIO, "bad"), KeyboardInterrupt()])
 @pytest.mark.parametrize("theirs", [None, b"theirs"])
-def test_a_claimed_name_is_given_back(
+def test_the_empty_file_is_removed_after_a_failure(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     error: BaseException,
     theirs: bytes | None,
 ) -> None:
-    """But not where another file has taken it meanwhile."""
+    """Unless another process has replaced it with its own file."""
     path = tmp_path / "a.bin"
 
     def fail(self: Path, target: Path) -> NoReturn:
@@ -166,7 +164,7 @@ def test_a_claimed_name_is_given_back(
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit, OutputError])
 @pytest.mark.parametrize("old", [None, b"old"])
-def test_nothing_is_left_behind(
+def test_an_error_in_the_body_leaves_no_new_file(
     tmp_path: Path, error: type[BaseException], old: bytes | None
 ) -> None:
     path = tmp_path / "a.bin"
@@ -177,7 +175,7 @@ def test_nothing_is_left_behind(
     assert [p.read_bytes() for p in tmp_path.iterdir()] == ([old] if old else [])
 
 
-def test_a_file_that_appeared_meanwhile_is_not_destroyed(tmp_path: Path) -> None:
+def test_a_file_created_during_the_write_is_not_replaced(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     with pytest.raises(OutputExistsError) as caught:
         write_while_another_does(path)
@@ -188,7 +186,7 @@ def test_a_file_that_appeared_meanwhile_is_not_destroyed(tmp_path: Path) -> None
     assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"theirs"]
 
 
-def test_errors_of_other_files_are_not_relabelled(tmp_path: Path) -> None:
+def test_errors_about_other_files_are_not_changed(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError) as caught, atomic_output(tmp_path / "a.bin"):
         (tmp_path / "elsewhere" / "b.bin").open()
     assert type(caught.value) is FileNotFoundError
@@ -202,7 +200,7 @@ def test_errors_of_other_files_are_not_relabelled(tmp_path: Path) -> None:
         (errno.EIO, "must be writable, found: input/output error."),
     ],
 )
-def test_a_failing_disk(
+def test_disk_errors_keep_the_old_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, text: str
 ) -> None:
     def fail(descriptor: int) -> NoReturn:
@@ -218,7 +216,7 @@ def test_a_failing_disk(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the file size as Linux does")
-def test_a_write_that_really_fails(tmp_path: Path) -> None:
+def test_a_write_beyond_the_file_size_limit_is_an_output_error(tmp_path: Path) -> None:
     program = (
         "import resource, sys\n"
         "from cvtgs.errors import OutputError\n"
@@ -241,7 +239,9 @@ def test_a_write_that_really_fails(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_early_check_of_what_cannot_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_impossible_outputs_are_refused_before_writing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder, old = tmp_path / "folder.ply", tmp_path / "old.ply"
     folder.mkdir()
     old.write_bytes(b"old")
@@ -275,7 +275,7 @@ def test_early_check_of_what_cannot_work(tmp_path: Path, monkeypatch: pytest.Mon
     )
 
 
-def test_early_check_of_the_suffix(tmp_path: Path) -> None:
+def test_an_unknown_suffix_is_refused_before_writing(tmp_path: Path) -> None:
     ends = r"\.compressed\.ply, \.ply, \.spz, \.splat, \.sog, \.spz\.glb, \.glb, \.gltf or \.usda"
     with pytest.raises(FileFormatError, match=f"the file name must end in {ends}, found no suffix"):
         check_save(tmp_path / "scene")
@@ -283,7 +283,7 @@ def test_early_check_of_the_suffix(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /dev/full")
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_devices_are_never_replaced(tmp_path: Path, overwrite: bool) -> None:
+def test_devices_and_pipes_are_never_replaced(tmp_path: Path, overwrite: bool) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     for path in (pipe, Path("/dev/full")):

@@ -1,4 +1,4 @@
-"""Axes of files: scenes are turned from them and to them, colours included."""
+"""Conversion of scenes from and to the axes of files, colours included."""
 
 import itertools
 from pathlib import Path
@@ -20,7 +20,7 @@ QUARTER_TURNS = {"rbd": (1, 1, 0, 0), "rfu": (1, -1, 0, 0)}
 
 
 def matrix_of(source: str, target: str) -> torch.Tensor:
-    """Return where a point goes, coordinate by coordinate."""
+    """Return the matrix between axes, coordinate by coordinate."""
     matrix = torch.zeros(3, 3, dtype=torch.float64)
     for row, letter in enumerate(target):
         axis, sign = LETTERS[letter]
@@ -35,7 +35,7 @@ def shapes_of(scene: GaussianScene) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("axes", "quat"), [*(HALF_TURNS | QUARTER_TURNS).items()])
-def test_a_scene_turns_as_that_of_the_oracle(axes: str, quat: tuple[int, ...]) -> None:
+def test_changed_axes_match_the_oracle(axes: str, quat: tuple[int, ...]) -> None:
     scene = random_scene(40, degree=3)
     turned, oracle = change_axes(scene, "rdf", axes), moved(scene, quat=quat)
     for name in ("means", "log_scales", "sh0", "shN"):
@@ -44,8 +44,8 @@ def test_a_scene_turns_as_that_of_the_oracle(axes: str, quat: tuple[int, ...]) -
 
 
 @pytest.mark.parametrize(("source", "target"), [*itertools.product(("rdf", "lfu", "ruf"), AXES)])
-def test_centres_shapes_and_colours_go_together(source: str, target: str) -> None:
-    """Of all sixteen, mirrored ones too: the same colour is seen from the turned direction."""
+def test_centres_shapes_and_colours_change_consistently(source: str, target: str) -> None:
+    """For all 16 axes, also mirrored ones: the turned direction shows the same colour."""
     scene = random_scene(20, degree=3, dtype=torch.float64)
     turned, matrix = change_axes(scene, source, target), matrix_of(source, target)
     torch.testing.assert_close(turned.means, scene.means @ matrix.T, rtol=0, atol=0)
@@ -57,7 +57,7 @@ def test_centres_shapes_and_colours_go_together(source: str, target: str) -> Non
 
 
 @pytest.mark.parametrize("axes", AXES[:8])
-def test_only_signs_change_where_no_axes_change_places(axes: str) -> None:
+def test_only_signs_change_if_no_axes_are_swapped(axes: str) -> None:
     scene = random_scene(20, degree=2)
     turned = change_axes(scene, "rdf", axes)
     for name, tensor in scene.tensors().items():
@@ -67,7 +67,7 @@ def test_only_signs_change_where_no_axes_change_places(axes: str) -> None:
 
 
 @pytest.mark.parametrize("end", ["ply", "compressed.ply", "spz", "splat", "sog"])
-def test_every_format_takes_axes(tmp_path: Path, end: str) -> None:
+def test_every_format_accepts_axes(tmp_path: Path, end: str) -> None:
     scene = random_scene(50, degree=0)
     scene = scene.with_tensors({"sh0": scene.sh0.clamp(-1.7, 1.7)}, {})
     save(scene, tmp_path / f"a.{end}")
@@ -80,7 +80,7 @@ def test_every_format_takes_axes(tmp_path: Path, end: str) -> None:
 
 
 def test_unknown_axes_are_refused_before_anything_is_read(tmp_path: Path) -> None:
-    text = r"axes must be three letters .* found 'xyz'"
+    text = r"axes must be the directions of x, y and z, .* found 'xyz'"
     with pytest.raises(InvalidArgumentError, match=text):
         load(tmp_path / "missing.ply", axes="xyz")
     with pytest.raises(InvalidArgumentError, match=text):

@@ -1,4 +1,4 @@
-"""Small files that claim or unpack to very much: below 1 GB each, and one sentence."""
+"""Small files with huge claimed or unpacked sizes: at most 1 GB of memory, one sentence."""
 
 import gzip
 import io
@@ -25,7 +25,7 @@ from scenes import random_scene
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="measures memory as Linux does")
 FULLEST = FREE_BYTES // 56
-"""Gaussians without view-dependent colour that a file of any size may claim."""
+"""Most Gaussians without view-dependent colour that a file of any size may claim."""
 
 MEASURE = """
 import os, sys, torch, cvtgs, cvtgs.io.sog, cvtgs.io.spz, cvtgs.io.checkpoints
@@ -79,7 +79,7 @@ def sog(path: Path, count: int, *, method: int = zipfile.ZIP_DEFLATED, junk: int
 
 
 def expanded(rows: int) -> dict[str, torch.Tensor]:
-    """Return a scene whose rows are all the same memory."""
+    """Return a scene whose rows all share the same memory."""
     tensors = cvtgs.to_dict(random_scene(1, degree=0))
     return {name: values.expand(rows, *values.shape[1:]) for name, values in tensors.items()}
 
@@ -90,7 +90,7 @@ class Filler:
 
 
 def make(folder: Path) -> dict[str, Path]:
-    """Write the files, by what is wrong with them."""
+    """Write the files, named after the fault of each."""
     paths = {}
 
     def at(name: str, suffix: str) -> Path:
@@ -143,12 +143,12 @@ def test_small_files_take_less_than_a_gigabyte(tmp_path: Path) -> None:
     assert {name: peak for name, peak in peaks.items() if peak >= 10**9} == {}
 
 
-def test_what_is_said(tmp_path: Path) -> None:
+def test_implausible_sizes_are_refused_in_one_sentence(tmp_path: Path) -> None:
     path = tmp_path / "a.sog"
     sog(path, 3_000_000)
     size = path.stat().st_size
     assert refusal(path) == (
-        f"{path}: a scene must have at most 64 MiB and {MOST_EXPANSION} times the bytes of its "
+        f"{path}: a scene must take at most 64 MiB plus {MOST_EXPANSION} times the bytes of its "
         f"file, found 3,000,000 Gaussians that take 168,000,000 bytes in a file of {size:,}; if "
         f"you trust the file, pass trust_sizes=True (--trust-sizes)."
     )
@@ -165,12 +165,12 @@ def test_what_is_said(tmp_path: Path) -> None:
     )
     torch.save({"more": Filler(), "splats": expanded(1)}, path)
     assert refusal(path) == (
-        f"{path}: must be a whole checkpoint of tensors and plain numbers, "
+        f"{path}: must be an intact checkpoint of tensors and plain numbers, "
         f"found '__builtin__.bytearray'."
     )
 
 
-def test_who_trusts_a_file_gets_it(tmp_path: Path) -> None:
+def test_trust_sizes_reads_files_with_implausible_sizes(tmp_path: Path) -> None:
     path = tmp_path / "a.pt"
     torch.save({"splats": expanded(100)}, path)
     assert len(cvtgs.load(path, trust_sizes=True)) == 100
@@ -179,12 +179,12 @@ def test_who_trusts_a_file_gets_it(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="if you trust the file"):
         cvtgs.load(path)
     assert len(cvtgs.load(path, trust_sizes=True)) == count
-    path = tmp_path / "a.splat"  # whose size cannot lie
+    path = tmp_path / "a.splat"  # its size is always the true one
     path.write_bytes(bytes(32))
     assert len(cvtgs.load(path, trust_sizes=True)) == 1
 
 
-def test_option_of_commands(tmp_path: Path) -> None:
+def test_commands_accept_trust_sizes(tmp_path: Path) -> None:
     path, small = tmp_path / "a.pt", tmp_path / "small.ply"
     torch.save({"splats": expanded(100)}, path)
     convert = ["convert", str(path), str(tmp_path / "a.ply"), "--quiet"]
@@ -196,7 +196,7 @@ def test_option_of_commands(tmp_path: Path) -> None:
     assert main([*words, "--quiet", "--trust-sizes"]) == 0
 
 
-def test_an_unbundled_sog_counts_its_images(tmp_path: Path) -> None:
+def test_the_images_of_an_unbundled_sog_count_as_stored_bytes(tmp_path: Path) -> None:
     sog(tmp_path / "a.sog", 3_000_000)
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         archive.extractall(tmp_path)
@@ -206,7 +206,7 @@ def test_an_unbundled_sog_counts_its_images(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["render", "evaluate", "compare", "tradeoff", "info"])
-def test_every_command_that_reads_can_be_told_to_trust_sizes(command):
+def test_every_reading_command_has_the_option_trust_sizes(command):
     parser = build_parser()
     words = {
         "render": ["render", "a.sog", "-o", "b"],

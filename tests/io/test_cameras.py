@@ -1,4 +1,4 @@
-"""Camera files of every format against one hand-made rig of cameras."""
+"""Camera files of every format, compared with one hand-made rig of cameras."""
 
 import json
 import math
@@ -47,7 +47,7 @@ def pixels(cameras: Cameras, point: np.ndarray = POINT) -> np.ndarray:
 
 
 @each_format
-def test_a_known_point_is_at_the_expected_pixel(write, tmp_path) -> None:
+def test_a_known_point_projects_to_the_expected_pixel(write, tmp_path) -> None:
     write(tmp_path)
     cameras = load_cameras(tmp_path)
     assert (cameras.width, cameras.height) == SIZE
@@ -59,7 +59,7 @@ def test_a_known_point_is_at_the_expected_pixel(write, tmp_path) -> None:
     torch.testing.assert_close(rotations.det(), torch.ones(len(NAMES)).double())
 
 
-def test_one_camera_by_hand(tmp_path) -> None:
+def test_the_numbers_of_one_camera_are_as_computed_by_hand(tmp_path) -> None:
     """At (1, 2, 5), looking along -z as OpenGL cameras do: up in the world is up in the image."""
     frame = {
         "file_path": "a.png",
@@ -78,7 +78,7 @@ def test_one_camera_by_hand(tmp_path) -> None:
 
 
 @each_format
-def test_every_eighth_name_is_for_testing(write, tmp_path) -> None:
+def test_every_eighth_camera_by_name_is_a_test_camera(write, tmp_path) -> None:
     write(tmp_path)
     test, train = (load_cameras(tmp_path, split=split) for split in ("test", "train"))
     by_name = sorted(NAMES)
@@ -89,14 +89,14 @@ def test_every_eighth_name_is_for_testing(write, tmp_path) -> None:
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])
 @pytest.mark.parametrize("write", [colmap_bin, colmap_txt])
-def test_places_of_a_colmap_model(write, place, tmp_path) -> None:
+def test_a_colmap_model_is_found_in_every_place(write, place, tmp_path) -> None:
     write(tmp_path / place)
     assert len(load_cameras(tmp_path)) == len(NAMES)
     for file in (tmp_path / place).iterdir():
         assert load_cameras(str(file)).names == NAMES
 
 
-def test_what_a_folder_is_searched_for_first(tmp_path) -> None:
+def test_the_formats_in_a_folder_are_tried_in_order(tmp_path) -> None:
     write_json(tmp_path / "cameras.json", inria()[:1])
     assert len(load_cameras(tmp_path)) == 1
     colmap_txt(tmp_path / "sparse", rows=range(2))
@@ -112,8 +112,8 @@ def test_what_a_folder_is_searched_for_first(tmp_path) -> None:
     assert len(load_cameras(tmp_path / "cameras.json")) == 1
 
 
-def test_blender_scenes_have_a_file_per_split_and_png_sizes(tmp_path) -> None:
-    """NeRF's own scenes: one angle, no image size, names without suffix."""
+def test_blender_scenes_have_one_file_per_split_and_png_sizes(tmp_path) -> None:
+    """The scenes of NeRF: one angle, no image size, names without suffix."""
     angle = 2 * math.atan(0.5)
     for split, rows in (("train", range(3)), ("test", range(3, 5))):
         document = transforms(rows=rows)
@@ -141,7 +141,7 @@ def test_blender_scenes_have_a_file_per_split_and_png_sizes(tmp_path) -> None:
         load_cameras(tmp_path / "transforms_test.json", split="train")
     assert str(error.value) == (
         f"{tmp_path / 'transforms_test.json'}: the split must be 'test' for this file, "
-        f"found 'train'; pass the folder to have both."
+        f"found 'train'; pass the folder to read both splits."
     )
 
 
@@ -150,7 +150,7 @@ def png(path: Path, width: int, height: int) -> None:
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + header)
 
 
-def test_nerfstudio_lists_its_splits(tmp_path) -> None:
+def test_the_splits_listed_by_nerfstudio_are_used(tmp_path) -> None:
     document = transforms()
     document["train_filenames"] = [NAMES[3], NAMES[1]]
     document["test_filenames"] = [f"./{NAMES[2]}"]
@@ -187,7 +187,7 @@ INTRINSICS = {
 
 
 @pytest.mark.parametrize("case", INTRINSICS)
-def test_intrinsics_of_transforms(case, tmp_path) -> None:
+def test_intrinsics_of_transforms_json_are_read(case, tmp_path) -> None:
     everything, own, wanted = INTRINSICS[case]
     document = {**everything, "frames": [{**FRAME, **own}]}
     cameras = load_cameras(write_json(tmp_path / "any_name.json", document))
@@ -195,7 +195,7 @@ def test_intrinsics_of_transforms(case, tmp_path) -> None:
     np.testing.assert_allclose(cameras.Ks[0], wanted, rtol=1e-6)
 
 
-def test_mixed_sizes_take_the_most_frequent_one(tmp_path) -> None:
+def test_mixed_image_sizes_become_the_most_frequent_one(tmp_path) -> None:
     frames = [dict(frame) for frame in transforms(rows=range(3))["frames"]]
     document = {**transforms(), "frames": frames}
     width, height = SIZE
@@ -207,7 +207,7 @@ def test_mixed_sizes_take_the_most_frequent_one(tmp_path) -> None:
     assert torch.equal(cameras.Ks[1], load_cameras(tmp_path, split="train").Ks[0])
 
 
-def test_rounded_rotations_are_set_right(tmp_path) -> None:
+def test_rounded_rotations_are_made_orthogonal(tmp_path) -> None:
     document = transforms()
     for frame in document["frames"]:
         frame["transform_matrix"] = np.round(frame["transform_matrix"], 3).tolist()
@@ -218,7 +218,7 @@ def test_rounded_rotations_are_set_right(tmp_path) -> None:
     np.testing.assert_allclose(pixels(cameras), expected_pixels(), atol=0.2)
 
 
-def test_a_pose_of_three_rows_and_a_byte_order_mark(tmp_path) -> None:
+def test_poses_of_three_rows_and_a_byte_order_mark_are_read(tmp_path) -> None:
     document = transforms()
     for frame in document["frames"]:
         frame["transform_matrix"] = frame["transform_matrix"][:3]
@@ -227,7 +227,7 @@ def test_a_pose_of_three_rows_and_a_byte_order_mark(tmp_path) -> None:
     np.testing.assert_allclose(pixels(load_cameras(path)), expected_pixels(), atol=1e-3)
 
 
-DISTORTION = "left out the lens distortion of {} of {} cameras, since images are rendered by "
+DISTORTION = "left out the lens distortion of {} of {} cameras, since rendering uses "
 DISTORTION += "pinhole cameras; compare with undistorted photographs."
 
 
@@ -243,7 +243,9 @@ DISTORTION += "pinhole cameras; compare with undistorted photographs."
     ],
 )
 @pytest.mark.parametrize("write", [colmap_bin, colmap_txt])
-def test_colmap_models(write, model, parameters, wanted, tmp_path) -> None:
+def test_the_pinhole_part_of_every_colmap_model_is_read(
+    write, model, parameters, wanted, tmp_path
+) -> None:
     write(tmp_path, model=model, parameters=parameters)
     distorted = any(parameters[4 if wanted[1] == 51 else 3 :])
     with warnings.catch_warnings(record=True) as caught:
@@ -258,14 +260,14 @@ def test_colmap_models(write, model, parameters, wanted, tmp_path) -> None:
     assert all(warning.filename == __file__ for warning in caught)
 
 
-def test_distortion_of_nothing_is_not_warned_about(tmp_path) -> None:
+def test_zero_distortion_gives_no_warning(tmp_path) -> None:
     colmap_bin(tmp_path / "a", model="OPENCV", parameters=[50, 51, 31, 23, 0, 0, 0, 0])
     document = {**transforms(), "k1": 0.0, "p2": 0, "camera_model": "OPENCV"}
     write_json(tmp_path / "b" / "transforms.json", document)
     assert len(load_cameras(tmp_path / "a")) == len(load_cameras(tmp_path / "b"))
 
 
-def test_distortion_of_transforms(tmp_path) -> None:
+def test_distortion_in_transforms_json_is_warned_about(tmp_path) -> None:
     document = transforms()
     document["frames"][2]["k1"] = 0.01
     path = write_json(tmp_path / "transforms.json", document)
@@ -275,23 +277,23 @@ def test_distortion_of_transforms(tmp_path) -> None:
     assert str(warning.message) == f"{path}: {DISTORTION.format(1, len(NAMES))}"
 
 
-def test_text_names_with_blanks_points_and_comments(tmp_path) -> None:
+def test_text_models_with_spaces_in_names_and_points_are_read(tmp_path) -> None:
     colmap_txt(tmp_path, rows=range(2), names=["b c.jpg", "a  d.jpg"], points="1 2 3 4.5 5 -1")
     assert load_cameras(tmp_path).names == ("a  d.jpg", "b c.jpg")
 
 
-def test_names_and_points_of_binary_files(tmp_path) -> None:
+def test_binary_models_with_long_names_and_points_are_read(tmp_path) -> None:
     names = ["ä/b c.jpg", "x" * 3000]
     colmap_bin(tmp_path, rows=range(2), names=names, points=1000)
     assert load_cameras(tmp_path).names == tuple(sorted(names))
 
 
-def test_quaternions_need_no_unit_length(tmp_path) -> None:
+def test_quaternions_are_normalised(tmp_path) -> None:
     colmap_txt(tmp_path, scale=-2.5)
     np.testing.assert_allclose(pixels(load_cameras(tmp_path)), expected_pixels(), atol=1e-3)
 
 
-def test_the_oracle_sees_the_point_inside_every_image() -> None:
+def test_the_oracle_projects_the_point_into_every_image() -> None:
     for (x, y), (rotation, center) in zip(expected_pixels(), poses(), strict=True):
         assert 0 < x < SIZE[0]
         assert 0 < y < SIZE[1]

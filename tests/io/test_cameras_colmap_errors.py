@@ -1,4 +1,4 @@
-"""What damaged COLMAP models and missing files get: one sentence, word for word."""
+"""Error messages about damaged COLMAP models and missing files, word for word."""
 
 import contextlib
 import os
@@ -26,11 +26,11 @@ CAMERAS_TXT: Mapping[str, tuple[str, str]] = {
     ),
     "few parameters": (
         "1 PINHOLE 64 48 9 9 9",
-        "must be 4 parameters of PINHOLE, found '1 PINHOLE 64 48 9 9 9'.",
+        "must be a PINHOLE camera with 4 parameters, found '1 PINHOLE 64 48 9 9 9'.",
     ),
     "no number": (
         "1 PINHOLE 64 48 9 9 9 x",
-        "must be a camera in numbers, found '1 PINHOLE 64 48 9 9 9 x'.",
+        "must be a camera with numeric fields, found '1 PINHOLE 64 48 9 9 9 x'.",
     ),
     "fisheye": (
         "1 OPENCV_FISHEYE 64 48 9 9 9 9 0 0 0 0",
@@ -54,7 +54,7 @@ CAMERAS_TXT: Mapping[str, tuple[str, str]] = {
 
 
 @pytest.mark.parametrize("case", CAMERAS_TXT)
-def test_colmap_cameras_txt(case, tmp_path) -> None:
+def test_damage_of_cameras_txt_is_one_sentence(case, tmp_path) -> None:
     colmap_txt(tmp_path)
     line, wanted = CAMERAS_TXT[case]
     path = tmp_path / "cameras.txt"
@@ -70,17 +70,15 @@ IMAGES_TXT: Mapping[str, tuple[str, str]] = {
     ),
     "no number": (
         "1 1 0 0 0 0 0 x 7 a.jpg",
-        "line 2: must be an image in numbers, found '1 1 0 0 0 0 0 x 7 a.jpg'.",
+        "line 2: must be an image with numeric fields, found '1 1 0 0 0 0 0 x 7 a.jpg'.",
     ),
     "zero quaternion": (
         "1 0 0 0 0 0 0 5 7 a.jpg",
-        "line 2: the pose must be finite with a quaternion other than 0, "
-        "found 0, 0, 0, 0, 0, 0, 5.",
+        "line 2: the pose must be finite with a nonzero quaternion, found 0, 0, 0, 0, 0, 0, 5.",
     ),
     "infinite": (
         "1 1 0 0 0 0 nan 5 7 a.jpg",
-        "line 2: the pose must be finite with a quaternion other than 0, "
-        "found 1, 0, 0, 0, 0, nan, 5.",
+        "line 2: the pose must be finite with a nonzero quaternion, found 1, 0, 0, 0, 0, nan, 5.",
     ),
     "no points line": (
         "1 1 0 0 0 0 0 5 7 a.jpg\n2 1 0 0 0 0 0 5 7 b.jpg",
@@ -89,13 +87,13 @@ IMAGES_TXT: Mapping[str, tuple[str, str]] = {
     ),
     "unknown camera": (
         "1 1 0 0 0 0 0 5 8 a.jpg",
-        "image 'a.jpg' must have a camera of the file of cameras, found camera 8.",
+        "image 'a.jpg' must refer to a camera in the camera file, found camera 8.",
     ),
 }
 
 
 @pytest.mark.parametrize("case", IMAGES_TXT)
-def test_colmap_images_txt(case, tmp_path) -> None:
+def test_damage_of_images_txt_is_one_sentence(case, tmp_path) -> None:
     colmap_txt(tmp_path)
     lines, wanted = IMAGES_TXT[case]
     path = tmp_path / "images.txt"
@@ -165,14 +163,14 @@ BINARY: Mapping[str, tuple[str, bytes, str]] = {
     ),
     "zero quaternion": (
         "images", packed_image(w=0.0),
-        "image 0: the pose must be finite with a quaternion other than 0, "
+        "image 0: the pose must be finite with a nonzero quaternion, "
         "found 0, 0, 0, 0, 0, 0, 5.",
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", BINARY)
-def test_colmap_binary(case, tmp_path) -> None:
+def test_damage_of_binary_models_is_one_sentence(case, tmp_path) -> None:
     name, data, wanted = BINARY[case]
     colmap_bin(tmp_path)
     path = tmp_path / f"{name}.bin"
@@ -182,7 +180,7 @@ def test_colmap_binary(case, tmp_path) -> None:
 
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "cameras.txt", "images.txt"])
-def test_any_damage_gives_cameras_or_one_sentence(name, tmp_path) -> None:
+def test_random_damage_gives_cameras_or_a_format_error(name, tmp_path) -> None:
     (colmap_bin if name.endswith("bin") else colmap_txt)(tmp_path)
     path = tmp_path / name
     good = path.read_bytes()
@@ -197,11 +195,11 @@ def test_any_damage_gives_cameras_or_one_sentence(name, tmp_path) -> None:
             load_cameras(tmp_path)
 
 
-def test_what_is_not_there(tmp_path) -> None:
+def test_missing_files_are_one_sentence(tmp_path) -> None:
     assert camera_refusal(tmp_path, InputNotFoundError) == (
         f"{tmp_path}: the folder must hold transforms.json, transforms_train.json, "
-        f"transforms_test.json, a COLMAP model in sparse/0, sparse or itself, or cameras.json; "
-        f"found none of them."
+        f"transforms_test.json, a COLMAP model (in sparse/0, sparse or the folder itself) "
+        f"or cameras.json; found none of them."
     )
     for name in ("no.json", "no"):
         assert camera_refusal(tmp_path / name, InputNotFoundError) == (
@@ -214,13 +212,13 @@ def test_what_is_not_there(tmp_path) -> None:
     )
     (tmp_path / "points.ply").write_bytes(b"ply\n")
     assert camera_refusal(tmp_path / "points.ply") == (
-        f"{tmp_path / 'points.ply'}: a file of cameras must be JSON (.json) or of a COLMAP model "
+        f"{tmp_path / 'points.ply'}: a camera file must be JSON (.json) or part of a COLMAP model "
         f"(cameras.bin, images.bin, cameras.txt, images.txt), found neither."
     )
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and permissions are those of POSIX")
-def test_what_cannot_be_read(tmp_path) -> None:
+def test_pipes_and_unreadable_files_are_refused(tmp_path) -> None:
     os.mkfifo(tmp_path / "pipe.json")
     assert camera_refusal(tmp_path / "pipe.json", InputError) == (
         f"{tmp_path / 'pipe.json'}: must be a regular file, found a device or a pipe."
@@ -234,8 +232,7 @@ def test_what_cannot_be_read(tmp_path) -> None:
     )
 
 
-def test_the_rest_of_the_files_is_left_alone(tmp_path) -> None:
-    """Reading writes nothing."""
+def test_reading_changes_no_file(tmp_path) -> None:
     colmap_bin(tmp_path, model="RADIAL", parameters=[50, 32, 24, 0.1, 0])
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.warns(DroppedDataWarning):

@@ -1,4 +1,4 @@
-"""What damaged camera files get: one sentence, word for word."""
+"""Error messages about damaged camera files, word for word."""
 
 import copy
 import math
@@ -50,27 +50,27 @@ TRANSFORMS: Mapping[str, tuple[Callable[[Any], None], str]] = {
     "boolean pose": (put("frames", 2, "transform_matrix", 0, 0, value=True), f" {MATRIX}[[True, "),
     "scaled pose": (
         put("frames", 2, "transform_matrix", value=BIGGER),
-        " frame 2: the pose must hold a rotation without scale or mirror, "
-        "found a matrix of determinant 8 that is 3 away from one.",
+        " frame 2: the pose must hold a rotation without scaling or reflection, "
+        "found a matrix of determinant 8, 3 from orthogonal.",
     ),
     "mirrored pose": (
         put("frames", 2, "transform_matrix", value=MIRROR),
-        " frame 2: the pose must hold a rotation without scale or mirror, "
-        "found a matrix of determinant -1 that is 0 away from one.",
+        " frame 2: the pose must hold a rotation without scaling or reflection, "
+        "found a matrix of determinant -1, 0 from orthogonal.",
     ),
     "pose by columns": (
         put("frames", 2, "transform_matrix", value=BY_COLUMNS),
-        " frame 2: 'transform_matrix' must be a pose in rows, with 0 0 0 1 as the last, found "
+        " frame 2: 'transform_matrix' must be a row-major pose with 0 0 0 1 as its last row, found "
         "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [3, 4, 5, 1]].",
     ),
     "no name": (
         drop("frames", 0, "file_path"),
-        " frame 0: 'file_path' must be a text, found none.",
+        " frame 0: 'file_path' must be a string, found none.",
     ),
     "no focal length": (
         lambda document: [document.pop(key) for key in ("fl_x", "fl_y")],
-        " frame 0: 'fl_x', 'fl_y', 'camera_angle_x' or 'camera_angle_y' must be given here or "
-        "for the whole file, found none.",
+        " frame 0: 'fl_x', 'fl_y', 'camera_angle_x' or 'camera_angle_y' must be given in "
+        "the frame or at the top level of the file, found none.",
     ),
     "text for a number": (put("fl_x", value="9"), " 'fl_x' must be a finite number, found '9'."),
     "huge number": (
@@ -101,7 +101,7 @@ TRANSFORMS: Mapping[str, tuple[Callable[[Any], None], str]] = {
 
 
 @pytest.mark.parametrize("case", TRANSFORMS)
-def test_transforms(case, tmp_path) -> None:
+def test_damage_of_transforms_json_is_one_sentence(case, tmp_path) -> None:
     change, wanted = TRANSFORMS[case]
     document = copy.deepcopy(transforms())
     change(document)
@@ -112,7 +112,7 @@ def test_transforms(case, tmp_path) -> None:
     assert "\n" not in found
 
 
-def test_splits_of_transforms(tmp_path) -> None:
+def test_impossible_splits_are_refused(tmp_path) -> None:
     document = {**transforms(), "train_filenames": ["images/frame_01.jpg", "images/none.jpg"]}
     path = write_json(tmp_path / "transforms.json", document)
     assert camera_refusal(path, split="train") == (
@@ -142,20 +142,20 @@ def test_splits_of_transforms(tmp_path) -> None:
     )
 
 
-def test_image_sizes_that_are_not_there(tmp_path) -> None:
+def test_missing_image_sizes_are_one_sentence(tmp_path) -> None:
     document = transforms(rows=[0])
     del document["w"]
     document["frames"][0]["file_path"] = "r_0"
     path = write_json(tmp_path / "transforms.json", document)
     assert camera_refusal(path) == (
-        f"{path}: frame 0: 'w' and 'h' must be given here or for the whole file, or the image "
-        f"must be there; found neither them nor {tmp_path / 'r_0'}."
+        f"{path}: frame 0: 'w' and 'h' must be given in the frame or at the top level of the "
+        f"file, or the image must exist; found neither them nor {tmp_path / 'r_0'}."
     )
     for content in (b"\xff\xd8\xff" + bytes(100), b"\x89PNG"):
         (tmp_path / "r_0.png").write_bytes(content)
         assert camera_refusal(path) == (
-            f"{tmp_path / 'r_0.png'}: must be a PNG file, since its size is not among the cameras; "
-            f"found another format. Give 'w' and 'h' in the file of the cameras."
+            f"{tmp_path / 'r_0.png'}: must be a PNG file, since the cameras do not give its size, "
+            f"found another format; add 'w' and 'h' to the camera file."
         )
 
 
@@ -169,7 +169,7 @@ INRIA: Mapping[str, tuple[Callable[[Any], None], str]] = {
         put(0, "position", value=[1, 0, None]),
         "camera 0: 'position' must be 3 finite numbers, found [1, 0, None].",
     ),
-    "name": (put(0, "img_name", value=3), "camera 0: 'img_name' must be a text, found 3."),
+    "name": (put(0, "img_name", value=3), "camera 0: 'img_name' must be a string, found 3."),
     "width": (drop(9, "width"), "camera 9: 'width' must be a whole number, found none."),
     "focal length": (
         put(9, "fy", value=0),
@@ -180,7 +180,7 @@ INRIA: Mapping[str, tuple[Callable[[Any], None], str]] = {
 
 
 @pytest.mark.parametrize("case", INRIA)
-def test_inria(case, tmp_path) -> None:
+def test_damage_of_inria_cameras_is_one_sentence(case, tmp_path) -> None:
     change, wanted = INRIA[case]
     entries = inria()
     change(entries)
@@ -194,7 +194,7 @@ JSON: Mapping[str, tuple[bytes, str]] = {
         b'{"w": 3,\n "frames": [',
         "must be JSON, found an error in line 2, column 13: expecting value.",
     ),
-    "latin 1": (b'["\xe4"]', "must be JSON in UTF-8, found another byte at 2."),
+    "latin 1": (b'["\xe4"]', "must be JSON in UTF-8, found an invalid byte at 2."),
     "other object": (
         b'{"w": 3}',
         "must be a list of cameras (INRIA's cameras.json) or an object with 'frames' "
@@ -210,14 +210,14 @@ JSON: Mapping[str, tuple[bytes, str]] = {
 
 
 @pytest.mark.parametrize("case", JSON)
-def test_json(case, tmp_path) -> None:
+def test_damaged_json_is_one_sentence(case, tmp_path) -> None:
     data, wanted = JSON[case]
     path = tmp_path / "cameras.json"
     path.write_bytes(data)
     assert camera_refusal(path) == f"{path}: {wanted}"
 
 
-def test_json_without_end(tmp_path) -> None:
+def test_nested_json_and_huge_numbers_are_refused(tmp_path) -> None:
     path = tmp_path / "cameras.json"
     for data in (b"[" * 1_000_000, b"[" + b"9" * 10_000 + b"]"):
         path.write_bytes(data)

@@ -21,7 +21,7 @@ NEWER, OLDER = "_model.gauss_params.", "_model."
 
 
 def splatfacto(scene: GaussianScene, prefix: str = NEWER) -> dict[str, Any]:
-    """Return what nerfstudio saves, with the things around the scene that it saves too."""
+    """Return a checkpoint as nerfstudio saves it, including data besides the scene."""
     state: OrderedDict[str, Tensor] = OrderedDict()
     state["datamanager.dummy"] = torch.zeros(0)
     state["_model.device_indicator_param"] = torch.empty(0)
@@ -46,13 +46,13 @@ def splatfacto(scene: GaussianScene, prefix: str = NEWER) -> dict[str, Any]:
 
 @pytest.mark.parametrize("prefix", [NEWER, OLDER, "module._model.gauss_params."])
 @pytest.mark.parametrize("degree", [1, 3])
-def test_splatfacto(tmp_path: Path, prefix: str, degree: int) -> None:
+def test_splatfacto_checkpoints_are_read(tmp_path: Path, prefix: str, degree: int) -> None:
     scene = random_scene(7, degree=degree)
     torch.save(splatfacto(scene, prefix), tmp_path / "step-000029999.ckpt")
     assert same_bits(load(tmp_path / "step-000029999.ckpt"), scene)
 
 
-def test_colours_without_sh_went_through_a_sigmoid(tmp_path: Path) -> None:
+def test_colours_of_degree_0_are_read_through_a_sigmoid(tmp_path: Path) -> None:
     scene = random_scene(5, degree=0)
     path = tmp_path / "a.ckpt"
     torch.save(splatfacto(scene), path)
@@ -61,7 +61,7 @@ def test_colours_without_sh_went_through_a_sigmoid(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["pt", "ckpt"])
-def test_gsplat(tmp_path: Path, suffix: str) -> None:
+def test_gsplat_checkpoints_are_read_as_copies(tmp_path: Path, suffix: str) -> None:
     scene = random_scene(7, degree=2)
     path = tmp_path / f"ckpt_29999_rank0.{suffix}"
     torch.save({"step": 29999, "splats": OrderedDict(to_dict(scene))}, path)
@@ -71,7 +71,7 @@ def test_gsplat(tmp_path: Path, suffix: str) -> None:
     assert same_bits(again, scene)
 
 
-def test_nothing_is_left_allowed(tmp_path: Path) -> None:
+def test_reading_leaves_torch_safe_globals_unchanged(tmp_path: Path) -> None:
     before = set(torch.serialization.get_safe_globals())
     torch.save(splatfacto(random_scene(2)), tmp_path / "a.ckpt")
     load(tmp_path / "a.ckpt")
@@ -83,16 +83,18 @@ class Evil:
         return (Path.touch, (Path("evil"),))
 
 
-def test_nothing_is_executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_in_a_checkpoint_is_not_executed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "a.ckpt"
     torch.save({**splatfacto(random_scene(2)), "config": Evil()}, path)
-    with pytest.raises(FileFormatError, match="must be a whole checkpoint of tensors and plain"):
+    with pytest.raises(FileFormatError, match="must be an intact checkpoint of tensors and plain"):
         load(path)
     assert not (tmp_path / "evil").exists()
 
 
-def test_other_checkpoints(tmp_path: Path) -> None:
+def test_checkpoints_without_a_whole_scene_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.ckpt"
     torch.save({"step": 1, "model": {"means": torch.zeros(2, 3)}}, path)
     with pytest.raises(FileFormatError) as caught:
@@ -117,7 +119,7 @@ def test_other_checkpoints(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.97])
-def test_cut_short(tmp_path: Path, share: float) -> None:
+def test_a_checkpoint_that_is_cut_short_is_refused(tmp_path: Path, share: float) -> None:
     path = tmp_path / "a.ckpt"
     torch.save(splatfacto(random_scene(50)), path)
     content = path.read_bytes()
@@ -125,14 +127,14 @@ def test_cut_short(tmp_path: Path, share: float) -> None:
     with pytest.raises(FileFormatError) as caught:
         load(path)
     assert str(caught.value) == (
-        f"{path}: must be a checkpoint that torch.save wrote as a zip, found another file."
+        f"{path}: must be a checkpoint in the zip format of torch.save, found another format."
     )
 
 
-def test_a_pickle_is_not_opened(tmp_path: Path) -> None:
+def test_a_plain_pickle_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.pt"
     path.write_bytes(pickle.dumps(Evil()))
-    with pytest.raises(FileFormatError, match="found another file"):
+    with pytest.raises(FileFormatError, match="found another format"):
         load(path)
 
 
@@ -148,35 +150,35 @@ ODD: dict[str, Callable[[], Any]] = {
     "floats, found torch.int64": MEANS.long,
     "means must have shape": lambda: torch.zeros(3, 3, 3),
 }
-"""Means that are something else, by how a sentence about them ends."""
+"""Means of a wrong kind, by the end of the error message about them."""
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("found", ODD)
-def test_what_is_no_tensor_of_rows(tmp_path: Path, found: str) -> None:
+def test_means_that_are_no_tensor_of_rows_are_refused(tmp_path: Path, found: str) -> None:
     path, means = tmp_path / "a.pt", ODD[found]()
     state = to_dict(random_scene(3)) | {"means": means}
     torch.save({"splats": state}, path)
     with pytest.raises(FileFormatError) as caught:
         load(path)
     text = str(caught.value)
-    assert found in text or "must be a whole checkpoint of tensors and plain numbers" in text
+    assert found in text or "must be an intact checkpoint of tensors and plain numbers" in text
     if not isinstance(means, Tensor) or means.layout == torch.strided:
         with pytest.raises(InvalidSceneError) as alone:
             from_dict(state)
         assert found in str(alone.value)
 
 
-def test_no_advice_of_torch_is_passed_on(tmp_path: Path) -> None:
+def test_errors_do_not_repeat_the_advice_of_torch(tmp_path: Path) -> None:
     path = tmp_path / "a.pt"
     torch.save({"splats": to_dict(random_scene(2)), "more": Evil()}, path)
     with pytest.raises(FileFormatError) as caught:
         load(path)
-    assert "must be a whole checkpoint of tensors and plain numbers, found" in str(caught.value)
+    assert "must be an intact checkpoint of tensors and plain numbers, found" in str(caught.value)
     assert "weights_only" not in str(caught.value)
 
 
-def test_many_names_are_not_all_named(tmp_path: Path) -> None:
+def test_errors_about_many_keys_are_short(tmp_path: Path) -> None:
     path = tmp_path / "a.pt"
     torch.save({f"{i}" * 100: 1 for i in range(50)}, path)
     with pytest.raises(FileFormatError) as caught:
@@ -184,8 +186,8 @@ def test_many_names_are_not_all_named(tmp_path: Path) -> None:
     assert len(str(caught.value)) < 500 + len(str(path))
 
 
-def test_every_damage_is_one_sentence(tmp_path: Path) -> None:
-    """Bits of the pickle, of the zip's directory and of everything, flipped."""
+def test_random_damage_is_one_sentence(tmp_path: Path) -> None:
+    """Bytes change in the pickle, in the zip directory or anywhere."""
     path, dice = tmp_path / "a.pt", random.Random(3)
     torch.save({"splats": to_dict(random_scene(2, degree=0)), "rate": 0.1}, path)
     content = path.read_bytes()

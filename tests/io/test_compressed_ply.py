@@ -33,7 +33,7 @@ ROW = (2047 << 21 | 512 << 11, ROTATION, 2047, 255 << 24 | 51)
 def by_hand(
     ranges: list[str] | None = None, *, chunks: int = 1, rows: int = 1, rest: int = 0
 ) -> bytes:
-    """Return a file of like Gaussians in [0, 4] with log-scales in [-1, 1] and red colours."""
+    """Return a file of equal Gaussians in [0, 4] with log-scales in [-1, 1] and red colours."""
     names = RANGES if ranges is None else ranges
     lines = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
     lines += [f"property float {name}" for name in names]
@@ -46,7 +46,7 @@ def by_hand(
     return header + body + rows * bytes(range(0, 5 * rest, 5))
 
 
-def test_a_file_by_hand(tmp_path: Path) -> None:
+def test_a_file_made_by_hand_is_read(tmp_path: Path) -> None:
     path = tmp_path / "any name.ply"
     path.write_bytes(by_hand(RANGES + COLORS))
     scene = load(path)
@@ -60,13 +60,13 @@ def test_a_file_by_hand(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rest", [0, 9, 45])
 @pytest.mark.parametrize("ranges", [RANGES, RANGES + COLORS], ids=["oldest", "newer"])
-def test_against_the_oracle(tmp_path: Path, ranges: list[str], rest: int) -> None:
+def test_files_are_read_as_by_the_oracle(tmp_path: Path, ranges: list[str], rest: int) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(by_hand(ranges, chunks=2, rows=300, rest=rest))
     assert_as_oracle(load(path), read_compressed_ply(path.read_bytes()))
 
 
-def test_file_of_splat_transform() -> None:
+def test_a_file_of_splat_transform_is_read() -> None:
     scene, source = load(THEIRS), load(DATA / "source.ply")
     assert_as_oracle(scene, read_compressed_ply(THEIRS.read_bytes()))
     assert_within(source, nearest_rows(source, scene), bounds(source))
@@ -104,7 +104,7 @@ def test_round_trip(
     assert again.comments == scene.comments
 
 
-def test_many_chunks_are_small_ones(tmp_path: Path) -> None:
+def test_large_scenes_are_split_into_small_chunks(tmp_path: Path) -> None:
     path = tmp_path / "a.compressed.ply"
     scene = storable_scene(4000, degree=0)
     save(scene, path)
@@ -114,20 +114,20 @@ def test_many_chunks_are_small_ones(tmp_path: Path) -> None:
     assert float(error.median()) < 1.5e-3
 
 
-def test_like_gaussians_have_no_width(tmp_path: Path) -> None:
+def test_equal_gaussians_are_stored_exactly(tmp_path: Path) -> None:
     path = tmp_path / "a.compressed.ply"
     scene = storable_scene(1).select(torch.zeros(300, dtype=torch.int64))
     save(scene, path)
     assert_within(scene, load(path), {"means": 1e-6, "log_scales": 1e-6, "sh0": 1e-6})
 
 
-def test_a_plain_copy_has_inrias_layout(tmp_path: Path) -> None:
+def test_a_plain_copy_has_the_layout_of_inria(tmp_path: Path) -> None:
     save(load(THEIRS), tmp_path / "plain.ply")
     assert b"property float f_rest_44\n" in (tmp_path / "plain.ply").read_bytes()
     assert len(load(tmp_path / "plain.ply")) == 40
 
 
-def test_large_coefficients_are_cut_off_and_said(tmp_path: Path) -> None:
+def test_clamped_values_are_warned_about(tmp_path: Path) -> None:
     scene = storable_scene(3)
     scene = scene.with_tensors({"shN": scene.shN * 0 + 7, "log_scales": scene.means * 0 - 30}, {})
     path = tmp_path / "a.compressed.ply"
@@ -176,13 +176,13 @@ DAMAGED = {
     ),
     "list": (
         GOOD.replace(b"end_header", b"element q 0\nproperty list uchar int a\nend_header"),
-        "a compressed PLY must hold no lists, found one.",
+        "a compressed PLY must have no list properties, found one.",
     ),
 }
 
 
 @pytest.mark.parametrize("name", DAMAGED)
-def test_each_damage_has_its_sentence(tmp_path: Path, name: str) -> None:
+def test_each_damage_has_its_own_message(tmp_path: Path, name: str) -> None:
     content, text = DAMAGED[name]
     path = tmp_path / "a.compressed.ply"
     path.write_bytes(content)
@@ -195,7 +195,7 @@ def test_each_damage_has_its_sentence(tmp_path: Path, name: str) -> None:
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
-def test_any_damage_is_an_error_of_ours(
+def test_random_damage_is_a_scene_or_a_cvtgs_error(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     content = bytearray(by_hand(RANGES + COLORS, rest=9))
@@ -208,20 +208,20 @@ def test_any_damage_is_an_error_of_ours(
 
 
 @pytest.mark.parametrize("missing", COLORS)
-def test_ranges_of_colours_are_all_there_or_none(tmp_path: Path, missing: str) -> None:
+def test_colour_ranges_must_be_complete_or_absent(tmp_path: Path, missing: str) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(by_hand([name for name in RANGES + COLORS if name != missing]))
     assert refusal(path).endswith(f"must have the float property '{missing}', found none.")
 
 
-def test_ranges_that_are_not_finite_give_no_warning(tmp_path: Path) -> None:
+def test_non_finite_ranges_give_no_warning(tmp_path: Path) -> None:
     path, content = tmp_path / "a.ply", by_hand()
     at = content.index(struct.pack("<6f", 0, 0, 0, 4, 4, 4))
     path.write_bytes(content[:at] + struct.pack("<2f", math.nan, -math.inf) + content[at + 8 :])
     assert not load(path).means.isfinite().all()
 
 
-def test_long_names_are_cut(tmp_path: Path) -> None:
+def test_long_names_are_shortened_in_errors(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     names = "".join(f"element {i}{chr(0x1F600) * 150} 1\nproperty int a\n" for i in range(9))
     path.write_text(f"ply\nformat ascii 1.0\n{names}end_header\n1\n", encoding="utf-8")

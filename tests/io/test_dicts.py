@@ -1,4 +1,4 @@
-"""Dictionaries of gsplat and nerfstudio in and out."""
+"""Conversion from and to the dictionaries of gsplat and nerfstudio."""
 
 import math
 import re
@@ -36,7 +36,7 @@ def splatfacto(prefix: str = "") -> dict[str, Any]:
     return {prefix + name: torch.nn.Parameter(value) for name, value in d.items()}
 
 
-def test_gsplat_values_are_stored_values() -> None:
+def test_gsplat_values_are_read_as_stored_values() -> None:
     scene = from_dict(gsplat())
     assert scene.means.tolist() == [[0, 1, 2], [3, 4, 5]]
     assert scene.log_scales.tolist() == [[-2] * 3] * 2
@@ -44,7 +44,7 @@ def test_gsplat_values_are_stored_values() -> None:
     assert scene.sh_degree == 1
 
 
-def test_activated_values() -> None:
+def test_activated_values_are_converted() -> None:
     values = {
         **gsplat(),
         "scales": torch.full((2, 3), math.e),
@@ -57,7 +57,7 @@ def test_activated_values() -> None:
 
 
 @pytest.mark.parametrize("prefix", ["", "gauss_params.", "_model.gauss_params."])
-def test_nerfstudio_is_the_same_scene(prefix: str) -> None:
+def test_nerfstudio_names_give_the_same_scene(prefix: str) -> None:
     other = {f"{prefix}x.y".replace("gauss_params.", "camera."): torch.zeros(1)} if prefix else {}
     scene = from_dict({**splatfacto(prefix), **other})
     for name, tensor in from_dict(gsplat()).tensors().items():
@@ -84,19 +84,19 @@ def test_numpy_arrays_are_copied(kind: str) -> None:
         (torch.float64, torch.float64),
     ],
 )
-def test_dtypes(dtype: torch.dtype, wanted: torch.dtype) -> None:
+def test_half_becomes_float32_and_double_stays(dtype: torch.dtype, wanted: torch.dtype) -> None:
     values = gsplat()
     scene = from_dict({**values, "means": values["means"].to(dtype)})
     assert {tensor.dtype for tensor in scene.tensors().values()} == {wanted}
 
 
-def test_without_view_dependent_colour() -> None:
+def test_missing_view_dependent_colour_gives_degree_0() -> None:
     values = gsplat()
     del values["shN"]
     assert from_dict(values).sh_degree == 0
 
 
-def test_there_and_back() -> None:
+def test_to_dict_inverts_from_dict() -> None:
     values = gsplat()
     again = to_dict(from_dict(values))
     assert list(again) == ["means", "quats", "scales", "opacities", "sh0", "shN"]
@@ -126,12 +126,12 @@ def test_the_mapping_is_not_changed() -> None:
         (
             {"features_dc": torch.zeros(2, 3)},
             False,
-            "a dictionary must give sh0 once, found 'sh0' and 'features_dc'.",
+            "a dictionary must hold sh0 only once, found 'sh0' and 'features_dc'.",
         ),
         (
             {"a.means": torch.zeros(2, 3)},
             False,
-            "a dictionary must give means once, found 'means' and 'a.means'.",
+            "a dictionary must hold means only once, found 'means' and 'a.means'.",
         ),
         (
             {"means": [[0.0, 0.0, 0.0]] * 2},
@@ -162,7 +162,7 @@ def test_the_mapping_is_not_changed() -> None:
         ),
     ],
 )
-def test_what_is_no_scene(changes: dict[str, Any], activated: bool, text: str) -> None:
+def test_bad_dictionaries_are_refused(changes: dict[str, Any], activated: bool, text: str) -> None:
     values = {name: v for name, v in {**gsplat(), **changes}.items() if v is not None}
     with pytest.raises(InvalidSceneError) as caught:
         from_dict(values, activated=activated)
@@ -186,18 +186,18 @@ def splats(count: int = 200, **changes: torch.Tensor) -> dict[str, torch.Tensor]
                 "opacities": torch.linspace(0, 1, 200),
                 "scales": torch.linspace(0.001, 0.8, 600).reshape(200, 3),
             },
-            "opacities from 0 to 1 and scales from 0.001 to 0.8: they are taken for stored values",
+            "opacities from 0 to 1 and scales from 0.001 to 0.8: they are read as stored values",
         ),
     ],
 )
-def test_activated_values_are_noticed(changes, found):
+def test_values_that_look_activated_are_warned_about(changes, found):
     with pytest.warns(UserWarning, match=re.escape(found)) as caught:
         from_dict(splats(**changes))
     assert len(caught) == 1
     assert caught[0].filename == __file__
 
 
-def test_stored_values_are_not_called_activated():
+def test_stored_values_give_no_warning():
     from_dict(splats())
     from_dict(splats(scales=torch.linspace(0.1, 5, 600).reshape(200, 3)))  # millimetres
     from_dict(splats(opacities=torch.full((200,), 0.5)))
@@ -206,7 +206,7 @@ def test_stored_values_are_not_called_activated():
     from_dict(splats(**activated), activated=True)
 
 
-def test_the_parameters_of_gsplat_are_taken():
+def test_the_parameter_dict_of_gsplat_is_accepted():
     scene = scene_of_object(20)
     parameters = {name: torch.nn.Parameter(one) for name, one in to_dict(scene).items()}
     made = from_dict(torch.nn.ParameterDict(parameters))

@@ -34,7 +34,7 @@ from scenes import random_scene, same_bits
 GOOD = ply_bytes(gaussian_properties(), gaussian_rows(gaussian_properties(), 3))
 
 
-def test_file_not_found(tmp_path: Path) -> None:
+def test_a_missing_file_is_one_sentence(tmp_path: Path) -> None:
     path = tmp_path / "none.ply"
     with pytest.raises(InputNotFoundError) as caught:
         load(path)
@@ -43,19 +43,19 @@ def test_file_not_found(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("end", ["ply", "compressed.ply", "spz", "splat", "sog", "ckpt", "pt"])
-def test_a_pointer_of_git_lfs_is_not_the_file(tmp_path: Path, end: str) -> None:
+def test_a_git_lfs_pointer_is_refused(tmp_path: Path, end: str) -> None:
     path = tmp_path / f"scene.{end}"
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
     with pytest.raises(FileFormatError) as caught:
         load(path)
     assert str(caught.value) == (
-        f"{path}: must be the file itself, found a pointer of Git LFS to it; get the file with: "
+        f"{path}: must be the file itself, found a Git LFS pointer to it; fetch the file with: "
         f"git lfs pull."
     )
 
 
 @pytest.mark.parametrize("name", ["folder", "folder.ply"])
-def test_a_directory_is_no_file(tmp_path: Path, name: str) -> None:
+def test_a_directory_without_a_scene_is_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.mkdir()
     with pytest.raises(InputError) as caught:
@@ -68,7 +68,7 @@ def test_a_directory_is_no_file(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-def test_a_pipe_is_no_file(tmp_path: Path) -> None:
+def test_a_pipe_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "pipe.ply"
     os.mkfifo(path)
     with pytest.raises(InputError) as caught:
@@ -76,7 +76,7 @@ def test_a_pipe_is_no_file(tmp_path: Path) -> None:
     assert str(caught.value) == f"{path}: must be a regular file, found a device or a pipe."
 
 
-def test_no_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreadable_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "s.ply"
     path.write_bytes(GOOD)
 
@@ -90,7 +90,7 @@ def test_no_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("name", "found"), [("s.xyz", "the suffix '.xyz'"), ("s", "no suffix")])
-def test_unknown_suffix(tmp_path: Path, name: str, found: str) -> None:
+def test_an_unknown_suffix_is_refused(tmp_path: Path, name: str, found: str) -> None:
     path = tmp_path / name
     path.write_bytes(GOOD)
     with pytest.raises(FileFormatError) as caught:
@@ -101,7 +101,7 @@ def test_unknown_suffix(tmp_path: Path, name: str, found: str) -> None:
     )
 
 
-def test_suffixes_ignore_case(tmp_path: Path) -> None:
+def test_the_case_of_suffixes_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "S.PLY"
     path.write_bytes(GOOD)
     assert len(load(path)) == 3
@@ -125,7 +125,7 @@ def inria_model(folder: Path, iterations: tuple[int, ...] = (7000, 30000)) -> Pa
     return folder
 
 
-def test_the_largest_iteration_counts(tmp_path: Path) -> None:
+def test_the_largest_iteration_of_a_model_is_read(tmp_path: Path) -> None:
     model = inria_model(tmp_path / "model", (7000, 30000, 9000))
     assert scene_file(model) == model / "point_cloud" / "iteration_30000" / "point_cloud.ply"
     assert len(load(model)) == 30
@@ -136,11 +136,11 @@ def test_the_largest_iteration_counts(tmp_path: Path) -> None:
     assert len(load(model)) == 9
 
 
-def test_its_cameras_are_found(tmp_path: Path) -> None:
+def test_the_cameras_of_a_model_folder_are_found(tmp_path: Path) -> None:
     assert len(load_cameras(inria_model(tmp_path))) == 12
 
 
-def test_splatfacto_runs(tmp_path: Path) -> None:
+def test_the_last_step_of_a_splatfacto_run_is_read(tmp_path: Path) -> None:
     steps = tmp_path / "nerfstudio_models"
     steps.mkdir()
     for step, count in ((999, 3), (29999, 5)):
@@ -149,19 +149,19 @@ def test_splatfacto_runs(tmp_path: Path) -> None:
     assert len(load(tmp_path)) == len(load(steps)) == 5
 
 
-def test_other_folders(tmp_path: Path) -> None:
+def test_point_cloud_ply_in_a_folder_is_read(tmp_path: Path) -> None:
     shutil.copy(DATA / "source.ply", tmp_path / "point_cloud.ply")
     assert len(load(tmp_path)) == 40
     with pytest.raises(InputError, match="found a directory without"):
         load(tmp_path.parent / tmp_path.name / "..")
 
 
-def test_the_size_of_an_unbundled_sog(tmp_path: Path) -> None:
+def test_the_size_of_an_unbundled_sog_includes_its_images(tmp_path: Path) -> None:
     shutil.unpack_archive(DATA / "splat-transform.sog", tmp_path, "zip")
     assert scene_size(tmp_path) == sum(file.stat().st_size for file in tmp_path.iterdir())
 
 
-def test_commands_take_the_folder_and_its_cameras(
+def test_commands_accept_a_model_folder_and_its_cameras(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model, small = inria_model(tmp_path / "model"), tmp_path / "small.spz"
@@ -190,7 +190,7 @@ def test_commands_take_the_folder_and_its_cameras(
     assert (found["views"], found["width"], found["height"]) == (["00000"], 32, 24)
 
 
-def test_a_folder_that_may_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreadable_folder_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(folder: Path) -> Iterator[Path]:
         raise PermissionError(13, "Permission denied")
 
@@ -219,7 +219,7 @@ class Pipe(io.RawIOBase):
 
 
 @pytest.mark.parametrize("end", FORMATS)
-def test_a_stream_holds_what_a_file_holds(tmp_path: Path, end: str) -> None:
+def test_a_stream_holds_the_bytes_of_a_file(tmp_path: Path, end: str) -> None:
     scene = replace(storable_scene(40, degree=0), comments=())
     path, stream = tmp_path / f"a{end}", io.BytesIO()
     cvtgs.save(scene, path)
@@ -231,7 +231,7 @@ def test_a_stream_holds_what_a_file_holds(tmp_path: Path, end: str) -> None:
             assert same_bits(cvtgs.load(source, format=named), cvtgs.load(path))
 
 
-def test_a_stream_gets_a_ply_and_is_read_from_where_it_stands() -> None:
+def test_streams_default_to_ply_and_are_read_from_their_position() -> None:
     stream = io.BytesIO()
     stream.write(b"before")
     cvtgs.save(storable_scene(5), stream)
@@ -240,7 +240,7 @@ def test_a_stream_gets_a_ply_and_is_read_from_where_it_stands() -> None:
     assert len(cvtgs.load(stream, sh_degree=1)) == 5
 
 
-def test_members_of_archives_and_checkpoints(tmp_path: Path) -> None:
+def test_scenes_in_members_of_a_zip_archive_are_read(tmp_path: Path) -> None:
     scene = storable_scene(5)
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         with archive.open("scene.ply", "w") as file:
@@ -253,7 +253,7 @@ def test_members_of_archives_and_checkpoints(tmp_path: Path) -> None:
                 assert torch.equal(cvtgs.load(file).means, scene.means)
 
 
-def test_a_format_may_be_named_whatever_the_file_is_called(tmp_path: Path) -> None:
+def test_the_format_argument_overrides_the_suffix(tmp_path: Path) -> None:
     scene = storable_scene(5)
     cvtgs.save(scene, tmp_path / "a.data", format=".ply")
     assert same_bits(cvtgs.load(tmp_path / "a.data", format=".ply"), scene)
@@ -265,12 +265,12 @@ def test_a_format_may_be_named_whatever_the_file_is_called(tmp_path: Path) -> No
     ("content", "error", "text"),
     [
         (b"", FileFormatError, "the first bytes must be those of a .ply, .spz, .sog, .glb or .pt"),
-        (b"what?", FileFormatError, "found b'what'; give format= for another one"),
+        (b"what?", FileFormatError, "found b'what'; give format= for other formats"),
         (b"ply\nnonsense", FileFormatError, "the BytesIO: the PLY header must end"),
         (b"PK\x03\x04nonsense", FileFormatError, "the BytesIO: a .sog file must be a zip"),
     ],
 )
-def test_what_cannot_be_read(content: bytes, error: type[Exception], text: str) -> None:
+def test_damaged_streams_are_refused(content: bytes, error: type[Exception], text: str) -> None:
     with pytest.raises(error) as caught:
         cvtgs.load(io.BytesIO(content))
     assert text in str(caught.value)
@@ -287,7 +287,7 @@ def test_text_files_and_closed_files_are_refused(tmp_path: Path) -> None:
         cvtgs.save(scene, file)
 
 
-def test_what_a_format_drops_is_said() -> None:
+def test_dropped_data_is_warned_about_for_streams() -> None:
     with pytest.warns(DroppedDataWarning, match="the BytesIO: files of this format do not hold"):
         cvtgs.save(storable_scene(5), io.BytesIO(), format=".splat")
 
@@ -302,7 +302,7 @@ def kinds_of_documents() -> list[type[Document]]:
 
 
 @pytest.mark.parametrize("kind", kinds_of_documents(), ids=lambda kind: kind.__name__)
-def test_every_key_of_a_document_says_what_it_must_be(kind: type[Document]) -> None:
+def test_every_key_of_a_document_has_an_error_message(kind: type[Document]) -> None:
     for key, field in kind.model_fields.items():
         if field.annotation is not Any:
             text = _sentence(kind, {key: 0.5}, [key], "file")

@@ -33,8 +33,8 @@ def small(tmp_path: Path) -> Path:
     return path
 
 
-def test_written_numbers_by_hand(tmp_path: Path) -> None:
-    """At (1, 2, 3) of a PLY, half a turn about x: glTF has y up and x left."""
+def test_written_numbers_are_as_computed_by_hand(tmp_path: Path) -> None:
+    """A Gaussian at (1, 2, 3) of a PLY, turned by pi about x; glTF has y up and x left."""
     scene = GaussianScene(
         means=torch.tensor([[1.0, 2.0, 3.0]]),
         quats=torch.tensor([[0.0, 5.0, 0.0, 0.0]]),
@@ -70,7 +70,7 @@ def test_written_numbers_by_hand(tmp_path: Path) -> None:
     assert position["min"] == position["max"] == [-1, -2, 3]
 
 
-def test_file_of_splat_transform() -> None:
+def test_a_file_of_splat_transform_is_read() -> None:
     path = DATA / "splat-transform.glb"
     scene, source = load(path), load(DATA / "source.ply")
     assert_as_oracle(change_axes(scene, "rdf", "luf"), read_glb(path.read_bytes()))
@@ -93,7 +93,7 @@ def test_round_trip(tmp_path: Path, degree: int, end: str) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_spz_inside(tmp_path: Path, degree: int) -> None:
+def test_spz_data_inside_a_glb_is_written_and_read(tmp_path: Path, degree: int) -> None:
     path, scene = tmp_path / "a.spz.glb", storable_scene(30, degree=degree)
     save(scene, path)
     save(scene, tmp_path / "a.spz", axes="luf", spz_version=3)
@@ -110,14 +110,14 @@ def test_spz_inside(tmp_path: Path, degree: int) -> None:
     assert path.stat().st_size < 2500 + 70 * len(scene)
 
 
-def test_axes_can_be_given(tmp_path: Path) -> None:
+def test_axes_are_followed_in_both_directions(tmp_path: Path) -> None:
     scene = storable_scene(9, degree=2)
     save(scene, tmp_path / "a.glb", axes="rdf")
     assert torch.equal(load(tmp_path / "a.glb", axes="rdf").means, scene.means)
     assert torch.equal(load(tmp_path / "a.glb").means, scene.means * torch.tensor([-1, -1, 1]))
 
 
-def test_nodes_move_gaussians(small: Path) -> None:
+def test_the_transforms_of_nodes_move_gaussians(small: Path) -> None:
     quat, shift, scale = (0.5, 0.1, -0.7, 0.5), (1.0, 2.0, -3.0), 2.5
     wanted = moved(load(small, axes="rdf"), quat=quat, shift=shift, scale=scale)
     length = math.hypot(*quat)
@@ -142,14 +142,14 @@ def test_all_nodes_and_primitives_are_read(small: Path) -> None:
         document["scenes"] = [{"nodes": [0, 1]}]
 
     first = load(small)
-    with pytest.warns(DroppedDataWarning, match="left out 1 mesh primitive that is not of Gauss"):
+    with pytest.warns(DroppedDataWarning, match="left out 1 mesh primitive that is not Gauss"):
         scene = load(changed(small, repeat))
     assert len(scene) == 10
     torch.testing.assert_close(scene.means[:5], first.means - torch.tensor([5.0, 0, 0]))
     assert torch.equal(scene.means[5:], first.means)
 
 
-def test_integers_are_normalised(small: Path) -> None:
+def test_normalized_integers_are_read(small: Path) -> None:
     """Rotations as signed bytes, opacities as shorts, with a stride."""
 
     def pack(document: dict[str, Any]) -> None:
@@ -174,7 +174,7 @@ def test_integers_are_normalised(small: Path) -> None:
 
 @pytest.mark.parametrize("normalized", [False, True])
 def test_quantized_positions_are_placed_by_their_node(small: Path, normalized: bool) -> None:
-    """Shorts, as KHR_mesh_quantization has them; sizes as unsigned bytes."""
+    """Positions are shorts, as KHR_mesh_quantization allows; sizes are unsigned bytes."""
     added = b"".join(struct.pack("<3hxx3Bx", row, -2 * row, 300, 1, 2, 4) for row in range(5))
 
     def quantize(document: dict[str, Any]) -> None:
@@ -199,7 +199,7 @@ def test_quantized_positions_are_placed_by_their_node(small: Path, normalized: b
     torch.testing.assert_close(scene.scales, torch.tensor([[2.0, 4.0, 8.0]] * 5))
 
 
-def test_buffers_beside_the_file(small: Path, tmp_path: Path) -> None:
+def test_buffers_are_read_from_the_folder_of_the_file_only(small: Path, tmp_path: Path) -> None:
     document, binary = parts(small.read_bytes())
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "some data.bin").write_bytes(binary)
@@ -222,10 +222,10 @@ def test_buffers_beside_the_file(small: Path, tmp_path: Path) -> None:
         assert "buffers[0] must " in str(refusal(path))
 
 
-def test_linear_colours_are_warned_about(small: Path) -> None:
+def test_a_linear_colour_space_is_warned_about(small: Path) -> None:
     def linear(document: dict[str, Any]) -> None:
         primitive(document)["extensions"][NAME]["colorSpace"] = "lin_rec709_display"
 
-    with pytest.warns(DroppedDataWarning, match="space 'lin_rec709_display' for those of") as said:
+    with pytest.warns(DroppedDataWarning, match="colour space 'lin_rec709_display' as") as said:
         load(changed(small, linear))
     assert said[0].filename == __file__

@@ -1,4 +1,4 @@
-"""Damaged and lying glTF: one sentence each."""
+"""Error messages about damaged or inconsistent glTF files."""
 
 import struct
 from pathlib import Path
@@ -22,21 +22,21 @@ def small(tmp_path: Path) -> Path:
 DAMAGE: dict[str, tuple[Change, str]] = {
     "elements": (
         lambda d: accessor(d, "POSITION").update(count=6),
-        "accessors[0] (POSITION) must have one element at least and end in its buffer view of 60 "
-        "bytes, found 6 elements that end at byte 72.",
+        "accessors[0] (POSITION) must have at least one element and end within its buffer view of "
+        "60 bytes, found 6 elements that end at byte 72.",
     ),
     "no elements": (
         lambda d: accessor(d, "POSITION").update(count=0),
-        "accessors[0] (POSITION) must have one element at least and end in its buffer view of 60 "
-        "bytes, found 0 elements that end at byte 0.",
+        "accessors[0] (POSITION) must have at least one element and end within its buffer view of "
+        "60 bytes, found 0 elements that end at byte 0.",
     ),
     "fewer elements": (
         lambda d: accessor(d, f"{NAME}:SCALE").update(count=4),
-        f"all attributes must have the 5 elements of POSITION, found 4 in {NAME}:SCALE.",
+        f"all attributes must have 5 elements like POSITION, found 4 in {NAME}:SCALE.",
     ),
     "view": (
         lambda d: d["bufferViews"][0].update(byteLength=10**9),
-        "bufferViews[0] must end in buffer 0 of 480 bytes, found byte 1,000,000,000.",
+        "bufferViews[0] must end within buffer 0 of 480 bytes, found byte 1,000,000,000.",
     ),
     "buffer": (
         lambda d: d["buffers"][0].update(byteLength=10**9),
@@ -44,23 +44,23 @@ DAMAGE: dict[str, tuple[Change, str]] = {
     ),
     "type": (
         lambda d: accessor(d, "POSITION").update(type="VEC4"),
-        "accessors[0] (POSITION) must be VEC3 of floats, or with KHR_mesh_quantization of bytes or "
-        "shorts, found 'VEC4' of component type 5126.",
+        "accessors[0] (POSITION) must be VEC3 of floats, or of bytes or shorts with "
+        "KHR_mesh_quantization, found 'VEC4' of component type 5126.",
     ),
     "component": (
         lambda d: accessor(d, f"{NAME}:OPACITY").update(componentType=5125),
-        f"accessors[4] ({NAME}:OPACITY) must be SCALAR of floats, or of unsigned bytes or shorts "
-        f"that are normalized, found 'SCALAR' of component type 5125.",
+        f"accessors[4] ({NAME}:OPACITY) must be SCALAR of floats, or of normalized unsigned "
+        f"bytes or shorts, found 'SCALAR' of component type 5125.",
     ),
     "bytes of opacities": (
         lambda d: accessor(d, f"{NAME}:OPACITY").update(componentType=5121),
-        f"accessors[4] ({NAME}:OPACITY) must be SCALAR of floats, or of unsigned bytes or shorts "
-        f"that are normalized, found 'SCALAR' of component type 5121, not normalized.",
+        f"accessors[4] ({NAME}:OPACITY) must be SCALAR of floats, or of normalized unsigned "
+        f"bytes or shorts, found 'SCALAR' of component type 5121, not normalized.",
     ),
     "unsigned rotations": (
         lambda d: accessor(d, f"{NAME}:ROTATION").update(componentType=5123, normalized=True),
-        f"accessors[2] ({NAME}:ROTATION) must be VEC4 of floats, or of signed bytes or shorts that "
-        f"are normalized, found 'VEC4' of component type 5123, normalized.",
+        f"accessors[2] ({NAME}:ROTATION) must be VEC4 of floats, or of normalized signed bytes "
+        f"or shorts, found 'VEC4' of component type 5123, normalized.",
     ),
     "shorts of SH": (
         lambda d: accessor(d, f"{NAME}:SH_DEGREE_0_COEF_0").update(componentType=5122),
@@ -69,8 +69,8 @@ DAMAGE: dict[str, tuple[Change, str]] = {
     ),
     "shorts without the extension": (
         lambda d: accessor(d, "POSITION").update(componentType=5122),
-        "accessors[0] (POSITION) must be VEC3 of floats, or with KHR_mesh_quantization of bytes or "
-        "shorts, found 'VEC3' of component type 5122, not normalized.",
+        "accessors[0] (POSITION) must be VEC3 of floats, or of bytes or shorts with "
+        "KHR_mesh_quantization, found 'VEC3' of component type 5122, not normalized.",
     ),
     "count": (
         lambda d: accessor(d, "POSITION").update(count="five"),
@@ -78,7 +78,7 @@ DAMAGE: dict[str, tuple[Change, str]] = {
     ),
     "sparse": (
         lambda d: accessor(d, "POSITION").update(sparse={}),
-        "accessors[0] (POSITION) must lie in a buffer view, found a sparse one.",
+        "accessors[0] (POSITION) must be in a buffer view, found a sparse one.",
     ),
     "reference": (
         lambda d: primitive(d)["attributes"].update(POSITION=99),
@@ -95,7 +95,8 @@ DAMAGE: dict[str, tuple[Change, str]] = {
     ),
     "kernel": (
         lambda d: primitive(d)["extensions"][NAME].update(kernel="ellipse2d"),
-        "Gaussians must be points (mode 0) of the kernel 'ellipse', found mode 0 and 'ellipse2d'.",
+        "Gaussians must be points (mode 0) with the kernel 'ellipse', found mode 0 "
+        "and 'ellipse2d'.",
     ),
     "mesh": (
         lambda d: primitive(d).update(extensions={}),
@@ -103,17 +104,17 @@ DAMAGE: dict[str, tuple[Change, str]] = {
     ),
     "required": (
         lambda d: d.update(extensionsRequired=["EXT_meshopt_compression"]),
-        f"must require no other extensions than {NAME}, {NAME}_compression_spz_2, "
+        f"must require no extensions other than {NAME}, {NAME}_compression_spz_2, "
         f"KHR_mesh_quantization, found 'EXT_meshopt_compression'.",
     ),
     "circle": (
         lambda d: d.update(nodes=[{"children": [0]}]),
-        "each node must hang in one place, found 0 again.",
+        "each node must occur once in the hierarchy, found 0 again.",
     ),
     "skewed": (
         lambda d: d.update(nodes=[{"mesh": 0, "scale": [1, 2, 1]}]),
-        "nodes must turn, shift and evenly scale Gaussians, found one that stretches, skews or "
-        "mirrors them.",
+        "nodes must only rotate, translate and uniformly scale Gaussians, found one that "
+        "stretches, skews or mirrors them.",
     ),
     "stride": (
         lambda d: d["bufferViews"][0].update(byteStride=4),
@@ -124,32 +125,32 @@ DAMAGE: dict[str, tuple[Change, str]] = {
 
 @pytest.mark.filterwarnings("ignore:left out 1 mesh", "ignore:.*left out 1 mesh")
 @pytest.mark.parametrize("name", DAMAGE)
-def test_damage(small: Path, name: str) -> None:
+def test_each_damage_has_its_own_message(small: Path, name: str) -> None:
     change, said = DAMAGE[name]
     assert refusal(changed(small, change)) == f"{small}: {said}"
 
 
-def test_damaged_containers(small: Path) -> None:
+def test_damaged_containers_are_refused(small: Path) -> None:
     content = small.read_bytes()
     small.write_bytes(content[:-9])
     assert refusal(small) == (
-        f"{small}: must be version 2 of glTF and have the {len(content):,} bytes that its header "
+        f"{small}: must be glTF version 2 with the {len(content):,} bytes that its header "
         f"promises, found version 2 and {len(content) - 9:,} bytes."
     )
     small.write_bytes(content[:16] + bytes(4) + content[20:])
-    assert refusal(small) == f"{small}: a .glb must have a chunk of JSON, found none."
+    assert refusal(small) == f"{small}: a .glb must have a JSON chunk, found none."
     small.write_bytes(content[:12] + b"\xff\xff\xff\x00" + content[16:])
-    assert "a chunk must end in the" in str(refusal(small))
+    assert "a chunk must end within the" in str(refusal(small))
     small.write_bytes(b"ply" + content)
     assert refusal(small) == f"{small}: a .glb must start with b'glTF', found b'plyg'."
     small.write_bytes(content[:8])
-    assert "must start with 12 bytes of header, found 8." in str(refusal(small))
+    assert "must start with a header of 12 bytes, found 8." in str(refusal(small))
     spz = joined({"meshes": [{"primitives": []}]}, b"")
     small.write_bytes(spz)
     assert refusal(small) == f"{small}: must have a mesh primitive with {NAME}, found none."
 
 
-def test_negative_scales(small: Path) -> None:
+def test_negative_scales_are_refused(small: Path) -> None:
     document, binary = parts(small.read_bytes())
     start = document["bufferViews"][accessor(document, f"{NAME}:SCALE")["bufferView"]]["byteOffset"]
     value = struct.pack("<f", -0.5)
@@ -159,7 +160,7 @@ def test_negative_scales(small: Path) -> None:
     )
 
 
-def test_nodes_that_repeat_a_mesh(tmp_path: Path) -> None:
+def test_nodes_that_repeat_a_mesh_too_often_are_refused(tmp_path: Path) -> None:
     def repeat(document: dict[str, Any]) -> None:
         document["nodes"] = [{"mesh": 0}] * 1500
         document["scenes"] = [{"nodes": list(range(1500))}]
@@ -171,19 +172,21 @@ def test_nodes_that_repeat_a_mesh(tmp_path: Path) -> None:
         load(path)
 
 
-def test_spz_inside_may_not_lie(tmp_path: Path) -> None:
+def test_damaged_spz_data_inside_a_glb_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.spz.glb"
     save(storable_scene(9), path)
     document, binary = parts(path.read_bytes())
     path.write_bytes(joined(document, bytes(4) + binary[4:]))
     assert refusal(path) == (
-        f"{path}: bufferViews[0]: an .spz file must start with gzip's or its own magic number, "
+        f"{path}: bufferViews[0]: an .spz file must start with the magic number of gzip or SPZ, "
         f"found b'\\x00\\x00\\x00\\x00'."
     )
 
 
-def test_more_than_a_glb_can_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_that_is_too_large_for_a_glb_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("cvtgs.io.gltf.write._MOST_BYTES", 1000)
-    with pytest.raises(InvalidSceneError, match="must have less than 4 GiB, found a scene that"):
+    with pytest.raises(InvalidSceneError, match="must be smaller than 4 GiB, found a scene that"):
         save(storable_scene(9), tmp_path / "a.glb")
     assert list(tmp_path.iterdir()) == []

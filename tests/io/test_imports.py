@@ -1,4 +1,4 @@
-"""What importing the io layer loads, proved in a fresh interpreter."""
+"""Modules that the io layer imports, checked in a fresh interpreter."""
 
 import os
 import subprocess
@@ -42,7 +42,7 @@ LOADED = (
 
 
 @pytest.mark.long
-def test_plyfile_is_loaded_only_for_odd_files(tmp_path: Path) -> None:
+def test_plyfile_is_imported_only_for_unusual_files(tmp_path: Path) -> None:
     properties = gaussian_properties()
     rows = gaussian_rows(properties, 1)
     common = write_ply_file(tmp_path / "a.ply", properties, rows)
@@ -60,7 +60,7 @@ def test_plyfile_is_loaded_only_for_odd_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_scene_in_memory_needs_no_format() -> None:
+def test_a_scene_in_memory_imports_no_format() -> None:
     program = (
         "import sys, cvtgs\n"
         "import cvtgs.io\n"
@@ -74,7 +74,7 @@ def test_a_scene_in_memory_needs_no_format() -> None:
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
 @pytest.mark.parametrize("end", FORMATS)
-def test_a_format_is_loaded_when_a_file_of_it_is_read(tmp_path: Path, end: str) -> None:
+def test_a_format_is_imported_when_a_file_of_it_is_read(tmp_path: Path, end: str) -> None:
     path = tmp_path / f"scene{end}"
     save(random_scene(5), path)
     (names,) = printed(f"import sys, cvtgs\ncvtgs.load(sys.argv[1])\n{LOADED}", path)

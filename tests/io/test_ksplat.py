@@ -1,4 +1,4 @@
-"""``.ksplat``: all compressions against what was stored, several sections, and damage."""
+"""``.ksplat`` files of all compressions, with several sections, and with damage."""
 
 import struct
 import tracemalloc
@@ -18,7 +18,7 @@ BLOCK, SIZE = 20.0, 256
 
 
 def section(level: int, degree: int, count: int, seed: int) -> tuple[bytes, bytes, dict[str, Any]]:
-    """Return a header, its data and the values in it: full buckets, and two that are not.
+    """Return a header, its data and the values in it: full buckets, and two partial ones.
 
     splat-transform 3.7.0 reads files like these as cvtgs does.
     """
@@ -61,7 +61,7 @@ def write(path: Path, level: int, *sections: tuple[bytes, bytes, dict[str, Any]]
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 @pytest.mark.parametrize("degree", [0, 1, 2])
-def test_every_compression_holds_what_was_stored(tmp_path: Path, level: int, degree: int) -> None:
+def test_every_compression_is_read(tmp_path: Path, level: int, degree: int) -> None:
     first, second = section(level, degree, 700, 0), section(level, 0, 300, 1)
     scene = cvtgs.load(write(tmp_path / "a.ksplat", level, first, second))
     assert (len(scene), scene.sh_degree) == (1000, degree)
@@ -87,10 +87,14 @@ def test_every_compression_holds_what_was_stored(tmp_path: Path, level: int, deg
 @pytest.mark.parametrize(
     ("place", "number", "text"),
     [
-        (1, struct.pack("<B", 2), "must be a .ksplat of version 0.1 and compression 0, 1 or 2"),
-        (20, struct.pack("<H", 7), "must be a .ksplat of version 0.1 and compression 0, 1 or 2"),
+        (1, struct.pack("<B", 2), "must be a .ksplat of version 0.1 with compression 0, 1 or 2"),
+        (20, struct.pack("<H", 7), "must be a .ksplat of version 0.1 with compression 0, 1 or 2"),
         (4, struct.pack("<I", 1 << 30), "must hold the headers of 1,073,741,824 sections"),
-        (16, struct.pack("<I", 701), "the sections must hold the 701 Gaussians of the header"),
+        (
+            16,
+            struct.pack("<I", 701),
+            "the sections must hold the 701 Gaussians that the header promises",
+        ),
         (4096, struct.pack("<I", 1 << 30), "a section of 1,073,741,824 Gaussians must take"),
         (4096 + 12, struct.pack("<I", 1 << 30), "a section of 700 Gaussians must take"),
         (4096 + 32, struct.pack("<I", 1), "the buckets of a section must hold its 700 Gaussians"),
@@ -106,7 +110,7 @@ def test_damage_is_one_sentence(tmp_path: Path, place: int, number: bytes, text:
     assert text in str(caught.value)
 
 
-def test_a_bucket_of_a_hundred_million_takes_no_memory(tmp_path: Path) -> None:
+def test_a_huge_bucket_size_takes_no_memory(tmp_path: Path) -> None:
     path = write(tmp_path / "a.ksplat", 1, section(1, 0, 300, seed=1))
     content = bytearray(path.read_bytes())
     content[4096 + 8 : 4096 + 12] = b"\0\0\0\x08"
@@ -119,7 +123,7 @@ def test_a_bucket_of_a_hundred_million_takes_no_memory(tmp_path: Path) -> None:
         tracemalloc.stop()
 
 
-def test_cut_or_random_files_never_end_in_another_error(tmp_path: Path) -> None:
+def test_cut_or_damaged_files_give_a_scene_or_a_format_error(tmp_path: Path) -> None:
     content = write(tmp_path / "a.ksplat", 1, section(1, 1, 700, 0)).read_bytes()
     rng, read = np.random.default_rng(0), 0
     for case in range(200):

@@ -1,4 +1,4 @@
-"""Leftovers of killed runs, loops of links, names on Windows, and maps of replaced files."""
+"""Leftovers of killed runs, loops of links, names on Windows, maps of replaced files."""
 
 import os
 import subprocess
@@ -36,7 +36,7 @@ def leftovers(folder: Path) -> list[str]:
 
 
 @posix
-def test_what_killed_runs_have_left_goes_with_the_next_one(tmp_path: Path) -> None:
+def test_the_next_run_removes_the_files_of_killed_runs(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     command = [sys.executable, "-c", HANGS, str(path)]
     started = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(3)]
@@ -45,7 +45,7 @@ def test_what_killed_runs_have_left_goes_with_the_next_one(tmp_path: Path) -> No
         assert process.stdout.readline() == b"writing\n"
     names = [f".a.bin.{number}.tmp" for number in range(3)]
     assert leftovers(tmp_path) == names
-    write(path)  # takes nothing from those who still write
+    write(path)  # does not remove the files of running writers
     assert leftovers(tmp_path) == names
     for process in started:
         process.kill()
@@ -56,7 +56,7 @@ def test_what_killed_runs_have_left_goes_with_the_next_one(tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_more_writers_than_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_writers_than_names_can_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(atomic, "_MOST_WRITERS", 1)
     path = tmp_path / "a.bin"
     with atomic_output(path, overwrite=True) as one, atomic_output(path, overwrite=True) as other:
@@ -67,7 +67,7 @@ def test_more_writers_than_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_without_locks_only_old_leftovers_go(
+def test_without_locks_only_old_leftovers_are_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(atomic, "fcntl", None)
@@ -83,7 +83,7 @@ def test_without_locks_only_old_leftovers_go(
 
 
 @posix
-def test_a_loop_of_links_is_found_before_the_work(tmp_path: Path) -> None:
+def test_a_loop_of_symbolic_links_is_refused_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "a.ply").symlink_to(tmp_path / "b.ply")
     (tmp_path / "b.ply").symlink_to(tmp_path / "a.ply")
     for overwrite in (False, True):
@@ -98,33 +98,33 @@ def test_a_loop_of_links_is_found_before_the_work(tmp_path: Path) -> None:
         (r"\\server\share\a b (1).ply", None),
         ("C:a.ply", None),
         ("console.ply", None),
-        (r"C:\scenes\a.ply:hidden", "the letters :"),
-        ("ab:c.ply", "the letters :"),
-        ('a<b>"|?*.ply', 'the letters " * < > ? |'),
+        (r"C:\scenes\a.ply:hidden", "the characters :"),
+        ("ab:c.ply", "the characters :"),
+        ('a<b>"|?*.ply', 'the characters " * < > ? |'),
         ("nul", "a device"),
         (r"D:\CON.ply", "a device"),
         ("com1.tar.ply", "a device"),
-        ("a.ply.", "a dot or blank"),
-        ("a.ply ", "a dot or blank"),
+        ("a.ply.", "a dot or space"),
+        ("a.ply ", "a dot or space"),
     ],
 )
-def test_names_that_windows_does_not_allow(path: str, wanted: str | None) -> None:
+def test_invalid_names_on_windows_are_recognised(path: str, wanted: str | None) -> None:
     found = atomic.windows_fault(PureWindowsPath(path))
     assert found is None if wanted is None else wanted in str(found)
 
 
-def test_on_windows_such_names_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_windows_names_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     check_output(tmp_path / "a.ply_b")
     monkeypatch.setattr(atomic, "_WINDOWS", True)
-    with pytest.raises(OutputError, match="the letters :, which Windows does not allow"):
+    with pytest.raises(OutputError, match="the characters :, which Windows does not allow"):
         check_output(tmp_path / "a.ply:b")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the maps of Linux")
-def test_a_file_is_not_mapped_when_it_is_replaced(
+def test_an_input_is_no_longer_mapped_when_it_is_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Windows refuses that."""
+    """Windows does not allow the replacement of a mapped file."""
     path, seen = tmp_path / "a.ply", list[str]()
     cvtgs.save(cvtgs.synthetic.scene("object", 3000, sh_degree=1, seed=0), path)
     replace = Path.replace
@@ -139,7 +139,7 @@ def test_a_file_is_not_mapped_when_it_is_replaced(
     words = ["simplify", str(path), str(path), "--rho", "0.1", "--overwrite", "--quiet"]
     assert main([*words, "--preset", "draft"]) == 0
     assert seen == ["looked"]
-    with path.open("rb") as file:  # the test can fail
+    with path.open("rb") as file:  # checks that the test can fail
         held = np.memmap(file, np.uint8, "r")
         look(path, path)
     assert len(held) > 0

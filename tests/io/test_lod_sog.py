@@ -1,4 +1,4 @@
-"""Streamed SOG: ``lod-meta.json`` and the SOGs that it names, as others write it."""
+"""Streamed SOG: ``lod-meta.json`` and its SOGs, as other programs write them."""
 
 import json
 import shutil
@@ -29,7 +29,7 @@ def write_folder(scene: GaussianScene, folder: Path) -> None:
 
 @pytest.fixture
 def stream(tmp_path: Path) -> Path:
-    """Two chunks; level 0 lies in two files, level 1 in one; rows 3 and 4 are of no chunk."""
+    """Write two chunks; level 0 is in two files, level 1 in one; two rows are in no chunk."""
     for name, seed, count in (("0_0", 0, 6), ("0_1", 1, 4), ("1_0", 2, 5), ("env", 3, 2)):
         write_folder(storable_scene(count, seed=seed, degree=1), tmp_path / name)
     near = {"0": {"file": 0, "offset": 0, "count": 3}, "1": {"file": 2, "offset": 0, "count": 2}}
@@ -77,7 +77,7 @@ def test_the_finest_level_is_read_with_its_environment(stream: Path) -> None:
     assert scene_size(stream) == sum(path.stat().st_size for path in files)
 
 
-def test_a_chunk_without_a_level_gives_the_next(stream: Path) -> None:
+def test_a_chunk_without_the_level_gives_its_next_level(stream: Path) -> None:
     def drop(document: dict[str, Any]) -> None:
         near, far = (child["lods"] for child in document["tree"]["children"])
         del near["0"], far["1"], document["environment"]
@@ -88,16 +88,16 @@ def test_a_chunk_without_a_level_gives_the_next(stream: Path) -> None:
     assert load(path, lod=1).means.tolist() == means(first, coarse[:2])
 
 
-def test_option_of_commands(stream: Path, tmp_path: Path) -> None:
+def test_commands_accept_lod(stream: Path, tmp_path: Path) -> None:
     words = ["convert", str(stream), str(tmp_path / "a.ply"), "--quiet", "--lod", "1"]
     assert main(words) == 0
     assert same_bits(load(tmp_path / "a.ply"), load(stream, lod=1))
     assert main(["info", str(stream), "--lod", "1"]) == 0
 
 
-def test_only_streams_have_levels(stream: Path, tmp_path: Path) -> None:
+def test_lod_is_refused_for_other_files_and_out_of_range(stream: Path, tmp_path: Path) -> None:
     save(storable_scene(3), tmp_path / "a.ply")
-    with pytest.raises(InvalidArgumentError, match=r"level of a streamed SOG \(lod-meta.json\), f"):
+    with pytest.raises(InvalidArgumentError, match=r"only for a streamed SOG \(lod-meta.json\), f"):
         load(tmp_path / "a.ply", lod=0)
     for lod in (-1, 2):
         with pytest.raises(
@@ -138,7 +138,8 @@ DAMAGE: dict[str, tuple[Change, str]] = {
     ),
     "sum": (
         lambda d: d.update(counts=[9, 5]),
-        "'counts' must be those of the chunks of 2 levels, found [9, 5] and 7 in level 0.",
+        "'counts' must hold the number of Gaussians of each of 2 levels, found [9, 5] and 7 in "
+        "the chunks of level 0.",
     ),
     "twice": (
         lambda d: rows(d, 1).update(file=0, offset=2),
@@ -162,23 +163,23 @@ DAMAGE: dict[str, tuple[Change, str]] = {
     ),
     "nothing": (
         lambda d: (d.pop("environment"), d.update(tree={}, counts=[0, 0])),
-        "level 0 must hold a Gaussian, found none.",
+        "level 0 must hold at least one Gaussian, found none.",
     ),
 }
 
 
 @pytest.mark.parametrize("name", DAMAGE)
-def test_damage(stream: Path, name: str) -> None:
+def test_each_damage_has_its_own_message(stream: Path, name: str) -> None:
     change, said = DAMAGE[name]
     path = changed(stream, change)
     assert refusal(path) == f"{path}: {said}"
 
 
-def test_missing_and_short_files(stream: Path) -> None:
+def test_missing_and_short_files_are_refused(stream: Path) -> None:
     shutil.rmtree(stream / "0_1")
     path = stream / "0_1" / "meta.json"
     assert refusal(stream) == f"{path}: the file to read must exist, found none."
     write_folder(storable_scene(2, degree=1), stream / "0_1")
     assert refusal(stream) == (
-        f"{path}: must have the 4 Gaussians that the stream takes of it, found 2."
+        f"{path}: must have the 4 Gaussians that the stream reads from it, found 2."
     )

@@ -1,4 +1,4 @@
-"""What damaged and foreign files get: one sentence, word for word."""
+"""Error messages about damaged files and files of other kinds, word for word."""
 
 import contextlib
 import random
@@ -71,8 +71,8 @@ HEADER_CASES: Mapping[str, tuple[bytes, str]] = {
     ),
     "web page": (
         b"<!DOCTYPE html>",
-        "a PLY file must start with the line 'ply', found a web page; a download that failed "
-        "leaves one.",
+        "a PLY file must start with the line 'ply', found a web page; failed downloads "
+        "often leave one.",
     ),
     "plywood": (b"plywood", "a PLY file must start with the line 'ply', found b'plywood'."),
     "no end": (
@@ -148,7 +148,7 @@ VERTEX_CASES: Mapping[str, tuple[bytes, str]] = {
     "point cloud": (
         ply_bytes([(name, "float") for name in "xyz"], [[1.0, 2.0, 3.0]]),
         NEEDED + "f_dc_0, f_dc_1, f_dc_2, opacity, scale_0, scale_1, rot_0, rot_1, rot_2, rot_3; "
-        "a point cloud or a mesh must be trained to a scene first.",
+        "train a scene from a point cloud or mesh first.",
     ),
     "list": (
         with_list("scale_1"),
@@ -213,11 +213,11 @@ DATA_CASES: Mapping[str, tuple[bytes, str]] = {
     ),
     "word": (
         ascii_row(1, put(9, "opaque")),
-        "row 1 of 'vertex': property 'opacity' must be a float, found something unreadable.",
+        "row 1 of 'vertex': property 'opacity' must be a float, found an unreadable value.",
     ),
     "not ascii": (
         ascii_row(2, put(0, "\uff11")),
-        "row 2 of 'vertex': property 'x' must be a float, found something unreadable.",
+        "row 2 of 'vertex': property 'x' must be a float, found an unreadable value.",
     ),
     "number too few": (
         ascii_row(0, lambda words: words.pop(-1) and None),
@@ -234,7 +234,7 @@ CASES = {**HEADER_CASES, **VERTEX_CASES, **DATA_CASES}
 
 
 @pytest.mark.parametrize(("data", "text"), CASES.values(), ids=CASES.keys())
-def test_each_damage_has_its_sentence(tmp_path: Path, data: bytes, text: str) -> None:
+def test_each_damage_has_its_own_message(tmp_path: Path, data: bytes, text: str) -> None:
     path = tmp_path / "damaged.ply"
     path.write_bytes(data)
     with pytest.raises(FileFormatError) as caught:
@@ -242,7 +242,7 @@ def test_each_damage_has_its_sentence(tmp_path: Path, data: bytes, text: str) ->
     assert str(caught.value) == f"{path}: {text}"
 
 
-def test_integers_out_of_range_are_an_error(tmp_path: Path) -> None:
+def test_integers_out_of_range_are_refused(tmp_path: Path) -> None:
     properties = [("label", "uchar"), *PROPERTIES]
     rows = [[7, *row] for row in ROWS]
     data = ply_bytes(properties, rows, encoding="ascii").replace(
@@ -252,12 +252,12 @@ def test_integers_out_of_range_are_an_error(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError) as caught:
         load(tmp_path / "s.ply")
     assert str(caught.value).startswith(
-        f"{tmp_path}/s.ply: every value must be a number of the type its property states, found "
+        f"{tmp_path}/s.ply: every value must be a number of the type of its property, found "
         f"one that is not: "
     )
 
 
-def test_no_cut_of_a_file_leaks_a_foreign_error(tmp_path: Path) -> None:
+def test_a_file_cut_anywhere_is_a_format_error(tmp_path: Path) -> None:
     path = tmp_path / "s.ply"
     for data in (GOOD, ASCII, WITH_FACES):
         for length in range(0, len(data) - 1, 7):
@@ -267,7 +267,7 @@ def test_no_cut_of_a_file_leaks_a_foreign_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_no_random_damage_leaks_a_foreign_error(tmp_path: Path) -> None:
+def test_random_damage_is_a_scene_or_a_format_error(tmp_path: Path) -> None:
     draw = random.Random(0)
     path = tmp_path / "s.ply"
     words = [

@@ -1,4 +1,4 @@
-"""Reading PLY files: values, layouts, encodings, and both readers against one another."""
+"""Reading PLY files: values, layouts, encodings, and agreement of both readers."""
 
 import io
 import random
@@ -51,7 +51,7 @@ def load_with_plyfile(path: Path) -> GaussianScene:
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_each_property_goes_to_its_place(tmp_path: Path, encoding: str) -> None:
+def test_each_property_is_read_to_its_tensor(tmp_path: Path, encoding: str) -> None:
     properties = gaussian_properties(9)
     row = [1, 2, 3, 0, 0, 0, 4, 5, 6, *range(10, 19), 7, -1, -2, -3, 0.5, 0.25, 0.125, 1.5]
     scene = load(write_ply_file(tmp_path / "one.ply", properties, [row], encoding=encoding))
@@ -66,7 +66,7 @@ def test_each_property_goes_to_its_place(tmp_path: Path, encoding: str) -> None:
 
 
 @pytest.mark.parametrize(("rest", "degree"), [(0, 0), (9, 1), (24, 2), (45, 3)])
-def test_every_sh_degree(tmp_path: Path, rest: int, degree: int) -> None:
+def test_every_sh_degree_is_read(tmp_path: Path, rest: int, degree: int) -> None:
     properties = gaussian_properties(rest)
     rows = gaussian_rows(properties, 3)
     scene = load(write_ply_file(tmp_path / "s.ply", properties, rows))
@@ -77,7 +77,7 @@ def test_every_sh_degree(tmp_path: Path, rest: int, degree: int) -> None:
     torch.testing.assert_close(scene.shN.transpose(1, 2).reshape(3, rest), expected, rtol=0, atol=0)
 
 
-def test_chunks_meet_without_gaps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reading_in_chunks_keeps_every_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(read, "CHUNK_BYTES", 3 * 17 * 4 + 5)
     properties = gaussian_properties()
     rows = gaussian_rows(properties, 10)
@@ -86,14 +86,14 @@ def test_chunks_meet_without_gaps(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert scene.quats[:, 3].tolist() == [0.25 * i + 16 for i in range(10)]
 
 
-def test_missing_normals_and_missing_third_scale(tmp_path: Path) -> None:
+def test_normals_and_the_third_scale_may_be_missing(tmp_path: Path) -> None:
     properties = [p for p in gaussian_properties(normals=False) if p[0] != "scale_2"]
     scene = load(write_ply_file(tmp_path / "s.ply", properties, gaussian_rows(properties, 2)))
     assert scene.log_scales[:, 2].tolist() == [FLAT_LOG_SCALE, FLAT_LOG_SCALE] == [-20, -20]
     assert "scale_2" not in dict(scene.layout)
 
 
-def test_normals_are_extras_only_where_they_say_something(tmp_path: Path) -> None:
+def test_normals_are_extras_only_if_any_is_nonzero(tmp_path: Path) -> None:
     properties = gaussian_properties()
     rows = gaussian_rows(properties, 5)
     rows[3][5] = 1.0
@@ -157,7 +157,7 @@ def test_nan_and_infinity_are_returned_as_they_are(tmp_path: Path, encoding: str
     assert scene.logit_opacities[1].item() == float("-inf")
 
 
-def test_comments_survive_wherever_they_stand(tmp_path: Path) -> None:
+def test_comments_are_kept_wherever_they_are_in_the_header(tmp_path: Path) -> None:
     data = ply_bytes(gaussian_properties(), [[0.0] * 17], comments=["SplatRenderMode: mip", ""])
     data = data.replace(b"property float y", b"comment  two  blanks \nobj_info 7\nproperty float y")
     data = data.replace(b"end_header", "comment K\u00e4se\nend_header".encode())
@@ -171,7 +171,7 @@ def test_comments_survive_wherever_they_stand(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n", "\r", "  \n", " \t\r\n"])
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_line_ends_and_trailing_blanks(tmp_path: Path, newline: str, encoding: str) -> None:
+def test_all_line_ends_and_blanks_are_accepted(tmp_path: Path, newline: str, encoding: str) -> None:
     properties = gaussian_properties()
     rows = gaussian_rows(properties, 3)
     path = tmp_path / "s.ply"
@@ -180,7 +180,7 @@ def test_line_ends_and_trailing_blanks(tmp_path: Path, newline: str, encoding: s
     assert same(load(path), load(plain))
 
 
-def test_first_value_may_look_like_a_line_end(tmp_path: Path) -> None:
+def test_the_first_value_may_look_like_a_line_end(tmp_path: Path) -> None:
     properties = [("flag", "uchar"), *gaussian_properties()]
     rows = [[10, *[0.0] * 17], [13, *[0.0] * 17]]
     for newline in ("\n", "\r\n", "\r"):
@@ -190,7 +190,7 @@ def test_first_value_may_look_like_a_line_end(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("where", ["before", "after"])
-def test_other_elements_are_left_out_by_name(tmp_path: Path, encoding: str, where: str) -> None:
+def test_other_elements_give_a_warning(tmp_path: Path, encoding: str, where: str) -> None:
     properties = gaussian_properties()
     rows = gaussian_rows(properties, 4)
     others = {
@@ -212,7 +212,7 @@ def test_other_elements_are_left_out_by_name(tmp_path: Path, encoding: str, wher
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_a_list_per_vertex_is_left_out(tmp_path: Path, encoding: str) -> None:
+def test_list_properties_are_left_out_with_a_warning(tmp_path: Path, encoding: str) -> None:
     properties = gaussian_properties()
     rows = gaussian_rows(properties, 3)
     listed = [*properties[:4], ("seen_by", "list uchar short"), *properties[4:]]
@@ -258,7 +258,7 @@ def test_both_readers_and_all_encodings_agree(
     assert expected.means.tolist() == [list(p) for p in zip(*map(columns.get, "xyz"), strict=True)]
 
 
-def test_double_values_too_large_for_float32_become_infinite(tmp_path: Path) -> None:
+def test_doubles_too_large_for_float32_become_infinite(tmp_path: Path) -> None:
     properties = [
         (name, "double" if name == "opacity" else kind) for name, kind in gaussian_properties()
     ]
@@ -270,7 +270,7 @@ def test_double_values_too_large_for_float32_become_infinite(tmp_path: Path) -> 
         assert load(path).logit_opacities.item() == float("inf")
 
 
-def test_an_unknown_device_is_one_clear_error(tmp_path: Path) -> None:
+def test_an_unknown_device_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DeviceError, match="device 'tpu9' cannot be used here: "):
         load(tmp_path / "s.ply", device="tpu9")
 
@@ -287,17 +287,17 @@ def test_only_binary_little_endian_files_are_read_in_parts(tmp_path: Path, encod
     )
 
 
-def test_files_that_cannot_be_opened(tmp_path: Path) -> None:
+def test_missing_files_and_directories_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputNotFoundError, match=r"none\.ply: the file to read must exist"):
         open_rows(tmp_path / "none.ply")
     with pytest.raises(InputError, match="must be a regular file, found a directory"):
         open_rows(tmp_path)
 
 
-def test_files_with_other_columns_are_not_joined(tmp_path: Path) -> None:
+def test_files_with_different_columns_are_not_joined(tmp_path: Path) -> None:
     first, second = tmp_path / "first.ply", tmp_path / "second.ply"
     first.write_bytes(ply_bytes(PROPERTIES, ROWS))
     second.write_bytes(ply_bytes([*PROPERTIES, ("q", "float")], [[*row, 1.0] for row in ROWS]))
     with pytest.raises(FileFormatError) as caught:
         join_plys([first, second], io.BytesIO())
-    assert str(caught.value) == f"{second}: must have the columns of {first}."
+    assert str(caught.value) == f"{second}: must have the same columns as {first}."

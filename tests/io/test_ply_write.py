@@ -1,4 +1,4 @@
-"""Writing PLY files: what is in them, and that reading gives the same bits."""
+"""Writing PLY files: their bytes and layouts, and round trips without loss."""
 
 import struct
 import warnings
@@ -50,7 +50,7 @@ def properties_of(path: Path) -> list[tuple[str, str]]:
     return [(line.split()[2], line.split()[1]) for line in lines if line.startswith("property")]
 
 
-def test_the_bytes_of_one_gaussian(tmp_path: Path) -> None:
+def test_the_bytes_of_one_gaussian_are_as_expected(tmp_path: Path) -> None:
     scene = GaussianScene(
         means=torch.tensor([[1.0, 2, 3]]),
         quats=torch.tensor([[13.0, 14, 15, 16]]),
@@ -78,7 +78,7 @@ def test_the_bytes_of_one_gaussian(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("k", [0, 3, 8, 15])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_reading_what_was_written_gives_the_same_bits(
+def test_writing_and_reading_keeps_every_bit(
     tmp_path: Path, k: int, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(write, "CHUNK_BYTES", 1000)
@@ -104,7 +104,7 @@ def test_reading_what_was_written_gives_the_same_bits(
     assert (tmp_path / "s.ply").read_bytes() == (tmp_path / "t.ply").read_bytes()
 
 
-def test_a_file_is_written_back_as_it_came(tmp_path: Path) -> None:
+def test_reading_and_writing_a_file_keeps_its_bytes(tmp_path: Path) -> None:
     properties = [
         ("rot_3", "float"), ("label", "ushort"), ("x", "double"), ("y", "double"),
         ("z", "double"), ("ny", "uchar"), ("opacity", "double"), ("rot_0", "float"),
@@ -163,7 +163,7 @@ def test_layout_follows_the_dtype(tmp_path: Path) -> None:
     assert_same(load(tmp_path / "s.ply"), doubled)
 
 
-def test_an_extra_that_outgrew_its_type_gets_a_wider_one(tmp_path: Path) -> None:
+def test_an_extra_too_large_for_its_type_gets_a_wider_type(tmp_path: Path) -> None:
     scene = loaded(tmp_path, [*gaussian_properties(), ("label", "ushort")])
     label = torch.tensor([0, -1, 70000], dtype=torch.int32)
     changed = replace(scene, extras={"label": label})
@@ -182,13 +182,13 @@ def test_an_extra_that_outgrew_its_type_gets_a_wider_one(tmp_path: Path) -> None
         (torch.tensor([-1, 2**31 - 1]), "int"),
     ],
 )
-def test_types_of_extras_made_in_memory(tmp_path: Path, column: Tensor, kind: str) -> None:
+def test_extras_are_written_with_fitting_types(tmp_path: Path, column: Tensor, kind: str) -> None:
     save(make_scene(2, extras={"q": column}), tmp_path / "s.ply")
     assert properties_of(tmp_path / "s.ply")[-1] == ("q", kind)
     assert load(tmp_path / "s.ply").extras["q"].tolist() == column.tolist()
 
 
-def test_flat_scenes_stay_flat(tmp_path: Path) -> None:
+def test_scenes_of_2dgs_are_written_without_a_third_scale(tmp_path: Path) -> None:
     properties = [p for p in gaussian_properties() if p[0] != "scale_2"]
     scene = loaded(tmp_path, properties)
     with warnings.catch_warnings():
@@ -206,7 +206,7 @@ def test_flat_scenes_stay_flat(tmp_path: Path) -> None:
     assert caught[0].filename == __file__
 
 
-def test_parameters_of_an_optimiser_can_be_saved(tmp_path: Path) -> None:
+def test_parameters_with_gradients_can_be_saved(tmp_path: Path) -> None:
     scene = make_scene()
     trained = replace(scene, means=torch.nn.Parameter(scene.means))
     save(trained, tmp_path / "s.ply")
@@ -249,7 +249,7 @@ def test_parameters_of_an_optimiser_can_be_saved(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_has_no_place_in_a_ply(tmp_path: Path, changes: dict[str, Any], text: str) -> None:
+def test_unwritable_data_is_refused(tmp_path: Path, changes: dict[str, Any], text: str) -> None:
     with pytest.raises(InvalidSceneError) as caught:
         save(make_scene(2, **changes), tmp_path / "s.ply")
     assert str(caught.value) == text
@@ -262,7 +262,7 @@ def test_an_empty_scene_is_not_written(tmp_path: Path) -> None:
     assert str(caught.value) == ("a scene must hold at least one Gaussian to be written, found 0.")
 
 
-def test_unknown_suffix(tmp_path: Path) -> None:
+def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError) as caught:
         save(make_scene(), tmp_path / "s.ckpt")
     assert str(caught.value) == (

@@ -1,4 +1,4 @@
-"""SOG: bundled and not, version 1 and 2."""
+"""SOG files: bundled and unbundled, version 1 and 2."""
 
 import io
 import json
@@ -33,7 +33,7 @@ THEIRS = DATA / "splat-transform.sog"
 
 
 def unpacked(folder: Path, source: Path = THEIRS) -> Path:
-    """Unpack a bundle; give its meta.json."""
+    """Unpack a bundle; return its meta.json."""
     with zipfile.ZipFile(source) as archive:
         archive.extractall(folder)
     return folder / "meta.json"
@@ -48,7 +48,7 @@ def changed(folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     return path
 
 
-def test_file_of_splat_transform() -> None:
+def test_a_file_of_splat_transform_is_read() -> None:
     scene, source = load(THEIRS), load(DATA / "source.ply")
     assert_as_oracle(scene, read_sog(THEIRS))
     assert scene.comments == ("SplatRenderMode: mip",)
@@ -57,7 +57,7 @@ def test_file_of_splat_transform() -> None:
     assert_within(source, nearest_rows(source, scene), bounds)
 
 
-def test_unbundled_by_file_and_by_folder(tmp_path: Path) -> None:
+def test_an_unbundled_sog_is_read_by_file_and_by_folder(tmp_path: Path) -> None:
     path, scene = unpacked(tmp_path), load(THEIRS)
     for source in (path, tmp_path):
         for name, tensor in load(source).tensors().items():
@@ -68,8 +68,8 @@ def image(rows: list[list[int]]) -> bytes:
     return encode_webp(np.array(rows, np.uint8).reshape(1, -1, 4))
 
 
-def test_version_1_by_hand(tmp_path: Path) -> None:
-    """Two Gaussians; numbers lie in equal steps between a least and a largest."""
+def test_a_file_of_version_1_made_by_hand_is_read(tmp_path: Path) -> None:
+    """Two Gaussians; values are in equal steps between a minimum and a maximum."""
     meta = {
         "means": {
             "shape": [2, 3], "mins": [0, 0, -math.log(3)], "maxs": [math.log(2), 1, 0],
@@ -133,7 +133,7 @@ def test_the_same_scene_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_faint_gaussians_keep_their_colour(tmp_path: Path) -> None:
-    """Pixels of opacity 0 must not be blackened by the encoder."""
+    """The encoder must not make pixels of opacity 0 black."""
     scene = storable_scene(20, degree=0)
     hidden = scene.with_tensors({"logit_opacities": scene.logit_opacities * 0 - 30}, {})
     save(hidden, tmp_path / "a.sog")
@@ -141,7 +141,7 @@ def test_faint_gaussians_keep_their_colour(tmp_path: Path) -> None:
     assert_within(scene, again, {"sh0": 0.03})
 
 
-def test_codebook_against_no_codebook_at_all() -> None:
+def test_the_codebook_is_better_than_uniform_steps() -> None:
     rng = np.random.default_rng(0)
     values = np.append(rng.normal(size=(5000, 3)), [[9.0, -9, 30]], axis=0)
     codes, labels = codebook(values)
@@ -155,12 +155,12 @@ def test_codebook_against_no_codebook_at_all() -> None:
 
 
 @pytest.mark.parametrize("values", [np.zeros((3, 3)), np.array([[1.0, 2.0, 2.0]])])
-def test_few_values_are_kept(values: np.ndarray) -> None:
+def test_the_codebook_keeps_few_values_exactly(values: np.ndarray) -> None:
     codes, labels = codebook(values)
     assert np.array_equal(codes[labels], values)
 
 
-def test_palette_of_many_rows() -> None:
+def test_the_palette_represents_many_rows() -> None:
     rng = np.random.default_rng(0)
     centres = rng.normal(size=(16, 9))
     rows = centres[rng.integers(0, 16, 4000)] + 1e-3 * rng.normal(size=(4000, 9))
@@ -175,12 +175,12 @@ def test_palette_of_many_rows() -> None:
     ("count", "size"),
     [(1, 1024), (1024, 1024), (2047, 1024), (15_000, 8192), (65_536, 65_536), (1 << 24, 65_536)],
 )
-def test_sizes_of_palettes(count: int, size: int) -> None:
+def test_the_palette_size_follows_the_row_count(count: int, size: int) -> None:
     assert palette_size(count) == size
 
 
-def test_a_palette_is_used_whole_and_where_rows_differ_most() -> None:
-    """A wide cloud gets nearly all entries, a tight one hardly any."""
+def test_palette_entries_are_spent_where_rows_differ_most() -> None:
+    """All entries are used: nearly all for a wide cloud, hardly any for a tight one."""
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(3000, 9)).astype(np.float32)
     rows[:1500] *= 1e-3
@@ -191,7 +191,7 @@ def test_a_palette_is_used_whole_and_where_rows_differ_most() -> None:
     assert float(np.median(wide)) == 0.0
 
 
-def test_a_small_scene_takes_no_more_bytes_for_colours_than_needed() -> None:
+def test_the_codebook_of_a_small_scene_is_short() -> None:
     scene = replace(storable_scene(3000), comments=())
     file = io.BytesIO()
     write_sog(scene, file)
@@ -203,7 +203,7 @@ def test_a_small_scene_takes_no_more_bytes_for_colours_than_needed() -> None:
     assert all(float(str(np.float32(code))) == code for code in meta["shN"]["codebook"])
 
 
-def test_equal_rows_need_one_entry() -> None:
+def test_equal_rows_have_one_palette_entry() -> None:
     assert len(palette(np.ones((100, 3)), 16).entries) == 1
 
 
@@ -232,7 +232,7 @@ DAMAGED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "files": (lambda m: m["sh0"].update(files=[]), "'files' must be 1 file name, found []."),
     "folder": (
         lambda m: m["sh0"].update(files=["../sh0.webp"]),
-        "the files of a SOG must be named without folders, found '../sh0.webp'.",
+        "the files of a SOG must have names without folders, found '../sh0.webp'.",
     ),
     "no image": (
         lambda m: m["sh0"].update(files=["meta.json"]),
@@ -242,7 +242,7 @@ DAMAGED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
 
 
 @pytest.mark.parametrize("name", DAMAGED)
-def test_each_damage_has_its_sentence(tmp_path: Path, name: str) -> None:
+def test_each_damage_has_its_own_message(tmp_path: Path, name: str) -> None:
     change, text = DAMAGED[name]
     path = changed(tmp_path, change)
     with pytest.raises(FileFormatError) as caught:
@@ -251,7 +251,7 @@ def test_each_damage_has_its_sentence(tmp_path: Path, name: str) -> None:
     assert text in str(caught.value)
 
 
-def test_missing_images(tmp_path: Path) -> None:
+def test_missing_images_are_refused(tmp_path: Path) -> None:
     path = unpacked(tmp_path)
     (tmp_path / "quats.webp").unlink()
     with pytest.raises(InputNotFoundError, match=r"quats\.webp: the file to read must exist"):
@@ -263,27 +263,27 @@ def test_missing_images(tmp_path: Path) -> None:
     assert str(caught.value) == f"{tmp_path}/a.sog: must contain means_l.webp, found none."
 
 
-def test_images_that_are_cut_short(tmp_path: Path) -> None:
+def test_images_that_are_cut_short_are_refused(tmp_path: Path) -> None:
     path = unpacked(tmp_path)
     image = tmp_path / "quats.webp"
     image.write_bytes(image.read_bytes()[:-40])
-    with pytest.raises(FileFormatError, match=r"quats\.webp must be a whole image, found: "):
+    with pytest.raises(FileFormatError, match=r"quats\.webp must be an intact image, found: "):
         load(path)
 
 
-def test_no_zip(tmp_path: Path) -> None:
+def test_a_file_that_is_no_zip_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.sog"
     path.write_bytes(b"ply\n")
     with pytest.raises(FileFormatError) as caught:
         load(path)
     assert str(caught.value) == (
-        f"{path}: a .sog file must be a zip of meta.json and images, found none: file is not a "
+        f"{path}: a .sog file must be a zip of meta.json and images, found no zip: file is not a "
         f"zip file."
     )
 
 
-def test_bombs_are_not_unpacked(tmp_path: Path) -> None:
-    """A meta.json of a gigabyte, and an image of 16 million pixels for 40 Gaussians."""
+def test_oversized_files_and_images_are_not_unpacked(tmp_path: Path) -> None:
+    """A meta.json of 32 MiB, an image file of 1 TiB, and 16 million pixels for 40 Gaussians."""
     path = tmp_path / "a.sog"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("meta.json", bytes(1 << 25))
@@ -293,7 +293,7 @@ def test_bombs_are_not_unpacked(tmp_path: Path) -> None:
     meta = unpacked(folder)
     image = (folder / "scales.webp").read_bytes()
     with (folder / "scales.webp").open("wb") as file:
-        file.truncate(1 << 40)  # takes no room on the disk
+        file.truncate(1 << 40)  # sparse: uses no disk space
     with pytest.raises(FileFormatError, match=r"scales\.webp must have at most 394,016 bytes"):
         load(meta)
     (folder / "scales.webp").write_bytes(image)
@@ -304,7 +304,7 @@ def test_bombs_are_not_unpacked(tmp_path: Path) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
-def test_any_damage_is_an_error_of_ours(
+def test_random_damage_is_a_scene_or_a_cvtgs_error(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     content = bytearray(THEIRS.read_bytes())
@@ -319,10 +319,10 @@ def test_any_damage_is_an_error_of_ours(
 @pytest.mark.parametrize(
     "name", ["", "..", "a\x00b", "\ud800", "a\x1b[2J", "c:x", "a" * 5000 + "/b"]
 )
-def test_odd_names_are_refused(tmp_path: Path, name: str) -> None:
+def test_file_names_with_odd_characters_or_folders_are_refused(tmp_path: Path, name: str) -> None:
     path = changed(tmp_path, lambda meta: meta["quats"].update(files=[name]))
     text = refusal(path)
-    assert "the files of a SOG must be named without folders, found" in text
+    assert "the files of a SOG must have names without folders, found" in text
     assert text.isprintable()
     assert len(text) < 200 + len(str(path))
 
@@ -345,13 +345,13 @@ def other_name_before_the_file(data: bytearray) -> None:
 
 
 @pytest.mark.parametrize("damage", [zip_version_99, undecodable_name, other_name_before_the_file])
-def test_damage_of_the_zip(tmp_path: Path, damage: Callable[[bytearray], None]) -> None:
+def test_damage_of_the_zip_is_refused(tmp_path: Path, damage: Callable[[bytearray], None]) -> None:
     data, path = bytearray(THEIRS.read_bytes()), tmp_path / "a.sog"
     damage(data)
     path.write_bytes(data)
     assert "found" in refusal(path)
 
 
-def test_numbers_beyond_float32_give_no_warning(tmp_path: Path) -> None:
+def test_ranges_beyond_float32_give_no_warning(tmp_path: Path) -> None:
     path = changed(tmp_path, lambda meta: meta["means"].update(maxs=[1e308, 1e308, 1e308]))
     assert not load(path).means.isfinite().all()

@@ -23,8 +23,8 @@ BOUNDS = {
 }
 
 
-def test_a_row_by_hand(tmp_path: Path) -> None:
-    """One Gaussian: at (1, 2, 3), scales 1, 2, e, red, opacity 51 / 255, a half turn about x."""
+def test_a_row_made_by_hand_is_read(tmp_path: Path) -> None:
+    """At (1, 2, 3), with scales 1, 2, e, red, opacity 51 / 255, a half turn about x."""
     path = tmp_path / "a.splat"
     path.write_bytes(struct.pack("<6f8B", 1, 2, 3, 1, 2, math.e, 255, 0, 0, 51, 128, 255, 128, 128))
     scene = load(path)
@@ -38,7 +38,7 @@ def test_a_row_by_hand(tmp_path: Path) -> None:
     assert scene.comments == ()
 
 
-def test_written_bytes_by_hand(tmp_path: Path) -> None:
+def test_the_written_bytes_are_as_computed_by_hand(tmp_path: Path) -> None:
     scene = GaussianScene(
         means=torch.tensor([[1.0, 2.0, 3.0]]),
         quats=torch.tensor([[0.0, 5.0, 0.0, 0.0]]),
@@ -53,11 +53,11 @@ def test_written_bytes_by_hand(tmp_path: Path) -> None:
     )
 
 
-def test_file_of_the_first_viewer() -> None:
+def test_a_file_of_the_antimatter15_viewer_is_read() -> None:
     path = DATA / "antimatter15.splat"
     scene = load(path)
     assert_as_oracle(scene, read_splat(path.read_bytes()))
-    # It cuts off instead of rounding, and so is a step away at most.
+    # Its writer truncates instead of rounding, so errors are up to a whole step.
     bounds = {name: 2 * bound for name, bound in BOUNDS.items() if name != "means"}
     source = load(DATA / "source.ply")
     assert_within(source, nearest_rows(source, scene), bounds)
@@ -76,7 +76,7 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, count: int, seed: 
     assert path.stat().st_size == 32 * count
 
 
-def test_what_has_no_place_is_said_before_anything_is_written(tmp_path: Path) -> None:
+def test_dropped_data_is_warned_about_in_full(tmp_path: Path) -> None:
     scene = storable_scene(4, degree=2)
     scene = scene.with_tensors({"sh0": 9 * scene.sh0.sign()}, {"label": torch.arange(4)})
     scene = scene.with_tensors(
@@ -105,17 +105,18 @@ def test_a_warning_that_is_an_error_leaves_no_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 31, 33])
-def test_half_a_gaussian(tmp_path: Path, size: int) -> None:
+def test_a_file_with_a_partial_gaussian_is_refused(tmp_path: Path, size: int) -> None:
     path = tmp_path / "a.splat"
     path.write_bytes(bytes(size))
     with pytest.raises(FileFormatError) as caught:
         load(path)
     assert str(caught.value) == (
-        f"{path}: a .splat file must be one or more Gaussians of 32 bytes, found {size} bytes."
+        f"{path}: a .splat file must hold one or more Gaussians of 32 bytes each, "
+        f"found {size} bytes."
     )
 
 
-def test_zeros_are_read_as_small_faint_gaussians(tmp_path: Path) -> None:
+def test_rows_of_zeros_are_read_as_small_faint_gaussians(tmp_path: Path) -> None:
     path = tmp_path / "a.splat"
     path.write_bytes(bytes(32))
     scene = load(path)
@@ -124,13 +125,13 @@ def test_zeros_are_read_as_small_faint_gaussians(tmp_path: Path) -> None:
     assert float(scene.opacities) < 2e-6
 
 
-def test_a_scene_of_nothing_is_not_written(tmp_path: Path) -> None:
+def test_a_scene_without_finite_gaussians_is_not_written(tmp_path: Path) -> None:
     scene = storable_scene(2, degree=0)
     scene = scene.with_tensors({"means": scene.means * float("nan")}, {})
     with pytest.warns(DroppedDataWarning), pytest.raises(InvalidSceneError) as caught:
         save(scene, tmp_path / "a.splat")
     assert str(caught.value) == (
-        "a scene must hold at least one Gaussian of finite numbers to be written, found 2 "
-        "Gaussians and none that is."
+        "a scene must hold at least one Gaussian with finite values to be written, found none "
+        "among 2 Gaussians."
     )
     assert list(tmp_path.iterdir()) == []

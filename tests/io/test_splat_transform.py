@@ -72,7 +72,7 @@ def ellipsoids(scene: GaussianScene) -> torch.Tensor:
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("suffix", THEY_READ)
-def test_they_read_what_is_in_our_files(suffix: str, degree: int, tmp_path: Path) -> None:
+def test_splat_transform_reads_our_files(suffix: str, degree: int, tmp_path: Path) -> None:
     scene = storable_scene(300, degree=degree)
     if suffix == ".splat":
         scene = replace(scene.with_sh_degree(0), comments=())
@@ -86,7 +86,9 @@ def test_they_read_what_is_in_our_files(suffix: str, degree: int, tmp_path: Path
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("suffix", THEY_WRITE)
-def test_we_read_what_is_in_their_files(suffix: str, degree: int, tmp_path: Path) -> None:
+def test_our_readers_read_files_of_splat_transform(
+    suffix: str, degree: int, tmp_path: Path
+) -> None:
     scene = storable_scene(300, degree=degree)
     save(scene, tmp_path / "a.ply")
     path = convert(tmp_path / "a.ply", tmp_path / f"b{suffix}")
@@ -99,7 +101,7 @@ def test_we_read_what_is_in_their_files(suffix: str, degree: int, tmp_path: Path
         assert max(worst.values()) < 2e-5
 
 
-def test_they_read_the_finest_level_of_our_streams(tmp_path: Path) -> None:
+def test_splat_transform_reads_the_finest_level_of_our_streams(tmp_path: Path) -> None:
     levels = Simplifier(preset="draft", device="cpu").levels(
         storable_scene(600, degree=1), [1.0, 0.25, 0.05]
     )

@@ -1,4 +1,4 @@
-"""``.spz`` files that are fine."""
+"""Valid ``.spz`` files."""
 
 import gzip
 import math
@@ -54,8 +54,8 @@ def one_gaussian(version: int, quat: bytes, *, bits: int = 12, flags: int = 0) -
         (3, struct.pack("<I", 0)),  # the largest is x, the others are 0
     ],
 )
-def test_a_file_by_hand(tmp_path: Path, version: int, quat: bytes) -> None:
-    """In the axes of PLY files, as most tools write them, unless the axes are given."""
+def test_a_file_made_by_hand_is_read(tmp_path: Path, version: int, quat: bytes) -> None:
+    """Files are in the axes of PLY files, as most tools write them, unless axes are given."""
     path = tmp_path / "a.spz"
     path.write_bytes(one_gaussian(version, quat, flags=1))
     scene = load(path)
@@ -74,7 +74,7 @@ def test_a_file_by_hand(tmp_path: Path, version: int, quat: bytes) -> None:
     assert turned.shN.tolist() == [[[-8 / 128, 0, 0], [8 / 128, 0, 0], [0, 16 / 128, 0]]]
 
 
-def test_half_precision_of_version_1(tmp_path: Path) -> None:
+def test_half_precision_positions_of_version_1_are_read(tmp_path: Path) -> None:
     body = struct.pack("<3e", 1, 2, -3) + bytes([51, 255, 0, 0, 160, 176, 192, 128, 128, 128])
     path = tmp_path / "a.spz"
     path.write_bytes(gzip.compress(HEADER.pack(b"NGSP", 1, 1, 0, 12, 0, 0) + body))
@@ -82,7 +82,7 @@ def test_half_precision_of_version_1(tmp_path: Path) -> None:
     assert_as_oracle(load(path), read_spz(path.read_bytes()))
 
 
-def test_fractional_bits_are_those_of_the_header(tmp_path: Path) -> None:
+def test_the_fractional_bits_of_the_header_are_used(tmp_path: Path) -> None:
     path = tmp_path / "a.spz"
     for bits in (0, 7, 20):
         path.write_bytes(one_gaussian(3, bytes(4), bits=bits))
@@ -90,8 +90,8 @@ def test_fractional_bits_are_those_of_the_header(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
-def test_files_of_niantics_library(version: int) -> None:
-    """They were written as Niantic's apps do, by a caller that stated the axes of the PLY."""
+def test_files_of_the_niantic_library_are_read(version: int) -> None:
+    """They were written as by the apps of Niantic, with the axes of the PLY stated."""
     path, source = DATA / f"niantic-v{version}.spz", load(DATA / "source.ply")
     scene = load(path, axes="rub")
     bounds = BOUNDS | ({"angle": 0.2} if version == 2 else {})  # w is derived, badly if small
@@ -101,8 +101,8 @@ def test_files_of_niantics_library(version: int) -> None:
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
-def test_our_files_are_niantics_files(tmp_path: Path, version: Version) -> None:
-    """Byte for byte when decompressed, but for halves, which may be rounded the other way."""
+def test_written_files_match_those_of_the_niantic_library(tmp_path: Path, version: Version) -> None:
+    """Decompressed bytes are equal, except one that may be rounded differently (a tie)."""
     path = tmp_path / "a.spz"
     source = change_axes(load(DATA / "source.ply"), "rdf", "rub")
     with atomic_output(path) as file:
@@ -111,7 +111,7 @@ def test_our_files_are_niantics_files(tmp_path: Path, version: Version) -> None:
         unpacked_spz(one.read_bytes()) for one in (path, DATA / f"niantic-v{version}.spz")
     )
     assert len(ours) == len(theirs)
-    stated = 2 if version == 4 else 0  # that there are extensions
+    stated = 2 if version == 4 else 0  # the flag for extensions
     assert ours[:16] == theirs[:14] + bytes([theirs[14] | stated]) + theirs[15:16]
     assert sum(a != b for a, b in zip(ours[16:], theirs[16:], strict=True)) <= 1
     splats = read_spz((DATA / f"niantic-v{version}.spz").read_bytes())
@@ -124,20 +124,20 @@ def test_files_of_splat_transform_have_the_axes_of_the_ply(version: int) -> None
     assert_within(source, load(DATA / f"splat-transform-v{version}.spz"), BOUNDS)
 
 
-def test_files_stand_as_their_ply_unless_axes_are_given(tmp_path: Path) -> None:
-    """Against rotated spherical harmonics of an oracle."""
+def test_files_are_in_the_axes_of_a_ply_unless_axes_are_given(tmp_path: Path) -> None:
+    """Compared with spherical harmonics that an oracle rotates."""
     path, scene = tmp_path / "a.spz", storable_scene(30)
     save(scene, path)
     assert_within(scene, load(path), BOUNDS)
     save(scene, path, axes="rub", overwrite=True)
-    assert_within(scene, load(path), BOUNDS)  # the file says so
+    assert_within(scene, load(path), BOUNDS)  # the file states its axes
     assert_within(half_turn(scene), load(path, axes="rdf"), BOUNDS)
     save(scene, path, axes="rub", overwrite=True, spz_version=3)
     assert_within(half_turn(scene), load(path), BOUNDS)
     assert_within(scene, load(path, axes="RUB"), BOUNDS)
 
 
-def test_a_fourth_version_by_hand(tmp_path: Path) -> None:
+def test_the_bytes_of_version_4_are_as_expected(tmp_path: Path) -> None:
     """The bytes of version 3 in six blocks behind a header that states the axes."""
     scene = storable_scene(3, degree=1)
     for version in (3, 4):
@@ -154,7 +154,7 @@ def test_a_fourth_version_by_hand(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", [1, 5, "4"])
-def test_versions_that_are_not_written(tmp_path: Path, version: Version) -> None:
+def test_unknown_versions_are_not_written(tmp_path: Path, version: Version) -> None:
     with pytest.raises(InvalidArgumentError, match="must be 2, 3 or 4, found"):
         save(storable_scene(3), tmp_path / "a.spz", spz_version=version)
     assert list(tmp_path.iterdir()) == []
@@ -163,8 +163,8 @@ def test_versions_that_are_not_written(tmp_path: Path, version: Version) -> None
 @pytest.mark.parametrize(
     ("number", "axes"), [(0, "rub"), (1, "ldb"), (4, "rub"), (6, "rdf"), (16, "rfu")]
 )
-def test_axes_that_a_file_states_are_followed(tmp_path: Path, number: int, axes: str) -> None:
-    """Adobe's extension, behind one of an unknown vendor; given axes count more."""
+def test_the_axes_that_a_file_states_are_used(tmp_path: Path, number: int, axes: str) -> None:
+    """The extension of Adobe follows an unknown one; the argument takes precedence."""
     path, fourth = tmp_path / "a.spz", (DATA / "splat-transform-v4.spz").read_bytes()
     other = with_extension(fourth, 0x12340001, b"unknown")
     path.write_bytes(with_extension(other, 0xADBE0003, number.to_bytes(4, "little")))
@@ -175,7 +175,7 @@ def test_axes_that_a_file_states_are_followed(tmp_path: Path, number: int, axes:
 
 @settings(max_examples=20, deadline=None)
 @given(count=st.integers(1, 40), seed=st.integers(0, 1000), degree=st.integers(0, 3))
-@example(count=14, seed=347, degree=0)  # two largest components alike: the other one is left out
+@example(count=14, seed=347, degree=0)  # its two largest components are equal
 def test_round_trip(
     tmp_path_factory: pytest.TempPathFactory, count: int, seed: int, degree: int
 ) -> None:
@@ -190,7 +190,7 @@ def test_round_trip(
     save(again, path, overwrite=True)
     for name, tensor in load(path).tensors().items():
         wanted, bound = again.tensors()[name], 1e-5
-        if name == "quats":  # q and -q are one rotation
+        if name == "quats":  # q and -q are the same rotation
             wanted = wanted * (tensor * wanted).sum(dim=1, keepdim=True).sign()
             bound = 2e-3
         torch.testing.assert_close(tensor, wanted, rtol=0, atol=bound)
@@ -199,7 +199,7 @@ def test_round_trip(
 @pytest.mark.parametrize(
     ("spread", "bits"), [(1e-3, 22), (0.05, 17), (1.0, 13), (100.0, 12), (1500.0, 10), (1e6, 1)]
 )
-def test_bits_follow_the_size_of_the_scene(tmp_path: Path, spread: float, bits: int) -> None:
+def test_fractional_bits_depend_on_the_scene_size(tmp_path: Path, spread: float, bits: int) -> None:
     scene = storable_scene(2000, degree=0)
     path = tmp_path / "a.spz"
     unit = scene.means / scene.means.abs().max() * 3.9 * spread
@@ -208,7 +208,7 @@ def test_bits_follow_the_size_of_the_scene(tmp_path: Path, spread: float, bits: 
     assert float((load(path).means - unit).abs().max()) <= 0.5 / 2**bits * 1.01
 
 
-def test_flyaways_do_not_cost_precision(tmp_path: Path) -> None:
+def test_flyaways_do_not_reduce_the_precision_of_others(tmp_path: Path) -> None:
     scene, path = storable_scene(2000, degree=0), tmp_path / "a.spz"
     means = scene.means.clone()
     means[7] = torch.tensor([1e7, 0.0, -1e7])
@@ -222,7 +222,7 @@ def test_flyaways_do_not_cost_precision(tmp_path: Path) -> None:
     assert float((again - means)[others].abs().max()) <= 0.5 / 4096
 
 
-def test_extremes_are_cut_off_and_said(tmp_path: Path) -> None:
+def test_clamped_values_are_warned_about(tmp_path: Path) -> None:
     scene = GaussianScene(
         means=torch.zeros(3, 3),
         quats=torch.tensor([[1.0, 1, 1, 1], [-1, 0, 0, 0], [0, 0, 1e-20, 0]]),

@@ -1,4 +1,4 @@
-"""``.spz`` files that are not fine: one sentence each, and never much memory."""
+"""Damaged ``.spz`` files: one sentence each, and little memory."""
 
 import gzip
 import struct
@@ -27,10 +27,10 @@ def header(*, magic=b"NGSP", version=3, count=40, degree=3, bits=12, flags=0, la
 WANTED = "must hold 2,600 bytes for the 40 Gaussians of SH degree 3 that the header promises"
 
 DAMAGED = {
-    "empty": (b"", "an .spz file must start with gzip's or its own magic number, found b''."),
+    "empty": (b"", "an .spz file must start with the magic number of gzip or SPZ, found b''."),
     "other": (
         b"ply\n",
-        "an .spz file must start with gzip's or its own magic number, found b'ply\\n'.",
+        "an .spz file must start with the magic number of gzip or SPZ, found b'ply\\n'.",
     ),
     "short": (
         gzip.compress(GOOD[:10]),
@@ -72,19 +72,19 @@ DAMAGED = {
     "cut off": (gzip.compress(GOOD)[:-30], f"{WANTED}, found "),
     "without checksum": (
         gzip.compress(GOOD)[:-4],
-        "must be whole gzip, found it cut short.",
+        "must be intact gzip data, found it cut short.",
     ),
     "wrong checksum": (
         gzip.compress(GOOD)[:-8] + bytes(8),
-        "must be whole gzip, found damage: Error -3 while decompressing data: incorrect data "
+        "must be intact gzip data, found damage: Error -3 while decompressing data: incorrect data "
         "check.",
     ),
-    "not gzip": (b"\x1f\x8b" + bytes(50), "must be whole gzip, found damage: Error -3 while"),
+    "not gzip": (b"\x1f\x8b" + bytes(50), "must be intact gzip data, found damage: Error -3 while"),
 }
 
 
 @pytest.mark.parametrize("name", DAMAGED)
-def test_each_damage_has_its_sentence(tmp_path: Path, name: str) -> None:
+def test_each_damage_has_its_own_message(tmp_path: Path, name: str) -> None:
     content, text = DAMAGED[name]
     path = tmp_path / "a.spz"
     path.write_bytes(content)
@@ -93,14 +93,14 @@ def test_each_damage_has_its_sentence(tmp_path: Path, name: str) -> None:
     assert str(caught.value).startswith(f"{path}: {text}")
 
 
-def test_the_undamaged_file_is_fine(tmp_path: Path) -> None:
+def test_the_undamaged_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a.spz"
     path.write_bytes(gzip.compress(GOOD))
     assert len(load(path)) == len(read_spz(path.read_bytes())) == 40
 
 
 @pytest.mark.parametrize("count", [2**20, 2**32 - 1])
-def test_a_lying_count_takes_no_memory(tmp_path: Path, count: int) -> None:
+def test_a_false_count_takes_no_memory(tmp_path: Path, count: int) -> None:
     path = tmp_path / "a.spz"
     path.write_bytes(gzip.compress(header(count=count) + GOOD[16:]))
     tracemalloc.start()
@@ -111,8 +111,8 @@ def test_a_lying_count_takes_no_memory(tmp_path: Path, count: int) -> None:
     assert peak < 4 << 20
 
 
-def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
-    """A gigabyte of zeros behind 40 Gaussians, in a megabyte."""
+def test_surplus_data_is_not_unpacked(tmp_path: Path) -> None:
+    """The file holds 256 MiB of zeros after 40 Gaussians."""
     squeeze = zlib.compressobj(9, wbits=31)
     content = squeeze.compress(GOOD)
     content += b"".join(squeeze.compress(bytes(1 << 24)) for _ in range(16)) + squeeze.flush()
@@ -125,7 +125,7 @@ def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
     tracemalloc.stop()
     assert peak < 8 << 20
     assert str(caught[0].message) == (
-        f"{path}: left out what stands behind the 40 Gaussians that the header promises."
+        f"{path}: left out the bytes after the 40 Gaussians that the header promises."
     )
     assert caught[0].filename == __file__
 
@@ -172,18 +172,21 @@ FOURTH_DAMAGED = {
     "cut short": (FOURTH[:-1], "block 'sh' must have 1,800 bytes for 40 Gaussians, found 1,800 in"),
     "axes": (
         with_extension(FOURTH, 0xADBE0003, struct.pack("<I", 17)),
-        "the extension for the axes must hold a number of 4 bytes from 0 to 16, found 17 in 4",
+        "the extension for the axes must hold a 4-byte number from 0 to 16, found 17 in 4",
     ),
     "size of axes": (
         with_extension(FOURTH, 0xADBE0003, b"\x04"),
-        "the extension for the axes must hold a number of 4 bytes from 0 to 16, found 4 in 1",
+        "the extension for the axes must hold a 4-byte number from 0 to 16, found 4 in 1",
     ),
-    "no zstd": (FOURTH[:128] + bytes(len(FOURTH) - 128), "block 'means' must be whole zstd, found"),
+    "no zstd": (
+        FOURTH[:128] + bytes(len(FOURTH) - 128),
+        "block 'means' must be intact zstd data, found",
+    ),
 }
 
 
 @pytest.mark.parametrize("name", FOURTH_DAMAGED)
-def test_each_damage_of_version_4_has_its_sentence(tmp_path: Path, name: str) -> None:
+def test_each_damage_of_version_4_has_its_own_message(tmp_path: Path, name: str) -> None:
     content, text = FOURTH_DAMAGED[name]
     path = tmp_path / "a.spz"
     path.write_bytes(content)
@@ -193,7 +196,7 @@ def test_each_damage_of_version_4_has_its_sentence(tmp_path: Path, name: str) ->
 
 
 @pytest.mark.parametrize(("size", "found"), [(359, "359"), (400, "more"), (1 << 28, "more")])
-def test_blocks_of_another_size_than_the_table_says(tmp_path: Path, size: int, found: str) -> None:
+def test_blocks_of_a_wrong_size_are_refused(tmp_path: Path, size: int, found: str) -> None:
     block = zstandard.ZstdCompressor().compress(bytes(size))
     table = struct.pack("<QQ", len(block), 360)
     path = tmp_path / "a.spz"
@@ -210,7 +213,7 @@ def test_blocks_of_another_size_than_the_table_says(tmp_path: Path, size: int, f
 @settings(max_examples=60, deadline=None)
 @given(data=st.data(), which=st.sampled_from(["niantic-v2.spz", "niantic-v4.spz"]))
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
-def test_any_damage_is_an_error_of_ours(
+def test_random_damage_is_a_scene_or_a_cvtgs_error(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, which: str
 ) -> None:
     content = bytearray((DATA / which).read_bytes())

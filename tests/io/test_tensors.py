@@ -25,7 +25,7 @@ def content_of(tensors: dict[str, torch.Tensor]) -> dict[str, tuple]:
     }
 
 
-def test_known_bytes():
+def test_the_bytes_of_a_file_are_as_expected():
     """Eight bytes of length, the header padded to eight, then the numbers."""
     content = pack_tensors({"x": torch.tensor([1, 2], dtype=torch.uint8)}, {"k": "v"})
     length = int.from_bytes(content[:8], "little")
@@ -48,7 +48,7 @@ def test_round_trip_through_bytes_and_files(tmp_path, tensors, metadata):
     assert path.read_bytes() == pack_tensors(tensors, metadata)
 
 
-def test_the_order_of_texts_and_names_does_not_matter():
+def test_the_order_of_tensors_and_metadata_does_not_matter():
     first = pack_tensors(TENSORS, METADATA)
     turned = dict(reversed(list(TENSORS.items()))), dict(reversed(list(METADATA.items())))
     assert all(pack_tensors(*turned) == first for _ in range(5))
@@ -62,7 +62,7 @@ def test_views_of_tensors_and_tensors_with_gradients_are_stored_by_value():
     assert not found["t"].requires_grad
 
 
-def test_a_file_is_replaced(tmp_path):
+def test_an_existing_file_is_replaced(tmp_path):
     path = tmp_path / "some.safetensors"
     for number in (1.0, 2.0):
         save_tensors(path, {"x": torch.tensor([number])}, {})
@@ -70,7 +70,7 @@ def test_a_file_is_replaced(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
-def test_what_was_mapped_outlives_its_file(tmp_path):
+def test_mapped_tensors_outlive_their_file(tmp_path):
     path = tmp_path / "some.safetensors"
     save_tensors(path, {"x": torch.arange(1000)}, {})
     mapped, _ = map_tensors(path)
@@ -92,24 +92,26 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
-def test_damaged_bytes_are_one_clear_error(tmp_path, damage):
+def test_damaged_bytes_are_refused(tmp_path, damage):
     content = damage(pack_tensors(TENSORS, METADATA))
-    with pytest.raises(FileFormatError, match=r"^these are no safetensors, or damaged ones\.$"):
+    with pytest.raises(
+        FileFormatError, match=r"^these bytes are not a safetensors file, or they are damaged\.$"
+    ):
         unpack_tensors(content)
     path = tmp_path / "some.safetensors"
     path.write_bytes(content)
     with pytest.raises(FileFormatError) as caught:
         map_tensors(path)
-    assert str(caught.value) == f"{path}: the file is no safetensors file, or damaged."
+    assert str(caught.value) == f"{path}: the file is not a safetensors file, or it is damaged."
 
 
-def test_a_missing_file_is_an_error(tmp_path):
+def test_a_missing_file_is_refused(tmp_path):
     for path in (tmp_path / "none.safetensors", tmp_path):
         with pytest.raises(InputNotFoundError) as caught:
             map_tensors(path)
         assert str(caught.value) == f"{path}: the file to read must exist, found none."
 
 
-def test_a_file_that_cannot_be_written_is_an_error(tmp_path):
+def test_a_file_that_cannot_be_written_is_an_output_error(tmp_path):
     with pytest.raises(OutputError, match="existing directory"):
         save_tensors(tmp_path / "nowhere" / "some.safetensors", TENSORS, {})

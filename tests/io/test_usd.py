@@ -1,4 +1,4 @@
-"""OpenUSD text: numbers, axes, bounds, and what Pixar's own library reads of it."""
+"""OpenUSD text: numbers, axes, bounds, and reading by the library of Pixar."""
 
 import re
 from dataclasses import replace
@@ -29,8 +29,8 @@ def written(scene: GaussianScene, path: Path) -> str:
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_numbers_are_those_of_the_scene(degree: int, tmp_path: Path) -> None:
-    """Right, up, back: y and z change sign, as they do where the axes of a scene are changed."""
+def test_the_written_numbers_are_those_of_the_scene(degree: int, tmp_path: Path) -> None:
+    """The axes are right, up, back: y and z change sign, as in a change of axes."""
     scene = storable_scene(7, degree=degree)
     text = written(scene, tmp_path / "a.usda")
     turned = change_axes(scene, "rdf", "rub")
@@ -61,7 +61,9 @@ def test_extent_holds_three_sigmas(tmp_path: Path) -> None:
     torch.testing.assert_close(high, (turned.means + 3 * sigmas).amax(dim=0))
 
 
-def test_parts_of_an_array_are_joined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arrays_written_in_parts_are_joined(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = storable_scene(7, degree=1)
     whole = written(scene, tmp_path / "a.usda")
     monkeypatch.setattr("cvtgs.io.usd._CHUNK_ROWS", 3)
@@ -77,7 +79,7 @@ def test_comments_are_quoted(tmp_path: Path) -> None:
     assert f"string[] comments = {quoted}" in text
 
 
-def test_invalid_rows(tmp_path: Path) -> None:
+def test_invalid_rows_are_left_out_with_a_warning(tmp_path: Path) -> None:
     scene = storable_scene(3, degree=0)
     means = scene.means.clone()
     means[1] = torch.nan
@@ -88,24 +90,22 @@ def test_invalid_rows(tmp_path: Path) -> None:
     nothing = scene.with_tensors({"means": torch.full_like(means, torch.nan)}, {})
     with (
         pytest.warns(DroppedDataWarning),
-        pytest.raises(InvalidSceneError, match="at least one Gaussian of finite numbers"),
+        pytest.raises(InvalidSceneError, match="at least one Gaussian with finite values"),
     ):
         save(nothing, tmp_path / "b.usda")
     assert not (tmp_path / "b.usda").exists()
 
 
-def test_levels_are_not_written_where_they_cannot_be_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_levels_are_not_written_to_usd(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save(storable_scene(50, degree=0), tmp_path / "a.ply")
     words = ["levels", str(tmp_path / "a.ply"), "-o", str(tmp_path / "out"), "--suffix", ".usda"]
     assert main(words) == 1
-    assert "levels need a format that can be read again, found '.usda'" in capsys.readouterr().err
+    assert "levels need a format that cvtgs can also read, found '.usda'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_the_library_of_openusd_reads_it(degree: int, tmp_path: Path) -> None:
+def test_the_openusd_library_reads_the_file(degree: int, tmp_path: Path) -> None:
     usd = pytest.importorskip("pxr.Usd", reason="needs the package usd-core")
     scene = replace(storable_scene(20, degree=degree), comments=('a "word"',))
     save(scene, tmp_path / "a.usda")

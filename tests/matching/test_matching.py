@@ -1,4 +1,4 @@
-"""Matching to images without descent: opacities by what cells paint, colours by least squares."""
+"""Matching to images without gradients: opacities by contributions, colours by least squares."""
 
 import pytest
 import torch
@@ -36,9 +36,11 @@ def views(scene):
 @pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_least_squares_recover_known_colours(degree):
-    """Images of a scene say which colours it had, where they show enough of it."""
+    """Images of a scene determine the colours of Gaussians that they show enough of."""
     scene = cvtgs.synthetic.scene("object", 150, sh_degree=degree, seed=2)
-    scene = scene.with_tensors({"sh0": scene.sh0 + 1.0}, {})  # none below 0, which would be cut
+    scene = scene.with_tensors(
+        {"sh0": scene.sh0 + 1.0}, {}
+    )  # no colour is below 0, which would be clamped
     views = observe(scene, random_views(scene, 40, size=64, seed=0))
     shN = 0.5 * scene.shN  # noqa: N806 (the name that scenes give it)
     dull = scene.with_tensors({"sh0": scene.sh0 + 0.3, "shN": shN}, {})
@@ -52,7 +54,7 @@ def test_least_squares_recover_known_colours(degree):
         assert after < 0.5 * before
 
 
-def test_the_ridge_keeps_colours_of_what_no_image_shows(scene, views):
+def test_the_ridge_keeps_colours_of_hidden_gaussians(scene, views):
     hidden = views.contributions == 0.0
     assert bool(hidden.any())
     dull = scene.with_tensors({"sh0": 0.5 * scene.sh0}, {})
@@ -74,8 +76,8 @@ def test_backends_find_the_same_colours(scene, views, backend, monkeypatch):
     assert torch.allclose(found.sh0, wanted.sh0, atol=2e-3)
 
 
-def test_matched_opacities_conserve_what_is_painted(scene, views):
-    """Where opacities were halved, what every Gaussian adds to the images comes back."""
+def test_matched_opacities_restore_contributions(scene, views):
+    """After opacities were lowered, the contributions of all Gaussians are restored."""
     fainter = scene.with_tensors({"logit_opacities": scene.logit_opacities - 1.5}, {})
     wanted = views.contributions
     config = MatchConfig(opacity_rounds=8)
@@ -89,7 +91,7 @@ def test_matched_opacities_conserve_what_is_painted(scene, views):
     assert errors[1] < 0.15 * errors[0]
 
 
-def test_cells_paint_what_their_members_painted(scene, views):
+def test_contributions_of_cells_are_sums_over_their_members(scene, views):
     partition = cvtgs.cells.Partition.from_labels(torch.arange(1500) % 7, 7)
     sums = cell_contributions(views.contributions, partition)
     assert float(sums.sum()) == pytest.approx(float(views.contributions.sum()))
@@ -104,7 +106,7 @@ def test_a_perfect_scene_stays_as_it_is(scene, views):
     assert float((found.scene.sh0 - scene.sh0).abs().amax()) < 1e-3
 
 
-def test_opacities_that_harm_held_out_images_are_not_taken(scene, views):
+def test_opacities_that_harm_held_out_images_are_rejected(scene, views):
     wrong = views.contributions * torch.linspace(0.1, 10, len(scene)).double()
     config = MatchConfig(opacity_rounds=2)
     found = match_views(scene, views, wrong, config=config)
@@ -115,7 +117,7 @@ def test_opacities_that_harm_held_out_images_are_not_taken(scene, views):
 @pytest.mark.slow
 @pytest.mark.parametrize("rho", [0.2, 0.05])
 def test_matching_is_better_than_standard_in_other_views(scene, rho):
-    """The same cells, by weights of which none comes from images."""
+    """The cells are the same: none of their weights come from images."""
     images = {"views": 16, "size": 96, "mass_share": 1.0}
     cameras = automatic_views(scene, 6, width=96, height=96, seed=9)
     truth = render(scene, cameras).rgb
@@ -138,8 +140,8 @@ def test_count_report_and_determinism(scene):
     assert float(small.opacities.amax()) <= 1 - 1e-6
 
 
-def test_steps_learn_from_the_images_that_were_matched_to(scene, monkeypatch):
-    """The full scene is rendered once, however many steps follow; a larger image is another."""
+def test_refinement_reuses_the_images_of_the_matching(scene, monkeypatch):
+    """The full scene is rendered once for all steps; larger images are rendered anew."""
     steps = {"size": 48, "stride": 2, "steps": 18, "steps_per_image": 20, "check_every": 3}
     images = {"views": 32, "size": 48, "stride": 2}
     config = preset(visibility=images, refine=steps)
@@ -185,7 +187,7 @@ def test_without_images_nothing_is_matched(scene):
     assert same_bits(small, Simplifier(device="cpu").simplify(scene, 0.1))
 
 
-def test_bands_that_were_left_out_stay_zero():
+def test_omitted_bands_stay_zero():
     scene = random_scene(300, degree=2)
     plain = scene.with_tensors({"shN": torch.zeros_like(scene.shN)}, {})
     small = Simplifier(config=preset(), device="cpu").simplify(plain, 0.1)

@@ -26,7 +26,7 @@ def test_depth_of_half_opaque_is_log_two():
     assert depth.item() == pytest.approx(math.log(2.0), rel=1e-15)
 
 
-def test_divide_takes_zero_by_zero_as_zero():
+def test_zero_divided_by_zero_is_zero():
     result = parameters.divide(torch.tensor([0.0, 6.0]), torch.tensor([0.0, 4.0]))
     assert result.tolist() == [0.0, 1.5]
 
@@ -87,7 +87,7 @@ def test_logit_of_extreme_depths(dtype):
     )
 
 
-def test_positive_log_of_nothing_is_finite():
+def test_positive_log_of_zero_is_finite():
     for dtype in DTYPES:
         smallest = math.log(torch.finfo(dtype).tiny)
         logs = parameters.positive_log(torch.zeros(1, dtype=dtype))
@@ -117,7 +117,7 @@ def test_integrated_depth_is_the_dilogarithm():
     torch.testing.assert_close(depths.depth_from_integrated(values), centres, rtol=1e-9, atol=1e-9)
 
 
-def test_depth_of_more_than_a_gaussian_can_have():
+def test_integrated_depths_above_the_largest_are_clamped():
     values = torch.tensor([0.0, 1e-300, 1.6449341, 2.0, 1e30, INF], dtype=torch.float64)
     centres = depths.depth_from_integrated(values)
     assert bool((centres >= 0).all())

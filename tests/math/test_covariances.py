@@ -1,4 +1,4 @@
-"""Covariances: built, split again, and their mean shadow."""
+"""Covariances: building, decomposition, and the mean projected area."""
 
 import math
 
@@ -138,7 +138,7 @@ def test_area_of_extreme_scales_in_float32(exponent):
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
 def test_logarithm_of_the_area(dtype, tolerance):
-    """A sphere of radius 2 has a shadow of 4 pi; the rest is as without logarithms."""
+    """A sphere of radius 2 has an area of 4 pi; other shapes agree with the plain area."""
     sphere = torch.full((1, 3), math.log(2.0), dtype=dtype)
     found = parameters.log_mean_projected_area(sphere)
     assert found.dtype == dtype
@@ -160,7 +160,7 @@ def test_logarithm_of_the_area_of_extreme_scales(dtype, exponent):
 
 
 def test_logarithm_of_the_area_of_discs_and_needles_is_finite():
-    """A disc as its area is; a needle is e^-200 thin, and so is its shadow, or nearly nothing."""
+    """The area of the disc is exact; that of the needle, e^-200 thin, is nearly zero."""
     shapes = torch.tensor([[0.0, 0.0, -500.0], [0.0, -200.0, -200.0]], requires_grad=True)
     disc, needle = parameters.log_mean_projected_area(shapes)
     flat = math.log(parameters.mean_projected_area(torch.tensor([[1.0, 1.0, 0.0]])).item())

@@ -78,7 +78,7 @@ def test_contraction_keeps_directions_and_order_and_shrinks():
     torch.testing.assert_close(contracted / lengths[:, None], directions)
 
 
-def test_contraction_by_degrees_shrinks_the_logarithm_of_the_distance():
+def test_partial_contraction_shrinks_the_logarithm_of_the_distance():
     points = torch.tensor([[0.0, 20.0, 0.0], [0.3, 0.1, 0.0]])
     assert UNIT.contract(points, 0.0).equal(points.double())
     whole, half = UNIT.contract(points)[0, 1], UNIT.contract(points, 0.5)[0, 1]

@@ -35,7 +35,7 @@ def test_half_turns_have_their_axis_as_quaternion(axis):
 
 
 def test_products_of_the_units():
-    """``ij = k``, ``jk = i``, ``ki = j``; turned round, the sign changes; ``ii = -1``."""
+    """``ij = k``, ``jk = i``, ``ki = j``; in reverse order, the sign changes; ``ii = -1``."""
     units = torch.eye(4, dtype=torch.float64)
     one, i, j, k = units
     table = [(i, j, k), (j, k, i), (k, i, j), (j, i, -k), (i, i, -one), (one, j, j), (j, one, j)]

@@ -26,7 +26,7 @@ def test_argmin_of_labels_names_the_first_of_equals():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_ascending_rows_as_a_stable_sort_gives_them(dtype):
+def test_ascending_rows_equal_a_stable_sort(dtype):
     inf, nan = float("inf"), float("nan")
     values = torch.tensor([0.5, -0.0, inf, 0.0, -2.0, nan, -inf, 0.5, -1.0, -nan], dtype=dtype)
     assert segments.ascending_rows(values).tolist() == [6, 4, 8, 1, 3, 0, 7, 2, 5, 9]
@@ -64,7 +64,7 @@ def test_shapes(dtype, inner):
         assert result.dtype == dtype
 
 
-def test_nothing_at_all():
+def test_empty_input():
     order, offsets = segments.sort_by_label(torch.zeros(0, dtype=torch.int64), 2)
     assert order.tolist() == []
     assert offsets.tolist() == [0, 0, 0]
@@ -90,7 +90,7 @@ def test_a_segment_of_a_million_keeps_its_digits():
     assert total == pytest.approx(1e5, rel=1e-10)
 
 
-def test_sums_in_the_order_of_rows_whatever_the_segments_beside():
+def test_sums_do_not_depend_on_other_segments():
     """A cell gives the same bits alone and among others."""
     g = torch.Generator().manual_seed(1)
     values = torch.randn(4000, 5, generator=g)
@@ -103,7 +103,7 @@ def test_sums_in_the_order_of_rows_whatever_the_segments_beside():
         assert torch.equal(alone[0], sums[segment])
 
 
-def test_columns_do_not_touch_one_another():
+def test_columns_are_independent():
     """Infinity and NaN stay in their column and segment."""
     values = torch.ones(5, 3)
     values[1, 0], values[3, 2] = torch.inf, torch.nan
@@ -125,7 +125,7 @@ def test_weighted_rows(dtype):
     assert segments.segment_sum(table[rows, 0], offsets, weights).tolist() == [-1.0, 0.0, 0.5]
 
 
-def test_a_table_of_which_no_row_is_named():
+def test_a_table_without_used_rows():
     nothing = torch.zeros(0, dtype=torch.int64)
     offsets = torch.zeros(3, dtype=torch.int64)
     sums = segments.segment_sum_of(torch.ones(4, 2, 3), nothing, offsets, torch.zeros(0))
@@ -133,7 +133,7 @@ def test_a_table_of_which_no_row_is_named():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_how_rows_lie_in_memory_does_not_matter(dtype):
+def test_memory_layout_does_not_matter(dtype):
     values = torch.randn(5, 3, generator=torch.Generator().manual_seed(3), dtype=dtype)
     by_column = values.T.contiguous().T
     wanted = segments.segment_sum(values, OFFSETS)

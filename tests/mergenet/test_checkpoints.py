@@ -1,4 +1,4 @@
-"""Checkpoints: the same bits back, and one clear sentence for every file that is none."""
+"""Checkpoints: exact round trips, and one clear sentence for every invalid file."""
 
 import hashlib
 import json
@@ -36,7 +36,7 @@ def path(tmp_path) -> Path:
 
 
 def content_of(said: CheckpointInfo = INFO, /, **changes: str | None) -> bytes:
-    """A checkpoint with other texts in its header; None leaves one out."""
+    """Return a checkpoint with other texts in its header; None leaves one out."""
     original = save_checkpoint(lively_net(torch.float32, architecture=said.architecture), said)
     length = int.from_bytes(original[:8], "little")
     header = json.loads(original[8 : 8 + length])
@@ -47,7 +47,7 @@ def content_of(said: CheckpointInfo = INFO, /, **changes: str | None) -> bytes:
 
 
 def refusal(path: Path, content: bytes | None = None) -> str:
-    """The one sentence that a file gets, without its name, which it must start with."""
+    """Return the error for a file without the file name, with which it must start."""
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(CheckpointError) as caught:
@@ -60,7 +60,7 @@ def refusal(path: Path, content: bytes | None = None) -> str:
 
 
 @pytest.mark.parametrize("architecture", [SMALL, Architecture()])
-def test_saved_and_loaded_gives_the_same_network(path, architecture):
+def test_saving_and_loading_gives_the_same_network(path, architecture):
     net = lively_net(torch.float32, architecture=architecture)
     info = INFO.model_copy(update={"architecture": architecture})
     path.write_bytes(save_checkpoint(net, info))
@@ -76,7 +76,7 @@ def test_saved_and_loaded_gives_the_same_network(path, architecture):
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
-def test_a_loaded_network_is_for_use_not_for_training(path):
+def test_a_loaded_network_is_ready_for_inference(path):
     path.write_bytes(content_of())
     net = load_checkpoint(str(path)).net
     assert not net.training
@@ -95,7 +95,7 @@ def test_the_same_network_gives_the_same_bytes(path):
     assert save_checkpoint(net.double(), INFO) == path.read_bytes()
 
 
-def test_other_weights_and_other_descriptions_give_other_digests(path):
+def test_other_weights_or_descriptions_give_other_digests(path):
     digests = set()
     for seed, steps in ((0, 12), (1, 12), (0, 13)):
         net = lively_net(torch.float32, seed=seed, architecture=SMALL)
@@ -105,7 +105,7 @@ def test_other_weights_and_other_descriptions_give_other_digests(path):
     assert {len(digest) for digest in digests} == {64}
 
 
-def test_a_digest_is_known_by_hand(path):
+def test_a_digest_by_hand(path):
     path.write_bytes(content_of())
     found = load_checkpoint(path)
     wanted = hashlib.sha256(f"{found.info.model_dump_json()}\n".encode())
@@ -116,14 +116,14 @@ def test_a_digest_is_known_by_hand(path):
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_checkpoints_are_small_and_say_what_they_are(name, path):
+def test_shipped_checkpoints_are_small_and_described(name, path):
     found = load_checkpoint(name)
     folder = Path(load_checkpoint.__code__.co_filename).parent / "data"
     content = (folder / f"{name}.safetensors").read_bytes()
     assert len(content) <= 3 * 2**20
     assert found.name == found.info.preset == name
     assert found.info.training
-    # Files of the first format are written in the present one: with a known range.
+    # Files of the first format are saved in the current one, with a known range.
     path.write_bytes(save_checkpoint(found.net, found.info))
     again = load_checkpoint(path)
     assert again.info == found.info
@@ -132,8 +132,8 @@ def test_shipped_checkpoints_are_small_and_say_what_they_are(name, path):
 
 
 @pytest.mark.long
-def test_every_flipped_bit_is_found(path):
-    """One bit of every byte, which one by chance: in header, texts and weights alike."""
+def test_every_flipped_bit_is_detected(path):
+    """A random bit of every byte is flipped: in header, texts and weights."""
     net, dice = lively_net(torch.float32, architecture=SMALL), random.Random(0)
     content = save_checkpoint(net, INFO)
     for place in range(len(content)):
@@ -142,15 +142,15 @@ def test_every_flipped_bit_is_found(path):
         assert len(refusal(path, bytes(damaged))) < 300
 
 
-def test_every_cut_is_found(path):
+def test_every_truncation_is_detected(path):
     content = content_of()
     for length in {0, 1, 7, 8, 9, 100, *range(0, len(content), 97), len(content) - 1}:
         assert refusal(path, content[:length]) == (
-            "the checkpoint is no safetensors file, or damaged."
+            "the checkpoint is not a safetensors file, or it is damaged."
         )
 
 
-def test_something_appended_is_found(path):
+def test_an_appended_byte_is_detected(path):
     refusal(path, content_of() + b"\0")
 
 
@@ -166,60 +166,64 @@ OTHER = {
 
 
 @pytest.mark.parametrize("content", OTHER.values(), ids=OTHER)
-def test_files_of_another_kind(path, content):
-    assert refusal(path, content) == "the checkpoint is no safetensors file, or damaged."
+def test_files_of_another_kind_are_refused(path, content):
+    assert refusal(path, content) == "the checkpoint is not a safetensors file, or it is damaged."
 
 
 def test_a_file_of_torch_is_not_unpickled(path):
     torch.save({"weights": torch.zeros(2)}, path)
-    assert refusal(path) == "the checkpoint is no safetensors file, or damaged."
+    assert refusal(path) == "the checkpoint is not a safetensors file, or it is damaged."
 
 
 @pytest.mark.parametrize("metadata", [None, {}, {"format": "pt"}])
-def test_safetensors_of_something_else(path, metadata):
+def test_safetensors_of_another_format_are_refused(path, metadata):
     found = None if not metadata else "pt"
     assert refusal(path, save({"a": torch.zeros(2)}, metadata)) == (
         f"the file holds no MergeNet; its format must be 'cvtgs-mergenet', found {found!r}."
     )
 
 
-def test_texts_that_are_null(path):
+def test_null_metadata_is_refused(path):
     text = b'{"__metadata__":null}'
     refusal(path, len(text).to_bytes(8, "little") + text)
 
 
 @pytest.mark.parametrize("version", ["3", "10", "0", "-1", "1.5", "new", "9" * 5000, None])
-def test_a_format_that_is_too_new_or_none(path, version):
+def test_an_unknown_format_version_is_refused(path, version):
     assert refusal(path, content_of(format_version=version)) == (
-        f"the checkpoint has format version {version}, this cvtgs reads up to 2; update cvtgs."
+        f"the checkpoint has format version {version}, but this cvtgs reads only versions up to 2; "
+        f"update cvtgs."
     )
 
 
 @pytest.mark.parametrize("info", [None, "", "{}", "[]", '{"preset": "standard", "depth": 3}'])
-def test_a_file_that_does_not_say_what_it_is(path, info):
-    assert refusal(path, content_of(info=info)) == "the checkpoint does not say what it is."
+def test_a_missing_or_invalid_description_is_refused(path, info):
+    assert (
+        refusal(path, content_of(info=info))
+        == "the checkpoint's description is missing or invalid."
+    )
 
 
-def test_a_preset_that_there_is_not(path):
+def test_an_unknown_preset_is_refused(path):
     assert refusal(path, content_of(INFO.model_copy(update={"preset": "fast"}))) == (
         "the preset of the checkpoint must be one of standard, paper, found 'fast'."
     )
 
 
 @pytest.mark.parametrize("feature", ["member_features", "pair_features", "cell_features"])
-def test_other_features_are_another_architecture(path, feature):
+def test_other_numbers_of_features_are_refused(path, feature):
     ours = getattr(Architecture(), feature)
     other = SMALL.model_copy(update={feature: ours + 1})
     info = INFO.model_copy(update={"architecture": other})
     assert refusal(path, content_of(info)) == (
-        f"the checkpoint is of another architecture: {feature} must be {ours}, found {ours + 1}."
+        f"the checkpoint has a different architecture: {feature} must be {ours}, found {ours + 1}."
     )
 
 
-def test_weights_that_do_not_fit_are_another_architecture(path):
+def test_weights_of_another_shape_are_refused(path):
     wider = lively_net(torch.float32, architecture=Architecture(width=3, cell_width=3))
     assert refusal(path, save_checkpoint(wider, INFO)) == (
-        "the checkpoint is of another architecture: cell_layers.0.weight, "
+        "the checkpoint has a different architecture: cell_layers.0.weight, "
         "member_gates.cell.weight, member_gates.gates.weight do not fit."
     )
 
@@ -232,14 +236,14 @@ class Other(torch.nn.Module):
         self.scale = torch.nn.Parameter(torch.tensor(1.0))
 
 
-def test_another_network_is_another_architecture(path):
+def test_weights_of_another_network_are_refused(path):
     text = refusal(path, save_checkpoint(Other(), INFO))
-    assert text.startswith("the checkpoint is of another architecture: ")
+    assert text.startswith("the checkpoint has a different architecture: ")
     assert text.endswith(" do not fit.")
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
-def test_weights_that_are_not_finite(path, value):
+def test_weights_that_are_not_finite_are_refused(path, value):
     net = lively_net(torch.float32, architecture=SMALL)
     with torch.no_grad():
         net.decoder.bias[2] = value
@@ -248,17 +252,17 @@ def test_weights_that_are_not_finite(path, value):
     )
 
 
-def test_a_missing_file(path):
+def test_a_missing_file_is_refused(path):
     for missing in (path, path / "deeper"):
         assert refusal(missing) == "no such checkpoint; it must be standard or paper, or a file."
 
 
-def test_a_name_that_no_file_can_have():
+def test_an_impossible_file_name_is_refused():
     with pytest.raises(CheckpointError, match="no such checkpoint"):
         load_checkpoint("net\0.safetensors")
 
 
-def test_a_folder_and_a_path_through_a_file(path):
+def test_a_folder_and_a_path_through_a_file_are_refused(path):
     assert refusal(path.parent) == "a checkpoint must be a file of at most 64 MiB."
     path.write_bytes(b"")
     assert refusal(path / "deeper") == "the checkpoint cannot be read: not a directory."
@@ -276,7 +280,7 @@ def test_an_untrained_network_is_a_valid_checkpoint(path):
 
 
 def test_a_file_of_the_first_version_corrects_every_cell(path):
-    """It has no known range; its other tensors are as they were."""
+    """It has no known range; its other tensors are unchanged."""
     net = lively_net(torch.float32, architecture=SMALL)
     weights = {name: v for name, v in net.state_dict().items() if not name.startswith("known.")}
     told = INFO.model_dump_json(exclude={"config", "start", "scenes"})
@@ -289,16 +293,16 @@ def test_a_file_of_the_first_version_corrects_every_cell(path):
     assert loaded.net.known(torch.full((1, SUMMARY_FEATURES), 1e9)).tolist() == [1.0]
 
 
-def test_a_half_known_range_is_another_architecture(path):
+def test_an_incomplete_known_range_is_refused(path):
     net = lively_net(torch.float32, architecture=SMALL)
     weights = {name: v for name, v in net.state_dict().items() if name != "known.low"}
     assert refusal(path, packed(weights, INFO.model_dump_json(), version="2")) == (
-        "the checkpoint is of another architecture: known.low does not fit."
+        "the checkpoint has a different architecture: known.low does not fit."
     )
 
 
 def packed(weights: dict[str, torch.Tensor], told: str, *, version: str) -> bytes:
-    """A checkpoint file of these tensors and this description."""
+    """Return a checkpoint file of these tensors and this description."""
     metadata = {
         "format": "cvtgs-mergenet",
         "format_version": version,

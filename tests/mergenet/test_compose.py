@@ -1,4 +1,4 @@
-"""Residuals become Gaussians: hand-computed, at rest bit for bit, and only in bands there are."""
+"""Applying residuals: hand-computed, exact for residuals of zero, and only in existing bands."""
 
 import math
 
@@ -36,7 +36,7 @@ def composed(case: Case, **changes: torch.Tensor) -> GaussianScene:
     return case.merged.with_tensors(tensors, {})
 
 
-def test_a_shift_is_along_the_own_axes_in_standard_deviations():
+def test_shifts_are_along_own_axes_in_standard_deviations():
     case = some_case()
     shifts = torch.randn(12, 3, generator=torch.Generator().manual_seed(0)).double()
     small = composed(case, d_means=shifts)
@@ -61,7 +61,7 @@ def test_growths_and_logits_are_added():
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("angle", [-0.5, 0.01, 0.5])
-def test_a_turn_is_about_the_own_axes(axis, angle):
+def test_turns_are_about_own_axes(axis, angle):
     """The quaternion times ``(1, turn / 2)``: an angle of ``2 atan(turn / 2)``."""
     case = some_case()
     turns = torch.zeros(12, 3).double()
@@ -76,7 +76,7 @@ def test_a_turn_is_about_the_own_axes(axis, angle):
 
 
 @degrees
-def test_members_and_neighbours_lend_their_colours(degree):
+def test_colours_of_members_and_neighbours_are_mixed_in(degree):
     case = some_case(degree=degree)
     g = torch.Generator().manual_seed(0)
     of_members = torch.randn(60, generator=g, dtype=torch.float64)
@@ -119,7 +119,7 @@ def test_an_untrained_network_returns_the_reference_bit_for_bit(degree, dtype):
 
 @dtypes
 @pytest.mark.parametrize("seed", range(4))
-def test_so_does_it_where_zeros_have_signs(seed, dtype):
+def test_an_untrained_network_keeps_signed_zeros_bit_for_bit(seed, dtype):
     """Frames along the axes of the scene, grey colours and sizes of 1 are full of zeros."""
     scene = random_scene(120, degree=1, dtype=dtype, seed=seed)
     g = torch.Generator().manual_seed(seed)
@@ -143,7 +143,7 @@ def test_so_does_it_where_zeros_have_signs(seed, dtype):
 
 
 class Watch(TorchDispatchMode):
-    """Collects the operations that meet a tensor of a certain shape."""
+    """Collect the operations on tensors of a certain shape."""
 
     def __init__(self, tail: tuple[int, ...]) -> None:
         super().__init__()
@@ -158,7 +158,7 @@ class Watch(TorchDispatchMode):
 
 
 @pytest.mark.parametrize(("degree", "bands"), [(0, 0), (1, 3), (3, 15)])
-def test_bands_that_are_not_there_are_copied_and_nothing_else(degree, bands):
+def test_bands_of_zero_width_are_only_copied(degree, bands):
     case, net = some_case(degree=degree), lively_net()
     with Watch((bands, 3)) as watch:
         case.correct(net)
@@ -167,7 +167,7 @@ def test_bands_that_are_not_there_are_copied_and_nothing_else(degree, bands):
     assert (watch.seen == copying) == (degree == 0)
 
 
-def test_gradients_in_the_residuals():
+def test_gradients_with_respect_to_residuals():
     case = some_case(10, 4, near=2)
     names = list(rest(case))
     g = torch.Generator().manual_seed(0)
@@ -180,7 +180,7 @@ def test_gradients_in_the_residuals():
     assert torch.autograd.gradcheck(outputs, [values.requires_grad_() for values in draws])
 
 
-def test_some_cells_are_composed_as_among_all():
+def test_a_subset_of_cells_gets_the_same_results():
     case = some_case()
     net = lively_net()
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Correcting all cells of a scene: turns and moves with it, leaves single members alone."""
+"""Correcting all cells of a scene: equivariant, and without effect on single members."""
 
 import json
 import math
@@ -55,7 +55,7 @@ def test_an_offset_of_all_colours_is_kept():
     assert_close(there.with_tensors({"sh0": there.sh0 - offset}, {}), here, 1e-9)
 
 
-def test_members_in_any_order():
+def test_order_of_members_does_not_matter():
     case, net = some_case(200, 30), lively_net()
     shuffle = torch.randperm(200, generator=torch.Generator().manual_seed(0))
     labels = some_labels(200, 30)
@@ -68,7 +68,7 @@ def test_members_in_any_order():
 @pytest.mark.parametrize("limit", [1, 10, 100, 1000])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
 def test_chunks_do_not_change_the_result(monkeypatch, dtype, tolerance, limit):
-    """But for rounding: matrix products may sum in another order for another number of rows."""
+    """Up to rounding: the order of sums in matrix products may depend on the number of rows."""
     case, net = some_case(300, 60, degree=2, dtype=dtype), lively_net(dtype)
     whole = case.correct(net)
     monkeypatch.setitem(correct_cells.__globals__, "CHUNK_MEMBERS", limit)
@@ -76,7 +76,7 @@ def test_chunks_do_not_change_the_result(monkeypatch, dtype, tolerance, limit):
 
 
 @dtypes
-def test_same_bits_twice(dtype):
+def test_results_are_deterministic(dtype):
     case, net = some_case(300, 60, dtype=dtype), lively_net(dtype)
     assert same_bits(case.correct(net), case.correct(net))
 
@@ -98,7 +98,7 @@ def test_cells_of_one_are_kept_bit_for_bit(dtype):
     assert biggest_change(small.select(others), case.merged.select(others)) > 0.1
 
 
-def test_nothing_but_cells_of_one():
+def test_a_scene_of_cells_of_one_is_unchanged():
     scene, told = random_scene(5), []
     case = case_of(scene, torch.arange(5))
     net = lively_net(torch.float32)
@@ -109,7 +109,7 @@ def test_nothing_but_cells_of_one():
     assert told == []
 
 
-def test_done_cells_are_told(monkeypatch):
+def test_progress_counts_the_finished_cells(monkeypatch):
     monkeypatch.setitem(correct_cells.__globals__, "CHUNK_MEMBERS", 4)
     scene, told = random_scene(10), []
     case = case_of(scene, torch.tensor([0, 0, 1, 2, 2, 2, 3, 3, 4, 0]), near=0)
@@ -133,7 +133,7 @@ def test_few_cells_have_few_neighbours(cells, dtype):
 @dtypes
 @pytest.mark.parametrize("copies", [2, 3, 100])
 def test_identical_members_keep_colour_and_place_when_alone(copies, dtype):
-    """They have nothing that sets them apart; only size and opacity may change."""
+    """Nothing distinguishes the members, so only size and opacity may change."""
     one = random_scene(1, degree=2, dtype=dtype)
     scene = one.select(torch.zeros(copies, dtype=torch.int64))
     case = case_of(scene, torch.zeros(copies, dtype=torch.int64))
@@ -154,7 +154,7 @@ def double_of(case: Case) -> Case:
 
 
 def test_cells_of_two_and_of_a_hundred_thousand():
-    """Sums of so many float32 numbers keep their digits: to 1e-5 as in float64."""
+    """Sums of many float32 numbers stay precise: within 1e-5 of float64."""
     scene = random_scene(100_020, degree=0)
     labels = torch.cat([torch.zeros(100_000, dtype=torch.int64), 1 + torch.arange(20) // 2])
     case = case_of(scene, labels)
@@ -167,7 +167,7 @@ def test_cells_of_two_and_of_a_hundred_thousand():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_float32_agrees_with_float64(seed):
-    """To 5e-6 of the extent of the scene, and of colours, logs and logits of the order of 1."""
+    """Within 5e-6 of the extent of the scene, and of colours, logs and logits of order 1."""
     case = some_case(2000, 300, degree=2, dtype=torch.float32, seed=seed)
     single = case.correct(lively_net(torch.float32, seed=seed))
     double = double_of(case).correct(lively_net(seed=seed))
@@ -222,7 +222,7 @@ def table() -> dict:
     return json.loads(golden.TABLE.read_text(encoding="utf-8"))
 
 
-def test_the_table_is_of_the_shipped_checkpoints(table):
+def test_the_golden_table_matches_the_shipped_checkpoints(table):
     assert table["digests"] == golden.digests(), f"a shipped checkpoint has changed: {RENEW}"
     assert list(table["figures"]) == golden.CASES, f"the cases have changed: {RENEW}"
 

@@ -1,4 +1,4 @@
-"""Cells that are hard on numbers: results and gradients stay finite."""
+"""Numerically hard cells: results and gradients stay finite."""
 
 import math
 from collections.abc import Callable
@@ -68,7 +68,7 @@ def hard_case(change: Callable[[GaussianScene], dict[str, Tensor]], dtype: torch
     scene = random_scene(COUNT, degree=3, dtype=dtype)
     changes = {name: values.to(dtype) for name, values in change(scene).items()}
     labels = torch.cat([torch.zeros(6), 1 + torch.arange(COUNT - 6) // 2]).long()
-    labels[-2:] += torch.tensor([1, 2])  # the last ones are alone
+    labels[-2:] += torch.tensor([1, 2])  # the last two members are alone
     labels = torch.unique(labels, return_inverse=True)[1]
     return case_of(scene.with_tensors(changes, {}), labels)
 
@@ -114,8 +114,8 @@ def test_gradients_of_all_parameters_are_finite(change, dtype):
 
 @dtypes
 @pytest.mark.parametrize("factor", [1e3, 1e6])
-def test_a_network_out_of_bounds_still_gives_gaussians(factor, dtype):
-    """Weights are finite, but as large as they like."""
+def test_a_network_with_huge_weights_gives_finite_gaussians(factor, dtype):
+    """Weights are finite, but arbitrarily large."""
     net = lively_net(dtype)
     with torch.no_grad():
         for values in net.parameters():
@@ -128,7 +128,7 @@ def test_a_network_out_of_bounds_still_gives_gaussians(factor, dtype):
 @pytest.mark.parametrize("log_scale", [-800.0, -400.0, -40.0, 88.0])
 @pytest.mark.parametrize("beside", [0.0, 1.0, 1e30])
 def test_extreme_neighbours_of_one_member(beside, log_scale, dtype):
-    """A cell of one is not corrected, but others see it: a point in the middle, or a whole sky."""
+    """A cell of one is not corrected, but is a neighbour: a point in the middle, or a whole sky."""
     scene = random_scene(5, dtype=dtype)
     means, log_scales = scene.means.clone(), scene.log_scales.clone()
     means[:4] = torch.tensor([1.0, 0, 0]) * torch.tensor([[-1.0], [1.0], [-2.0], [2.0]])
@@ -142,7 +142,7 @@ def test_extreme_neighbours_of_one_member(beside, log_scale, dtype):
 
 
 @pytest.mark.parametrize("far", [3e38, -3e38])
-def test_what_overflows_keeps_the_reference(far):
+def test_cells_that_overflow_keep_the_reference(far):
     case = hard_case(flown(far), torch.float32)
     assert_finite(case.merged.tensors())
     assert_finite(features_of(case.describe()))

@@ -1,4 +1,4 @@
-"""MergeNet: against the oracle, at rest before training, blind to order; its known range."""
+"""MergeNet: against the oracle, zero before training, order-invariant; its known range."""
 
 import math
 from dataclasses import replace
@@ -110,7 +110,7 @@ def test_other_widths(width, cell_width):
     assert all(bool(values.isfinite().all()) for values in fields_of(found).values())
 
 
-def test_architecture_is_that_of_the_descriptors_and_closed():
+def test_the_architecture_matches_the_descriptors_and_is_validated():
     ours = Architecture()
     features = (ours.member_features, ours.pair_features, ours.cell_features)
     assert features == (MEMBER_FEATURES, PAIR_FEATURES, CELL_FEATURES)
@@ -119,7 +119,7 @@ def test_architecture_is_that_of_the_descriptors_and_closed():
             Architecture(**bad)
 
 
-def test_cells_do_not_see_one_another():
+def test_cells_do_not_affect_one_another():
     """Any subset of cells gets the same residuals."""
     case, net = some_case(), lively_net()
     whole = fields_of(net(case.describe()))
@@ -239,8 +239,8 @@ def test_a_feature_that_never_varied_has_a_margin():
     assert found == pytest.approx([1.0, 0.5, 0.0], abs=1e-4)
 
 
-def test_tails_of_a_case_do_not_count_but_a_small_case_does():
-    """200 cells: two at each end are its tails. A case of one cell has a say all the same."""
+def test_tails_of_a_case_are_ignored_but_a_small_case_is_not():
+    """200 cells: two at each end are its tails. A case of one cell counts in full."""
     large = rows(*[-90.0, -80.0], *torch.linspace(0, 1, 196).tolist(), *[80.0, 90.0])
     known = fitted(large, rows(3.0))
     assert (float(known.low[0]), float(known.high[0])) == (0.0, 3.0)
@@ -257,18 +257,18 @@ def test_cells_of_thousands_of_members_are_never_known():
     assert known(seen).tolist() == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0], abs=1e-3)
 
 
-def test_that_feature_is_the_number_of_members():
+def test_the_members_feature_is_the_number_of_members():
     scene = random_scene(60, degree=0, dtype=torch.float64, seed=0, size=0.4)
     seen = case_of(scene, torch.arange(60) % 2).describe()
     assert seen.cells[:, MEMBERS].tolist() == pytest.approx([0.2 * math.log(30)] * 2)
 
 
-def test_nothing_is_unknown_before_a_training():
+def test_everything_is_known_before_training():
     assert KnownRange()(rows(-1e9, 0.0, 1e9)).tolist() == [1.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize("near", [0, 8])
-def test_summaries_are_those_of_the_cell_and_weighted_means(near):
+def test_summaries_are_cell_features_and_weighted_means(near):
     seen = some_case(near=near).describe()
     found = summarize(seen)
     assert found.shape == (len(seen), SUMMARY_FEATURES)
@@ -312,7 +312,7 @@ def test_no_residual_for_a_cell_with_a_huge_far_faint_member():
     assert not torch.equal(corrected.means[others], odd.merged.means[others])
 
 
-def test_cells_that_it_learned_from_keep_their_residuals():
+def test_training_cells_keep_their_residuals():
     case, net = some_case(), lively_net()
     before = fields_of(net(case.describe()))
     net.known.fit([summarize(case.describe())])

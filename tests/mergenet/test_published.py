@@ -143,8 +143,8 @@ def test_one_network_corrects_every_degree_and_all_its_bands(degree):
             assert not bool(changed[~several].any())
 
 
-def test_residuals_are_free():
-    """Nothing limits them: twice the last layer gives twice the residuals, however large."""
+def test_residuals_are_not_limited():
+    """Twice the last layer gives twice the residuals, however large."""
     case, net = some_case(), lively()
     once = net(described(case))
     with torch.no_grad():
@@ -182,7 +182,7 @@ def test_far_members_and_huge_differences_stay_finite():
     assert float(found.members.abs().amax()) <= 50.0
 
 
-def test_saved_and_loaded_it_knows_its_kind(tmp_path):
+def test_saving_and_loading_keeps_the_kind(tmp_path):
     path, net = tmp_path / "net.safetensors", lively(torch.float32)
     path.write_bytes(save_checkpoint(net, INFO))
     found = load_checkpoint(path)
@@ -200,25 +200,25 @@ def refusal(tmp_path, net: torch.nn.Module, info: CheckpointInfo) -> str:
     return str(caught.value).removeprefix(f"{path}: ")
 
 
-def test_another_descriptor_is_one_sentence(tmp_path):
+def test_another_descriptor_is_refused_in_one_sentence(tmp_path):
     shape = SMALL.model_copy(update={"member_features": 59})
     info = INFO.model_copy(update={"architecture": shape})
     assert refusal(tmp_path, PublishedMergeNet(shape), info) == (
-        "the checkpoint is of another architecture: member_features must be 60, found 59."
+        "the checkpoint has a different architecture: member_features must be 60, found 59."
     )
 
 
-def test_another_kind_is_one_sentence(tmp_path):
+def test_an_unknown_kind_is_refused_in_one_sentence(tmp_path):
     told = INFO.model_dump_json().replace('"published"', '"graph"')
     info = SimpleNamespace(model_dump_json=lambda: told)
     assert refusal(tmp_path, lively(torch.float32), info) == (
-        "the checkpoint is of another architecture: its kind must be gated or published, "
+        "the checkpoint has a different architecture: its kind must be gated or published, "
         "found 'graph'."
     )
 
 
 @pytest.mark.parametrize("kind", ["gated", "published"])
-def test_weights_of_the_other_kind_are_one_sentence(tmp_path, kind):
+def test_weights_of_the_other_kind_are_refused_in_one_sentence(tmp_path, kind):
     gated = lively_net(torch.float32, architecture=Architecture(width=2, cell_width=3))
     net, info = (
         (gated, INFO)
@@ -226,12 +226,12 @@ def test_weights_of_the_other_kind_are_one_sentence(tmp_path, kind):
         else (lively(torch.float32), INFO.model_copy(update={"architecture": gated.architecture}))
     )
     text = refusal(tmp_path, net, info)
-    assert text.startswith("the checkpoint is of another architecture: ")
+    assert text.startswith("the checkpoint has a different architecture: ")
     assert text.endswith(" do not fit.")
 
 
-def test_files_of_the_first_release_are_of_our_kind(tmp_path):
-    """They do not name one."""
+def test_files_of_the_first_release_are_of_the_gated_kind(tmp_path):
+    """Their descriptions name no kind."""
     path = tmp_path / "net.safetensors"
     gated = lively_net(torch.float32, architecture=Architecture(width=2, cell_width=3))
     info = CheckpointInfo(architecture=gated.architecture, preset="standard")
@@ -242,7 +242,7 @@ def test_files_of_the_first_release_are_of_our_kind(tmp_path):
     assert load_checkpoint(path).info.architecture.kind == "gated"
 
 
-def test_a_scene_is_simplified_by_it_and_keeps_its_count(tmp_path):
+def test_a_simplified_scene_keeps_its_count(tmp_path):
     path = tmp_path / "net.safetensors"
     path.write_bytes(save_checkpoint(lively(torch.float32, scale=0.1), INFO))
     scene = cvtgs.synthetic.scene("object", 400, sh_degree=1, seed=0)
@@ -252,12 +252,12 @@ def test_a_scene_is_simplified_by_it_and_keeps_its_count(tmp_path):
     assert not torch.equal(simplified.shN, merged.shN)
 
 
-def test_paper_has_no_rule_of_ours_for_axes():
+def test_the_paper_preset_does_not_align_axes():
     assert not SimplifyConfig.from_preset("paper").merge.align_axes
     assert SimplifyConfig.from_preset("standard").merge.align_axes
 
 
-def test_it_asks_for_no_neighbours(tmp_path, monkeypatch):
+def test_no_neighbours_are_searched(tmp_path, monkeypatch):
     path = tmp_path / "net.safetensors"
     path.write_bytes(save_checkpoint(lively(torch.float32, scale=0.1), INFO))
     asked = []

@@ -64,7 +64,7 @@ def test_shared_counts_always_add_up():
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 16])
-def test_blocks_have_equal_measure_whatever_flies_away(count):
+def test_blocks_have_equal_measure_despite_far_outliers(count):
     g = torch.Generator().manual_seed(1)
     points = torch.randn(4000, 3, generator=g, dtype=torch.float64)
     points[:5] *= 1e12
@@ -96,7 +96,7 @@ def test_the_total_is_exact_and_the_output_is_an_ordinary_scene(source, tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["out.ply"]
 
 
-def test_one_block_is_the_scene_in_one_piece(scene, source, tmp_path):
+def test_one_block_gives_the_same_bits_as_a_run_in_one_piece(scene, source, tmp_path):
     simplify_file(source, tmp_path / "out.ply", 0.05, blocks=1)
     with one_thread():
         whole = Simplifier(device="cpu").simplify(cvtgs.load(source), 0.05)
@@ -129,7 +129,7 @@ def test_sums_do_not_depend_on_ranges(scene, source, monkeypatch):
     ends = range(0, 6001, 600)
     parts = [scan_range(rows, frame, (), RowRange(0, *pair)) for pair in pairwise(ends)]
     by_part = sum(part.mass for part in parts), sum(part.falloff_mass for part in parts)
-    assert by_part != (whole.mass, whole.falloff_mass)  # as rounding goes
+    assert by_part != (whole.mass, whole.falloff_mass)  # they are rounded differently
     total = add_totals(parts)
     assert (total.mass, total.falloff_mass) == (whole.mass, whole.falloff_mass)
 
@@ -146,7 +146,7 @@ def test_seams_cost_little(scene, source, tmp_path):
     assert scores[1].psnr.mean > scores[0].psnr.mean - 0.5  # 150 cells per block: many seams
 
 
-def test_protected_rows_come_first_and_are_the_same_bits(scene, source, tmp_path):
+def test_protected_rows_come_first_with_unchanged_bits(scene, source, tmp_path):
     box = Box(min=(-0.5, -9, -0.5), max=(0.5, 9, 0.5))
     kept = scene.select(cvtgs.boxes.inside([box], scene.means))
     assert 0 < len(kept) < 1000
@@ -158,11 +158,11 @@ def test_protected_rows_come_first_and_are_the_same_bits(scene, source, tmp_path
     first = small.select(torch.arange(len(kept)))
     assert all(torch.equal(a, kept.tensors()[name]) for name, a in first.tensors().items())
     everything = Box(min=(-1e30,) * 3, max=(1e30,) * 3)
-    with pytest.raises(InvalidArgumentError, match="must be left"):
+    with pytest.raises(InvalidArgumentError, match="the target must be at least"):
         simplify_file(source, tmp_path / "no.ply", 0.2, blocks=3, boxes=[everything])
 
 
-def test_invalid_rows_and_flyaways_do_not_disturb(tmp_path):
+def test_invalid_rows_are_dropped_and_flyaways_do_no_harm(tmp_path):
     scene = random_scene(2000, degree=0)
     means, logits = scene.means.clone(), scene.logit_opacities.clone()
     means[7], means[11] = torch.nan, 1e9
@@ -176,13 +176,13 @@ def test_invalid_rows_and_flyaways_do_not_disturb(tmp_path):
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_fewer_gaussians_than_blocks(source, tmp_path, count):
+def test_a_target_below_the_number_of_blocks_is_met(source, tmp_path, count):
     report = simplify_file(source, tmp_path / "out.ply", count=count, blocks=8)
     assert (report.output_count, len(cvtgs.load(tmp_path / "out.ply"))) == (count, count)
 
 
 def test_gaussians_of_blocks_without_cells_are_merged(tmp_path):
-    """Protected Gaussians take so many of the target that four of six blocks get none."""
+    """Protected Gaussians use up so much of the target that four of six blocks get no cells."""
     scene = random_scene(500, degree=0)
     scene = scene.with_tensors({"logit_opacities": torch.full((500,), 2.0)}, {})
     cvtgs.save(scene, tmp_path / "in.ply")
@@ -198,7 +198,7 @@ def test_gaussians_of_blocks_without_cells_are_merged(tmp_path):
 
 
 def test_a_filter_that_leaves_too_few_is_switched_off(tmp_path):
-    """Nine tenths of the Gaussians are faint, and more are asked for than are not."""
+    """Nine tenths of the Gaussians are faint, and the target exceeds the number of the others."""
     scene = random_scene(600, seed=5)
     logits = torch.where(torch.arange(600) % 10 == 0, 4.0, -8.0)
     cvtgs.save(scene.with_tensors({"logit_opacities": logits}, {}), tmp_path / "in.ply")
@@ -215,7 +215,7 @@ def test_files_without_a_valid_row_are_refused(tmp_path):
     assert not (tmp_path / "out.ply").exists()
 
 
-def test_extra_columns_and_other_formats(tmp_path):
+def test_extra_columns_are_kept_and_other_output_formats_work(tmp_path):
     scene = random_scene(500, degree=0)
     extra = {"id": torch.arange(500, dtype=torch.int32), "heat": torch.rand(500)}
     cvtgs.save(scene.with_tensors({}, extra), tmp_path / "in.ply")
@@ -237,7 +237,7 @@ def test_extra_columns_and_other_formats(tmp_path):
         ({"visibility": {"views": 8}}, "not for weights; found 8 views"),
     ],
 )
-def test_images_that_blocks_cannot_use_are_refused(source, tmp_path, settings, problem):
+def test_settings_that_blocks_cannot_use_are_refused(source, tmp_path, settings, problem):
     simplifier = Simplifier(config=SimplifyConfig.from_mapping(settings), device="cpu")
     with pytest.raises(ConfigError, match=problem):
         simplify_file(source, tmp_path / "no.ply", 0.1, blocks=2, simplifier=simplifier)
@@ -245,7 +245,7 @@ def test_images_that_blocks_cannot_use_are_refused(source, tmp_path, settings, p
 
 
 @pytest.mark.parametrize("preset", ["draft", "paper"])
-def test_other_presets(source, tmp_path, preset):
+def test_other_presets_work_in_blocks(source, tmp_path, preset):
     simplifier = Simplifier(config=SimplifyConfig.from_preset(preset), device="cpu")
     simplify_file(source, tmp_path / "out.ply", 0.03, blocks=3, simplifier=simplifier)
     assert len(cvtgs.load(tmp_path / "out.ply")) == 180
@@ -254,12 +254,12 @@ def test_other_presets(source, tmp_path, preset):
 @pytest.mark.parametrize(
     ("text", "wanted"), [("4GB", 4 * 10**9), ("2 GiB", 2**31), ("500mb", 5 * 10**8)]
 )
-def test_amounts_of_memory(text, wanted):
+def test_amounts_of_memory_are_parsed(text, wanted):
     assert read_bytes(text) == wanted
 
 
 @pytest.mark.parametrize("text", ["", "4XB", "-1GB", "much", "300MB"])
-def test_bad_amounts_of_memory(text):
+def test_bad_amounts_of_memory_are_refused(text):
     with pytest.raises(InvalidArgumentError, match="memory must be"):
         read_bytes(text)
 
@@ -271,7 +271,7 @@ def test_less_memory_makes_more_blocks(source):
 
 
 @pytest.mark.slow
-def test_command(source, tmp_path, capsys, monkeypatch):
+def test_the_command_cuts_the_scene_if_memory_is_low(source, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("cvtgs.outofcore.memory.BASE_BYTES", 10)
     monkeypatch.setattr("cvtgs.outofcore.memory.LEAST_BYTES", 20)
     monkeypatch.setattr(

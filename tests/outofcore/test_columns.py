@@ -1,4 +1,4 @@
-"""Blocks read and write what one piece does: SH degrees, axes, and what the report says of rows."""
+"""SH degrees, axes and the row counts of the report are the same in blocks as in one piece."""
 
 import pytest
 import torch
@@ -19,13 +19,13 @@ def scene():
 
 
 def in_blocks(folder, scene, name="out.ply", *, axes=None, **options):
-    """Return what three blocks make of a scene, and the report."""
+    """Simplify a scene in three blocks; return the path of the output and the report."""
     cvtgs.save(scene, folder / "in.ply", axes=axes, overwrite=True)
     report = simplify_file(folder / "in.ply", folder / name, 0.3, blocks=3, **options)
     return folder / name, report
 
 
-def test_dropped_bands_are_those_of_a_scene_without_them(scene, tmp_path):
+def test_dropped_sh_bands_give_the_bytes_of_a_scene_without_them(scene, tmp_path):
     wanted, _ = in_blocks(tmp_path, scene.with_sh_degree(1), "wanted.ply", boxes=[BOX])
     found, report = in_blocks(tmp_path, scene, "found.ply", boxes=[BOX], sh_degree=1)
     assert 10 < report.kept_count < 200
@@ -34,7 +34,7 @@ def test_dropped_bands_are_those_of_a_scene_without_them(scene, tmp_path):
 
 
 @pytest.mark.slow
-def test_axes_turn_the_scene_and_its_boxes(scene, tmp_path):
+def test_source_and_output_axes_are_applied_in_blocks(scene, tmp_path):
     wanted, _ = in_blocks(tmp_path, scene, "wanted.ply", boxes=[BOX])
     found, report = in_blocks(
         tmp_path, scene, "rub.ply", axes="rub", boxes=[BOX], source_axes="rub", output_axes="ruf"
@@ -45,7 +45,7 @@ def test_axes_turn_the_scene_and_its_boxes(scene, tmp_path):
     plain = scene.with_sh_degree(0)
     wanted, _ = in_blocks(tmp_path, plain, "plain.ply", boxes=[BOX])
     packed, _ = in_blocks(tmp_path, plain, "out.spz", boxes=[BOX], output_axes="lub")
-    turned = cvtgs.load(packed)  # which states its axes
+    turned = cvtgs.load(packed)  # the file states its axes
     torch.testing.assert_close(turned.means, cvtgs.load(wanted).means, atol=1e-3, rtol=0.0)
 
 
@@ -64,7 +64,7 @@ def test_the_command_passes_axes_and_degree_to_blocks(scene, tmp_path, monkeypat
     assert float(torch.minimum(lows, highs).amin()) > -0.1
 
 
-def test_the_report_is_that_of_one_piece(tmp_path):
+def test_the_report_matches_a_run_in_one_piece(tmp_path):
     scene = random_scene(900, degree=0, seed=1)
     means, quats, logits = scene.means.clone(), scene.quats.clone(), scene.logit_opacities.clone()
     means[[7, 300]], quats[[7, 20]] = torch.nan, 0.0
@@ -84,8 +84,8 @@ def test_the_report_is_that_of_one_piece(tmp_path):
     assert report.energy == pytest.approx(whole.energy, rel=0.2)
 
 
-def test_scenes_far_from_the_origin_are_warned_of(tmp_path):
+def test_scenes_far_from_the_origin_cause_a_warning(tmp_path):
     scene = random_scene(300, degree=0)
     far = scene.with_tensors({"means": scene.means + 3e6}, {})
-    with pytest.warns(UserWarning, match="float32 keeps steps of 0.25"):
+    with pytest.warns(UserWarning, match="float32 only resolves steps of 0.25"):
         in_blocks(tmp_path, far)

@@ -1,4 +1,4 @@
-"""Blocks on a cluster of processes: the same bits, also when a worker is killed."""
+"""Blocks on a cluster of processes: the same bits, even if a worker is killed."""
 
 import json
 import os
@@ -39,7 +39,7 @@ def cluster():
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore")
-def test_a_killed_worker_changes_nothing(cluster, source, tmp_path):
+def test_a_killed_worker_does_not_change_the_output(cluster, source, tmp_path):
     from distributed import Client  # noqa: PLC0415 (optional)
 
     alone, together = tmp_path / "alone.ply", tmp_path / "together.ply"
@@ -64,7 +64,7 @@ def test_a_killed_worker_changes_nothing(cluster, source, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_command(cluster, source, tmp_path):
+def test_the_command_simplifies_on_a_cluster(cluster, source, tmp_path):
     words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.01", "--quiet"]
     assert main([*words, "--scheduler", cluster.scheduler_address]) == 0
     assert len(cvtgs.load(tmp_path / "out.ply")) == 200
@@ -79,7 +79,7 @@ def test_without_the_package_the_error_says_what_to_install(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_a_relative_path_is_that_of_the_caller(cluster, source, tmp_path, monkeypatch):
+def test_a_relative_path_starts_at_the_folder_of_the_caller(cluster, source, tmp_path, monkeypatch):
     monkeypatch.chdir(source.parent)
     report = simplify_distributed(
         source.name, 0.01, cluster.scheduler_address, output=tmp_path / "out.ply", blocks=3
@@ -90,7 +90,7 @@ def test_a_relative_path_is_that_of_the_caller(cluster, source, tmp_path, monkey
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_a_cluster_without_workers_is_one_sentence(source, tmp_path, monkeypatch):
+def test_a_cluster_without_workers_is_an_error(source, tmp_path, monkeypatch):
     package = pytest.importorskip("distributed")
     monkeypatch.setattr(distributed, "ANSWER_SECONDS", 1.0)
     with (
@@ -101,7 +101,7 @@ def test_a_cluster_without_workers_is_one_sentence(source, tmp_path, monkeypatch
 
 
 class Answers:
-    """A client whose only worker answers a question as it is told to."""
+    """A client whose only worker gives a fixed answer or error."""
 
     def __init__(self, answer, error=None):
         self.answer, self.error, self.status = answer, error, "running"
@@ -137,14 +137,14 @@ def answer(**changes):
 @pytest.mark.parametrize(
     ("found", "error", "text"),
     [
-        (answer(versions={"cvtgs": "0.0.1"}), None, "found cvtgs 0.0.1 for "),
+        (answer(versions={"cvtgs": "0.0.1"}), None, "found cvtgs 0.0.1 instead of "),
         (answer(source_bytes=None), None, "must see the input .* found none"),
         (answer(source_bytes=7), None, "found 7 bytes"),
-        (answer(sees_folder=False), None, "must see and may write the folder of the output"),
+        (answer(sees_folder=False), None, "must be able to read and write the output folder"),
         (None, ModuleNotFoundError("No module named 'cvtgs'"), "must have cvtgs .*No module named"),
     ],
 )
-def test_a_worker_that_cannot_do_the_work_is_named(tmp_path, monkeypatch, found, error, text):
+def test_the_error_names_a_worker_that_cannot_do_the_job(tmp_path, monkeypatch, found, error, text):
     package = pytest.importorskip("distributed")
     monkeypatch.setattr(package, "wait", lambda futures, timeout: None)
     source = tmp_path / "in.ply"
@@ -160,7 +160,7 @@ def test_a_worker_that_cannot_do_the_work_is_named(tmp_path, monkeypatch, found,
     assert "\n" not in str(caught.value)
 
 
-def test_a_worker_sees_what_it_sees(tmp_path):
+def test_a_worker_reports_which_files_it_can_see(tmp_path):
     folder = tmp_path / ".out.ply.blocks" / "key"
     folder.mkdir(parents=True)
     (tmp_path / "in.ply").write_bytes(b"12345")
@@ -175,13 +175,13 @@ def test_a_worker_sees_what_it_sees(tmp_path):
 
 def test_a_worker_that_joins_later_with_another_version_is_refused():
     assert distributed._call(abs, distributed._versions(), -3) == 3
-    with pytest.raises(RunError, match="must have the versions of this process"):
+    with pytest.raises(RunError, match="must have the same package versions as this process"):
         distributed._call(abs, {"cvtgs": "0.0.1"}, -3)
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_errors_of_workers_are_sentences(cluster, source):
+def test_errors_of_workers_are_reported_in_one_sentence(cluster, source):
     from distributed import Client  # noqa: PLC0415 (optional)
 
     def fails(kind, text, item):
@@ -190,13 +190,13 @@ def test_errors_of_workers_are_sentences(cluster, source):
     with Client(cluster) as client:
         workers = ClusterWorkers(client)
         for kind, text, wanted in (
-            (FileNotFoundError, "/data/x", "a worker could not do its work: FileNotFoundError: /d"),
-            (ValueError, "", "a worker could not do its work: ValueError; all need"),
+            (FileNotFoundError, "/data/x", "a worker failed: FileNotFoundError: /data/x; all"),
+            (ValueError, "", "a worker failed: ValueError; all workers need"),
         ):
             with pytest.raises(RunError) as caught:
                 list(workers(lambda item, k=kind, t=text: fails(k, t, item), [1]))
             assert str(caught.value).startswith(wanted)
-            assert str(caught.value).endswith("the same command continues.")
+            assert str(caught.value).endswith("run the same command again to continue.")
         with pytest.raises(InvalidSceneError, match="ours"):
             list(workers(lambda item: fails(InvalidSceneError, "ours", item), [1]))
 
@@ -204,8 +204,8 @@ def test_errors_of_workers_are_sentences(cluster, source):
 @pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
 @pytest.mark.parametrize("fault", ["no scheduler", "no cvtgs", "another cvtgs"])
-def test_the_command_ends_in_one_sentence(source, tmp_path, fault):
-    """With a real scheduler, which is killed, or a real worker, without this cvtgs."""
+def test_the_command_reports_cluster_failures_in_one_sentence(source, tmp_path, fault):
+    """With a real scheduler that is killed, or a real worker without this version of cvtgs."""
     address, other = tmp_path / "scheduler.json", tmp_path / "other"
     other.mkdir()
     (other / "cvtgs.py").write_text(
@@ -245,7 +245,7 @@ def test_the_command_ends_in_one_sentence(source, tmp_path, fault):
     assert errors.startswith("cvtgs: error: ")
     assert errors.count("\n") == 1
     wanted = {
-        "no scheduler": "the same command continues.",
+        "no scheduler": "run the same command again to continue.",
         "no cvtgs": f"must have cvtgs {cvtgs.__version__}, found ImportError: no cvtgs; install",
         "another cvtgs": f"must have cvtgs {cvtgs.__version__}, found 0.0.1; install it",
     }

@@ -1,4 +1,4 @@
-"""The halo: blocks give together what one piece gives, wherever they meet."""
+"""The halo: blocks together give the same result as one piece, also where they meet."""
 
 import time
 
@@ -37,7 +37,7 @@ def stop_before_assemble(event):
 
 @pytest.fixture(scope="module")
 def job(tmp_path_factory):
-    """A job that is done, but for putting its blocks together."""
+    """A job that is complete except for the assembly of its blocks."""
     folder = tmp_path_factory.mktemp("borders")
     scene = cvtgs.synthetic.scene("courtyard", COUNT, sh_degree=1, seed=4)
     cvtgs.save(scene, folder / "in.ply")
@@ -75,7 +75,7 @@ def block_starts(job):
 
 
 def random_blocks(count, dim, *, seed=0):
-    """Points and sites in slabs along the first axis, and the other slabs as seen by one."""
+    """Return random points and sites, split into slabs along the first axis."""
     g = torch.Generator().manual_seed(seed)
     points = torch.rand(900, dim, generator=g)
     sites = torch.rand(60, dim, generator=g).double()
@@ -120,7 +120,7 @@ def test_the_nearest_site_is_found_in_any_block(count, dim):
     assert (crossed > 0) == (count > 1)
 
 
-def test_equally_near_sites_stay_in_the_own_block():
+def test_a_tie_goes_to_the_site_in_the_own_block():
     others = [OtherBlock(3, torch.tensor([[2.0], [2.0]]), lambda: torch.tensor([[2.0]]))]
     found = assign_points(
         torch.tensor([[1.0]]), torch.zeros(1, 1).double(), others, nearest=cvt.nearest_scipy
@@ -128,7 +128,7 @@ def test_equally_near_sites_stay_in_the_own_block():
     assert found.blocks.tolist() == [-1]
 
 
-def test_several_nearest():
+def test_several_nearest_sites_match_brute_force():
     g = torch.Generator().manual_seed(1)
     points, sites = torch.rand(50, 3, generator=g), torch.rand(20, 3, generator=g)
     rows, distances = nearest_several(points, sites, 4)
@@ -138,8 +138,8 @@ def test_several_nearest():
     assert nearest_several(points, sites, 99)[0].shape == (50, 20)
 
 
-def test_coincident_sites_are_not_compared_all_with_all():
-    """Without care that is quadratic: six times as long as sites that lie apart take."""
+def test_coincident_sites_do_not_take_quadratic_time():
+    """A naive search is quadratic: it takes six times as long as for separate sites."""
     apart = torch.rand(30_000, 3, generator=torch.Generator().manual_seed(0)).double()
     seconds = []
     for sites in (apart, torch.zeros_like(apart)):
@@ -150,8 +150,8 @@ def test_coincident_sites_are_not_compared_all_with_all():
     assert seconds[1] < 2 * seconds[0] + 0.1
 
 
-@pytest.mark.parametrize("count", [2, 7, 30])  # of 30 blocks many have fewer cells than neighbours
-def test_a_halo_holds_all_that_may_be_a_neighbour(count):
+@pytest.mark.parametrize("count", [2, 7, 30])  # many of 30 blocks have fewer cells than neighbours
+def test_a_halo_holds_all_possible_neighbours(count):
     blocks = [(None, sites) for _, sites in random_blocks(count, 3, seed=2) if len(sites)]
     starts = torch.tensor([0, *[len(sites) for _, sites in blocks]]).cumsum(0)
     centers = torch.cat([sites for _, sites in blocks])
@@ -228,12 +228,12 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
     assert moved > COUNT // 50
     sizes = of_all(job, job.merged_path, "sizes")
     wanted_sizes = torch.bincount(final, minlength=TARGET)
-    # Only one that fits a group best among those of its block may stay where one piece moves it.
+    # A Gaussian that one piece moves may stay only if no other group of its block fits it better.
     assert int((sizes.sort().values - wanted_sizes.sort().values).abs().sum()) < moved // 50
 
 
 @pytest.mark.slow
-def test_cells_that_do_not_fit_into_memory_merge_by_parts(tmp_path, monkeypatch):
+def test_cells_that_exceed_the_memory_are_merged_in_parts(tmp_path, monkeypatch):
     cvtgs.save(cvtgs.synthetic.scene("room", 900, sh_degree=0, seed=2), tmp_path / "in.ply")
     monkeypatch.setattr("cvtgs.outofcore.memory.CELL_ROOM", 50)
     with pytest.warns(UserWarning, match="compared within 5 parts"):
@@ -241,7 +241,7 @@ def test_cells_that_do_not_fit_into_memory_merge_by_parts(tmp_path, monkeypatch)
     assert len(cvtgs.load(tmp_path / "out.ply")) == 70 == report.output_count
 
 
-def test_cells_have_the_neighbours_of_one_piece(job):
+def test_cells_have_the_same_neighbours_as_in_one_piece(job):
     merged = scene_of_all(job, job.merged_path)
     wanted = cvt.nearest_neighbors(merged.means, 8)
     starts, crossed = block_starts(job), 0
@@ -260,7 +260,7 @@ def test_cells_have_the_neighbours_of_one_piece(job):
     assert crossed > TARGET // 5
 
 
-def test_axes_and_inflation_are_those_of_one_piece(job):
+def test_axes_and_inflation_are_the_same_as_in_one_piece(job):
     merged, inflated = scene_of_all(job, job.merged_path), scene_of_all(job, job.inflated_path)
     sizes = of_all(job, job.merged_path, "sizes")
     partition = cells.Partition.from_labels(
@@ -316,7 +316,7 @@ def test_the_network_corrects_as_in_one_piece(job):
 
 @pytest.mark.long
 def test_seams_cost_less_than_a_tenth_of_a_decibel(tmp_path):
-    """Means over counts: one of them alone moves by more than a seam may cost."""
+    """Average over several counts, since a single PSNR varies by more than the limit."""
     scene = cvtgs.synthetic.scene("object", 20_000, sh_degree=0, seed=3)
     source, counts = tmp_path / "in.ply", range(950, 1050, 10)
     cvtgs.save(scene, source)
@@ -336,7 +336,7 @@ def test_seams_cost_less_than_a_tenth_of_a_decibel(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 2])
-def test_all_that_is_kept_stays_as_it_is_in_any_number_of_blocks(tmp_path, degree):
+def test_a_ratio_of_one_keeps_every_gaussian_unchanged_in_blocks(tmp_path, degree):
     scene = cvtgs.synthetic.scene("room", 600, sh_degree=degree, seed=1)
     cvtgs.save(scene, tmp_path / "in.ply")
     simplify_file(tmp_path / "in.ply", tmp_path / "out.ply", 1.0, blocks=4)

@@ -1,4 +1,4 @@
-"""Blocks are matched to images and refined with the others drawn but fixed: no seams, same bits."""
+"""Blocks are matched and refined while the others are rendered but fixed: no seams, same bits."""
 
 import pytest
 import torch
@@ -60,7 +60,7 @@ def psnr_of(scene, small):
 def scores(scene, source, tmp_path_factory):
     """PSNR in one piece and in blocks, with and without matching.
 
-    By views chosen as those of blocks are, blurred ones too; so few cells vary by 2 dB.
+    Views are chosen like those of blocks, also blurred ones; PSNR of so few cells varies by 2 dB.
     """
     folder, found = tmp_path_factory.mktemp("scores"), {}
     with pytest.MonkeyPatch.context() as patch:
@@ -79,13 +79,13 @@ def scores(scene, source, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_matching_in_blocks_gains(scores):
+def test_matching_in_blocks_improves_psnr(scores):
     assert scores["matched"]["blocks"] > scores["standard"]["blocks"] + 0.1
 
 
 @pytest.mark.slow
 @pytest.mark.xfail(strict=True, reason="images of blocks gain 0.2 to 0.7 dB, of one piece 1.0")
-def test_matching_in_blocks_costs_little_more_than_blocks_do(scores):
+def test_matching_adds_little_to_the_loss_from_blocks(scores):
     losses = {name: found["one"] - found["blocks"] for name, found in scores.items()}
     assert losses["matched"] < losses["standard"] + 0.3
 
@@ -102,8 +102,8 @@ def test_the_order_of_blocks_does_not_matter(source, tmp_path, settings):
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
-def test_images_need_some_memory(source, tmp_path):
-    with pytest.raises(InvalidArgumentError, match="at least 800 MB for images"):
+def test_images_raise_the_least_memory(source, tmp_path):
+    with pytest.raises(InvalidArgumentError, match="at least 800 MB with images"):
         in_blocks(source, tmp_path / "no.ply", MATCHED, blocks=None, memory=600_000_000)
 
 
@@ -116,7 +116,7 @@ def test_two_workers_give_the_same_bits(source, tmp_path):
 
 
 @pytest.mark.slow
-def test_refined_blocks_gain_and_protected_gaussians_stay(scene, source, tmp_path):
+def test_refinement_in_blocks_gains_and_keeps_protected_gaussians(scene, source, tmp_path):
     lowest = float(scene.means[:, 2].kthvalue(len(scene) - 40).values)
     box = Box(min=(-99, -99, lowest), max=(99, 99, 99))
     kept = scene.select(cvtgs.boxes.inside([box], scene.means))

@@ -1,4 +1,4 @@
-"""How much memory a process may still use: machine, control groups, limits of the process."""
+"""Memory that a process may still use: machine, control groups, limits of the process."""
 
 import subprocess
 import sys
@@ -24,7 +24,7 @@ from cvtgs.outofcore.memory import (
 
 
 def machine(root: Path, groups: str, files: dict[str, str]) -> Path:
-    """Write the files of the system under another root."""
+    """Write the system files of a machine under another root."""
     for name, text in {"proc/self/cgroup": groups, **files}.items():
         path = root / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -89,12 +89,12 @@ MACHINES = {
 
 
 @pytest.mark.parametrize("name", MACHINES)
-def test_control_groups(tmp_path: Path, name: str) -> None:
+def test_limits_of_control_groups_are_read(tmp_path: Path, name: str) -> None:
     groups, files, rooms = MACHINES[name]
     assert sorted(control_group_rooms(machine(tmp_path, groups, files))) == rooms
 
 
-def test_the_least_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_smallest_limit_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     memory = SimpleNamespace(available=5000)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
     rooms = [9000]
@@ -107,7 +107,7 @@ def test_the_least_counts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no ulimit")
-def test_limit_of_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_limit_of_the_process_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     resource = pytest.importorskip("resource")
     used = psutil.Process().memory_info().vms
     limits = (used + 500_000_000, resource.RLIM_INFINITY)
@@ -115,7 +115,7 @@ def test_limit_of_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
     assert abs(available_memory() - 500_000_000) < 50_000_000
 
 
-def test_little_memory_gives_blocks_and_no_division_by_zero(tmp_path: Path) -> None:
+def test_little_memory_gives_blocks_without_dividing_by_zero(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     cvtgs.save(cvtgs.synthetic.scene("object", 200, sh_degree=0), path)
     rows = open_rows(path)
@@ -130,7 +130,7 @@ def test_little_memory_gives_blocks_and_no_division_by_zero(tmp_path: Path) -> N
     assert sample_rows(LEAST_BYTES) < sample_rows(ROOMY_BYTES) == sample_rows(1 << 40)
 
 
-def test_the_least_memory_is_read() -> None:
+def test_the_least_memory_is_accepted_and_less_is_refused() -> None:
     assert read_bytes("400MB") == LEAST_BYTES
     with pytest.raises(InvalidArgumentError, match=r"at least 400 MB: .*; found '399MB'"):
         read_bytes("399MB")
@@ -139,7 +139,7 @@ def test_the_least_memory_is_read() -> None:
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="kilobytes of Linux")
 def test_blocks_stay_within_the_least_memory(tmp_path: Path) -> None:
-    """Beside what torch, scipy and the network take: 280 MB here, more in builds for GPUs."""
+    """Not counting torch, scipy and the network, which take 280 MB here and more in GPU builds."""
     path = tmp_path / "a.ply"
     cvtgs.save(cvtgs.synthetic.scene("object", 262_144, sh_degree=3), path)
     program = (
@@ -158,8 +158,8 @@ def test_blocks_stay_within_the_least_memory(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="uses ulimit")
-def test_a_job_under_a_limit_chooses_blocks_by_itself(tmp_path: Path) -> None:
-    """With less than the scene takes at once, and more than the program itself does."""
+def test_a_job_under_a_ulimit_uses_blocks_without_an_option(tmp_path: Path) -> None:
+    """The limit is below the memory for the whole scene and above that for the program itself."""
     path, small = tmp_path / "a.ply", tmp_path / "small.ply"
     cvtgs.save(cvtgs.synthetic.scene("object", 260_000, sh_degree=3), path)
     program = (

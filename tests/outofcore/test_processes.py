@@ -1,4 +1,4 @@
-"""Blocks in processes of this machine: the bits of one process, errors, and how they end."""
+"""Blocks in local processes: the same bits as in one process, errors, and how they end."""
 
 import os
 import signal
@@ -38,7 +38,7 @@ def workers():
 
 
 @pytest.mark.long
-def test_the_same_bits_and_the_same_progress(source, tmp_path, workers):
+def test_workers_give_the_same_bits_and_progress_as_one_process(source, tmp_path, workers):
     events = {}
     for name, more in {"alone": {}, "together": {"workers": workers}}.items():
         seen = events[name] = []
@@ -55,19 +55,19 @@ def test_calls_are_shared_and_results_in_order(workers):
     assert os.getpid() not in {pid for _, pid, _ in found}
 
 
-def test_errors_come_back(workers):
+def test_errors_of_workers_reach_the_caller(workers):
     with pytest.raises(InvalidSceneError, match="0: found none"):
         list(workers(refuse, range(3)))
     assert [number for number, _, _ in workers(numbered, [7])] == [7]
 
 
-def test_a_process_that_is_ended():
+def test_a_worker_that_dies_is_an_error():
     with pytest.raises(RunError, match="most likely for lack of memory"), LocalWorkers(1) as found:
         list(found(die, range(2)))
 
 
 @on_posix
-def test_an_interrupt_ends_what_is_at_work(tmp_path):
+def test_an_interrupt_ends_the_workers(tmp_path):
     def interrupt() -> None:
         while len(list(tmp_path.iterdir())) < 2:
             time.sleep(0.01)
@@ -110,7 +110,7 @@ def test_no_process_is_left_behind_and_the_run_continues(source, tmp_path, sign)
     children = psutil.Process(running.pid).children(recursive=True)
     running.send_signal(signal.Signals[sign])
     running.wait()
-    _, left = psutil.wait_procs(children, timeout=300)  # of processor time they may get little
+    _, left = psutil.wait_procs(children, timeout=300)  # they may get little processor time
     assert len(children) >= 2
     assert not left
     assert not output.exists()
@@ -123,11 +123,11 @@ def test_no_process_is_left_behind_and_the_run_continues(source, tmp_path, sign)
     ("memory", "wanted", "found"),
     [(10**9, None, 1), (10**11, 3, 3), (4 * 10**9, 8, 4), (2**60, None, None)],
 )
-def test_how_many(memory, wanted, found):
+def test_the_number_of_workers_follows_memory_and_cores(memory, wanted, found):
     assert worker_count(memory, wanted) == (found or core_count())
 
 
-def test_at_the_command_line(source, tmp_path, monkeypatch, capsys):
+def test_workers_of_the_command_share_the_memory(source, tmp_path, monkeypatch, capsys):
     plans = []
     true = cvtgs.outofcore.simplify_file
 
@@ -146,10 +146,10 @@ def test_at_the_command_line(source, tmp_path, monkeypatch, capsys):
     assert "In 4 blocks." in capsys.readouterr().out
 
 
-def test_workers_must_be_some(source, tmp_path, capsys):
+def test_zero_workers_are_refused(source, tmp_path, capsys):
     words = ["simplify", str(source), str(tmp_path / "a.ply"), "--rho", "0.1", "--workers", "0"]
     assert main(words) == 1
     assert capsys.readouterr().err == (
-        "cvtgs: error: --workers must be at least 1, and goes with blocks on this machine, not "
-        "with --scheduler; found 0.\n"
+        "cvtgs: error: --workers must be at least 1, and cannot be used with --scheduler; "
+        "found 0.\n"
     )

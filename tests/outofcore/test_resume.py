@@ -31,7 +31,7 @@ def start(source, output):
 
 
 def kill_when(process, found):
-    """Kill a process as soon as something is found; False if it ended before."""
+    """Kill a process as soon as ``found()`` is true; return False if the process ends first."""
     while process.poll() is None:
         if found():
             process.send_signal(signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Two runs with one output: the second is refused, and neither damages what the other writes."""
+"""Two runs with one output: the second is refused, and neither damages the output of the other."""
 
 import json
 import os
@@ -33,7 +33,7 @@ def source(tmp_path):
     return path
 
 
-def test_a_lock_says_who_holds_it_and_leaves_nothing(tmp_path):
+def test_a_lock_names_its_holder_and_leaves_no_file(tmp_path):
     path = tmp_path / "out.ply"
     with (
         output_lock(path),
@@ -59,7 +59,7 @@ def test_a_link_to_an_output_shares_its_lock(tmp_path):
         pass
 
 
-def test_a_holder_that_cannot_be_read_is_another_process(tmp_path):
+def test_an_unreadable_lock_is_reported_as_another_process(tmp_path):
     path = tmp_path / "out.ply"
     for text in ("", "[]", "{}", json.dumps({"process": 3})):
         with output_lock(path):
@@ -105,7 +105,7 @@ def test_a_second_run_is_refused_and_changes_nothing(source, tmp_path):
 
 
 class SortsTwice:
-    """Workers of which each range is sorted by one that is taken for dead, too, before and after.
+    """Workers that also sort each range for a worker taken for dead, once before and once after.
 
     The second one ends when the blocks are at work already, in the same folder.
     """
@@ -126,7 +126,7 @@ class SortsTwice:
 
 
 @pytest.mark.slow
-def test_a_worker_taken_for_dead_changes_nothing(source, tmp_path):
+def test_late_results_of_a_worker_taken_for_dead_are_ignored(source, tmp_path):
     output, whole = tmp_path / "out.ply", tmp_path / "whole.ply"
     options = {"blocks": 3, "range_rows": 1000}
     simplify_file(source, whole, 0.1, **options)
@@ -137,7 +137,7 @@ def test_a_worker_taken_for_dead_changes_nothing(source, tmp_path):
 
 
 def test_a_worker_of_another_job_cannot_write(source, tmp_path):
-    """Its folder is gone when the output is that of another job."""
+    """Its folder is removed once another job writes the same output."""
     calls = []
 
     class Keeps:
@@ -158,7 +158,7 @@ def test_a_worker_of_another_job_cannot_write(source, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("damage", ["missing", "short"])
-def test_files_that_did_not_arrive_are_not_adopted(source, tmp_path, damage):
+def test_missing_and_short_files_of_workers_are_refused(source, tmp_path, damage):
     def lossy(function, items):
         results = [function(item) for item in items]
         if function.func is sort_range:
@@ -166,22 +166,22 @@ def test_files_that_did_not_arrive_are_not_adopted(source, tmp_path, damage):
             path.unlink() if damage == "missing" else os.truncate(path, 40)
         return results
 
-    wanted = "must see the folder" if damage == "missing" else "bytes that were written"
+    wanted = "must see the output folder" if damage == "missing" else "bytes that were written"
     with pytest.raises(RunError, match=wanted):
         simplify_file(source, tmp_path / "out.ply", 0.1, blocks=3, workers=lossy)
     simplify_file(source, tmp_path / "out.ply", 0.1, blocks=3)
     assert len(open_rows(tmp_path / "out.ply").names) > 3
 
 
-def test_a_folder_that_cannot_be_emptied_is_one_sentence(source, tmp_path):
+def test_a_folder_that_cannot_be_emptied_is_an_error(source, tmp_path):
     (tmp_path / ".out.ply.blocks").write_text("a file in its place")
-    with pytest.raises(OutputError, match="must become an empty folder"):
+    with pytest.raises(OutputError, match="must be replaceable by an empty folder"):
         simplify_file(source, tmp_path / "out.ply", 0.1, blocks=3)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the maps of Linux")
 def test_no_file_is_mapped_when_the_folder_is_removed(source, tmp_path, monkeypatch):
-    """Windows does not remove such files."""
+    """Windows does not remove mapped files."""
     seen, remove = [], shutil.rmtree
 
     def look(path, **options):

@@ -69,7 +69,7 @@ def test_invalid_rows_of_the_full_scene_are_left_out():
 
 
 @pytest.mark.slow
-def test_gradients_that_are_not_finite_are_survived(monkeypatch):
+def test_gradients_that_are_not_finite_do_no_harm(monkeypatch):
     full = full_scene()
     module = import_module("cvtgs.refinement.optimize")
     honest, calls = module.relative_loss, []
@@ -109,7 +109,7 @@ def test_other_kinds_of_scenes(kind):
 
 
 @pytest.mark.slow
-def test_antialiased_scenes_are_shown_so():
+def test_antialiased_scenes_are_rendered_antialiased():
     full = full_scene()
     object.__setattr__(full, "comments", ("SplatRenderMode: mip",))
     small = small_scene(full, 0.3)
@@ -146,9 +146,9 @@ def test_infinite_logits():
 
 
 def refined_beside_nothing(*, stray=0, seed=0):
-    """A full scene, what came in, and what 120 short steps make of it.
+    """Return a full scene, a small one, and its refinement by 120 short steps.
 
-    In images of 48 pixels steps of the usual length do not come to rest. Stray Gaussians, black
+    With images of 48 pixels, steps of the usual length do not converge. Stray Gaussians, black
     and nearly opaque, are added where the full scene is empty.
     """
     full = random_scene(1500, degree=0, size=0.1)
@@ -169,7 +169,7 @@ def refined_beside_nothing(*, stray=0, seed=0):
 
 
 def alphas_of(*scenes):
-    """Their alphas in views of the first, and which pixels of it are empty."""
+    """Return their alphas in views of the first scene, and the mask of its empty pixels."""
     views = cvtgs.views.automatic_views(scenes[0], 4, width=48, height=48, seed=3)
     alphas = [cvtgs.render(scene, views).alpha for scene in scenes]
     empty = alphas[0] < 1e-3
@@ -186,7 +186,7 @@ def test_an_empty_background_stays_empty():
 
 @pytest.mark.long
 def test_an_empty_background_stays_nearly_empty():
-    """In the mean of three sets of views; one alone says little about a twentieth."""
+    """The mean of three sets of views: one alone is too noisy for a bound of a twentieth."""
     paint, errors = [], []
     for seed in range(3):
         (wanted, before, after), empty = alphas_of(*refined_beside_nothing(seed=seed))
@@ -198,7 +198,7 @@ def test_an_empty_background_stays_nearly_empty():
 
 @pytest.mark.slow
 def test_random_backgrounds_take_black_paint_from_an_empty_background(monkeypatch):
-    """Over black alone, what is black and opaque costs nothing."""
+    """Over black alone, black opaque Gaussians cost nothing."""
     full, small, refined = refined_beside_nothing(stray=20)
     monkeypatch.setattr(ImageBuffer, "draw_background", lambda self: torch.zeros(3))
     _, _, over_black = refined_beside_nothing(stray=20)

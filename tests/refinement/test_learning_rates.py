@@ -16,7 +16,7 @@ from scenes import random_scene, same_bits
 
 
 def with_one_far_away(scene: GaussianScene, one: GaussianScene) -> GaussianScene:
-    """The same scene, and one Gaussian more with nothing around it."""
+    """Return the scene with one more Gaussian that has nothing around it."""
     tensors = one.with_tensors({"means": one.means + 1e3}, {}).tensors()
     return GaussianScene(
         **{name: torch.cat([values, tensors[name]]) for name, values in scene.tensors().items()}
@@ -27,7 +27,7 @@ def visibility_of(scene: GaussianScene) -> torch.Tensor:
     return ambient_visibility(scene.means, scene.masses, robust_frame(scene.means)).float()
 
 
-def test_what_represents_itself_alone_does_not_move():
+def test_gaussians_that_represent_only_themselves_do_not_move():
     full, one = full_scene(300), full_scene(1, seed=1)
     small = with_one_far_away(full.select(torch.arange(40)), one)
     factors = learning_rate_scales(small, with_one_far_away(full, one))
@@ -35,7 +35,7 @@ def test_what_represents_itself_alone_does_not_move():
     assert float(factors[:-1].median()) > 0.1  # pruned: they represent others, too
 
 
-def test_copies_of_one_gaussian_share_what_it_represents():
+def test_copies_of_a_gaussian_share_its_learning_rate():
     full = full_scene(300)
     twice = full.select(torch.arange(300).repeat(2))
     assert not learning_rate_scales(full, full).any()
@@ -43,13 +43,13 @@ def test_copies_of_one_gaussian_share_what_it_represents():
 
 
 @pytest.mark.parametrize("name", ["means", "log_scales", "logit_opacities", "sh0"])
-def test_what_was_changed_moves_as_it_is_seen(name):
+def test_changed_gaussians_move_in_proportion_to_their_visibility(name):
     full = full_scene(300)
     changed = full.with_tensors({name: full.tensors()[name] + 1e-3}, {})
     torch.testing.assert_close(learning_rate_scales(changed, full), visibility_of(changed))
 
 
-def test_what_cannot_be_drawn_does_not_move():
+def test_gaussians_that_cannot_be_rendered_do_not_move():
     full = random_scene(50)
     means = full.means.clone()
     means[3], means[7] = math.nan, 0.1
@@ -59,7 +59,7 @@ def test_what_cannot_be_drawn_does_not_move():
 
 
 @pytest.mark.slow
-def test_a_refinement_leaves_exact_ones_alone_and_moves_merged_ones():
+def test_refinement_moves_merged_gaussians_but_not_exact_ones():
     full = full_scene(500)
     small = discolored(small_scene(full, 0.5), 0.5)
     exact = (small.means[:, None] == full.means).all(dim=2).any(dim=1)

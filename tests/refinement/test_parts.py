@@ -26,7 +26,7 @@ from scenes import random_scene, same_bits
 
 
 class Clock:
-    """Stands still until it is told to go on."""
+    """A clock that stands still until a test advances it."""
 
     def __init__(self, monkeypatch):
         self.now = 100.0
@@ -58,7 +58,7 @@ def test_steps_are_counted():
         (1.0, [1, 1 / 2, 1 / 4, 0.1]),
     ],
 )
-def test_steps_become_shorter_and_end_at_nothing_if_so_wanted(cooling, wanted):
+def test_steps_become_shorter_and_end_at_zero_if_configured(cooling, wanted):
     limits, config = Limits(None, steps=4), RefineConfig(half_after=2, cooling=cooling)
     found = []
     for _ in range(4):
@@ -68,7 +68,7 @@ def test_steps_become_shorter_and_end_at_nothing_if_so_wanted(cooling, wanted):
     assert found == pytest.approx(wanted)
 
 
-def test_time_ends_before_a_round_that_would_not_fit(clock):
+def test_refinement_stops_before_a_round_that_would_exceed_the_time(clock):
     limits = Limits(10.0, steps=None)
     limits.begin()
     clock.now += 2
@@ -82,7 +82,7 @@ def test_time_ends_before_a_round_that_would_not_fit(clock):
     assert limits.reached() == "time"
 
 
-def test_the_first_step_is_told_though_hardly_any_time_went_by(clock):
+def test_the_first_step_is_reported_however_little_time_has_passed(clock):
     limits = Limits(10.0, steps=None)
     assert limits.done == 0
     limits.begin()
@@ -92,7 +92,7 @@ def test_the_first_step_is_told_though_hardly_any_time_went_by(clock):
     assert (limits.done, limits.share()) == (999, 1.0)
 
 
-def test_own_views_are_endless_and_the_held_out_ones_are_others():
+def test_generated_views_are_endless_and_differ_from_held_out_ones():
     full = full_scene()
     views = generated_views(full, config=quick(heldout=5, batch=4), seed=0)
     assert len(views.heldout) == 5
@@ -117,7 +117,7 @@ def test_the_seed_decides_the_views():
 @pytest.mark.parametrize(
     ("count", "heldout", "number"), [(2, 8, 1), (9, 8, 1), (16, 8, 2), (100, 8, 8), (100, 3, 3)]
 )
-def test_given_cameras_are_divided(count, heldout, number):
+def test_given_cameras_are_split(count, heldout, number):
     cameras = ring(count)
     views = split_views(cameras, config=RefineConfig(heldout=heldout), seed=0)
     training = list(views.training)
@@ -130,7 +130,7 @@ def test_given_cameras_are_divided(count, heldout, number):
     ("width", "height", "size"),
     [(640, 480, (64, 48)), (40, 30, (40, 30)), (6400, 100, (64, 11)), (5, 7, (11, 11))],
 )
-def test_large_images_are_made_smaller_and_tiny_ones_larger(width, height, size):
+def test_large_images_are_scaled_down_and_tiny_ones_up(width, height, size):
     views = split_views(ring(2, width=width, height=height), config=RefineConfig(size=64), seed=0)
     camera = views.heldout[0]
     assert (camera.width, camera.height) == size
@@ -173,7 +173,7 @@ def test_scores_by_hand(monkeypatch):
     assert found.tolist() == pytest.approx([20, 20, 20, 60], abs=1e-4)
 
 
-def test_a_view_far_better_than_the_others_does_not_decide():
+def test_the_psnr_of_a_far_better_view_is_capped():
     assert psnr_cap(torch.tensor([20.0, 24.0, 26.0, 58.0])) == 34
     assert psnr_cap(torch.tensor([55.0, 58.0])) == 60
 
@@ -185,7 +185,7 @@ def three_views(*, endless: bool = False) -> RefineViews:
 
 
 @pytest.mark.parametrize("endless", [False, True])
-def test_images_are_taken_when_needed_and_used_again(endless):
+def test_images_are_rendered_when_needed_and_reused(endless):
     full = full_scene(50)
     config = quick(steps_per_image=3, images=2)
     images = ImageBuffer(full, three_views(endless=endless), config=config, seed=0)
@@ -201,13 +201,13 @@ def test_images_are_taken_when_needed_and_used_again(endless):
     torch.testing.assert_close(drawn[0].rgb.float(), exact.rgb, rtol=1e-3, atol=1e-3)
 
 
-def test_first_steps_have_images_of_their_own_and_all_come_up_in_turn():
+def test_first_steps_get_new_images_and_all_images_recur():
     config = quick(first_images=8, steps_per_image=100)
     views = RefineViews(heldout=(), training=iter(ring(8).singles()), endless=True)
     images = ImageBuffer(full_scene(50), views, config=config, seed=0)
     eyes = [tuple(images.draw().camera.centers[0].tolist()) for _ in range(8 + 64)]
     assert images.rendered == len(set(eyes[:8])) == 8
-    # An image that was just used comes up again after half of the others, and not much later.
+    # An image recurs after at least half of the others were used, and not much later.
     for eye in set(eyes):
         uses = [step for step, other in enumerate(eyes) if other == eye]
         gaps = torch.tensor(uses).diff()
@@ -215,7 +215,7 @@ def test_first_steps_have_images_of_their_own_and_all_come_up_in_turn():
         assert int(gaps.amax()) < 24
 
 
-def test_a_step_sees_some_pixels_of_an_image_as_they_are_in_the_whole():
+def test_the_pixels_of_a_step_equal_those_of_the_whole_image():
     full = full_scene(200)
     cameras = ring(1, width=47, height=33)
     views = RefineViews(heldout=(), training=iter([cameras]), endless=False)
@@ -235,19 +235,19 @@ def test_a_step_sees_some_pixels_of_an_image_as_they_are_in_the_whole():
     assert len(seen) == 9
 
 
-def test_held_out_views_are_thinned_like_images_to_learn_from():
+def test_held_out_views_are_thinned_like_training_images():
     full = full_scene(50)
     views = generated_views(full, config=quick(size=48, stride=2), seed=0)
     assert all(camera.stride == 2 for camera in views.heldout)
     assert {(camera.width, camera.height) for camera in views.heldout} == {(24, 24)}
     assert next(views.training).width == 48
     tiny = generated_views(full, config=quick(size=16, stride=3), seed=0)
-    assert next(tiny.training).width == 33  # as many as SSIM needs of the pixels that are left
+    assert next(tiny.training).width == 33  # so that enough pixels for SSIM are left
     given = split_views(ring(8), config=quick(stride=2), seed=0)
     assert [(camera.width, camera.height) for camera in given.heldout] == [(16, 12)]
 
 
-def test_how_many_images_some_steps_take():
+def test_the_number_of_images_for_a_number_of_steps():
     config = RefineConfig(first_images=32, steps_per_image=8)
     assert [config.new_images(steps) for steps in (0, 5, 32, 39, 40, 48)] == [0, 5, 32, 32, 33, 34]
     config = quick(first_images=3, steps_per_image=3)
@@ -261,7 +261,7 @@ def test_how_many_images_some_steps_take():
     assert taken == [1, 2, 3, 3, 3, 4, 4, 4, 5]
 
 
-def test_images_that_are_there_come_first_and_every_eighth_of_them_is_held_out():
+def test_observed_images_come_first_and_every_eighth_is_held_out():
     full, cameras = full_scene(50), ring(24)
     config = quick(stride=2, first_images=2, steps_per_image=50)
     observed = observe(full, cameras.select(torch.arange(16)).interleaved(2))
@@ -281,7 +281,7 @@ def test_images_that_are_there_come_first_and_every_eighth_of_them_is_held_out()
     torch.testing.assert_close(drawn[0].rgb.float(), exact.rgb, rtol=1e-3, atol=1e-3)
 
 
-def test_no_view_is_looked_for_before_one_is_due(monkeypatch):
+def test_no_view_is_searched_before_it_is_needed(monkeypatch):
     full = full_scene(50)
     observed = observe(full, ring(8))
     monkeypatch.setattr(images_module, "find_view_positions", None)
@@ -301,7 +301,7 @@ def test_images_that_are_never_used_again_are_not_kept():
     assert second.rgb.shape == (1, 24, 32, 3)
 
 
-def test_backgrounds_are_drawn():
+def test_backgrounds_are_random_and_seeded():
     full = full_scene(50)
     buffers = [ImageBuffer(full, three_views(), config=quick(), seed=seed) for seed in (0, 0, 1)]
     first, again, other = (images.draw_background() for images in buffers)
@@ -310,7 +310,7 @@ def test_backgrounds_are_drawn():
     assert 0 <= float(first.amin()) <= float(first.amax()) <= 1
 
 
-def test_a_step_has_the_length_of_the_rate_times_the_scale_of_the_gaussian():
+def test_a_step_is_the_rate_times_the_scale_of_the_gaussian():
     scene = random_scene(4, degree=0)
     scale = torch.tensor([1.0, 1.0, 0.5, 0.0])
     optimizer = SceneOptimizer(scene, Rates(sh0=0.25, means=0.5), learning_rate_scale=scale)
@@ -370,7 +370,7 @@ def test_a_row_with_one_bad_gradient_is_left_alone():
     assert changed_count(scene, found) == 1
 
 
-def test_rows_that_left_what_can_be_drawn_come_back():
+def test_rows_that_leave_the_valid_range_are_restored():
     scene = random_scene(3)
     optimizer = SceneOptimizer(
         scene, Rates(log_scales=1e6), learning_rate_scale=torch.ones(len(scene))
@@ -379,7 +379,7 @@ def test_rows_that_left_what_can_be_drawn_come_back():
     assert same_bits(optimizer.result(), scene)
 
 
-def test_a_loss_that_depends_on_nothing():
+def test_a_loss_without_gradients_changes_nothing():
     scene = random_scene(3)
     optimizer = SceneOptimizer(scene, Rates(), learning_rate_scale=torch.ones(len(scene)))
     optimizer.step(torch.tensor(1.0), factor=1.0)
@@ -390,11 +390,11 @@ def test_a_loss_that_depends_on_nothing():
 @pytest.mark.parametrize(
     "values", [{"size": 8}, {"half_after": 0}, {"rates": {"sh0": -1}}, {"colour": 1}]
 )
-def test_settings_that_cannot_be(values):
+def test_invalid_settings_are_refused(values):
     with pytest.raises(pydantic.ValidationError):
         RefineConfig(**values)
 
 
-def test_cameras_of_one_view_each():
+def test_training_cameras_have_one_view_each():
     views = split_views(ring(4), config=RefineConfig(), seed=1)
     assert all(isinstance(camera, Cameras) and len(camera) == 1 for camera in views.training)

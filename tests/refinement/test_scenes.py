@@ -1,4 +1,4 @@
-"""Refinement as a whole: what is gained, what stays, when it ends, and what it tells."""
+"""Refinement as a whole: gains, unchanged parts, limits, progress and reports."""
 
 import math
 
@@ -17,7 +17,7 @@ WILD = Rates(means=50, quats=5, log_scales=5, logit_opacities=50, sh0=50, shN=50
 
 
 @pytest.mark.slow
-def test_wrong_colours_are_mended():
+def test_wrong_colours_are_corrected():
     full = full_scene()
     refined = refine(discolored(full), full, steps=40, config=quick())
     report = refined.report
@@ -32,7 +32,7 @@ def test_wrong_colours_are_mended():
 
 
 @pytest.mark.slow
-def test_a_simplified_scene_gets_better_on_views_that_nobody_chose():
+def test_a_simplified_scene_improves_on_unseen_views():
     full = full_scene(2000, degree=0)
     small = small_scene(full, 0.02)
     refined = refine(small, full, steps=80, config=quick(size=48))
@@ -61,7 +61,7 @@ def test_count_degree_layout_comments_and_extras_stay():
     torch.testing.assert_close(lengths, torch.ones(len(small)))
 
 
-def test_the_scenes_that_come_in_are_not_changed():
+def test_the_input_scenes_are_not_changed():
     full = full_scene()
     small = small_scene(full)
     copies = [scene.select(torch.arange(len(scene))) for scene in (small, full)]
@@ -71,7 +71,7 @@ def test_the_scenes_that_come_in_are_not_changed():
 
 
 @pytest.mark.slow
-def test_never_worse():
+def test_the_result_is_never_worse_than_the_input():
     """Steps so long that every scene but the first is nonsense."""
     full = full_scene()
     small = small_scene(full)
@@ -100,7 +100,7 @@ def test_the_same_steps_give_the_same_bits_and_another_seed_others():
     assert not same_bits(first.scene, other.scene)
 
 
-def test_without_time_for_a_step_the_scene_comes_back():
+def test_without_time_for_a_step_the_scene_is_returned_unchanged():
     full = full_scene()
     small = small_scene(full)
     refined = refine(small, full, seconds=1e-3, config=quick())
@@ -109,7 +109,7 @@ def test_without_time_for_a_step_the_scene_comes_back():
 
 
 @pytest.mark.slow
-def test_time_ends_it_before_the_steps():
+def test_a_time_limit_stops_before_all_steps():
     patient = quick(patience=10**6)
     full = full_scene()
     report = refine(small_scene(full), full, seconds=1.5, steps=10**9, config=patient).report
@@ -117,13 +117,13 @@ def test_time_ends_it_before_the_steps():
     assert report.cost.seconds < 3
 
 
-def test_steps_of_the_configuration():
+def test_the_configuration_sets_the_steps():
     full = full_scene()
     report = refine(discolored(full), full, config=quick(steps=3)).report
     assert report.steps == 3
 
 
-def test_given_cameras():
+def test_given_cameras_are_used():
     full = full_scene()
     report = refine(discolored(full), full, steps=20, cameras=ring(9), config=quick()).report
     assert (report.heldout, report.images) == (1, 8)
@@ -131,7 +131,7 @@ def test_given_cameras():
 
 
 @pytest.mark.slow
-def test_every_step_is_told_with_the_gain_so_far():
+def test_every_step_is_reported_with_the_gain_so_far():
     events: list[ProgressEvent] = []
     full = full_scene()
     report = refine(discolored(full), full, steps=12, config=quick(), listener=events.append).report
@@ -143,7 +143,7 @@ def test_every_step_is_told_with_the_gain_so_far():
     assert notes[-2] == f"{report.gain:+.2f} dB"
 
 
-def test_a_listener_can_end_it():
+def test_a_listener_can_interrupt_a_refinement():
     def stop(event: ProgressEvent) -> None:
         if event.done == 3:
             raise KeyboardInterrupt
@@ -181,7 +181,7 @@ def test_reports_are_joined():
         ({"device": "abacus"}, DeviceError, "device 'abacus' cannot be used here"),
     ],
 )
-def test_bad_arguments(options, error, text):
+def test_bad_arguments_are_refused(options, error, text):
     full = full_scene(50)
     with pytest.raises(error) as caught:
         refine(full, full, **options)
@@ -189,7 +189,7 @@ def test_bad_arguments(options, error, text):
 
 
 @pytest.mark.parametrize("which", ["simplified", "full"])
-def test_a_scene_without_valid_rows(which):
+def test_a_scene_without_valid_rows_is_refused(which):
     full = full_scene(50)
     bad = full.with_tensors({"means": full.means * math.nan}, {})
     scenes = (bad, full) if which == "simplified" else (full, bad)

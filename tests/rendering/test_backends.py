@@ -63,14 +63,14 @@ def test_backends_name_the_device_that_they_need(name):
     )
 
 
-def test_unknown_backend():
+def test_an_unknown_backend_is_refused():
     with pytest.raises(InvalidArgumentError) as caught:
         choose_backend("cuda", torch.device("cpu"))
     assert str(caught.value) == "backend must be one of auto, torch, numba, gsplat, found 'cuda'."
 
 
 @pytest.mark.slow
-def test_without_numba():
+def test_without_numba_auto_takes_torch_and_numba_is_refused():
     lines = python(
         "import sys\n"
         "sys.modules['numba'] = None\n"
@@ -94,7 +94,7 @@ def test_without_numba():
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="needs a limit of memory")
-def test_without_memory_for_numba_no_other_backend_is_taken():
+def test_without_memory_for_numba_no_other_backend_is_chosen():
     pytest.importorskip("numba")
     lines = python(
         "import re, resource, torch\n"
@@ -111,7 +111,7 @@ def test_without_memory_for_numba_no_other_backend_is_taken():
 
 
 @pytest.mark.slow
-def test_without_a_folder_for_compiled_code():
+def test_kernels_work_without_a_folder_for_compiled_code():
     pytest.importorskip("numba")
     lines = python(
         "from numba.core import caching\n"

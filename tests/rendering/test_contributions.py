@@ -15,7 +15,7 @@ from scenes import random_scene
 
 @pytest.mark.parametrize("backend", ["torch", "numba"])
 def test_contributions_are_alpha_times_transmittance_over_all_pixels(backend):
-    """An image of one Gaussian alone is its alpha; what stands in front dims those behind."""
+    """An image of one Gaussian alone is its alpha; Gaussians in front dim those behind."""
     scene = gaussians(
         [[0.0, 0, 0], [0.2, 0, 1], [-0.5, 0.1, -1]], opacities=[0.6, 0.9, 0.3], scales=[0.2] * 3
     )
@@ -33,7 +33,7 @@ def test_contributions_are_alpha_times_transmittance_over_all_pixels(backend):
 
 
 @pytest.mark.parametrize("backend", ["torch", "numba"])
-def test_they_do_not_depend_on_colours_and_sum_to_the_alpha_of_the_images(backend):
+def test_contributions_ignore_colours_and_sum_to_the_alpha_of_images(backend):
     scene = random_scene(50, degree=1, dtype=torch.float64)
     dark = scene.with_tensors({"sh0": scene.sh0 - 100.0}, {})
     cameras = one_camera(16, 12)
@@ -43,8 +43,8 @@ def test_they_do_not_depend_on_colours_and_sum_to_the_alpha_of_the_images(backen
     assert float(found.sum()) == pytest.approx(float(alpha.sum()), rel=1e-9)
 
 
-def test_what_is_hidden_is_not_visible():
-    """Behind an opaque wall nothing is, however opaque."""
+def test_hidden_gaussians_contribute_nothing():
+    """Nothing behind an opaque wall contributes, however opaque."""
     shield = [[x / 4, y / 4, -1.0] for x in range(-4, 5) for y in range(-4, 5)]
     back = [[x, y, z + 2] for x, y, z in shield]
     cameras = one_camera(16, 16)
@@ -53,7 +53,7 @@ def test_what_is_hidden_is_not_visible():
     assert float(seen[:81].sum()) > 50 * float(seen[81:].sum())
 
 
-def test_it_needs_no_gradients_and_leaves_none():
+def test_contributions_need_no_gradients_and_leave_none():
     scene = random_scene(20)
     with torch.no_grad():
         found = contributions(scene, automatic_views(scene, 1, width=16, height=16))
@@ -62,7 +62,7 @@ def test_it_needs_no_gradients_and_leaves_none():
 
 
 def ball_and_core(count: int = 600) -> cvtgs.GaussianScene:
-    """An opaque shell around as many Gaussians that nobody sees."""
+    """An opaque shell around as many hidden Gaussians."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     core = 0.5 * torch.rand(count, 1, generator=generator) * directions
@@ -70,7 +70,7 @@ def ball_and_core(count: int = 600) -> cvtgs.GaussianScene:
     return gaussians(places, opacities=[0.95] * len(places), scales=[0.08] * len(places))
 
 
-def test_cells_go_where_images_show_something():
+def test_cells_go_to_visible_regions():
     scene = ball_and_core()
     settings = {"merge.network": "false", "cvt.hidden_share": "1", "cvt.area_power": "1"}
     blind = SimplifyConfig.compose(settings=settings)
@@ -159,8 +159,8 @@ def test_painting_a_scene_s_own_colours_gives_its_image(backend):
 
 
 @backends
-def test_products_are_those_of_one_matrix(backend):
-    """The matrix, column by column, from images of single Gaussians that are white."""
+def test_products_equal_those_of_the_weight_matrix(backend):
+    """The columns of the matrix are images of single white Gaussians."""
     scene, camera = random_scene(12, degree=0, dtype=torch.float64), one_camera(20, 18)
     weights = blending_weights(scene, camera, backend=backend)
     columns = []
@@ -180,7 +180,7 @@ def test_products_are_those_of_one_matrix(backend):
     assert torch.allclose(powers[:, 0], contributions(scene, camera), rtol=1e-5, atol=1e-6)
 
 
-def test_what_lies_behind_a_finished_pixel_has_no_weight():
+def test_gaussians_behind_a_finished_pixel_have_no_weight():
     """Memory that was used before must not show through where nothing was written."""
     scene = cvtgs.synthetic.scene("courtyard", 3000, sh_degree=0, seed=0)
     scene = scene.with_tensors({"logit_opacities": scene.logit_opacities + 4.0}, {})

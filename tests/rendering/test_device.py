@@ -14,7 +14,7 @@ from refine_cases import as_dtype, discolored, full_scene, quick, small_scene
 from render_cases import around, dtypes
 from scenes import random_scene
 
-# Tiles are larger on a device, so sums are other ones in the last bits.
+# Tiles are larger on a device, so sums differ in the last bits.
 CLOSE = {
     torch.float32: {"rtol": 1e-4, "atol": 1e-4},
     torch.float64: {"rtol": 1e-11, "atol": 1e-11},
@@ -24,7 +24,7 @@ REFINED = {
     torch.float32: {"rtol": 1e-3, "atol": 1e-3},
     torch.float64: {"rtol": 1e-6, "atol": 1e-6},
 }
-"""Steps add up differences in the last bits."""
+"""Steps accumulate differences in the last bits."""
 
 
 @dtypes

@@ -121,7 +121,7 @@ def test_backends_agree(dtype, comments):
 
 @pytest.mark.slow
 @backends
-def test_same_bits_twice_and_with_any_number_of_threads(backend):
+def test_results_are_deterministic_with_any_number_of_threads(backend):
     scene = random_scene(400, degree=2, size=0.2)
     found = []
     threads = torch.get_num_threads()

@@ -28,7 +28,7 @@ mip = pytest.mark.parametrize("comments", [(), MIP], ids=["plain", "mip"])
 
 @pytest.fixture
 def install(monkeypatch):
-    """Return what takes a function for gsplat's, on a CPU that passes for CUDA, unprobed."""
+    """Return an installer of a function as gsplat's, unprobed, on a CPU posing as CUDA."""
     for kind in (GaussianScene, Cameras):
         on_cpu = partial(lambda move, self, device: move(self, torch.device("cpu")), kind.to)
         monkeypatch.setattr(kind, "to", lambda self, device, _move=on_cpu: _move(self, device))
@@ -45,7 +45,7 @@ def install(monkeypatch):
 
 
 def reason():
-    """Return why gsplat is not taken."""
+    """Return the reason for not choosing gsplat."""
     with pytest.raises(MissingDependencyError) as caught:
         choose_backend("gsplat", CUDA)
     begin, end = (
@@ -76,7 +76,7 @@ def test_without_gsplat(install):
     assert reason() == ("it cannot be imported (import of gsplat halted; None in sys.modules)")
 
 
-def test_a_gsplat_that_fails_late_is_probed_once_and_its_first_line_reported(install):
+def test_a_late_failure_of_gsplat_is_probed_once_and_reported_in_one_line(install):
     calls = []
 
     def rasterization(**_):
@@ -92,7 +92,7 @@ def test_a_gsplat_that_fails_late_is_probed_once_and_its_first_line_reported(ins
 
 
 def without(name):
-    """Return the stand-in as a version of gsplat would be that does not know an argument."""
+    """Return the stand-in for a version of gsplat that lacks an argument."""
 
     def rasterization(**arguments):
         if name in arguments:
@@ -103,7 +103,7 @@ def without(name):
 
 
 @pytest.mark.parametrize("name", ["eps2d", "render_mode", "rasterize_mode", "viewmats"])
-def test_an_argument_that_gsplat_does_not_know(install, name):
+def test_a_gsplat_without_a_needed_argument_is_refused(install, name):
     install(without(name))
     assert f"unexpected keyword argument '{name}'" in reason()
 
@@ -137,7 +137,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_gsplat_that_renders_something_else(install, name):
+def test_a_gsplat_that_renders_something_else_is_refused(install, name):
     install(WRONG[name])
     kind = "gradient" if name == "detached" else "image"
     found = reason()
@@ -146,7 +146,7 @@ def test_a_gsplat_that_renders_something_else(install, name):
 
 
 @pytest.mark.parametrize("center", [0.0, 1.0])
-def test_a_gsplat_that_samples_corners_of_pixels(install, monkeypatch, center):
+def test_a_gsplat_that_samples_corners_of_pixels_is_refused(install, monkeypatch, center):
     monkeypatch.setattr(gsplat_stand_in, "CENTER", center)
     install(gsplat_stand_in.rasterization)
     assert reason().startswith("its image of one Gaussian differs by ")
@@ -277,7 +277,7 @@ def test_the_stand_in_follows_the_oracle(comments):
     torch.testing.assert_close(colors[..., 3].double()[solid], depth[solid], rtol=1e-3, atol=1e-3)
 
 
-def test_the_stand_in_packs():
+def test_the_stand_in_supports_packed_output():
     scene, cameras = random_scene(30, seed=6, spread=3.0), around()
     packed, loose = (documented(scene, cameras, packed=choice) for choice in (True, False))
     assert torch.equal(packed[0], loose[0])
@@ -289,7 +289,7 @@ def test_the_stand_in_packs():
     assert torch.equal(packed[2]["means2d"], loose[2]["means2d"][shown])
 
 
-def test_the_stand_in_refuses():
+def test_the_stand_in_refuses_undocumented_arguments():
     scene, cameras = random_scene(2), straight()
     with pytest.raises(TypeError, match="antialiased"):
         documented(scene, cameras, antialiased=True)

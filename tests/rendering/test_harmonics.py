@@ -21,7 +21,7 @@ def directions(count):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_basis_is_that_of_scipy(degree):
+def test_basis_equals_that_of_scipy(degree):
     ways = directions(50)
     rows = [oracle.sh_basis(way, degree) for way in ways.tolist()]
     wanted = torch.tensor(rows, dtype=torch.float64)
@@ -63,8 +63,8 @@ def test_gradients_of_colors():
 
 @pytest.mark.parametrize("side", [4, 7, 16])
 @pytest.mark.parametrize("size", [0.02, 0.3])
-def test_tiles_are_those_with_a_pixel_that_is_reached(side, size):
-    """Every tile with such a pixel is listed, and at most a few by rounding besides."""
+def test_every_tile_that_a_splat_reaches_is_listed(side, size):
+    """All tiles with a reached pixel are listed, and at most a few others by rounding."""
     scene = random_scene(80, degree=0, dtype=torch.float64, size=size)
     viewmat = torch.eye(4).double()
     viewmat[2, 3] = 3.0

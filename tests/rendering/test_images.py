@@ -71,8 +71,8 @@ def test_opacity_0_and_1(backend):
 
 
 @backends
-def test_light_ends_before_the_gaussian_that_would_take_the_last_of_it(backend):
-    """Of 0.02^2 = 4e-4 a third of the same kind would leave 8e-6, and half of it 13 times 1e-4."""
+def test_blending_stops_before_transmittance_falls_below_the_limit(backend):
+    """0.02^2 = 4e-4 is left, and a third one would leave 8e-6; 0.5^13 is the last above 1e-4."""
     rows = [((0, 0, 2.0 + k), (9.0, 9.0, 9.0), 0.98, (1.0, 1.0, 1.0)) for k in range(4)]
     found = render(scene_of(*rows), straight(), backend=backend).alpha[0, 3, 4].item()
     assert found == pytest.approx(1 - 4e-4)
@@ -109,7 +109,7 @@ def test_any_size_and_number_of_cameras(backend, width, height):
 @backends
 @pytest.mark.parametrize("comments", [(), MIP])
 @pytest.mark.parametrize(("stride", "first"), [(2, (0, 1)), (2, (1, 0)), (3, (2, 1))])
-def test_every_so_manyth_pixel_is_as_in_the_whole_image(backend, comments, stride, first):
+def test_strided_pixels_equal_those_of_the_whole_image(backend, comments, stride, first):
     scene = replace(random_scene(60, degree=1), comments=comments)
     cameras = around()
     whole = render(scene, cameras, backend=backend)
@@ -160,7 +160,7 @@ def test_no_gaussians_and_none_in_view(backend):
         ),
     ],
 )
-def test_wrong_arguments(options, text):
+def test_wrong_arguments_are_refused(options, text):
     with pytest.raises(InvalidArgumentError) as caught:
         render(random_scene(3), around(1), **options)
     assert str(caught.value) == text
@@ -178,10 +178,8 @@ def test_wrong_arguments(options, text):
     ],
 )
 @backends
-def test_wrong_cameras(backend, changes, wish):
+def test_wrong_cameras_are_refused(backend, changes, wish):
     cameras = straight(dtype=torch.float32)
     with pytest.raises(InvalidArgumentError) as caught:
         render(random_scene(3), replace(cameras, **changes), backend=backend)
-    assert str(caught.value) == (
-        f"cameras must have {wish}; 1 of 1 have not, the first is camera 0."
-    )
+    assert str(caught.value) == f"cameras must have {wish}; 1 of 1 do not, the first is camera 0."

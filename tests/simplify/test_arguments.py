@@ -13,7 +13,7 @@ from cvtgs.refinement import RefineConfig
 from scenes import random_scene, same_bits
 
 
-def test_a_preset_by_its_name():
+def test_a_preset_is_chosen_by_its_name():
     fast = Simplifier(preset="fast", device="cpu")
     assert fast.config.preset == "fast"
     scene = random_scene(300)
@@ -37,13 +37,13 @@ def test_one_call_takes_a_scene_or_a_path(tmp_path):
         cvtgs.simplify(tmp_path / "missing.ply", 0.1)
 
 
-def test_a_preset_in_the_place_of_the_checkpoint():
+def test_a_preset_given_as_the_checkpoint_is_an_error():
     with pytest.raises(CheckpointError, match="For the preset, write preset='fast'"):
         Simplifier("fast")
 
 
 @pytest.mark.slow
-def test_paths_are_taken_where_scenes_are(tmp_path):
+def test_paths_are_accepted_wherever_scenes_are(tmp_path):
     scene, path = random_scene(300), tmp_path / "scene.ply"
     scene.save(path)
     simplifier = Simplifier(preset="fast", device="cpu")
@@ -66,7 +66,7 @@ def test_paths_are_taken_where_scenes_are(tmp_path):
     assert cvtgs.budget.find_count(path, psnr=1.0, simplifier=simplifier).psnr >= 1
 
 
-def test_what_is_no_scene_is_named():
+def test_the_error_names_an_argument_that_is_not_a_scene():
     with pytest.raises(InvalidArgumentError, match="scene must be a GaussianScene or the path of"):
         Simplifier(device="cpu").levels(3, [0.1])
     cameras = cvtgs.views.automatic_views(random_scene(30), 1, width=32, height=24)
@@ -83,7 +83,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "method" / "index.md"
 
 @pytest.fixture(scope="module")
 def simplify_by_hand():
-    """What the page defines."""
+    """Return the function that the page defines."""
     (code,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
     names: dict[str, object] = {}
     exec(compile(code, str(PAGE), "exec"), names)

@@ -1,7 +1,7 @@
-"""What must hold on a CUDA device; where there is none, on the pretended one.
+"""Tests on a CUDA device, or on the pretended one if there is none.
 
-Devices round differently, so scenes are compared by what they show. ``nox -s gpu`` runs these on a
-card, together with the tests that need one.
+Devices round differently, so scenes are compared by their images. ``nox -s gpu`` runs these on a
+GPU, together with the tests that need one.
 """
 
 from collections.abc import Iterator
@@ -46,7 +46,7 @@ def assert_looks_like(found: cvtgs.GaussianScene, wanted: cvtgs.GaussianScene) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", ["draft", "fast", "standard", "paper"])
-def test_presets(preset):
+def test_presets_look_the_same_as_on_the_cpu(preset):
     scene = made()
     wanted = Simplifier(config=preset, device="cpu").simplify(scene, 0.1)
     simplifier = Simplifier(config=preset, device=DEVICE)
@@ -66,7 +66,7 @@ def test_levels_and_protected_regions():
     assert same_bits(small.select(torch.arange(25)), scene.select(keep))
 
 
-def test_images_and_gradients():
+def test_images_and_gradients_match_those_of_the_cpu():
     scene = made(100)
     cameras = automatic_views(scene, 1, width=48, height=32)
 
@@ -94,7 +94,7 @@ def test_refinement_gains():
 
 
 @pytest.mark.long
-def test_a_preset_that_refines():
+def test_a_preset_that_refines_works_on_the_device():
     changes = {"steps": 2, "check_every": 2, "size": 32, "heldout": 4, "batch": 4}
     settings = {"preset": "high", "refine": changes, "visibility": {"views": 4, "size": 32}}
     config = SimplifyConfig.from_mapping(settings)

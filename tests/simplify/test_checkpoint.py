@@ -1,4 +1,4 @@
-"""Which network corrects: the shipped ones, a file, or none."""
+"""The network that corrects merged Gaussians: a shipped one, one from a file, or none."""
 
 from pathlib import Path
 
@@ -40,7 +40,7 @@ def lively(tmp_path) -> Path:
 
 
 @each_preset
-def test_a_shipped_name_brings_its_preset(preset):
+def test_a_shipped_checkpoint_selects_its_preset(preset):
     simplifier = Simplifier(preset, device="cpu")
     assert simplifier.config == SimplifyConfig.from_preset(preset)
     assert simplifier.checkpoint.name == preset
@@ -50,7 +50,7 @@ def test_a_shipped_name_brings_its_preset(preset):
 
 
 @each_preset
-def test_auto_is_the_shipped_one_of_the_preset(preset):
+def test_auto_is_the_shipped_checkpoint_of_the_preset(preset):
     scene = random_scene(300)
     by_config, by_name = Simplifier(config=preset, device="cpu"), Simplifier(preset, device="cpu")
     assert by_config.checkpoint.digest == by_name.checkpoint.digest
@@ -87,7 +87,7 @@ def test_a_file_corrects_and_is_named_in_the_report(lively, kind):
     assert len(small) == len(plain) == 30
 
 
-def test_a_file_brings_its_preset_and_a_configuration_wins(tmp_path):
+def test_a_file_selects_its_preset_unless_a_config_is_given(tmp_path):
     path = saved(tmp_path / "a.safetensors", lively_net(torch.float32), "paper")
     assert Simplifier(path).config.preset == "paper"
     assert Simplifier(path, config="standard").config.preset == "standard"
@@ -123,8 +123,8 @@ def test_ratio_of_one_needs_no_network(lively):
     assert "network" not in {stage.stage for stage in report.stages}
 
 
-def test_no_members_leave_the_stage_of_the_network(lively):
-    """Cells of one come out as they went in, beside corrected ones."""
+def test_the_network_does_not_change_single_member_cells(lively):
+    """Cells with one member stay unchanged, while others are corrected."""
     scene = random_scene(40)
     small, report = Simplifier(lively, device="cpu").run(scene, count=35)
     rows = {tuple(mean) for mean in scene.means.tolist()}
@@ -132,7 +132,7 @@ def test_no_members_leave_the_stage_of_the_network(lively):
     assert kept == report.single_member_cells > 0
 
 
-def test_the_reference_is_what_the_network_is_given(lively):
+def test_the_reference_is_the_input_of_the_network(lively):
     """Correcting the reference by hand gives what the stages give."""
     scene, config = random_scene(300), SimplifyConfig()
     net = load_checkpoint(lively).net
@@ -161,7 +161,7 @@ def test_a_reference_needs_fewer_cells_than_gaussians(target):
 
 
 @pytest.mark.parametrize("ckpt", ["net.safetensors", "best", Path("nowhere/net.safetensors")])
-def test_a_checkpoint_that_is_not_there_is_an_error(ckpt):
+def test_a_missing_checkpoint_is_an_error(ckpt):
     with pytest.raises(CheckpointError) as caught:
         Simplifier(ckpt)
     assert str(caught.value) == (
@@ -173,7 +173,10 @@ def test_a_damaged_checkpoint_is_an_error(lively):
     lively.write_bytes(lively.read_bytes()[:-1])
     with pytest.raises(CheckpointError) as caught:
         Simplifier(lively)
-    assert str(caught.value) == f"{lively}: the checkpoint is no safetensors file, or damaged."
+    assert (
+        str(caught.value)
+        == f"{lively}: the checkpoint is not a safetensors file, or it is damaged."
+    )
 
 
 def test_the_command_line_switches_the_network_off(tmp_path):

@@ -1,4 +1,4 @@
-"""How many Gaussians come out: exactly as many as asked for."""
+"""The number of output Gaussians is exactly the requested one."""
 
 import math
 from fractions import Fraction
@@ -50,7 +50,7 @@ def test_count_of_known_ratios(total, rho, wanted):
 
 
 @pytest.mark.parametrize("total", [1, 2, 3, 10, 99, 100, 1000, 123_457, 10**8])
-def test_count_is_the_ceiling_of_the_decimal_that_was_written(total):
+def test_the_count_is_the_ceiling_of_the_decimal_as_written(total):
     for hundredths in range(1, 101):
         wanted = math.ceil(Fraction(hundredths, 100) * total)
         assert target_count(total, float(f"{hundredths / 100:.2f}")) == wanted
@@ -87,7 +87,7 @@ def test_ratio_of_one_is_the_identity(preset):
 
 
 @each_preset
-def test_more_than_the_survivors_of_the_filter(preset):
+def test_a_count_above_the_survivors_of_the_filter_is_met(preset):
     """All but ten are faint; a count of 60 lets the heaviest of the faint back in."""
     scene = random_scene(100)
     logits = torch.full((100,), -6.0)
@@ -189,14 +189,14 @@ def test_counts_out_of_range_are_errors(count):
         ({"rho": 0.5, "max_count": 2}, "rho and max_count"),
     ],
 )
-def test_several_or_none_are_errors(wish, found):
+def test_exactly_one_of_rho_count_and_max_count_is_required(wish, found):
     with pytest.raises(InvalidArgumentError) as caught:
         simplifier("standard").simplify(random_scene(5), **wish)
     assert str(caught.value) == f"give one of rho, count and max_count, found {found}."
 
 
 @pytest.mark.parametrize(("most", "kept"), [(1, 1), (4, 4), (5, 5), (500, 5)])
-def test_a_scene_below_the_most_stays_as_it_is(most, kept):
+def test_a_scene_below_max_count_is_unchanged(most, kept):
     scene = random_scene(5)
     small = simplifier("standard").simplify(scene, max_count=most)
     assert len(small) == kept
@@ -204,7 +204,7 @@ def test_a_scene_below_the_most_stays_as_it_is(most, kept):
 
 
 @pytest.mark.parametrize("most", [0, 2.0, True])
-def test_a_most_that_is_no_count_is_an_error(most):
+def test_an_invalid_max_count_is_an_error(most):
     with pytest.raises(InvalidArgumentError, match="max_count must be a whole number above 0"):
         simplifier("standard").simplify(random_scene(5), max_count=most)
 
@@ -213,12 +213,12 @@ def test_a_most_that_is_no_count_is_an_error(most):
     ("text", "ratio"),
     [("5%", 0.05), ("0.7 %", 0.007), ("7%", 0.07), ("0.1", 0.1), ("1e-3", 0.001), (".5", 0.5)],
 )
-def test_ratios_as_they_are_written(text, ratio):
+def test_ratios_are_parsed(text, ratio):
     assert read_ratio(text) == ratio
 
 
 @pytest.mark.parametrize("text", ["", "%", "5 percent", "5%%", "1,5"])
-def test_no_ratios(text):
+def test_invalid_ratios_are_refused(text):
     with pytest.raises(InvalidArgumentError, match=r"a ratio must be a number such as 0\.05 or 5%"):
         read_ratio(text)
 
@@ -227,11 +227,11 @@ def test_no_ratios(text):
     ("text", "count"),
     [("50000", 50_000), ("50_000", 50_000), ("50k", 50_000), ("1.5M", 1_500_000), ("2 K", 2000)],
 )
-def test_counts_as_they_are_written(text, count):
+def test_counts_are_parsed(text, count):
     assert read_count(text) == count
 
 
 @pytest.mark.parametrize("text", ["", "k", "0", "-5", "1.5", "0.1234k", "5g", "1e3"])
-def test_no_counts(text):
+def test_invalid_counts_are_refused(text):
     with pytest.raises(InvalidArgumentError, match="a count must be a whole number above 0"):
         read_count(text)

@@ -1,4 +1,4 @@
-"""Simplification on a pretended CUDA device: no mixing of devices, the CPU's bits, few waits."""
+"""Simplification on a pretended CUDA device: devices are not mixed, the CPU's bits, few waits."""
 
 import pytest
 import torch
@@ -13,11 +13,11 @@ from scenes import random_scene, same_bits
 
 PRESETS = ["draft", "fast", "standard", "paper"]
 WAITS, COPIES = 14, 9
-"""Most waits of the host, and copies, in one simplification.
+"""Largest numbers of host waits and of copies in one simplification.
 
-Of the copies 1 is the network, 2 are the tessellation (points to the host, labels back), 4 the
-allocation and 2 the neighbours of merged Gaussians; a scene that is not on the device is 6 more.
-Neither grows with the scene, but for what is computed in chunks, which are large on a device.
+One copy is for the network, 2 are for the tessellation (points to the host, labels back), 4 for the
+allocation and 2 for the neighbours of merged Gaussians; a scene outside the device adds 6. Neither
+number grows with the scene, except where work is done in chunks, which are large on a device.
 """
 
 
@@ -29,7 +29,7 @@ def on_device(scene):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_scene_on_a_device(preset, dtype):
+def test_a_device_gives_the_bits_of_the_cpu_with_few_waits(preset, dtype):
     scene = random_scene(600, degree=1, dtype=dtype)
     wanted = Simplifier(config=preset, device="cpu").simplify(scene, 0.1)
     with pretended_cuda() as traffic:
@@ -42,7 +42,7 @@ def test_a_scene_on_a_device(preset, dtype):
     assert report.backend == "scipy"
 
 
-def test_a_larger_scene_waits_no_more():
+def test_a_larger_scene_causes_no_more_waits():
     scene = random_scene(6000, degree=0, size=0.02)
     with pretended_cuda() as traffic:
         there = scene.to("cuda")
@@ -52,7 +52,7 @@ def test_a_larger_scene_waits_no_more():
     assert traffic.copies.total() <= COPIES, traffic.copies
 
 
-def test_auto_takes_the_device_for_a_scene_of_the_cpu():
+def test_auto_uses_the_device_for_a_scene_on_the_cpu():
     scene = random_scene(300)
     wanted = Simplifier(device="cpu").simplify(scene, 0.1)
     with pretended_cuda() as traffic:
@@ -61,7 +61,7 @@ def test_auto_takes_the_device_for_a_scene_of_the_cpu():
 
 
 @pytest.mark.slow
-def test_without_enough_memory_auto_takes_the_cpu():
+def test_auto_falls_back_to_the_cpu_if_memory_runs_out():
     scene = random_scene(300)
     prepared = Simplifier(device="cpu").prepare(scene)
     with pretended_cuda(largest=1000):
@@ -75,17 +75,17 @@ def test_without_enough_memory_auto_takes_the_cpu():
         assert level.report.device == "cpu"
 
 
-def test_a_named_device_without_enough_memory():
+def test_a_named_device_without_enough_memory_is_an_error():
     with pretended_cuda(largest=1000), pytest.raises(OutOfMemoryError) as caught:
         Simplifier(device="cuda").simplify(random_scene(300), 0.1)
     assert str(caught.value) == (
-        "simplifying 300 Gaussians needs more memory than cuda:0 has, in short chunks too; free "
-        "some there, or compute with device='cpu' (--device cpu)."
+        "simplifying 300 Gaussians needs more memory than cuda:0 has, even in short chunks; free "
+        "some of it, or compute with device='cpu' (--device cpu)."
     )
 
 
 @pytest.mark.long
-def test_short_chunks_where_long_ones_do_not_fit(monkeypatch):
+def test_short_chunks_are_used_where_long_ones_do_not_fit(monkeypatch):
     for name in ("mergenet.apply", "cells.merge"):
         monkeypatch.setattr(f"cvtgs.{name}.CHUNK_MEMBERS", 64)
     monkeypatch.setattr("cvtgs.analysis.visibility.HALF_GRID", 8)
@@ -101,7 +101,7 @@ def test_short_chunks_where_long_ones_do_not_fit(monkeypatch):
 
 
 @pytest.mark.parametrize("preset", ["standard", "paper"])
-def test_levels(preset):
+def test_levels_on_a_device(preset):
     scene, rhos = random_scene(2000, degree=1), [0.2, 0.04, 0.01]
     wanted = Simplifier(config=preset, device="cpu").levels(scene, rhos)
     with pretended_cuda():
@@ -112,7 +112,7 @@ def test_levels(preset):
 
 
 @pytest.mark.parametrize("preset", ["draft", "standard"])
-def test_protected_regions(preset):
+def test_protected_regions_on_a_device(preset):
     scene = random_scene(500, degree=1)
     keep = torch.arange(500) % 25 == 0
     wanted = Simplifier(config=preset, device="cpu").simplify(scene, 0.1, keep=keep)
@@ -135,7 +135,7 @@ def test_nearest_sites_of_points_on_a_device():
             assert torch.equal(one.cpu(), same)
 
 
-def test_ties_on_a_curve_of_a_device():
+def test_ties_on_a_curve_on_a_device():
     generator = torch.Generator().manual_seed(0)
     points = torch.randint(0, 3, (400, 3), generator=generator).double()  # 27 places
     masses = torch.randint(0, 5, (400,), generator=generator).float()

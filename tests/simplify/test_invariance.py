@@ -1,12 +1,12 @@
-"""What must not change the result: order, place and unit; and the same bits every time.
+"""The result does not depend on order, place or unit, and has the same bits in every run.
 
-Scenes are float64 here, so that a moved scene is the same scene but for rounding. Where exact
-equality is not to be expected: the Morton curve that the seeds follow, the median that the
-frame is centred on, and the light that MergeNet sees know the axes. A turned scene therefore has
-other seeds and other, equally good, cells. So turns are tested with every seed certain (few
-Gaussians hold nearly all of the mass), where the curve no longer matters, by quarter turns where
-the median matters, and with a network only where all light is even; and for any turn and any
-scene with given cells and light, in test_cells_moments.py and test_mergenet_correct.py.
+Scenes are float64 here, so that a moved scene is the same scene up to rounding. Exact equality is
+not expected of rotated scenes in general: the Morton curve that the seeds follow, the median that
+the frame is centred on, and the light that MergeNet sees depend on the axes, so a rotated scene has
+other seeds and other, equally good, cells. Rotations are therefore tested with every seed certain
+(few Gaussians hold nearly all of the mass), where the curve does not matter; by quarter turns where
+the median matters; and with a network only where all light is even. Other scenes are rotated with
+given cells and light in cells/test_moments.py and mergenet/test_correct.py.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])
 HALF = math.sqrt(0.5)
 
 SEEDS = 62
-"""Cells of the tessellation of which 31 are left, a tenth of 301 Gaussians."""
+"""Number of cells in the tessellation; 31 of them remain, a tenth of 301 Gaussians."""
 
 
 def simplified(
@@ -37,7 +37,7 @@ def simplified(
 
 @pytest.fixture(params=[None, "auto"], ids=["moments", "network"])
 def ckpt(request, monkeypatch) -> str | None:
-    """No network, or the shipped one in a scene where everything is seen freely."""
+    """Return None for no network, or the shipped one with full ambient visibility everywhere."""
     if request.param is not None:
         even = lambda means, masses, frame: torch.ones(len(means), dtype=torch.float64)  # noqa: E731
         analysis = import_module("cvtgs.analysis.analyze")  # a function has the module's name
@@ -64,7 +64,7 @@ def dominated_scene(heavy: int, total: int, degree: int) -> GaussianScene:
 
 @each_preset
 @pytest.mark.parametrize("rho", [0.5, 0.1, 0.01])
-def test_permutation(preset, rho):
+def test_the_order_of_rows_does_not_matter(preset, rho):
     scene = random_scene(900, degree=2, dtype=torch.float64)
     shuffle = torch.randperm(900, generator=torch.Generator().manual_seed(0))
     assert_same_gaussians(
@@ -72,7 +72,7 @@ def test_permutation(preset, rho):
     )
 
 
-def test_permutation_in_float32():
+def test_the_order_of_rows_does_not_matter_in_float32():
     scene = random_scene(900, degree=1)
     shuffle = torch.randperm(900, generator=torch.Generator().manual_seed(0))
     assert_same_gaussians(
@@ -82,7 +82,7 @@ def test_permutation_in_float32():
 
 @each_preset
 @pytest.mark.parametrize("scale", [1e-3, 0.5, 7.0, 1e3])
-def test_unit_of_length(preset, scale):
+def test_the_unit_of_length_does_not_matter(preset, scale):
     scene = random_scene(500, dtype=torch.float64)
     assert_same_gaussians(
         simplified(moved(scene, scale=scale), preset, 0.1),
@@ -92,7 +92,7 @@ def test_unit_of_length(preset, scale):
 
 @each_preset
 @pytest.mark.parametrize("shift", [(1.0, -2.0, 3.0), (1e4, 1e4, -1e4)])
-def test_shift(preset, shift):
+def test_a_shift_does_not_matter(preset, shift):
     scene = random_scene(500, dtype=torch.float64)
     assert_same_gaussians(
         simplified(moved(scene, shift=shift), preset, 0.1),
@@ -116,7 +116,7 @@ def test_turns_that_keep_the_axes(quat, degree, ckpt):
 
 @pytest.mark.parametrize("quat", [(0.9, 0.1, -0.3, 0.2), (0.1, 0.7, 0.2, -0.6)])
 def test_any_turn_without_colour_and_contraction(quat, ckpt):
-    """Colour and contraction are measured in robust radii about the median, which knows axes."""
+    """Colour and contraction use robust radii about the median, which depends on the axes."""
     config = SimplifyConfig.from_mapping({"cvt": {"color": 0.0}, "effects": {"unbounded": "off"}})
     scene = dominated_scene(SEEDS, 301, 3)
     motion = {"quat": quat, "shift": (1.0, 2.0, 3.0), "scale": 10.0}
@@ -139,13 +139,13 @@ def test_any_turn_gives_an_equally_good_result(preset):
 
 
 @each_preset
-def test_same_bits_twice(preset):
+def test_two_runs_give_the_same_bits(preset):
     scene = random_scene(800, degree=2)
     first, second = simplified(scene, preset, 0.1), simplified(scene, preset, 0.1)
     assert same_bits(first, second)
 
 
-def test_the_seed_matters_where_seeds_are_drawn():
+def test_the_seed_matters_only_where_seeds_are_random():
     scene = random_scene(800)
     for preset, equal in (("standard", True), ("paper", False)):
         configs = (SimplifyConfig.from_mapping({"preset": preset, "seed": seed}) for seed in (0, 1))
@@ -175,7 +175,7 @@ for preset in ("standard", "paper"):
 
 
 @pytest.mark.slow
-def test_same_bits_in_other_processes():
+def test_other_processes_give_the_same_bits():
     here = os.path.dirname(__file__)  # noqa: PTH120 (an entry of a search path)
     found = []
     for hash_seed in ("1", "2"):

@@ -1,4 +1,4 @@
-"""Protected regions: kept bit for bit, counted, and an error where that cannot be."""
+"""Protected regions: kept bit for bit, counted, and an error if they do not fit the target."""
 
 import json
 
@@ -22,7 +22,7 @@ def scene():
 
 @EACH
 @pytest.mark.parametrize("kept", [0, 1, 39, 40])
-def test_kept_rows_come_first_and_are_the_same_bits(scene, preset, kept):
+def test_kept_rows_come_first_with_unchanged_bits(scene, preset, kept):
     keep = torch.zeros(400, dtype=torch.bool)
     keep[torch.randperm(400, generator=torch.Generator().manual_seed(1))[:kept]] = True
     small, report = Simplifier(config=preset, device="cpu").run(scene, count=41, keep=keep)
@@ -31,19 +31,19 @@ def test_kept_rows_come_first_and_are_the_same_bits(scene, preset, kept):
     assert same_bits(small.select(torch.arange(kept)), scene.select(keep))
 
 
-def test_without_kept_rows_the_result_is_that_without_a_mask(scene):
+def test_an_empty_mask_gives_the_same_bits_as_no_mask(scene):
     simplifier = Simplifier(device="cpu")
     nothing = torch.zeros(400, dtype=torch.bool)
     assert same_bits(simplifier.simplify(scene, 0.1, keep=nothing), simplifier.simplify(scene, 0.1))
 
 
-def test_the_rest_must_get_something(scene):
+def test_the_target_must_exceed_the_kept_rows(scene):
     keep = torch.arange(400) < 40
-    with pytest.raises(InvalidArgumentError, match=r"so at least 41 of the 400 must be left"):
+    with pytest.raises(InvalidArgumentError, match=r"so the target must be at least 41 of the 400"):
         Simplifier(device="cpu").simplify(scene, 0.1, keep=keep)
 
 
-def test_all_rows_stay_all_rows(scene):
+def test_a_ratio_of_one_keeps_all_rows_and_kept_ones_come_first(scene):
     keep = torch.arange(400) >= 390
     small = Simplifier(device="cpu").simplify(scene, 1.0, keep=keep)
     assert same_bits(small.select(torch.arange(10)), scene.select(keep))
@@ -75,7 +75,7 @@ def test_refinement_leaves_kept_rows_alone(scene):
     assert same_bits(small.select(torch.arange(30)), scene.select(keep))
 
 
-def test_boxes_have_faces():
+def test_boxes_include_their_faces():
     box = Box(min=(0, 0, 0), max=(1, 1, 1))
     points = torch.tensor([[0.0, 0, 0], [1, 1, 1], [1.0001, 0, 0], [-1, 0, 0]])
     assert inside([box], points).tolist() == [True, True, False, False]
@@ -85,7 +85,7 @@ def test_boxes_have_faces():
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("nothing", "must be JSON"),
+        ("nothing", "must be valid JSON"),
         ("[]", "at least one box"),
         ('{"min": [0, 0, 0]}', "max: field required"),
         ('{"min": [0, 0, 2], "max": [1, 1, 1]}', "min must not be above max"),
@@ -102,7 +102,7 @@ def test_bad_box_files_say_what_is_wrong(tmp_path, text, problem):
         read_boxes(tmp_path / "none.json")
 
 
-def test_command(scene, tmp_path):
+def test_the_command_keeps_the_gaussians_in_boxes(scene, tmp_path):
     cvtgs.save(scene, tmp_path / "in.ply")
     box = {"min": [0.5, -9, -9], "max": [9, 9, 9]}
     (tmp_path / "box.json").write_text(json.dumps([box, box]))

@@ -1,4 +1,4 @@
-"""What comes out of a simplification, what is reported, and what is refused."""
+"""The output of a simplification, its report, and arguments that are refused."""
 
 import math
 
@@ -58,7 +58,7 @@ def test_infinite_opacities_are_valid_input():
 
 
 def test_mass_of_haze_is_conserved_without_inflation_and_network():
-    """In transparent cells opacity is depth, and depth times area adds up."""
+    """In transparent cells, opacity equals optical depth, and depth times area is additive."""
     config = SimplifyConfig.from_mapping(
         {"filter": {"max_mass_share": 0.0}, "merge": {"inflation": 0.0}}
     )
@@ -146,7 +146,7 @@ def test_devices_that_do_not_exist_are_errors(device):
     assert "\n" not in str(caught.value)
 
 
-def test_cuda_that_is_not_there_is_an_error():
+def test_missing_cuda_is_an_error():
     if torch.cuda.is_available():
         pytest.skip("there is a CUDA device")
     with pytest.raises(DeviceError, match="device 'cuda' cannot be used here: "):
@@ -155,7 +155,7 @@ def test_cuda_that_is_not_there_is_an_error():
 
 @pytest.mark.cuda
 @each_preset
-def test_cuda_gives_a_standard_scene_where_the_input_was(preset):
+def test_cuda_gives_a_standard_scene_on_the_device_of_the_input(preset):
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
     scene = random_scene(2000, degree=2)

@@ -1,4 +1,4 @@
-"""One look at a scene, any number of sizes: the bits of single runs, and nothing done twice."""
+"""A scene is prepared once for any number of sizes: the bits of single runs, no repeated work."""
 
 import pytest
 import torch
@@ -24,7 +24,7 @@ def stages(report):
 @pytest.mark.parametrize(
     "preset", ["standard", "draft", "paper", pytest.param("high", marks=pytest.mark.long)]
 )
-def test_every_run_gives_the_bits_of_a_run_of_its_own(scene, preset):
+def test_every_run_gives_the_bits_of_a_separate_run(scene, preset):
     quick = {"visibility.views": 4, "visibility.size": 32, "refine.steps": 2, "refine.size": 32}
     settings = {key: str(value) for key, value in quick.items()} if preset == "high" else {}
     config = SimplifyConfig.compose(preset=preset, settings=settings)
@@ -34,7 +34,7 @@ def test_every_run_gives_the_bits_of_a_run_of_its_own(scene, preset):
         assert same_bits(prepared.run(count=count).scene, simplifier.simplify(scene, count=count))
 
 
-def test_what_is_shared_is_done_in_the_first_run_only(scene):
+def test_shared_stages_run_only_the_first_time(scene):
     simplifier = Simplifier(config=SimplifyConfig(visibility={"views": 2, "size": 16}))
     prepared = simplifier.prepare(scene)
     first, second, third = (stages(prepared.run(0.1).report) for _ in range(3))
@@ -43,7 +43,7 @@ def test_what_is_shared_is_done_in_the_first_run_only(scene):
     assert third == first - SHARED
 
 
-def test_rows_are_ordered_once_and_again_where_the_filter_leaves_others(scene, monkeypatch):
+def test_rows_are_ordered_again_only_if_the_filter_keeps_other_ones(scene, monkeypatch):
     config = SimplifyConfig(filter={"min_opacity": 0.99, "max_mass_share": 1.0})
     simplifier = Simplifier(config=config, ckpt=None, device="cpu")
     prepared, calls = simplifier.prepare(scene), []
@@ -78,7 +78,7 @@ def test_neighbours_of_single_gaussians_are_found_once(scene, monkeypatch):
     assert whole == [1, 1, 0, 0]
 
 
-def test_a_warm_scene_has_what_runs_share(scene, monkeypatch):
+def test_warming_up_does_the_work_that_runs_share(scene, monkeypatch):
     simplifier = Simplifier(preset="draft", device="cpu")
     prepared, wanted = simplifier.prepare(scene), simplifier.simplify(scene, 0.5)
     prepared.warm_up(0.5)
@@ -104,7 +104,7 @@ def test_protected_gaussians_may_differ_from_run_to_run(scene):
         assert torch.equal(small.means[0], scene.means[row])
 
 
-def test_all_rows_and_invalid_ones():
+def test_invalid_rows_are_warned_about_once_and_counted_in_every_run():
     scene = random_scene(50)
     means = scene.means.clone()
     means[7] = torch.inf

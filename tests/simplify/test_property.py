@@ -1,4 +1,4 @@
-"""Property test: small scenes of nasty values come out finite, standard and exactly as many."""
+"""Property test: small scenes of nasty values give finite, standard output of the exact count."""
 
 import warnings
 
@@ -72,7 +72,7 @@ each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])
     database=None,
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )
-def test_nasty_scenes(preset, scene, share):
+def test_nasty_scenes_give_standard_output_of_the_exact_count(preset, scene, share):
     valid = int(valid_mask(scene).sum())
     count = max(1, int(share * len(scene)))
     simplifier = Simplifier(config=preset, device="cpu")
@@ -89,7 +89,7 @@ def test_nasty_scenes(preset, scene, share):
     if count < valid:
         assert_standard(small)
         assert report.mass_out >= 0
-    else:  # the scene's own valid rows, as they are but for infinite opacities
+    else:  # the valid rows of the scene, unchanged except for infinite opacities
         assert torch.equal(small.means, scene.means[valid_mask(scene)])
         assert bool(small.logit_opacities.isfinite().all())
 
@@ -115,7 +115,7 @@ def test_flyaways_neither_crash_nor_become_a_giant_blob(far, size, dtype, preset
 
 @each_preset
 @pytest.mark.parametrize("exponent", [-400.0, -40.0, 20.0, 88.0])
-def test_extreme_scales(exponent, preset):
+def test_extreme_scales_give_standard_output(exponent, preset):
     scene = random_scene(100)
     scene = scene.with_tensors({"log_scales": scene.log_scales.clamp(-0.1, 0.1) + exponent}, {})
     small, report = Simplifier(config=preset, device="cpu").run(scene, 0.2)

@@ -62,7 +62,7 @@ def test_counts_are_exact_and_the_finest_level_is_the_scene(
     assert names_in(tmp_path) == ["out", "scene.ply"]
 
 
-def test_every_level_paints_as_much_as_that_of_one_piece(tmp_path: Path) -> None:
+def test_every_level_has_the_mass_of_a_run_in_one_piece(tmp_path: Path) -> None:
     room = make("room", 4000, sh_degree=0, seed=3)
     save(room, tmp_path / "room.ply")
     stream(tmp_path / "room.ply", tmp_path / "out")
@@ -99,11 +99,11 @@ def test_workers_give_the_same_bytes(tmp_path: Path, source: Path) -> None:
 
 
 class StoppedError(RuntimeError):
-    """What ends a run in the middle."""
+    """Ends a run before it is complete."""
 
 
 def until(most: int, done: list[int]) -> Callable[..., Iterator[Any]]:
-    """Return workers that fail when so many blocks are written."""
+    """Return workers that fail once ``most`` blocks are written."""
 
     def work(function: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[Any]:
         for item in items:
@@ -141,13 +141,13 @@ def test_a_damaged_part_is_written_again(tmp_path: Path, source: Path) -> None:
     assert len(load(tmp_path / "out")) == 4000
 
 
-def test_another_choice_starts_anew(tmp_path: Path, source: Path) -> None:
+def test_other_options_start_the_stream_over(tmp_path: Path, source: Path) -> None:
     with pytest.raises(StoppedError):
         stream(source, tmp_path / "out", workers=until(2, []))
     assert stream(source, tmp_path / "out", chunk_gaussians=200).resumed_blocks == 0
 
 
-def test_a_stream_is_replaced_only_if_asked(tmp_path: Path, source: Path) -> None:
+def test_a_stream_is_replaced_only_with_overwrite(tmp_path: Path, source: Path) -> None:
     out = tmp_path / "out"
     stream(source, out)
     with pytest.raises(OutputExistsError, match=r"lod-meta.json: the output must not exist yet"):
@@ -167,7 +167,7 @@ def test_invalid_rows_are_counted(tmp_path: Path, scene: GaussianScene) -> None:
     assert [level.gaussians for level in report.levels] == [3998, 1000, 200, 50]
 
 
-def test_axes_and_degree(tmp_path: Path) -> None:
+def test_axes_and_sh_degree_are_applied(tmp_path: Path) -> None:
     save(make("courtyard", 1000, sh_degree=1, seed=3), tmp_path / "scene.ply")
     stream(tmp_path / "scene.ply", tmp_path / "a")
     stream(tmp_path / "scene.ply", tmp_path / "b", axes=("rdf", "rub"), sh_degree=0)
@@ -177,14 +177,14 @@ def test_axes_and_degree(tmp_path: Path) -> None:
     assert float(torch.cdist(flipped, turned.means).amin(dim=1).max()) < 0.05
 
 
-def test_wrong_sizes(tmp_path: Path, source: Path) -> None:
+def test_levels_of_equal_size_are_refused(tmp_path: Path, source: Path) -> None:
     with pytest.raises(InvalidArgumentError, match="needs levels of different sizes"):
         stream_file(source, tmp_path / "out", [0.1, 0.1], kind="sog", simplifier=FAST)
     assert names_in(tmp_path) == ["scene.ply"]
 
 
 def test_blocks_share_one_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where a run ends after all blocks, and another one takes them over."""
+    """Even if a run ends after all blocks and another one resumes it."""
     near, far = make("object", 3000, sh_degree=0, seed=1), make("object", 200, sh_degree=0, seed=2)
     directions = torch.nn.functional.normalize(far.means - far.means.mean(dim=0))
     radius = float(near.means.norm(dim=1).quantile(0.7))

@@ -1,7 +1,7 @@
-"""Streams and glTF in the viewers that others wrote: PlayCanvas' engine and CesiumJS.
+"""Streams and glTF in third-party viewers: the PlayCanvas engine and CesiumJS.
 
-``nox -s viewers`` brings both from npm and runs this in headless Chromium with software WebGL. A
-page of ours shows a file and sends pictures until one is like that of our renderer.
+``nox -s viewers`` installs both from npm and runs this in headless Chromium with software WebGL. A
+test page shows a file and sends pictures until one matches the picture of our renderer.
 """
 
 import base64
@@ -33,8 +33,8 @@ WIDTH, HEIGHT, FIELD_OF_VIEW = 640, 480, 50.0
 EYE, TARGET = (1.5, -1.2, -3.6), (0.0, 0.0, 0.0)
 SECONDS = 120.0
 MOST = 2.0
-"""Mean difference from our picture, of 255 levels: viewers cut Gaussians off elsewhere, and sort
-and blend them with fewer bits."""
+"""Largest mean difference from our picture, in levels of 255: viewers cut Gaussians off at other
+radii, and sort and blend them with fewer bits."""
 
 pytestmark = [
     needs_browser,
@@ -47,7 +47,7 @@ pytestmark = [
 
 
 class Pictured(NamedTuple):
-    """A scene and how our renderer shows it."""
+    """A scene and its picture by our renderer."""
 
     scene: cvtgs.GaussianScene
     picture: np.ndarray
@@ -65,7 +65,7 @@ def pictured() -> Pictured:
 
 
 class Served:
-    """A server of a folder, of the pages and of the modules, and what the pages sent to it."""
+    """A server for a folder, the pages and the modules; it stores the data that the pages send."""
 
     def __init__(self, folder: Path) -> None:
         self.pictures: list[np.ndarray] = []
@@ -111,7 +111,7 @@ def served(tmp_path: Path) -> Iterator[Served]:
 def least_difference(
     served: Served, folder: Path, wanted: np.ndarray, page: str, **query: str
 ) -> float:
-    """Show a page until its picture is like ours; return the least mean difference seen."""
+    """Show a page until its picture matches ours; return the least mean difference seen."""
     camera = ",".join(map(str, (*EYE, *TARGET)))
     words = urlencode({"camera": camera, "fov": FIELD_OF_VIEW} | query)
     address = f"{served.address}/pages/{page}?{words}"
@@ -134,7 +134,7 @@ def least_difference(
 
 @pytest.mark.parametrize("blocks", [1, 4])
 @pytest.mark.parametrize(("kind", "page"), [("sog", "playcanvas"), ("3dtiles", "cesium")])
-def test_streams(
+def test_streams_look_the_same_in_other_viewers(
     tmp_path: Path, served: Served, pictured: Pictured, kind: str, page: str, blocks: int
 ) -> None:
     scene, wanted = pictured
@@ -150,14 +150,14 @@ def test_streams(
     assert least_difference(served, tmp_path, wanted, f"{page}.html", url=url, **words) < MOST
 
 
-def test_gltf_in_playcanvas(tmp_path: Path, served: Served, pictured: Pictured) -> None:
+def test_gltf_looks_right_in_playcanvas(tmp_path: Path, served: Served, pictured: Pictured) -> None:
     scene, wanted = pictured
     cvtgs.save(scene, tmp_path / "scene.glb")
     words = {"type": "container", "url": "/files/scene.glb"}
     assert least_difference(served, tmp_path, wanted, "playcanvas.html", **words) < MOST
 
 
-def test_another_picture_is_not_taken_for_ours(pictured: Pictured) -> None:
+def test_a_different_picture_does_not_match(pictured: Pictured) -> None:
     wanted = pictured.picture
     assert float(np.abs(wanted[:, ::-1] - wanted).mean()) > 2 * MOST
     assert float(wanted.mean()) > 2 * MOST

@@ -45,7 +45,7 @@ def nodes(node: StreamNode) -> list[StreamNode]:
     return [node, *(below for child in node.children for below in nodes(child))]
 
 
-def test_levels_say_which_gaussian_stands_for_which(
+def test_levels_assign_each_input_gaussian_to_one_of_theirs(
     scene: GaussianScene, levels: tuple[Level, ...]
 ) -> None:
     assert levels[0].assignment is None
@@ -70,8 +70,8 @@ def test_every_row_of_every_level_is_in_one_chunk(plan: StreamPlan) -> None:
     assert all(size <= 500 or alone for size, alone in zip(sizes, single, strict=True))
 
 
-def test_chunks_of_nested_levels_stand_for_the_same_gaussians(plan: StreamPlan) -> None:
-    """The finest merged level and the coarsest, cell by cell; so no seams."""
+def test_chunks_of_nested_levels_represent_the_same_gaussians(plan: StreamPlan) -> None:
+    """The finest merged level and the coarsest match cell by cell, so there are no seams."""
     finest, coarsest = plan.levels[1], plan.levels[3]
     assert coarsest.nested
     assert finest.assignment is not None
@@ -86,7 +86,7 @@ def test_chunks_of_nested_levels_stand_for_the_same_gaussians(plan: StreamPlan) 
     assert all(chunk_of[0][fine] == chunk_of[1][coarse] for fine, coarse in both)
 
 
-def test_boxes_hold_what_is_in_them(plan: StreamPlan) -> None:
+def test_boxes_enclose_their_children_and_gaussians(plan: StreamPlan) -> None:
     leaves = [node for node in nodes(plan.root) if node.chunk is not None]
     assert [leaf.chunk for leaf in leaves] == list(range(len(plan.chunks)))
     for node in nodes(plan.root):
@@ -104,7 +104,7 @@ def test_boxes_hold_what_is_in_them(plan: StreamPlan) -> None:
                 assert chunk.box_max[axis] >= mean[axis] + reach * 0.999
 
 
-def test_streamed_sog(plan: StreamPlan, tmp_path: Path) -> None:
+def test_streamed_sog_holds_all_levels(plan: StreamPlan, tmp_path: Path) -> None:
     events: list[ProgressEvent] = []
     written = write_sog_stream(plan, tmp_path, file_gaussians=700, listener=events.append)
     document = json.loads((tmp_path / "lod-meta.json").read_text())
@@ -131,7 +131,7 @@ def test_streamed_sog(plan: StreamPlan, tmp_path: Path) -> None:
         )
 
 
-def test_3d_tiles(plan: StreamPlan, tmp_path: Path) -> None:
+def test_3d_tiles_hold_all_levels(plan: StreamPlan, tmp_path: Path) -> None:
     written = write_tiles(plan, tmp_path, tile_gaussians=400)
     document = json.loads((tmp_path / "tileset.json").read_text())
     assert document["asset"]["version"] == "1.1"
@@ -161,7 +161,7 @@ def test_3d_tiles(plan: StreamPlan, tmp_path: Path) -> None:
 
 
 def test_tiles_lie_in_their_boxes(plan: StreamPlan, tmp_path: Path) -> None:
-    """3D Tiles turn a glTF from y up to z up: (x, y, z) to (x, -z, y)."""
+    """3D Tiles rotate glTF content from y up to z up: (x, y, z) to (x, -z, y)."""
     write_tiles(plan, tmp_path, tile_gaussians=400)
 
     def check(tile: dict[str, Any]) -> None:
@@ -176,7 +176,9 @@ def test_tiles_lie_in_their_boxes(plan: StreamPlan, tmp_path: Path) -> None:
     check(json.loads((tmp_path / "tileset.json").read_text())["root"])
 
 
-def test_one_level_and_one_chunk(levels: tuple[Level, ...], tmp_path: Path) -> None:
+def test_a_stream_may_have_one_level_and_one_chunk(
+    levels: tuple[Level, ...], tmp_path: Path
+) -> None:
     plan = plan_stream(levels[3:])
     assert len(plan.chunks) == 1
     write_sog_stream(plan, tmp_path / "sog")
@@ -184,7 +186,7 @@ def test_one_level_and_one_chunk(levels: tuple[Level, ...], tmp_path: Path) -> N
     assert len(load(tmp_path / "sog")) == len(load(tmp_path / "tiles" / "0_0.glb")) == 50
 
 
-def test_what_is_there_is_not_replaced_unasked(plan: StreamPlan, tmp_path: Path) -> None:
+def test_existing_files_are_replaced_only_with_overwrite(plan: StreamPlan, tmp_path: Path) -> None:
     write_sog_stream(plan, tmp_path)
     with pytest.raises(OutputExistsError, match=r"lod-meta.json: the output must not exist yet"):
         write_sog_stream(plan, tmp_path)
@@ -194,7 +196,7 @@ def test_what_is_there_is_not_replaced_unasked(plan: StreamPlan, tmp_path: Path)
 
 
 @pytest.mark.parametrize("kind", ["sog", "3dtiles"])
-def test_a_stream_takes_the_files_of_the_one_before(
+def test_a_new_stream_removes_the_files_of_the_old_one(
     levels: tuple[Level, ...], tmp_path: Path, kind: str
 ) -> None:
     write = write_sog_stream if kind == "sog" else write_tiles
@@ -209,7 +211,7 @@ def test_a_stream_takes_the_files_of_the_one_before(
     assert names[0] == names[1] | {"own.html", "9_9_9"}
 
 
-def test_wrong_levels(levels: tuple[Level, ...]) -> None:
+def test_wrong_levels_and_chunk_sizes_are_refused(levels: tuple[Level, ...]) -> None:
     for wrong in ([], [levels[0], levels[0]]):
         with pytest.raises(InvalidArgumentError, match="needs levels of different sizes"):
             plan_stream(wrong)
@@ -217,7 +219,7 @@ def test_wrong_levels(levels: tuple[Level, ...]) -> None:
         plan_stream(levels, chunk_gaussians=0)
 
 
-def test_a_place_on_the_earth() -> None:
+def test_the_transform_of_a_place_on_earth() -> None:
     """At 90 degrees east on the equator, east is -x, north is z, and up is y."""
     matrix = torch.tensor(geo_transform(90.0, 0.0, 100.0), dtype=torch.float64).reshape(4, 4).T
     wanted = [[-1, 0, 0, 0], [0, 0, 1, 6378237], [0, 1, 0, 0], [0, 0, 0, 1]]
@@ -234,7 +236,7 @@ def test_a_place_on_the_earth() -> None:
             geo_transform(*wrong)
 
 
-def test_tiles_stand_where_they_are_told(plan: StreamPlan, tmp_path: Path) -> None:
+def test_the_transform_of_tiles_is_written_and_checked(plan: StreamPlan, tmp_path: Path) -> None:
     place = geo_transform(8.5, 47.4, 400.0)
     write_tiles(plan, tmp_path / "a", transform=place)
     assert json.loads((tmp_path / "a" / "tileset.json").read_text())["root"]["transform"] == [
@@ -246,7 +248,7 @@ def test_tiles_stand_where_they_are_told(plan: StreamPlan, tmp_path: Path) -> No
     assert not (tmp_path / "b").exists()
 
 
-def test_nothing_is_left_of_a_stream_that_fails(plan: StreamPlan, tmp_path: Path) -> None:
+def test_a_failed_stream_leaves_no_files(plan: StreamPlan, tmp_path: Path) -> None:
     def fail(event: ProgressEvent) -> None:
         if event.done == 2:
             raise KeyboardInterrupt
@@ -258,7 +260,7 @@ def test_nothing_is_left_of_a_stream_that_fails(plan: StreamPlan, tmp_path: Path
 
 @pytest.fixture(scope="module")
 def open_levels() -> tuple[Level, ...]:
-    """Two levels of a lawn under a sky of 200 Gaussians, 40 times as far."""
+    """Levels of an object under a sky of 200 Gaussians, 40 times as far away."""
     near, far = make("object", 3000, sh_degree=0, seed=1), make("object", 200, sh_degree=0, seed=2)
     directions = torch.nn.functional.normalize(far.means - far.means.mean(dim=0))
     radius = float(near.means.norm(dim=1).quantile(0.7))
@@ -267,7 +269,7 @@ def open_levels() -> tuple[Level, ...]:
     return Simplifier(preset="draft", device="cpu").levels(scene, [1.0, 0.25, 0.05])
 
 
-def test_what_is_far_is_the_environment_of_all_levels(
+def test_far_gaussians_become_the_environment_of_all_levels(
     open_levels: tuple[Level, ...], tmp_path: Path
 ) -> None:
     plan = plan_stream(open_levels, chunk_gaussians=500, environment_radii=10)
@@ -288,14 +290,16 @@ def test_what_is_far_is_the_environment_of_all_levels(
     assert sorted(path.name for path in tmp_path.glob(".*")) == []
 
 
-def test_no_environment_where_nothing_is_far(levels: tuple[Level, ...], tmp_path: Path) -> None:
+def test_there_is_no_environment_if_nothing_is_far(
+    levels: tuple[Level, ...], tmp_path: Path
+) -> None:
     plan = plan_stream(levels, environment_radii=1e6)
     assert plan.environment is None
     write_sog_stream(plan, tmp_path)
     assert "environment" not in json.loads((tmp_path / "lod-meta.json").read_text())
 
 
-def test_of_a_large_environment_a_coarser_level_is_taken(
+def test_a_large_environment_uses_a_coarser_level(
     open_levels: tuple[Level, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("cvtgs.streams.plan.ENVIRONMENT_GAUSSIANS", 100)

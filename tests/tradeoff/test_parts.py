@@ -103,14 +103,14 @@ MADE = (
 )
 
 
-def test_the_front_by_hand():
+def test_the_pareto_front_equals_that_by_hand():
     assert on_front([1, 2, 3, 3], [5, 4, 6, 7]) == (True, False, False, True)
     assert on_front([1, 1], [2, 2]) == (True, True)
     assert on_front([1, 2], [float("nan"), 1.0]) == (False, True)
     assert on_front([], []) == ()
 
 
-def test_fronts_are_found_ratio_by_ratio():
+def test_each_ratio_has_its_own_front():
     assert [one.fronts for one in with_fronts(MADE)] == [
         ("psnr", "ssim"),
         (),
@@ -119,12 +119,12 @@ def test_fronts_are_found_ratio_by_ratio():
     ]
 
 
-def test_less_lpips_is_better():
+def test_a_lower_lpips_is_better():
     both = [result("a", 1.0, 20.0, lpips=0.3), result("b", 2.0, 20.0, lpips=0.1)]
     assert [one.fronts for one in with_fronts(both)] == [("psnr", "ssim", "lpips"), ("lpips",)]
 
 
-def test_stages_of_different_runs_come_in_one_order():
+def test_stages_of_all_runs_are_in_one_order():
     made = tradeoff(*MADE)
     assert made.stages == ("check", "visibility", "merge")
     assert made.rest_seconds(made.results[0]) == pytest.approx(2.0 - 1.0 - 0.25 - 0.5)
@@ -143,14 +143,14 @@ def test_csv_has_a_line_per_run_and_seconds_per_stage():
     assert float(rows[3]["rho"]) == 0.01
 
 
-def test_json_comes_back():
+def test_json_reads_back():
     made = tradeoff(*MADE, result("same", 3.0, float("inf"), 1.0))
     assert Tradeoff.model_validate_json(made.to_json()) == made
     stages = json.loads(made.to_json())["results"][0]["report"]["stages"]
     assert all(stage["peak_memory_bytes"] > 0 for stage in stages)
 
 
-def test_words_of_the_table():
+def test_the_texts_of_the_table():
     made = tradeoff(*MADE)
     assert cells(made, made.results[0]) == {
         "preset": "draft",
@@ -178,14 +178,14 @@ def test_words_of_the_table():
     assert how_measured(named).endswith(" on abacus. LPIPS with the network vgg.")
 
 
-def test_warnings_of_processes_are_passed_on_once():
+def test_repeated_warnings_of_processes_are_issued_once():
     errors = f"{WARNING}dropped 3 rows.\nsome noise\n{WARNING}dropped 3 rows.\n"
     with pytest.warns(UserWarning, match=r"^dropped 3 rows\.$") as caught:
         pass_warnings_on(errors, set())
     assert len(caught) == 1
 
 
-def test_the_page_part_is_escaped_and_names_failures():
+def test_the_page_escapes_texts_and_names_failures():
     made = tradeoff(*MADE, failures=(Failure(name="max 0.1", reason="a < b."),))
     html = page_summary(made, None)
     assert "<img" not in html
@@ -194,7 +194,7 @@ def test_the_page_part_is_escaped_and_names_failures():
     assert 'src="data:image/png;base64,' in page_summary(made, b"png")
 
 
-def test_round_numbers_on_the_axis():
+def test_ticks_are_round_numbers():
     assert ticks(0.9, 1.1) == [0.7, 1.0, 2.0]
     assert ticks(2.0, 20.0) == [2.0, 3.0, 5.0, 7.0, 10.0, 20.0]
     assert ticks(0.06, 150.0)[:5] == [0.05, 0.1, 0.2, 0.5, 1.0]
@@ -234,7 +234,7 @@ def test_files_are_written_completely_and_replaced_only_when_asked(measured, tmp
     write_tradeoff(measured, tmp_path / "new", overwrite=True)
 
 
-def test_without_matplotlib_the_rest_is_written(measured, tmp_path, monkeypatch):
+def test_without_matplotlib_only_the_plot_is_missing(measured, tmp_path, monkeypatch):
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)
     paths, note = write_tradeoff(measured, tmp_path)
@@ -242,7 +242,7 @@ def test_without_matplotlib_the_rest_is_written(measured, tmp_path, monkeypatch)
     assert "pip install 'cvtgs[plots]'" in note
 
 
-def test_a_process_is_measured():
+def test_time_and_memory_of_a_process_are_measured():
     cost = run_process([sys.executable, "-c", "print('done'); x = bytearray(80_000_000)"])
     assert cost.output == "done\n"
     assert cost.wall_seconds > 0
@@ -262,18 +262,18 @@ def test_a_process_is_measured():
         ),
     ],
 )
-def test_why_a_process_failed_is_one_sentence(code, text):
+def test_a_failed_process_is_explained_in_one_sentence(code, text):
     with pytest.raises(RunError) as caught:
         run_process([sys.executable, "-c", code])
     assert str(caught.value).startswith(text)
 
 
-def test_a_program_that_is_not_there():
+def test_a_missing_program_is_an_error():
     with pytest.raises(RunError, match="no-such-program could not be started"):
         run_process(["no-such-program"])
 
 
-def test_tasks_are_checked():
+def test_presets_and_ratios_are_checked():
     names = [task.name for task in tasks_of(None, [0.1])]
     assert names == [f"{preset} 0.1" for preset in cvtgs.PRESETS]
     with pytest.raises(ConfigError, match="found 'best'"):
@@ -289,11 +289,13 @@ def test_tasks_are_checked():
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are those of POSIX")
 @pytest.mark.parametrize("number", ["SIGINT", "SIGKILL"])
-def test_what_ends_this_process_ends_the_one_that_it_started(tmp_path, number):
+def test_the_child_process_ends_with_its_parent(tmp_path, number):
     note = tmp_path / "pid"
     inner = f"import os, pathlib, time; pathlib.Path({str(note)!r}).write_text(str(os.getpid()))"
     outer = "import signal, sys; from cvtgs.tradeoff.runs import run_process;"
-    outer += "signal.signal(signal.SIGINT, signal.default_int_handler);"  # ignored in background
+    outer += (
+        "signal.signal(signal.SIGINT, signal.default_int_handler);"  # ignored in the background
+    )
     outer += "run_process("
     outer += f"[sys.executable, '-c', {inner + '; time.sleep(120)'!r}])"
     with subprocess.Popen([sys.executable, "-c", outer], stderr=subprocess.PIPE) as process:
@@ -340,7 +342,7 @@ def page(tmp_path_factory):
 
 
 @pytest.mark.long
-def test_plot_table_and_slider_are_there(page):
+def test_the_page_has_plot_table_and_slider(page):
     html = dom(page)
     assert attribute(html, "ready") == "yes"
     table = re.search(r'<table id="tradeoff">.*?</table>', html, re.DOTALL).group(0)
@@ -351,11 +353,11 @@ def test_plot_table_and_slider_are_there(page):
 
 
 @pytest.mark.slow
-def test_it_fits_a_phone(page):
-    """The wide table scrolls inside its own box."""
+def test_the_page_fits_a_phone(page):
+    """The wide table scrolls in its own container."""
     assert layout_on_a_phone(page) == "390/390 390"
 
 
 @pytest.mark.slow
-def test_it_asks_for_nothing(page):
+def test_the_page_loads_nothing_from_the_network(page):
     assert not re.search(r"https?://", page.read_text(encoding="utf-8"))

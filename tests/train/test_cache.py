@@ -1,4 +1,4 @@
-"""The cache: everything is made once, and is the same as if it were made anew."""
+"""The cache: everything is computed once, and equals a fresh computation."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -67,7 +67,7 @@ def test_a_scene_is_made_once(source, made, tmp_path):
     assert [bits_of_views(v) for v in again.views] == [bits_of_views(v) for v in first.views]
 
 
-def test_what_is_cached_equals_what_is_fresh(source, made, tmp_path):
+def test_cached_results_equal_fresh_ones(source, made, tmp_path):
     config = config_of()
     for prepared in (
         prepare_scene(source, config, tmp_path),
@@ -105,7 +105,7 @@ def test_cameras_of_a_file_are_spread_evenly_and_fitted(made, tmp_path):
         torch.testing.assert_close(views.cameras.centers, torch.stack(places))
 
 
-def test_learning_from_a_scene_that_validated_makes_new_images(source, made, tmp_path):
+def test_training_on_a_former_validation_scene_makes_new_images(source, made, tmp_path):
     """Also where both have the same ratios."""
     config = tiny_config(tiny_data(Path(), ratios=(0.2,), validation_ratios=(0.2,)))
     prepare_scene(replace(source, is_validation=True), config, tmp_path)
@@ -114,9 +114,11 @@ def test_learning_from_a_scene_that_validated_makes_new_images(source, made, tmp
     assert [len(views.cameras) for views in prepared.views] == [4, 4]
 
 
-def test_what_cannot_be_simplified_has_no_cases(tmp_path):
+def test_a_ratio_that_leaves_nothing_to_merge_has_no_cases(tmp_path):
     few = small_scene(300).select(torch.arange(3))
-    scene = few.with_tensors({"log_scales": few.log_scales + 3}, {})  # they overlap: none is lone
+    scene = few.with_tensors(
+        {"log_scales": few.log_scales + 3}, {}
+    )  # they overlap, so none is isolated
     for _ in range(2):
         prepared = prepare_scene(source_of(scene), config_of(), tmp_path)
         assert [case.ratio for case in prepared.cases] == [0.2, 0.05]
@@ -139,7 +141,9 @@ def test_what_cannot_be_simplified_has_no_cases(tmp_path):
     ],
     ids=["seed", "preset", "ratios", "count", "sizes", "nothing that matters"],
 )
-def test_only_what_has_changed_is_made_anew(source, made, tmp_path, changes, images, cases):
+def test_only_results_affected_by_a_change_are_recomputed(
+    source, made, tmp_path, changes, images, cases
+):
     prepare_scene(source, config_of(), tmp_path)
     before = files_in(tmp_path)
     assert len(before) == 2
@@ -152,7 +156,7 @@ def test_only_what_has_changed_is_made_anew(source, made, tmp_path, changes, ima
     assert made.count == 1 + (images + cases > 0)
 
 
-def test_another_identity_is_another_scene(source, made, tmp_path):
+def test_another_identity_is_cached_separately(source, made, tmp_path):
     prepare_scene(source, config_of(), tmp_path)
     prepare_scene(replace(source, identity="another"), config_of(), tmp_path)
     assert made.count == 2
@@ -171,7 +175,7 @@ DAMAGE = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
-def test_a_damaged_file_is_made_anew(source, made, tmp_path, damage):
+def test_a_damaged_file_is_recomputed(source, made, tmp_path, damage):
     first = prepare_scene(source, config_of(), tmp_path)
     wanted = [bits_of_case(case) for case in first.cases], [bits_of_views(v) for v in first.views]
     for path in tmp_path.iterdir():
@@ -185,8 +189,8 @@ def test_a_damaged_file_is_made_anew(source, made, tmp_path, damage):
     assert made.count == 3
 
 
-def test_an_antialiased_scene_stays_one(tmp_path):
-    """Its merged Gaussians are rendered as it was."""
+def test_an_antialiased_scene_stays_antialiased(tmp_path):
+    """Its merged Gaussians are rendered antialiased, too."""
     scene = replace(small_scene(300), comments=(ANTIALIASED_TAG,))
     for _ in range(2):
         case = prepare_scene(source_of(scene), config_of(), tmp_path).cases[1]
@@ -196,6 +200,6 @@ def test_an_antialiased_scene_stays_one(tmp_path):
         )
 
 
-def test_a_folder_that_is_not_there_is_an_error(source, tmp_path):
+def test_a_missing_folder_is_an_error(source, tmp_path):
     with pytest.raises(OutputError):
         prepare_scene(source, config_of(), tmp_path / "nowhere")

@@ -1,4 +1,4 @@
-"""Cases: what a scene at a ratio holds, and what a network changes of it; target images."""
+"""Cases: contents for a scene at a ratio, corrections by a network, and target images."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ from train_cases import (
 )
 
 
-def test_a_case_is_the_reference_and_its_cells_of_several():
+def test_a_case_is_the_reference_and_its_cells_of_several_members():
     scene, config = random_scene(200), SimplifyConfig()
     case = make_case("box", scene, 0.31, config)
     reference = merge_scene(scene, 62, config)
@@ -35,15 +35,15 @@ def test_a_case_is_the_reference_and_its_cells_of_several():
     assert len(case.descriptors) == len(case.cells) < 62
 
 
-def test_nothing_to_learn_is_no_case():
+def test_scenes_with_nothing_to_learn_give_no_case():
     scene, config = random_scene(20), SimplifyConfig()
     assert make_case("box", scene, 0.99, config) is None
     assert make_case("box", scene.select(torch.tensor([0])), 0.5, config) is None
     assert make_case("box", scene.select(torch.zeros(0, dtype=torch.int64)), 0.5, config) is None
 
 
-def test_cells_of_one_only_are_no_case():
-    """The faint half is filtered, and as many are left as are kept."""
+def test_scenes_with_only_cells_of_one_give_no_case():
+    """The faint half is filtered, and the number of the rest is the target."""
     scene = random_scene(40)
     logits = torch.where(torch.arange(40) < 20, 3.0, -9.0)
     scene = scene.with_tensors({"logit_opacities": logits}, {})
@@ -61,7 +61,7 @@ def test_an_untrained_network_changes_no_bit():
         assert bits(values) == bits(before[name])
 
 
-def test_corrected_is_what_the_simplifier_does():
+def test_corrections_equal_those_of_the_simplifier():
     case, net = some_case(), lively_net(torch.float32)
     reference = case.reference
     with torch.no_grad():
@@ -79,7 +79,7 @@ def test_corrected_is_what_the_simplifier_does():
     assert float((corrected.log_scales - reference.merged.log_scales).abs().amax()) > 0.1
 
 
-def test_some_cells_are_seen_as_among_all():
+def test_a_subset_of_cells_gets_the_same_descriptors():
     case, net = some_case(), lively_net(torch.float32)
     rows = torch.tensor([0, 3, 4, 11])
     some = case.select(rows)
@@ -93,7 +93,7 @@ def test_some_cells_are_seen_as_among_all():
         torch.testing.assert_close(values, changed[name][rows])
 
 
-def test_no_cells_can_be_taken():
+def test_an_empty_subset_of_cells_can_be_selected():
     some = some_case().select(torch.zeros(0, dtype=torch.int64))
     assert len(some.cells) == len(some.part) == len(some.descriptors) == 0
 
@@ -112,12 +112,12 @@ def test_gradients_flow_through_every_cell():
     assert all(bool(values.grad.isfinite().all()) for values in net.parameters())
 
 
-def test_moving_to_where_a_case_is_costs_nothing():
+def test_moving_to_the_same_device_is_a_no_op():
     case = some_case()
     assert case.to(torch.device("cpu")) is case
 
 
-def test_moving_takes_everything_along():
+def test_moving_moves_every_tensor():
     """``meta`` stands for another device: it has shapes and no values."""
     moved = some_case().to(torch.device("meta"))
     reference, seen = moved.reference, moved.descriptors
@@ -135,7 +135,7 @@ def test_the_same_scene_gives_the_same_bits():
 
 
 def numbered_views(size: int = 8) -> TargetViews:
-    """One image whose red tells the column and whose green tells the row."""
+    """One image whose red encodes the column and whose green encodes the row."""
     steps = torch.arange(size, dtype=torch.float16)
     rgb = torch.zeros(1, size, size, 3, dtype=torch.float16)
     rgb[..., 0], rgb[..., 1] = steps, steps[:, None]
@@ -214,7 +214,7 @@ def test_a_faint_scene_can_be_looked_at_too():
     assert len(random_views(faint, 3, size=32, seed=0)) == 3
 
 
-def test_how_far_away_random_views_are():
+def test_distances_of_random_views():
     scene = small_scene()
     frame = robust_frame(scene.means[scene.opacities > 0.1])
     cameras = random_views(scene, 60, size=100, seed=0, reach=(0.2, 1.4))

@@ -67,7 +67,7 @@ def test_equal_members_and_their_cell_look_the_same():
     assert float((members - merged).abs().mean()) < 0.01
 
 
-def test_what_is_not_changed_looks_the_same():
+def test_unchanged_cells_look_the_same():
     grid = grid_of(twins())
     assert torch.equal(image(grid.merged, grid), image(grid.corrected, grid))
 
@@ -112,7 +112,7 @@ def test_members_stay_with_their_cell():
 
 
 def test_a_layout_turns_and_scales_and_nothing_else():
-    """Distances over scales, shapes against one another, opacities and colours stay."""
+    """Distances relative to scales, relative shapes, opacities and colours stay the same."""
     case = sixteen(some_case(1500, ratio=0.1))
     grid, own = grid_of(case), case.reference.merged.select(case.cells)
     members = case.reference.scene.select(case.part.order)
@@ -134,7 +134,7 @@ def test_a_layout_turns_and_scales_and_nothing_else():
         assert after.sh_degree == 0
 
 
-def test_the_seed_decides():
+def test_the_seed_decides_the_grid():
     case = twins()
     first, again, other = (grid_of(case, seed=seed) for seed in (0, 0, 1))
     assert torch.equal(first.members.means, again.members.means)
@@ -143,7 +143,7 @@ def test_the_seed_decides():
 
 
 @pytest.mark.parametrize("net", [small_net(), lively_net(torch.float32)], ids=["new", "lively"])
-def test_gradients_flow_into_what_is_changed(net):
+def test_gradients_flow_into_the_corrected_tensors(net):
     case = sixteen(some_case(1500, ratio=0.1))
     changed = {
         name: values.detach().requires_grad_()

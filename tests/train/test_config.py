@@ -1,4 +1,4 @@
-"""TrainConfig: what a TOML file may say."""
+"""TrainConfig: settings and errors of a TOML file."""
 
 from pathlib import Path
 
@@ -55,13 +55,13 @@ def test_relative_paths_start_at_the_file(tmp_path):
     assert config.data.folders == (tmp_path / "scenes", tmp_path / "../more", Path("/far/away"))
 
 
-def test_paths_may_be_texts_and_the_path_of_the_file_too(tmp_path):
+def test_all_paths_may_be_strings(tmp_path):
     (tmp_path / "training.toml").write_text("steps = 3")
     assert TrainConfig.from_toml(str(tmp_path / "training.toml")).steps == 3
 
 
 @pytest.mark.parametrize("recipe", sorted(RECIPES.glob("*.toml")), ids=lambda path: path.stem)
-def test_the_recipes_are_of_the_preset_that_they_are_called(recipe):
+def test_each_recipe_is_for_the_preset_of_its_name(recipe):
     assert TrainConfig.from_toml(recipe).preset == recipe.stem.partition("-")[0]
 
 
@@ -118,7 +118,7 @@ def test_every_problem_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"steps: 3", b"\xff\xfe"])
-def test_what_is_no_toml_is_an_error(tmp_path, content):
+def test_a_file_that_is_not_toml_is_an_error(tmp_path, content):
     path = tmp_path / "training.toml"
     path.write_bytes(content)
     with pytest.raises(ConfigError, match="is not a TOML file") as caught:

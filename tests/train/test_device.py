@@ -57,8 +57,8 @@ def stop_after_three(event: ProgressEvent) -> None:
 @pytest.mark.parametrize(
     ("kind", "copies"), [("scene", SCENE_COPIES), ("local", 10), ("published", 11)]
 )
-def test_copies_of_a_step(kind, copies, tmp_path):
-    """An image is 2 copies, its loss and background 2; where cells lie is 3, which they are 1."""
+def test_copies_to_the_device_in_a_step(kind, copies, tmp_path):
+    """An image takes 2 copies, its loss and background 2; places of cells 3, their numbers 1."""
     scenes = write_scenes(tmp_path / "scenes", ["exam", "lesson"], 300)
     changes = {"preset": "paper"} if kind == "published" else {}
     config = tiny_config(tiny_data(scenes), kind=kind, steps=6, validate_every=6, **changes)

@@ -1,4 +1,4 @@
-"""A training learns: on scenes and views that it never sees, too."""
+"""Training gains quality, also on unseen scenes and views."""
 
 import hashlib
 import json
@@ -31,7 +31,7 @@ from train_cases import (
 pytestmark = needs_matplotlib
 COUNT = 1200
 UNSEEN = 7
-"""Seed of a scene that is neither learned from nor validated with."""
+"""Seed of a scene that is used for neither training nor validation."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def trained(request, tmp_path_factory) -> Trained:
 
 
 @pytest.mark.slow
-def test_a_scene_never_learned_from_gains(trained):
+def test_an_unseen_scene_gains(trained):
     start, *later = trained.history.validations
     assert start.gains == (Gain("exam", 0.06, 0.0),)
     assert all(entry.mean_gain > 0.2 for entry in later)
@@ -68,7 +68,7 @@ def test_a_scene_never_learned_from_gains(trained):
 
 
 @pytest.mark.slow
-def test_a_training_scene_gains_in_views_never_seen(trained):
+def test_a_training_scene_gains_in_unseen_views(trained):
     """Other views, at another ratio, through the simplifier and the file that was written."""
     scene = small_scene(COUNT, seed=0)
     views = automatic_views(scene, 2, width=48, height=40, seed=9)
@@ -100,7 +100,7 @@ def test_the_loss_of_an_unseen_scene_falls(trained):
     assert loss(net) < loss(small_net()) - 0.05
 
 
-def test_the_checkpoint_says_what_it_is(trained):
+def test_the_checkpoint_is_described(trained):
     info = load_checkpoint(trained.files.checkpoint).info
     assert info.preset == "paper"
     assert info.training == f"{trained.config.kind} training"
@@ -109,7 +109,7 @@ def test_the_checkpoint_says_what_it_is(trained):
     assert (info.architecture.width, info.architecture.cell_width) == (6, 10)
 
 
-def test_the_checkpoint_says_how_to_make_it_again(trained):
+def test_the_checkpoint_records_how_to_reproduce_it(trained):
     info = load_checkpoint(trained.files.checkpoint).info
     told = json.loads(info.config)
     assert "folders" not in told["data"]
@@ -130,7 +130,7 @@ def test_the_checkpoint_says_how_to_make_it_again(trained):
 
 
 def test_a_second_training_names_the_first(trained, tmp_path):
-    """And it forgets the range of the first: only what it learns from counts."""
+    """It discards the known range of the first: only its own training cases count."""
     folders = (write_scenes(tmp_path / "other", ["exam", "lesson"]),)
     config = trained.config.model_copy(
         update={
@@ -151,7 +151,7 @@ def test_a_second_training_names_the_first(trained, tmp_path):
 
 
 def test_the_known_range_is_that_of_the_training_cases(trained):
-    """The lessons are within it for the most part; an exam of other cells is not."""
+    """Most training cells are within it; very different cells are not."""
     known = load_checkpoint(trained.files.checkpoint).net.known
     lessons = some_case(COUNT, seed=1, ratio=0.05, preset="paper")
     shares = known(summarize(lessons.descriptors))
@@ -160,13 +160,13 @@ def test_the_known_range_is_that_of_the_training_cases(trained):
     assert not bool(known(summarize(wild)).any())
 
 
-def test_curves_are_a_image(trained):
+def test_curves_are_an_image(trained):
     content = trained.files.curves.read_bytes()
     assert content == trained.history.curves()
     assert content[:8] == b"\x89PNG\r\n\x1a\n"
 
 
-def test_nothing_else_is_left_behind(trained):
+def test_no_other_files_are_left_behind(trained):
     folder = Path(trained.files.checkpoint).parent
     names = {path.name for path in folder.iterdir()}
     assert names == {"net.safetensors", "net.state", "net.png", "net.cache"}

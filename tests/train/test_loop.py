@@ -1,4 +1,4 @@
-"""The loop: what is kept, when it stops, what it does with bad scenes and bad losses."""
+"""The loop: the network that is kept, stopping, bad scenes and bad losses."""
 
 import math
 from pathlib import Path
@@ -51,7 +51,7 @@ class Marks:
         return 20.0, 20.0 + self.gains[len(self.nets) - 1]
 
 
-def test_the_files_are_called_like_the_checkpoint():
+def test_files_are_named_after_the_checkpoint():
     files = TrainFiles.beside(Path("out/net.v2.safetensors"))
     assert files.checkpoint == Path("out/net.v2.safetensors")
     assert (files.state, files.curves) == (Path("out/net.v2.state"), Path("out/net.v2.png"))
@@ -59,7 +59,7 @@ def test_the_files_are_called_like_the_checkpoint():
     assert TrainFiles.beside(Path("a.safetensors"), Path("c")).cache == Path("c")
 
 
-def test_validations_before_every_so_many_steps_and_at_the_end(scenes, cache, tmp_path):
+def test_validations_run_at_every_interval_and_at_the_end(scenes, cache, tmp_path):
     seen: list[list[int]] = []
 
     def watch(history: History) -> None:
@@ -74,7 +74,7 @@ def test_validations_before_every_so_many_steps_and_at_the_end(scenes, cache, tm
     assert all(math.isfinite(entry.loss) for entry in later)
 
 
-def test_the_listener_hears_of_scenes_and_steps(scenes, cache, tmp_path):
+def test_progress_is_reported_for_scenes_and_steps(scenes, cache, tmp_path):
     events: list[ProgressEvent] = []
     run(config_of(scenes, steps=3), tmp_path / "net.safetensors", cache, listener=events.append)
     found = [(event.stage, event.done, event.total) for event in events]
@@ -94,7 +94,7 @@ def test_the_same_training_gives_the_same_bytes(scenes, cache, tmp_path):
         assert contents[0] == contents[1]
 
 
-def test_torch_keeps_its_random_numbers(scenes, cache, tmp_path):
+def test_the_random_state_of_torch_is_kept(scenes, cache, tmp_path):
     torch.manual_seed(5)
     wanted = torch.rand(3)
     torch.manual_seed(5)
@@ -113,14 +113,14 @@ def test_the_best_network_is_kept(scenes, cache, tmp_path, monkeypatch):
     assert len({str(net) for net in marks.nets}) == 4
 
 
-def test_patience_stops(scenes, cache, tmp_path, monkeypatch):
+def test_training_stops_when_patience_runs_out(scenes, cache, tmp_path, monkeypatch):
     monkeypatch.setattr(train_loop, "validation_psnr", Marks(0.0, 0.5, 0.2, 0.4, 0.1, 0.9))
     config = config_of(scenes, steps=100, patience=2)
     history = run(config, tmp_path / "net.safetensors", cache)
     assert [entry.step for entry in history.validations] == [0, 2, 4, 6]
 
 
-def test_a_network_that_only_loses_leaves_the_untrained_one(scenes, cache, tmp_path, monkeypatch):
+def test_without_any_gain_the_untrained_network_is_kept(scenes, cache, tmp_path, monkeypatch):
     monkeypatch.setattr(train_loop, "validation_psnr", Marks(0.0, -0.5, -0.2, -0.1))
     path = tmp_path / "net.safetensors"
     run(config_of(scenes), path, cache)
@@ -157,7 +157,9 @@ def test_a_missing_start_is_an_error(scenes, cache, tmp_path):
 
 @pytest.mark.parametrize("bad", ["loss", "gradient"])
 @pytest.mark.parametrize("kind", ["scene", "local"])
-def test_a_loss_that_is_not_finite_stops(scenes, cache, tmp_path, monkeypatch, kind, bad):
+def test_training_stops_at_a_loss_that_is_not_finite(
+    scenes, cache, tmp_path, monkeypatch, kind, bad
+):
     name, path, calls = f"{kind}_loss", tmp_path / "net.safetensors", []
     true_loss = getattr(train_loop, name)
 
@@ -176,12 +178,12 @@ def test_a_loss_that_is_not_finite_stops(scenes, cache, tmp_path, monkeypatch, k
         run(config_of(scenes, kind=kind), path, cache)
     assert str(caught.value) == (
         f"the loss or its gradient is not finite at step 3, lesson at 0.05; "
-        f"the last good checkpoint is {path}."
+        f"last good checkpoint: {path}."
     )
     assert load_checkpoint(path).info.steps in (0, 2)
 
 
-def test_a_training_that_broke_can_be_resumed(scenes, cache, tmp_path, monkeypatch):
+def test_a_failed_training_can_be_resumed(scenes, cache, tmp_path, monkeypatch):
     path, whole = tmp_path / "net.safetensors", tmp_path / "whole.safetensors"
     true_loss = train_loop.scene_loss
     with monkeypatch.context() as patch:
@@ -195,17 +197,17 @@ def test_a_training_that_broke_can_be_resumed(scenes, cache, tmp_path, monkeypat
 
 @pytest.mark.parametrize(
     ("changes", "text"),
-    [({"ratios": (0.999,)}, "learn from"), ({"validation_ratios": (0.999,)}, "validate with")],
+    [({"ratios": (0.999,)}, "training"), ({"validation_ratios": (0.999,)}, "validation")],
 )
 def test_scenes_too_small_for_their_ratios_are_an_error(scenes, cache, tmp_path, changes, text):
     config = tiny_config(tiny_data(scenes, **changes))
-    with pytest.raises(ConfigError, match=f"the scenes to {text} are too small for their ratios"):
+    with pytest.raises(ConfigError, match=f"the {text} scenes are too small for their ratios"):
         run(config, tmp_path / "net.safetensors", cache)
 
 
 def test_a_cache_that_is_a_file_is_an_error(scenes, tmp_path):
     (tmp_path / "cache").write_text("precious")
-    with pytest.raises(OutputError, match="must become a folder"):
+    with pytest.raises(OutputError, match="must be a folder or a new path"):
         run(config_of(scenes), tmp_path / "net.safetensors", tmp_path / "cache")
     assert (tmp_path / "cache").read_text() == "precious"
 

@@ -1,4 +1,4 @@
-"""What a step makes small, and what validations measure."""
+"""The losses that steps minimize, and the scores of validations."""
 
 import math
 import random
@@ -44,7 +44,7 @@ def test_the_loss_of_equal_images_is_finite():
     assert bool(same.grad.isfinite().all())
 
 
-def test_the_parts_add_up():
+def test_the_loss_is_the_weighted_sum_of_its_parts():
     image, target = images()
     error = (image - target).square().mean().item()
     other = image_loss(image, target).item()
@@ -54,7 +54,7 @@ def test_the_parts_add_up():
         assert loss == pytest.approx(wanted, rel=1e-4)
 
 
-def test_twice_the_error_costs_the_same_wherever_one_starts():
+def test_doubling_the_error_costs_the_same_at_any_error():
     image, target = images()
     config = LossConfig(mse_weight=1.0, image_weight=0.0)
     losses = [
@@ -84,8 +84,8 @@ def test_an_untrained_network_has_the_loss_of_the_reference():
 
 
 @pytest.mark.parametrize("kind", ["scene", "local"])
-def test_the_seed_decides_and_nothing_else(kind, monkeypatch):
-    """Over colours: two seeds may choose the same image over black."""
+def test_the_loss_depends_only_on_the_seed(kind, monkeypatch):
+    """Over coloured backgrounds only: over black, two seeds may choose the same image."""
     monkeypatch.setattr("cvtgs.train.losses.BLACK_SHARE", 0.0)
     case, views, config = some_case(), some_views(), config_of()
 
@@ -100,7 +100,7 @@ def test_the_seed_decides_and_nothing_else(kind, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["scene", "local"])
-def test_changes_have_their_price(kind):
+def test_residuals_are_penalized(kind):
     case, views, net = some_case(), some_views(), lively_net(torch.float32)
 
     def loss(residual: float) -> float:
@@ -117,7 +117,7 @@ def test_changes_have_their_price(kind):
 
 @pytest.mark.parametrize("kind", ["scene", "local"])
 def test_gradients_reach_the_last_layers_of_a_new_network(kind):
-    """They start at zero, and nothing below them can move before they do."""
+    """They start at zero, and no layer below them can change before they do."""
     case, views, net, config = some_case(), some_views(), small_net(), config_of()
     rng = random.Random(0)
     if kind == "local":

@@ -77,7 +77,7 @@ def test_no_window_reaches_across_cells():
     assert image_loss(images, targets).item() == pytest.approx(sum(single) / 4, rel=1e-5)
 
 
-def test_colours_are_those_of_all_bands_as_the_camera_sees_them():
+def test_colours_use_all_bands_in_the_direction_of_the_camera():
     case = some_case(600, seed=1)  # of degree 1
     merged = case.reference.merged.select(case.cells[:4])
     assert merged.shN.shape[1] == 3
@@ -92,7 +92,7 @@ def test_colours_are_those_of_all_bands_as_the_camera_sees_them():
     assert not torch.allclose(grid.merged.sh0, grid_of(case, count=4, all_bands=False).merged.sh0)
 
 
-def test_the_loss_is_that_of_the_publication_without_a_logarithm():
+def test_the_loss_is_the_published_one_without_a_logarithm():
     case = some_case(1500, ratio=0.1)
     config = TrainConfig(kind="published", cells=4, tile=TILE)
     found = published_loss(net_of(), case, config=config, rng=random.Random(5)).item()
@@ -116,7 +116,7 @@ def test_the_loss_is_that_of_the_publication_without_a_logarithm():
     assert found == pytest.approx(image_loss(image, target).item(), rel=1e-5)
 
 
-def test_gradients_reach_every_residual_once_the_last_layer_moves():
+def test_gradients_reach_every_residual_once_the_last_layer_is_not_zero():
     case = some_case(600, seed=1)
     net, config = net_of(scale=0.01), TrainConfig(kind="published", cells=9, tile=TILE)
     published_loss(net, case, config=config, rng=random.Random(0)).backward()
@@ -127,7 +127,7 @@ def test_gradients_reach_every_residual_once_the_last_layer_moves():
 
 
 @pytest.mark.parametrize(("members", "drawn"), [(1, 1), (40, None), (10**6, 9)])
-def test_a_step_takes_no_more_members_than_it_may(monkeypatch, members, drawn):
+def test_a_step_respects_the_limit_of_members(monkeypatch, members, drawn):
     case, taken = some_case(600, ratio=0.05), []
     net, forward = net_of(), PublishedMergeNet.forward
     monkeypatch.setattr(
@@ -143,7 +143,7 @@ def test_a_step_takes_no_more_members_than_it_may(monkeypatch, members, drawn):
 
 
 @pytest.mark.slow
-def test_a_training_gains_is_resumed_and_names_its_kind(tmp_path, monkeypatch):
+def test_a_training_run_gains_resumes_and_records_its_kind(tmp_path, monkeypatch):
     monkeypatch.setattr(History, "curves", lambda history: b"an image")
     scenes = write_scenes(tmp_path / "scenes", ["lesson", "exam", "lesson2"], 1500)
     config = tiny_config(

@@ -1,4 +1,4 @@
-"""Interrupted trainings: what is resumed gives the bits of what never stopped."""
+"""Interrupted training: a resumed run gives the bits of an uninterrupted one."""
 
 from pathlib import Path
 
@@ -74,7 +74,7 @@ def assert_same_files(first: Path, second: Path) -> None:
 @pytest.mark.usefixtures("_quick_curves")
 @pytest.mark.parametrize("kind", ["scene", "local"])
 @pytest.mark.parametrize("stops", [[1], [2], [1, 3, 4, 5]], ids=str)
-def test_interrupted_anywhere_and_resumed(scenes, cache, tmp_path, kind, stops):
+def test_a_run_interrupted_anywhere_can_be_resumed(scenes, cache, tmp_path, kind, stops):
     whole, cut = tmp_path / "whole.safetensors", tmp_path / "cut.safetensors"
     config = config_of(scenes, kind=kind)
     wanted = run(config, whole, cache)
@@ -89,7 +89,9 @@ def test_interrupted_anywhere_and_resumed(scenes, cache, tmp_path, kind, stops):
 
 @pytest.mark.usefixtures("_quick_curves")
 @pytest.mark.parametrize(("where", "count"), [("validation_psnr", 2), ("atomic_output", 3)])
-def test_interrupted_inside_a_validation(scenes, cache, tmp_path, monkeypatch, where, count):
+def test_a_run_interrupted_during_validation_can_be_resumed(
+    scenes, cache, tmp_path, monkeypatch, where, count
+):
     whole, cut = tmp_path / "whole.safetensors", tmp_path / "cut.safetensors"
     config, calls = config_of(scenes), []
     run(config, whole, cache)
@@ -110,7 +112,9 @@ def test_interrupted_inside_a_validation(scenes, cache, tmp_path, monkeypatch, w
 
 
 @pytest.mark.usefixtures("_quick_curves")
-def test_interrupted_between_checkpoint_and_state(scenes, cache, tmp_path, monkeypatch):
+def test_a_run_interrupted_between_checkpoint_and_state_can_be_resumed(
+    scenes, cache, tmp_path, monkeypatch
+):
     """The checkpoint is then newer than the state, and is written again."""
     whole, cut = tmp_path / "whole.safetensors", tmp_path / "cut.safetensors"
     config, calls = config_of(scenes), []
@@ -134,7 +138,7 @@ def test_interrupted_between_checkpoint_and_state(scenes, cache, tmp_path, monke
 
 
 @pytest.mark.usefixtures("_quick_curves")
-def test_resuming_what_is_finished_changes_nothing(scenes, cache, tmp_path):
+def test_resuming_a_finished_run_changes_nothing(scenes, cache, tmp_path):
     path = tmp_path / "net.safetensors"
     first = run(config_of(scenes), path, cache)
     files = {entry: entry.read_bytes() for entry in tmp_path.iterdir() if entry.is_file()}
@@ -146,7 +150,7 @@ def test_resuming_what_is_finished_changes_nothing(scenes, cache, tmp_path):
 
 
 @pytest.mark.usefixtures("_quick_curves")
-def test_without_resume_a_training_starts_anew(scenes, cache, tmp_path):
+def test_without_resume_a_training_starts_over(scenes, cache, tmp_path):
     path = tmp_path / "net.safetensors"
     with pytest.raises(PowerCutError):
         run(config_of(scenes), path, cache, listener=interrupting(5))
@@ -155,7 +159,7 @@ def test_without_resume_a_training_starts_anew(scenes, cache, tmp_path):
 
 
 @pytest.mark.usefixtures("_quick_curves")
-def test_more_patience_lets_a_training_go_on(scenes, cache, tmp_path, monkeypatch):
+def test_more_patience_lets_a_training_continue(scenes, cache, tmp_path, monkeypatch):
     path, whole = tmp_path / "net.safetensors", tmp_path / "whole.safetensors"
     true_psnr = train_loop.validation_psnr
 
@@ -179,17 +183,17 @@ def test_another_configuration_or_a_damaged_state_is_one_clear_error(scenes, cac
     run(config_of(scenes), path, cache)
     checkpoint, state = path.read_bytes(), path.with_suffix(".state")
     for changes in ({"seed": 1}, {"width": 7}, {"learning_rate": 0.1}):
-        with pytest.raises(CheckpointError, match="a training with another configuration"):
+        with pytest.raises(CheckpointError, match="a training run with another configuration"):
             run(config_of(scenes, **changes), path, cache, resume=True)
     state.write_bytes(state.read_bytes()[:-1])
-    with pytest.raises(CheckpointError, match="the state of the training is damaged"):
+    with pytest.raises(CheckpointError, match="the training state is damaged; remove it"):
         run(config_of(scenes), path, cache, resume=True)
     assert path.read_bytes() == checkpoint
 
 
 @pytest.mark.slow
 @needs_matplotlib
-def test_the_curves_are_those_of_the_whole_training(scenes, cache, tmp_path):
+def test_the_curves_cover_the_whole_training(scenes, cache, tmp_path):
     whole, cut = tmp_path / "whole.safetensors", tmp_path / "cut.safetensors"
     config = config_of(scenes, validate_every=4)
     run(config, whole, cache)

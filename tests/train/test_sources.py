@@ -1,4 +1,4 @@
-"""Sources: which scenes are learned from, which decide, and what is made of them."""
+"""Sources: scenes for training, scenes for validation, and variants made of them."""
 
 import random
 
@@ -24,7 +24,7 @@ def with_bad_rows(scene: cvtgs.GaussianScene) -> cvtgs.GaussianScene:
     return scene.with_tensors({"means": means, "quats": quats}, scene.extras)
 
 
-def test_folders_are_searched_to_the_bottom(tmp_path):
+def test_folders_are_searched_recursively(tmp_path):
     write_scenes(tmp_path, ["b", "exam", "deep/er/a", "deep/c"], 50)
     (tmp_path / "notes.txt").write_text("no scene")
     sources = find_sources(tiny_data(tmp_path), seed=0)
@@ -53,13 +53,13 @@ def test_only_scenes_for_validation_have_cameras(tmp_path):
     assert cameras == {"a": None, "exam": tmp_path / "exam.transforms.json"}
 
 
-def test_several_folders_one_after_the_other(tmp_path):
+def test_several_folders_are_searched_in_order(tmp_path):
     first, second = (write_scenes(tmp_path / name, [name], 5) for name in ("z", "exam"))
     sources = find_sources(tiny_data(first, folders=(first, second)), seed=0)
     assert [source.name for source in sources] == ["z", "exam"]
 
 
-def test_blocks_and_copies_of_what_is_learned_from(tmp_path):
+def test_blocks_and_copies_are_made_of_training_scenes(tmp_path):
     write_scenes(tmp_path, ["exam", "large"], 60)
     write_scenes(tmp_path, ["small"], 40)
     data = tiny_data(tmp_path, blocks=2, block_count=40, copies=1)
@@ -75,7 +75,7 @@ def test_blocks_and_copies_of_what_is_learned_from(tmp_path):
     assert not same_bits(*blocks)
 
 
-def test_files_above_the_largest_scene_are_learned_from_in_pieces(tmp_path):
+def test_files_above_the_largest_scene_are_split_into_pieces(tmp_path):
     write_scenes(tmp_path, ["exam", "large"], 60)
     data = tiny_data(tmp_path, blocks=1, block_count=40, largest_scene=59)
     assert [source.name for source in find_sources(data, seed=0)] == ["exam", "large-block0"]
@@ -119,7 +119,7 @@ def test_making_twice_gives_the_same_bits(tmp_path):
         assert same_bits(source.make(), source.make())
 
 
-def test_another_content_is_another_identity(tmp_path):
+def test_other_contents_give_another_identity(tmp_path):
     write_scenes(tmp_path, ["a", "exam"], 60)
     before = find_sources(tiny_data(tmp_path), seed=0)[0].identity
     cvtgs.save(small_scene(61), tmp_path / "a.ply", overwrite=True)
@@ -145,9 +145,18 @@ def test_invalid_rows_of_a_file_are_left_out(tmp_path):
         ({"folders": ["."]}, "data.folders: {0} holds no PLY file."),
         ({"folders": ["some"], "validation": ("x",)}, "data.validation: no file named x.ply in"),
         ({"folders": ["some", "some"]}, "data.folders: two files have the same name."),
-        ({"folders": ["some"], "validation": ("a", "exam")}, "data: there is no scene to learn"),
-        ({"folders": ["one"], "validation": ()}, "data: there is no scene to validate with."),
-        ({"folders": [], "validation": ()}, "data: there is no scene to learn from."),
+        (
+            {"folders": ["some"], "validation": ("a", "exam")},
+            "data: at least one training scene is needed, found none.",
+        ),
+        (
+            {"folders": ["one"], "validation": ()},
+            "data: at least one validation scene is needed, found none.",
+        ),
+        (
+            {"folders": [], "validation": ()},
+            "data: at least one training scene is needed, found none.",
+        ),
     ],
 )
 def test_folders_that_cannot_be_used_are_errors(tmp_path, changes, text):
@@ -161,7 +170,7 @@ def test_folders_that_cannot_be_used_are_errors(tmp_path, changes, text):
     assert str(caught.value).startswith(text.format(tmp_path))
 
 
-def test_a_file_is_no_folder(tmp_path):
+def test_a_file_instead_of_a_folder_is_an_error(tmp_path):
     write_scenes(tmp_path, ["a"], 5)
     with pytest.raises(ConfigError, match=r"a\.ply is not a folder"):
         find_sources(tiny_data(tmp_path / "a.ply"), seed=0)
@@ -174,7 +183,7 @@ def test_a_damaged_file_is_named(tmp_path):
         find_sources(tiny_data(tmp_path), seed=0)
 
 
-def test_a_block_is_a_gaussian_and_those_nearest_to_it():
+def test_a_block_is_a_gaussian_and_its_nearest_neighbours():
     scene = random_scene(60)
     block = cut_block(scene, 20, seed=5)
     middle = scene.means[random.Random(5).randrange(60)]
@@ -190,7 +199,7 @@ def test_a_scene_that_is_no_larger_than_a_block_stays_whole(count):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_perturbed_scene_is_valid_and_another_one(seed):
+def test_a_perturbed_scene_is_valid_and_different(seed):
     scene = small_scene(300, seed=seed)
     other = perturb(scene, random.Random(seed))
     assert 0.3 * len(scene) < len(other) <= len(scene)
@@ -209,8 +218,8 @@ def test_the_seed_decides_what_is_perturbed():
     assert len(first) != len(other)
 
 
-def test_what_perturbing_changes():
-    """Places and shapes are stretched alike, colours of all bands mixed alike, logits moved."""
+def test_perturbing_changes_places_shapes_colours_and_opacities():
+    """Places and shapes are stretched alike, colours of all bands mixed alike, logits shifted."""
     scene = random_scene(200, degree=1, dtype=torch.float64)
     logits = 10.0 * torch.arange(200, dtype=torch.float64)
     scene = scene.with_tensors({"logit_opacities": logits}, {})

@@ -1,4 +1,4 @@
-"""The state of a training: what is saved is what is resumed; its history, and how it is drawn."""
+"""The training state: saving and loading; its history, and curves of the history."""
 
 import copy
 import json
@@ -21,7 +21,7 @@ CONFIG = TrainConfig(steps=10, width=6, cell_width=10)
 
 
 def stepped(state: TrainState, steps: int) -> TrainState:
-    """Take steps on something that depends on every weight."""
+    """Take steps on a loss that depends on every weight."""
     seen = some_case(dtype=torch.float32).describe()
     for _ in range(steps):
         residuals = state.net(seen)
@@ -50,7 +50,7 @@ def loaded(path: Path, config: TrainConfig = CONFIG) -> TrainState:
     return state
 
 
-def test_what_was_saved_is_taken_over(tmp_path):
+def test_loading_restores_what_was_saved(tmp_path):
     path = saved(tmp_path / "a.state")
     state, wanted = loaded(path), stepped(TrainState(small_net(), CONFIG), 3)
     assert state.step == 3
@@ -61,7 +61,7 @@ def test_what_was_saved_is_taken_over(tmp_path):
     assert entry.gains == (Gain("room", 0.1, 0.1 + 0.2), Gain("room", 0.01, -1e-9))
 
 
-def test_going_on_gives_the_same_bits(tmp_path):
+def test_continuing_gives_the_same_bits(tmp_path):
     state = stepped(loaded(saved(tmp_path / "a.state")), 4)
     wanted = stepped(TrainState(small_net(), CONFIG), 7)
     assert bits_of(state.net.state_dict()) == bits_of(wanted.net.state_dict())
@@ -75,7 +75,7 @@ def test_saving_again_gives_the_same_bytes(tmp_path):
     assert (tmp_path / "b.state").read_bytes() == path.read_bytes()
 
 
-def test_going_on_does_not_touch_the_file(tmp_path):
+def test_continuing_does_not_change_the_file(tmp_path):
     path = saved(tmp_path / "a.state")
     before = path.read_bytes()
     stepped(loaded(path), 2)
@@ -91,7 +91,7 @@ def test_a_state_before_the_first_step(tmp_path):
 
 
 def test_the_running_mean_starts_fast_and_becomes_slow():
-    """After the first step a tenth is left of the start, and late a five hundredth is new."""
+    """After the first step a tenth of the start is left; late steps contribute a five-hundredth."""
     state = TrainState(small_net(), CONFIG)
     with torch.no_grad():
         for values in (*state.net.parameters(), *state.mean_net.parameters()):
@@ -107,7 +107,7 @@ def test_the_running_mean_starts_fast_and_becomes_slow():
     assert late == pytest.approx(share + (1 - share) / CONFIG.averaged_steps)
 
 
-def test_the_running_mean_is_a_network_of_its_own():
+def test_the_running_mean_is_a_separate_network():
     state = TrainState(small_net(), CONFIG)
     before = copy.deepcopy(state.mean_net.state_dict())
     with torch.no_grad():
@@ -137,7 +137,7 @@ def test_another_configuration_is_one_clear_error(tmp_path, changes):
     with pytest.raises(CheckpointError) as caught:
         state.load(path, config)
     assert str(caught.value) == (
-        f"{path}: the state belongs to a training with another configuration; "
+        f"{path}: the state belongs to a training run with another configuration; "
         f"remove it, or train to another output."
     )
     assert state.step == 0
@@ -155,15 +155,15 @@ SCENES = (LearnedScene(name="room", count=5, sha256="ab"), LearnedScene(name="ex
     "scenes", [SCENES[:1], (*SCENES[:1], SCENES[1].model_copy(update={"count": 8}))]
 )
 def test_other_scenes_are_one_clear_error(tmp_path, scenes):
-    """Else the checkpoint would name scenes that only the last steps saw."""
+    """Otherwise the checkpoint would name scenes that only the last steps saw."""
     path = tmp_path / "a.state"
     TrainState(small_net(), CONFIG, SCENES).save(path, CONFIG)
     TrainState(small_net(), CONFIG, reversed(SCENES)).load(path, CONFIG)
     with pytest.raises(CheckpointError) as caught:
         TrainState(small_net(), CONFIG, scenes).load(path, CONFIG)
     assert str(caught.value) == (
-        f"{path}: the state belongs to a training on other scenes, exam is one of them; "
-        f"put the scenes back, or train to another output."
+        f"{path}: the state belongs to a training run on other scenes (exam differs); "
+        f"restore the scenes, or train to another output."
     )
 
 
@@ -174,7 +174,7 @@ def test_the_state_of_another_version_is_one_clear_error(tmp_path, monkeypatch):
     with pytest.raises(CheckpointError) as caught:
         loaded(path)
     assert str(caught.value) == (
-        f"{path}: the state was made by cvtgs {here}, this is 9.9; "
+        f"{path}: the state was written by cvtgs {here}, but this is 9.9; "
         f"remove it, or train to another output."
     )
 
@@ -226,7 +226,10 @@ def test_a_damaged_file_is_one_clear_error(tmp_path, kind):
     damaged(path, kind)
     with pytest.raises(CheckpointError) as caught:
         loaded(path)
-    assert str(caught.value) == f"{path}: the state of the training is damaged."
+    assert (
+        str(caught.value)
+        == f"{path}: the training state is damaged; remove it, or train to another output."
+    )
 
 
 GAINS = (

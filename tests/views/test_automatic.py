@@ -1,4 +1,4 @@
-"""Automatic views: up, inside or outside, and cameras that stand well."""
+"""Automatic views: up direction, inside or outside, and well-placed cameras."""
 
 import math
 
@@ -81,7 +81,7 @@ def test_views_of_every_kind(kind, turn):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_only_the_room_is_seen_from_inside(kind):
+def test_only_rooms_are_viewed_from_inside(kind):
     layout = find_layout(generated(kind))
     candidates = choose_candidates(layout, 4, size=(64, 48), turn=0.5)
     assert candidates.inside == (kind == "room")
@@ -93,7 +93,7 @@ def test_only_the_room_is_seen_from_inside(kind):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_flyaways_change_next_to_nothing(kind):
+def test_flyaways_hardly_change_the_views(kind):
     scene = generated(kind)
     plain = automatic_views(scene, 4, width=32, height=24)
     strewn = automatic_views(with_flyaways(scene), 4, width=32, height=24)
@@ -119,7 +119,7 @@ def test_a_camera_inside_of_a_floater_moves():
     assert bool(score_cameras(layout, again, distances=distances, inside=False).good.all())
 
 
-def test_a_wall_before_the_camera_makes_it_move():
+def test_a_camera_moves_if_a_wall_blocks_its_view():
     scene = generated("object")
     first = automatic_views(scene, 1, width=32, height=24)
     grid = torch.linspace(-0.6, 0.6, 13)
@@ -139,7 +139,7 @@ def test_a_wall_before_the_camera_makes_it_move():
     assert float(((seen.alpha > 0.5) & (seen.depth < 1.0)).float().mean()) < 0.1
 
 
-def test_same_scene_same_views():
+def test_the_same_scene_gives_the_same_views():
     scene = generated("courtyard", 5000)
     one, two = (automatic_views(scene, 5, width=40, height=30) for _ in range(2))
     assert torch.equal(one.viewmats, two.viewmats)
@@ -163,7 +163,7 @@ def test_the_scene_is_in_the_middle_of_upright_images():
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 50])
-def test_few_gaussians_have_views_too(count):
+def test_scenes_of_few_gaussians_have_views(count):
     scene = random_scene(count, seed=count)
     cameras = automatic_views(scene, 3, width=32, height=24)
     assert bool(torch.isfinite(cameras.viewmats).all())
@@ -179,7 +179,7 @@ def test_faint_coinciding_and_flat_scenes_have_views():
         assert bool(torch.isfinite(automatic_views(one, 2, width=32, height=24).viewmats).all())
 
 
-def test_infinite_opacities_and_bad_rows_are_no_obstacle():
+def test_infinite_opacities_and_bad_rows_do_no_harm():
     scene = generated("object", 2000)
     logits = scene.logit_opacities.clone()
     logits[:10] = math.inf
@@ -200,7 +200,7 @@ def test_infinite_opacities_and_bad_rows_are_no_obstacle():
     ids=["automatic", "random", "mixed"],
 )
 def test_views_of_a_georeferenced_scene_are_those_of_the_scene_at_the_origin(dtype, choose):
-    """At 6e6 float32 steps by 0.5: the scene is a kilometre large, and keeps these steps."""
+    """At 6e6 float32 resolves steps of 0.5; the scene spans a kilometre and is rounded to them."""
     scene = generated("object", 2000)
     shift = torch.tensor([6e6, -5e5, 3e6], dtype=torch.float64)
     tensors = {name: values.to(dtype) for name, values in scene.tensors().items()}
@@ -217,7 +217,7 @@ def test_views_of_a_georeferenced_scene_are_those_of_the_scene_at_the_origin(dty
         assert float(psnr(one.clamp(0, 1), other.clamp(0, 1)).amin()) > 60
 
 
-def test_bad_arguments():
+def test_bad_arguments_are_refused():
     scene = random_scene(10)
     for words, text in (
         ({"count": 0}, "count must be at least 1, found 0."),
@@ -231,7 +231,7 @@ def test_bad_arguments():
 
 
 def test_large_scenes_are_thinned_and_look_the_same(monkeypatch):
-    """The sample is enlarged, so that its masses and its views are those of the scene."""
+    """The Gaussians of the sample are enlarged, which keeps the mass and views of the scene."""
     scene = cvtgs.synthetic.scene("courtyard", 6000, sh_degree=0, seed=3)
     whole = find_layout(scene)
     monkeypatch.setattr("cvtgs.views.layout.SAMPLE_SIZE", 3000)

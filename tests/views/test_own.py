@@ -71,7 +71,7 @@ def test_cameras_beside_a_file_are_found(tmp_path, scene):
     assert (len(own.cameras), own.source) == (3, tmp_path)
 
 
-def test_cameras_of_another_world_damaged_ones_and_a_single_one_are_not_taken(tmp_path, scene):
+def test_foreign_damaged_and_single_cameras_are_not_used(tmp_path, scene):
     file = model_of(tmp_path, scene)
     cameras = automatic_views(scene, 4, width=64, height=48)
     moved = cameras.viewmats.clone()
@@ -86,7 +86,7 @@ def test_cameras_of_another_world_damaged_ones_and_a_single_one_are_not_taken(tm
     assert find_own_cameras(scene, tmp_path / "nowhere.ply") is None
 
 
-def test_a_preset_that_renders_uses_them_and_the_report_says_so(tmp_path, scene, capsys):
+def test_a_preset_that_renders_uses_and_reports_the_cameras(tmp_path, scene, capsys):
     file = model_of(tmp_path, scene)
     write_inria(tmp_path / "cameras.json", automatic_views(scene, 5, width=48, height=48))
     config = cvtgs.SimplifyConfig.compose(settings={"visibility.views": "4"})

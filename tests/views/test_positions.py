@@ -111,8 +111,8 @@ def test_views_of_a_room_are_inside_of_it():
         assert bool(((cameras.centers > low) & (cameras.centers < high)).all())
 
 
-def test_a_wall_that_was_seen_from_one_side_is_looked_at_from_there():
-    """Behind what images show, where none was taken, Gaussians are larger."""
+def test_a_wall_captured_from_one_side_is_viewed_from_that_side():
+    """Gaussians are larger behind the wall, where no image was taken."""
     generator = torch.Generator().manual_seed(0)
     means = 2 * torch.rand(6000, 3, generator=generator) - 1
     means[:, 2] = 0.4 * means[:, 2].abs()
@@ -121,7 +121,7 @@ def test_a_wall_that_was_seen_from_one_side_is_looked_at_from_there():
     assert float((eyes[:, 2] < 0).double().mean()) > 0.9
 
 
-def test_splats_are_as_large_as_they_are_in_the_image():
+def test_splat_sizes_are_those_in_the_image():
     """Near ones are 0.1 wide at a distance of 2, and hide the far one."""
     means = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [0, 0, 2]])
     layout = find_layout(blobs(means, torch.tensor([0.1, 0.1, 0.1]).log()))
@@ -138,8 +138,8 @@ def test_splats_are_as_large_as_they_are_in_the_image():
     assert sizes.in_scene.tolist() == pytest.approx([0.1 / layout.frame.radius], rel=1e-5)
 
 
-def test_where_splats_are_large_hardly_any_view_is():
-    """Half of a ball is of large and of tiny Gaussians, as large in the mean as those elsewhere."""
+def test_few_views_are_placed_where_splats_are_large():
+    """Half of a ball mixes large and tiny Gaussians; their mean log size is that of the rest."""
     means = sphere(4000)
     large = torch.rand(4000, generator=torch.Generator().manual_seed(1)) < 0.5
     factors = torch.where(large, 6.0, 1 / 6).where(means[:, 0] > 0, 1.0)
@@ -152,8 +152,8 @@ def test_where_splats_are_large_hardly_any_view_is():
     assert share(mixed_views(positions, 32, size=32)) < 0.2
 
 
-def test_the_smooth_back_of_an_object_is_looked_at():
-    """Its Gaussians are almost twice as large as those in front, and yet no fog."""
+def test_the_smooth_back_of_an_object_is_viewed():
+    """Its Gaussians are almost twice as large as those in front, but they are not fog."""
     front, back = sphere(6000), sphere(1200, 0.97)
     front, back = front[front[:, 2] < 0], back[back[:, 2] >= 0]
     sizes = torch.cat([torch.full((len(front),), 0.012), torch.full((len(back),), 0.021)])
@@ -176,7 +176,7 @@ def test_automatic_views_among_mixed_ones_are_all_around(count):
     assert float(gaps.amax()) < 1.2 * math.tau / (count // 4)
 
 
-def test_same_scene_same_positions():
+def test_the_same_scene_gives_the_same_positions():
     scene = turned("courtyard", CONVENTIONS["y-down"])
     one, two = (find_view_positions(scene) for _ in range(2))
     assert torch.equal(one.eyes, two.eyes)
@@ -207,7 +207,7 @@ def test_a_ground_across_x_gives_a_unit_vector(sense):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 3])
-def test_a_hollow_object_is_no_room(seed: int) -> None:
+def test_a_hollow_object_is_not_a_room(seed: int) -> None:
     vase = cvtgs.synthetic.scene("object", 6000, sh_degree=0, seed=seed)
     positions = find_view_positions(vase)
     assert positions.layout.room is None
@@ -216,7 +216,7 @@ def test_a_hollow_object_is_no_room(seed: int) -> None:
     assert float(away.min()) > 2 * layout.radius
 
 
-def test_what_is_behind_walls_is_counted() -> None:
+def test_the_share_hidden_behind_walls_by_hand() -> None:
     angles = torch.linspace(0, 2 * math.pi, 200, dtype=torch.float64)[:-1]
     ring = torch.stack([angles.cos(), 0 * angles, angles.sin()], dim=1)
     eye = torch.zeros(3, dtype=torch.float64)

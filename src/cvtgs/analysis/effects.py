@@ -153,7 +153,7 @@ def plan_effects(
         mip=Effect(
             active=antialiased and choices.mip != "off",
             figure=float(antialiased),
-            meaning="1 if the comment SplatRenderMode: mip is there, on at 1",
+            meaning="1 if the comment SplatRenderMode: mip is present, on at 1",
             forced=choices.mip != "auto",
         ),
         unbounded=GradedEffect(
@@ -171,7 +171,7 @@ def plan_effects(
             duplicates,
             choices.duplicates,
             DUPLICATE_SHARE,
-            "share of Gaussians exactly where others of their colour are",
+            "share of Gaussians that coincide with others of the same colour",
         ),
         extras=Effect(
             active=bool(scene.extras),

@@ -188,7 +188,7 @@ def find_count(
     if best is None:
         nearest = max(tried, key=target.of)
         raise GoalError(
-            f"no smaller scene reaches {target.text(target.value)}: the best that was tried, "
+            f"no simplified scene reaches {target.text(target.value)}: the best one tried, with "
             f"{nearest.count:,} of {len(scene):,} Gaussians, reaches "
             f"{target.text(target.of(nearest))}."
         )
@@ -326,7 +326,7 @@ def choose_preset(
     if isinstance(work, GaussianScene):
         work = Work.of(work, target_count(len(work), rho, count=count))
     elif rho is not None or count is not None:
-        raise InvalidArgumentError("rho and count go with a scene; a Work has its target.")
+        raise InvalidArgumentError("rho and count are for a scene only; a Work has its target.")
     known = cost_model() if model is None else model
     costs = {
         name: known.seconds(
@@ -339,8 +339,8 @@ def choose_preset(
         fastest = min(costs, key=lambda name: costs[name])
         raise GoalError(
             f"no preset fits into {seconds:.2g} s: the fastest, {fastest}, takes about "
-            f"{costs[fastest]:.2g} s to make {work.target:,} of {work.count:,} Gaussians, and is "
-            f"given {MARGIN:g} times that."
+            f"{costs[fastest]:.2g} s to make {work.target:,} of {work.count:,} Gaussians, and "
+            f"{MARGIN:g} times that is reserved."
         )
     best = fitting[-1]
     return Choice(best, costs[best])

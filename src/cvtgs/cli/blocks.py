@@ -28,20 +28,20 @@ def add_block_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--memory",
         metavar="AMOUNT",
-        help="memory to use, for example 4GB (default: what is free); a binary .ply that needs "
-        "more is worked on block by block, and the same command resumes an interrupted run",
+        help="memory to use, for example 4GB (default: the free memory); a binary .ply that needs "
+        "more is processed in blocks, and the same command resumes an interrupted run",
     )
     parser.add_argument(
         "--workers",
         type=int,
         metavar="N",
-        help="processes that work on blocks and share --memory (default: one for each core, as "
-        "far as memory allows)",
+        help="processes for the blocks, which share --memory (default: one per core, as far as "
+        "memory allows)",
     )
     parser.add_argument(
         "--scheduler",
         metavar="ADDRESS",
-        help="address of a Dask cluster that works on the blocks; its workers need access to "
+        help="address of a Dask cluster that processes the blocks; its workers need access to "
         "the files, and --memory is the memory of each task",
     )
 
@@ -53,8 +53,8 @@ def memory_of(options: argparse.Namespace) -> int:
 
     if options.workers is not None and (options.workers < 1 or options.scheduler is not None):
         raise InvalidArgumentError(
-            "--workers must be at least 1, and goes with blocks on this machine, not with "
-            f"--scheduler; found {options.workers}."
+            "--workers must be at least 1, and cannot be used with --scheduler; found "
+            f"{options.workers}."
         )
     if options.memory is None:
         return memory_to_plan(available_memory())

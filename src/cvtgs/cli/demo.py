@@ -22,8 +22,8 @@ def add_demo(add_parser: AddParser) -> None:
     parser = add_parser(
         "demo",
         help="simplify a generated scene; needs no files",
-        description="Generate a scene, make it 10 and 100 times smaller, and write all three "
-        "and a page that shows them side by side.",
+        description="Generate a scene, simplify it to 10 % and 1 % of its Gaussians, and write all "
+        "three scenes and a page that shows them side by side.",
     )
     parser.set_defaults(run=demo)
     parser.add_argument(
@@ -113,7 +113,7 @@ def _print_table(columns: list[dict[str, str]]) -> None:
 
 
 def _print_next_steps(folder: Path) -> None:
-    say("Look at them side by side: open this page in a browser, it needs no network.")
+    say("Compare them side by side: open this page in a browser (it works offline).")
     say(f"  {(folder / 'index.html').resolve().as_uri()}")
     say_wrapped(f"The scenes are in {folder}; any 3DGS viewer opens them.")
     say("With a scene of your own:")

@@ -89,7 +89,7 @@ def doctor(options: argparse.Namespace) -> None:
         say(f"\n{one}: {device_name(one)}")
         taken = cvtgs.rendering.choose_backend("auto", one)[0]
         for name in RENDERERS:
-            use = " (used: the fastest of those that work here)" if name == taken else ""
+            use = " (used: the fastest that works here)" if name == taken else ""
             say(f"  images by {name:<7} {_renderer_state(name, one)}{use}")
         say(f"  nearest site by {cvtgs.cvt.SEARCH} (a k-d tree on the host, whatever the device)")
     default = chosen_device(options.device)
@@ -130,10 +130,12 @@ def _small_run(device: "torch.device") -> list[str]:
     color = float(image.rgb.mean())
     times.append(time.perf_counter())
     if len(small) != report.target_count or not 0.0 < color < 1.0:
-        raise DeviceError(f"{len(small):,} Gaussians and a mean colour of {color:.3g} came out")
+        raise DeviceError(
+            f"the result has {len(small):,} Gaussians and a mean colour of {color:.3g}"
+        )
     generated, simplified, viewed, rendered = (after - before for before, after in pairwise(times))
     compiles = image.backend == "numba"
-    note = "   the first images with numba compile for some ten seconds" if compiles else ""
+    note = "   numba compiles for about ten seconds at its first use" if compiles else ""
     return [
         f"generate  {generated:6.2f} s",
         f"simplify  {simplified:6.2f} s   search by {report.backend}, "

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from cvtgs.scene import GaussianScene
 
 _NUMBERS = {
-    "--crop-box": "six numbers x,y,z,X,Y,Z, the least and the largest coordinates",
-    "--crop-sphere": "four numbers x,y,z,r, the centre and the radius",
+    "--crop-box": "six numbers x,y,z,X,Y,Z, the minimum and maximum coordinates",
+    "--crop-sphere": "four numbers x,y,z,r, the centre and radius",
     "--rotate": "three numbers x,y,z, degrees about each axis",
     "--translate": "three numbers x,y,z",
 }
@@ -24,7 +24,7 @@ _NUMBERS = {
 def add_edit_options(parser: argparse.ArgumentParser) -> None:
     """Add the options, in the order in which they are applied."""
     group = parser.add_argument_group(
-        "edits", "in this order, in the coordinates of a PLY; rows that stay keep their bits"
+        "edits", "applied in this order, in PLY coordinates; rows that are kept do not change"
     )
     group.add_argument(
         "--merge",
@@ -39,18 +39,18 @@ def add_edit_options(parser: argparse.ArgumentParser) -> None:
         metavar="X,Y,Z,X,Y,Z",
         action="append",
         default=[],
-        help="box to keep, by its least and its largest corner; with more than one region, "
-        "Gaussians in any of them stay",
+        help="box to keep, by its minimum and maximum corner; with more than one region, "
+        "Gaussians in any of them are kept",
     )
     group.add_argument(
         "--crop-sphere",
         metavar="X,Y,Z,R",
         action="append",
         default=[],
-        help="sphere to keep, by its centre and its radius",
+        help="sphere to keep, by its centre and radius",
     )
     group.add_argument(
-        "--min-opacity", metavar="A", type=float, help="least opacity to keep, 0 to 1"
+        "--min-opacity", metavar="A", type=float, help="lowest opacity to keep, 0 to 1"
     )
     group.add_argument(
         "--max-size",
@@ -58,11 +58,15 @@ def add_edit_options(parser: argparse.ArgumentParser) -> None:
         type=float,
         help="largest standard deviation of a Gaussian to keep, scene units",
     )
-    group.add_argument("--scale", metavar="F", type=float, help="factor of all lengths")
+    group.add_argument("--scale", metavar="F", type=float, help="scale factor of all lengths")
     group.add_argument(
-        "--rotate", metavar="X,Y,Z", help="degrees to turn about x, then y, then z; SH turn, too"
+        "--rotate",
+        metavar="X,Y,Z",
+        help="rotation in degrees about x, then y, then z, which also rotates the SH",
     )
-    group.add_argument("--translate", metavar="X,Y,Z", help="shift, after turning and scaling")
+    group.add_argument(
+        "--translate", metavar="X,Y,Z", help="translation, after rotation and scaling"
+    )
 
 
 class SceneEdits:
@@ -95,8 +99,7 @@ class SceneEdits:
             scene = smaller
         if len(scene) == 0:
             raise InvalidArgumentError(
-                f"at least one Gaussian must be left to be written, found none: "
-                f"{'; '.join(phrases)}."
+                f"at least one Gaussian must be left to write, found none: {'; '.join(phrases)}."
             )
         if self.motion is not None:
             scene = cvtgs.edit.move(scene, self.motion)
@@ -105,7 +108,7 @@ class SceneEdits:
     def _filtered(self, scene: "GaussianScene") -> "Iterator[tuple[str, GaussianScene]]":
         if self.regions:
             scene = cvtgs.edit.crop(scene, self.regions)
-            yield "outside of --crop-box and --crop-sphere", scene
+            yield "outside --crop-box and --crop-sphere", scene
         if self.least is not None:
             scene = cvtgs.edit.drop_faint(scene, self.least)
             yield "below --min-opacity", scene

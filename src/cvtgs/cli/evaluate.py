@@ -215,8 +215,8 @@ def add_compare(add_parser: AddParser) -> None:
         help="write a page that shows the full scene and simplified ones side by side",
         description="Write index.html, a single file that works offline, with a divider between "
         "REF and each SMALL; sheet.png, all images with their scores; and errors.png, maps of "
-        f"the errors of colour and of alpha. Scores are those of cvtgs evaluate; of many "
-        f"--cameras, {MOST_CAMERAS} are shown unless --views sets a number.",
+        f"the colour and alpha errors. Scores are those of cvtgs evaluate; at most {MOST_CAMERAS} "
+        f"of the --cameras are shown, unless --views sets another number.",
     )
     parser.set_defaults(run=compare)
     add_options(parser, "reference", "small", "--lpips", "-o/--output")
@@ -260,18 +260,18 @@ def add_tradeoff(add_parser: AddParser) -> None:
     """Add the command and its options."""
     parser = add_parser(
         "tradeoff",
-        help="run all presets on a scene and show seconds against quality",
-        description="Simplify IN by every preset, each run in its own process, score the results "
+        help="run all presets on a scene and show quality against time",
+        description="Simplify IN with every preset, each run in its own process, score the results "
         "against IN, print a table, and write tradeoff.csv, tradeoff.json, tradeoff.png and "
-        "index.html, a single file that works offline. Of --cameras, "
-        f"{MOST_CAMERAS} are used unless --views sets a number.",
+        f"index.html, a single file that works offline. At most {MOST_CAMERAS} of the --cameras "
+        "are used, unless --views sets another number.",
     )
     parser.set_defaults(run=tradeoff)
     add_options(parser, "input", "--rho")
     parser.add_argument("--presets", metavar="NAME,NAME", help="presets to run (default: all)")
     add_options(parser, "-o/--output")
     parser.add_argument(
-        "--save", action="store_true", help="write the simplified scenes to DIR, too"
+        "--save", action="store_true", help="also write the simplified scenes to DIR"
     )
     add_options(parser, "--lpips", "--images", "--trust-sizes", "--overwrite")
     add_view_options(parser, size=SCORED_SIZE)
@@ -308,7 +308,7 @@ def tradeoff(options: argparse.Namespace) -> None:
         names = ", ".join(path.name for path in paths)
         say(f"Wrote {names}. Open {paths[-1]} in a browser.")
         if note:
-            say(f"Without a plot: {note}")
+            say(f"No plot was written: {note}")
 
 
 def _print_tradeoff(tradeoff: "Tradeoff") -> None:

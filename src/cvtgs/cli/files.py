@@ -73,7 +73,7 @@ def show_checkpoint(path: Path, *, as_json: bool) -> None:
     ]
     rows += [
         (
-            "validated with" if scene.is_validation else "learned from",
+            "validated on" if scene.is_validation else "trained on",
             f"{scene.name}, {scene.count:,}, {scene.sha256 or 'generated'}",
         )
         for scene in info.scenes
@@ -137,8 +137,8 @@ def add_convert(add_parser: AddParser) -> None:
         "convert",
         help="write scenes in another format",
         description="Read IN and write it as OUT; the suffixes of the names set the formats. "
-        "Prints what the format of OUT cannot hold before writing it. Scenes can be merged, "
-        "cropped, filtered and moved on the way.",
+        "Before writing, print the data that the format of OUT cannot hold. Scenes can also be "
+        "merged, cropped, filtered and moved.",
     )
     parser.set_defaults(run=convert)
     parser.check = check_paths

@@ -28,7 +28,7 @@ from cvtgs.text import printable
 STREAM = "-"
 """The path that stands for standard input or output."""
 
-_OTHER_FORMATS = "write a scene of another format to a file, whose name says which it is"
+_OTHER_FORMATS = "save a scene in another format as a file, whose suffix gives the format"
 
 
 class Outcome(NamedTuple):
@@ -71,8 +71,8 @@ def add_paths(parser: CommandParser, *, options: str) -> None:
         nargs="+",
         metavar="IN OUT",
         help=f"scene to read ({READABLE}) and scene to write ({WRITABLE}); - is standard input or "
-        "output. With -o, any number of scenes to read; patterns such as 'scans/*.ply' are "
-        "expanded, and a folder stands for the scenes in it",
+        "output. With -o, any number of scenes to read; patterns such as 'scans/*.ply' and "
+        "folders of scenes are expanded",
     )
     parser.add_argument(
         "-o",
@@ -80,13 +80,13 @@ def add_paths(parser: CommandParser, *, options: str) -> None:
         dest="folder",
         type=Path,
         metavar="DIR",
-        help="directory to write to, under the names of the scenes",
+        help="directory to write to; each scene keeps its name",
     )
     parser.add_argument(
         "--suffix",
         metavar="END",
-        help="format of what is written to DIR or to standard output, for example .spz (default "
-        "that of IN if it can be written, else .ply)",
+        help="format of the scenes in DIR or on standard output, for example .spz (default: the "
+        "format of IN if it can be written, else .ply)",
     )
 
 
@@ -96,9 +96,9 @@ def check_paths(parser: CommandParser, options: argparse.Namespace) -> None:
         found = f"{len(options.paths)} {'path' if len(options.paths) == 1 else 'paths'}"
         parser.error(f"give IN and OUT, or any number of IN with -o DIR; found {found}")
     if options.folder is not None and STREAM in options.paths:
-        parser.error("- goes with OUT, not with -o DIR")
+        parser.error("- cannot be used with -o DIR; give IN and OUT")
     if options.suffix and options.folder is None and options.paths[1] != STREAM:
-        parser.error("--suffix goes with -o DIR or the OUT -; else the name of OUT says the format")
+        parser.error("--suffix needs -o DIR or - as OUT; otherwise the name of OUT sets the format")
 
 
 @contextmanager
@@ -114,7 +114,7 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
     with ExitStack() as stack:
         if to_stream:
             if sys.stdout.isatty():
-                raise OutputError("the OUT - must be a pipe or a file, found a terminal.")
+                raise OutputError("standard output must be a pipe or a file, found a terminal.")
             folder = stack.enter_context(TemporaryDirectory(prefix="cvtgs-"))
             target = f"{folder}/standard-output{options.suffix or '.ply'}"
         path = Path(source)

@@ -41,18 +41,19 @@ def add_levels(add_parser: AddParser) -> None:
     """Add the command and its options."""
     parser = add_parser(
         "levels",
-        help="make several sizes of a scene at once",
+        help="simplify a scene to several sizes at once",
         description="Write IN in several sizes, each an ordinary scene of exactly ceil(rho * N) "
-        "Gaussians, and levels.json with counts, bytes, scores, geometric errors and boxes. It "
-        "takes little more time than the finest size alone, plus the time of the scores "
-        "(--no-scores).",
+        "Gaussians, and levels.json with counts, bytes, scores, geometric errors and boxes. This "
+        "takes little more time than the finest size alone, plus the time for scoring, which "
+        "--no-scores skips.",
     )
     parser.set_defaults(run=levels)
     add_options(parser, "input", "-o/--output")
     parser.add_argument(
         "--rho",
         metavar="R,R",
-        help="ratios of Gaussians to keep (default 0.1,0.01,0.001; of --stream 1,0.25,0.06,0.015)",
+        help="ratios of Gaussians to keep (default 0.1,0.01,0.001; with --stream "
+        "1,0.25,0.06,0.015)",
     )
     parser.add_argument("--suffix", metavar="END", help="format of the files (default .ply)")
     add_stream_options(parser)

@@ -30,8 +30,8 @@ WRITE_SEVERAL = ("levels", "render", "compare", "tradeoff", "demo", "train")
 
 INTERRUPTED, TERMINATED, PIPE_CLOSED = 130, 143, 141
 MEMORY_ADVICE = (
-    "free some, or give simplify less to hold at once: a binary .ply with --memory AMOUNT, for "
-    "example 2GB, and --device cpu if a GPU ran out"
+    "free some, or let simplify process a binary .ply in blocks with --memory AMOUNT, for example "
+    "2GB, and use --device cpu if a GPU ran out"
 )
 
 
@@ -134,7 +134,7 @@ def build_parser() -> CommandParser:
     parser.add_argument(
         "--version",
         action=ShowVersions,
-        help="print the versions of cvtgs and of the packages that it computes with",
+        help="print the versions of cvtgs, Python and the packages used for computation",
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for add in (

@@ -49,7 +49,7 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     "--ckpt": {
         "metavar": "NAME",
         "default": "auto",
-        "help": "MergeNet checkpoint: auto (default: the one of the preset), standard, paper, a "
+        "help": "MergeNet checkpoint: auto (default: that of the preset), standard, paper, a "
         "file, or none to merge by moments alone",
     },
     "--config": {"metavar": "F.toml", "type": Path, "help": "configuration file"},
@@ -62,8 +62,8 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     },
     "--effects": {
         "metavar": "NAME=VALUE,...",
-        "help": "effects to force, for example sh=1,mip=off, instead of those that the scene "
-        "needs: sh (0 to 3); mip, unbounded, haze, duplicates (on or off); flat, extras, "
+        "help": "effects to force, for example sh=1,mip=off, instead of choosing them by the "
+        "scene: sh (0 to 3); mip, unbounded, haze, duplicates (on or off); flat, extras, "
         "visibility (off)",
     },
     "--lpips": {
@@ -80,14 +80,15 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     "--images": {
         "metavar": "DIR",
         "type": Path,
-        "help": "photographs of --cameras, found by name, to score against too; their size is that "
-        "of the images unless --size is given",
+        "help": "photographs of --cameras, matched by name, to score against as well; images are "
+        "rendered at their size unless --size is given",
     },
-    "--split": {"choices": ("train", "test"), "help": "part of the cameras of --cameras to use"},
+    "--split": {"choices": ("train", "test"), "help": "split of --cameras to use"},
     "--views": {
         "metavar": "N",
         "type": int,
-        "help": "number of views; of --cameras, N spread evenly (default 8, or all of --cameras)",
+        "help": "number of views; with --cameras, N of them, spread evenly (default 8, or all of "
+        "--cameras)",
     },
     "--background": {
         "metavar": "COLOR",
@@ -108,12 +109,13 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
         "metavar": "D",
         "type": int,
         "choices": range(4),
-        "help": "drop the SH bands of IN above this degree, 0 to 3; OUT gets smaller",
+        "help": "drop the SH bands of IN above this degree, 0 to 3, which makes OUT smaller",
     },
     "--axes": {
         "metavar": "IN[:OUT]",
         "help": "axes of the files: where x, y and z point, for example rub (right, up, back) or "
-        "rub:rub (default rdf, right, down, forward; of glTF luf; unless IN states its own)",
+        "rub:rub (default: rdf, that is right, down, forward; luf for glTF; unless IN states its "
+        "own)",
     },
     "--lod": {
         "metavar": "N",
@@ -129,7 +131,7 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     "--json": {"action": "store_true", "help": "print JSON"},
     "--viewer": {
         "action": "store_true",
-        "help": "write viewer.html, too: the scenes in 3D, in one file (needs the extra view)",
+        "help": "also write viewer.html, one file with the scenes in 3D (needs the extra view)",
     },
 }
 
@@ -192,7 +194,7 @@ def read_ratios(text: str) -> list[float]:
         ratios = []
     if not ratios or len(set(ratios)) < len(ratios):
         raise InvalidArgumentError(
-            f"--rho must be different numbers with commas, for example 0.1,0.01 or 10%,1%; "
+            f"--rho must be different numbers separated by commas, for example 0.1,0.01 or 10%,1%; "
             f"found {text!r}."
         )
     return ratios
@@ -308,7 +310,7 @@ def check_written_files(options: argparse.Namespace) -> None:
         for other, taken in others.items():
             if path is not None and _is_same_file(path, taken):
                 raise InvalidArgumentError(
-                    f"{name} must be another file than {other}, found {path} for both."
+                    f"{name} and {other} must be different files, found {path} for both."
                 )
 
 

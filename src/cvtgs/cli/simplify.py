@@ -42,7 +42,7 @@ def add_simplify(add_parser: AddParser) -> None:
     """Add the command and its options."""
     parser = add_parser(
         "simplify",
-        help="make scenes smaller",
+        help="simplify scenes",
         description="Write a scene with exactly ceil(rho * N) of the N Gaussians of IN.",
     )
     parser.set_defaults(run=simplify)
@@ -65,7 +65,7 @@ def add_simplify(add_parser: AddParser) -> None:
         "--max-count",
         type=count,
         metavar="M",
-        help="number of Gaussians to keep if there are more; a smaller scene stays as it is",
+        help="largest number of Gaussians to keep; a smaller scene stays as it is",
     )
     size.add_argument(
         "--target-psnr",
@@ -82,14 +82,14 @@ def add_simplify(add_parser: AddParser) -> None:
     parser.add_argument(
         "--time-budget",
         metavar="TIME",
-        help="time to finish in, for example 20s or 2m, with the best preset that fits; the first "
-        "use measures this machine, which takes about 20 seconds and does not count",
+        help="time limit, for example 20s or 2m, with the best preset that fits; the first use "
+        "measures this machine, which takes about 20 seconds and does not count",
     )
     parser.add_argument(
         "--shipped-rates",
         action="store_true",
-        help="choose for --time-budget by how long another machine took, which comes with cvtgs, "
-        "instead of measuring this one",
+        help="choose the preset for --time-budget by the timings of another machine, shipped with "
+        "cvtgs, instead of measuring this one",
     )
     parser.add_argument(
         "--recalibrate", action="store_true", help="measure this machine again for --time-budget"
@@ -117,12 +117,12 @@ def add_simplify(add_parser: AddParser) -> None:
         "--keep",
         type=Path,
         metavar="BOX.json",
-        help="boxes whose Gaussians stay unchanged, come first in OUT and count: "
-        '{"min": [x, y, z], "max": [x, y, z]}, or a list of these',
+        help="boxes whose Gaussians stay unchanged; they come first in OUT and count towards its "
+        'size: {"min": [x, y, z], "max": [x, y, z]}, or a list of these',
     )
     add_block_options(parser)
     parser.add_argument(
-        "--report", type=Path, metavar="R.json", help="file for a report of the run in JSON"
+        "--report", type=Path, metavar="R.json", help="file for a JSON report of the run"
     )
     add_options(
         parser,
@@ -150,7 +150,7 @@ def simplify(options: argparse.Namespace) -> None:
         cvtgs.target_count(1, options.rho)
     with open_jobs(options) as jobs:
         if options.report is not None and len(jobs) > 1:
-            raise InvalidArgumentError(f"--report is for one scene, found {len(jobs)}.")
+            raise InvalidArgumentError(f"--report needs exactly one scene, found {len(jobs)}.")
         for job in jobs:
             check_written_files(job.options)
             cvtgs.io.check_save(job.options.output, overwrite=options.overwrite)
@@ -221,8 +221,8 @@ def _simplify_in_memory(
         small, report = found.scene, found.report
         notes.append(
             f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f}, alpha error "
-            f"{found.alpha_error:.4f} (bias {found.alpha_bias:+.4f}) over views that were "
-            f"held out; found in {len(found.tried)} tries."
+            f"{found.alpha_error:.4f} (bias {found.alpha_bias:+.4f}) over held-out views; "
+            f"found in {len(found.tried)} tries."
         )
     else:
         keep = None
@@ -267,10 +267,14 @@ def _report_notes(report: "SimplifyReport") -> list[str]:
     if report.device_note:
         notes.append(f"{report.device_note}.")
     if report.blocks > 1:
-        resumed = f", {report.resumed_blocks} of them done before" if report.resumed_blocks else ""
+        resumed = (
+            f", {report.resumed_blocks} of them from an earlier run"
+            if report.resumed_blocks
+            else ""
+        )
         notes.append(f"In {report.blocks} blocks{resumed}.")
     if report.shortfall:
-        notes.append(f"Fewer than the {report.target_count:,} asked for: {report.shortfall}.")
+        notes.append(f"Fewer than the requested {report.target_count:,}: {report.shortfall}.")
     if report.matching is not None:
         matched = report.matching
         notes.append(
@@ -281,7 +285,7 @@ def _report_notes(report: "SimplifyReport") -> list[str]:
         refined = report.refinement
         notes.append(
             f"Refined in {refined.steps:,} {'step' if refined.steps == 1 else 'steps'}: "
-            f"{refined.gain:+.2f} dB on views that were held out, "
+            f"{refined.gain:+.2f} dB on held-out views, "
             f"{refined.psnr_before:.2f} -> {refined.psnr_after:.2f}."
         )
     return notes
@@ -322,7 +326,9 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
         return None
     if excluded:
         words = ", ".join("--" + name.replace("_", "-") for name in excluded)
-        raise InvalidArgumentError(f"blocks cannot go with {words}, which need the whole scene.")
+        raise InvalidArgumentError(
+            f"blocks cannot be used with {words}, which need the whole scene."
+        )
     check_config(config)
     return memory
 

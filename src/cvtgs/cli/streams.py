@@ -27,33 +27,33 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stream",
         choices=STREAMS,
-        help="write chunks that viewers load while they show them, instead of whole scenes: sog "
+        help="write chunks that viewers load progressively, instead of whole scenes: sog "
         "(lod-meta.json, for PlayCanvas and SuperSplat) or 3dtiles (tileset.json, for CesiumJS)",
     )
     parser.add_argument(
         "--chunk",
         type=int,
         metavar="N",
-        help="Gaussians in a chunk of a stream at its finest level (default 32768)",
+        help="Gaussians per chunk of a stream at its finest level (default 32768)",
     )
     parser.add_argument(
         "--environment",
         type=float,
         metavar="RADII",
-        help="distance from the middle beyond which Gaussians are the environment of a streamed "
-        "SOG, which all levels share; in robust radii, of which one holds 70 %% of the Gaussians, "
+        help="distance from the centre beyond which Gaussians are the environment of a streamed "
+        "SOG, which all levels share; in robust radii, one of which holds 70 %% of the Gaussians, "
         "for example 10 for a sky",
     )
     parser.add_argument(
         "--place",
         metavar="LON,LAT[,H]",
-        help="longitude, latitude (degrees) and height (metres) at which 3D Tiles stand, with "
+        help="longitude, latitude (degrees) and height (metres) of the origin of 3D Tiles, with "
         "x to the east and z up",
     )
     parser.add_argument(
         "--transform",
         metavar="16 NUMBERS",
-        help="transform of the root of 3D Tiles, column by column, instead of --place",
+        help="column-major transform of the root of 3D Tiles, instead of --place",
     )
     add_block_options(parser)
 
@@ -65,18 +65,20 @@ def check_stream_options(options: argparse.Namespace) -> None:
     if options.stream is None:
         for name in OF_STREAMS:
             if getattr(options, name) is not None:
-                raise InvalidArgumentError(f"--{name} goes with --stream.")
+                raise InvalidArgumentError(f"--{name} needs --stream.")
         return
     if options.viewer:
-        raise InvalidArgumentError("--viewer cannot go with --stream, which viewers load by parts.")
+        raise InvalidArgumentError(
+            "--viewer cannot be used with --stream, which viewers load in chunks."
+        )
     if options.suffix is not None:
-        raise InvalidArgumentError("--suffix cannot go with --stream, which sets the format.")
+        raise InvalidArgumentError("--suffix cannot be used with --stream, which sets the format.")
     if options.chunk is not None and options.chunk < 1:
         raise InvalidArgumentError(f"--chunk must be at least 1, found {options.chunk}.")
     far = options.environment
     if far is not None and not (options.stream == "sog" and 0 < far < math.inf):
         raise InvalidArgumentError(
-            f"--environment must be above 0, and goes with --stream sog; found {far:g}."
+            f"--environment must be above 0, and needs --stream sog; found {far:g}."
         )
     read_transform(options)
     check_stream(options.output, options.stream, overwrite=options.overwrite)
@@ -89,7 +91,9 @@ def read_transform(options: argparse.Namespace) -> tuple[float, ...] | None:
     if options.place is None and options.transform is None:
         return None
     if options.stream != "3dtiles" or None not in (options.place, options.transform):
-        raise InvalidArgumentError("one of --place and --transform goes with --stream 3dtiles.")
+        raise InvalidArgumentError(
+            "only one of --place and --transform may be given, and it needs --stream 3dtiles."
+        )
     if options.transform is not None:
         numbers = _numbers(options.transform, "--transform", (16,))
         return check_transform(numbers)
@@ -105,7 +109,7 @@ def _numbers(text: str, name: str, counts: Sequence[int]) -> list[float]:
     if len(numbers) not in counts:
         wanted = " or ".join(map(str, counts))
         raise InvalidArgumentError(
-            f"{name} must be {wanted} numbers with commas between, found {text!r}."
+            f"{name} must be {wanted} numbers separated by commas, found {text!r}."
         )
     return numbers
 
@@ -134,7 +138,9 @@ def stream_blocks(
             raise
         return False
     if options.cameras is not None:
-        raise InvalidArgumentError("blocks cannot go with --cameras, which need the whole scene.")
+        raise InvalidArgumentError(
+            "blocks cannot be used with --cameras, which need the whole scene."
+        )
     with progress_bars(quiet=options.quiet) as listener, block_workers(options, memory) as blocks:
         report = stream_file(
             options.input,
@@ -152,7 +158,7 @@ def stream_blocks(
             overwrite=options.overwrite,
             listener=listener,
         )
-    done = f", {report.resumed_blocks} of them done before" if report.resumed_blocks else ""
+    done = f", {report.resumed_blocks} of them from an earlier run" if report.resumed_blocks else ""
     _print_levels(options, report.chunks, report.levels, f" and {report.blocks} blocks{done}")
     return True
 

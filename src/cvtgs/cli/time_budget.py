@@ -34,10 +34,10 @@ def check_time_budget(options: argparse.Namespace, *, has_target: bool) -> None:
         for name in ("recalibrate", "shipped_rates"):
             if getattr(options, name):
                 option = name.replace("_", "-")
-                raise InvalidArgumentError(f"--{option} goes with --time-budget.")
+                raise InvalidArgumentError(f"--{option} needs --time-budget.")
         return
     if options.recalibrate and options.shipped_rates:
-        raise InvalidArgumentError("give --recalibrate or --shipped-rates, found both.")
+        raise InvalidArgumentError("give either --recalibrate or --shipped-rates, found both.")
     read_seconds(options.time_budget)
     excluded = {
         "--preset": options.preset is not None,
@@ -49,7 +49,7 @@ def check_time_budget(options: argparse.Namespace, *, has_target: bool) -> None:
     wrong = [name for name, is_given in excluded.items() if is_given]
     if wrong:
         raise InvalidArgumentError(
-            f"--time-budget chooses the preset and cannot go with {', '.join(wrong)}."
+            f"--time-budget chooses the preset and cannot be used with {', '.join(wrong)}."
         )
 
 
@@ -91,8 +91,7 @@ def choose_preset(
         again = options.recalibrate or not is_calibrated(options.device)
         if again and not options.quiet:
             say(
-                "cvtgs: measuring this machine once, about 20 seconds "
-                "(--shipped-rates does without)",
+                "cvtgs: measuring this machine once, about 20 seconds (--shipped-rates skips this)",
                 file=sys.stderr,
             )
         model = cvtgs.budget.cost_model(options.device, recalibrate=again, listener=listener)

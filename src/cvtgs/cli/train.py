@@ -13,7 +13,7 @@ from cvtgs.errors import OutputError
 if TYPE_CHECKING:
     from cvtgs.train import History, TrainConfig
 
-WITHOUT_CURVES = "no image of its curves: that needs pip install 'cvtgs[plots]'"
+WITHOUT_CURVES = "no image of its curves, which needs pip install 'cvtgs[plots]'"
 
 
 def add_train(add_parser: AddParser) -> None:
@@ -50,7 +50,7 @@ def add_train(add_parser: AddParser) -> None:
         metavar="DIR",
         help="directory of prepared scenes (default: NAME.cache)",
     )
-    parser.add_argument("--resume", action="store_true", help="continue an interrupted training")
+    parser.add_argument("--resume", action="store_true", help="resume an interrupted training")
     add_options(parser, "--device", "--overwrite", "--quiet")
 
 
@@ -76,7 +76,7 @@ def train(options: argparse.Namespace) -> None:
         )
     best = history.best()
     if best is not None and not options.quiet:
-        say(f"best at step {best.step}: {best.mean_gain:+.2f} dB on scenes left out of training")
+        say(f"best at step {best.step}: {best.mean_gain:+.2f} dB on held-out scenes")
         curves = f"curves in {files.curves}" if files.curves.is_file() else WITHOUT_CURVES
         say(f"{files.checkpoint}, {curves}")
 
@@ -90,8 +90,8 @@ def print_validation(history: "History") -> None:
     """Print one line about the last validation."""
     last = history.validations[-1]
     gains = ", ".join(
-        f"{sum(row) / len(row):+.2f} (least {min(row):+.2f}) at {ratio:g}"
+        f"{sum(row) / len(row):+.2f} (lowest {min(row):+.2f}) at {ratio:g}"
         for ratio, row in last.by_ratio().items()
     )
     loss = "-" if math.isnan(last.loss) else f"{last.loss:.3f}"
-    say(f"step {last.step}: loss {loss}, dB gained: {gains}")
+    say(f"step {last.step}: loss {loss}, gain in dB: {gains}")

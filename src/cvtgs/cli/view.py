@@ -24,19 +24,19 @@ def add_view(add_parser: AddParser) -> None:
     parser = add_parser(
         "view",
         help="choose the size of a scene in the browser",
-        description="Serve a page that shows IN and, as a slider of rho is moved, IN simplified "
-        "(needs the extra view). It flips between scenes, scores the present view and saves. "
-        "Colours are those of SH degree 0.",
+        description="Serve a page that shows IN, and IN simplified to the ratio of a slider (needs "
+        "the extra view). The page switches between scenes, scores the current view and saves "
+        "scenes. Colours are those of SH degree 0.",
     )
     parser.set_defaults(run=view)
     add_options(parser, "input")
     parser.add_argument(
-        "small", metavar="SMALL", type=Path, nargs="*", help="scenes to flip to, in any format"
+        "small", metavar="SMALL", type=Path, nargs="*", help="scenes to switch to, in any format"
     )
     parser.add_argument(
         "--preset",
         metavar="NAME",
-        help=f"preset to start with: {PRESET_NAMES} (default draft, for a quick slider)",
+        help=f"preset to start with: {PRESET_NAMES} (default draft, for a responsive slider)",
     )
     parser.add_argument(
         "--rho", type=ratio, metavar="R", default=0.1, help="ratio to start with (default 0.1)"
@@ -46,7 +46,7 @@ def add_view(add_parser: AddParser) -> None:
         type=Path,
         metavar="F.html",
         help="write the page to a file that needs no server, instead of serving it; its time line "
-        "flips between the scenes",
+        "switches between the scenes",
     )
     parser.add_argument(
         "--host", default=HOST, help=f"address to listen on (default {HOST}: this machine only)"
@@ -54,7 +54,7 @@ def add_view(add_parser: AddParser) -> None:
     parser.add_argument(
         "--port", type=int, metavar="N", default=PORT, help=f"port to listen on (default {PORT})"
     )
-    parser.add_argument("--no-browser", action="store_true", help="open no browser")
+    parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
     add_options(parser, "--device", "--trust-sizes", "--overwrite", "--quiet")
 
 

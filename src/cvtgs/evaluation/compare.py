@@ -212,7 +212,8 @@ def _named_scenes(
 ) -> dict[str, GaussianScene]:
     if reference_name in small:
         raise InvalidArgumentError(
-            f"the scenes must have different names; {reference_name!r} is that of the full scene."
+            f"the scenes must have different names; {reference_name!r} is the name of the full "
+            f"scene."
         )
     read = {name: as_scene(one, f"scene {name!r}") for name, one in small.items()}
     return {reference_name: as_scene(reference, "reference"), **read}

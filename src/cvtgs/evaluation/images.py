@@ -245,8 +245,8 @@ def fit_cameras(cameras: Cameras, folder: str | os.PathLike[str]) -> Cameras:
         cameras.width, cameras.height
     ):
         raise InvalidArgumentError(
-            f"{folder}: photographs must have the shape of the cameras' images, {cameras.width} x "
-            f"{cameras.height} or smaller, found {width} x {height}."
+            f"{folder}: photographs must have the aspect ratio of the cameras' images, "
+            f"{cameras.width} x {cameras.height} or smaller, found {width} x {height}."
         )
     return cameras.resized(width, height) if width < cameras.width else cameras
 

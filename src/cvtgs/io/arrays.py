@@ -41,8 +41,8 @@ def arrays_of(scene: GaussianScene, *, sh_degree: int = 3) -> Arrays:
     rows = writable_rows(scene)
     if not bool(rows.any()):
         raise InvalidSceneError(
-            f"a scene must hold at least one Gaussian of finite numbers to be written, "
-            f"found {len(scene):,} Gaussians and none that is."
+            f"a scene must hold at least one Gaussian with finite values to be written, "
+            f"found none among {len(scene):,} Gaussians."
         )
     whole = bool(rows.all())
     own = {

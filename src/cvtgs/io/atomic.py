@@ -58,7 +58,7 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
     target = _target(path)
     fault = windows_fault(PureWindowsPath(path)) if _WINDOWS else None
     if fault is not None:
-        raise OutputError(f"{os.fspath(path)}: the output must have a name, found {fault}.")
+        raise OutputError(f"{os.fspath(path)}: the output must have a valid name, found {fault}.")
     try:
         if target.is_symlink():  # realpath follows all links but loops
             raise OutputError(
@@ -150,7 +150,9 @@ def make_folder(folder: str | os.PathLike[str], *, parents: bool = True) -> None
         Path(folder).mkdir(parents=parents, exist_ok=True)
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
-        raise OutputError(f"{os.fspath(folder)}: must become a folder, found: {reason}.") from error
+        raise OutputError(
+            f"{os.fspath(folder)}: must be a folder or a new path, found: {reason}."
+        ) from error
 
 
 def windows_fault(path: PureWindowsPath) -> str | None:
@@ -158,11 +160,11 @@ def windows_fault(path: PureWindowsPath) -> str | None:
     name = path.name
     wrong = sorted({letter for letter in name if letter in '<>:"|?*' or letter < " "})
     if wrong:  # "a.ply:b" is an alternate data stream of a.ply
-        return f"the letters {' '.join(wrong)}, which Windows does not allow"
+        return f"the characters {' '.join(wrong)}, which Windows does not allow"
     if name.split(".")[0].rstrip(" ").upper() in _RESERVED:
         return f"{name}, which is a device on Windows"
     if name != name.rstrip(" ."):
-        return "a dot or blank at its end, which Windows drops"
+        return "a dot or space at its end, which Windows drops"
     return None
 
 

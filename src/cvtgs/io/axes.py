@@ -31,8 +31,8 @@ def checked_axes(name: str) -> str:
     """Check the name of axes, and return it in lower case."""
     if name.lower() not in AXES:
         raise InvalidArgumentError(
-            f"axes must be three letters for x, y and z, such as rdf (right, down, forward: PLY) "
-            f"or rub (right, up, back: Niantic), of {', '.join(AXES)}; found {name!r}."
+            f"axes must be the directions of x, y and z, such as rdf (right, down, forward: PLY) "
+            f"or rub (right, up, back: Niantic), one of {', '.join(AXES)}; found {name!r}."
         )
     return name.lower()
 

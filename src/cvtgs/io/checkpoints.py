@@ -93,7 +93,7 @@ def _damage_named(path: Path) -> Iterator[None]:
         if is_out_of_memory(error):
             raise
         raise FileFormatError(
-            f"{path}: must be a whole checkpoint of tensors and plain numbers, found damage "
+            f"{path}: must be an intact checkpoint of tensors and plain numbers, found damage "
             f"({type(error).__name__})."
         ) from error
 
@@ -103,12 +103,13 @@ def _unpickled(path: Path) -> Any:
     with open_input(path) as file:
         if not zipfile.is_zipfile(file):
             raise FileFormatError(
-                f"{path}: must be a checkpoint that torch.save wrote as a zip, found another file."
+                f"{path}: must be a checkpoint in the zip format of torch.save, "
+                f"found another format."
             )
     for name in _names_in(path):
         if not _ALLOWED.fullmatch(name):
             raise FileFormatError(
-                f"{path}: must be a whole checkpoint of tensors and plain numbers, "
+                f"{path}: must be an intact checkpoint of tensors and plain numbers, "
                 f"found {shown(name)}."
             )
     with _numpy_numbers_ignored(), warnings.catch_warnings():
@@ -125,9 +126,9 @@ def _names_in(path: Path) -> Iterator[str]:
         entries = archive.infolist()
         for entry in entries:
             if entry.compress_type != zipfile.ZIP_STORED:  # torch.save never compresses
-                yield f"a packed {entry.filename}"
+                yield f"a compressed {entry.filename}"
             elif entry.compress_size != entry.file_size:
-                yield f"two lengths of {entry.filename}"
+                yield f"two different lengths of {entry.filename}"
         for entry in entries:
             if entry.filename.endswith(".pkl"):
                 for operation, value, _ in pickletools.genops(archive.read(entry)):

@@ -181,7 +181,7 @@ def _check_rest(table: Element, vertices: int, path: Path) -> None:
 def _read_tables(file: BinaryIO, header: Header, path: Path) -> dict[str, Rows]:
     """Read every element, after checking that the file is long enough for all."""
     if any(table.has_lists for table in header.elements):
-        raise FileFormatError(f"{path}: a compressed PLY must hold no lists, found one.")
+        raise FileFormatError(f"{path}: a compressed PLY must have no list properties, found one.")
     dtypes = {table.name: row_dtype(table.columns) for table in header.elements}
     wanted = header.data_offset + sum(
         table.count * dtypes[table.name].itemsize for table in header.elements

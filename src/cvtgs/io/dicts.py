@@ -92,8 +92,8 @@ def from_dict(
     scene = GaussianScene(**tensors, extras={}, comments=(), layout=())
     if not activated and (unlikely := activated_values(scene)):
         warnings.warn(
-            f"{' and '.join(unlikely)}: they are taken for stored values (logarithms of scales, "
-            f"logits of opacities) but look like activated ones; if they are, pass activated=True.",
+            f"{' and '.join(unlikely)}: they are read as stored values (logarithms of scales, "
+            f"logits of opacities) but look activated; if they are, pass activated=True.",
             stacklevel=2,
         )
     return scene
@@ -156,7 +156,8 @@ def _keys(mapping: Mapping[str, Any]) -> dict[str, str]:
             raise InvalidSceneError(f"the names must be {_KNOWN}, found {shown(key)}.")
         if name in keys:
             raise InvalidSceneError(
-                f"a dictionary must give {name} once, found {shown(keys[name])} and {shown(key)}."
+                f"a dictionary must hold {name} only once, found {shown(keys[name])} "
+                f"and {shown(key)}."
             )
         keys[name] = key
     missing = [
@@ -176,7 +177,7 @@ def _prefix(mapping: Mapping[str, Any]) -> str:
     found = [key for key in mapping if str(key) == "means" or str(key).endswith(".means")]
     if len(found) > 1:
         raise InvalidSceneError(
-            f"a dictionary must give means once, found {' and '.join(map(repr, found))}."
+            f"a dictionary must hold means only once, found {' and '.join(map(repr, found))}."
         )
     return found[0].removesuffix("means") if found else ""
 

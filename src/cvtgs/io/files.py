@@ -44,7 +44,7 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
         with path.open("rb") as file:
             if file.peek(len(_POINTER)).startswith(_POINTER):
                 raise FileFormatError(
-                    f"{path}: must be the file itself, found a pointer of Git LFS to it; get the "
+                    f"{path}: must be the file itself, found a Git LFS pointer to it; fetch the "
                     "file with: git lfs pull."
                 )
             yield file
@@ -153,7 +153,7 @@ def check_expansion(path: Path | str, *, count: int, rest: int, stored: int) -> 
     wanted = 4 * count * (_FLOATS + 3 * rest)
     if wanted > FREE_BYTES + MOST_EXPANSION * stored:
         raise FileFormatError(
-            f"{path}: a scene must have at most {FREE_BYTES >> 20} MiB and {MOST_EXPANSION} times "
+            f"{path}: a scene must take at most {FREE_BYTES >> 20} MiB plus {MOST_EXPANSION} times "
             f"the bytes of its file, found {count:,} Gaussians that take {wanted:,} bytes in a "
             f"file of {stored:,}; if you trust the file, pass trust_sizes=True (--trust-sizes)."
         )
@@ -187,7 +187,7 @@ Whole = Annotated[
     BeforeValidator(_without_point),  # 800.0
     Field(ge=-_MOST_WHOLE, le=_MOST_WHOLE, description="a whole number"),
 ]
-Text = Annotated[str, Strict(), Field(description="a text")]
+Text = Annotated[str, Strict(), Field(description="a string")]
 Flag = Annotated[bool, Strict(), Field(description="true or false")]
 Items = Annotated[list[Any], Field(description="a list")]
 Vector = Annotated[tuple[Number, Number, Number], Field(description="3 finite numbers")]
@@ -234,7 +234,7 @@ def parse_json(data: bytes, path: str | Path) -> Any:
         ) from error
     except UnicodeDecodeError as error:
         raise FileFormatError(
-            f"{path}: must be JSON in UTF-8, found another byte at {error.start:,}."
+            f"{path}: must be JSON in UTF-8, found an invalid byte at {error.start:,}."
         ) from error
     except (RecursionError, ValueError) as error:  # too deeply nested; numbers too long
         raise FileFormatError(f"{path}: must be plain JSON, found: {error}.") from error

@@ -169,7 +169,7 @@ def load(
     if lod is not None:
         if suffix != _STREAM:
             raise InvalidArgumentError(
-                f"lod chooses a level of a streamed SOG ({_STREAM}), found {lod} for {source}."
+                f"lod must be given only for a streamed SOG ({_STREAM}), found {lod} for {source}."
             )
         options["lod"] = lod
     with memory_errors(f"{source}: reading the scene", _ADVICE):

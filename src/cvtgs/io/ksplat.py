@@ -58,13 +58,13 @@ def read_ksplat(path: Path) -> GaussianScene:
         head = file.read(HEADER_BYTES)
         if len(head) < HEADER_BYTES:
             raise FileFormatError(
-                f"{path}: a .ksplat file must begin with {HEADER_BYTES} bytes of header, "
+                f"{path}: a .ksplat file must start with a header of {HEADER_BYTES} bytes, "
                 f"found {len(head)}."
             )
         major, minor, most, _, _, count, level, *_, low, high = _HEADER.unpack_from(head)
         if (major, minor) != (0, 1) or level >= len(_NUMBERS):
             raise FileFormatError(
-                f"{path}: must be a .ksplat of version 0.1 and compression 0, 1 or 2, found "
+                f"{path}: must be a .ksplat of version 0.1 with compression 0, 1 or 2, found "
                 f"version {major}.{minor} and compression {level}."
             )
         ends = HEADER_BYTES + most * SECTION_BYTES
@@ -88,8 +88,8 @@ def read_ksplat(path: Path) -> GaussianScene:
     found = sum(len(part.means) for part in parts)
     if found != count or not count:
         raise FileFormatError(
-            f"{path}: the sections must hold the {count:,} Gaussians of the header, at least one, "
-            f"found {found:,}."
+            f"{path}: the sections must hold the {count:,} Gaussians that the header promises, "
+            f"and at least one, found {found:,}."
         )
     names = [field.name for field in dataclasses.fields(Arrays)]
     joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}

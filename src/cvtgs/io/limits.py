@@ -74,7 +74,7 @@ _GLTF = FormatLimits(
     antialiased=True,
     comments=True,
     ranges={"log_scales": (-87.3, 88.7)},  # scales are stored as float32
-    changed=("scales and opacities as float32, not their logarithms and logits",),
+    changed=("scales and opacities as float32 instead of their logarithms and logits",),
 )
 
 FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
@@ -86,8 +86,8 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
             ranges={"log_scales": (-20.0, 20.0), "shN": (-4.0, 4.0)},
             changed=(
                 "rows in Morton order",
-                "positions and scales in 2048 (y: 1024) steps and colours in 256 between the "
-                "least and the largest of 256 Gaussians",
+                "positions and scales in 2048 steps (y: 1024) and colours in 256 steps between the "
+                "minimum and maximum of each 256 Gaussians",
                 "rotations in steps of 1/723 per component",
                 "opacities in steps of 1/255",
                 "view-dependent SH coefficients in steps of 1/32",
@@ -113,12 +113,12 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
             antialiased=True,
             changed=(
                 "rows in Morton order",
-                "positions in 65,536 steps of sign(x) log(1 + |x|) between the least and the "
-                "largest",
-                "scales, colours and SH coefficients to 256 numbers each",
+                "positions in 65,536 steps of sign(x) log(1 + |x|) between minimum and maximum",
+                "scales, colours and SH coefficients limited to 256 different values each",
                 "rotations in steps of 1/180 per component",
                 "opacities in steps of 1/255",
-                "view-dependent colours to a palette of half as many or more, at most 65,536",
+                "view-dependent colours from a palette of half as many entries or more, at most "
+                "65,536",
             ),
         ),
     }

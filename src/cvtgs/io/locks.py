@@ -27,8 +27,8 @@ def output_lock(path: str | os.PathLike[str]) -> Iterator[None]:
         lock.acquire()
     except Timeout as error:
         raise OutputBusyError(
-            f"{os.fspath(path)}: one run at a time may work on it, found {_holder(file)} at work; "
-            "wait until it ends, or choose another output."
+            f"{os.fspath(path)}: only one run at a time may work on it, found {_holder(file)} at "
+            "work; wait until it ends, or choose another output."
         ) from error
     except (OSError, NotImplementedError) as error:
         reason = (getattr(error, "strerror", None) or str(error)).lower()

@@ -44,8 +44,8 @@ def read_splat(path: Path) -> GaussianScene:
         size = os.fstat(file.fileno()).st_size
         if size == 0 or size % _ROW.itemsize:
             raise FileFormatError(
-                f"{path}: a .splat file must be one or more Gaussians of {_ROW.itemsize} bytes, "
-                f"found {size:,} bytes."
+                f"{path}: a .splat file must hold one or more Gaussians of {_ROW.itemsize} bytes "
+                f"each, found {size:,} bytes."
             )
         rows = np.fromfile(file, _ROW)
     with np.errstate(invalid="ignore"):

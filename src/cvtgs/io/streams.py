@@ -40,7 +40,7 @@ def file_of(
     format: str | None = None,
     *,
     name: str | None = None,
-    advice: str = "give format= for another one, such as '.splat'",
+    advice: str = "give format= for other formats, such as '.splat'",
 ) -> Iterator[Path]:
     """Copy the rest of a stream to a temporary file, which exists while the context is open.
 

@@ -199,7 +199,7 @@ def _unpack(content: bytes, name: str) -> tuple[dict[str, Tensor], dict[str, str
         tensors, metadata = unpack_tensors(content)
     except FileFormatError as error:
         raise CheckpointError(
-            f"{name}: the checkpoint is no safetensors file, or damaged."
+            f"{name}: the checkpoint is not a safetensors file, or it is damaged."
         ) from error
     if metadata.get("format") != FORMAT:
         raise CheckpointError(
@@ -213,19 +213,21 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
     version = metadata.get("format_version")
     if version not in {str(number) for number in range(1, FORMAT_VERSION + 1)}:
         raise CheckpointError(
-            f"{name}: the checkpoint has format version {version}, this cvtgs reads up to "
-            f"{FORMAT_VERSION}; update cvtgs."
+            f"{name}: the checkpoint has format version {version}, but this cvtgs reads only "
+            f"versions up to {FORMAT_VERSION}; update cvtgs."
         )
     try:
         kind = _Described.model_validate_json(metadata.get("info", "")).architecture.kind
         if kind not in KINDS:
             raise CheckpointError(
-                f"{name}: the checkpoint is of another architecture: its kind must be "
+                f"{name}: the checkpoint has a different architecture: its kind must be "
                 f"{' or '.join(KINDS)}, found {printable(kind)!r}."
             )
         info = CheckpointInfo.model_validate_json(metadata.get("info", ""))
     except pydantic.ValidationError as error:
-        raise CheckpointError(f"{name}: the checkpoint does not say what it is.") from error
+        raise CheckpointError(
+            f"{name}: the checkpoint's description is missing or invalid."
+        ) from error
     if info.preset not in SHIPPED:
         raise CheckpointError(
             f"{name}: the preset of the checkpoint must be one of {', '.join(SHIPPED)}, "
@@ -235,7 +237,7 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
     for feature in ("member_features", "pair_features", "cell_features"):
         if getattr(ours, feature, 0) != getattr(theirs, feature, 0):
             raise CheckpointError(
-                f"{name}: the checkpoint is of another architecture: {feature} must be "
+                f"{name}: the checkpoint has a different architecture: {feature} must be "
                 f"{getattr(ours, feature)}, found {getattr(theirs, feature)}."
             )
     return info
@@ -267,7 +269,7 @@ def _build_net(
     if wanted != found:
         odd = sorted(key for key in wanted | found if wanted.get(key) != found.get(key))
         raise CheckpointError(
-            f"{name}: the checkpoint is of another architecture: {', '.join(odd[:3])} "
+            f"{name}: the checkpoint has a different architecture: {', '.join(odd[:3])} "
             f"{'does' if len(odd) == 1 else 'do'} not fit."
         )
     if not all(bool(torch.isfinite(values).all()) for values in tensors.values()):

@@ -77,8 +77,8 @@ def allocate(job: Job) -> None:
     regions = _regions(job)
     if len(regions) > 1:
         warnings.warn(
-            f"{sum(job.cells)} cells do not fit into memory together, so costs of merging are "
-            f"compared within {len(regions)} parts of the scene; give more --memory if there is.",
+            f"{sum(job.cells)} cells do not fit into memory together, so merge costs are only "
+            f"compared within {len(regions)} parts of the scene; raise --memory if possible.",
             UserWarning,
             stacklevel=4,
         )

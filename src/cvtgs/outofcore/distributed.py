@@ -91,7 +91,7 @@ def connect(address: str) -> "Client":
         from distributed import Client  # noqa: PLC0415 (optional)
     except ImportError as error:
         raise MissingDependencyError(
-            "work on many machines needs the package distributed; "
+            "running on several machines needs the package distributed; "
             "install it with: pip install 'cvtgs[dask]'."
         ) from error
     for name in ("distributed", "distributed.client"):  # their messages are raised as errors, too
@@ -147,8 +147,13 @@ def _call(function: Callable[[Any], Any], versions: dict[str, str], item: Any) -
 
 def _differs(worker: str, found: dict[str, str]) -> str:
     pairs = [(name, own, found.get(name, "none")) for name, own in _versions().items()]
-    wrong = ", ".join(f"{name} {other} for {own}" for name, own, other in pairs if own != other)
-    return f"{worker}: must have the versions of this process, found {wrong}; install the same."
+    wrong = ", ".join(
+        f"{name} {other} instead of {own}" for name, own, other in pairs if own != other
+    )
+    return (
+        f"{worker}: must have the same package versions as this process, found {wrong}; "
+        "install the same versions there."
+    )
 
 
 class ClusterWorkers:
@@ -292,12 +297,12 @@ class ClusterWorkers:
                 if future.status in ("cancelled", "lost"):
                     raise _gone() from error
                 raise RunError(
-                    f"a worker could not do its work: {_told(error)}; all need the same packages "
-                    "and access to input and output; the same command continues."
+                    f"a worker failed: {_told(error)}; all workers need the same packages and "
+                    "access to input and output; run the same command again to continue."
                 ) from error
         raise RunError(
-            f"{MAX_DEATHS} rounds of workers died with the same piece of work; give them more "
-            "memory, or less to hold by --memory; the same command continues."
+            f"{MAX_DEATHS} rounds of workers died on the same task; give them more memory or lower "
+            "--memory, and run the same command again to continue."
         )
 
     def _is_at_work(self) -> bool:
@@ -314,8 +319,8 @@ def _check_answer(address: str, future: "Future[Any]", job: Job) -> None:
         )
     if future.status != "finished":
         raise RunError(
-            f"{address}: this worker must answer within {ANSWER_SECONDS:g} s, found nothing; end "
-            "it, install the same cvtgs there, or wait until it has less to do."
+            f"{address}: this worker must answer within {ANSWER_SECONDS:g} s, found no answer; "
+            "stop it, install the same cvtgs there, or wait until it is less busy."
         )
     found: _Worker = future.result()
     if found.versions != _versions():
@@ -330,7 +335,7 @@ def _check_answer(address: str, future: "Future[Any]", job: Job) -> None:
     if not found.sees_folder:
         folder = Path(job.folder).parent.parent
         raise RunError(
-            f"{address}: this worker must see and may write the folder of the output under the "
+            f"{address}: this worker must be able to read and write the output folder under the "
             f"same path, found no access to {folder}."
         )
 
@@ -348,8 +353,8 @@ def _scheduler_errors() -> Iterator[None]:
 
 def _gone() -> RunError:
     return RunError(
-        "the scheduler or all of its workers are gone; start them again, and the same command "
-        "continues."
+        "the scheduler or all of its workers are gone; start them again, then run the same "
+        "command again to continue."
     )
 
 

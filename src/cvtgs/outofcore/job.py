@@ -264,7 +264,8 @@ class Job:
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
             raise OutputError(
-                f"{parent}: must become an empty folder for the files of blocks, found: {reason}."
+                f"{parent}: must be replaceable by an empty folder for block files, "
+                f"found: {reason}."
             ) from error
 
     def adopt(self, files: Iterable[SortedFile]) -> None:
@@ -359,6 +360,6 @@ def job_folder(output: str | os.PathLike[str], key: str) -> str:
 
 def _not_seen(path: Path) -> RunError:
     return RunError(
-        f"{path}: a worker says that it wrote this file, and it is not here; every worker must "
-        "see the folder of the output under the same path."
+        f"{path}: a worker reported that it wrote this file, but it is not here; every worker "
+        "must see the output folder under the same path."
     )

@@ -62,8 +62,8 @@ def read_bytes(text: str) -> int:
     amount = int(float(match[1]) * unit)
     if amount < LEAST_BYTES:
         raise InvalidArgumentError(
-            f"memory must be at least {LEAST_BYTES / 1e6:g} MB: torch and scipy take 280 MB of it, "
-            f"the sample, grids and a small block the rest; found {text!r}."
+            f"memory must be at least {LEAST_BYTES / 1e6:g} MB: torch and scipy take 280 MB, "
+            f"and the sample, the grids and a small block need the rest; found {text!r}."
         )
     return amount
 

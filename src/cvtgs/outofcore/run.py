@@ -130,8 +130,8 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         room -= IMAGE_BYTES
         if memory is not None and room < LEAST_BYTES:
             raise InvalidArgumentError(
-                f"memory must be at least {(LEAST_BYTES + IMAGE_BYTES) / 1e6:g} MB for images of "
-                f"the scene; found {memory / 1e6:g} MB, use preset standard or more memory."
+                f"memory must be at least {(LEAST_BYTES + IMAGE_BYTES) / 1e6:g} MB with images of "
+                f"the scene, found {memory / 1e6:g} MB; use preset standard or more memory."
             )
     wanted = blocks or block_count(rows, room)
     job = Job(
@@ -182,7 +182,7 @@ def check_config(config: SimplifyConfig, *, with_images: bool = True) -> None:
     """
     if not with_images and (config.uses_renders or config.refine.enabled):
         raise ConfigError(
-            "blocks need a preset that takes no images of the scene (draft, fast, standard, "
+            "blocks need a preset that uses no images of the scene (draft, fast, standard, "
             f"paper) and no refinement; found {config.preset!r} with {config.visibility.views} "
             f"views and {config.refine.steps} steps of refinement."
         )
@@ -193,8 +193,8 @@ def check_config(config: SimplifyConfig, *, with_images: bool = True) -> None:
         )
     if config.refine.seconds:
         raise ConfigError(
-            "blocks are refined for a number of steps (--refine-steps, refine.steps), not of "
-            f"seconds; found {config.refine.seconds:g} s."
+            "blocks are refined for a number of steps (--refine-steps, refine.steps), not "
+            f"of seconds; found {config.refine.seconds:g} s."
         )
 
 

@@ -90,7 +90,7 @@ def _scan(
     check_room(kept, target=job.target, total=valid)
     if kept == valid:
         raise InvalidArgumentError(
-            f"all {kept} valid Gaussians are to be kept as they are; none is left."
+            f"all {kept} valid Gaussians are protected, so there is nothing to simplify."
         )
     rest = min(job.target, valid) - kept
     scan = scan_scene(

@@ -158,8 +158,8 @@ class LocalWorkers:
                 yield result
         except BrokenProcessPool as error:
             raise RunError(
-                "a process that worked on blocks was ended, most likely for lack of memory; run "
-                "the same command again, with less --memory or fewer --workers."
+                "a worker process ended unexpectedly, most likely for lack of memory; run the "
+                "same command again, with less --memory or fewer --workers."
             ) from error
         finally:
             for future in futures:

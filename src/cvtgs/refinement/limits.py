@@ -11,12 +11,12 @@ def check_limits(seconds: float | None, *, steps: int | None) -> None:
     """Raise an error if seconds or steps are not positive."""
     if seconds is not None and not 0 < seconds < math.inf:
         raise InvalidArgumentError(
-            f"the seconds to refine for must be above 0 and finite, found {seconds!r}."
+            f"the refinement time in seconds must be above 0 and finite, found {seconds!r}."
         )
     whole = isinstance(steps, int) and not isinstance(steps, bool)
     if steps is not None and not (whole and steps >= 1):
         raise InvalidArgumentError(
-            f"the steps to refine for must be a whole number of at least 1, found {steps!r}."
+            f"the number of refinement steps must be a whole number of at least 1, found {steps!r}."
         )
 
 

@@ -123,7 +123,7 @@ def _check(viewmats: Tensor, Ks: Tensor) -> None:  # noqa: N803 (the name that g
         bad = (~good).nonzero()[:, 0].tolist()
         if bad:
             raise InvalidArgumentError(
-                f"cameras must have {wish}; {len(bad)} of {len(good)} have not, "
+                f"cameras must have {wish}; {len(bad)} of {len(good)} do not, "
                 f"the first is camera {bad[0]}."
             )
 

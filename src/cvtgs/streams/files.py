@@ -259,7 +259,7 @@ def _remove(path: Path) -> None:
 
 def _refused(place: Path, error: OSError) -> OutputError:
     reason = (error.strerror or str(error)).lower()
-    return OutputError(f"{place}: must take the files of a stream, found: {reason}.")
+    return OutputError(f"{place}: must be writable for the files of a stream, found: {reason}.")
 
 
 def _has_files(folder: Path) -> bool:

@@ -174,7 +174,7 @@ def geo_transform(longitude: float, latitude: float, height: float = 0.0) -> tup
     """
     if not (abs(longitude) <= 360.0 and abs(latitude) <= 90.0 and math.isfinite(height)):
         raise InvalidArgumentError(
-            "a place on the Earth needs a longitude from -360 to 360 degrees, a latitude from -90 "
+            "a place on Earth needs a longitude from -360 to 360 degrees, a latitude from -90 "
             f"to 90 and a height in metres, found {longitude!r}, {latitude!r} and {height!r}."
         )
     east, north = math.radians(longitude), math.radians(latitude)
@@ -218,8 +218,8 @@ def check_transform(numbers: Sequence[float]) -> tuple[float, ...]:
         if abs(float(torch.linalg.det(matrix))) > 0.0:
             return values
     raise InvalidArgumentError(
-        "the transform of a tileset must be 16 finite numbers, column by column, that can be "
-        f"undone, each fourth 0 but for the last, which is 1; found {list(values)[:17]}."
+        "the transform of a tileset must be 16 finite numbers, column by column: an "
+        f"invertible 4 x 4 matrix whose last row is 0, 0, 0, 1; found {list(values)[:17]}."
     )
 
 

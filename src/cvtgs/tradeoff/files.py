@@ -27,11 +27,11 @@ MOST_TICKS = 12
 """Largest number of tick labels that do not overlap."""
 
 MARK = "*"
-MARK_MEANS = "* no other preset is as good in less time, with as many Gaussians"
+MARK_MEANS = "* no other preset is as good in less time with the same number of Gaussians"
 
 SUMMARY = """\
 <section class="tradeoff">
-<h2>What more time buys</h2>
+<h2>Quality against time</h2>
 {% if chart %}
 <img class="chart" src="data:image/png;base64,{{ chart }}" alt="PSNR and SSIM over seconds, a line \
 per ratio; the table has the same numbers">
@@ -236,7 +236,7 @@ def how_measured(tradeoff: Tradeoff) -> str:
     )
     return (
         f"{len(evaluation.views)} views of {evaluation.width} x {evaluation.height} pixels, "
-        f"rendered by {evaluation.backend}. Every run is a process of its own on "
+        f"rendered by {evaluation.backend}. Every run is a separate process on "
         f"{tradeoff.machine}. {against}{evaluation.lpips_sentence}"
     ).rstrip()
 

@@ -194,11 +194,11 @@ def _prepare_scenes(
         else:
             cases += [(case, scene.views) for case in scene.cases]
     validation_scenes = [scene for scene in validation_scenes if scene.cases]
-    for found, text in ((cases, "learn from"), (validation_scenes, "validate with")):
+    for found, text in ((cases, "training"), (validation_scenes, "validation")):
         if not found:
             raise ConfigError(
-                f"data: the scenes to {text} are too small for their ratios: "
-                f"no cell has several members."
+                f"data: the {text} scenes are too small for their ratios: "
+                f"no cell has more than one member."
             )
     listener(ProgressEvent(stage="prepare", done=len(sources), total=len(sources)))
     return cases, validation_scenes
@@ -224,7 +224,7 @@ def _step(
         good = files.checkpoint if files.checkpoint.is_file() else "none yet"
         raise TrainingError(
             f"the loss or its gradient is not finite at step {state.step}, {case.name}; "
-            f"the last good checkpoint is {good}."
+            f"last good checkpoint: {good}."
         )
     state.optimizer.step()
     state.average()

@@ -75,9 +75,9 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
     sources = [*_from_files(files, held_out, config, seed), *_generated(config, seed)]
     if len({source.name for source in sources}) < len(sources):
         raise ConfigError("data.folders: two files have the same name.")
-    for is_validation, text in ((False, "learn from"), (True, "validate with")):
+    for is_validation, text in ((False, "training"), (True, "validation")):
         if not any(source.is_validation == is_validation for source in sources):
-            raise ConfigError(f"data: there is no scene to {text}.")
+            raise ConfigError(f"data: at least one {text} scene is needed, found none.")
     return sources
 
 

@@ -212,7 +212,7 @@ class TrainState:
             record = json.loads(metadata["state"])
             if record["config"] != _fingerprint(config):
                 raise CheckpointError(
-                    f"{path}: the state belongs to a training with another configuration; "
+                    f"{path}: the state belongs to a training run with another configuration; "
                     f"remove it, or train to another output."
                 )
             self._check_origin(path, record["version"], record["scenes"])
@@ -223,21 +223,23 @@ class TrainState:
         except (KeyError, ValueError, TypeError, RuntimeError) as error:
             if isinstance(error, CheckpointError):
                 raise
-            raise CheckpointError(f"{path}: the state of the training is damaged.") from error
+            raise CheckpointError(
+                f"{path}: the training state is damaged; remove it, or train to another output."
+            ) from error
 
     def _check_origin(self, path: Path, version: str, scenes: list[dict[str, Any]]) -> None:
         """Raise an error for another version or other scenes: a checkpoint names one of each."""
         if version != cvtgs.__version__:
             raise CheckpointError(
-                f"{path}: the state was made by cvtgs {version}, this is {cvtgs.__version__}; "
-                f"remove it, or train to another output."
+                f"{path}: the state was written by cvtgs {version}, but this is "
+                f"{cvtgs.__version__}; remove it, or train to another output."
             )
         theirs = {LearnedScene.model_validate(scene) for scene in scenes}
         odd = sorted(scene.name for scene in theirs ^ set(self.scenes))
         if self.scenes and odd:
             raise CheckpointError(
-                f"{path}: the state belongs to a training on other scenes, {odd[0]} is one of "
-                f"them; put the scenes back, or train to another output."
+                f"{path}: the state belongs to a training run on other scenes ({odd[0]} differs); "
+                f"restore the scenes, or train to another output."
             )
 
     def _load_tensors(self, tensors: dict[str, Tensor]) -> None:

@@ -69,7 +69,7 @@ class SceneViewer:
         taken = {FULL, SIMPLIFIED} & set(others or {})
         if taken:
             raise InvalidArgumentError(
-                f"a scene beside the full one must not be named {taken.pop()!r}; rename it."
+                f"scenes other than the full one must not be named {taken.pop()!r}; rename it."
             )
         self._scene, self._device = scene, device
         self._prepared: dict[str, Prepared] = {}

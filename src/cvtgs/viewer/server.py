@@ -68,7 +68,7 @@ class ViewerServer:
         )
         score = gui.add_button("PSNR of this view")
         self._path = gui.add_text("file", "small.ply")
-        keep = gui.add_button("save what is shown")
+        keep = gui.add_button("save this scene")
         self._notes = gui.add_markdown("")
         self._slider.on_update(lambda _: self._wanted.set())
         self._preset.on_update(lambda _: self._wanted.set())

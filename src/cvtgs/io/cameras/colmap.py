@@ -90,7 +90,7 @@ def _views(images: Sequence[_Image], lenses: Mapping[int, Lens], path: Path) -> 
     for image in images:
         if image.camera not in lenses:
             raise FileFormatError(
-                f"{path}: image {shown(image.name)} must have a camera of the file of cameras, "
+                f"{path}: image {shown(image.name)} must refer to a camera in the camera file, "
                 f"found camera {image.camera}."
             )
     quats = torch.tensor([image.quat for image in images], dtype=torch.float64).reshape(-1, 4)
@@ -107,7 +107,7 @@ def _checked_image(name: str, camera: int, *, pose: Sequence[float], where: str)
     """Build an image; raise an error if its pose or name is invalid."""
     if not all(map(math.isfinite, pose)) or not any(pose[:4]):
         raise FileFormatError(
-            f"{where}: the pose must be finite with a quaternion other than 0, "
+            f"{where}: the pose must be finite with a nonzero quaternion, "
             f"found {', '.join(f'{value:g}' for value in pose)}."
         )
     if not name:
@@ -237,12 +237,12 @@ def _cameras_of_txt(path: Path) -> dict[int, Lens]:
                 raise _wrong(where, "a camera: CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line)
             model = _find_model(words[1], where)
             if len(words) != 4 + model.parameters:
-                raise _wrong(where, f"{model.parameters} parameters of {words[1]}", line)
+                raise _wrong(where, f"a {words[1]} camera with {model.parameters} parameters", line)
             try:
                 camera, width, height = int(words[0]), int(words[2]), int(words[3])
                 parameters = [float(word) for word in words[4:]]
             except ValueError as error:
-                raise _wrong(where, "a camera in numbers", line) from error
+                raise _wrong(where, "a camera with numeric fields", line) from error
             lenses[camera] = _lens_of(model, parameters, width=width, height=height, where=where)
     return lenses
 
@@ -274,7 +274,7 @@ def _image_of_line(line: str, where: str) -> _Image:
         pose = [float(word) for word in words[1:8]]
         camera = int(words[8])
     except ValueError as error:
-        raise _wrong(where, "an image in numbers", line) from error
+        raise _wrong(where, "an image with numeric fields", line) from error
     return _checked_image(words[9], camera, pose=pose, where=where)
 
 

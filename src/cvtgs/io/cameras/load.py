@@ -10,8 +10,8 @@ from cvtgs.io.files import is_file
 
 _COLMAP_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 _KNOWN_FILES = (
-    "transforms.json, transforms_train.json, transforms_test.json, a COLMAP model in sparse/0, "
-    "sparse or itself, or cameras.json"
+    "transforms.json, transforms_train.json, transforms_test.json, a COLMAP model (in sparse/0, "
+    "sparse or the folder itself) or cameras.json"
 )
 
 
@@ -103,7 +103,7 @@ def _file_views(path: Path, split: Split | None) -> list[View]:
         return hold_out(colmap_views(path.parent), split)
     if path.suffix.lower() != ".json" and is_file(path):
         raise FileFormatError(
-            f"{path}: a file of cameras must be JSON (.json) or of a COLMAP model "
+            f"{path}: a camera file must be JSON (.json) or part of a COLMAP model "
             f"({', '.join(_COLMAP_FILES)}), found neither."
         )
     from cvtgs.io.cameras.transforms import inria_views, transforms_views  # noqa: PLC0415

@@ -141,7 +141,7 @@ def transforms_views(content: Any, path: Path, split: Split | None) -> list[View
         if own != split:
             raise InvalidArgumentError(
                 f"{path}: the split must be {own!r} for this file, found {split!r}; "
-                f"pass the folder to have both."
+                f"pass the folder to read both splits."
             )
         return views
     lists = {
@@ -159,7 +159,7 @@ def _view(content: Any, document: _Transforms, *, path: Path, where: str) -> Vie
     pose = np.array(frame.transform_matrix)
     if len(pose) == 4 and not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
         raise FileFormatError(
-            f"{where}: 'transform_matrix' must be a pose in rows, with 0 0 0 1 as the last, "
+            f"{where}: 'transform_matrix' must be a row-major pose with 0 0 0 1 as its last row, "
             f"found {shown(content['transform_matrix'])}."
         )
     lens = _lens(frame, document, path=path, where=where)
@@ -179,7 +179,7 @@ def _lens(frame: _Frame, document: _Transforms, *, path: Path, where: str) -> Le
     if fx is None or fy is None:
         raise FileFormatError(
             f"{where}: 'fl_x', 'fl_y', 'camera_angle_x' or 'camera_angle_y' must be given "
-            f"here or for the whole file, found none."
+            f"in the frame or at the top level of the file, found none."
         )
     distortions = (_either(getattr(frame, key), getattr(document, key)) for key in _DISTORTIONS)
     return Lens(
@@ -220,8 +220,8 @@ def _size(frame: _Frame, document: _Transforms, *, path: Path, where: str) -> tu
         if is_file(candidate):
             return _png_size(candidate)
     raise FileFormatError(
-        f"{where}: 'w' and 'h' must be given here or for the whole file, or the image must "
-        f"be there; found neither them nor {image}."
+        f"{where}: 'w' and 'h' must be given in the frame or at the top level of the file, or the "
+        f"image must exist; found neither them nor {image}."
     )
 
 
@@ -234,8 +234,8 @@ def _png_size(path: Path) -> tuple[int, int]:
         if signature == _PNG_SIGNATURE and chunk == b"IHDR":
             return width, height
     raise FileFormatError(
-        f"{path}: must be a PNG file, since its size is not among the cameras; found another "
-        f"format. Give 'w' and 'h' in the file of the cameras."
+        f"{path}: must be a PNG file, since the cameras do not give its size, found another "
+        f"format; add 'w' and 'h' to the camera file."
     )
 
 

@@ -72,8 +72,8 @@ def viewmat_of_pose(
         determinant = float(np.linalg.det(rotation))
     if not skew <= _SKEW or determinant < 0:  # also refuses NaN
         raise FileFormatError(
-            f"{where}: the pose must hold a rotation without scale or mirror, "
-            f"found a matrix of determinant {determinant:.6g} that is {skew:.3g} away from one."
+            f"{where}: the pose must hold a rotation without scaling or reflection, "
+            f"found a matrix of determinant {determinant:.6g}, {skew:.3g} from orthogonal."
         )
     left, _, right = np.linalg.svd(rotation)
     inverse = (left @ right).T
@@ -82,7 +82,9 @@ def viewmat_of_pose(
     with np.errstate(over="ignore", invalid="ignore"):
         viewmat[:3, 3] = -inverse @ center
     if not np.isfinite(viewmat).all():
-        raise FileFormatError(f"{where}: the camera must be nearer, found it at {center.tolist()}.")
+        raise FileFormatError(
+            f"{where}: the camera must be closer to the origin, found it at {center.tolist()}."
+        )
     return viewmat
 
 
@@ -121,7 +123,7 @@ def _warn_of_distortion(views: Sequence[View], path: str) -> None:
     if count:
         warnings.warn(
             f"{path}: left out the lens distortion of {count:,} of {len(views):,} cameras, since "
-            f"images are rendered by pinhole cameras; compare with undistorted photographs.",
+            f"rendering uses pinhole cameras; compare with undistorted photographs.",
             DroppedDataWarning,
             stacklevel=4,
         )

@@ -52,14 +52,14 @@ _INTEGERS = frozenset((kind, scaled) for kind in _LARGEST for scaled in (False, 
 _ENCODINGS = {
     ROTATION: (
         frozenset({(BYTE, True), (SHORT, True)}),
-        "floats, or of signed bytes or shorts that are normalized",
+        "floats, or of normalized signed bytes or shorts",
     ),
     SCALE: (_INTEGERS, "floats, bytes or shorts"),
     OPACITY: (
         frozenset({(UNSIGNED_BYTE, True), (UNSIGNED_SHORT, True)}),
-        "floats, or of unsigned bytes or shorts that are normalized",
+        "floats, or of normalized unsigned bytes or shorts",
     ),
-    POSITION: (_INTEGERS, f"floats, or with {QUANTIZATION} of bytes or shorts"),
+    POSITION: (_INTEGERS, f"floats, or of bytes or shorts with {QUANTIZATION}"),
 }
 """Integer encodings of attributes (component type, whether normalized) and the text for errors. All
 attributes may be floats; those that are not listed must be."""
@@ -145,7 +145,7 @@ class GltfFile:
         end = view.byteOffset + view.byteLength
         if end > len(content):
             raise self.error(
-                f"bufferViews[{index}] must end in buffer {view.buffer} of {len(content):,} "
+                f"bufferViews[{index}] must end within buffer {view.buffer} of {len(content):,} "
                 f"bytes, found byte {end:,}"
             )
         return memoryview(content)[view.byteOffset : end], view.byteStride
@@ -172,7 +172,7 @@ class GltfFile:
             )
         if accessor.sparse is not None or accessor.bufferView is None:
             found = "a sparse one" if accessor.sparse is not None else "none"
-            raise self.error(f"{where} must lie in a buffer view, found {found}")
+            raise self.error(f"{where} must be in a buffer view, found {found}")
         content, stated = self.view(accessor.bufferView)
         width = WIDTHS[kind] * dtype.itemsize
         stride = stated or width
@@ -184,7 +184,7 @@ class GltfFile:
         end = accessor.byteOffset + stride * (accessor.count - 1) + width
         if accessor.count == 0 or end > len(content):
             raise self.error(
-                f"{where} must have one element at least and end in its buffer view of "
+                f"{where} must have at least one element and end within its buffer view of "
                 f"{len(content):,} bytes, found {accessor.count:,} elements that end at "
                 f"byte {end:,}"
             )
@@ -230,7 +230,7 @@ class GltfFile:
         try:
             return base64.b64decode(text, validate=True)
         except ValueError as error:  # also binascii.Error
-            raise self.error(f"buffers[{index}] must be whole base64, found: {error}") from error
+            raise self.error(f"buffers[{index}] must be valid base64, found: {error}") from error
 
     def _beside(self, uri: str, index: int, length: int) -> bytes:
         parts = urlsplit(uri)
@@ -264,12 +264,12 @@ def _chunks(content: bytes, path: Path) -> tuple[bytes, bytes | None]:
     """Split a ``.glb`` into its JSON chunk and its binary chunk."""
     if len(content) < HEADER.size:
         raise FileFormatError(
-            f"{path}: a .glb must start with {HEADER.size} bytes of header, found {len(content)}."
+            f"{path}: a .glb must start with a header of {HEADER.size} bytes, found {len(content)}."
         )
     _, version, length = HEADER.unpack_from(content)
     if version != VERSION or length > len(content):
         raise FileFormatError(
-            f"{path}: must be version {VERSION} of glTF and have the {length:,} bytes that its "
+            f"{path}: must be glTF version {VERSION} with the {length:,} bytes that its "
             f"header promises, found version {version} and {len(content):,} bytes."
         )
     found: dict[int, bytes] = {}
@@ -279,11 +279,11 @@ def _chunks(content: bytes, path: Path) -> tuple[bytes, bytes | None]:
         at += CHUNK.size
         if at + size > length:
             raise FileFormatError(
-                f"{path}: a chunk must end in the {length:,} bytes of the file, found one that "
+                f"{path}: a chunk must end within the {length:,} bytes of the file, found one that "
                 f"ends at byte {at + size:,}."
             )
         found.setdefault(kind, content[at : at + size])
         at += size
     if JSON_CHUNK not in found:
-        raise FileFormatError(f"{path}: a .glb must have a chunk of JSON, found none.")
+        raise FileFormatError(f"{path}: a .glb must have a JSON chunk, found none.")
     return found[JSON_CHUNK], found.get(BINARY_CHUNK)

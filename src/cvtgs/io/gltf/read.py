@@ -104,7 +104,7 @@ def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False)
     strange = [name for name in file.root.extensionsRequired if name not in _KNOWN]
     if strange:
         raise file.error(
-            f"must require no other extensions than {', '.join(_KNOWN)}, found {shown(strange[0])}"
+            f"must require no extensions other than {', '.join(_KNOWN)}, found {shown(strange[0])}"
         )
     placed = list(_splats(file))
     if not placed:
@@ -134,7 +134,7 @@ def _splats(file: GltfFile) -> Iterator[_Placed]:
     if others:
         warnings.warn(
             f"{file.path}: left out {others:,} mesh "
-            f"{'primitive that is' if others == 1 else 'primitives that are'} not of Gaussians.",
+            f"{'primitive that is' if others == 1 else 'primitives that are'} not Gaussians.",
             DroppedDataWarning,
             stacklevel=4,
         )
@@ -151,7 +151,9 @@ def _placed_meshes(file: GltfFile) -> Iterator[tuple[int, Matrix]]:
     while waiting:
         index, above = waiting.pop()
         if not isinstance(index, int) or isinstance(index, bool) or index in seen:
-            raise file.error(f"each node must hang in one place, found {shown(index)} again")
+            raise file.error(
+                f"each node must occur once in the hierarchy, found {shown(index)} again"
+            )
         seen.add(index)
         node = file.entry(_Node, "nodes", index)
         matrix = above @ _local_matrix(node)
@@ -189,12 +191,12 @@ def _read_primitive(file: GltfFile, one: _Placed, *, trust_sizes: bool) -> Gauss
     primitive, splatting, where, _ = one
     if primitive.mode != _POINTS or splatting.kernel != KERNEL:
         raise file.error(
-            f"Gaussians must be points (mode 0) of the kernel {KERNEL!r}, found mode "
+            f"Gaussians must be points (mode 0) with the kernel {KERNEL!r}, found mode "
             f"{primitive.mode} and {shown(splatting.kernel)}"
         )
     if splatting.colorSpace != COLOR_SPACE:
         warnings.warn(
-            f"{file.path}: took colours of the space {shown(splatting.colorSpace)} for those of "
+            f"{file.path}: read colours of the colour space {shown(splatting.colorSpace)} as "
             f"{COLOR_SPACE!r}.",
             DroppedDataWarning,
             stacklevel=4,
@@ -216,7 +218,7 @@ def _read_attributes(file: GltfFile, one: _Placed) -> GaussianScene:
         values = file.values(_index(file, one, name), kind, name)
         if len(values) != len(means):
             raise file.error(
-                f"all attributes must have the {len(means):,} elements of {POSITION}, found "
+                f"all attributes must have {len(means):,} elements like {POSITION}, found "
                 f"{len(values):,} in {name}"
             )
         return values
@@ -299,8 +301,8 @@ def _moved(file: GltfFile, scene: GaussianScene, one: _Placed) -> GaussianScene:
     affine = np.array_equal(matrix[3], [0, 0, 0, 1]) and bool(np.isfinite(matrix).all())
     if not even or not affine:
         raise file.error(
-            "nodes must turn, shift and evenly scale Gaussians, found one that stretches, skews "
-            "or mirrors them"
+            "nodes must only rotate, translate and uniformly scale Gaussians, found one that "
+            "stretches, skews or mirrors them"
         )
     w, a, b, c = matrices_to_quats(torch.from_numpy(rotation)[None])[0].tolist()
     x, y, z = matrix[:3, 3].tolist()

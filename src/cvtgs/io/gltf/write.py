@@ -208,7 +208,7 @@ def _start_glb(file: BinaryIO, document: dict[str, Any], size: int) -> None:
     length = HEADER.size + 2 * CHUNK.size + len(text) + padded
     if length >= _MOST_BYTES:
         raise InvalidSceneError(
-            f"a .glb must have less than 4 GiB, found a scene that takes {length:,} bytes; write "
+            f"a .glb must be smaller than 4 GiB, found a scene that takes {length:,} bytes; write "
             f".spz.glb, or simplify it."
         )
     file.write(HEADER.pack(MAGIC, VERSION, length))

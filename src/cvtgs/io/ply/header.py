@@ -26,7 +26,7 @@ _OTHER_FILES = MappingProxyType(
     {
         b"\x1f\x8b": "a gzip file; unpack it first",
         b"PK\x03\x04": "a zip archive; unpack it first",
-        b"<": "a web page; a download that failed leaves one",
+        b"<": "a web page; failed downloads often leave one",
     }
 )
 _MAX_COUNT_DIGITS = 18

@@ -129,7 +129,7 @@ def _check_properties(vertex: Element, path: str) -> None:
     if missing:
         names = ", ".join(missing)
         is_cloud = set(missing) == set(standard_slots(0)) - set(_OPTIONAL) - set("xyz")
-        hint = "; a point cloud or a mesh must be trained to a scene first" if is_cloud else ""
+        hint = "; train a scene from a point cloud or mesh first" if is_cloud else ""
         raise FileFormatError(
             f"{path}: a 3DGS scene must have the 'vertex' properties x, y, z, f_dc_0..2, opacity, "
             f"scale_0..1 and rot_0..3, found none named {names}{hint}."

@@ -224,7 +224,7 @@ def _read_rows(file: BinaryIO, header: Header, *, vertex: Element, path: str) ->
         raise FileFormatError(_explain(error, needed, path)) from error
     except (PlyParseError, ValueError, OverflowError) as error:
         raise FileFormatError(
-            f"{path}: every value must be a number of the type its property states, "
+            f"{path}: every value must be a number of the type of its property, "
             f"found one that is not: {error}."
         ) from error
     rows: NDArray[Any] = data.view(np.ndarray)
@@ -300,4 +300,4 @@ def _explain(error: Any, elements: tuple[Element, ...], path: str) -> str:
             f"{place} must have a value for property {shown(prop.name)}, found the end of the line."
         )
     kind = f"list of {prop.type}" if prop.count_type else prop.type
-    return f"{place}: property {shown(prop.name)} must be a {kind}, found something unreadable."
+    return f"{place}: property {shown(prop.name)} must be a {kind}, found an unreadable value."

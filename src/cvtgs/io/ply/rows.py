@@ -162,7 +162,7 @@ def join_plys(paths: Sequence[str | os.PathLike[str]], file: BinaryIO) -> int:
     first, total = parts[0], sum(part.count for part in parts)
     for part in parts:
         if part.names != first.names:
-            raise FileFormatError(f"{part.path}: must have the columns of {first.path}.")
+            raise FileFormatError(f"{part.path}: must have the same columns as {first.path}.")
     file.write(header_bytes(first.comments, [("vertex", total, first.layout)]))
     for part in parts:
         with Path(part.path).open("rb") as content:

@@ -68,7 +68,7 @@ def _inside(path: Path) -> Iterator[tuple[Reader, StoredBytes]]:
             if is_out_of_memory(error):
                 raise
             raise FileFormatError(
-                f"{path}: a .sog file must be a zip of meta.json and images, found none: "
+                f"{path}: a .sog file must be a zip of meta.json and images, found no zip: "
                 f"{_reason(error)}."
             ) from error
 
@@ -93,7 +93,7 @@ def _inside(path: Path) -> Iterator[tuple[Reader, StoredBytes]]:
                 if is_out_of_memory(error):
                     raise
                 raise FileFormatError(
-                    f"{path}: {name} must be whole, found damage: {_reason(error)}."
+                    f"{path}: {name} must be intact, found damage: {_reason(error)}."
                 ) from error
 
         with archive:
@@ -108,7 +108,7 @@ def _check_name(name: str, path: Path) -> None:
     plain = name.isprintable() and name not in ("", "..") and not set(name) & set("\\:")
     if PurePosixPath(name).name != name or not plain:
         raise FileFormatError(
-            f"{path}: the files of a SOG must be named without folders, found {shown(name)}."
+            f"{path}: the files of a SOG must have names without folders, found {shown(name)}."
         )
     if len(name) > _LONGEST_NAME:
         raise FileFormatError(
@@ -142,7 +142,9 @@ def decode_webp(content: bytes, where: str, *, most_pixels: int) -> UInt8[np.nda
     except Exception as error:  # Pillow passes on errors of its codecs
         if is_out_of_memory(error):
             raise
-        raise FileFormatError(f"{where} must be a whole image, found: {_reason(error)}.") from error
+        raise FileFormatError(
+            f"{where} must be an intact image, found: {_reason(error)}."
+        ) from error
 
 
 def encode_webp(numbers: UInt8[np.ndarray, "h w 4"]) -> bytes:

@@ -24,7 +24,7 @@ class _LodMeta(Document):
     version: Annotated[Whole, Field(ge=1, le=1, description="1")] | None = None
     lodLevels: Annotated[Whole, Field(ge=1, description="1 or more")]  # noqa: N815
     counts: Annotated[list[_Size], Field(description="a list of whole numbers")] | None = None
-    filenames: Annotated[list[Text], Field(description="a list of texts")]
+    filenames: Annotated[list[Text], Field(description="a list of strings")]
     environment: Text | None = None
     tree: _Object
 
@@ -87,7 +87,7 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
     if meta.environment is not None:
         sources.append((_inside(path, meta.environment), []))
     if not sources:
-        raise FileFormatError(f"{path}: level {lod} must hold a Gaussian, found none.")
+        raise FileFormatError(f"{path}: level {lod} must hold at least one Gaussian, found none.")
     scenes = []
     for source, parts in sources:
         scenes.append(_read_rows(source, parts, trust_sizes=trust_sizes))
@@ -140,8 +140,8 @@ def _check_count(
     total = sum(part.end - part.start for parts in ranges.values() for part in parts)
     if len(meta.counts) != meta.lodLevels or meta.counts[lod] != total:
         raise FileFormatError(
-            f"{path}: 'counts' must be those of the chunks of {meta.lodLevels} levels, found "
-            f"{shown(meta.counts)} and {total:,} in level {lod}."
+            f"{path}: 'counts' must hold the number of Gaussians of each of {meta.lodLevels} "
+            f"levels, found {shown(meta.counts)} and {total:,} in the chunks of level {lod}."
         )
 
 
@@ -165,7 +165,7 @@ def _read_rows(source: Path, parts: Sequence[_Range], *, trust_sizes: bool) -> G
     scene = read_sog(source, trust_sizes=trust_sizes)
     if parts and parts[-1].end > len(scene):
         raise FileFormatError(
-            f"{source}: must have the {parts[-1].end:,} Gaussians that the stream takes of it, "
+            f"{source}: must have the {parts[-1].end:,} Gaussians that the stream reads from it, "
             f"found {len(scene):,}."
         )
     if not parts or sum(part.end - part.start for part in parts) == len(scene):

@@ -133,7 +133,7 @@ def _parsed(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Content:
     if content[:4] == MAGIC.to_bytes(4, "little"):
         return _read_version_4(content, path, trust_sizes=trust_sizes)
     raise FileFormatError(
-        f"{path}: an .spz file must start with gzip's or its own magic number, "
+        f"{path}: an .spz file must start with the magic number of gzip or SPZ, "
         f"found {content[:4]!r}."
     )
 
@@ -144,13 +144,15 @@ def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Conte
         header = _header(stream.decompress(content, HEADER.size), path, versions=(1, 2, 3))
         wanted = sum(header.sizes.values())
         if wanted > _MOST_EXPANSION * len(content):
-            raise _too_short(path, header, wanted, f"{len(content):,} compressed ones")
+            raise _too_short(path, header, wanted, f"{len(content):,} compressed bytes")
         if not trust_sizes:
             _check_expansion(path, header, len(content))
         payload = stream.decompress(stream.unconsumed_tail, wanted)
         surplus = len(stream.decompress(stream.unconsumed_tail, 1))
     except zlib.error as error:
-        raise FileFormatError(f"{path}: must be whole gzip, found damage: {error}.") from error
+        raise FileFormatError(
+            f"{path}: must be intact gzip data, found damage: {error}."
+        ) from error
     if len(payload) < wanted:
         raise _too_short(path, header, wanted, f"{len(payload):,}")
     if surplus and header.flags & EXTENSIONS_FLAG:  # their end is not recorded
@@ -160,13 +162,13 @@ def _read_gzip(content: bytes, path: Path | str, *, trust_sizes: bool) -> _Conte
         )
     if surplus:
         warnings.warn(
-            f"{path}: left out what stands behind the {header.count:,} Gaussians that the header "
+            f"{path}: left out the bytes after the {header.count:,} Gaussians that the header "
             f"promises.",
             DroppedDataWarning,
             stacklevel=6,
         )
     elif not stream.eof:
-        raise FileFormatError(f"{path}: must be whole gzip, found it cut short.")
+        raise FileFormatError(f"{path}: must be intact gzip data, found it cut short.")
     ends = np.cumsum(list(header.sizes.values()))[:-1]
     blocks = np.split(np.frombuffer(payload, np.uint8), ends)
     return _Content(header, dict(zip(header.sizes, blocks, strict=True)))
@@ -193,7 +195,7 @@ def _read_version_4(content: bytes, path: Path | str, *, trust_sizes: bool) -> _
         if unpacked != size or at + packed > len(content):
             raise FileFormatError(
                 f"{path}: block {name!r} must have {size:,} bytes for {header.count:,} Gaussians, "
-                f"found {unpacked:,} in {packed:,} compressed ones of a file of {len(content):,}."
+                f"found {unpacked:,} in {packed:,} compressed bytes of a file of {len(content):,}."
             )
         blocks[name] = _unzstd(content[at : at + packed], size, f"{path}: block {name!r}")
         at += packed
@@ -210,7 +212,7 @@ def _stated_axes(extensions: bytes, path: Path | str) -> str | None:
             number = int.from_bytes(extensions[at + 8 : at + 12], "little")
             if size != 4 or len(extensions) < at + 12 or number > len(AXES):
                 raise FileFormatError(
-                    f"{path}: the extension for the axes must hold a number of 4 bytes from 0 to "
+                    f"{path}: the extension for the axes must hold a 4-byte number from 0 to "
                     f"{len(AXES)}, found {number} in {size:,} bytes."
                 )
             axes = AXES[number - 1] if number else "rub"  # as Niantic's library takes it
@@ -269,7 +271,9 @@ def _unzstd(content: bytes, size: int, where: str) -> UInt8[np.ndarray, "b"]:
         with zstandard.ZstdDecompressor().stream_reader(content) as stream:
             data = stream.read(size + 1)
     except zstandard.ZstdError as error:
-        raise FileFormatError(f"{where} must be whole zstd, found damage: {error}.") from error
+        raise FileFormatError(
+            f"{where} must be intact zstd data, found damage: {error}."
+        ) from error
     if len(data) != size:
         found = f"{len(data):,}" if len(data) < size else "more"
         raise FileFormatError(f"{where} must have {size:,} bytes, found {found}.")
