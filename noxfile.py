@@ -36,9 +36,16 @@ def lint(session: nox.Session) -> None:
 
 @nox.session
 def tests(session: nox.Session) -> None:
-    """Unit, property and documentation tests but the longest, a process per core, with coverage."""
+    """All tests except the longest, one process per core."""
     session.install(*CONSTRAINTS, "-e", ".[test]")
-    session.run("pytest", *PARALLEL, "--cov=cvtgs", "-m", "not long", *session.posargs)
+    session.run("pytest", *PARALLEL, "-m", "not long", *session.posargs)
+
+
+@nox.session
+def coverage(session: nox.Session) -> None:
+    """All tests with line and branch coverage, at least 95 %."""
+    session.install(*CONSTRAINTS, "-e", ".[test]")
+    session.run("pytest", *PARALLEL, "--cov=cvtgs", *session.posargs)
 
 
 @nox.session

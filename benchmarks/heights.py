@@ -17,11 +17,11 @@ import cvtgs
 from benchmarks.quality import scenes
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.evaluation import psnr
-from cvtgs.math.frames import robust_frame
+from cvtgs.views.layout import find_layout
 
 HEIGHTS = ((90, 1.5), (60, 1.2), (35, 1.6), (20, 1.2), (20, 2.8), (10, 2.2), (-15, 2.8), (-35, 2.0),
            (-60, 1.5))  # fmt: skip
-"""Elevation in degrees from the xz plane toward +y, and distance in robust radii."""
+"""Elevation in degrees above the level of the centre, and distance in robust radii."""
 
 
 def main() -> None:
@@ -54,14 +54,16 @@ def views_at(
     scene: cvtgs.GaussianScene, height: float, far: float, count: int, *, size: int, seed: int
 ) -> Cameras:
     """Return cameras that look at the centre of a scene from one elevation and distance."""
-    frame = robust_frame(scene.means[scene.opacities > 0.1])
+    layout = find_layout(scene)
+    up, frame = layout.up, layout.frame
+    right, ahead = torch.linalg.svd(up[None]).Vh[1:]
     turns = 2 * math.pi * torch.rand(count, generator=torch.Generator().manual_seed(seed)).double()
     rise = torch.full_like(turns, math.radians(height))
-    ways = torch.stack([rise.cos() * turns.cos(), rise.sin(), rise.cos() * turns.sin()], dim=1)
+    level = turns.cos()[:, None] * right + turns.sin()[:, None] * ahead
+    ways = rise.cos()[:, None] * level + rise.sin()[:, None] * up
     focal = 0.5 * size / math.tan(math.radians(25))
     intrinsics = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]).double()
     eyes = frame.center + far * frame.radius * ways
-    up = torch.tensor([0.0, 1.0, 0.0]).double()
     return Cameras(
         viewmats=look_at(eyes, frame.center.expand_as(eyes), up),
         Ks=intrinsics.repeat(count, 1, 1),

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cvtgs.errors import InputError, InputNotFoundError, InvalidArgumentError
+from cvtgs.errors import InputError, InputNotFoundError, InvalidArgumentError, reason_of
 from cvtgs.text import MOST_LETTERS, shortened
 
 Corner = tuple[float, float, float]
@@ -78,7 +78,7 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
     except FileNotFoundError as error:
         raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
+        reason = reason_of(error)
         raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
     except (ValueError, RecursionError) as error:  # RecursionError: lists nested too deeply
         raise InvalidArgumentError(f"{path}: must be valid JSON, found: {error}.") from None

@@ -85,6 +85,11 @@ class DroppedDataWarning(UserWarning):
     """Something in the input was dropped; the message says what, how much and why."""
 
 
+def reason_of(error: Exception) -> str:
+    """Return the text of an operating-system error within a sentence: no number, no path."""
+    return (getattr(error, "strerror", None) or str(error)).lower()
+
+
 def is_out_of_memory(error: BaseException) -> bool:
     """Check whether an error of any library means that there is not enough memory."""
     if isinstance(error, MemoryError):

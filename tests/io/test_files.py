@@ -5,6 +5,8 @@ import io
 import json
 import os
 import shutil
+import sys
+import tempfile
 import zipfile
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -23,6 +25,7 @@ from cvtgs.errors import (
     FileFormatError,
     InputError,
     InputNotFoundError,
+    InvalidArgumentError,
     OutputError,
 )
 from cvtgs.io import scene_file, scene_size
@@ -285,6 +288,38 @@ def test_text_files_and_closed_files_are_refused(tmp_path: Path) -> None:
     cvtgs.save(scene, path, overwrite=True)
     with path.open("rb") as file, pytest.raises(OutputError, match="must be open for writing"):
         cvtgs.save(scene, file)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits the file size as Linux does")
+def test_no_room_for_a_copy_of_a_stream_is_an_error_of_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import resource  # noqa: PLC0415 (not on Windows)
+
+    content = io.BytesIO()
+    cvtgs.save(storable_scene(5), content)
+    content.seek(0)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    with pytest.raises(OutputError, match=r"gone: must be writable and have room for"):
+        cvtgs.load(content)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        with pytest.raises(OutputError, match="found: file too large; TMPDIR sets another folder"):
+            cvtgs.load(content)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    content.seek(0)
+    assert len(cvtgs.load(content)) == 5
+
+
+def test_a_level_of_a_stream_that_has_none_is_refused() -> None:
+    content = io.BytesIO()
+    cvtgs.save(storable_scene(5), content)
+    content.seek(0)
+    with pytest.raises(InvalidArgumentError, match=r"lod .* found 1 for the BytesIO"):
+        cvtgs.load(content, lod=1)
 
 
 def test_dropped_data_is_warned_about_for_streams() -> None:

@@ -323,9 +323,6 @@ def is_alive(pid: int) -> bool:
     return True
 
 
-pytestmark = needs_browser
-
-
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
     pytest.importorskip("matplotlib")
@@ -341,6 +338,7 @@ def page(tmp_path_factory):
     return write_tradeoff(measured, folder).paths[-1]
 
 
+@needs_browser
 @pytest.mark.long
 def test_the_page_has_plot_table_and_slider(page):
     html = dom(page)
@@ -352,6 +350,7 @@ def test_the_page_has_plot_table_and_slider(page):
     assert "50 Gaussians" in html
 
 
+@needs_browser
 @pytest.mark.slow
 def test_the_page_fits_a_phone(page):
     """The wide table scrolls in its own container."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TextIO
 
 import cvtgs
-from cvtgs.errors import OutputError
+from cvtgs.errors import OutputError, reason_of
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.text import printable
 
@@ -44,7 +44,7 @@ def _console_errors(file: TextIO) -> Iterator[None]:
         yield
     except OSError as error:
         if file is not sys.stderr:
-            reason = (error.strerror or str(error)).lower()
+            reason = reason_of(error)
             raise OutputError(f"standard output must be writable, found: {reason}.") from error
 
 

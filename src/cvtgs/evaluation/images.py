@@ -14,7 +14,13 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.errors import FileFormatError, InputError, InputNotFoundError, InvalidArgumentError
+from cvtgs.errors import (
+    FileFormatError,
+    InputError,
+    InputNotFoundError,
+    InvalidArgumentError,
+    reason_of,
+)
 
 Encoding = Literal["png", "webp"]
 
@@ -130,7 +136,7 @@ def _opened(path: Path) -> Iterator[None]:
         raise FileFormatError(f"{path}: must be an image, found something else.") from error
     except (OSError, SyntaxError, ValueError) as error:
         if isinstance(error, OSError) and error.errno is not None:
-            reason = (error.strerror or str(error)).lower()
+            reason = reason_of(error)
             raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
         raise FileFormatError(f"{path}: must be a whole image, found a damaged one.") from error
 

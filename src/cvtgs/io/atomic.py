@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path, PureWindowsPath
 from typing import BinaryIO
 
-from cvtgs.errors import CvtgsError, OutputError, OutputExistsError
+from cvtgs.errors import CvtgsError, OutputError, OutputExistsError, reason_of
 
 try:
     import fcntl
@@ -149,7 +149,7 @@ def make_folder(folder: str | os.PathLike[str], *, parents: bool = True) -> None
     try:
         Path(folder).mkdir(parents=parents, exist_ok=True)
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
+        reason = reason_of(error)
         raise OutputError(
             f"{os.fspath(folder)}: must be a folder or a new path, found: {reason}."
         ) from error
@@ -307,5 +307,5 @@ def _failed(path: str | os.PathLike[str], error: OSError) -> OutputError:
             f"{os.fspath(path)}: the output needs more space than the disk has left; "
             f"nothing was written."
         )
-    reason = (error.strerror or str(error)).lower()
+    reason = reason_of(error)
     return OutputError(f"{os.fspath(path)}: the output must be writable, found: {reason}.")

@@ -13,7 +13,7 @@ import pydantic
 from pydantic import AllowInfNan, BeforeValidator, Field, Strict
 from torch import Tensor
 
-from cvtgs.errors import CvtgsError, FileFormatError, InputError, InputNotFoundError
+from cvtgs.errors import CvtgsError, FileFormatError, InputError, InputNotFoundError, reason_of
 from cvtgs.text import shown
 
 _POINTER = b"version https://git-lfs."
@@ -53,7 +53,7 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
     except FileNotFoundError as error:
         raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
+        reason = reason_of(error)
         raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
 
 
@@ -92,7 +92,7 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
     try:
         found = next(_scenes(folder), None)
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
+        reason = reason_of(error)
         raise InputError(f"{folder}: the folder must be readable, found: {reason}.") from error
     if found is None:
         raise InputError(

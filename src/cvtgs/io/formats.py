@@ -153,6 +153,7 @@ def load(
                 extras=extras,
                 axes=axes,
                 trust_sizes=trust_sizes,
+                lod=lod,
             )
     source = scene_file(path)
     named = _dotted(format) or source

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from cvtgs.errors import OutputBusyError, OutputError
+from cvtgs.errors import OutputBusyError, OutputError, reason_of
 
 
 @contextmanager
@@ -31,7 +31,7 @@ def output_lock(path: str | os.PathLike[str]) -> Iterator[None]:
             "work; wait until it ends, or choose another output."
         ) from error
     except (OSError, NotImplementedError) as error:
-        reason = (getattr(error, "strerror", None) or str(error)).lower()
+        reason = reason_of(error)
         raise OutputError(
             f"{os.fspath(path)}: its folder must allow a lock file, found: {reason}."
         ) from error

@@ -4,15 +4,18 @@ import re
 import shutil
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from tempfile import SpooledTemporaryFile, TemporaryDirectory
+from tempfile import SpooledTemporaryFile, TemporaryDirectory, gettempdir
 from typing import BinaryIO, Protocol, cast
 
-from cvtgs.errors import CvtgsError, FileFormatError, InputError, OutputError
+from cvtgs.errors import CvtgsError, FileFormatError, InputError, OutputError, reason_of
 
 MEMORY_BYTES = 1 << 26
 """A file is built in memory up to this size, and on disk beyond it."""
+
+CHUNK_BYTES = 1 << 16
+"""Bytes of a stream that are read at once."""
 
 _FIRST_BYTES = {b"ply": ".ply", b"\x1f\x8b": ".spz", b"NGSP": ".spz", b"glTF": ".glb"}
 _TORCH_MEMBER = re.compile(r"[^/]+/data\.pkl")
@@ -48,26 +51,27 @@ def file_of(
     ``advice`` ends the error message if the first bytes match no format.
     """
     name = name or name_of(stream)
-    with TemporaryDirectory(prefix="cvtgs-") as folder:
-        path = Path(folder) / "stream"
-        with _opened(path) as file:
-            try:
-                first = stream.read(1 << 16)
-                if not isinstance(first, bytes):
-                    raise InputError(
-                        f"{name}: must be open in binary mode, found text; open it with 'rb'."
-                    )
-                file.write(first)
-                shutil.copyfileobj(stream, file)
-            except OSError as error:
-                if isinstance(error, InputError):
-                    raise
-                raise InputError(f"{name}: must be readable to its end, found: {error}.") from error
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(TemporaryDirectory(prefix="cvtgs-"))
+            path = Path(folder) / "stream"
+            with path.open("xb") as file:
+                for chunk in _chunks(stream, name):
+                    file.write(chunk)
+        except InputError:
+            raise
+        except OSError as error:
+            raise OutputError(
+                f"{gettempdir()}: must be writable and have room for a copy of {name}, found: "
+                f"{reason_of(error)}; TMPDIR sets another folder."
+            ) from error
         suffix = format or format_of(path)
         if suffix is None:
+            with path.open("rb") as file:
+                first = file.read(4)
             raise FileFormatError(
                 f"{name}: the first bytes must be those of a .ply, .spz, .sog, .glb or .pt, found "
-                f"{first[:4]!r}; {advice}."
+                f"{first!r}; {advice}."
             )
         path = path.rename(path.with_suffix(suffix))
         try:
@@ -77,6 +81,20 @@ def file_of(
             if str(path) not in text:
                 raise
             raise type(error)(text.replace(str(path), name)) from error
+
+
+def _chunks(stream: ByteSource, name: str) -> Iterator[bytes]:
+    """Yield the rest of a stream, in pieces."""
+    while True:
+        try:
+            chunk = stream.read(CHUNK_BYTES)
+        except OSError as error:
+            raise InputError(f"{name}: must be readable to its end, found: {error}.") from error
+        if not isinstance(chunk, bytes):
+            raise InputError(f"{name}: must be open in binary mode, found text; open it with 'rb'.")
+        if not chunk:
+            return
+        yield chunk
 
 
 @contextmanager
@@ -115,14 +133,3 @@ def name_of(stream: ByteSource | ByteSink) -> str:
     """Return the name of a stream for messages."""
     name = getattr(stream, "name", None)
     return name if isinstance(name, str) else f"the {type(stream).__name__}"
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
-    """Open a temporary file; failure to create it is an OutputError that names its folder."""
-    try:
-        file = path.open("xb")
-    except OSError as error:
-        raise OutputError(f"{path.parent}: must be writable, found: {error}.") from error
-    with file:
-        yield file

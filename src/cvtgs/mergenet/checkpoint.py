@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from cvtgs.config import PRESETS, SimplifyConfig
-from cvtgs.errors import CheckpointError, ConfigError, FileFormatError
+from cvtgs.errors import CheckpointError, ConfigError, FileFormatError, reason_of
 from cvtgs.io.tensors import pack_tensors, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet
 from cvtgs.mergenet.published import PublishedArchitecture, PublishedMergeNet
@@ -187,7 +187,7 @@ def _read(path: Path, name: str) -> bytes:
             f"{name}: no such checkpoint; it must be {' or '.join(SHIPPED)}, or a file.{preset}"
         ) from None
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
+        reason = reason_of(error)
         raise CheckpointError(f"{name}: the checkpoint cannot be read: {reason}.") from error
     raise CheckpointError(
         f"{name}: a checkpoint must be a file of at most {LARGEST_FILE >> 20} MiB."

@@ -16,7 +16,7 @@ import torch
 import cvtgs
 from cvtgs.boxes import Box
 from cvtgs.config import SimplifyConfig
-from cvtgs.errors import CvtgsError, OutputError, RunError
+from cvtgs.errors import CvtgsError, OutputError, RunError, reason_of
 from cvtgs.io import atomic_output
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.ply import PlyRows, open_rows
@@ -262,7 +262,7 @@ class Job:
         try:
             Path(self.folder).mkdir(parents=True)
         except OSError as error:
-            reason = (error.strerror or str(error)).lower()
+            reason = reason_of(error)
             raise OutputError(
                 f"{parent}: must be replaceable by an empty folder for block files, "
                 f"found: {reason}."

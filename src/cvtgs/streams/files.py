@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from cvtgs.config.base import Record
-from cvtgs.errors import OutputError, OutputExistsError
+from cvtgs.errors import OutputError, OutputExistsError, reason_of
 from cvtgs.io import atomic_output, check_output
 from cvtgs.io.atomic import make_folder
 from cvtgs.progress import ProgressListener
@@ -258,7 +258,7 @@ def _remove(path: Path) -> None:
 
 
 def _refused(place: Path, error: OSError) -> OutputError:
-    reason = (error.strerror or str(error)).lower()
+    reason = reason_of(error)
     return OutputError(f"{place}: must be writable for the files of a stream, found: {reason}.")
 
 
