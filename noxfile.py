@@ -57,7 +57,7 @@ def long(session: nox.Session) -> None:
 
 @nox.session(reuse_venv=True)
 def quick(session: nox.Session) -> None:
-    """All tests but the slow ones: three minutes on two cores."""
+    """All tests except the slow ones."""
     session.install(*CONSTRAINTS, "-e", ".[test]")
     session.run("pytest", *PARALLEL, "-m", "not slow and not long", *session.posargs)
 

@@ -50,6 +50,7 @@ def test_chunks_are_longer_where_launches_are_expensive(monkeypatch, gigabytes, 
 
 
 @pytest.mark.parametrize("may_leave", [True, False])
+@pytest.mark.slow
 def test_running_out_of_memory_leads_to_short_chunks_then_the_cpu(may_leave):
     tried = []
 

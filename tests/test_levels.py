@@ -29,6 +29,7 @@ def simplifier():
 
 
 @pytest.mark.parametrize("rhos", [RHOS, RHOS[::-1], [0.04, 1.0, 0.2], [0.1, 0.09, 0.1], [0.5]])
+@pytest.mark.slow
 def test_counts_are_exact_and_in_the_order_of_the_ratios(scene, simplifier, rhos):
     levels = simplifier.levels(scene, rhos)
     assert [len(level.scene) for level in levels] == [cvtgs.target_count(3000, r) for r in rhos]
@@ -113,6 +114,7 @@ def test_the_index_describes_the_files(scene, simplifier, tmp_path):
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
 @pytest.mark.parametrize("axes", ["rdf", "luf"])
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".splat", ".sog"])
+@pytest.mark.slow
 def test_boxes_counts_and_errors_match_the_files(scene, simplifier, tmp_path, suffix, axes):
     levels = simplifier.levels(scene, RHOS)
     write_levels(levels, tmp_path / "out", rhos=RHOS, source="a.ply", suffix=suffix, axes=axes)
@@ -132,6 +134,7 @@ def test_boxes_counts_and_errors_match_the_files(scene, simplifier, tmp_path, su
         assert 0.5 < found / entry["geometric_error"] < 1.1
 
 
+@pytest.mark.slow
 def test_scores_are_measured_on_the_files(scene, tmp_path):
     """A .splat file drops the view-dependent colours, which its score shows."""
     cvtgs.save(scene, tmp_path / "in.ply")

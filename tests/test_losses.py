@@ -202,6 +202,7 @@ def test_cuda_gives_the_same_values_and_gradients(loss) -> None:
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_importing_losses_is_light() -> None:
     program = (
         "import sys, cvtgs, cvtgs.losses, cvtgs.evaluation, cvtgs.io\n"

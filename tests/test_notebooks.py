@@ -27,6 +27,7 @@ def test_a_scene_shows_an_image_and_its_facts():
         assert fact in text
 
 
+@pytest.mark.slow
 def test_a_result_shows_counts_and_settings():
     scene = cvtgs.synthetic.scene("object", 500, sh_degree=0, seed=0)
     result = cvtgs.Simplifier(None, preset="draft", device="cpu").run(scene, 0.1)
@@ -41,6 +42,7 @@ def test_a_result_shows_counts_and_settings():
     )
 
 
+@pytest.mark.slow
 def test_only_the_heaviest_gaussians_of_large_scenes_are_drawn(monkeypatch: pytest.MonkeyPatch):
     scene = cvtgs.synthetic.scene("object", 500, sh_degree=0, seed=0)
     whole = image_of(scene._repr_html_())

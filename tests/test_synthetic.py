@@ -94,6 +94,7 @@ def test_checker_alternates():
 
 @pytest.mark.parametrize("kind", synthetic.KINDS)
 @pytest.mark.parametrize("count", [1, 2, 3, 29, 5000])
+@pytest.mark.slow
 def test_counts_are_exact_and_values_sane(kind, count):
     scene = synthetic.scene(kind, count, sh_degree=1, seed=3)
     assert len(scene) == count
@@ -118,6 +119,7 @@ def test_scenes_have_the_requested_sh_degree(degree):
 
 
 @pytest.mark.parametrize("kind", synthetic.KINDS)
+@pytest.mark.slow
 def test_same_seed_same_bits_other_seed_other_scene(kind):
     first, again, other = (
         synthetic.scene(kind, 3000, sh_degree=2, seed=seed).tensors() for seed in (5, 5, 6)

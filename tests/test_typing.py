@@ -45,5 +45,6 @@ def test_wrong_calls_are_found(folder: Path) -> None:
     assert done.stdout.count("[arg-type]") == 3, done.stdout
 
 
+@pytest.mark.slow
 def test_the_program_runs(tmp_path: Path) -> None:
     assert typed_embedding.main(tmp_path) > 30

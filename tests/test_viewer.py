@@ -133,6 +133,7 @@ def test_a_standalone_page_starts_in_view_of_the_scene(scene: GaussianScene) -> 
     assert sum(x * (m - e) for x, m, e in zip(toward, middle, eye, strict=True)) > 0
 
 
+@pytest.mark.slow
 def test_compare_and_levels_write_a_page(
     tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -229,6 +229,7 @@ def test_no_image_is_rendered_unless_the_preset_asks(monkeypatch):
 
 @pytest.mark.parametrize("choice", ["auto", "on", "off"])
 @pytest.mark.parametrize("is_tagged", [True, False])
+@pytest.mark.slow
 def test_images_are_compensated_as_planned_and_the_tag_stays(is_tagged, choice, monkeypatch):
     scene = random_scene(100)
     scene, taken = tagged(scene) if is_tagged else scene, []

@@ -21,6 +21,7 @@ def source(tmp_path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_steps_are_in_the_report_and_the_summary(source, tmp_path, capsys):
     output, report = tmp_path / "out.ply", tmp_path / "report.json"
     words = ["simplify", str(source), str(output), "--rho", "0.1", "--report", str(report)]

@@ -34,6 +34,7 @@ def test_every_case_is_in_the_catalogue_and_states_its_source():
 
 @dtypes
 @each_case
+@pytest.mark.slow
 def test_each_case(make, dtype, subtests, tmp_path):
     """Files keep the case, filters find its faults, and its results can be saved and loaded."""
     scene = make(COUNT, dtype)

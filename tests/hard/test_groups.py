@@ -33,6 +33,7 @@ def squared_distances(points, sites):
 
 @dtypes
 @each_case
+@pytest.mark.slow
 def test_each_case(make, dtype, subtests):
     """Space and weights are finite, cells are not empty, and the nearest sites are found."""
     scene = valid_case(make, COUNT, dtype)

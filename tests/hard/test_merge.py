@@ -45,6 +45,7 @@ def case_of_cells(scene, device) -> Case:
 
 @dtypes
 @each_case
+@pytest.mark.slow
 def test_each_case_without_a_network(make, dtype, subtests):
     scene = valid_case(make, COUNT, dtype)
     bounded = scene if make is not CASES["far_flyaways"] else CASES["flyaways"](COUNT, dtype)

@@ -54,6 +54,7 @@ def test_least_squares_recover_known_colours(degree):
         assert after < 0.5 * before
 
 
+@pytest.mark.slow
 def test_the_ridge_keeps_colours_of_hidden_gaussians(scene, views):
     hidden = views.contributions == 0.0
     assert bool(hidden.any())
@@ -140,6 +141,7 @@ def test_count_report_and_determinism(scene):
     assert float(small.opacities.amax()) <= 1 - 1e-6
 
 
+@pytest.mark.slow
 def test_refinement_reuses_the_images_of_the_matching(scene, monkeypatch):
     """The full scene is rendered once for all steps; larger images are rendered anew."""
     steps = {"size": 48, "stride": 2, "steps": 18, "steps_per_image": 20, "check_every": 3}

@@ -67,6 +67,7 @@ def test_order_of_members_does_not_matter():
 
 @pytest.mark.parametrize("limit", [1, 10, 100, 1000])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-12)])
+@pytest.mark.slow
 def test_chunks_do_not_change_the_result(monkeypatch, dtype, tolerance, limit):
     """Up to rounding: the order of sums in matrix products may depend on the number of rows."""
     case, net = some_case(300, 60, degree=2, dtype=dtype), lively_net(dtype)

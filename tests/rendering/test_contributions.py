@@ -159,6 +159,7 @@ def test_painting_a_scene_s_own_colours_gives_its_image(backend):
 
 
 @backends
+@pytest.mark.slow
 def test_products_equal_those_of_the_weight_matrix(backend):
     """The columns of the matrix are images of single white Gaussians."""
     scene, camera = random_scene(12, degree=0, dtype=torch.float64), one_camera(20, 18)

@@ -113,6 +113,7 @@ def test_the_preset_that_matches(dtype):
 
 @pytest.mark.usefixtures("_torch_only")
 @dtypes
+@pytest.mark.slow
 def test_scores(dtype):
     full = as_dtype(full_scene(300), dtype)
     small, settings = discolored(small_scene(full)), EvaluationSettings(lpips="off")

@@ -43,6 +43,7 @@ def smooth_scene(degree, comments):
 @backends
 @pytest.mark.parametrize("name", ["means", "quats", "log_scales", "logit_opacities", "sh0", "shN"])
 @pytest.mark.parametrize("comments", [(), MIP], ids=["plain", "mip"])
+@pytest.mark.slow
 def test_every_tensor_of_a_smooth_scene(backend, name, comments):
     scene = smooth_scene(3, comments)
 

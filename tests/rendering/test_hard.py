@@ -29,6 +29,7 @@ from scenes import random_scene
 @dtypes
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("comments", [(), MIP], ids=["plain", "mip"])
+@pytest.mark.slow
 def test_random_scenes(backend, dtype, degree, comments):
     scene = random_scene(25, seed=degree, degree=degree, dtype=dtype, size=0.2)
     scene = replace(scene, comments=comments)

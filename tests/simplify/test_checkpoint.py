@@ -97,6 +97,7 @@ def test_a_file_selects_its_preset_unless_a_config_is_given(tmp_path):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @each_preset
+@pytest.mark.slow
 def test_an_untrained_network_changes_no_bit(tmp_path, preset, dtype, degree):
     path = saved(tmp_path / "zero.safetensors", MergeNet(Architecture()), preset)
     scene = random_scene(300, degree=degree, dtype=dtype)

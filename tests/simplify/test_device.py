@@ -29,6 +29,7 @@ def on_device(scene):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.slow
 def test_a_device_gives_the_bits_of_the_cpu_with_few_waits(preset, dtype):
     scene = random_scene(600, degree=1, dtype=dtype)
     wanted = Simplifier(config=preset, device="cpu").simplify(scene, 0.1)
@@ -101,6 +102,7 @@ def test_short_chunks_are_used_where_long_ones_do_not_fit(monkeypatch):
 
 
 @pytest.mark.parametrize("preset", ["standard", "paper"])
+@pytest.mark.slow
 def test_levels_on_a_device(preset):
     scene, rhos = random_scene(2000, degree=1), [0.2, 0.04, 0.01]
     wanted = Simplifier(config=preset, device="cpu").levels(scene, rhos)
@@ -112,6 +114,7 @@ def test_levels_on_a_device(preset):
 
 
 @pytest.mark.parametrize("preset", ["draft", "standard"])
+@pytest.mark.slow
 def test_protected_regions_on_a_device(preset):
     scene = random_scene(500, degree=1)
     keep = torch.arange(500) % 25 == 0

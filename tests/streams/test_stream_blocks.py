@@ -141,12 +141,14 @@ def test_a_damaged_part_is_written_again(tmp_path: Path, source: Path) -> None:
     assert len(load(tmp_path / "out")) == 4000
 
 
+@pytest.mark.slow
 def test_other_options_start_the_stream_over(tmp_path: Path, source: Path) -> None:
     with pytest.raises(StoppedError):
         stream(source, tmp_path / "out", workers=until(2, []))
     assert stream(source, tmp_path / "out", chunk_gaussians=200).resumed_blocks == 0
 
 
+@pytest.mark.slow
 def test_a_stream_is_replaced_only_with_overwrite(tmp_path: Path, source: Path) -> None:
     out = tmp_path / "out"
     stream(source, out)
@@ -167,6 +169,7 @@ def test_invalid_rows_are_counted(tmp_path: Path, scene: GaussianScene) -> None:
     assert [level.gaussians for level in report.levels] == [3998, 1000, 200, 50]
 
 
+@pytest.mark.slow
 def test_axes_and_sh_degree_are_applied(tmp_path: Path) -> None:
     save(make("courtyard", 1000, sh_degree=1, seed=3), tmp_path / "scene.ply")
     stream(tmp_path / "scene.ply", tmp_path / "a")

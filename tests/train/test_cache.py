@@ -56,6 +56,7 @@ def files_in(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 def test_a_scene_is_made_once(source, made, tmp_path):
     first = prepare_scene(source, config_of(), tmp_path)
     assert made.count == 1
@@ -67,6 +68,7 @@ def test_a_scene_is_made_once(source, made, tmp_path):
     assert [bits_of_views(v) for v in again.views] == [bits_of_views(v) for v in first.views]
 
 
+@pytest.mark.slow
 def test_cached_results_equal_fresh_ones(source, made, tmp_path):
     config = config_of()
     for prepared in (
@@ -105,6 +107,7 @@ def test_cameras_of_a_file_are_spread_evenly_and_fitted(made, tmp_path):
         torch.testing.assert_close(views.cameras.centers, torch.stack(places))
 
 
+@pytest.mark.slow
 def test_training_on_a_former_validation_scene_makes_new_images(source, made, tmp_path):
     """Also where both have the same ratios."""
     config = tiny_config(tiny_data(Path(), ratios=(0.2,), validation_ratios=(0.2,)))
@@ -114,6 +117,7 @@ def test_training_on_a_former_validation_scene_makes_new_images(source, made, tm
     assert [len(views.cameras) for views in prepared.views] == [4, 4]
 
 
+@pytest.mark.slow
 def test_a_ratio_that_leaves_nothing_to_merge_has_no_cases(tmp_path):
     few = small_scene(300).select(torch.arange(3))
     scene = few.with_tensors(
@@ -141,6 +145,7 @@ def test_a_ratio_that_leaves_nothing_to_merge_has_no_cases(tmp_path):
     ],
     ids=["seed", "preset", "ratios", "count", "sizes", "nothing that matters"],
 )
+@pytest.mark.slow
 def test_only_results_affected_by_a_change_are_recomputed(
     source, made, tmp_path, changes, images, cases
 ):
@@ -156,6 +161,7 @@ def test_only_results_affected_by_a_change_are_recomputed(
     assert made.count == 1 + (images + cases > 0)
 
 
+@pytest.mark.slow
 def test_another_identity_is_cached_separately(source, made, tmp_path):
     prepare_scene(source, config_of(), tmp_path)
     prepare_scene(replace(source, identity="another"), config_of(), tmp_path)
@@ -189,6 +195,7 @@ def test_a_damaged_file_is_recomputed(source, made, tmp_path, damage):
     assert made.count == 3
 
 
+@pytest.mark.slow
 def test_an_antialiased_scene_stays_antialiased(tmp_path):
     """Its merged Gaussians are rendered antialiased, too."""
     scene = replace(small_scene(300), comments=(ANTIALIASED_TAG,))
@@ -200,6 +207,7 @@ def test_an_antialiased_scene_stays_antialiased(tmp_path):
         )
 
 
+@pytest.mark.slow
 def test_a_missing_folder_is_an_error(source, tmp_path):
     with pytest.raises(OutputError):
         prepare_scene(source, config_of(), tmp_path / "nowhere")

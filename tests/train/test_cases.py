@@ -162,6 +162,7 @@ def test_one_image_keeps_its_camera():
     assert len(one.cameras) == 1
 
 
+@pytest.mark.slow
 def test_views_are_mixed_ones():
     scene = small_scene()
     views = render_views(scene, 5, size=32, seed=2)
@@ -175,6 +176,7 @@ def test_views_are_mixed_ones():
     torch.testing.assert_close(views.alpha.float(), images.alpha, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_one_view_is_an_automatic_one():
     scene = small_scene()
     usual = automatic_views(scene, 1, width=32, height=32, seed=0)
@@ -182,6 +184,7 @@ def test_one_view_is_an_automatic_one():
     assert torch.equal(views.cameras.viewmats, usual.viewmats)
 
 
+@pytest.mark.slow
 def test_the_seed_decides_the_views():
     scene = small_scene()
     first, again, other = (render_views(scene, 2, size=32, seed=seed) for seed in (0, 0, 1))

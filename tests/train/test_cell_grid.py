@@ -73,6 +73,7 @@ def test_unchanged_cells_look_the_same():
 
 
 @pytest.mark.parametrize("count", [1, 2, 4, 5, 9, 10])
+@pytest.mark.slow
 def test_there_is_a_tile_for_every_cell(count):
     case = some_case(1500, ratio=0.1).select(torch.arange(count))
     grid = grid_of(case)

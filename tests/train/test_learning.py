@@ -100,6 +100,7 @@ def test_the_loss_of_an_unseen_scene_falls(trained):
     assert loss(net) < loss(small_net()) - 0.05
 
 
+@pytest.mark.slow
 def test_the_checkpoint_is_described(trained):
     info = load_checkpoint(trained.files.checkpoint).info
     assert info.preset == "paper"
@@ -129,6 +130,7 @@ def test_the_checkpoint_records_how_to_reproduce_it(trained):
     )
 
 
+@pytest.mark.slow
 def test_a_second_training_names_the_first(trained, tmp_path):
     """It discards the known range of the first: only its own training cases count."""
     folders = (write_scenes(tmp_path / "other", ["exam", "lesson"]),)
@@ -160,6 +162,7 @@ def test_the_known_range_is_that_of_the_training_cases(trained):
     assert not bool(known(summarize(wild)).any())
 
 
+@pytest.mark.slow
 def test_curves_are_an_image(trained):
     content = trained.files.curves.read_bytes()
     assert content == trained.history.curves()

@@ -59,6 +59,7 @@ def test_files_are_named_after_the_checkpoint():
     assert TrainFiles.beside(Path("a.safetensors"), Path("c")).cache == Path("c")
 
 
+@pytest.mark.slow
 def test_validations_run_at_every_interval_and_at_the_end(scenes, cache, tmp_path):
     seen: list[list[int]] = []
 
@@ -84,6 +85,7 @@ def test_progress_is_reported_for_scenes_and_steps(scenes, cache, tmp_path):
     ]
 
 
+@pytest.mark.slow
 def test_the_same_training_gives_the_same_bytes(scenes, cache, tmp_path):
     for kind in ("scene", "local"):
         config, contents = config_of(scenes, kind=kind, steps=4), []
@@ -157,6 +159,7 @@ def test_a_missing_start_is_an_error(scenes, cache, tmp_path):
 
 @pytest.mark.parametrize("bad", ["loss", "gradient"])
 @pytest.mark.parametrize("kind", ["scene", "local"])
+@pytest.mark.slow
 def test_training_stops_at_a_loss_that_is_not_finite(
     scenes, cache, tmp_path, monkeypatch, kind, bad
 ):
@@ -183,6 +186,7 @@ def test_training_stops_at_a_loss_that_is_not_finite(
     assert load_checkpoint(path).info.steps in (0, 2)
 
 
+@pytest.mark.slow
 def test_a_failed_training_can_be_resumed(scenes, cache, tmp_path, monkeypatch):
     path, whole = tmp_path / "net.safetensors", tmp_path / "whole.safetensors"
     true_loss = train_loop.scene_loss

@@ -65,6 +65,7 @@ def test_doubling_the_error_costs_the_same_at_any_error():
     torch.testing.assert_close(steps, torch.full((3,), math.log(4)), rtol=0, atol=2e-2)
 
 
+@pytest.mark.slow
 def test_an_untrained_network_has_the_loss_of_the_reference():
     """The same views over the same backgrounds, half of them black, cut the same way."""
     case, views, config = some_case(), some_views(size=40), config_of()
@@ -84,6 +85,7 @@ def test_an_untrained_network_has_the_loss_of_the_reference():
 
 
 @pytest.mark.parametrize("kind", ["scene", "local"])
+@pytest.mark.slow
 def test_the_loss_depends_only_on_the_seed(kind, monkeypatch):
     """Over coloured backgrounds only: over black, two seeds may choose the same image."""
     monkeypatch.setattr("cvtgs.train.losses.BLACK_SHARE", 0.0)
@@ -100,6 +102,7 @@ def test_the_loss_depends_only_on_the_seed(kind, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["scene", "local"])
+@pytest.mark.slow
 def test_residuals_are_penalized(kind):
     case, views, net = some_case(), some_views(), lively_net(torch.float32)
 
@@ -116,6 +119,7 @@ def test_residuals_are_penalized(kind):
 
 
 @pytest.mark.parametrize("kind", ["scene", "local"])
+@pytest.mark.slow
 def test_gradients_reach_the_last_layers_of_a_new_network(kind):
     """They start at zero, and no layer below them can change before they do."""
     case, views, net, config = some_case(), some_views(), small_net(), config_of()

@@ -89,6 +89,7 @@ def test_a_run_interrupted_anywhere_can_be_resumed(scenes, cache, tmp_path, kind
 
 @pytest.mark.usefixtures("_quick_curves")
 @pytest.mark.parametrize(("where", "count"), [("validation_psnr", 2), ("atomic_output", 3)])
+@pytest.mark.slow
 def test_a_run_interrupted_during_validation_can_be_resumed(
     scenes, cache, tmp_path, monkeypatch, where, count
 ):
@@ -112,6 +113,7 @@ def test_a_run_interrupted_during_validation_can_be_resumed(
 
 
 @pytest.mark.usefixtures("_quick_curves")
+@pytest.mark.slow
 def test_a_run_interrupted_between_checkpoint_and_state_can_be_resumed(
     scenes, cache, tmp_path, monkeypatch
 ):
@@ -159,6 +161,7 @@ def test_without_resume_a_training_starts_over(scenes, cache, tmp_path):
 
 
 @pytest.mark.usefixtures("_quick_curves")
+@pytest.mark.slow
 def test_more_patience_lets_a_training_continue(scenes, cache, tmp_path, monkeypatch):
     path, whole = tmp_path / "net.safetensors", tmp_path / "whole.safetensors"
     true_psnr = train_loop.validation_psnr

@@ -159,6 +159,7 @@ def test_invalid_rows_of_a_file_are_left_out(tmp_path):
         ),
     ],
 )
+@pytest.mark.slow
 def test_folders_that_cannot_be_used_are_errors(tmp_path, changes, text):
     if changes["folders"] != ["."]:
         write_scenes(tmp_path / "some", ["a", "exam"], 5)

@@ -81,6 +81,7 @@ def test_views_of_every_kind(kind, turn):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.slow
 def test_only_rooms_are_viewed_from_inside(kind):
     layout = find_layout(generated(kind))
     candidates = choose_candidates(layout, 4, size=(64, 48), turn=0.5)
@@ -102,6 +103,7 @@ def test_flyaways_hardly_change_the_views(kind):
     assert float(moves.median()) < 0.3 * radius
 
 
+@pytest.mark.slow
 def test_a_camera_inside_of_a_floater_moves():
     scene = generated("object")
     first = automatic_views(scene, 4, width=32, height=24)
@@ -119,6 +121,7 @@ def test_a_camera_inside_of_a_floater_moves():
     assert bool(score_cameras(layout, again, distances=distances, inside=False).good.all())
 
 
+@pytest.mark.slow
 def test_a_camera_moves_if_a_wall_blocks_its_view():
     scene = generated("object")
     first = automatic_views(scene, 1, width=32, height=24)
@@ -139,6 +142,7 @@ def test_a_camera_moves_if_a_wall_blocks_its_view():
     assert float(((seen.alpha > 0.5) & (seen.depth < 1.0)).float().mean()) < 0.1
 
 
+@pytest.mark.slow
 def test_the_same_scene_gives_the_same_views():
     scene = generated("courtyard", 5000)
     one, two = (automatic_views(scene, 5, width=40, height=30) for _ in range(2))
@@ -149,6 +153,7 @@ def test_the_same_scene_gives_the_same_views():
     assert not torch.equal(one.viewmats, other.viewmats)
 
 
+@pytest.mark.slow
 def test_the_scene_is_in_the_middle_of_upright_images():
     scene = turned(generated("object"), (0.9, 0.2, 0.1, 0.3))
     cameras = automatic_views(scene, 4, width=64, height=64)
@@ -163,6 +168,7 @@ def test_the_scene_is_in_the_middle_of_upright_images():
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 50])
+@pytest.mark.slow
 def test_scenes_of_few_gaussians_have_views(count):
     scene = random_scene(count, seed=count)
     cameras = automatic_views(scene, 3, width=32, height=24)
@@ -170,6 +176,7 @@ def test_scenes_of_few_gaussians_have_views(count):
     assert len(cameras) == 3
 
 
+@pytest.mark.slow
 def test_faint_coinciding_and_flat_scenes_have_views():
     scene = random_scene(200)
     faint = scene.with_tensors({"logit_opacities": torch.full((200,), -5.0)}, {})
@@ -199,6 +206,7 @@ def test_infinite_opacities_and_bad_rows_do_no_harm():
     ],
     ids=["automatic", "random", "mixed"],
 )
+@pytest.mark.slow
 def test_views_of_a_georeferenced_scene_are_those_of_the_scene_at_the_origin(dtype, choose):
     """At 6e6 float32 resolves steps of 0.5; the scene spans a kilometre and is rounded to them."""
     scene = generated("object", 2000)

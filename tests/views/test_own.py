@@ -86,6 +86,7 @@ def test_foreign_damaged_and_single_cameras_are_not_used(tmp_path, scene):
     assert find_own_cameras(scene, tmp_path / "nowhere.ply") is None
 
 
+@pytest.mark.slow
 def test_a_preset_that_renders_uses_and_reports_the_cameras(tmp_path, scene, capsys):
     file = model_of(tmp_path, scene)
     write_inria(tmp_path / "cameras.json", automatic_views(scene, 5, width=48, height=48))

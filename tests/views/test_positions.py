@@ -98,6 +98,7 @@ def test_no_view_is_inside_a_closed_surface():
     assert not bool(positions.admit(torch.zeros(1, 3, dtype=torch.float64)).any())
 
 
+@pytest.mark.slow
 def test_views_of_a_room_are_inside_of_it():
     scene = turned("room", CONVENTIONS["y-down"])
     layout = find_layout(scene)
@@ -138,6 +139,7 @@ def test_splat_sizes_are_those_in_the_image():
     assert sizes.in_scene.tolist() == pytest.approx([0.1 / layout.frame.radius], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_few_views_are_placed_where_splats_are_large():
     """Half of a ball mixes large and tiny Gaussians; their mean log size is that of the rest."""
     means = sphere(4000)
@@ -152,6 +154,7 @@ def test_few_views_are_placed_where_splats_are_large():
     assert share(mixed_views(positions, 32, size=32)) < 0.2
 
 
+@pytest.mark.slow
 def test_the_smooth_back_of_an_object_is_viewed():
     """Its Gaussians are almost twice as large as those in front, but they are not fog."""
     front, back = sphere(6000), sphere(1200, 0.97)
@@ -168,6 +171,7 @@ def test_the_smooth_back_of_an_object_is_viewed():
 
 
 @pytest.mark.parametrize("count", [12, 32])
+@pytest.mark.slow
 def test_automatic_views_among_mixed_ones_are_all_around(count):
     cameras = mixed_views(blobs(sphere(4000), torch.full((4000,), 0.03).log()), count, size=32)
     x, _, z = cameras.centers[: count // 4].unbind(1)
@@ -176,6 +180,7 @@ def test_automatic_views_among_mixed_ones_are_all_around(count):
     assert float(gaps.amax()) < 1.2 * math.tau / (count // 4)
 
 
+@pytest.mark.slow
 def test_the_same_scene_gives_the_same_positions():
     scene = turned("courtyard", CONVENTIONS["y-down"])
     one, two = (find_view_positions(scene) for _ in range(2))
@@ -207,6 +212,7 @@ def test_a_ground_across_x_gives_a_unit_vector(sense):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 3])
+@pytest.mark.slow
 def test_a_hollow_object_is_not_a_room(seed: int) -> None:
     vase = cvtgs.synthetic.scene("object", 6000, sh_degree=0, seed=seed)
     positions = find_view_positions(vase)
