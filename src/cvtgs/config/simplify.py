@@ -49,7 +49,7 @@ THINNED: Mapping[str, Any] = {
     "size": 400,
     "stride": 2,
     "first_images": 32,
-    "steps_per_image": 16,
+    "steps_per_image": 320,
     "check_every": 50,
 }
 
@@ -58,7 +58,11 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "fast": {"merge": {"network": False}},
     "standard": {},
     "matched": MATCHED,
-    "high": {**MATCHED, "refine": THINNED},
+    "high": {
+        **MATCHED,
+        "visibility": {**MATCHED["visibility"], "views": 48},
+        "refine": THINNED,
+    },
     "paper": {
         "effects": {"unbounded": "off", "duplicates": "off"},
         "filter": {"max_mass_share": 1.0, "max_flyaway_share": 0.0},
