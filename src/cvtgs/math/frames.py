@@ -67,8 +67,9 @@ class RobustFrame:
         """Express points in radii, and contract those beyond one radius logarithmically.
 
         A point at distance d > 1 moves to distance ``1 + log(d)`` in the same direction. Steps
-        along and across the view from the middle then shrink alike, so a far cell keeps its shape;
-        the map ``2 - 1/d`` of mip-NeRF 360 (Barron et al. 2022) flattens it.
+        along the view from the middle shrink by ``1/d`` and those across it by ``(1 + log(d))/d``,
+        so a far cell nearly keeps its shape; the map ``2 - 1/d`` of mip-NeRF 360 (Barron et al.
+        2022) flattens it.
 
         Args:
             points: Finite positions, scene units.
