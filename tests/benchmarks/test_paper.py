@@ -129,7 +129,7 @@ def test_photographs_of_another_shape_are_refused(root):
         Image.fromarray(np.zeros((24, 40, 3), np.uint8)).save(path)
     assert refusal(garden) == (
         f"{garden.folder / 'images_4'}: photographs must have the aspect ratio of the cameras' "
-        f"images, 64 x 48 or smaller, found 40 x 24."
+        f"images, 64 x 48, found 40 x 24."
     )
 
 

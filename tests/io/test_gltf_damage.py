@@ -111,6 +111,10 @@ DAMAGE: dict[str, tuple[Change, str]] = {
         lambda d: d.update(nodes=[{"children": [0]}]),
         "each node must occur once in the hierarchy, found 0 again.",
     ),
+    "node by name": (
+        lambda d: d.update(nodes=[{"children": ["base"]}]),
+        "nodes must be listed by number, found 'base'.",
+    ),
     "skewed": (
         lambda d: d.update(nodes=[{"mesh": 0, "scale": [1, 2, 1]}]),
         "nodes must only rotate, translate and uniformly scale Gaussians, found one that "

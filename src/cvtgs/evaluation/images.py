@@ -252,7 +252,7 @@ def fit_cameras(cameras: Cameras, folder: str | os.PathLike[str]) -> Cameras:
     ):
         raise InvalidArgumentError(
             f"{folder}: photographs must have the aspect ratio of the cameras' images, "
-            f"{cameras.width} x {cameras.height} or smaller, found {width} x {height}."
+            f"{cameras.width} x {cameras.height}, found {width} x {height}."
         )
     return cameras.resized(width, height) if width < cameras.width else cameras
 

@@ -150,7 +150,9 @@ def _placed_meshes(file: GltfFile) -> Iterator[tuple[int, Matrix]]:
     seen: set[int] = set()
     while waiting:
         index, above = waiting.pop()
-        if not isinstance(index, int) or isinstance(index, bool) or index in seen:
+        if not isinstance(index, int) or isinstance(index, bool):
+            raise file.error(f"nodes must be listed by number, found {shown(index)}")
+        if index in seen:
             raise file.error(
                 f"each node must occur once in the hierarchy, found {shown(index)} again"
             )
