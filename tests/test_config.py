@@ -218,6 +218,7 @@ ENDLESS = {
 
 
 @pytest.mark.parametrize(("text", "end"), ENDLESS.values(), ids=ENDLESS)
+@pytest.mark.slow
 def test_errors_about_huge_files_are_short(tmp_path, text, end):
     path = tmp_path / "config.toml"
     path.write_text(text, encoding="utf-8")

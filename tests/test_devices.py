@@ -161,6 +161,7 @@ def test_one_thread_computes_in_the_calling_thread():
         assert set(found) == {threading.get_ident()}
 
 
+@pytest.mark.slow
 def test_stages_give_the_same_bits_in_two_threads(two_threads, monkeypatch):
     for name in ("cells.allocate.CHUNK", "cells.inflate.CHUNK", "cells.merge.CHUNK_MEMBERS"):
         monkeypatch.setattr(f"cvtgs.{name}", 100)

@@ -44,6 +44,7 @@ def test_statistics_equal_those_by_hand():
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("count", [1, 2, 500])
+@pytest.mark.slow
 def test_statistics_of_any_scene_are_consistent(degree, count):
     info = describe(random_scene(count, degree=degree))
     assert (info.count, info.sh_degree) == (count, degree)

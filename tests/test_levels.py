@@ -41,6 +41,7 @@ def test_counts_are_exact_and_in_the_order_of_the_ratios(scene, simplifier, rhos
 
 
 @pytest.mark.parametrize("config", ["standard", "paper", "draft"])
+@pytest.mark.slow
 def test_the_finest_level_equals_a_single_run(scene, config):
     simplifier = Simplifier(config=config, device="cpu")
     assert same_bits(simplifier.levels(scene, RHOS)[0].scene, simplifier.simplify(scene, RHOS[0]))
@@ -157,6 +158,7 @@ def mean_distance(scene, small):
     return float(((scene.masses * squares).sum() / scene.masses.sum()).sqrt())
 
 
+@pytest.mark.slow
 def test_the_command_writes_levels(scene, tmp_path, capsys):
     cvtgs.save(scene, tmp_path / "in.ply")
     words = ["levels", str(tmp_path / "in.ply"), "-o", str(tmp_path / "out"), "--rho", "0.1,0.01"]

@@ -18,6 +18,7 @@ def image_of(text: str) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))))
 
 
+@pytest.mark.slow
 def test_a_scene_shows_an_image_and_its_facts():
     scene = cvtgs.synthetic.scene("object", 2000, sh_degree=1, seed=0)
     text = scene.with_tensors(extras={"<label>": torch.arange(2000)})._repr_html_()

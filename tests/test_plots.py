@@ -122,6 +122,7 @@ def test_invalid_sizes_and_columns_are_refused(wrong):
 
 
 @needs_matplotlib
+@pytest.mark.slow
 def test_more_names_than_colours_and_styles_still_look_different():
     """The 25th line repeats the first colour and style, but with another marker shape."""
     names = [str(number) for number in range(25)]
@@ -157,6 +158,7 @@ def test_hollow_points_are_left_out_of_the_line():
 
 
 @needs_matplotlib
+@pytest.mark.slow
 def test_labels_are_drawn_and_avoid_overlap():
     labelled = Series(
         name="a", x=[1, 1.01, 5], y=[1, 1, 1], markers=True, labels=["one", "two", ""]

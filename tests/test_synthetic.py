@@ -112,6 +112,7 @@ def test_counts_are_exact_and_values_sane(kind, count):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.slow
 def test_scenes_have_the_requested_sh_degree(degree):
     scene = synthetic.demo_scene(500, sh_degree=degree)
     assert scene.sh_degree == degree

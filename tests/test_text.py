@@ -45,6 +45,7 @@ def test_printable_escapes_control_and_unencodable_characters(
         assert json.loads(f'"{found}"') == text
 
 
+@pytest.mark.slow
 def test_shown_escapes_and_shortens_values() -> None:
     assert shown("a\x1b") == r"'a\x1b'"
     assert len(shown("x" * 1000)) == 60

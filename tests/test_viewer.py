@@ -58,6 +58,7 @@ def visible(page: Any) -> list[int]:
     return [node.count for node in page.stand.scene.nodes.values() if node.visible]
 
 
+@pytest.mark.slow
 def test_the_page_starts_with_the_simplified_scene(page: Any) -> None:
     assert page.server.address == "http://127.0.0.1:8080"
     assert page.stand.scene.up == "-y"
@@ -66,6 +67,7 @@ def test_the_page_starts_with_the_simplified_scene(page: Any) -> None:
     assert control(page, "show").options == ("simplified", "full scene", "other.ply")
 
 
+@pytest.mark.slow
 def test_moving_the_slider_shows_the_simplified_scene(page: Any, scene: GaussianScene) -> None:
     control(page, "log10 of rho").value = -2.0
     until(lambda: visible(page) == [5])
@@ -74,6 +76,7 @@ def test_moving_the_slider_shows_the_simplified_scene(page: Any, scene: Gaussian
     assert same_bits(page.viewer.scenes["simplified"].scene, wanted)
 
 
+@pytest.mark.slow
 def test_data_shared_by_all_sizes_is_computed_in_advance(
     scene: GaussianScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -85,6 +88,7 @@ def test_data_shared_by_all_sizes_is_computed_in_advance(
     server.close()
 
 
+@pytest.mark.slow
 def test_presets_and_scenes_can_be_switched(page: Any) -> None:
     control(page, "preset").value = "fast"
     until(lambda: control(page, FACTS).content.endswith("with fast"))
@@ -95,6 +99,7 @@ def test_presets_and_scenes_can_be_switched(page: Any) -> None:
     assert visible(page) == [7]
 
 
+@pytest.mark.slow
 def test_the_current_view_is_scored(page: Any) -> None:
     camera = SimpleNamespace(wxyz=(1, 0, 0, 0), position=(0, 0, -4), fov=0.8, aspect=1.5)
     control(page, "PSNR of this view").call(SimpleNamespace(camera=camera))
@@ -104,6 +109,7 @@ def test_the_current_view_is_scored(page: Any) -> None:
     assert page.viewer.score("full scene", view) > 60
 
 
+@pytest.mark.slow
 def test_the_shown_scene_is_saved(page: Any, tmp_path: Path) -> None:
     path = tmp_path / "out.ply"
     control(page, "file").value = str(path)
@@ -116,11 +122,13 @@ def test_the_shown_scene_is_saved(page: Any, tmp_path: Path) -> None:
     assert control(page, NOTES).content == "**a file name is needed to save a scene, found none.**"
 
 
+@pytest.mark.slow
 def test_the_standalone_page_shows_every_scene(page: Any) -> None:
     assert page.server.page() == "<html>[[500], [50], [7]] True</html>"
     assert visible(page) == [50]
 
 
+@pytest.mark.slow
 def test_a_standalone_page_starts_in_view_of_the_scene(scene: GaussianScene) -> None:
     assert scene_page({"a": scene, "b": random_scene(7)}) == "<html>[[500], [7]] True</html>"
     stand = viser_stand_in.ViserServer.latest
@@ -170,6 +178,7 @@ def test_names_reserved_by_the_viewer_are_refused(scene: GaussianScene) -> None:
         SceneViewer(scene, {"simplified": scene})
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_page(
     tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
 ) -> None:

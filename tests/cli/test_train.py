@@ -75,6 +75,7 @@ def test_all_files_are_beside_the_checkpoint(made):
     assert load_checkpoint(made / "net.safetensors").info.preset == "standard"
 
 
+@pytest.mark.slow
 def test_the_summary_says_that_matplotlib_is_missing(again, tmp_path, capsys, monkeypatch):
     def curves(history: History) -> bytes:
         raise MissingDependencyError("charts need matplotlib")

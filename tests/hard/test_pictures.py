@@ -159,6 +159,7 @@ def test_images_are_no_worse_than_mass_pruning(make, subtests):
 
 
 @pytest.mark.parametrize("name", ["needles", "points"])
+@pytest.mark.slow
 def test_subpixel_gaussians_are_as_good_as_pruned_without_dilation(name):
     """Gaussians of antialiased scenes cover only their own area: images are as good as pruned.
 

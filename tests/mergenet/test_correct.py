@@ -229,6 +229,7 @@ def test_the_golden_table_matches_the_shipped_checkpoints(table):
 
 
 @pytest.mark.parametrize("case", golden.CASES)
+@pytest.mark.slow
 def test_golden_output(table, case):
     found, wanted = golden.figures(case), table["figures"][case]
     assert found.keys() == wanted.keys()

@@ -46,6 +46,7 @@ def test_cost_is_the_mean_square_of_the_four_kinds_of_change():
 
 @pytest.mark.parametrize("near", [0, 1, 5, 8])
 @pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.slow
 def test_residuals_equal_the_oracle(seed, near):
     case, net = some_case(seed=seed, near=near), lively_net(seed=seed)
     weights = {name: values.numpy() for name, values in net.state_dict().items()}

@@ -115,6 +115,7 @@ def test_the_order_of_work_does_not_matter(source, tmp_path):
     assert outputs[0].read_bytes() == outputs[1].read_bytes()
 
 
+@pytest.mark.slow
 def test_the_size_of_ranges_does_not_matter(source, tmp_path):
     for name, rows in (("a.ply", 1 << 20), ("b.ply", 1777)):
         simplify_file(source, tmp_path / name, 0.05, blocks=3, range_rows=rows)
@@ -162,6 +163,7 @@ def test_protected_rows_come_first_with_unchanged_bits(scene, source, tmp_path):
         simplify_file(source, tmp_path / "no.ply", 0.2, blocks=3, boxes=[everything])
 
 
+@pytest.mark.slow
 def test_invalid_rows_are_dropped_and_flyaways_do_no_harm(tmp_path):
     scene = random_scene(2000, degree=0)
     means, logits = scene.means.clone(), scene.logit_opacities.clone()
@@ -215,6 +217,7 @@ def test_files_without_a_valid_row_are_refused(tmp_path):
     assert not (tmp_path / "out.ply").exists()
 
 
+@pytest.mark.slow
 def test_extra_columns_are_kept_and_other_output_formats_work(tmp_path):
     scene = random_scene(500, degree=0)
     extra = {"id": torch.arange(500, dtype=torch.int32), "heat": torch.rand(500)}
@@ -245,6 +248,7 @@ def test_settings_that_blocks_cannot_use_are_refused(source, tmp_path, settings,
 
 
 @pytest.mark.parametrize("preset", ["draft", "paper"])
+@pytest.mark.slow
 def test_other_presets_work_in_blocks(source, tmp_path, preset):
     simplifier = Simplifier(config=SimplifyConfig.from_preset(preset), device="cpu")
     simplify_file(source, tmp_path / "out.ply", 0.03, blocks=3, simplifier=simplifier)

@@ -136,6 +136,7 @@ def test_late_results_of_a_worker_taken_for_dead_are_ignored(source, tmp_path):
     assert names == ["in.ply", "out.ply", "whole.ply"]
 
 
+@pytest.mark.slow
 def test_a_worker_of_another_job_cannot_write(source, tmp_path):
     """Its folder is removed once another job writes the same output."""
     calls = []

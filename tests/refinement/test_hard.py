@@ -40,6 +40,7 @@ def test_gaussians_that_no_view_shows_stay_bit_for_bit():
     assert same_bits(scene.select(torch.arange(len(full), len(both))), behind)
 
 
+@pytest.mark.slow
 def test_invalid_rows_stay_and_do_no_harm():
     full = full_scene()
     small = discolored(full)

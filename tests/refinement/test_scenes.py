@@ -45,6 +45,7 @@ def test_a_simplified_scene_improves_on_unseen_views():
     assert after > before
 
 
+@pytest.mark.slow
 def test_count_degree_layout_comments_and_extras_stay():
     full = full_scene()
     small = small_scene(full)

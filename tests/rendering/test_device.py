@@ -28,6 +28,7 @@ REFINED = {
 
 
 @dtypes
+@pytest.mark.slow
 def test_images_and_gradients(dtype):
     def results(scene):
         leaf = scene.means.detach().requires_grad_()

@@ -60,6 +60,7 @@ HARD = {
 @dtypes
 @pytest.mark.parametrize("row", HARD.values(), ids=HARD)
 @pytest.mark.parametrize("comments", [(), MIP], ids=["plain", "mip"])
+@pytest.mark.slow
 def test_hard_gaussians(backend, dtype, row, comments):
     behind = ((0, 0, 8.0), (0.8, 1.5, 1.0), 0.6, (0, 0, 1.0))
     scene = scene_of(row, behind, dtype=dtype, comments=comments)

@@ -54,6 +54,7 @@ def test_colors(degree, dtype):
         torch.testing.assert_close(found[row].double(), wanted, rtol=0, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_gradients_of_colors():
     scene = random_scene(6, degree=3, dtype=torch.float64)
     leaves = [scene.sh0 + 2, scene.shN, directions(0)]

@@ -96,6 +96,7 @@ def simplify_by_hand():
     [random_scene(600, degree=2), cvtgs.synthetic.scene("landscape", 1500, sh_degree=1, seed=2)],
     ids=["random", "landscape"],
 )
+@pytest.mark.slow
 def test_stages_by_hand_give_the_bits_of_the_simplifier(simplify_by_hand, scene, preset):
     whole = cvtgs.Simplifier(preset, device="cpu").simplify(scene, count=90)
     assert same_bits(simplify_by_hand(scene, 90, preset), whole)

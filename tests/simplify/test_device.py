@@ -43,6 +43,7 @@ def test_a_device_gives_the_bits_of_the_cpu_with_few_waits(preset, dtype):
     assert report.backend == "scipy"
 
 
+@pytest.mark.slow
 def test_a_larger_scene_causes_no_more_waits():
     scene = random_scene(6000, degree=0, size=0.02)
     with pretended_cuda() as traffic:
@@ -53,6 +54,7 @@ def test_a_larger_scene_causes_no_more_waits():
     assert traffic.copies.total() <= COPIES, traffic.copies
 
 
+@pytest.mark.slow
 def test_auto_uses_the_device_for_a_scene_on_the_cpu():
     scene = random_scene(300)
     wanted = Simplifier(device="cpu").simplify(scene, 0.1)
@@ -76,6 +78,7 @@ def test_auto_falls_back_to_the_cpu_if_memory_runs_out():
         assert level.report.device == "cpu"
 
 
+@pytest.mark.slow
 def test_a_named_device_without_enough_memory_is_an_error():
     with pretended_cuda(largest=1000), pytest.raises(OutOfMemoryError) as caught:
         Simplifier(device="cuda").simplify(random_scene(300), 0.1)

@@ -68,6 +68,7 @@ def test_invalid_rows_are_never_kept(scene):
     assert same_bits(small.select(torch.arange(4)), scene.select(torch.arange(1, 5)))
 
 
+@pytest.mark.slow
 def test_refinement_leaves_kept_rows_alone(scene):
     keep = torch.arange(400) < 30
     config = SimplifyConfig.from_mapping({"refine": {"steps": 2, "size": 32, "heldout": 2}})

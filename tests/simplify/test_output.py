@@ -17,6 +17,7 @@ INF = float("inf")
 @each_preset
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.slow
 def test_output_is_a_standard_scene(degree, dtype, preset):
     scene = random_scene(300, degree=degree, dtype=dtype)
     small = Simplifier(config=preset, device="cpu").simplify(scene, 0.1)

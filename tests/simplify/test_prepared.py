@@ -34,6 +34,7 @@ def test_every_run_gives_the_bits_of_a_separate_run(scene, preset):
         assert same_bits(prepared.run(count=count).scene, simplifier.simplify(scene, count=count))
 
 
+@pytest.mark.slow
 def test_shared_stages_run_only_the_first_time(scene):
     simplifier = Simplifier(config=SimplifyConfig(visibility={"views": 2, "size": 16}))
     prepared = simplifier.prepare(scene)

@@ -48,6 +48,7 @@ def names_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
+@pytest.mark.slow
 def test_counts_are_exact_and_the_finest_level_is_the_scene(
     tmp_path: Path, source: Path, scene: GaussianScene
 ) -> None:
@@ -62,6 +63,7 @@ def test_counts_are_exact_and_the_finest_level_is_the_scene(
     assert names_in(tmp_path) == ["out", "scene.ply"]
 
 
+@pytest.mark.slow
 def test_every_level_has_the_mass_of_a_run_in_one_piece(tmp_path: Path) -> None:
     room = make("room", 4000, sh_degree=0, seed=3)
     save(room, tmp_path / "room.ply")
@@ -131,6 +133,7 @@ def test_an_interrupted_run_is_continued(tmp_path: Path, source: Path) -> None:
     assert names_in(tmp_path) == ["out", "scene.ply", "whole"]
 
 
+@pytest.mark.slow
 def test_a_damaged_part_is_written_again(tmp_path: Path, source: Path) -> None:
     done: list[int] = []
     with pytest.raises(StoppedError):
@@ -160,6 +163,7 @@ def test_a_stream_is_replaced_only_with_overwrite(tmp_path: Path, source: Path) 
     assert (out / "index.html").exists()
 
 
+@pytest.mark.slow
 def test_invalid_rows_are_counted(tmp_path: Path, scene: GaussianScene) -> None:
     means = scene.means.clone()
     means[[5, 77]] = torch.nan
@@ -186,6 +190,7 @@ def test_levels_of_equal_size_are_refused(tmp_path: Path, source: Path) -> None:
     assert names_in(tmp_path) == ["scene.ply"]
 
 
+@pytest.mark.slow
 def test_blocks_share_one_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Even if a run ends after all blocks and another one resumes it."""
     near, far = make("object", 3000, sh_degree=0, seed=1), make("object", 200, sh_degree=0, seed=2)

@@ -196,6 +196,7 @@ def test_existing_files_are_replaced_only_with_overwrite(plan: StreamPlan, tmp_p
 
 
 @pytest.mark.parametrize("kind", ["sog", "3dtiles"])
+@pytest.mark.slow
 def test_a_new_stream_removes_the_files_of_the_old_one(
     levels: tuple[Level, ...], tmp_path: Path, kind: str
 ) -> None:

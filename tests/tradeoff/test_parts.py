@@ -201,6 +201,7 @@ def test_ticks_are_round_numbers():
     assert ticks(0.06, 900.0) == [0.01, 0.1, 1.0, 10.0, 100.0, 1000.0]
 
 
+@pytest.mark.slow
 def test_the_chart_is_a_png():
     pytest.importorskip("matplotlib")
     assert tradeoff_chart(tradeoff(*MADE))[1:4] == b"PNG"
@@ -234,6 +235,7 @@ def test_files_are_written_completely_and_replaced_only_when_asked(measured, tmp
     write_tradeoff(measured, tmp_path / "new", overwrite=True)
 
 
+@pytest.mark.slow
 def test_without_matplotlib_only_the_plot_is_missing(measured, tmp_path, monkeypatch):
     for name in ("matplotlib", "matplotlib.figure", "matplotlib.backends.backend_agg"):
         monkeypatch.setitem(sys.modules, name, None)

@@ -84,6 +84,7 @@ def test_cached_results_equal_fresh_ones(source, made, tmp_path):
             assert bits_of_views(views) == bits_of_views(fresh)
 
 
+@pytest.mark.slow
 def test_scenes_for_validation_have_their_own_ratios_and_views(made, tmp_path):
     source = replace(source_of(made.scene, is_validation=True), make=made)
     prepared = prepare_scene(source, config_of(), tmp_path)

@@ -152,6 +152,7 @@ def test_images_over_a_background():
     assert image[0, 0].tolist() == [1.0, 0.5, 0.0]
 
 
+@pytest.mark.slow
 def test_one_image_keeps_its_camera():
     scene = small_scene()
     views = render_views(scene, 3, size=32, seed=2)
@@ -192,6 +193,7 @@ def test_the_seed_decides_the_views():
     assert not torch.equal(first.cameras.viewmats, other.cameras.viewmats)
 
 
+@pytest.mark.slow
 def test_random_views_look_at_the_middle_from_around():
     scene = small_scene()
     frame = robust_frame(scene.means[scene.opacities > 0.1])
@@ -217,6 +219,7 @@ def test_a_faint_scene_can_be_looked_at_too():
     assert len(random_views(faint, 3, size=32, seed=0)) == 3
 
 
+@pytest.mark.slow
 def test_distances_of_random_views():
     scene = small_scene()
     frame = robust_frame(scene.means[scene.opacities > 0.1])

@@ -110,6 +110,7 @@ def test_the_checkpoint_is_described(trained):
     assert (info.architecture.width, info.architecture.cell_width) == (6, 10)
 
 
+@pytest.mark.slow
 def test_the_checkpoint_records_how_to_reproduce_it(trained):
     info = load_checkpoint(trained.files.checkpoint).info
     told = json.loads(info.config)

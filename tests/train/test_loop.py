@@ -131,6 +131,7 @@ def test_without_any_gain_the_untrained_network_is_kept(scenes, cache, tmp_path,
     assert float(kept.net.decoder.weight.abs().amax()) == 0.0
 
 
+@pytest.mark.slow
 def test_a_training_may_start_from_a_checkpoint(scenes, cache, tmp_path):
     first, second = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
     run(config_of(scenes, preset="paper"), first, cache)

@@ -143,12 +143,14 @@ def test_a_local_step_takes_no_more_cells_than_there_are():
     assert math.isfinite(loss.item())
 
 
+@pytest.mark.slow
 def test_an_untrained_network_gains_nothing():
     before, after = validation_psnr(small_net(), some_case(), some_views())
     assert before == after
     assert 5 < before < 60
 
 
+@pytest.mark.slow
 def test_validation_psnr_is_that_of_the_images_over_grey():
     case, views, net = some_case(), some_views(), lively_net(torch.float32)
     before, after = validation_psnr(net, case, views)
@@ -162,6 +164,7 @@ def test_validation_psnr_is_that_of_the_images_over_grey():
     assert abs(after - before) > 0.005
 
 
+@pytest.mark.slow
 def test_validation_psnr_leaves_no_gradient():
     net = lively_net(torch.float32)
     validation_psnr(net, some_case(), some_views())

@@ -140,6 +140,7 @@ def test_a_run_interrupted_between_checkpoint_and_state_can_be_resumed(
 
 
 @pytest.mark.usefixtures("_quick_curves")
+@pytest.mark.slow
 def test_resuming_a_finished_run_changes_nothing(scenes, cache, tmp_path):
     path = tmp_path / "net.safetensors"
     first = run(config_of(scenes), path, cache)
@@ -152,6 +153,7 @@ def test_resuming_a_finished_run_changes_nothing(scenes, cache, tmp_path):
 
 
 @pytest.mark.usefixtures("_quick_curves")
+@pytest.mark.slow
 def test_without_resume_a_training_starts_over(scenes, cache, tmp_path):
     path = tmp_path / "net.safetensors"
     with pytest.raises(PowerCutError):
@@ -181,6 +183,7 @@ def test_more_patience_lets_a_training_continue(scenes, cache, tmp_path, monkeyp
 
 
 @pytest.mark.usefixtures("_quick_curves")
+@pytest.mark.slow
 def test_another_configuration_or_a_damaged_state_is_one_clear_error(scenes, cache, tmp_path):
     path = tmp_path / "net.safetensors"
     run(config_of(scenes), path, cache)

@@ -81,6 +81,7 @@ def test_files_above_the_largest_scene_are_split_into_pieces(tmp_path):
     assert [source.name for source in find_sources(data, seed=0)] == ["exam", "large-block0"]
 
 
+@pytest.mark.slow
 def test_generated_scenes_of_every_kind():
     kinds = cvtgs.synthetic.KINDS
     data = DataConfig(generated=2, generated_validation=1, generated_counts=(50, 70))

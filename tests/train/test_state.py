@@ -221,6 +221,7 @@ def damaged(path: Path, kind: str) -> None:
         "facts cut short",
     ],
 )
+@pytest.mark.slow
 def test_a_damaged_file_is_one_clear_error(tmp_path, kind):
     path = saved(tmp_path / "a.state")
     damaged(path, kind)

@@ -186,6 +186,7 @@ def test_faint_coinciding_and_flat_scenes_have_views():
         assert bool(torch.isfinite(automatic_views(one, 2, width=32, height=24).viewmats).all())
 
 
+@pytest.mark.slow
 def test_infinite_opacities_and_bad_rows_do_no_harm():
     scene = generated("object", 2000)
     logits = scene.logit_opacities.clone()

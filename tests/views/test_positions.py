@@ -80,6 +80,7 @@ def test_no_view_is_beneath_the_floor(kind, convention):
         assert float((-cameras.viewmats[:, 1, :3] @ up).amin()) > 0, "images are upright"
 
 
+@pytest.mark.slow
 def test_a_scene_without_a_floor_has_none_and_is_seen_from_all_sides():
     scene = blobs(sphere(4000), torch.full((4000,), math.log(0.05)))
     positions = find_view_positions(scene)
@@ -90,6 +91,7 @@ def test_a_scene_without_a_floor_has_none_and_is_seen_from_all_sides():
         assert float(eyes[:, axis].amax()) > 1
 
 
+@pytest.mark.slow
 def test_no_view_is_inside_a_closed_surface():
     scene = blobs(sphere(4000), torch.full((4000,), math.log(0.05)))
     positions = find_view_positions(scene)
@@ -112,6 +114,7 @@ def test_views_of_a_room_are_inside_of_it():
         assert bool(((cameras.centers > low) & (cameras.centers < high)).all())
 
 
+@pytest.mark.slow
 def test_a_wall_captured_from_one_side_is_viewed_from_that_side():
     """Gaussians are larger behind the wall, where no image was taken."""
     generator = torch.Generator().manual_seed(0)
@@ -189,6 +192,7 @@ def test_the_same_scene_gives_the_same_positions():
     assert torch.equal(views, mixed_views(scene, 6, size=32, seed=2).viewmats)
 
 
+@pytest.mark.slow
 def test_views_do_not_cut_off_the_top():
     """A thin rod on a ball: 1 % of all voxels, and as tall as the ball."""
     rod = torch.stack([torch.zeros(60), -torch.linspace(1, 3, 60), torch.zeros(60)], dim=1)
