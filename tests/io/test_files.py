@@ -300,7 +300,13 @@ def test_no_room_for_a_copy_of_a_stream_is_an_error_of_the_folder(
     cvtgs.save(storable_scene(5), content)
     content.seek(0)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
-    with pytest.raises(OutputError, match=r"gone: must be writable and have room for"):
+    with pytest.raises(
+        OutputError, match="folder of temporary files must be writable and have room for"
+    ):
+        cvtgs.load(content)
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", list)
+    with pytest.raises(OutputError, match="found: no usable temporary directory found"):
         cvtgs.load(content)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     before = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -6,7 +6,7 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from tempfile import SpooledTemporaryFile, TemporaryDirectory, gettempdir
+from tempfile import SpooledTemporaryFile, TemporaryDirectory
 from typing import BinaryIO, Protocol, cast
 
 from cvtgs.errors import CvtgsError, FileFormatError, InputError, OutputError, reason_of
@@ -62,8 +62,8 @@ def file_of(
             raise
         except OSError as error:
             raise OutputError(
-                f"{gettempdir()}: must be writable and have room for a copy of {name}, found: "
-                f"{reason_of(error)}; TMPDIR sets another folder."
+                f"the folder of temporary files must be writable and have room for a copy of "
+                f"{name}, found: {reason_of(error)}; TMPDIR sets another folder."
             ) from error
         suffix = format or format_of(path)
         if suffix is None:
