@@ -26,7 +26,7 @@ def points(places, *, colors=None, weights=None, size=0.01):
     covariances[[0, 3, 5]] = size**2
     weights = torch.tensor(weights or [1.0] * count).double()
     shades = torch.tensor(colors or [0.5] * count).double().expand(3, -1).contiguous()
-    return Moments(weights, weights, means, covariances, shades)
+    return Moments(torch.ones_like(weights), weights, weights, means, covariances, shades)
 
 
 def all_others(count):
@@ -84,14 +84,24 @@ def test_a_pair_that_images_hardly_show_merges_first():
 
 
 def test_the_cost_of_a_pair_by_hand():
-    """Two round Gaussians of variance s^2, a apart: log-volume grows by log(1 + a^2 / 4 s^2)."""
+    """Two round Gaussians of variance s^2, a apart: the variance between them grows by a^2 / 4.
+
+    To each variance, a hundredth of the sum of variances and the floor are added.
+    """
     groups, config = points([0.0, 0.3], size=0.1, colors=[0.2, 0.4]), AllocationConfig(mass_power=1)
     costs = merge_pairs.__globals__["_pair_costs"](
         groups, torch.tensor([0]), torch.tensor([1]), config
     )
-    wanted = 0.5 * math.log((0.01 + 0.0225 + 1e-8) / (0.01 + 1e-8))
+    own, added = 0.01 + 0.01 * 0.03 + 1e-8, 0.01 * (0.03 + 0.0225) + 1e-8
+    across, along = 0.01 + added, 0.01 + 0.0225 + added
+    wanted = 0.5 * (math.log(along) + 2 * math.log(across) - 3 * math.log(own))
     wanted += config.color * 0.25 * 3 * 0.2**2
-    assert float(costs[0]) == pytest.approx(2.0 * wanted)
+    assert float(costs[0]) == pytest.approx(2.0 * 2.0 * wanted)
+    groups = groups._replace(counts=torch.tensor([3.0, 4.0]).double())
+    costs = merge_pairs.__globals__["_pair_costs"](
+        groups, torch.tensor([0]), torch.tensor([1]), config
+    )
+    assert float(costs[0]) == pytest.approx(2.0 * 7.0 * wanted)
 
 
 @pytest.mark.parametrize("count", [1, 2, 37, 99])
@@ -194,7 +204,7 @@ def test_moving_members_lowers_the_divergence(kind):
 def test_merged_cells_lose_less_than_those_of_the_tessellation():
     scene, target = make("object", 4000, sh_degree=0, seed=2), 200
     members, losses = scene_moments(scene), []
-    for oversampling in (2.0, 1.0):
+    for oversampling in (DEFAULT.oversampling, 1.0):
         allocation = {"oversampling": oversampling, "reassign": False}
         config = SimplifyConfig.from_mapping({"allocation": allocation})
         analysis = analyze(scene, config)
@@ -210,8 +220,8 @@ def test_without_allocation_the_cells_of_the_tessellation_are_kept():
     members, labels = points([0.0, 1.0, 2.0]), torch.tensor([0, 1, 0])
     assert allocate(members, labels, 2, 2, off) is labels
     assert finer_count(10, 12, off) == 10
-    assert finer_count(10, 80, DEFAULT) == 20
-    assert finer_count(10, 79, DEFAULT) == 79
+    assert finer_count(10, 320, DEFAULT) == 80
+    assert finer_count(10, 319, DEFAULT) == 319
 
 
 def test_colours_count_more_where_cells_are_small():
@@ -220,8 +230,16 @@ def test_colours_count_more_where_cells_are_small():
     assert allocation_at(0.01, config).color == pytest.approx(10.0)
 
 
+def test_large_groups_merge_last():
+    """By divergence alone, the group of thirty and its neighbour are the cheapest pair."""
+    moments = points([0.0, 0.1, 9.0, 9.5], size=0.1)
+    assert merge_pairs(moments, all_others(4), 3, DEFAULT).tolist() == [0, 0, 1, 2]
+    moments = moments._replace(counts=torch.tensor([30.0, 1.0, 1.0, 1.0]).double())
+    assert merge_pairs(moments, all_others(4), 3, DEFAULT).tolist() == [0, 1, 2, 2]
+
+
 def test_rounds_keep_groups_balanced():
-    """By cost alone, four near ones would become one before the two pairs on the right merge."""
-    moments = points([0.0, 0.1, 0.2, 0.3, 5.0, 5.5, 9.0, 9.5], size=0.1)
+    """By divergence alone, four near ones would become one before the pairs on the right merge."""
+    moments = points([0.0, 0.1, 0.2, 0.3, 5.0, 5.25, 9.0, 9.25], size=0.1)
     labels = merge_pairs(moments, all_others(8), 4, DEFAULT)
     assert labels.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]

@@ -72,7 +72,7 @@ def ball_and_core(count: int = 600) -> cvtgs.GaussianScene:
 
 def test_cells_go_to_visible_regions():
     scene = ball_and_core()
-    settings = {"merge.network": "false", "cvt.hidden_share": "1", "cvt.area_power": "1"}
+    settings = {"merge.network": "false", "cvt.hidden_share": "1", "allocation.mass_power": "1"}
     blind = SimplifyConfig.compose(settings=settings)
     seeing = SimplifyConfig.compose(
         settings=settings | {"visibility.views": "6", "visibility.mass_share": "0.1"}

@@ -21,8 +21,12 @@ from cvtgs.scene import GaussianScene
 CHUNK = 1 << 15
 """Gaussians per chunk of the cost computation, to bound memory."""
 
-SHARE_PER_ROUND = 0.5
+SHARE_PER_ROUND = 0.35
 """Largest number of pairs merged before costs are recomputed, as a share of the cells."""
+
+THICKNESS = 0.01
+"""The cost of a pair adds this share of the sum of variances to each, so that the thickness of
+flat Gaussians, which images hardly show, counts less than their extent."""
 
 FLOOR = 1e-4
 """Standard deviation, in robust radii, added in quadrature so that flat shapes have a volume."""
@@ -35,6 +39,7 @@ class Moments(NamedTuple):
     """Mean, covariance and colour of Gaussians or of groups, one column per item, float64.
 
     Attributes:
+        counts: ``(n,)`` number of Gaussians.
         weights: ``(n,)`` weights in the moments of a group: the masses.
         masses: ``(n,)`` masses as seen in images, mean 1 over all Gaussians.
         means: ``(3, n)`` positions, robust radii from the centre of the scene.
@@ -42,6 +47,7 @@ class Moments(NamedTuple):
         colors: ``(3, n)`` RGB of the constant band.
     """
 
+    counts: Float[Tensor, "n"]
     weights: Float[Tensor, "n"]
     masses: Float[Tensor, "n"]
     means: Float[Tensor, "3 n"]
@@ -51,6 +57,7 @@ class Moments(NamedTuple):
     def take(self, rows: Int[Tensor, "k"]) -> "Moments":
         """Return the moments of some rows."""
         return Moments(
+            self.counts.index_select(0, rows),
             self.weights.index_select(0, rows),
             self.masses.index_select(0, rows),
             self.means.index_select(1, rows),
@@ -62,9 +69,9 @@ class Moments(NamedTuple):
         """Return the moments on a device, moved in a single copy."""
         if self.weights.device == device:
             return self
-        table = torch.cat([self.weights[None], self.masses[None], *self[2:]]).to(device)
-        weights, masses, *others = table.split([1, 1, 3, 6, 3])
-        return Moments(weights[0], masses[0], *others)
+        table = torch.cat([torch.stack(self[:3]), *self[3:]]).to(device)
+        scalars, *others = table.split([3, 3, 6, 3])
+        return Moments(*scalars, *others)
 
 
 def gaussian_moments(
@@ -115,6 +122,7 @@ def gaussian_moments(
         values.mean() if unit is None else values.new_tensor(unit) for values in (weights, masses)
     ]
     return Moments(
+        counts=torch.ones_like(weights),
         weights=(weights / units[0].clamp_min(tiny)).clamp_min(1e-12),
         masses=masses / units[1].clamp_min(tiny),
         means=means,
@@ -134,8 +142,9 @@ def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Mom
     Returns:
         Moments of the groups.
     """
-    sums = label_sums([members.weights, members.masses], labels, count).T
-    shares = members.weights / sums[0].index_select(0, labels)
+    sums = label_sums([members.counts, members.weights, members.masses], labels, count).T
+    sums = sums.contiguous()
+    shares = members.weights / sums[1].index_select(0, labels)
     columns = [shares * column for column in (*members.means, *members.colors)]
     means, colors = label_sums(columns, labels, count).T.contiguous().split(3)
     shifts = members.means - means.index_select(1, labels)
@@ -144,7 +153,7 @@ def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Mom
         for covariance, (i, j) in zip(members.covariances, UPPER, strict=True)
     ]
     covariances = label_sums(columns, labels, count).T.contiguous()
-    return Moments(sums[0].contiguous(), sums[1].contiguous(), means, covariances, colors)
+    return Moments(*sums, means, covariances, colors)
 
 
 def merge_pairs(
@@ -153,7 +162,8 @@ def merge_pairs(
     """Merge neighbouring groups in pairs, cheapest first, until ``count`` are left.
 
     The cost of a pair is Runnalls' bound (2007) on the change of the mixture when both become one
-    Gaussian, plus the squared colour distance, times a power of the mass as seen in images.
+    Gaussian, plus the squared colour distance, times a power of the mass as seen in images, times
+    the number of Gaussians, which keeps groups balanced.
 
     Args:
         groups: Moments of the groups.
@@ -216,7 +226,8 @@ def _pair_costs(
         own, others = volumes.index_select(0, i), volumes.index_select(0, j)
         cost = 0.5 * (_log_volume(merged) - share * own - other * others)
         cost += config.color * product * (a.colors - b.colors).square().sum(0)
-        costs: Tensor = cost * (a.masses + b.masses) ** config.mass_power
+        cost *= (a.masses + b.masses) ** config.mass_power
+        costs: Tensor = cost * (a.counts + b.counts)
         return costs
 
     parts = list(zip(first.split(chunk), second.split(chunk), strict=True))
@@ -224,9 +235,10 @@ def _pair_costs(
 
 
 def _log_volume(covariances: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:
-    """Return the logarithms of the determinants, with the floor added."""
+    """Return the logarithms of the determinants, with some thickness added."""
     xx, xy, xz, yy, yz, zz = covariances
-    xx, yy, zz = xx + FLOOR**2, yy + FLOOR**2, zz + FLOOR**2
+    added = FLOOR**2 + THICKNESS * (xx + yy + zz)
+    xx, yy, zz = xx + added, yy + added, zz + added
     minors = yy * zz - yz * yz, xy * zz - yz * xz, xy * yz - yy * xz
     determinants = xx * minors[0] - xy * minors[1] + xz * minors[2]
     volumes: Tensor = determinants.clamp_min(FLOOR**6).log()

@@ -93,9 +93,9 @@ class TessellationConfig(Section):
     color: float = pydantic.Field(default=0.05, ge=0.0)
     color_power: float = pydantic.Field(default=-0.25, ge=-1.0, le=1.0)
     seeding: Literal["stratified", "weighted"] = "stratified"
-    iterations: int = pydantic.Field(default=4, ge=0)
+    iterations: int = pydantic.Field(default=2, ge=0)
     tolerance: float = pydantic.Field(default=1e-3, ge=0.0)
-    samples_per_site: int = pydantic.Field(default=12, ge=0)
+    samples_per_site: int = pydantic.Field(default=3, ge=0)
 
 
 class AllocationConfig(Section):
@@ -113,11 +113,11 @@ class AllocationConfig(Section):
         reassign: Whether every Gaussian then moves to the cell that explains it best.
     """
 
-    oversampling: float = pydantic.Field(default=2.0, ge=1.0, le=8.0)
+    oversampling: float = pydantic.Field(default=8.0, ge=1.0, le=64.0)
     neighbors: int = pydantic.Field(default=6, ge=1, le=64)
     color: float = pydantic.Field(default=75.0, ge=0.0)
     color_power: float = pydantic.Field(default=0.3, ge=0.0, le=1.0)
-    mass_power: float = pydantic.Field(default=0.1, ge=0.0, le=2.0)
+    mass_power: float = pydantic.Field(default=0.4, ge=0.0, le=2.0)
     reassign: bool = True
 
 
