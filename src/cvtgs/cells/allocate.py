@@ -70,8 +70,8 @@ class Moments(NamedTuple):
         if self.weights.device == device:
             return self
         table = torch.cat([torch.stack(self[:3]), *self[3:]]).to(device)
-        scalars, *others = table.split([3, 3, 6, 3])
-        return Moments(*scalars, *others)
+        scalars, means, covariances, colors = table.split([3, 3, 6, 3])
+        return Moments(scalars[0], scalars[1], scalars[2], means, covariances, colors)
 
 
 def gaussian_moments(
@@ -153,7 +153,7 @@ def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Mom
         for covariance, (i, j) in zip(members.covariances, UPPER, strict=True)
     ]
     covariances = label_sums(columns, labels, count).T.contiguous()
-    return Moments(*sums, means, covariances, colors)
+    return Moments(sums[0], sums[1], sums[2], means, covariances, colors)
 
 
 def merge_pairs(
