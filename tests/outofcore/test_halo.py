@@ -23,7 +23,7 @@ from cvtgs.scene import concatenate
 from cvtgs.views import automatic_views
 from scenes import same_bits
 
-COUNT, BLOCKS, TARGET = 4000, 5, 230
+COUNT, BLOCKS, TARGET = 4000, 5, 120
 
 
 class StoppedError(Exception):

@@ -205,8 +205,8 @@ def _scan_and_sort(
     found = sort_into_blocks(job, workers, clock)
     total = sum(found.rows)
     finer = finer_count(found.rest, total, job.config.allocation)
-    finer = min(finer, max(room, 2 * found.rest))  # one process merges all that fit there,
-    finer = min(finer, max(found.rest, total // 2))  # and holds all sites of Lloyd
+    if total > room:  # one process merges all cells
+        finer = min(finer, max(room, 2 * found.rest), max(found.rest, total // 2))
     if finer < sum(1 for count in found.rows if count):  # the heaviest get one each
         order = sorted(range(job.blocks), key=lambda block: -found.cells[block])
         cells = [int(block in order[:finer]) for block in range(job.blocks)]
