@@ -364,7 +364,7 @@ def order_rows(
         config: Weights.
 
     Returns:
-        The argument ``ordered`` of :func:`group_rows`; 152 bytes per Gaussian.
+        The argument ``ordered`` of :func:`group_rows`; 160 bytes per Gaussian.
     """
     points = _weighted(scene, rows, analysis, config)
     return OrderedRows(rows, points._replace(moments=_moments(points, analysis)))
