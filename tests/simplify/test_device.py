@@ -94,14 +94,14 @@ def test_short_chunks_are_used_where_long_ones_do_not_fit(monkeypatch):
         monkeypatch.setattr(f"cvtgs.{name}.CHUNK_MEMBERS", 64)
     monkeypatch.setattr("cvtgs.analysis.visibility.HALF_GRID", 8)
     scene = random_scene(3000, degree=0, size=0.02)
-    wanted = Simplifier(device="cpu").simplify(scene, 0.1)
+    wanted = Simplifier(device="cpu").simplify(scene, 0.02)
     with pretended_cuda(largest=300_000):
         prepared = Simplifier(device="cuda").prepare(scene.to("cuda"))
-        small, report = prepared.run(0.1)
+        small, report = prepared.run(0.02)
         assert same_bits(on_device(small), wanted)
         assert report.device_note == "cuda:0 ran out of memory; computed there in short chunks"
     with pretended_cuda():
-        assert Simplifier(device="cuda").run(scene.to("cuda"), 0.1).report.device_note == ""
+        assert Simplifier(device="cuda").run(scene.to("cuda"), 0.02).report.device_note == ""
 
 
 @pytest.mark.parametrize("preset", ["standard", "paper"])
