@@ -18,6 +18,9 @@ from cvtgs.rendering.compiled import (
 )
 from cvtgs.rendering.projection import MIN_ALPHA, NEAR_PLANE
 
+CHUNK = 256
+"""Gaussians per step of a parallel loop, which share their scratch arrays."""
+
 C2A, C2B = SH_C2
 C3A, C3B, C3C, C3D = SH_C3
 
@@ -167,28 +170,29 @@ def project_all(
     """Write the packed splat of every Gaussian, and whether it is in view."""
     means, quats, log_scales, logits, sh0, rest = gaussians
     camera, _, degree, antialiased = settings
-    for i in prange(len(means)):
-        scratch = np.empty((11, 3))
+    for chunk in prange((len(means) + CHUNK - 1) // CHUNK):
+        scratch, basis = np.empty((11, 3)), np.empty(15)
         offset, local, color = scratch[0], scratch[1], scratch[2]
         rotation, axes = scratch[3:6], scratch[6:11]
-        visible[i] = False
-        local_of(means[i], camera, offset, local)
-        opacity = sigmoid(logits[i])
-        if not (local[2] >= NEAR_PLANE and local[2] < math.inf and opacity >= MIN_ALPHA):
-            continue
-        length = rotation_of(quats[i], rotation)
-        if not (length > 0 and length < math.inf):
-            continue
-        axes_of(rotation, log_scales[i], camera, local, axes)
-        if antialiased:
-            opacity *= survival_of(axes, camera[8, 2])
-        if not (opacity >= MIN_ALPHA and splat_of(axes, local, camera, opacity, packed[i])):
-            continue
-        normalize_in_place(offset)
-        color_of((sh0[i], rest[i]), offset, degree, np.empty(15), color)
-        for channel in range(3):
-            packed[i, 6 + channel] = max(0.0, color[channel])
-        visible[i] = True
+        for i in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(means))):
+            visible[i] = False
+            local_of(means[i], camera, offset, local)
+            opacity = sigmoid(logits[i])
+            if not (local[2] >= NEAR_PLANE and local[2] < math.inf and opacity >= MIN_ALPHA):
+                continue
+            length = rotation_of(quats[i], rotation)
+            if not (length > 0 and length < math.inf):
+                continue
+            axes_of(rotation, log_scales[i], camera, local, axes)
+            if antialiased:
+                opacity *= survival_of(axes, camera[8, 2])
+            if not (opacity >= MIN_ALPHA and splat_of(axes, local, camera, opacity, packed[i])):
+                continue
+            normalize_in_place(offset)
+            color_of((sh0[i], rest[i]), offset, degree, basis, color)
+            for channel in range(3):
+                packed[i, 6 + channel] = max(0.0, color[channel])
+            visible[i] = True
 
 
 @serial
@@ -222,12 +226,14 @@ def color_gradient(
     offset: Array,
     degree: int,
     sh: tuple[Array, Array],
-    out: tuple[Array, Array],
-    toward: Array,
+    out: tuple[Array, Array, Array],
+    scratch: tuple[Array, Array],
 ) -> None:
-    """Write the gradient by the SH coefficients; add that by the offset from the camera."""
-    direction, basis, slopes = offset.copy(), np.empty(15), np.empty((15, 3))
-    color, kept = np.empty(3), np.empty(3)
+    """Write the gradients by the SH coefficients; add that by the offset from the camera."""
+    toward, (rows, basis) = out[2], scratch
+    direction, color, kept, turn, slopes = rows[0], rows[1], rows[2], rows[3], rows[4:19]
+    for k in range(3):
+        direction[k], turn[k] = offset[k], 0
     norm = normalize_in_place(direction)
     color_of(sh, direction, degree, basis, color)
     for channel in range(3):
@@ -236,7 +242,6 @@ def color_gradient(
     if degree == 0:
         return
     rest_slopes_at(direction[0], direction[1], direction[2], degree, slopes)
-    turn = np.zeros(3)
     for j in range((degree + 1) * (degree + 1) - 1):
         worth = 0.0
         for channel in range(3):
@@ -360,30 +365,33 @@ def project_all_gradient(
     of_means, of_quats, of_log_scales, of_logits, of_sh0, of_rest = gradients
     camera, _, degree, antialiased = settings
     rows, starts, _ = splats
-    for splat in prange(len(rows)):
-        i = rows[splat]
-        grad, scratch = np.zeros(10), np.zeros((18, 3))
-        for place in range(starts[splat], starts[splat + 1]):
-            for column in range(10):
-                grad[column] += per_intersection[place, column]
+    for chunk in prange((len(rows) + CHUNK - 1) // CHUNK):
+        grad, scratch = np.empty(10), np.empty((18, 3))
         offset, local, of_local, of_offset = scratch[0], scratch[1], scratch[2], scratch[3]
         rotation, axes = scratch[4:7], scratch[7:12]
         of_axes, of_rotation = scratch[12:15], scratch[15:18]
-        local_of(means[i], camera, offset, local)
-        length = rotation_of(quats[i], rotation)
-        axes_of(rotation, log_scales[i], camera, local, axes)
-        opacity = sigmoid(logits[i])
-        of_a, of_b, of_d = covariance_gradient(grad, axes, camera[8, 2], antialiased)
-        if abs(logits[i]) < LOGIT_LIMIT:
-            of_logits[i] = grad[5] * (1 - opacity)
-        of_local[0] = grad[0] * camera[4, 0] / local[2]
-        of_local[1] = grad[1] * camera[4, 1] / local[2]
-        of_local[2] = grad[9] - (of_local[0] * local[0] + of_local[1] * local[1]) / local[2]
-        out = (of_axes, of_log_scales[i], of_local)
-        axes_gradient((of_a, of_b, of_d), axes, log_scales[i], (camera, local), out)
-        rotate_back(camera, of_axes, of_local, of_rotation, of_offset)
-        quaternion_gradient(quats[i], length, of_rotation, of_quats[i])
-        sh, of_sh = (sh0[i], rest[i]), (of_sh0[i], of_rest[i])
-        color_gradient(grad[6:9], offset, degree, sh, of_sh, of_offset)
-        for k in range(3):
-            of_means[i, k] = of_offset[k]
+        color_scratch = (np.empty((19, 3)), np.empty(15))
+        for splat in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(rows))):
+            i = rows[splat]
+            grad[:] = 0
+            for place in range(starts[splat], starts[splat + 1]):
+                for column in range(10):
+                    grad[column] += per_intersection[place, column]
+            local_of(means[i], camera, offset, local)
+            length = rotation_of(quats[i], rotation)
+            axes_of(rotation, log_scales[i], camera, local, axes)
+            opacity = sigmoid(logits[i])
+            of_a, of_b, of_d = covariance_gradient(grad, axes, camera[8, 2], antialiased)
+            if abs(logits[i]) < LOGIT_LIMIT:
+                of_logits[i] = grad[5] * (1 - opacity)
+            of_local[0] = grad[0] * camera[4, 0] / local[2]
+            of_local[1] = grad[1] * camera[4, 1] / local[2]
+            of_local[2] = grad[9] - (of_local[0] * local[0] + of_local[1] * local[1]) / local[2]
+            out = (of_axes, of_log_scales[i], of_local)
+            axes_gradient((of_a, of_b, of_d), axes, log_scales[i], (camera, local), out)
+            rotate_back(camera, of_axes, of_local, of_rotation, of_offset)
+            quaternion_gradient(quats[i], length, of_rotation, of_quats[i])
+            sh, of_sh = (sh0[i], rest[i]), (of_sh0[i], of_rest[i], of_offset)
+            color_gradient(grad[6:9], offset, degree, sh, of_sh, color_scratch)
+            for k in range(3):
+                of_means[i, k] = of_offset[k]

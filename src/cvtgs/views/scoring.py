@@ -118,14 +118,17 @@ class SplatSizes(NamedTuple):
 def splat_sizes(layout: SceneLayout, cameras: Cameras) -> SplatSizes:
     """Return the median size of the splats that each camera shows, for at least one camera."""
     sample, small = layout.sample, _small(cameras)
+    means = sample.means.double()
     widths = sample.log_scales.double().sort(dim=1).values[:, 1:].mean(dim=1).exp()
     in_image, in_scene = [], []
     for camera in small.singles():
         painted = observe(sample, camera).contributions.double()
-        ahead = sample.means.double() @ camera.viewmats[0, 2, :3] + camera.viewmats[0, 2, 3]
-        share = _weighted_median(widths / ahead.clamp_min(1e-9), painted)
-        in_image.append(share * camera.Ks[0, 0, 0] / PIXELS)
-        in_scene.append(_weighted_median(widths, painted) / layout.frame.radius)
+        ahead = means @ camera.viewmats[0, 2, :3] + camera.viewmats[0, 2, 3]
+        seen = painted > 0
+        seen |= ~seen.any()  # an empty image shows no size
+        near = widths[seen] / ahead[seen].clamp_min(1e-9)
+        in_image.append(_weighted_median(near, painted[seen]) * camera.Ks[0, 0, 0] / PIXELS)
+        in_scene.append(_weighted_median(widths[seen], painted[seen]) / layout.frame.radius)
     return SplatSizes(torch.stack(in_image), torch.stack(in_scene))
 
 
