@@ -187,6 +187,9 @@ def _tessellate(
         on_iteration=on_iteration,
     )
     labels, allocation = tessellation.labels, config.allocation
+    if analysis.plan.visibility.active:
+        update = {"mass_power": config.visibility.mass_power}
+        allocation = allocation.model_copy(update=update)
     if count > target or (allocation.reassign and count < len(rows)):
         labels = allocate(
             points.moments or _moments(points, analysis),

@@ -132,12 +132,14 @@ class VisibilityConfig(Section):
             the whole image.
         mass_share: Share of the apparent mass that still comes from size, opacity and position,
             so that Gaussians that no image shows also count.
+        mass_power: Replaces ``allocation.mass_power`` where images measure the mass.
     """
 
     views: int = pydantic.Field(default=0, ge=0)
     size: int = pydantic.Field(default=128, ge=16)
     stride: Count = 1
     mass_share: Share = 0.3
+    mass_power: float = pydantic.Field(default=0.7, ge=0.0, le=2.0)
 
 
 class MatchConfig(Section):

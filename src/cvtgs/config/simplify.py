@@ -30,7 +30,6 @@ def unknown_preset(name: object) -> ConfigError:
 
 MATCHED: Mapping[str, Any] = {
     "visibility": {"views": 24, "size": 400, "stride": 2},
-    "allocation": {"mass_power": 0.7},
     "match": {"opacity_rounds": 1},
     "refine": {
         "steps": 50,
