@@ -187,7 +187,7 @@ def _tessellate(
         on_iteration=on_iteration,
     )
     labels, allocation = tessellation.labels, config.allocation
-    if analysis.plan.visibility.active:
+    if analysis.is_measured:
         update = {"mass_power": config.visibility.mass_power}
         allocation = allocation.model_copy(update=update)
     if count > target or (allocation.reassign and count < len(rows)):

@@ -72,7 +72,8 @@ def ball_and_core(count: int = 600) -> cvtgs.GaussianScene:
 
 def test_cells_go_to_visible_regions():
     scene = ball_and_core()
-    settings = {"merge.network": "false", "cvt.hidden_share": "1", "visibility.mass_power": "1"}
+    powers = {"allocation.mass_power": "1", "visibility.mass_power": "1"}
+    settings = {"merge.network": "false", "cvt.hidden_share": "1", **powers}
     blind = SimplifyConfig.compose(settings=settings)
     seeing = SimplifyConfig.compose(
         settings=settings | {"visibility.views": "6", "visibility.mass_share": "0.1"}
@@ -125,8 +126,7 @@ def test_images_that_show_nothing_change_nothing():
         width=32,
         height=32,
     )
-    same_power = {"visibility.mass_power": str(SimplifyConfig().allocation.mass_power)}
-    seeing = SimplifyConfig.compose(settings={"visibility.views": "4", **same_power})
+    seeing = SimplifyConfig.compose(settings={"visibility.views": "4"})
     one = Simplifier(config=seeing, device="cpu").simplify(scene, 0.2, cameras=away)
     assert torch.equal(one.means, Simplifier(device="cpu").simplify(scene, 0.2).means)
 

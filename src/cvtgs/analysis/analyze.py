@@ -36,6 +36,7 @@ class SceneAnalysis:
         visibility: ``(n,)`` ambient visibility of every Gaussian, 0 (enclosed) to 1 (free);
             empty if neither weights nor the network use it.
         plan: The effects that the scene calls for.
+        is_measured: Whether images of the scene corrected the apparent areas.
         observed: Images of the scene and the contributions of these Gaussians to them; None if
             later stages do not use them.
     """
@@ -47,6 +48,7 @@ class SceneAnalysis:
     apparent_areas: Float[Tensor, "n"]
     visibility: Float[Tensor, "n_or_0"]
     plan: EffectPlan
+    is_measured: bool = False
     observed: ObservedViews | None = None
 
     def select(self, rows: Tensor) -> Self:
@@ -168,14 +170,17 @@ def measure_visibility(
         rendered = contributions(used, views)
     opacities, apparent = analysis.opacities, analysis.apparent_areas
     masses = (apparent * opacities).double()
-    if float(rendered.sum()) > 0.0:
+    shows = float(rendered.sum()) > 0.0
+    if shows:
         total, all_rendered = masses.sum(), rendered.sum()
         trust = 1.0 - choices.mass_share
         blended = choices.mass_share * masses + trust * rendered * (total / all_rendered)
         apparent = divide(blended, opacities.double().clamp_min(MIN_OPACITY)).to(apparent.dtype)
     haze = plan_haze(float(haze_share(opacities, apparent * opacities, config)), config)
     plan = analysis.plan.model_copy(update={"haze": haze})
-    return replace(analysis, apparent_areas=apparent, plan=plan, observed=observed)
+    return replace(
+        analysis, apparent_areas=apparent, is_measured=shows, plan=plan, observed=observed
+    )
 
 
 def select_columns(scene: GaussianScene, choices: EffectsConfig) -> GaussianScene:
