@@ -37,6 +37,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=200_000, help="Gaussians of generated scenes")
     parser.add_argument("--kinds", default=",".join(KINDS), help="kinds of generated scenes")
     parser.add_argument("--blocks", default="4,16", help="numbers of blocks to compare")
+    parser.add_argument("--presets", default="standard", help="presets to compare by blocks")
     parser.add_argument(
         "--memory",
         default="2GB",
@@ -100,21 +101,23 @@ def seams(options: argparse.Namespace) -> None:
     Changing the count by one per cent changes a single figure by more than seams do.
     """
     numbers = [1, *(int(word) for word in options.blocks.split(","))]
-    print(f"| scene, rho {options.rho:g} | one piece |", *(f"{n} blocks |" for n in numbers[1:]))
-    print("|---|---|" + "---|" * len(numbers[1:]))
-    for name, scene in scenes(options):
-        small = {}
+    columns = f"| scene, rho {options.rho:g} | preset | one piece |"
+    print(columns, *(f"{n} blocks |" for n in numbers[1:]))
+    print("|---|---|---|" + "---|" * len(numbers[1:]))
+    for (name, scene), preset in itertools.product(scenes(options), options.presets.split(",")):
+        small, simplifier = {}, cvtgs.Simplifier(preset=preset, device="cpu")
         with tempfile.TemporaryDirectory() as folder:
             path, output = Path(folder) / "in.ply", Path(folder) / "out.ply"
             cvtgs.save(scene, path)
             for number, share in itertools.product(numbers, SHARES):
                 rho = share * options.rho
-                simplify_file(path, output, rho, blocks=number, overwrite=True)
+                how = {"blocks": number, "simplifier": simplifier, "overwrite": True}
+                simplify_file(path, output, rho, **how)
                 small[f"{number} {share}"] = cvtgs.load(output)
         psnr = scores(scene, small)
         means = [mean(psnr[f"{n} {share}"] for share in SHARES) for n in numbers]
         words = [f"{means[0]:.2f} |", *(f"{value - means[0]:+.2f} |" for value in means[1:])]
-        print(f"| {name}, {len(scene):,} |", *words, flush=True)
+        print(f"| {name}, {len(scene):,} | {preset} |", *words, flush=True)
 
 
 def blocks(options: argparse.Namespace) -> None:

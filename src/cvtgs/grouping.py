@@ -186,17 +186,14 @@ def _tessellate(
         has_duplicates=has_duplicates,
         on_iteration=on_iteration,
     )
-    labels, allocation = tessellation.labels, config.allocation
-    if analysis.is_measured:
-        update = {"mass_power": config.visibility.mass_power}
-        allocation = allocation.model_copy(update=update)
-    if count > target or (allocation.reassign and count < len(rows)):
+    labels = tessellation.labels
+    if count > target or (config.allocation.reassign and count < len(rows)):
         labels = allocate(
             points.moments or _moments(points, analysis),
             labels,
             count,
             target,
-            allocation_at(target / total, allocation),
+            allocation_at(target / total, config, is_measured=analysis.is_measured),
             neighbors=points.neighbors if count == len(rows) else None,
         )
     return tessellation, labels
@@ -213,9 +210,16 @@ def finer_count(target: int, available: int, config: AllocationConfig) -> int:
     return available if count * MEMBERS_PER_CELL > available else count
 
 
-def allocation_at(ratio: float, config: AllocationConfig) -> AllocationConfig:
-    """Return the configuration with the colour weight scaled to a ratio of cells to Gaussians."""
-    return config.model_copy(update={"color": config.color * ratio**config.color_power})
+def allocation_at(ratio: float, config: SimplifyConfig, *, is_measured: bool) -> AllocationConfig:
+    """Return the weights of the costs: colour at a ratio of cells to Gaussians, and masses.
+
+    Masses count more if images of the scene measured them.
+    """
+    costs = config.allocation
+    update = {"color": costs.color * ratio**costs.color_power}
+    if is_measured:
+        update["mass_power"] = config.visibility.mass_power
+    return costs.model_copy(update=update)
 
 
 def allocate(

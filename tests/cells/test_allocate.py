@@ -225,9 +225,17 @@ def test_without_allocation_the_cells_of_the_tessellation_are_kept():
 
 
 def test_colours_count_more_where_cells_are_small():
-    config = AllocationConfig(color=100.0, color_power=0.5)
-    assert allocation_at(0.25, config).color == pytest.approx(50.0)
-    assert allocation_at(0.01, config).color == pytest.approx(10.0)
+    config = SimplifyConfig(allocation=AllocationConfig(color=100.0, color_power=0.5))
+    assert allocation_at(0.25, config, is_measured=False).color == pytest.approx(50.0)
+    assert allocation_at(0.01, config, is_measured=False).color == pytest.approx(10.0)
+
+
+def test_measured_masses_count_by_a_power_of_their_own():
+    config = SimplifyConfig.from_mapping({
+        "allocation": {"mass_power": 0.3}, "visibility": {"mass_power": 0.9}
+    })  # fmt: skip
+    assert allocation_at(0.1, config, is_measured=False).mass_power == 0.3
+    assert allocation_at(0.1, config, is_measured=True).mass_power == 0.9
 
 
 def test_large_groups_merge_last():

@@ -237,7 +237,6 @@ def test_extra_columns_are_kept_and_other_output_formats_work(tmp_path):
     ("settings", "problem"),
     [
         ({"refine": {"seconds": 3.0}}, "number of steps .* found 3 s"),
-        ({"visibility": {"views": 8}}, "not for weights; found 8 views"),
     ],
 )
 def test_settings_that_blocks_cannot_use_are_refused(source, tmp_path, settings, problem):

@@ -213,7 +213,7 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
         weights=scene.masses,
         masses=torch.cat(areas) * scene.opacities,
     )
-    config = allocation_at(TARGET / COUNT, job.config.allocation)
+    config = allocation_at(TARGET / COUNT, job.config, is_measured=False)
     fine = sum(job.cells)
     assert fine > TARGET + 50
     whole = cells.group_moments(members, labels, fine)

@@ -84,7 +84,6 @@ def test_matching_in_blocks_improves_psnr(scores):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="cells of blocks do not know contributions: 0.1 dB more")
 def test_matching_adds_little_to_the_loss_from_blocks(scores):
     losses = {name: found["one"] - found["blocks"] for name, found in scores.items()}
     assert losses["matched"] < losses["standard"] + 0.3

@@ -7,8 +7,10 @@ from cvtgs.analysis.analyze import (
     drop_mip_tag,
     drop_unused_bands,
     measure_visibility,
+    measured_areas,
     restore_columns,
     select_columns,
+    visibility_cameras,
 )
 from cvtgs.analysis.effects import (
     BAND_LOSS,
@@ -59,11 +61,13 @@ __all__ = [
     "far_share",
     "haze_share",
     "measure_visibility",
+    "measured_areas",
     "perspective_falloff",
     "plan_effects",
     "plan_haze",
     "restore_columns",
     "select_columns",
     "visibility_at",
+    "visibility_cameras",
     "visibility_grid",
 ]

@@ -154,14 +154,7 @@ def measure_visibility(
     Returns:
         The analysis with corrected apparent areas, and the haze effect decided by them.
     """
-    choices = config.visibility
-    if cameras is None:
-        side = max(choices.size, SSIM_WINDOW * choices.stride)
-        views = mixed_views(scene, choices.views, size=side, seed=config.seed)
-    else:
-        longer, least = max(cameras.width, cameras.height), SSIM_WINDOW * choices.stride
-        views = cameras.spread(choices.views).fitted(min(choices.size, longer), least=least)
-    views = views.interleaved(choices.stride)
+    views = visibility_cameras(scene, config, cameras=cameras)
     used, observed = drop_unused_bands(scene, analysis.plan), None
     if config.match.enabled:
         observed = observe(used, views)
@@ -169,18 +162,68 @@ def measure_visibility(
     else:
         rendered = contributions(used, views)
     opacities, apparent = analysis.opacities, analysis.apparent_areas
-    masses = (apparent * opacities).double()
     shows = float(rendered.sum()) > 0.0
     if shows:
-        total, all_rendered = masses.sum(), rendered.sum()
-        trust = 1.0 - choices.mass_share
-        blended = choices.mass_share * masses + trust * rendered * (total / all_rendered)
-        apparent = divide(blended, opacities.double().clamp_min(MIN_OPACITY)).to(apparent.dtype)
+        apparent = measured_areas(
+            apparent,
+            opacities,
+            rendered,
+            mass_per_pixel=(apparent * opacities).double().sum() / rendered.sum(),
+            share=config.visibility.mass_share,
+        )
     haze = plan_haze(float(haze_share(opacities, apparent * opacities, config)), config)
     plan = analysis.plan.model_copy(update={"haze": haze})
     return replace(
         analysis, apparent_areas=apparent, is_measured=shows, plan=plan, observed=observed
     )
+
+
+def visibility_cameras(
+    scene: GaussianScene, config: SimplifyConfig, *, cameras: Cameras | None = None
+) -> Cameras:
+    """Return the cameras of the images that contributions are measured in.
+
+    Args:
+        scene: The Gaussians; all rows must be valid.
+        config: The configuration; ``config.visibility`` and the seed are used.
+        cameras: Cameras to choose from; None generates views.
+
+    Returns:
+        The cameras of images of every ``config.visibility.stride``-th pixel.
+    """
+    choices = config.visibility
+    if cameras is None:
+        side = max(choices.size, SSIM_WINDOW * choices.stride)
+        views = mixed_views(scene, choices.views, size=side, seed=config.seed)
+    else:
+        longer, least = max(cameras.width, cameras.height), SSIM_WINDOW * choices.stride
+        views = cameras.spread(choices.views).fitted(min(choices.size, longer), least=least)
+    return views.interleaved(choices.stride)
+
+
+def measured_areas(
+    areas: Float[Tensor, "n"],
+    opacities: Float[Tensor, "n"],
+    contributions: Float[Tensor, "n"],
+    *,
+    mass_per_pixel: Float[Tensor, ""],
+    share: float,
+) -> Float[Tensor, "n"]:
+    """Return apparent areas that are corrected by the contributions to images.
+
+    Args:
+        areas: Apparent areas.
+        opacities: Opacities.
+        contributions: Contributions to images, pixels, float64.
+        mass_per_pixel: Area times opacity per pixel, summed over the whole scene.
+        share: Share of the given areas in the result, 0 to 1.
+
+    Returns:
+        Areas, in the type of ``areas``.
+    """
+    shown = (1.0 - share) * contributions * mass_per_pixel
+    blended = share * (areas * opacities).double() + shown
+    return divide(blended, opacities.double().clamp_min(MIN_OPACITY)).to(areas.dtype)
 
 
 def select_columns(scene: GaussianScene, choices: EffectsConfig) -> GaussianScene:

@@ -22,7 +22,8 @@ from cvtgs.io import atomic_output
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.math.segments import segment_argmax, sort_by_label
 from cvtgs.outofcore.job import SENT_BYTES, Job
-from cvtgs.outofcore.rows import BlockRows, read_rows, send_rows
+from cvtgs.outofcore.rows import BlockRows, send_rows
+from cvtgs.outofcore.visibility import is_measured, read_apparent_rows
 
 KEY = 1 << 32
 """The global key of a cell or group is its block times this, plus its number in the block."""
@@ -139,7 +140,8 @@ def _allocate_region(job: Job, region: Sequence[int], count: int) -> list[int]:
 
 def _costs(job: Job) -> AllocationConfig:
     """Return the costs of merging at the ratio of the whole scene."""
-    return allocation_at(job.total / job.read_scan().row_count, job.config.allocation)
+    ratio = job.total / job.read_scan().row_count
+    return allocation_at(ratio, job.config, is_measured=is_measured(job))
 
 
 def _add_parts(job: Job, region: Sequence[int]) -> Moments:
@@ -179,7 +181,7 @@ def join(job: Job, block: int) -> None:
     (groups,) = _take(job, owners * KEY + numbers, "groups")
     found = groups[tensors["parts"].long()]
     if job.config.allocation.reassign:
-        rows = read_rows(job, block, is_slim=True)
+        rows = read_apparent_rows(job, block)
         found = _reassigned(job, block, _members(job, rows), found)
         del rows
     owners, labels = found // KEY, found % KEY

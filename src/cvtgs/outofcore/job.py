@@ -29,6 +29,12 @@ SENT_BYTES = "sent_bytes"
 """Entry of the label file of a block: bytes of the file of its sent rows."""
 
 
+STEPS = (
+    "contributions", "sample", "sites", "sums", "parts", "groups", "labels", "merged", "inflated"
+)  # fmt: skip
+"""First words of the names of the tensor files of steps."""
+
+
 class Manifest(pydantic.BaseModel):
     """Record written once all rows are sorted into blocks; from then on the job can be resumed.
 
@@ -95,6 +101,10 @@ class Job:
         """Return the file with the curve order of a block, and the points that Lloyd samples."""
         return self.path(f"sample_{block:05d}")
 
+    def contributions_path(self, block: int) -> Path:
+        """Return the file with the contributions of the rows of a block to images of the scene."""
+        return self.path(f"contributions_{block:05d}")
+
     def sites_path(self, iteration: int, block: int) -> Path:
         """Return the file with the sites of a block after some iterations of Lloyd."""
         return self.path(f"sites_{iteration:02d}_{block:05d}")
@@ -148,7 +158,7 @@ class Job:
     @property
     def goes_by_steps(self) -> bool:
         """Whether each step runs for all blocks before the next; else there is only one step."""
-        return self.blocks > 1 or self.uses_images
+        return self.blocks > 1 or self.uses_images or self.config.uses_renders
 
     def report_path(self, block: int) -> Path:
         """Return the file with the report of a finished block."""
@@ -317,7 +327,7 @@ class Job:
 
     def _remove_damaged(self) -> None:
         """Remove damaged files of steps, so that these steps run again."""
-        for kind in ("sample", "sites", "sums", "parts", "groups", "labels", "merged", "inflated"):
+        for kind in STEPS:
             for path in self.path("").glob(f"{kind}_*"):
                 try:
                     _, facts = map_tensors(path)

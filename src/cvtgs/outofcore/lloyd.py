@@ -21,7 +21,7 @@ from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.outofcore.allocate import cell_parts
 from cvtgs.outofcore.halo import Assignment, assign_points, bounding_box, other_blocks
 from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.rows import read_rows
+from cvtgs.outofcore.visibility import read_apparent_rows
 
 
 class EmbeddedRows(NamedTuple):
@@ -120,7 +120,7 @@ def assign(job: Job, iterations: int, block: int) -> None:
     owners, labels = torch.empty_like(rows), torch.empty_like(rows)
     owners[rows], labels[rows] = found.blocks, found.labels
     del order, points, weights, found, rows
-    parts = cell_parts(job, block, read_rows(job, block, is_slim=True), owners, labels)
+    parts = cell_parts(job, block, read_apparent_rows(job, block), owners, labels)
     facts = {"energy": energy, "refilled": torch.tensor(refilled)}
     save_tensors(job.parts_path(block), parts | facts, {})
 
@@ -128,7 +128,7 @@ def assign(job: Job, iterations: int, block: int) -> None:
 def _embedded_rows(job: Job, block: int, order: Tensor | None = None) -> EmbeddedRows:
     """Embed the Gaussians of a block in a given order, or in one computed here."""
     scan = job.read_scan()
-    scene, areas, visibility = read_rows(job, block, is_slim=True)
+    scene, areas, visibility = read_apparent_rows(job, block)
     analysis = SceneAnalysis(
         frame=scan.frame,
         farthest=0.0,  # flyaways are already left out

@@ -41,6 +41,7 @@ from cvtgs.outofcore.merge import correct, inflate, merge, read_report, simplify
 from cvtgs.outofcore.rows import kept_rows
 from cvtgs.outofcore.scan import CHUNK
 from cvtgs.outofcore.sort import sort_into_blocks
+from cvtgs.outofcore.visibility import add_contributions, measure
 from cvtgs.outofcore.workers import Result, Workers, begin, sequentially, with_progress
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport
@@ -186,11 +187,6 @@ def check_config(config: SimplifyConfig, *, with_images: bool = True) -> None:
             f"paper) and no refinement; found {config.preset!r} with {config.visibility.views} "
             f"views and {config.refine.steps} steps of refinement."
         )
-    if config.uses_renders and not (config.match.enabled or config.refine.enabled):
-        raise ConfigError(
-            "blocks use images for matching and refinement only, not for weights; found "
-            f"{config.visibility.views} views without either: set visibility.views=0."
-        )
     if config.refine.seconds:
         raise ConfigError(
             "blocks are refined for a number of steps (--refine-steps, refine.steps), not "
@@ -243,6 +239,10 @@ def _tessellate_and_merge(job: Job, workers: Workers, clock: StageClock) -> tupl
     Returns the energy before every Lloyd iteration.
     """
     blocks, iterations = job.blocks_with_rows(), job.config.cvt.iterations
+    if job.config.uses_renders:
+        with clock.stage("visibility", len(blocks)) as advance:
+            _run_all(workers, partial(measure, job), blocks, advance)
+            add_contributions(job)
     with clock.stage("tessellate", (iterations + 2) * len(blocks)) as advance:
 
         def run(step: Callable[[int], Result], nth: int) -> list[Result]:
@@ -355,7 +355,7 @@ def report_blocks(
         backend=reports[0].backend if reports else "none",
         checkpoint="none" if simplifier.checkpoint is None else simplifier.checkpoint.name,
         plan=scan.plan,
-        views="found" if matchings or refinements else "none",
+        views="found" if simplifier.config.uses_renders or refinements else "none",
         stages=tuple(clock.costs),
         matching=join_matchings(matchings) if matchings else None,
         refinement=join_refinements(refinements) if refinements else None,

@@ -22,6 +22,7 @@ from cvtgs.outofcore.scan import (
     scan_range,
     scan_scene,
 )
+from cvtgs.outofcore.visibility import write_views
 from cvtgs.outofcore.workers import Workers, with_progress
 
 
@@ -92,6 +93,8 @@ def _scan(
         raise InvalidArgumentError(
             f"all {kept} valid Gaussians are protected, so there is nothing to simplify."
         )
+    if job.config.uses_renders:
+        write_views(job, sample)
     rest = min(job.target, valid) - kept
     scan = scan_scene(
         sample,

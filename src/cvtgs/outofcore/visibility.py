@@ -1,0 +1,102 @@
+"""Visibility in blocks: contributions of Gaussians to images, measured before cells form.
+
+The images show the whole scene, from the same cameras for all blocks. A block is rendered with all
+of its Gaussians; a sample of the scene, enlarged to cover the same area, stands for the others.
+"""
+
+import json
+import math
+
+import torch
+from torch import Tensor
+
+from cvtgs.analysis import drop_mip_tag, measured_areas, visibility_cameras
+from cvtgs.boxes import inside
+from cvtgs.cameras import Cameras
+from cvtgs.devices import one_thread
+from cvtgs.io import atomic_output
+from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
+from cvtgs.outofcore.job import Job
+from cvtgs.outofcore.rows import BlockRows, read_rows
+from cvtgs.rendering import contributions
+from cvtgs.scene import GaussianScene, concatenate
+
+VIEWS, MEASURED = "views", "measured.json"
+"""Files of the cameras with the sample, and of the sums over all blocks."""
+
+SCENE = "scene/"
+
+
+@one_thread()
+def write_views(job: Job, sample: GaussianScene) -> None:
+    """Choose cameras by a sample of the scene, and write both."""
+    cameras = visibility_cameras(sample, job.config)
+    enlarged = sample.log_scales + 0.5 * math.log(max(1.0, job.source.count / len(sample)))
+    tensors = sample.with_sh_degree(0).tensors() | {"log_scales": enlarged}
+    save_tensors(
+        job.path(VIEWS),
+        {"viewmats": cameras.viewmats, "Ks": cameras.Ks, **add_prefix(SCENE, tensors)},
+        {"width": str(cameras.width), "height": str(cameras.height)},
+    )
+
+
+@one_thread()
+def measure(job: Job, block: int) -> None:
+    """Write the contributions of the Gaussians of a block, and their sums."""
+    path = job.contributions_path(block)
+    if path.exists():
+        return
+    scan, rows = job.read_scan(), read_rows(job, block, is_slim=True)
+    tensors, facts = map_tensors(job.path(VIEWS))
+    cameras = Cameras(
+        viewmats=tensors["viewmats"],
+        Ks=tensors["Ks"],
+        width=int(facts["width"]),
+        height=int(facts["height"]),
+    )
+    sample = rows.scene.with_tensors(under_prefix(SCENE, tensors), {})
+    blocks = scan.partition.blocks_of(scan.frame.contract(sample.means))
+    others = sample.select((blocks != block) | inside(job.boxes, sample.means))
+    drawn = drop_mip_tag(concatenate([rows.scene, others]), scan.plan)
+    found = contributions(drawn, cameras)[: len(rows.scene)].contiguous()
+    mass = (rows.apparent_areas * rows.scene.opacities).double().sum()
+    save_tensors(path, {"contributions": found, "pixels": found.sum(), "mass": mass}, {})
+
+
+def add_contributions(job: Job) -> None:
+    """Write the sums of masses and contributions over all blocks."""
+    sums = {"mass": 0.0, "pixels": 0.0}
+    for block in job.blocks_with_rows():
+        tensors, _ = map_tensors(job.contributions_path(block))
+        sums = {name: total + float(tensors[name]) for name, total in sums.items()}
+    with atomic_output(job.path(MEASURED), overwrite=True) as file:
+        file.write(json.dumps(sums).encode())
+
+
+def is_measured(job: Job) -> bool:
+    """Return whether images showed any of the Gaussians."""
+    return _mass_per_pixel(job) is not None
+
+
+def read_apparent_rows(job: Job, block: int) -> BlockRows:
+    """Read slim rows, with the areas that images measured if there are images."""
+    rows, mass_per_pixel = read_rows(job, block, is_slim=True), _mass_per_pixel(job)
+    if mass_per_pixel is None:
+        return rows
+    measured = measured_areas(
+        rows.apparent_areas,
+        rows.scene.opacities,
+        map_tensors(job.contributions_path(block))[0]["contributions"],
+        mass_per_pixel=mass_per_pixel,
+        share=job.config.visibility.mass_share,
+    )
+    return rows._replace(apparent_areas=measured)
+
+
+def _mass_per_pixel(job: Job) -> Tensor | None:
+    if not job.config.uses_renders:
+        return None
+    sums = json.loads(job.path(MEASURED).read_bytes())
+    if sums["pixels"] == 0.0:
+        return None
+    return torch.tensor(sums["mass"] / sums["pixels"], dtype=torch.float64)
