@@ -142,6 +142,17 @@ def test_splat_sizes_are_those_in_the_image():
     assert sizes.in_scene.tolist() == pytest.approx([0.1 / layout.frame.radius], rel=1e-5)
 
 
+def test_every_fourth_gaussian_shows_nearly_the_same_sizes(monkeypatch):
+    scene = cvtgs.synthetic.scene("object", 24_000, sh_degree=0, seed=1)
+    layout, cameras = find_layout(scene), automatic_views(scene, 6, width=64, height=64)
+    thinned = splat_sizes(layout, cameras)
+    monkeypatch.setattr("cvtgs.views.scoring._SPARSE", 1)
+    whole = splat_sizes(layout, cameras)
+    assert not torch.equal(thinned.in_scene, whole.in_scene)
+    torch.testing.assert_close(thinned.in_scene, whole.in_scene, rtol=0.25, atol=0)
+    torch.testing.assert_close(thinned.in_image, whole.in_image, rtol=0.25, atol=0)
+
+
 @pytest.mark.slow
 def test_few_views_are_placed_where_splats_are_large():
     """Half of a ball mixes large and tiny Gaussians; their mean log size is that of the rest."""
