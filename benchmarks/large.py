@@ -111,8 +111,9 @@ def seams(options: argparse.Namespace) -> None:
             cvtgs.save(scene, path)
             for number, share in itertools.product(numbers, SHARES):
                 rho = share * options.rho
-                how = {"blocks": number, "simplifier": simplifier, "overwrite": True}
-                simplify_file(path, output, rho, **how)
+                simplify_file(
+                    path, output, rho, blocks=number, simplifier=simplifier, overwrite=True
+                )
                 small[f"{number} {share}"] = cvtgs.load(output)
         psnr = scores(scene, small)
         means = [mean(psnr[f"{n} {share}"] for share in SHARES) for n in numbers]

@@ -6,16 +6,15 @@ import pytest
 import torch
 
 import cvtgs
-from cvtgs import Simplifier, cells, cvt, validity
+from block_jobs import unfinished_job
+from cvtgs import cells, cvt, validity
 from cvtgs.cvt import nearest_several
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.grouping import REASSIGN, allocate, allocation_at
-from cvtgs.io.ply import open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import correct_cells
 from cvtgs.outofcore import simplify_file
 from cvtgs.outofcore.halo import Balls, OtherBlock, assign_points, bounding_box, halo_cells
-from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.merge import read_cells
 from cvtgs.outofcore.rows import read_rows
 from cvtgs.pipeline import shape_merged
@@ -26,39 +25,10 @@ from scenes import same_bits
 COUNT, BLOCKS, TARGET = 4000, 5, 120
 
 
-class StoppedError(Exception):
-    """Ends a run from its listener."""
-
-
-def stop_before_assemble(event):
-    if event.stage == "assemble":
-        raise StoppedError
-
-
 @pytest.fixture(scope="module")
 def job(tmp_path_factory):
-    """A job that is complete except for the assembly of its blocks."""
-    folder = tmp_path_factory.mktemp("borders")
     scene = cvtgs.synthetic.scene("courtyard", COUNT, sh_degree=1, seed=4)
-    cvtgs.save(scene, folder / "in.ply")
-    with pytest.raises(StoppedError):
-        simplify_file(
-            folder / "in.ply",
-            folder / "out.ply",
-            count=TARGET,
-            blocks=BLOCKS,
-            listener=stop_before_assemble,
-        )
-    return Job(
-        folder=str(next((folder / ".out.ply.blocks").iterdir())),
-        source=open_rows(folder / "in.ply"),
-        target=TARGET,
-        blocks=BLOCKS,
-        boxes=(),
-        config=Simplifier().config,
-        has_network=True,
-        range_rows=1 << 26,
-    )
+    return unfinished_job(scene, tmp_path_factory.mktemp("borders"), count=TARGET, blocks=BLOCKS)
 
 
 def of_all(job, path, name):

@@ -4,16 +4,18 @@ import pytest
 import torch
 
 import cvtgs
+from block_jobs import unfinished_job
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.analysis import visibility_cameras
 from cvtgs.boxes import Box, inside
-from cvtgs.io.ply import open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.outofcore import simplify_file
-from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.rows import read_rows
 from cvtgs.outofcore.visibility import is_measured, read_apparent_rows
+from cvtgs.progress import silent
 from cvtgs.rendering import contributions
+from cvtgs.scene import concatenate
+from scenes import same_bits
 
 COUNT, BLOCKS, TARGET = 3000, 3, 150
 SETTINGS = {
@@ -23,43 +25,18 @@ SETTINGS = {
 BOX = Box(min=(-0.08, -0.08, -9), max=(0.08, 0.08, 9))
 
 
-class StoppedError(Exception):
-    """Ends a run from its listener."""
-
-
-def stop_before_assemble(event):
-    if event.stage == "assemble":
-        raise StoppedError
-
-
 @pytest.fixture(scope="module")
 def scene():
     return cvtgs.synthetic.scene("object", COUNT, sh_degree=1, seed=4)
 
 
 def run(scene, folder, config, *, boxes=()):
-    """Return a job that is complete except for the assembly of its blocks."""
-    cvtgs.save(scene, folder / "in.ply")
-    with pytest.raises(StoppedError):
-        simplify_file(
-            folder / "in.ply",
-            folder / "out.ply",
-            count=TARGET,
-            blocks=BLOCKS,
-            boxes=boxes,
-            simplifier=Simplifier(config=config, device="cpu"),
-            listener=stop_before_assemble,
-        )
-    return Job(
-        folder=str(next((folder / ".out.ply.blocks").iterdir())),
-        source=open_rows(folder / "in.ply"),
-        target=TARGET,
-        blocks=BLOCKS,
-        boxes=tuple(boxes),
-        config=config,
-        has_network=True,
-        range_rows=1 << 26,
-    )
+    return unfinished_job(scene, folder, count=TARGET, blocks=BLOCKS, config=config, boxes=boxes)
+
+
+def contributions_of(job):
+    paths = [job.contributions_path(block) for block in job.blocks_with_rows()]
+    return torch.cat([map_tensors(path)[0]["contributions"] for path in paths])
 
 
 def paired(job, scene):
@@ -78,13 +55,21 @@ def test_contributions_are_those_of_one_piece(scene, tmp_path, boxes):
     rows = paired(job, scene)
     kept = int(inside(boxes, scene.means).sum()) if boxes else 0
     assert len(rows.unique()) == COUNT - kept
-    found = torch.cat([
-        map_tensors(job.contributions_path(block))[0]["contributions"]
-        for block in job.blocks_with_rows()
-    ])  # fmt: skip
+    found = contributions_of(job)
     wanted = contributions(scene, visibility_cameras(scene, config))[rows]
     assert float(wanted.sum()) > 1000
     torch.testing.assert_close(found, wanted, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_invalid_rows_do_not_enlarge_the_sample(scene, tmp_path):
+    """The sample is the whole scene here; invalid rows are dropped from it."""
+    config = SimplifyConfig.from_mapping(SETTINGS)
+    broken = scene.select(torch.arange(1500))
+    broken.means[:] = torch.nan
+    job = run(concatenate([broken, scene]), tmp_path, config)
+    wanted = contributions(scene, visibility_cameras(scene, config))[paired(job, scene)]
+    torch.testing.assert_close(contributions_of(job), wanted, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.slow
@@ -97,12 +82,8 @@ def test_measured_areas_keep_the_mass_and_move_it_to_what_images_show(scene, tmp
         for rows in (plain, measured)
     )
     assert float(after.sum()) == pytest.approx(float(before.sum()), rel=1e-4)
-    shown = torch.cat([
-        map_tensors(job.contributions_path(block))[0]["contributions"]
-        for block in job.blocks_with_rows()
-    ])  # fmt: skip
     share = job.config.visibility.mass_share
-    hidden = shown == 0
+    hidden = contributions_of(job) == 0
     assert int(hidden.sum()) > 20
     torch.testing.assert_close(after[hidden], share * before[hidden], rtol=1e-5, atol=0)
 
@@ -123,6 +104,29 @@ def test_images_that_show_nothing_change_nothing(scene, tmp_path, monkeypatch):
         assert job.small_path(block).read_bytes() == expected.small_path(block).read_bytes()
 
 
+def finish(folder, config, listener=silent):
+    """Run the job of a folder again."""
+    return simplify_file(
+        folder / "in.ply",
+        folder / "out.ply",
+        count=TARGET,
+        blocks=BLOCKS,
+        simplifier=Simplifier(config=config, device="cpu"),
+        listener=listener,
+    )
+
+
+@pytest.mark.slow
+def test_a_job_with_damaged_views_starts_over(scene, tmp_path):
+    config = SimplifyConfig.from_mapping(SETTINGS)
+    job = run(scene, tmp_path, config)
+    small = [cvtgs.load(job.small_path(block)) for block in job.blocks_with_cells()]
+    job.views_path.write_bytes(b"damaged")
+    job.contributions_path(1).unlink()
+    assert finish(tmp_path, config).resumed_blocks == 0
+    assert same_bits(cvtgs.load(tmp_path / "out.ply"), concatenate(small))
+
+
 @pytest.mark.slow
 def test_damaged_contributions_are_measured_again(scene, tmp_path):
     config = SimplifyConfig.from_mapping(SETTINGS)
@@ -137,13 +141,6 @@ def test_damaged_contributions_are_measured_again(scene, tmp_path):
         if event.stage == "assemble":
             seen["again"] = job.contributions_path(1).read_bytes()
 
-    report = simplify_file(
-        tmp_path / "in.ply",
-        tmp_path / "out.ply",
-        count=TARGET,
-        blocks=BLOCKS,
-        simplifier=Simplifier(config=config, device="cpu"),
-        listener=note,
-    )
+    report = finish(tmp_path, config, note)
     assert seen["again"] == whole
     assert (report.resumed_blocks, report.views) == (BLOCKS, "found")

@@ -101,6 +101,11 @@ class Job:
         """Return the file with the curve order of a block, and the points that Lloyd samples."""
         return self.path(f"sample_{block:05d}")
 
+    @property
+    def views_path(self) -> Path:
+        """The file of the cameras that all blocks share, and of the sample of the scene."""
+        return self.path("views.safetensors")
+
     def contributions_path(self, block: int) -> Path:
         """Return the file with the contributions of the rows of a block to images of the scene."""
         return self.path(f"contributions_{block:05d}")
@@ -250,6 +255,8 @@ class Job:
         """
         try:
             self.read_scan()
+            if self.config.uses_renders:
+                map_tensors(self.views_path)
             if self._manifest().key != key or not self.has_sorted_rows():
                 return False
         except (OSError, ValueError, KeyError, TypeError):

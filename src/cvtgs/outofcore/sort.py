@@ -94,7 +94,7 @@ def _scan(
             f"all {kept} valid Gaussians are protected, so there is nothing to simplify."
         )
     if job.config.uses_renders:
-        write_views(job, sample)
+        write_views(job, sample, total=valid)
     rest = min(job.target, valid) - kept
     scan = scan_scene(
         sample,

@@ -21,20 +21,20 @@ from cvtgs.outofcore.rows import BlockRows, read_rows
 from cvtgs.rendering import contributions
 from cvtgs.scene import GaussianScene, concatenate
 
-VIEWS, MEASURED = "views", "measured.json"
-"""Files of the cameras with the sample, and of the sums over all blocks."""
+MEASURED = "measured.json"
+"""File of the sums over all blocks."""
 
 SCENE = "scene/"
 
 
 @one_thread()
-def write_views(job: Job, sample: GaussianScene) -> None:
-    """Choose cameras by a sample of the scene, and write both."""
+def write_views(job: Job, sample: GaussianScene, *, total: int) -> None:
+    """Choose cameras by a sample of ``total`` Gaussians, and write both."""
     cameras = visibility_cameras(sample, job.config)
-    enlarged = sample.log_scales + 0.5 * math.log(max(1.0, job.source.count / len(sample)))
+    enlarged = sample.log_scales + 0.5 * math.log(total / len(sample))
     tensors = sample.with_sh_degree(0).tensors() | {"log_scales": enlarged}
     save_tensors(
-        job.path(VIEWS),
+        job.views_path,
         {"viewmats": cameras.viewmats, "Ks": cameras.Ks, **add_prefix(SCENE, tensors)},
         {"width": str(cameras.width), "height": str(cameras.height)},
     )
@@ -47,7 +47,7 @@ def measure(job: Job, block: int) -> None:
     if path.exists():
         return
     scan, rows = job.read_scan(), read_rows(job, block, is_slim=True)
-    tensors, facts = map_tensors(job.path(VIEWS))
+    tensors, facts = map_tensors(job.views_path)
     cameras = Cameras(
         viewmats=tensors["viewmats"],
         Ks=tensors["Ks"],
