@@ -101,6 +101,23 @@ def test_the_loss_depends_only_on_the_seed(kind, monkeypatch):
     assert len({loss(seed) for seed in range(4)}) == 4
 
 
+@pytest.mark.parametrize("length", [1, 40, 200])
+def test_chunks_of_the_network_change_neither_loss_nor_gradient(length, monkeypatch):
+    case, views, config = some_case(), some_views(), config_of(residual_weight=1.0)
+
+    def loss_and_gradients() -> tuple[float, list[torch.Tensor]]:
+        net = lively_net(torch.float32)
+        loss = scene_loss(net, case, views, config=config, rng=random.Random(0))
+        loss.backward()
+        return loss.item(), [values.grad for values in net.parameters()]
+
+    loss, gradients = loss_and_gradients()
+    monkeypatch.setattr("cvtgs.train.losses.CHUNK_MEMBERS", length)
+    in_chunks, others = loss_and_gradients()
+    assert in_chunks == pytest.approx(loss, rel=1e-5)
+    torch.testing.assert_close(others, gradients, rtol=1e-3, atol=1e-5)
+
+
 @pytest.mark.parametrize("kind", ["scene", "local"])
 @pytest.mark.slow
 def test_residuals_are_penalized(kind):

@@ -2,7 +2,7 @@
 
 import math
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Partition
+from cvtgs.devices import chunk_length
 from cvtgs.evaluation import psnr
 from cvtgs.losses import image_loss, relative_loss
 from cvtgs.math import parameters, spherical_harmonics
@@ -26,6 +27,9 @@ from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
 from cvtgs.train.cases import Case, MergedScene, TargetViews
 from cvtgs.train.config import LossConfig, TrainConfig
+
+CHUNK_MEMBERS = 1 << 16
+"""Members and neighbours per chunk of the network in a step."""
 
 BLACK_SHARE = 0.5
 """Share of the images of whole scenes that have a black background."""
@@ -48,7 +52,7 @@ def scene_loss(
     Whole images are rendered, because a camera of the crop alone would project Gaussians beside it
     differently.
     """
-    residuals: Residuals = net(case.descriptors)
+    residuals = _predict(net, case)
     corrected = case.correct_scene(residuals)
     losses = []
     for _ in range(config.views.per_step):
@@ -61,6 +65,19 @@ def scene_loss(
         target = view.over(background)
         losses.append(view_loss(image[:, y, x], target[:, y, x], config.loss))
     return torch.stack(losses).mean() + _residual_penalty(residuals, config.loss)
+
+
+def _predict(net: MergeNet, case: Case) -> Residuals:
+    """Predict all residuals in chunks, whose tensors fit the caches of a CPU."""
+    near = case.descriptors.pairs.shape[1]
+    length = chunk_length(CHUNK_MEMBERS, case.cells.device)
+    parts = [net(case.descriptors.cut(run)) for run, _ in case.part.chunks(length, cell_cost=near)]
+    return Residuals(
+        **{
+            field.name: torch.cat([getattr(part, field.name) for part in parts])
+            for field in fields(Residuals)
+        }
+    )
 
 
 def local_loss(
