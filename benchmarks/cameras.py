@@ -1,14 +1,18 @@
-"""Hand-picked cameras of a scene, and a disk cache of images of full scenes.
+"""Cameras beside a scene, and a disk cache of images of full scenes.
 
 The cameras of ``NAME.ply`` are in ``NAME.cameras.json`` beside it: ``width`` and ``height`` in
 pixels, the intrinsic matrix ``K``, and ``world_to_camera``, a list of 4 x 4 OpenCV matrices.
+``python -m benchmarks.cameras SCENE.ply ...`` writes them for objects on nothing or on the ground:
+two rings from which people would look. Look at their images before you use them.
 """
 
+import argparse
 import hashlib
 import io
 import json
+import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,8 +22,18 @@ import torch
 import cvtgs
 import cvtgs.rendering
 from benchmarks.measuring import write_file
-from cvtgs.cameras import Cameras
+from cvtgs.cameras import Cameras, look_at
 from cvtgs.evaluation.scorer import ViewImage, render_view
+from cvtgs.views.layout import find_layout
+
+RINGS = ((8, 10, 14, 2.9), (4, 35, 32, 2.1))
+"""Number of cameras, azimuth of the first one and elevation in degrees, and distance in radii."""
+
+LIFT = 0.15
+"""Height of the point that the rings look at, above the middle of the scene, in radii."""
+
+SIDE, FIELD = 400, 50
+"""Side of the images of the rings in pixels, and their field of view in degrees."""
 
 CACHE = Path(tempfile.gettempdir()) / "cvtgs-full-images"
 
@@ -41,6 +55,48 @@ def cameras_beside(scene: Path, *, size: int | None = None) -> Cameras:
         viewmats=viewmats, Ks=intrinsics, width=found["width"], height=found["height"]
     )
     return cameras if size is None else cameras.fitted(size)
+
+
+def ring_cameras(scene: cvtgs.GaussianScene) -> Cameras:
+    """Return eight cameras around a scene, and four nearer ones that look down more steeply."""
+    layout = find_layout(scene)
+    up, radius = layout.up.double(), float(layout.frame.radius)
+    middle = layout.frame.center.double() + LIFT * radius * up
+    across = torch.nn.functional.normalize(
+        torch.linalg.cross(up, torch.eye(3, dtype=up.dtype)[up.abs().argmin()]), dim=0
+    )
+    along = torch.linalg.cross(up, across)
+    eyes = []
+    for count, first, elevation, distance in RINGS:
+        height = math.radians(elevation)
+        for number in range(count):
+            angle = math.radians(first + 360 / count * number)
+            level = math.cos(angle) * across + math.sin(angle) * along
+            way = math.cos(height) * level + math.sin(height) * up
+            eyes.append(middle + distance * radius * way)
+    focal, half = SIDE / 2 / math.tan(math.radians(FIELD / 2)), SIDE / 2
+    intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]], dtype=up.dtype)
+    return Cameras(
+        viewmats=look_at(torch.stack(eyes), middle.expand(len(eyes), 3), up),
+        Ks=intrinsics.expand(len(eyes), 3, 3),
+        width=SIDE,
+        height=SIDE,
+    )
+
+
+def write_rings(scene: Path) -> Path:
+    """Write the rings of a scene beside it."""
+    cameras, path = ring_cameras(cvtgs.load(scene)), cameras_file(scene)
+    text = json.dumps(
+        {
+            "width": cameras.width,
+            "height": cameras.height,
+            "K": cameras.Ks[0].tolist(),
+            "world_to_camera": cameras.viewmats.tolist(),
+        }
+    )
+    write_file(path, text.encode())
+    return path
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,3 +154,17 @@ def _npy(array: np.ndarray) -> bytes:
     file = io.BytesIO()
     np.save(file, array)
     return file.getvalue()
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Write the rings of every scene."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("files", nargs="+", type=Path, help="scenes")
+    for file in parser.parse_args(args).files:
+        print(write_rings(file))
+
+
+if __name__ == "__main__":
+    main()

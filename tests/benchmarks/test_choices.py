@@ -9,6 +9,7 @@ import torch
 import cvtgs
 from benchmarks import cameras as camera_files
 from benchmarks import choices, heights
+from cvtgs.edit import Motion, move
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.views import automatic_views
 
@@ -61,6 +62,27 @@ def test_full_scenes_are_rendered_once_and_then_read(file, tmp_path, monkeypatch
     assert first[0].shape == (1, 30, 40, 4)
     monkeypatch.delattr(camera_files, "render_view")
     assert all(torch.equal(one, other) for one, other in zip(first, images(), strict=True))
+
+
+@pytest.mark.parametrize("up", ["y", "-y", "z"])
+def test_rings_look_at_an_object_from_above_its_ground(up, tmp_path, capsys):
+    scene = cvtgs.synthetic.scene("object", 2000, sh_degree=0, seed=0)
+    quat = {"y": (0.0, 1.0, 0, 0), "-y": (1.0, 0, 0, 0), "z": (1.0, -1.0, 0, 0)}[up]
+    axis = {"y": (0, 1.0, 0), "-y": (0, -1.0, 0), "z": (0, 0, 1.0)}[up]
+    turned = move(scene, Motion(quat=quat))
+    cvtgs.save(turned, tmp_path / "thing.ply")
+    camera_files.main([str(tmp_path / "thing.ply")])
+    assert capsys.readouterr().out.strip() == str(tmp_path / "thing.cameras.json")
+    cameras = camera_files.cameras_beside(tmp_path / "thing.ply")
+    assert len(cameras) == 12
+    middle = turned.means.double().median(dim=0).values
+    directions = torch.nn.functional.normalize(cameras.centers - middle, dim=1)
+    heights = directions @ torch.tensor(axis, dtype=torch.float64)
+    assert heights[:8].min() > 0.1
+    assert heights[8:].min() > heights[:8].max()
+    assert torch.unique(directions.round(decimals=3), dim=0).shape[0] == 12
+    alphas = cvtgs.render(turned, cameras.fitted(40)).alpha
+    assert alphas.mean(dim=(1, 2)).min() > 0.03  # each shows the object
 
 
 def test_a_scene_without_cameras_is_refused_by_name(tmp_path):
