@@ -3,7 +3,8 @@
 The cameras of ``NAME.ply`` are in ``NAME.cameras.json`` beside it: ``width`` and ``height`` in
 pixels, the intrinsic matrix ``K``, and ``world_to_camera``, a list of 4 x 4 OpenCV matrices.
 ``python -m benchmarks.cameras SCENE.ply ...`` writes them for objects on nothing or on the ground:
-two rings from which people would look. Look at their images before you use them.
+two rings from which people would look. Look at their images before you use them. With
+``--transforms``, also ``NAME.transforms.json``, which ``cvtgs train`` and ``--cameras`` read.
 """
 
 import argparse
@@ -15,6 +16,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -84,19 +86,33 @@ def ring_cameras(scene: cvtgs.GaussianScene) -> Cameras:
     )
 
 
-def write_rings(scene: Path) -> Path:
-    """Write the rings of a scene beside it."""
-    cameras, path = ring_cameras(cvtgs.load(scene)), cameras_file(scene)
-    text = json.dumps(
-        {
-            "width": cameras.width,
-            "height": cameras.height,
-            "K": cameras.Ks[0].tolist(),
-            "world_to_camera": cameras.viewmats.tolist(),
-        }
-    )
-    write_file(path, text.encode())
-    return path
+def hand_picked_format(cameras: Cameras) -> dict[str, Any]:
+    """Return the content of ``NAME.cameras.json``."""
+    return {
+        "width": cameras.width,
+        "height": cameras.height,
+        "K": cameras.Ks[0].tolist(),
+        "world_to_camera": cameras.viewmats.tolist(),
+    }
+
+
+def nerf_format(cameras: Cameras) -> dict[str, Any]:
+    """Return the content of ``transforms.json``: poses with OpenGL axes."""
+    poses = torch.linalg.inv(cameras.viewmats)
+    poses[:, :3, 1:3] *= -1
+    (focal_x, _, center_x), (_, focal_y, center_y), _ = cameras.Ks[0].tolist()
+    return {
+        "w": cameras.width,
+        "h": cameras.height,
+        "fl_x": focal_x,
+        "fl_y": focal_y,
+        "cx": center_x,
+        "cy": center_y,
+        "frames": [
+            {"file_path": f"{number:03d}", "transform_matrix": pose.tolist()}
+            for number, pose in enumerate(poses)
+        ],
+    }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -157,13 +173,21 @@ def _npy(array: np.ndarray) -> bytes:
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Write the rings of every scene."""
+    """Write the rings of every scene beside it."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("files", nargs="+", type=Path, help="scenes")
-    for file in parser.parse_args(args).files:
-        print(write_rings(file))
+    parser.add_argument("--transforms", action="store_true", help="also NAME.transforms.json")
+    options = parser.parse_args(args)
+    for file in options.files:
+        cameras = ring_cameras(cvtgs.load(file))
+        contents = {cameras_file(file): hand_picked_format(cameras)}
+        if options.transforms:
+            contents[file.with_suffix(".transforms.json")] = nerf_format(cameras)
+        for path, content in contents.items():
+            write_file(path, json.dumps(content).encode())
+            print(path)
 
 
 if __name__ == "__main__":

@@ -71,9 +71,13 @@ def test_rings_look_at_an_object_from_above_its_ground(up, tmp_path, capsys):
     axis = {"y": (0, 1.0, 0), "-y": (0, -1.0, 0), "z": (0, 0, 1.0)}[up]
     turned = move(scene, Motion(quat=quat))
     cvtgs.save(turned, tmp_path / "thing.ply")
-    camera_files.main([str(tmp_path / "thing.ply")])
-    assert capsys.readouterr().out.strip() == str(tmp_path / "thing.cameras.json")
+    camera_files.main([str(tmp_path / "thing.ply"), "--transforms"])
+    names = ["thing.cameras.json", "thing.transforms.json"]
+    assert capsys.readouterr().out.split() == [str(tmp_path / name) for name in names]
     cameras = camera_files.cameras_beside(tmp_path / "thing.ply")
+    same = cvtgs.load_cameras(tmp_path / "thing.transforms.json")
+    torch.testing.assert_close(same.viewmats.double(), cameras.viewmats, rtol=0, atol=1e-5)
+    torch.testing.assert_close(same.Ks.double(), cameras.Ks, rtol=1e-6, atol=1e-6)
     assert len(cameras) == 12
     middle = turned.means.double().median(dim=0).values
     directions = torch.nn.functional.normalize(cameras.centers - middle, dim=1)
