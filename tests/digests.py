@@ -5,6 +5,7 @@
 
 import hashlib
 import json
+import platform
 import sys
 import tempfile
 import warnings
@@ -148,7 +149,10 @@ def measure(name: str) -> dict[str, object]:
 
 
 def canary() -> str:
-    """Return the digest of a few operations that processors and libraries may round differently."""
+    """Return a digest of the processor and of operations that libraries may round differently.
+
+    Libraries choose code by processor, and no few operations find all differences.
+    """
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(64, 3, 3, generator=generator)
     y = torch.randn(5000, generator=generator)
@@ -164,9 +168,20 @@ def canary() -> str:
                 torch.nn.functional.linear(y.reshape(50, 100), y[:3200].reshape(32, 100)),
                 (y.abs() ** 0.37),
                 (y.abs().double() ** 1.6),
+                torch.tensor(list(processor().encode())),
             ]
         )
     )
+
+
+def processor() -> str:
+    """Return the kind of processor, in more detail than its name, where the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0].splitlines()
+    except OSError:
+        return platform.processor()
+    kinds = ("vendor_id", "cpu family", "model", "flags")
+    return "\n".join(line for line in lines if line.split("\t")[0].rstrip() in kinds)
 
 
 def main() -> None:

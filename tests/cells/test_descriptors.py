@@ -119,20 +119,6 @@ def test_a_subset_of_cells_gets_the_same_descriptors():
     torch.testing.assert_close(some.members, whole.members[members])
 
 
-def test_descriptors_of_a_run_of_cells_are_those_of_its_partition():
-    case = some_case(60, 12)
-    run = slice(3, 8)
-    whole, part = case.describe(), case.part.cut(run)
-    some = whole.cut(run)
-    assert torch.equal(some.offsets, part.offsets)
-    assert torch.equal(some.cells, whole.cells[run])
-    assert torch.equal(some.pairs, whole.pairs[run])
-    first = int(case.part.offsets[3])
-    for name in ("members", "weights", "positions"):
-        wanted = getattr(whole, name)[first : first + len(part.order)]
-        assert torch.equal(getattr(some, name), wanted)
-
-
 def test_moving_to_another_dtype_and_device():
     seen = some_case().describe()
     single = seen.to(torch.float32).to(torch.device("cpu"))

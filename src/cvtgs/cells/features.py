@@ -67,27 +67,6 @@ class Descriptors:
         """Return the number of cells."""
         return len(self.cells)
 
-    def cut(self, run: slice) -> Self:
-        """Keep some consecutive cells.
-
-        Args:
-            run: Range of cells, at least one.
-
-        Returns:
-            Their descriptors; all tensors but ``offsets`` are views.
-        """
-        ends = self.offsets[run.start : run.stop + 1]
-        members = slice(int(ends[0]), int(ends[-1]))
-        return type(self)(
-            members=self.members[members],
-            pairs=self.pairs[run],
-            cells=self.cells[run],
-            weights=self.weights[members],
-            offsets=ends - ends[0],
-            positions=self.positions[members],
-            pair_positions=self.pair_positions[run],
-        )
-
     def to(self, target: torch.device | torch.dtype) -> Self:
         """Return the descriptors on a device or in another precision.
 

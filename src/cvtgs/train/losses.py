@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.cells import Partition
+from cvtgs.cells import Descriptors, Partition
 from cvtgs.devices import chunk_length
 from cvtgs.evaluation import psnr
 from cvtgs.losses import image_loss, relative_loss
@@ -71,12 +71,29 @@ def _predict(net: MergeNet, case: Case) -> Residuals:
     """Predict all residuals in chunks, whose tensors fit the caches of a CPU."""
     near = case.descriptors.pairs.shape[1]
     length = chunk_length(CHUNK_MEMBERS, case.cells.device)
-    parts = [net(case.descriptors.cut(run)) for run, _ in case.part.chunks(length, cell_cost=near)]
+    parts = [
+        net(_cut(case.descriptors, run)) for run, _ in case.part.chunks(length, cell_cost=near)
+    ]
     return Residuals(
         **{
             field.name: torch.cat([getattr(part, field.name) for part in parts])
             for field in fields(Residuals)
         }
+    )
+
+
+def _cut(described: Descriptors, run: slice) -> Descriptors:
+    """Keep some consecutive cells; all tensors but ``offsets`` are views."""
+    ends = described.offsets[run.start : run.stop + 1]
+    members = slice(int(ends[0]), int(ends[-1]))
+    return Descriptors(
+        members=described.members[members],
+        pairs=described.pairs[run],
+        cells=described.cells[run],
+        weights=described.weights[members],
+        offsets=ends - ends[0],
+        positions=described.positions[members],
+        pair_positions=described.pair_positions[run],
     )
 
 
