@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 import cvtgs
 import cvtgs.rendering
@@ -35,7 +37,7 @@ LIFT = 0.15
 """Height of the point that the rings look at, above the middle of the scene, in radii."""
 
 SIDE, FIELD = 400, 50
-"""Side of the images of the rings in pixels, and their field of view in degrees."""
+"""Side of the images of the rings in pixels, and the field of view in degrees."""
 
 CACHE = Path(tempfile.gettempdir()) / "cvtgs-full-images"
 
@@ -59,34 +61,59 @@ def cameras_beside(scene: Path, *, size: int | None = None) -> Cameras:
     return cameras if size is None else cameras.fitted(size)
 
 
-def ring_cameras(scene: cvtgs.GaussianScene) -> Cameras:
-    """Return eight cameras around a scene, and four nearer ones that look down more steeply."""
+def cameras_around(
+    scene: cvtgs.GaussianScene,
+    azimuths: Float[Tensor, "c"],
+    *,
+    elevation: float,
+    distance: float,
+    size: int = SIDE,
+    lift: float = 0.0,
+) -> Cameras:
+    """Return cameras that look at the middle of a scene, all from one elevation and distance.
+
+    Angles are in degrees; ``distance``, and ``lift`` of the middle along up, in robust radii.
+    """
     layout = find_layout(scene)
     up, radius = layout.up.double(), float(layout.frame.radius)
-    middle = layout.frame.center.double() + LIFT * radius * up
-    across = torch.nn.functional.normalize(
-        torch.linalg.cross(up, torch.eye(3, dtype=up.dtype)[up.abs().argmin()]), dim=0
-    )
+    middle = layout.frame.center.double() + lift * radius * up
+    least = torch.eye(3, dtype=up.dtype)[up.abs().argmin()]
+    across = torch.nn.functional.normalize(torch.linalg.cross(up, least), dim=0)
     along = torch.linalg.cross(up, across)
-    eyes = []
-    for count, first, elevation, distance in RINGS:
-        height = math.radians(elevation)
-        for number in range(count):
-            angle = math.radians(first + 360 / count * number)
-            level = math.cos(angle) * across + math.sin(angle) * along
-            way = math.cos(height) * level + math.sin(height) * up
-            eyes.append(middle + distance * radius * way)
-    focal, half = SIDE / 2 / math.tan(math.radians(FIELD / 2)), SIDE / 2
+    turns, rise = torch.deg2rad(azimuths.double())[:, None], math.radians(elevation)
+    level = turns.cos() * across + turns.sin() * along
+    eyes = middle + distance * radius * (math.cos(rise) * level + math.sin(rise) * up)
+    focal, half = size / 2 / math.tan(math.radians(FIELD / 2)), size / 2
     intrinsics = torch.tensor([[focal, 0, half], [0, focal, half], [0, 0, 1]], dtype=up.dtype)
     return Cameras(
-        viewmats=look_at(torch.stack(eyes), middle.expand(len(eyes), 3), up),
-        Ks=intrinsics.expand(len(eyes), 3, 3),
+        viewmats=look_at(eyes, middle.expand_as(eyes), up),
+        Ks=intrinsics.repeat(len(eyes), 1, 1),
+        width=size,
+        height=size,
+    )
+
+
+def ring_cameras(scene: cvtgs.GaussianScene) -> Cameras:
+    """Return eight cameras around a scene, and four nearer ones that look down more steeply."""
+    rings = [
+        cameras_around(
+            scene,
+            first + 360 / count * torch.arange(count),
+            elevation=elevation,
+            distance=distance,
+            lift=LIFT,
+        )
+        for count, first, elevation, distance in RINGS
+    ]
+    return Cameras(
+        viewmats=torch.cat([ring.viewmats for ring in rings]),
+        Ks=torch.cat([ring.Ks for ring in rings]),
         width=SIDE,
         height=SIDE,
     )
 
 
-def hand_picked_format(cameras: Cameras) -> dict[str, Any]:
+def beside_format(cameras: Cameras) -> dict[str, Any]:
     """Return the content of ``NAME.cameras.json``."""
     return {
         "width": cameras.width,
@@ -182,7 +209,7 @@ def main(args: Sequence[str] | None = None) -> None:
     options = parser.parse_args(args)
     for file in options.files:
         cameras = ring_cameras(cvtgs.load(file))
-        contents = {cameras_file(file): hand_picked_format(cameras)}
+        contents = {cameras_file(file): beside_format(cameras)}
         if options.transforms:
             contents[file.with_suffix(".transforms.json")] = nerf_format(cameras)
         for path, content in contents.items():

@@ -7,17 +7,16 @@ A small set of views misleads if some are inside solid ground, where PSNR change
 """
 
 import argparse
-import math
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 import cvtgs
+from benchmarks.cameras import cameras_around
 from benchmarks.quality import scenes
-from cvtgs.cameras import Cameras, look_at
+from cvtgs.cameras import Cameras
 from cvtgs.evaluation import psnr
-from cvtgs.views.layout import find_layout
 
 HEIGHTS = ((90, 1.5), (60, 1.2), (35, 1.6), (20, 1.2), (20, 2.8), (10, 2.2), (-15, 2.8), (-35, 2.0),
            (-60, 1.5))  # fmt: skip
@@ -53,23 +52,9 @@ def main() -> None:
 def views_at(
     scene: cvtgs.GaussianScene, height: float, far: float, count: int, *, size: int, seed: int
 ) -> Cameras:
-    """Return cameras that look at the centre of a scene from one elevation and distance."""
-    layout = find_layout(scene)
-    up, frame = layout.up, layout.frame
-    right, ahead = torch.linalg.svd(up[None]).Vh[1:]
-    turns = 2 * math.pi * torch.rand(count, generator=torch.Generator().manual_seed(seed)).double()
-    rise = torch.full_like(turns, math.radians(height))
-    level = turns.cos()[:, None] * right + turns.sin()[:, None] * ahead
-    ways = rise.cos()[:, None] * level + rise.sin()[:, None] * up
-    focal = 0.5 * size / math.tan(math.radians(25))
-    intrinsics = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]).double()
-    eyes = frame.center + far * frame.radius * ways
-    return Cameras(
-        viewmats=look_at(eyes, frame.center.expand_as(eyes), up),
-        Ks=intrinsics.repeat(count, 1, 1),
-        width=size,
-        height=size,
-    )
+    """Return cameras in random directions from one elevation and distance."""
+    azimuths = 360 * torch.rand(count, generator=torch.Generator().manual_seed(seed))
+    return cameras_around(scene, azimuths, elevation=height, distance=far, size=size)
 
 
 def scores(scene: cvtgs.GaussianScene, variant: str, cameras: list[Cameras], rho: float) -> Tensor:

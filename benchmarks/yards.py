@@ -18,8 +18,9 @@ import torch
 from numpy.typing import NDArray
 
 import cvtgs
+from benchmarks.cameras import beside_format
 from cvtgs import synthetic
-from cvtgs.cameras import look_at
+from cvtgs.cameras import Cameras, look_at
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
@@ -68,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     folder: Path = parser.parse_args(arguments).folder
     for name, (count, seed, degree) in YARDS.items():
         cvtgs.save(yard(count, seed=seed, degree=degree), folder / f"{name}.ply")
-        (folder / f"{name}.cameras.json").write_text(json.dumps(cameras()), encoding="utf-8")
+        (folder / f"{name}.cameras.json").write_text(json.dumps(beside_format(cameras())))
         print(folder / f"{name}.ply")
 
 
@@ -109,8 +110,8 @@ def yard(count: int, *, seed: int, degree: int) -> GaussianScene:
     )
 
 
-def cameras() -> dict[str, object]:
-    """Return cameras of a walk around the object, in the layout of ``cameras.json``."""
+def cameras() -> Cameras:
+    """Return cameras of a walk around the object."""
     turns, steps = torch.arange(VIEWS) * 2 * math.pi / VIEWS, torch.arange(VIEWS) % 3
     heights, away = torch.tensor([0.5, 0.8, 1.3])[steps], torch.tensor([1.6, 2.2, 2.8])[steps]
     eyes = torch.stack([away * torch.cos(turns), -heights, away * torch.sin(turns)], dim=1).double()
@@ -120,8 +121,9 @@ def cameras() -> dict[str, object]:
     targets[::3, 1] = -0.6
     poses = look_at(eyes, targets, torch.tensor([0.0, -1.0, 0.0]).double())
     focal = 0.5 * WIDTH / math.tan(math.radians(30))
-    intrinsics = [[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]]
-    return {"width": WIDTH, "height": HEIGHT, "K": intrinsics, "world_to_camera": poses.tolist()}
+    rows = [[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]]
+    intrinsics = torch.tensor(rows, dtype=torch.float64)
+    return Cameras(viewmats=poses, Ks=intrinsics.repeat(VIEWS, 1, 1), width=WIDTH, height=HEIGHT)
 
 
 def _ground(count: int, fine: float, rng: np.random.Generator) -> Part:
