@@ -11,11 +11,13 @@ import torch
 
 import cvtgs
 from cvtgs.devices import (
+    HOST,
     chosen_device,
     chunk_length,
     core_count,
     device_name,
     in_threads,
+    move_together,
     one_thread,
     resolve_device,
     thread_count,
@@ -23,11 +25,35 @@ from cvtgs.devices import (
     within_memory,
 )
 from cvtgs.errors import DeviceError, OutOfMemoryError
+from pretended_device import pretended_cuda
 from scenes import same_bits
 
 
 def test_a_named_device_is_used_as_given():
     assert chosen_device("cpu", "meta") == usable_device("cpu") == torch.device("cpu")
+
+
+def test_tensors_of_any_dtype_and_shape_move_in_one_copy():
+    tensors = [
+        torch.arange(12, dtype=torch.float64).view(3, 4).T,
+        torch.tensor([True, False, True]),
+        torch.tensor(7),
+        torch.empty(0, 3),
+        torch.linspace(0, 1, 33, dtype=torch.float32),
+    ]
+    with pretended_cuda() as traffic:
+        there = move_together(tensors, torch.device("cuda"))
+        assert traffic.copies.total() == 1
+        back = move_together(there, HOST)
+        assert traffic.copies.total() == 2
+    for before, after in zip(tensors, back, strict=True):
+        assert before.dtype == after.dtype
+        assert torch.equal(before, after)
+
+
+def test_tensors_that_are_there_do_not_move():
+    tensors = [torch.ones(2), torch.zeros(3)]
+    assert all(a is b for a, b in zip(tensors, move_together(tensors, HOST), strict=True))
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,10 @@
-"""Devices: choice by name, chunk lengths, out-of-memory fallbacks, and CPU threads."""
+"""Devices: choice by name, copies, chunk lengths, out-of-memory fallbacks, and CPU threads."""
 
 import gc
 import os
 import platform
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import TypeVar
 
 import torch
+from torch import Tensor
+from torch.nn.functional import pad
 
 from cvtgs.errors import DeviceError, OutOfMemoryError, is_out_of_memory
 
@@ -20,6 +22,11 @@ LONGER_CHUNKS = 32
 
 CHUNK_BYTES = 1 << 28
 """Device memory to reserve per chunk of CPU length, which takes at most a quarter of it."""
+
+HOST = torch.device("cpu")
+
+ALIGNMENT = 128
+"""Bytes at which a tensor of a shared copy starts, enough for matrix products."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -62,6 +69,19 @@ def device_name(device: torch.device) -> str:
         lines = []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return models[0] if models else platform.processor() or platform.machine()
+
+
+def move_together(tensors: Sequence[Tensor], device: torch.device) -> list[Tensor]:
+    """Return tensors of one device and any dtypes on another device, moved in a single copy."""
+    if tensors[0].device == device:
+        return list(tensors)
+    parts = [tensor.reshape(-1).view(torch.uint8) for tensor in tensors]
+    padded = [pad(part, (0, -len(part) % ALIGNMENT)) for part in parts]
+    moved = torch.cat(padded).to(device).split([len(part) for part in padded])
+    return [
+        there[: len(part)].view(tensor.dtype).view(tensor.shape)
+        for there, part, tensor in zip(moved, parts, tensors, strict=True)
+    ]
 
 
 def chunk_length(length: int, device: torch.device) -> int:
@@ -138,7 +158,7 @@ def within_memory(
             f"{work} needs more memory than {device} has, even in short chunks; free some of it, "
             f"or compute with device='cpu' (--device cpu)."
         )
-    return compute(torch.device("cpu"), f"{device} ran out of memory; computed on the CPU")
+    return compute(HOST, f"{device} ran out of memory; computed on the CPU")
 
 
 def core_count() -> int:

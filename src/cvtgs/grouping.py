@@ -12,6 +12,7 @@ from torch import Tensor
 from cvtgs import cells, cvt
 from cvtgs.analysis import SceneAnalysis
 from cvtgs.config import AllocationConfig, SimplifyConfig
+from cvtgs.devices import HOST, move_together
 from cvtgs.math.frames import RobustFrame, morton_order
 from cvtgs.math.segments import label_sums
 from cvtgs.scene import GaussianScene
@@ -246,17 +247,19 @@ def allocate(
         The new cell of each member; no cell is empty.
     """
     groups = members if count == len(labels) else cells.group_moments(members, labels, count)
+    merged = torch.arange(count, device=labels.device)
     if count > target:
-        groups = groups.to(torch.device("cpu"))  # many small steps
+        groups = cells.Moments(*move_together(groups, HOST))  # many small steps
         if neighbors is None:
             neighbors = cvt.nearest_neighbors(groups.means.T, config.neighbors)
         merged = cells.merge_pairs(groups, neighbors, target, config)
-        labels = merged.to(labels.device).index_select(0, labels)
         groups = cells.group_moments(groups, merged, target)
     if not config.reassign or target == len(labels):
-        return labels
-    near = cvt.nearest_neighbors(groups.means.T, REASSIGN).to(labels.device)
-    return cells.reassign(members, labels, groups.to(labels.device), near, config)
+        return labels if count == target else merged.to(labels.device).index_select(0, labels)
+    near = cvt.nearest_neighbors(groups.means.T, REASSIGN)
+    merged, near, *moments = move_together([merged, near, *groups], labels.device)
+    labels = merged.index_select(0, labels)
+    return cells.reassign(members, labels, cells.Moments(*moments), near, config)
 
 
 def group_cells(

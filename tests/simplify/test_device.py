@@ -12,11 +12,11 @@ from pretended_device import CUDA, DeviceTensor, pretended_cuda
 from scenes import random_scene, same_bits
 
 PRESETS = ["draft", "fast", "standard", "paper"]
-WAITS, COPIES = 14, 9
+WAITS, COPIES = 14, 7
 """Largest numbers of host waits and of copies in one simplification.
 
-One copy is for the network, 2 are for the tessellation (points to the host, labels back), 4 for the
-allocation and 2 for the neighbours of merged Gaussians; a scene outside the device adds 6. Neither
+One copy is for the network, and 2 each, to the host and back, are for the tessellation, for the
+allocation and for the neighbours of merged Gaussians; a scene outside the device adds 6. Neither
 number grows with the scene, except where work is done in chunks, which are large on a device.
 """
 

@@ -65,14 +65,6 @@ class Moments(NamedTuple):
             self.colors.index_select(1, rows),
         )
 
-    def to(self, device: torch.device) -> "Moments":
-        """Return the moments on a device, moved in a single copy."""
-        if self.weights.device == device:
-            return self
-        table = torch.cat([torch.stack(self[:3]), *self[3:]]).to(device)
-        scalars, means, covariances, colors = table.split([3, 3, 6, 3])
-        return Moments(scalars[0], scalars[1], scalars[2], means, covariances, colors)
-
 
 def gaussian_moments(
     scene: GaussianScene,

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from cvtgs.config import TessellationConfig
 from cvtgs.cvt.nearest import SEARCH, NearestSite, nearest_scipy, search_once_per_position
+from cvtgs.devices import HOST, move_together
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.segments import label_argmin, label_sums, smallest_rows
 
@@ -87,7 +88,7 @@ def tessellate(
             backend=SEARCH,
         )
     nearest = choose_search(has_duplicates=has_duplicates)
-    points, weights = to_host(points, weights)  # where the tree is
+    points, weights = move_together([points, weights], HOST)  # where the tree is
     seeds = choose_seeds(weights, count, config=config, seed=seed)
     sample, sample_weights = sample_points(points, weights, config.samples_per_site * count)
     settled = lloyd(
@@ -110,16 +111,6 @@ def tessellate(
         refilled=refilled,
         backend=SEARCH,
     )
-
-
-def to_host(
-    points: Float[Tensor, "n d"], weights: Float[Tensor, "n"]
-) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n"]]:
-    """Return points and weights on the CPU; another device sends them in a single copy."""
-    if points.device.type == "cpu":
-        return points, weights
-    table = torch.cat([points.double(), weights.double()[:, None]], dim=1).cpu()
-    return table[:, :-1].to(points.dtype), table[:, -1].to(weights.dtype)
 
 
 def choose_search(*, has_duplicates: bool) -> NearestSite:

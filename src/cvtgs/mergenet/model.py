@@ -10,9 +10,9 @@ import pydantic
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.nn.functional import pad
 
 from cvtgs.cells.features import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES, Descriptors
+from cvtgs.devices import move_together
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
 
 LARGE_GROWTH = 0.6
@@ -145,12 +145,8 @@ class CellNetwork(nn.Module):
         if device.type == "cpu":
             return copied
         state = copied.state_dict()
-        # Each tensor starts at a multiple of 16 elements, the alignment for matrix products.
-        padded = [pad(values.flatten(), (0, -values.numel() % 16)) for values in state.values()]
-        parts = torch.cat(padded).to(device).split([len(values) for values in padded])
-        for (name, values), part in zip(state.items(), parts, strict=True):
-            state[name] = part[: values.numel()].view(values.shape)
-        copied.load_state_dict(state, assign=True)
+        moved = move_together(list(state.values()), device)
+        copied.load_state_dict(dict(zip(state, moved, strict=True)), assign=True)
         return copied
 
 

@@ -9,14 +9,12 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import torch
-
 from cvtgs.analysis import select_columns
 from cvtgs.boxes import Box
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, shortfall, target_count
-from cvtgs.devices import one_thread
+from cvtgs.devices import HOST, one_thread
 from cvtgs.errors import ConfigError, DroppedDataWarning, InvalidArgumentError
 from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output, check_save, load, save
@@ -149,7 +147,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     )
     key = job.key(simplifier.checkpoint)
     job = replace(job, folder=job_folder(output, key))
-    clock = StageClock(listener, torch.device("cpu"))
+    clock = StageClock(listener, HOST)
     with output_lock(output):
         resumes = job.can_resume(key)
         begin(job, workers, clock, simplifier.checkpoint, resumes=resumes)

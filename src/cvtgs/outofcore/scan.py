@@ -18,7 +18,7 @@ from cvtgs import analysis, cvt, filters, validity
 from cvtgs.analysis import EffectPlan
 from cvtgs.boxes import Box, inside
 from cvtgs.config import SimplifyConfig
-from cvtgs.devices import one_thread
+from cvtgs.devices import HOST, one_thread
 from cvtgs.io.ply import PlyRows
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.math.frames import RobustFrame
@@ -221,7 +221,7 @@ def scan_range(
     source: PlyRows, frame: RobustFrame, boxes: tuple[Box, ...], rows: RowRange
 ) -> RangeTotals:
     """Sum optical depths, masses and counts over a range of the source."""
-    depths = analysis.empty_depth_grid(torch.device("cpu"))
+    depths = analysis.empty_depth_grid(HOST)
     all_masses, falloff_masses, valid_count, kept_count = list[float](), list[float](), 0, 0
     far_masses, found = [torch.zeros(0, dtype=torch.float64)], Counter[str]()
     for start in range(rows.start, rows.stop, CHUNK):

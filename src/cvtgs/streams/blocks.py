@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
 from jaxtyping import Int
 from torch import Tensor
 
@@ -19,7 +18,7 @@ from cvtgs.analysis import SceneAnalysis, select_columns
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, target_count
-from cvtgs.devices import one_thread
+from cvtgs.devices import HOST, one_thread
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
 from cvtgs.io import atomic_output, change_axes
 from cvtgs.io.atomic import make_folder
@@ -236,15 +235,12 @@ def stream_file(  # noqa: PLR0913 (options by name)
     spec = replace(spec, job=replace(job, folder=job_folder(folder, key)))
     check_stream(folder, kind, overwrite=overwrite)
     with output_lock(Path(spec.job.folder).parent):  # commands lock the output folder
-        parts, resumed = _run(spec, targets, simplifier, workers, StageClock(listener, _CPU))
+        parts, resumed = _run(spec, targets, simplifier, workers, StageClock(listener, HOST))
         write_index(form, parts, spec.folder)
         publish(spec.folder, Path(folder), kind, overwrite=overwrite)
         shutil.rmtree(Path(spec.job.folder).parent, ignore_errors=True)
     chunks = sum(part.chunks for part in parts)
     return StreamReport(join_levels(parts), chunks, len(parts), resumed)
-
-
-_CPU = torch.device("cpu")
 
 
 def _run(
