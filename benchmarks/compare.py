@@ -237,6 +237,7 @@ def report(table: Table, options: argparse.Namespace) -> str:
     if options.cameras is not None:
         judge = "cvtgs' own renderer, the cameras of --cameras"
         judge += " against photographs" if options.images is not None else ""
+    judge += f", over {options.background}"
     if options.scorer:
         judge = "the command of --scorer"
     clock = "wall-clock" if options.clock == "wall" else "user CPU"

@@ -47,6 +47,7 @@ VIEWS = 8
 SIZE = 400
 """Number of automatic views, and their width and height in pixels, for the own renderer."""
 
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "gray": (0.5, 0.5, 0.5), "white": (1.0, 1.0, 1.0)}
 RATIOS = (0.1, 0.01, 0.001)
 MEAN = "mean"
 SCORES = ("psnr", "ssim", "lpips", "alpha_error", "alpha_bias")
@@ -113,7 +114,7 @@ def scoring_parser(description: str | None) -> argparse.ArgumentParser:
         "--images", type=Path, metavar="DIR", help="photographs of --cameras, to score against"
     )
     parser.add_argument(
-        "--white", action="store_true", help="white background for scenes and --images"
+        "--background", choices=BACKGROUNDS, default="black", help="of scenes and of --images"
     )
     return parser
 
@@ -161,24 +162,27 @@ def make_scorer(options: argparse.Namespace, file: Path | None) -> Scorer:
     if options.scorer:
         return command_scorer(options.scorer)
     weights = None if options.lpips is None else any_lpips(options.lpips)
+    background = BACKGROUNDS[options.background]
     if options.cameras is not None:
-        return given_scorer(options, weights)
+        return given_scorer(options, weights, background)
     if options.images is not None:
         raise SystemExit("--images needs the cameras of the photographs: --cameras.")
     beside = file is not None and cameras_file(file).is_file()
-    return own_scorer(weights, cameras_beside(file) if file and beside else None)
+    cameras = cameras_beside(file) if file and beside else None
+    return own_scorer(weights, cameras, background=background)
 
 
-def given_scorer(options: argparse.Namespace, weights: LpipsWeights | None) -> Scorer:
+def given_scorer(
+    options: argparse.Namespace, weights: LpipsWeights | None, background: scorers.Color
+) -> Scorer:
     """Return a scorer from given cameras, against the full scene or against photographs."""
     if len(options.files) != 1:
         raise SystemExit(f"--cameras needs exactly one scene, found {len(options.files)} scenes.")
     try:
         cameras = cvtgs.load_cameras(options.cameras, split=options.split)
         if options.images is None:
-            return own_scorer(weights, cameras)
+            return own_scorer(weights, cameras, background=background)
         cameras = fit_cameras(cameras, options.images)
-        background = (1.0, 1.0, 1.0) if options.white else (0.0, 0.0, 0.0)
         photographs = load_photographs(options.images, cameras, background=background)
     except cvtgs.CvtgsError as error:
         raise SystemExit(str(error)) from None
@@ -222,12 +226,15 @@ def any_lpips(path: Path) -> LpipsWeights:
         return load_lpips("alex", path)
 
 
-def own_scorer(weights: LpipsWeights | None, cameras: Cameras | None = None) -> Scorer:
+def own_scorer(
+    weights: LpipsWeights | None, cameras: Cameras | None, *, background: scorers.Color
+) -> Scorer:
     """Return a scorer with cvtgs' own renderer, from cameras or else from automatic views."""
+    metrics = scorers.Metrics(lpips=weights)
 
     def score(full: cvtgs.GaussianScene, small: Sequence[cvtgs.GaussianScene]) -> list[Quality]:
         views = cameras or automatic_views(full, VIEWS, width=SIZE, height=SIZE)
-        scorer = scorers.Scorer(full, views.singles(), metrics=scorers.Metrics(lpips=weights))
+        scorer = scorers.Scorer(full, views.singles(), metrics=metrics, backgrounds=(background,))
         found = [scorers.scene_scores("", len(scene), scorer.score(scene)) for scene in small]
         return [Quality.of(scores) for scores in found]
 

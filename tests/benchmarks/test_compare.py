@@ -11,6 +11,7 @@ import cvtgs
 import lpips_cases
 from benchmarks import compare, compare_tables, quality
 from benchmarks.baselines import BASELINES, baseline
+from cvtgs.evaluation import EvaluationSettings
 from cvtgs.evaluation.images import as_bytes, encode
 from cvtgs.views import automatic_views
 
@@ -80,15 +81,24 @@ def test_methods_and_a_tool_are_run_judged_and_reported(file, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_table_has_the_scores_of_the_baseline(file, capsys):
-    compare.main([str(file), "--rho", "0.1", "--methods", "mass pruning"])
-    full = cvtgs.load(file)
-    (found,) = quality.own_scorer(None)(full, [baseline("mass pruning")(full, 100)])
-    assert rows_of(capsys.readouterr().out)[2][1:4] == [
-        f"{found.psnr:.2f}",
-        f"{found.ssim:.4f}",
-        f"{found.alpha_error:.4f}",
+@pytest.mark.parametrize("background", ["black", "white"])
+def test_the_table_has_the_scores_of_the_baseline(file, capsys, background):
+    arguments = [str(file), "--rho", "0.1", "--methods", "mass pruning"]
+    compare.main([*arguments, "--background", background])
+    full, settings = (
+        cvtgs.load(file),
+        EvaluationSettings(background=quality.BACKGROUNDS[background], lpips="off"),
+    )
+    small = {"pruned": baseline("mass pruning")(full, 100)}
+    views = automatic_views(full, 2, width=48, height=48)
+    (found,) = cvtgs.evaluate(full, small, views, settings=settings).scenes
+    text = capsys.readouterr().out
+    assert rows_of(text)[2][1:4] == [
+        f"{found.psnr.mean:.2f}",
+        f"{found.ssim.mean:.4f}",
+        f"{found.alpha_error.mean:.4f}",
     ]
+    assert f"pixels where none are beside a scene, over {background}. " in text
 
 
 @pytest.mark.slow
