@@ -91,6 +91,7 @@ def row(preset: str, part: str) -> str:
 def report(table: Table, options: argparse.Namespace) -> str:
     """Return the report: the settings of the measurement, then the results."""
     images = f"cvtgs' own renderer, {VIEWS} automatic views of {SIZE} x {SIZE} pixels"
+    images += f", over {options.background}"
     scenes = "FILES" if options.files else f"--count {options.count}"
     nets = ", ".join(
         [f"{name} {described(name)}" for name in PRESETS]

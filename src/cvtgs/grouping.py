@@ -236,8 +236,7 @@ def allocate(
 
     Args:
         members: Moments of the members.
-        labels: Cell of each member; no cell is empty. If there are as many cells as members, cell
-            ``i`` is member ``i``.
+        labels: Cell of each member, none empty; ``i`` of member ``i`` if there is one for each.
         count: Number of cells.
         target: Target number of cells.
         config: Weights of the costs.
@@ -247,13 +246,14 @@ def allocate(
         The new cell of each member; no cell is empty.
     """
     groups = members if count == len(labels) else cells.group_moments(members, labels, count)
-    merged = torch.arange(count, device=labels.device)
     if count > target:
         groups = cells.Moments(*move_together(groups, HOST))  # many small steps
         if neighbors is None:
             neighbors = cvt.nearest_neighbors(groups.means.T, config.neighbors)
         merged = cells.merge_pairs(groups, neighbors, target, config)
         groups = cells.group_moments(groups, merged, target)
+    else:
+        merged = torch.arange(count, device=labels.device)
     if not config.reassign or target == len(labels):
         return labels if count == target else merged.to(labels.device).index_select(0, labels)
     near = cvt.nearest_neighbors(groups.means.T, REASSIGN)
