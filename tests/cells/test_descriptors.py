@@ -10,7 +10,7 @@ import mergenet_oracle as oracle
 import oracles
 from cvtgs import GaussianScene
 from cvtgs.cells import describe_cells
-from cvtgs.cells.features import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES
+from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES
 from mergenet_cases import (
     Case,
     assert_same_features,
@@ -228,3 +228,22 @@ def test_inverted_visibility_matters_and_mirroring_does_not():
 
     other = Case(mirrored(case.scene), mirrored(case.merged), *case[2:])
     assert_same_features(case.describe(), other.describe())
+
+
+def test_descriptors_of_some_cells():
+    """Selected or cut out, they are the same bits as in the whole."""
+    case = some_case()
+    seen, counts = case.describe(), case.part.counts
+    for chosen, found in (
+        (torch.tensor([1, 3, 4]), seen.select(torch.tensor([1, 3, 4]))),
+        (torch.arange(2, 5), seen.cut(slice(2, 5))),
+        (torch.arange(0), seen.select(torch.arange(0))),
+    ):
+        is_chosen = torch.zeros(len(counts), dtype=torch.bool)
+        is_chosen[chosen] = True
+        members = is_chosen.repeat_interleave(counts)
+        assert found.offsets.tolist() == [0, *counts[chosen].cumsum(0).tolist()]
+        for name in ("members", "weights", "positions"):
+            assert getattr(found, name).equal(getattr(seen, name)[members])
+        for name in ("pairs", "cells", "pair_positions"):
+            assert getattr(found, name).equal(getattr(seen, name)[chosen])

@@ -10,7 +10,7 @@ import torch
 
 import mergenet_oracle as oracle
 from cvtgs import GaussianScene
-from cvtgs.cells.features import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES
+from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES
 from cvtgs.mergenet import Architecture, KnownRange, MergeNet, Residuals, summarize
 from cvtgs.mergenet.model import MARGIN, MEMBERS, NARROWEST, SUMMARY_FEATURES
 from mergenet_cases import case_of, fields_of, lively_net, some_case, some_labels

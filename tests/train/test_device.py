@@ -12,7 +12,7 @@ from cvtgs.train.cases import Case, DeviceCopies, make_case
 from pretended_device import DeviceTensor, pretended_cuda
 from train_cases import bits_of_state, run, small_scene, tiny_config, tiny_data, write_scenes
 
-SCENE_COPIES = 8
+SCENE_COPIES = 14
 
 
 @pytest.fixture
@@ -58,7 +58,10 @@ def stop_after_three(event: ProgressEvent) -> None:
     ("kind", "copies"), [("scene", SCENE_COPIES), ("local", 10), ("published", 11)]
 )
 def test_copies_to_the_device_in_a_step(kind, copies, tmp_path):
-    """An image takes 2 copies, its loss and background 2; places of cells 3, their numbers 1."""
+    """An image takes 2 copies, and 6 to find the cells in it; its loss and background 2.
+
+    Places of cells take 3, their numbers 1.
+    """
     scenes = write_scenes(tmp_path / "scenes", ["exam", "lesson"], 300)
     changes = {"preset": "paper"} if kind == "published" else {}
     config = tiny_config(tiny_data(scenes), kind=kind, steps=6, validate_every=6, **changes)

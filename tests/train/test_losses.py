@@ -2,6 +2,7 @@
 
 import math
 import random
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -11,7 +12,9 @@ from cvtgs.evaluation import psnr
 from cvtgs.losses import image_loss
 from cvtgs.rendering import render
 from cvtgs.train import LossConfig
+from cvtgs.train.cases import TargetViews
 from cvtgs.train.losses import local_loss, scene_loss, validation_psnr, view_loss
+from cvtgs.views import mixed_views
 from mergenet_cases import lively_net
 from train_cases import small_net, small_scene, some_case, some_views, tiny_config, tiny_data
 
@@ -24,6 +27,15 @@ def images() -> tuple[torch.Tensor, torch.Tensor]:
     g = torch.Generator().manual_seed(0)
     target = torch.rand(1, 16, 20, 3, generator=g)
     return target + 0.1 * torch.randn(1, 16, 20, 3, generator=g), target
+
+
+def views_by(change: Callable[[torch.Tensor, torch.Tensor], object]) -> TargetViews:
+    """Views of 4,000 Gaussians by cameras changed in place."""
+    scene = small_scene(4000)
+    cameras = mixed_views(scene, 2, size=32, seed=0)
+    change(cameras.viewmats, cameras.Ks)
+    images = render(scene, cameras)
+    return TargetViews(cameras=cameras, rgb=images.rgb.half(), alpha=images.alpha.half())
 
 
 def test_a_known_loss():
@@ -116,6 +128,37 @@ def test_chunks_of_the_network_change_neither_loss_nor_gradient(length, monkeypa
     in_chunks, others = loss_and_gradients()
     assert in_chunks == pytest.approx(loss, rel=1e-5)
     torch.testing.assert_close(others, gradients, rtol=1e-3, atol=1e-5)
+
+
+def test_only_cells_that_are_seen_are_corrected(monkeypatch):
+    """The loss and its gradient are those of a correction of all cells."""
+    case, config, rows = some_case(4000, ratio=0.1), config_of(), []
+    views = views_by(lambda viewmats, intrinsics: intrinsics[:, :2, :2].mul_(4.0))
+
+    def loss_and_gradients() -> tuple[float, list[torch.Tensor]]:
+        net = lively_net(torch.float32)
+        net.register_forward_hook(lambda net, args, result: rows.append(len(args[0])))
+        loss = scene_loss(net, case, views, config=config, rng=random.Random(0))
+        loss.backward()
+        return loss.item(), [values.grad for values in net.parameters()]
+
+    loss, gradients = loss_and_gradients()
+    monkeypatch.setattr("cvtgs.train.losses.LEAST_PAINTED", -1.0)
+    of_all, others = loss_and_gradients()
+    assert rows[0] < 0.8 * rows[1] == 0.8 * len(case.cells)
+    assert loss == pytest.approx(of_all, abs=1e-3)
+    ours, theirs = (torch.cat([part.flatten() for part in parts]) for parts in (gradients, others))
+    assert torch.cosine_similarity(ours, theirs, dim=0).item() > 0.999
+
+
+def test_views_that_show_nothing_can_be_compared():
+    net = lively_net(torch.float32)
+    views = views_by(lambda viewmats, intrinsics: viewmats[:, 2, 3].fill_(-100.0))
+    assert not views.alpha.any()
+    loss = scene_loss(net, some_case(4000), views, config=config_of(), rng=random.Random(0))
+    loss.backward()
+    assert math.isfinite(loss.item())
+    assert all(bool((values.grad == 0).all()) for values in net.parameters())
 
 
 @pytest.mark.parametrize("kind", ["scene", "local"])

@@ -7,7 +7,8 @@ from cvtgs.cells.allocate import (
     merge_pairs,
     reassign,
 )
-from cvtgs.cells.features import Descriptors, describe_cells
+from cvtgs.cells.descriptors import Descriptors
+from cvtgs.cells.features import describe_cells
 from cvtgs.cells.inflate import align_axes, inflate_cells, side_cover
 from cvtgs.cells.merge import (
     Members,

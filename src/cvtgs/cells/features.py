@@ -1,31 +1,22 @@
-"""Descriptors: the input of MergeNet, relative to a cell's position, rotation, size and colour.
+"""Compute descriptors, relative to a cell's position, rotation, size and colour.
 
 The values of one feature are contiguous in memory: sums of products over three components are then
 limited by memory bandwidth only, and many times as fast as products of small matrices.
 """
 
-from dataclasses import dataclass, fields
 from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from cvtgs.cells.descriptors import Descriptors
 from cvtgs.cells.inflate import project_on_axes, side_cover
 from cvtgs.cells.partition import Partition
 from cvtgs.math import parameters
 from cvtgs.math.segments import gather_columns, segment_ids, segment_max, segment_sum
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
-
-MEMBER_FEATURES = 19
-"""Number of features of a member relative to its cell."""
-
-PAIR_FEATURES = 18
-"""Number of features of a neighbour relative to a cell."""
-
-CELL_FEATURES = 19
-"""Number of features of a cell itself."""
 
 LARGEST_DISTANCE = 50.0
 """Distances in features are clamped to this, in standard deviations."""
@@ -35,54 +26,6 @@ LARGEST_POSITION, LARGEST_LOG = 1e4, 80.0
 
 LARGEST_CONTRAST = 1.0
 """Contrast of black and white: larger values are rare in training, and make networks grow cells."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Descriptors:
-    """The input of a network for some cells, in the dtype of the scene.
-
-    Every feature is relative to the merged Gaussian of the cell: in its frame, in units of its
-    standard deviations, and independent of the sign of each axis.
-
-    Attributes:
-        members: ``(n, 19)`` features of the members; those of one cell are contiguous.
-        pairs: ``(m, k, 18)`` features of the neighbours of every cell.
-        cells: ``(m, 19)`` features of the cells.
-        weights: ``(n,)`` shares of the mass of the cell; those of one cell sum to 1.
-        offsets: ``(m + 1,)`` start of each cell, and the end of the last one.
-        positions: ``(n, 3)`` positions of the members relative to the centre of the cell, in its
-            frame and its standard deviations.
-        pair_positions: ``(m, k, 3)`` the same for the neighbours.
-    """
-
-    members: Float[Tensor, "n d"]
-    pairs: Float[Tensor, "m k e"]
-    cells: Float[Tensor, "m c"]
-    weights: Float[Tensor, "n"]
-    offsets: Int[Tensor, "m_plus_1"]
-    positions: Float[Tensor, "n 3"]
-    pair_positions: Float[Tensor, "m k 3"]
-
-    def __len__(self) -> int:
-        """Return the number of cells."""
-        return len(self.cells)
-
-    def to(self, target: torch.device | torch.dtype) -> Self:
-        """Return the descriptors on a device or in another precision.
-
-        Args:
-            target: A device, or a dtype for all but ``offsets``.
-
-        Returns:
-            The moved or converted descriptors.
-        """
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        moves = {
-            name: value.to(target)
-            for name, value in values.items()
-            if isinstance(target, torch.device) or value.is_floating_point()
-        }
-        return type(self)(**(values | moves))
 
 
 class ActivatedGaussians(NamedTuple):

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from cvtgs.cells.features import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES, Descriptors
+from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES, Descriptors
 from cvtgs.devices import move_together
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
 

@@ -102,8 +102,14 @@ class Case:
 
     def select(self, rows: Int[Tensor, "s"]) -> "Case":
         """Return the case restricted to some of its cells."""
-        part, cells = self.part.select(rows), self.cells[rows]
-        return describe_case(self.scene_name, self.ratio, self.reference, cells, part)
+        return Case(
+            scene_name=self.scene_name,
+            ratio=self.ratio,
+            reference=self.reference,
+            cells=self.cells[rows],
+            part=self.part.select(rows),
+            descriptors=self.descriptors.select(rows),
+        )
 
     def correct_cells(self, residuals: Residuals) -> dict[str, Tensor]:
         """Return the tensors of the corrected cells, differentiably."""

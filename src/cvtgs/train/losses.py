@@ -2,20 +2,22 @@
 
 import math
 import random
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.cells import Descriptors, Partition
+from cvtgs.cells import Partition
 from cvtgs.devices import chunk_length
 from cvtgs.evaluation import psnr
 from cvtgs.losses import image_loss, relative_loss
 from cvtgs.math import parameters, spherical_harmonics
-from cvtgs.math.segments import segment_ids
+from cvtgs.math.segments import segment_ids, true_rows
 from cvtgs.mergenet import (
     MergeNet,
     PublishedMergeNet,
@@ -23,10 +25,13 @@ from cvtgs.mergenet import (
     compose_published,
     describe_published,
 )
-from cvtgs.rendering import render
+from cvtgs.rendering import contributions, render
 from cvtgs.scene import GaussianScene
 from cvtgs.train.cases import Case, MergedScene, TargetViews
 from cvtgs.train.config import LossConfig, TrainConfig
+
+LEAST_PAINTED = 0.02
+"""Contribution from which a step corrects a cell, pixels."""
 
 CHUNK_MEMBERS = 1 << 16
 """Members and neighbours per chunk of the network in a step."""
@@ -49,51 +54,60 @@ def scene_loss(
 ) -> Float[Tensor, ""]:
     """Compare random crops of images of the corrected scene, over black or a random background.
 
-    Whole images are rendered, because a camera of the crop alone would project Gaussians beside it
+    Only cells that can be seen in these images are corrected, which saves most of the time. Whole
+    images are rendered, because a camera of the crop alone would project Gaussians beside it
     differently.
     """
+    shots = [_Shot.draw(views, config.views.crop, case, rng) for _ in range(config.views.per_step)]
+    case = case.select(_seen_cells(case, [shot.view.cameras for shot in shots]))
     residuals = _predict(net, case)
     corrected = case.correct_scene(residuals)
     losses = []
-    for _ in range(config.views.per_step):
+    for shot in shots:
+        image = render(corrected, shot.view.cameras, background=shot.background).rgb
+        target = shot.view.over(shot.background)
+        losses.append(view_loss(shot.crop(image), shot.crop(target), config.loss))
+    return torch.stack(losses).mean() + _residual_penalty(residuals, config.loss)
+
+
+class _Shot(NamedTuple):
+    """One image of a step: a view, a background, and the crop that is compared."""
+
+    view: TargetViews
+    background: Float[Tensor, "3"]
+    rows: slice
+    columns: slice
+
+    @classmethod
+    def draw(cls, views: TargetViews, side: int, case: Case, rng: random.Random) -> "_Shot":
         background = _background(rng, case)
         view = views.select(rng.randrange(len(views.cameras)))
-        last = max(0, view.cameras.width - config.views.crop)
+        last = max(0, view.cameras.width - side)
         top, left = rng.randint(0, last), rng.randint(0, last)
-        y, x = (slice(start, start + config.views.crop) for start in (top, left))
-        image = render(corrected, view.cameras, background=background).rgb
-        target = view.over(background)
-        losses.append(view_loss(image[:, y, x], target[:, y, x], config.loss))
-    return torch.stack(losses).mean() + _residual_penalty(residuals, config.loss)
+        return cls(view, background, slice(top, top + side), slice(left, left + side))
+
+    def crop(self, images: Float[Tensor, "1 h w 3"]) -> Float[Tensor, "1 y x 3"]:
+        return images[:, self.rows, self.columns]
+
+
+def _seen_cells(case: Case, cameras: Sequence[Cameras]) -> Int[Tensor, "s"]:
+    """Return the cells that paint something in any of some views; all if none does."""
+    merged = case.reference.merged
+    painted = torch.stack([contributions(merged, camera) for camera in cameras]).amax(dim=0)
+    is_seen = painted[case.cells] > LEAST_PAINTED
+    return true_rows(is_seen if bool(is_seen.any()) else torch.ones_like(is_seen))
 
 
 def _predict(net: MergeNet, case: Case) -> Residuals:
     """Predict all residuals in chunks, whose tensors fit the caches of a CPU."""
     near = case.descriptors.pairs.shape[1]
     length = chunk_length(CHUNK_MEMBERS, case.cells.device)
-    parts = [
-        net(_cut(case.descriptors, run)) for run, _ in case.part.chunks(length, cell_cost=near)
-    ]
+    parts = [net(case.descriptors.cut(run)) for run, _ in case.part.chunks(length, cell_cost=near)]
     return Residuals(
         **{
             field.name: torch.cat([getattr(part, field.name) for part in parts])
             for field in fields(Residuals)
         }
-    )
-
-
-def _cut(described: Descriptors, run: slice) -> Descriptors:
-    """Keep some consecutive cells; all tensors but ``offsets`` are views."""
-    ends = described.offsets[run.start : run.stop + 1]
-    members = slice(int(ends[0]), int(ends[-1]))
-    return Descriptors(
-        members=described.members[members],
-        pairs=described.pairs[run],
-        cells=described.cells[run],
-        weights=described.weights[members],
-        offsets=ends - ends[0],
-        positions=described.positions[members],
-        pair_positions=described.pair_positions[run],
     )
 
 

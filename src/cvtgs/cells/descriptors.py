@@ -1,0 +1,109 @@
+"""Descriptors: the input of MergeNet."""
+
+from dataclasses import dataclass, fields
+from typing import Self
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cvtgs.cells.partition import Partition
+
+MEMBER_FEATURES = 19
+"""Number of features of a member relative to its cell."""
+
+PAIR_FEATURES = 18
+"""Number of features of a neighbour relative to a cell."""
+
+CELL_FEATURES = 19
+"""Number of features of a cell itself."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Descriptors:
+    """The input of a network for some cells, in the dtype of the scene.
+
+    Every feature is relative to the merged Gaussian of the cell: in its frame, in units of its
+    standard deviations, and independent of the sign of each axis.
+
+    Attributes:
+        members: ``(n, 19)`` features of the members; those of one cell are contiguous.
+        pairs: ``(m, k, 18)`` features of the neighbours of every cell.
+        cells: ``(m, 19)`` features of the cells.
+        weights: ``(n,)`` shares of the mass of the cell; those of one cell sum to 1.
+        offsets: ``(m + 1,)`` start of each cell, and the end of the last one.
+        positions: ``(n, 3)`` positions of the members relative to the centre of the cell, in its
+            frame and its standard deviations.
+        pair_positions: ``(m, k, 3)`` the same for the neighbours.
+    """
+
+    members: Float[Tensor, "n d"]
+    pairs: Float[Tensor, "m k e"]
+    cells: Float[Tensor, "m c"]
+    weights: Float[Tensor, "n"]
+    offsets: Int[Tensor, "m_plus_1"]
+    positions: Float[Tensor, "n 3"]
+    pair_positions: Float[Tensor, "m k 3"]
+
+    def __len__(self) -> int:
+        """Return the number of cells."""
+        return len(self.cells)
+
+    def select(self, cells: Int[Tensor, "s"]) -> Self:
+        """Return the descriptors of some cells.
+
+        Args:
+            cells: The cells to keep, ascending.
+
+        Returns:
+            Their descriptors, in the same order.
+        """
+        numbers = torch.arange(len(self.members), device=self.offsets.device)
+        part = Partition(order=numbers, offsets=self.offsets).select(cells)
+        return type(self)(
+            members=self.members.index_select(0, part.order),
+            pairs=self.pairs.index_select(0, cells),
+            cells=self.cells.index_select(0, cells),
+            weights=self.weights[part.order],
+            offsets=part.offsets,
+            positions=self.positions.index_select(0, part.order),
+            pair_positions=self.pair_positions.index_select(0, cells),
+        )
+
+    def cut(self, run: slice) -> Self:
+        """Return the descriptors of some consecutive cells; all but ``offsets`` are views.
+
+        Args:
+            run: The cells to keep, with a start and a stop.
+
+        Returns:
+            Their descriptors.
+        """
+        ends = self.offsets[run.start : run.stop + 1]
+        members = slice(int(ends[0]), int(ends[-1]))
+        return type(self)(
+            members=self.members[members],
+            pairs=self.pairs[run],
+            cells=self.cells[run],
+            weights=self.weights[members],
+            offsets=ends - ends[0],
+            positions=self.positions[members],
+            pair_positions=self.pair_positions[run],
+        )
+
+    def to(self, target: torch.device | torch.dtype) -> Self:
+        """Return the descriptors on a device or in another precision.
+
+        Args:
+            target: A device, or a dtype for all but ``offsets``.
+
+        Returns:
+            The moved or converted descriptors.
+        """
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        moves = {
+            name: value.to(target)
+            for name, value in values.items()
+            if isinstance(target, torch.device) or value.is_floating_point()
+        }
+        return type(self)(**(values | moves))
