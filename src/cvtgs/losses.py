@@ -13,6 +13,9 @@ __all__ = ["gradient_loss", "image_loss", "l1_loss", "relative_loss", "ssim_loss
 SSIM_WINDOW = 11
 """Side of the Gaussian window in pixels; its standard deviation is 1.5 pixels."""
 
+SSIM_WEIGHT = GRADIENT_WEIGHT = 0.2
+"""Weights in the loss of CVT-GS."""
+
 SQUARED_FLOOR = 1e-5
 IMAGE_FLOOR = 1e-3
 """Floors added to errors before the logarithm, so that near-perfect images count less."""
@@ -131,8 +134,8 @@ def image_loss(
     prediction: Float[Tensor, "c h w 3"],
     target: Float[Tensor, "c h w 3"],
     *,
-    ssim_weight: float = 0.2,
-    gradient_weight: float = 0.2,
+    ssim_weight: float = SSIM_WEIGHT,
+    gradient_weight: float = GRADIENT_WEIGHT,
 ) -> Float[Tensor, ""]:
     """Return ``(1 - l) L1 + l (1 - SSIM) + l_g (|dx| + |dy|)``, the loss of CVT-GS.
 
@@ -164,12 +167,8 @@ def image_loss(
         raise InvalidArgumentError(
             f"gradient_weight must be a finite number of at least 0, found {gradient_weight!r}."
         )
-    loss = (1 - ssim_weight) * l1_loss(prediction, target)
-    if ssim_weight:
-        loss = loss + ssim_weight * ssim_loss(prediction, target)
-    if gradient_weight:
-        loss = loss + gradient_weight * gradient_loss(prediction, target)
-    return loss
+    dissimilarity = ssim_loss(prediction, target) if ssim_weight else 0.0
+    return _image_loss(prediction, target, dissimilarity, ssim_weight, gradient_weight)
 
 
 def relative_loss(
@@ -209,10 +208,27 @@ def relative_loss(
     if squared_weight:
         squared = (prediction - target).square().mean()
         loss = loss + squared_weight * positive_log(squared + SQUARED_FLOOR)
+    if not image_weight and not ssim_weight:
+        return loss
+    dissimilarity = ssim_loss(prediction, target)  # once: it takes longest
     if image_weight:
-        loss = loss + image_weight * positive_log(image_loss(prediction, target) + IMAGE_FLOOR)
+        image = _image_loss(prediction, target, dissimilarity, SSIM_WEIGHT, GRADIENT_WEIGHT)
+        loss = loss + image_weight * positive_log(image + IMAGE_FLOOR)
     if ssim_weight:
-        loss = loss + ssim_weight * positive_log(ssim_loss(prediction, target) + IMAGE_FLOOR)
+        loss = loss + ssim_weight * positive_log(dissimilarity + IMAGE_FLOOR)
+    return loss
+
+
+def _image_loss(
+    prediction: Tensor,
+    target: Tensor,
+    dissimilarity: Tensor | float,
+    ssim_weight: float,
+    gradient_weight: float,
+) -> Float[Tensor, ""]:
+    loss = (1 - ssim_weight) * l1_loss(prediction, target) + ssim_weight * dissimilarity
+    if gradient_weight:
+        loss = loss + gradient_weight * gradient_loss(prediction, target)
     return loss
 
 
