@@ -1,6 +1,7 @@
 """Digests of the results of every way of simplifying: refactoring must not change a bit.
 
-``python tests/digests.py`` compares with ``digests.json``; with ``--record`` it writes that file.
+``python tests/digests.py`` compares with ``digests.json``; with ``--record`` it writes that file,
+and with ``--print`` and names it prints digests and figures of these cases.
 """
 
 import hashlib
@@ -191,6 +192,9 @@ def main() -> None:
         for name in CASES:
             recorded["cases"][name] = measure(name)
         FILE.write_text(json.dumps(recorded, indent=1) + "\n", encoding="utf-8")
+        return
+    if "--print" in sys.argv:
+        print(json.dumps({name: measure(name) for name in sys.argv[2:]}))
         return
     recorded = json.loads(FILE.read_text(encoding="utf-8"))
     words = [word for word in sys.argv[1:] if not word.startswith("-")]

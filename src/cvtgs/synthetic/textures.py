@@ -1,7 +1,6 @@
 """Textures, which map texture coordinates to colours, and a source of random textures."""
 
 import colorsys
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -59,9 +58,9 @@ def bricks(brick: Texture, mortar: Texture, size: float) -> Texture:
         along = coords[:, 0] / (2.4 * size) + 0.5 * row.remainder(2)
         column = torch.floor(along)
         joint = ((along - column) < 0.04) | ((coords[:, 1] / size - row) < 0.1)
-        # A hash of the brick: pseudo-random numbers in [0, 1).
-        mixed = torch.stack([row, column], dim=1) @ torch.tensor([12.9898, 78.233])
-        hashed = (torch.sin(mixed.remainder(2 * math.pi)) * 4375.85).remainder(1.0)
+        # A hash of the brick, in integers, so that it is the same on every processor.
+        mixed = row.long() * 7919 + column.long() * 104_729 + 31_337
+        hashed = (mixed * mixed).remainder(65_521) / 65_521
         return torch.where(
             joint[:, None], mortar(coords), brick(coords) * (0.75 + 0.5 * hashed)[:, None]
         )
