@@ -27,7 +27,7 @@ COUNT, BLOCKS, TARGET = 4000, 5, 120
 
 @pytest.fixture(scope="module")
 def job(tmp_path_factory):
-    scene = cvtgs.synthetic.scene("courtyard", COUNT, sh_degree=1, seed=4)
+    scene = cvtgs.synthetic.scene("courtyard", COUNT, sh_degree=1, seed=8)
     return unfinished_job(scene, tmp_path_factory.mktemp("borders"), count=TARGET, blocks=BLOCKS)
 
 

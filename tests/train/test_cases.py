@@ -200,8 +200,9 @@ def test_random_views_look_at_the_middle_from_around():
     cameras = random_views(scene, 60, size=100, seed=0)
     steps = (cameras.centers - frame.center.float()) / float(frame.radius)
     distances = torch.linalg.vector_norm(steps, dim=1)
-    assert 1.1 <= float(distances.amin()) < 1.4
-    assert 2.6 < float(distances.amax()) <= 3.0 + 1e-4
+    shift = 0.05 * 3**0.5 + 1e-4  # positions are moved by up to this
+    assert 1.1 - shift <= float(distances.amin()) < 1.4
+    assert 2.6 < float(distances.amax()) <= 3.0 + shift
     assert float(steps.amin(dim=0).amax()) < -1
     around = sorted(steps.amax(dim=0).tolist())
     assert around[1] > 1  # the views do not look from under the ground

@@ -53,6 +53,7 @@ def trained(request, tmp_path_factory) -> Trained:
         steps=70,
         validate_every=35,
         learning_rate=0.01,
+        seed=3,
     )
     name = tmp_path_factory.mktemp("out") / "net.safetensors"
     history = run(config, name)
@@ -63,8 +64,8 @@ def trained(request, tmp_path_factory) -> Trained:
 def test_an_unseen_scene_gains(trained):
     start, *later = trained.history.validations
     assert start.gains == (Gain("exam", 0.06, 0.0),)
-    assert all(entry.mean_gain > 0.2 for entry in later)
-    assert trained.history.best().mean_gain > 0.4
+    assert all(entry.mean_gain > 0.5 for entry in later)
+    assert trained.history.best().mean_gain > 1.0
 
 
 @pytest.mark.slow
@@ -106,7 +107,7 @@ def test_the_checkpoint_is_described(trained):
     assert info.preset == "paper"
     assert info.training == f"{trained.config.kind} training"
     assert info.steps == trained.history.best().step > 0
-    assert (info.seed, info.version) == (0, cvtgs.__version__)
+    assert (info.seed, info.version) == (3, cvtgs.__version__)
     assert (info.architecture.width, info.architecture.cell_width) == (6, 10)
 
 
