@@ -13,6 +13,7 @@ import torch
 from matplotlib.axes import Axes
 
 import cvtgs
+from cvtgs.analysis import perspective_falloff
 from cvtgs.config import SimplifyConfig
 from cvtgs.math.frames import morton_order, robust_frame
 from docs.drawings.saving import figure, save_small
@@ -33,7 +34,7 @@ def main() -> None:
     order = morton_order(frame.contract(scene.means))
     # By position alone and uncontracted, so that straight borders are what the method sees.
     points = cvtgs.cvt.embed(scene.means[order], frame=frame)
-    seen = scene.areas[order] * cvtgs.cvt.falloff(scene.means[order], frame)
+    seen = scene.areas[order] * perspective_falloff(frame.distances(scene.means[order]))
     weights = cvtgs.cvt.tessellation_weights(
         scene.opacities[order], seen, area_power=1.0, floor=config.weight_floor
     )
