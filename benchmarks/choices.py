@@ -17,7 +17,6 @@ with maps of the colour and alpha errors.
 
 import argparse
 import json
-import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -254,5 +253,4 @@ def save(rows: Sequence[Row], path: Path | None) -> None:
 
 
 if __name__ == "__main__":
-    sys.stdout.reconfigure(line_buffering=True)
     main()

@@ -118,7 +118,7 @@ def means_table(table: Table, rho: float, clock: Clock) -> str:
     for method in methods_of(table):
         column = [rows_of.get(method, {}).get(rho) for rows_of in table.values()]
         cells = [
-            _cell([result and value(result) for result in column], form)
+            _cell([None if result is None else value(result) for result in column], form)
             for value, form in metrics.values()
         ]
         rows.append([method, *cells])

@@ -148,7 +148,7 @@ class Operations(TorchDispatchMode):
     """Counts operations; each is one kernel launch or a few."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.count = 0
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
@@ -205,9 +205,8 @@ def main() -> None:
     parser.add_argument("--axes", type=int, choices=(3, 6), default=6, help="6 with colours")
     parser.add_argument("--share", type=float, default=0.02, help="sites per point")
     options = parser.parse_args()
-    print(
-        "\n".join(table(torch.device(options.device), options.counts, options.axes, options.share))
-    )
+    device = torch.device(options.device)
+    print("\n".join(search_table(device, options.counts, axes=options.axes, share=options.share)))
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import resource
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,7 +49,7 @@ def without_bands(count: int) -> GaussianScene:
 
 
 def tagged(count: int) -> GaussianScene:
-    return GaussianScene(**make("thin", count, sh_degree=0).tensors(), comments=(ANTIALIASED_TAG,))
+    return replace(make("thin", count, sh_degree=0), comments=(ANTIALIASED_TAG,))
 
 
 def without_faint(count: int) -> GaussianScene:
@@ -65,8 +66,8 @@ def surfels(count: int) -> GaussianScene:
     quats = cvtgs.math.parameters.matrices_to_quats(_right_handed(scene.quats, order.indices))
     names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1"]
     names += [f"rot_{i}" for i in range(4)]
-    tensors = {**scene.tensors(), "log_scales": order.values, "quats": quats}
-    return GaussianScene(**tensors, layout=tuple((name, "float") for name in names))
+    layout = tuple((name, "float") for name in names)
+    return replace(scene, log_scales=order.values, quats=quats, layout=layout)
 
 
 def _right_handed(quats: torch.Tensor, order: torch.Tensor) -> torch.Tensor:
@@ -109,7 +110,8 @@ def main() -> None:
     parser.add_argument("--child", nargs=4, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
-        print(json.dumps(run_child(*options.child, options)))
+        name, path, choice, settings = options.child
+        print(json.dumps(run_child(name, path, choice, settings, options)))
         return
     text = "\n".join([effect_table(options), figure_table(options.count)])
     if options.output is None:

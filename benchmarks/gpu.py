@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -23,7 +23,7 @@ from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.devices import device_name
 from cvtgs.errors import CvtgsError
 from cvtgs.progress import ProgressEvent
-from cvtgs.rendering import choose_backend, render
+from cvtgs.rendering import BackendName, choose_backend, render
 from cvtgs.report import SimplifyReport
 from cvtgs.train import DataConfig, TrainConfig, TrainFiles, ViewsConfig, train
 from cvtgs.views import automatic_views
@@ -36,7 +36,8 @@ HIGH: dict[str, Any] = {"preset": "high"}
 CASE_COUNT = 20_000
 """Number of Gaussians of the scene to train on."""
 
-TRAININGS = ("scene", "local")
+RENDERERS: tuple[BackendName, ...] = ("torch", "gsplat", "numba")
+TRAININGS: tuple[Literal["scene", "local"], ...] = ("scene", "local")
 """Kinds of training to time."""
 
 
@@ -118,18 +119,18 @@ def renderer_table(device: torch.device, count: int, *, size: int, runs: int) ->
     cameras = automatic_views(scene, 1, width=size, height=size)
     scene, wanted = scene.to(device), None
     lines = ["| renderer | image s | with gradient s | largest difference |", "|---|---|---|---|"]
-    for name in ("torch", "gsplat", "numba"):
+    for name in RENDERERS:
         try:
             choose_backend(name, device)
         except CvtgsError as error:
             lines.append(f"| {name} | not available: {error} | | |")
             continue
 
-        def image(name: str = name) -> torch.Tensor:
+        def image(name: BackendName = name) -> torch.Tensor:
             with torch.no_grad():
                 return render(scene, cameras, backend=name).rgb
 
-        def gradient(name: str = name) -> None:
+        def gradient(name: BackendName = name) -> None:
             leaf = scene.sh0.detach().requires_grad_()
             moved = scene.with_tensors({"sh0": leaf}, scene.extras)
             render(moved, cameras, backend=name).rgb.square().sum().backward()

@@ -69,7 +69,8 @@ def levels(options: argparse.Namespace) -> None:
     simplifier = cvtgs.Simplifier(device="cpu")
     for name, scene in scenes(options):
         simplifier.simplify(scene.select(torch.arange(1000)), 0.1)  # loads scipy
-        small, finest, together = {}, 0.0, 0.0
+        small: dict[str, cvtgs.GaussianScene] = {}
+        finest, together = 0.0, 0.0
         for share in SHARES:
             ratios = [share * rho for rho in RATIOS]
             start = time.process_time()

@@ -68,7 +68,8 @@ def catalogue() -> Cases:
     sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
     from hard_cases import CASES  # noqa: PLC0415 (found there only)
 
-    return CASES
+    cases: Cases = CASES
+    return cases
 
 
 def error_table(cases: Cases, count: int) -> str:

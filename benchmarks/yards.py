@@ -11,7 +11,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -102,12 +102,11 @@ def yard(count: int, *, seed: int, degree: int) -> GaussianScene:
         "means": center.means * size + torch.tensor([0.0, -0.02, 0.0]),
         "log_scales": center.log_scales + math.log(size),
     }
-    return GaussianScene(
-        **{
-            name: torch.cat([torch.tensor(values, dtype=torch.float32), others[name]])
-            for name, values in own.items()
-        }
-    )
+    joined: dict[str, Any] = {
+        name: torch.cat([torch.tensor(values, dtype=torch.float32), others[name]])
+        for name, values in own.items()
+    }
+    return GaussianScene(**joined)
 
 
 def cameras() -> Cameras:

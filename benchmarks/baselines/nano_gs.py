@@ -71,7 +71,8 @@ def neighbor_edges(means: Float[Tensor, "n 3"]) -> Int[Tensor, "e 2"]:
     rows = torch.arange(len(places))[:, None].expand_as(found)
     pairs = torch.stack([torch.minimum(rows, found), torch.maximum(rows, found)], dim=2)
     pairs = pairs.flatten(0, 1)
-    return torch.unique(pairs[pairs[:, 0] < pairs[:, 1]], dim=0)
+    edges: Tensor = torch.unique(pairs[pairs[:, 0] < pairs[:, 1]], dim=0)
+    return edges
 
 
 def edge_costs(scene: GaussianScene, edges: Int[Tensor, "e 2"]) -> Float[Tensor, "e"]:

@@ -45,7 +45,7 @@ def main() -> None:
     rows = ((scene.means[:, 1] - HEIGHT).abs() < THICKNESS).nonzero()[:, 0]
     rows = rows[(scene.scales[rows].mean(dim=1) < 0.3) & (scene.opacities[rows] > 0.1)]
     colors = (0.5 + 0.282 * scene.sh0[rows, 0]).clamp(0, 1)
-    palette = torch.tensor(mpl.colormaps["tab20"].colors)
+    palette = torch.tensor(mpl.colormaps["tab20"](range(20)))[:, :3]
     shuffled = palette[(labels[rows] * 7919) % 20]
     draw_dots(left, scene, rows, colors)
     draw_dots(right, scene, rows, shuffled)
