@@ -117,8 +117,8 @@ def divergences(
     offsets = means[:, None] - centers
     distance = torch.einsum("nmi,mij,nmj->nm", offsets, inverse, offsets)
     logs = torch.logdet(spreads) - torch.logdet(shapes)[:, None]
-    divergences: Tensor = (trace + distance - 3 + logs) / 2
-    return divergences
+    found: Tensor = (trace + distance - 3 + logs) / 2
+    return found
 
 
 def filled(labels: Int[Tensor, "n"], costs: Float[Tensor, "n m"], count: int) -> Int[Tensor, "n"]:
