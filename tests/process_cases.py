@@ -3,11 +3,13 @@
 import os
 import time
 
+import torch
+
 from cvtgs.errors import InvalidSceneError
 
 
-def numbered(number: int) -> tuple[int, int, str]:
-    return number, os.getpid(), os.environ["OMP_NUM_THREADS"]
+def numbered(number: int) -> tuple[int, int, int]:
+    return number, os.getpid(), torch.get_num_threads()
 
 
 def refuse(number: int) -> None:

@@ -21,7 +21,7 @@ TEXTS = {path: path.read_text(encoding="utf-8") for path in FILES}
 LEVELS = [
     {"errors", "progress", "text"},
     {"math", "clock", "devices", "plots", "counts", "boxes"},
-    {"config", "scene", "cameras"},
+    {"config", "scene", "cameras", "processes"},
     {"validity", "edit"},
     {"io", "synthetic", "rendering", "losses"},
     {"views", "evaluation"},

@@ -51,7 +51,7 @@ def test_workers_give_the_same_bits_and_progress_as_one_process(source, tmp_path
 def test_calls_are_shared_and_results_in_order(workers):
     found = list(workers(numbered, range(40)))
     assert [number for number, _, _ in found] == list(range(40))
-    assert {threads for _, _, threads in found} == {str(max(1, core_count() // 2))}
+    assert {threads for _, _, threads in found} == {max(1, core_count() // 2)}
     assert os.getpid() not in {pid for _, pid, _ in found}
 
 

@@ -3,7 +3,8 @@
 from cvtgs.outofcore.distributed import ClusterWorkers, connect, simplify_distributed
 from cvtgs.outofcore.memory import available_memory, block_count, needed_memory, read_bytes
 from cvtgs.outofcore.run import check_config, simplify_file
-from cvtgs.outofcore.workers import LocalWorkers, Workers, worker_count
+from cvtgs.outofcore.workers import Workers, worker_count
+from cvtgs.processes import LocalWorkers
 
 __all__ = [
     "ClusterWorkers",

@@ -98,6 +98,8 @@ class TrainConfig(Section):
         start: Checkpoint to start from, of the same kind, widths and largest growth.
         seed: Seed of all random numbers.
         steps: Number of training steps.
+        cases_per_step: Number of scenes, each at one ratio, whose gradients are averaged in a step.
+            On a CPU, processes on all cores share them.
         learning_rate: Largest learning rate of AdamW; it falls to zero along a cosine.
         width: Units of the layers for members and neighbours.
         cell_width: Units of the layers for cells.
@@ -124,6 +126,7 @@ class TrainConfig(Section):
     start: Path | None = None
     seed: int = pydantic.Field(default=0, ge=0, lt=1 << 63)
     steps: Count = 6000
+    cases_per_step: Count = 1
     learning_rate: float = pydantic.Field(default=5e-3, gt=0.0)
     width: Count = 48
     cell_width: Count = 96

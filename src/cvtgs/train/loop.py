@@ -2,13 +2,11 @@
 
 import copy
 import math
-import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 import cvtgs
 from cvtgs.errors import ConfigError, MissingDependencyError, TrainingError
@@ -29,7 +27,8 @@ from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.train.cache import TrainingScene, prepare_scene
 from cvtgs.train.cases import Case, DeviceCopies, TargetViews
 from cvtgs.train.config import TrainConfig
-from cvtgs.train.losses import local_loss, published_loss, scene_loss, validation_psnr
+from cvtgs.train.gradients import CaseGradient, step_gradients
+from cvtgs.train.losses import validation_psnr
 from cvtgs.train.sources import Source, find_sources
 from cvtgs.train.state import Gain, History, TrainState, Validation
 
@@ -90,9 +89,10 @@ def train(
 ) -> History:
     """Train a MergeNet.
 
-    Each step takes one scene at one ratio. The choice of scene, ratio and cameras depends only on
-    the seed and the step number, so a resumed training gives the same bits as an uninterrupted
-    one. The saved network is a running mean over steps, from the validation of largest gain.
+    Each step takes a few scenes, each at one ratio. The choice of scene, ratio and cameras depends
+    only on the seed and the step number, so a resumed training gives the same bits as an
+    uninterrupted one. The saved network is a running mean over steps, from the validation of
+    largest gain.
 
     Args:
         config: The settings.
@@ -146,14 +146,15 @@ def train(
         _validate(state, validation_scenes, math.nan, config, files, copies)
         on_validation(state.history)
     losses: list[float] = []
-    while state.step < config.steps and state.history.since_best() < config.patience:
-        losses.append(_step(state, cases, config, files, copies))
-        listener(ProgressEvent(stage="train", done=state.step, total=config.steps))
-        if state.step % config.validate_every == 0 or state.step == config.steps:
-            loss = sum(losses) / len(losses)
-            _validate(state, validation_scenes, loss, config, files, copies)
-            on_validation(state.history)
-            losses = []
+    with step_gradients(cases, config, files.cache, copies) as compute:
+        while state.step < config.steps and state.history.since_best() < config.patience:
+            losses.append(_step(state, compute, config, files))
+            listener(ProgressEvent(stage="train", done=state.step, total=config.steps))
+            if state.step % config.validate_every == 0 or state.step == config.steps:
+                loss = sum(losses) / len(losses)
+                _validate(state, validation_scenes, loss, config, files, copies)
+                on_validation(state.history)
+                losses = []
     return state.history
 
 
@@ -206,47 +207,29 @@ def _prepare_scenes(
 
 def _step(
     state: TrainState,
-    cases: Sequence[tuple[Case, tuple[TargetViews, ...]]],
+    compute: Callable[[MergeNet | PublishedMergeNet, int], list[CaseGradient]],
     config: TrainConfig,
     files: TrainFiles,
-    copies: DeviceCopies,
 ) -> float:
-    rng = random.Random(f"{config.seed}/{state.step}")
-    case, views = rng.choice(cases)
+    results = compute(state.net, state.step)
     for group in state.optimizer.param_groups:
         group["lr"] = _learning_rate(config, state.step)
-    loss = _loss(state.net, case, views, config, rng, copies)
-    state.optimizer.zero_grad()
-    loss.backward()
-    length = torch.nn.utils.clip_grad_norm_(state.net.parameters(), LARGEST_GRADIENT)
-    error = float(loss.detach())
-    if not (math.isfinite(error) and math.isfinite(float(length))):
-        good = files.checkpoint if files.checkpoint.is_file() else "none yet"
-        raise TrainingError(
-            f"the loss or its gradient is not finite at step {state.step}, {case.name}; "
-            f"last good checkpoint: {good}."
-        )
+    for parameter, *parts in zip(
+        state.net.parameters(), *(result.gradients for result in results), strict=True
+    ):
+        parameter.grad = torch.stack(parts).mean(dim=0)
+    for result in results:
+        if not result.is_finite:
+            good = files.checkpoint if files.checkpoint.is_file() else "none yet"
+            raise TrainingError(
+                f"the loss or its gradient is not finite at step {state.step}, {result.name}; "
+                f"last good checkpoint: {good}."
+            )
+    torch.nn.utils.clip_grad_norm_(state.net.parameters(), LARGEST_GRADIENT)
     state.optimizer.step()
     state.average()
     state.step += 1
-    return error
-
-
-def _loss(
-    net: MergeNet | PublishedMergeNet,
-    case: Case,
-    views: Sequence[TargetViews],
-    config: TrainConfig,
-    rng: random.Random,
-    copies: DeviceCopies,
-) -> Tensor:
-    case = copies.get(case)
-    if isinstance(net, PublishedMergeNet):
-        return published_loss(net, case, config=config, rng=rng)
-    some_views = rng.choice(views)
-    if config.kind == "local":
-        return local_loss(net, case, config=config, rng=rng)
-    return scene_loss(net, case, copies.get(some_views), config=config, rng=rng)
+    return sum(result.loss for result in results) / len(results)
 
 
 def _learning_rate(config: TrainConfig, step: int) -> float:

@@ -1,0 +1,110 @@
+"""Processes of this machine that call functions, on all cores."""
+
+import os
+import pickle
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Self, TypeVar
+
+import torch
+
+from cvtgs.devices import core_count
+from cvtgs.errors import RunError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class LocalWorkers:
+    """Context manager that calls functions in processes of this machine.
+
+    However this process ends, the others end with it. A program that uses them must guard its main
+    code with ``if __name__ == "__main__":``, since they import it.
+
+    Args:
+        count: Number of processes.
+        remedy: What to do when a process ends unexpectedly, for the error message.
+    """
+
+    def __init__(self, count: int, remedy: str = "with less --memory or fewer --workers") -> None:
+        self._count, self._remedy = count, remedy
+
+    def __enter__(self) -> Self:
+        context = get_context("spawn")  # fork would copy locks that torch's threads hold
+        self._watched, self._alive = context.Pipe(duplex=False)
+        threads = max(1, core_count() // self._count)
+        self._pool = ProcessPoolExecutor(
+            self._count, context, initializer=_begin, initargs=(self._watched, threads)
+        )
+        for _ in range(self._count):  # they start while this process reads the sample
+            self._pool.submit(os.getpid)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self._pool.shutdown()
+        self._alive.close()  # ends processes that still work
+        self._pool.shutdown(cancel_futures=True)
+        self._watched.close()
+
+    def __call__(
+        self, function: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[Result]:
+        """Call a function for every item.
+
+        Args:
+            function: A function that can be pickled.
+            items: The arguments.
+
+        Yields:
+            The results, in the order of the items.
+
+        Raises:
+            RunError: A process ended unexpectedly.
+        """
+        futures = deque(self._pool.submit(_call, pickle.dumps((function, one))) for one in items)
+        try:
+            while futures:  # drops results once yielded: a scan has dozens of megabytes
+                result: Result = pickle.loads(futures.popleft().result())
+                yield result
+        except BrokenProcessPool as error:
+            raise RunError(
+                f"a worker process ended unexpectedly, most likely for lack of memory; run the "
+                f"same command again, {self._remedy}."
+            ) from error
+        finally:
+            for future in futures:
+                future.cancel()
+
+
+def _call(work: bytes) -> bytes:
+    """Call a pickled function; as objects, torch would pass tensors through files in a folder."""
+    function, item = pickle.loads(work)  # made by the process that started this one
+    return pickle.dumps(function(item))
+
+
+def _begin(watched: Connection, threads: int) -> None:
+    """Prepare a worker process: it leaves Ctrl-C to its parent, and ends when the parent ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ["OMP_NUM_THREADS"] = str(threads)  # for searches and for libraries loaded later
+    torch.set_num_threads(threads)  # torch is already loaded
+    threading.Thread(target=_end_with, args=(watched,), daemon=True).start()
+
+
+def _end_with(watched: Connection) -> None:
+    try:
+        watched.recv_bytes()
+    except (EOFError, OSError):
+        os._exit(1)
