@@ -54,12 +54,12 @@ def scene_loss(
 ) -> Float[Tensor, ""]:
     """Compare random crops of images of the corrected scene, over black or a random background.
 
-    Only cells that can be seen in these images are corrected, which saves most of the time. Whole
+    Only cells that can be seen in these crops are corrected, which saves most of the time. Whole
     images are rendered, because a camera of the crop alone would project Gaussians beside it
     differently.
     """
     shots = [_Shot.draw(views, config.views.crop, case, rng) for _ in range(config.views.per_step)]
-    case = case.select(_seen_cells(case, [shot.view.cameras for shot in shots]))
+    case = case.select(_seen_cells(case, [shot.crop_camera() for shot in shots]))
     residuals = _predict(net, case)
     corrected = case.correct_scene(residuals)
     losses = []
@@ -89,9 +89,21 @@ class _Shot(NamedTuple):
     def crop(self, images: Float[Tensor, "1 h w 3"]) -> Float[Tensor, "1 y x 3"]:
         return images[:, self.rows, self.columns]
 
+    def crop_camera(self) -> Cameras:
+        """Return the camera whose image is the crop, but for Gaussians beside it."""
+        camera = self.view.cameras
+        offset = torch.zeros_like(camera.Ks)
+        offset[:, 0, 2], offset[:, 1, 2] = self.columns.start, self.rows.start
+        return Cameras(
+            viewmats=camera.viewmats,
+            Ks=camera.Ks - offset,
+            width=min(self.columns.stop, camera.width) - self.columns.start,
+            height=min(self.rows.stop, camera.height) - self.rows.start,
+        )
+
 
 def _seen_cells(case: Case, cameras: Sequence[Cameras]) -> Int[Tensor, "s"]:
-    """Return the cells that paint something in any of some views; all if none does."""
+    """Return the cells that paint something in any of some images; all if none does."""
     merged = case.reference.merged
     painted = torch.stack([contributions(merged, camera) for camera in cameras]).amax(dim=0)
     is_seen = painted[case.cells] > LEAST_PAINTED
