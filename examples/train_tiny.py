@@ -2,7 +2,7 @@
 
 python examples/train_tiny.py tiny.safetensors --steps 20
 
-Such a short training learns nothing useful; the shipped network began with recipes/standard.toml.
+Such a short training learns nothing useful; the shipped network is made by recipes/standard.toml.
 """
 
 import argparse

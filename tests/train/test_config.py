@@ -68,9 +68,6 @@ def test_each_recipe_is_for_the_preset_of_its_name(recipe):
 def test_there_are_recipes():
     assert {path.stem for path in RECIPES.glob("*.toml")} == {
         "standard",
-        "standard-low",
-        "standard-pairs",
-        "standard-depth",
         "paper",
         "paper-gated",
         "paper-gated-local",

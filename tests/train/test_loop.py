@@ -115,6 +115,18 @@ def test_the_best_network_is_kept(scenes, cache, tmp_path, monkeypatch):
     assert len({str(net) for net in marks.nets}) == 4
 
 
+def test_the_last_network_is_kept_if_the_configuration_says_so(
+    scenes, cache, tmp_path, monkeypatch
+):
+    marks = Marks(0.0, 0.5, 0.2, 0.4)
+    monkeypatch.setattr(train_loop, "validation_psnr", marks)
+    path = tmp_path / "net.safetensors"
+    history = run(config_of(scenes, keep="last"), path, cache)
+    kept = load_checkpoint(path)
+    assert (history.best().step, kept.info.steps) == (2, 6)
+    assert bits_of(kept.net.state_dict()) == marks.nets[-1]
+
+
 def test_training_stops_when_patience_runs_out(scenes, cache, tmp_path, monkeypatch):
     monkeypatch.setattr(train_loop, "validation_psnr", Marks(0.0, 0.5, 0.2, 0.4, 0.1, 0.9))
     config = config_of(scenes, steps=100, patience=2)

@@ -21,7 +21,7 @@ def add_train(add_parser: AddParser) -> None:
     parser = add_parser(
         "train",
         help="train the network that merges Gaussians",
-        description="Train a MergeNet with the configuration CONFIG.toml. Writes the best network "
+        description="Train a MergeNet with the configuration CONFIG.toml. Writes the network "
         "to NAME.safetensors, and its curves and the state to resume from beside it.",
     )
     parser.set_defaults(run=train)
@@ -74,9 +74,9 @@ def train(options: argparse.Namespace) -> None:
             listener=listener,
             on_validation=lambda history: None if options.quiet else print_validation(history),
         )
-    best = history.best()
-    if best is not None and not options.quiet:
-        say(f"best at step {best.step}: {best.mean_gain:+.2f} dB on held-out scenes")
+    kept = history.best() if config.keep == "best" else history.validations[-1]
+    if kept is not None and not options.quiet:
+        say(f"{config.keep} at step {kept.step}: {kept.mean_gain:+.2f} dB on held-out scenes")
         curves = f"curves in {files.curves}" if files.curves.is_file() else WITHOUT_CURVES
         say(f"{files.checkpoint}, {curves}")
 

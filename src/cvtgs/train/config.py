@@ -106,6 +106,7 @@ class TrainConfig(Section):
         largest_growth: Largest change of a log scale; the published network has no limit.
         validate_every: Steps between validations.
         patience: Number of validations without a new best after which training stops.
+        keep: Which validation gives the saved network: the ``best`` so far, or the ``last``.
         averaged_steps: The saved network is a running mean of the weights over about this many
             steps, and over at most a ninth of all steps so far.
         cells: Largest number of cells in one step of a ``local`` or ``published`` training.
@@ -133,6 +134,7 @@ class TrainConfig(Section):
     largest_growth: float = pydantic.Field(default=0.6, gt=0.0, le=3.0)
     validate_every: Count = 500
     patience: Count = 1000
+    keep: Literal["best", "last"] = "best"
     averaged_steps: Count = 500
     cells: Count = 49
     members: Count = 4096

@@ -44,7 +44,7 @@ class TrainFiles:
     """Output files of a training.
 
     Attributes:
-        checkpoint: The best network so far.
+        checkpoint: The network of the best validation so far, or of the last one.
         state: State to resume from.
         curves: Plot of the history; not written without matplotlib.
         cache: Folder of prepared scenes.
@@ -92,7 +92,7 @@ def train(
     Each step takes a few scenes, each at one ratio. The choice of scene, ratio and cameras depends
     only on the seed and the step number, so a resumed training gives the same bits as an
     uninterrupted one. The saved network is a running mean over steps, from the validation of
-    largest gain.
+    largest gain or from the last one (``config.keep``).
 
     Args:
         config: The settings.
@@ -253,7 +253,7 @@ def _validate(
             gains.append(Gain(scene=scene.name, ratio=case.ratio, decibels=after - before))
     history = state.history
     history.validations.append(Validation(step=state.step, loss=loss, gains=tuple(gains)))
-    if history.since_best() == 0:
+    if config.keep == "last" or history.since_best() == 0:
         with atomic_output(files.checkpoint, overwrite=True) as file:
             file.write(save_checkpoint(state.mean_net, _description(state, config)))
     state.save(files.state, config)

@@ -199,7 +199,7 @@ def perturb(scene: GaussianScene, rng: random.Random) -> GaussianScene:
             "means": kept.means * stretch,
             "log_scales": positive_log(scales).to(scene.dtype),
             "quats": turned.to(scene.dtype),
-            "logit_opacities": kept.logit_opacities + rng.uniform(-1.0, 1.0),
+            "logit_opacities": kept.logit_opacities + rng.triangular(-2.0, 4.0, 0.0),
             "sh0": kept.sh0 @ mix,
             "shN": kept.shN @ mix,
         },

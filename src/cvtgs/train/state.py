@@ -254,4 +254,4 @@ class TrainState:
 
 def _fingerprint(config: TrainConfig) -> dict[str, Any]:
     """Return the settings that must not change between start and resume."""
-    return config.model_dump(mode="json", exclude={"note", "patience"})
+    return config.model_dump(mode="json", exclude={"note", "patience", "keep"})
