@@ -179,6 +179,24 @@ def test_scenes_can_be_given_on_the_command_line(made, tmp_path, capsys):
     assert found.digest == wanted.digest
 
 
+@pytest.mark.slow
+def test_validation_scenes_and_the_kept_network_can_be_chosen(made, tmp_path, capsys):
+    config = tmp_path / "training.toml"
+    text = write_config(made).read_text()
+    config.write_text('keep = "last"\n' + text.replace('"scenes"', f'"{made / "scenes"}"'))
+    words = ["train", str(config), "-o", str(tmp_path / "net.safetensors")]
+    assert main([*words, "--validation", "lesson"]) == 0
+    assert "last at step 3: " in capsys.readouterr().out
+    info = load_checkpoint(tmp_path / "net.safetensors").info
+    assert {scene.name: scene.is_validation for scene in info.scenes} == {
+        "exam": False,
+        "lesson": True,
+    }
+    assert info.steps == 3
+    assert main([*words, "--overwrite", "--validation", "nobody"]) == 1
+    assert "data.validation: no file named nobody.ply" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("change", "text"),
     [

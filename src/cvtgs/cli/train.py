@@ -45,6 +45,14 @@ def add_train(add_parser: AddParser) -> None:
         help="directory of PLY files to train on, besides those of CONFIG.toml; can be repeated",
     )
     parser.add_argument(
+        "--validation",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="scenes for validation only, by file name without .ply (default: those of "
+        "CONFIG.toml, or every fifth)",
+    )
+    parser.add_argument(
         "--cache",
         type=Path,
         metavar="DIR",
@@ -58,7 +66,8 @@ def train(options: argparse.Namespace) -> None:
     """Run ``cvtgs train``."""
     from cvtgs.devices import chosen_device
 
-    config = _with_scenes(cvtgs.train.TrainConfig.from_toml(options.config), options.scenes)
+    config = cvtgs.train.TrainConfig.from_toml(options.config)
+    config = _with_scenes(config, options.scenes, options.validation)
     if options.output.suffix != ".safetensors":
         raise OutputError(f"{options.output}: the name must end in .safetensors.")
     files = cvtgs.train.TrainFiles.beside(options.output, options.cache)
@@ -81,8 +90,14 @@ def train(options: argparse.Namespace) -> None:
         say(f"{files.checkpoint}, {curves}")
 
 
-def _with_scenes(config: "TrainConfig", folders: list[Path]) -> "TrainConfig":
-    data = config.data.model_copy(update={"folders": (*config.data.folders, *folders)})
+def _with_scenes(
+    config: "TrainConfig", folders: list[Path], validation: list[str]
+) -> "TrainConfig":
+    changes = {
+        "folders": (*config.data.folders, *folders),
+        "validation": tuple(validation) or config.data.validation,
+    }
+    data = config.data.model_copy(update=changes)
     return config.model_copy(update={"data": data})
 
 
