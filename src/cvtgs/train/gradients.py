@@ -28,7 +28,7 @@ class CaseGradient(NamedTuple):
     """Loss and gradient of one case of a step.
 
     Attributes:
-        name: Name of the scene.
+        name: Name of the case: scene and ratio.
         loss: Its loss.
         gradients: Gradient of every parameter.
     """
@@ -73,7 +73,7 @@ def step_gradients(
         ]
         return
     text = config.model_dump_json()
-    with LocalWorkers(processes, "with --resume, on fewer cores") as workers:
+    with LocalWorkers(processes, "with --resume and OMP_NUM_THREADS=1") as workers:
         yield lambda net, step: list(
             workers(_compute, [_Task(text, cache, net, step, number) for number in numbers])
         )
