@@ -28,10 +28,10 @@ from torch import Tensor
 import cvtgs
 from benchmarks.baselines import baseline
 from benchmarks.measuring import write_file
-from benchmarks.quality import PhotographJudge, Quality, cells_of, markdown_rows
+from benchmarks.quality import PhotographJudge, Quality, any_lpips, cells_of, markdown_rows
 from cvtgs.cameras import Cameras
 from cvtgs.evaluation import fit_cameras, load_photographs
-from cvtgs.evaluation.scorer import chosen_metrics
+from cvtgs.evaluation.scorer import Metrics, chosen_metrics
 from cvtgs.losses import image_loss
 from cvtgs.views import automatic_views
 
@@ -67,7 +67,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         cvtgs.save(fit(first, *train, steps=options.steps, seed=options.seed), model)
     scene = cvtgs.load(model)
     cameras, photographs = test
-    metrics = chosen_metrics("auto", (cameras.width, cameras.height))
+    if options.lpips is not None:
+        metrics = Metrics(lpips=any_lpips(options.lpips))
+    else:
+        metrics = chosen_metrics("auto", (cameras.width, cameras.height))
     judge = PhotographJudge(cameras, photographs, WHITE, metrics)
     rows = {f"trained, {len(scene):,} Gaussians": judge.score(scene)}
     for rho in options.rho:
@@ -96,6 +99,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--size", type=int, default=200, help="longer side of pictures, pixels")
     found.add_argument("--views", type=int, default=64, help="pictures of the generated scene")
     found.add_argument("--rho", type=float, nargs="+", default=[0.1, 0.01])
+    found.add_argument("--lpips", type=Path, help="weights file of LPIPS")
     found.add_argument("--seed", type=int, default=0)
     return found
 

@@ -38,7 +38,7 @@ def test_the_paper_preset_is_cvt_gs():
 
 def test_standard_is_mass_everywhere():
     standard = SimplifyConfig()
-    assert standard.filter.max_mass_share == 0.0
+    assert standard.filter == FilterConfig(min_opacity=0.005, max_mass_share=0.01)
     assert (standard.cvt.area_power, standard.merge.area_power) == (0.4, 1.0)
     assert standard.cvt.perspective
     assert standard.cvt.seeding == "stratified"

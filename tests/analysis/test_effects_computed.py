@@ -163,7 +163,10 @@ def test_faint_gaussians_without_mass_are_not_sorted(monkeypatch):
 
 def test_with_haze_off_all_faint_gaussians_are_filtered_as_in_the_paper():
     scene = random_scene(400)
-    on, off = (run_with(scene, effects={"haze": haze}).report for haze in ("auto", "off"))
+    faint = {"min_opacity": 0.1}
+    on, off = (
+        run_with(scene, filter=faint, effects={"haze": haze}).report for haze in ("auto", "off")
+    )
     assert on.plan.haze.active
     faint = int((scene.opacities < 0.1).sum())
     assert on.filtered_count < faint == off.filtered_count
@@ -187,7 +190,11 @@ def test_duplicates_are_searched_once(monkeypatch):
         "nearest_scipy",
         lambda points, sites: searched.append(len(points)) or original(points, sites),
     )
-    settings = {"cvt": {"iterations": 1}, "allocation": {"oversampling": 1.0}}
+    settings = {
+        "filter": {"min_opacity": 0.0},
+        "cvt": {"iterations": 1},
+        "allocation": {"oversampling": 1.0},
+    }
     for rho in (0.1, 0.5):
         planned = run_with(scene, rho, **settings)
         assert planned.report.plan.duplicates.active

@@ -52,15 +52,16 @@ class FilterConfig(Section):
     """The filter that drops faint Gaussians and flyaways before the tessellation.
 
     Attributes:
-        min_opacity: Gaussians with an opacity below this are faint and may be dropped.
+        min_opacity: Gaussians with an opacity below this are faint and may be dropped. The default
+            is what 3DGS itself prunes at while it trains.
         max_mass_share: Faint Gaussians are dropped, faintest first, as long as they hold at most
             this share of the scene's mass; 1 drops all of them.
         max_flyaway_share: Gaussians beyond 100 robust radii are dropped, lightest first, as long
             as they hold at most this share of the mass as seen from the middle of the scene.
     """
 
-    min_opacity: Share = 0.1
-    max_mass_share: Share = 0.0
+    min_opacity: Share = 0.005
+    max_mass_share: Share = 0.01
     max_flyaway_share: Share = 1e-3
 
 

@@ -65,7 +65,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     },
     "paper": {
         "effects": {"unbounded": "off", "duplicates": "off"},
-        "filter": {"max_mass_share": 1.0, "max_flyaway_share": 0.0},
+        "filter": {"min_opacity": 0.1, "max_mass_share": 1.0, "max_flyaway_share": 0.0},
         "cvt": {
             "area_power": 0.0,
             "perspective": False,
