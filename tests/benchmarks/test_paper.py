@@ -128,8 +128,8 @@ def test_photographs_of_another_shape_are_refused(root):
     for path in (garden.folder / "images_4").iterdir():
         Image.fromarray(np.zeros((24, 40, 3), np.uint8)).save(path)
     assert refusal(garden) == (
-        f"{garden.folder / 'images_4'}: photographs must have the aspect ratio of the cameras' "
-        f"images, 64 x 48, found 40 x 24."
+        f"{garden.folder / 'images_4' / 'frame_00.png'}: photographs must have the aspect ratio "
+        f"of the cameras' images, 64 x 48, found 40 x 24."
     )
 
 

@@ -90,8 +90,8 @@ def test_another_aspect_ratio_is_refused_in_one_sentence(folder, scenes, tmp_pat
     words = ["--cameras", str(folder), "--images", str(tmp_path)]
     assert main(["evaluate", *scenes[:2], *words]) == 1
     assert capsys.readouterr().err == (
-        f"cvtgs: error: {tmp_path}: photographs must have the aspect ratio of the cameras' "
-        f"images, 64 x 48, found 48 x 48.\n"
+        f"cvtgs: error: {tmp_path / '0.png'}: photographs must have the aspect ratio of the "
+        f"cameras' images, 64 x 48, found 48 x 48.\n"
     )
 
 

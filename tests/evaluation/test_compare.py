@@ -18,6 +18,7 @@ from cvtgs.evaluation import (
     alpha_error,
     compare,
     evaluate,
+    fit_cameras,
     load_photographs,
     lpips,
     psnr,
@@ -215,6 +216,23 @@ def test_missing_and_damaged_photographs_are_named(tmp_path, cameras):
     (tmp_path / "view 1.png").write_bytes(content[: len(content) // 2])
     with pytest.raises(cvtgs.errors.FileFormatError, match="must be a whole image"):
         load_photographs(tmp_path, cameras)
+
+
+def test_each_photograph_must_have_the_shape_of_its_own_camera(tmp_path, cameras):
+    """A camera with images of its own size has been stretched to the size of the others."""
+    intrinsics = cameras.Ks.clone()
+    intrinsics[1, 1, 1] *= 2.0  # its own images are twice as wide
+    mixed = cvtgs.Cameras(
+        viewmats=cameras.viewmats, Ks=intrinsics, width=48, height=36, names=("a", "b", "c")
+    )
+    for name, size in (("a", (18, 24)), ("b", (18, 48)), ("c", (18, 24))):
+        pixels = np.zeros((*size, 3), np.uint8)
+        (tmp_path / f"{name}.png").write_bytes(encode(pixels, "png"))
+    fitted = fit_cameras(mixed, tmp_path)
+    assert (fitted.width, fitted.height) == (24, 18)
+    (tmp_path / "c.png").write_bytes(encode(np.zeros((24, 18, 3), np.uint8), "png"))  # upright
+    with pytest.raises(InvalidArgumentError, match=r"c\.png: .* 48 x 36, found 18 x 24"):
+        fit_cameras(mixed, tmp_path)
 
 
 def test_error_maps_grow_brighter_with_the_error():

@@ -230,7 +230,7 @@ def fit_cameras(cameras: Cameras, folder: str | os.PathLike[str]) -> Cameras:
         Cameras with scaled intrinsics, or the same cameras; the most frequent size is used.
 
     Raises:
-        InvalidArgumentError: The cameras have no names, or the aspect ratios differ.
+        InvalidArgumentError: The cameras have no names, or an aspect ratio differs.
         InputNotFoundError: There is no such folder, or a camera has no photograph in it.
         FileFormatError: A photograph is no image.
 
@@ -245,15 +245,18 @@ def fit_cameras(cameras: Cameras, folder: str | os.PathLike[str]) -> Cameras:
         8
     """
     paths = _find_all(Path(folder), cameras)
-    (width, height), _ = Counter(image_size(path) for path in paths).most_common(1)[0]
-    # The tolerance allows for sizes that were rounded when the photographs were scaled.
-    if abs(width * cameras.height - height * cameras.width) > 1.5 * max(
-        cameras.width, cameras.height
-    ):
-        raise InvalidArgumentError(
-            f"{folder}: photographs must have the aspect ratio of the cameras' images, "
-            f"{cameras.width} x {cameras.height}, found {width} x {height}."
-        )
+    sizes = [image_size(path) for path in paths]
+    (width, height), _ = Counter(sizes).most_common(1)[0]
+    stretches = (cameras.Ks[:, 1, 1] / cameras.Ks[:, 0, 0]).tolist()  # from a size of its own
+    for path, (wide, high), stretch in zip(paths, sizes, stretches, strict=True):
+        # The tolerance allows for sizes that were rounded when the photographs were scaled.
+        tolerance = 1.5 * max(cameras.width, cameras.height) * max(1.0, stretch)
+        errors = [abs(wide * cameras.height - high * cameras.width * x) for x in (1.0, stretch)]
+        if min(errors) > tolerance:
+            raise InvalidArgumentError(
+                f"{path}: photographs must have the aspect ratio of the cameras' images, "
+                f"{cameras.width} x {cameras.height}, found {wide} x {high}."
+            )
     return cameras.resized(width, height) if width < cameras.width else cameras
 
 
