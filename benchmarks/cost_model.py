@@ -2,9 +2,10 @@
 
 ``python -m benchmarks.cost_model`` simplifies generated scenes of kinds, seeds and sizes that the
 calibration has not seen, with every preset to choose from. Each run is a separate process. The
-script prints predicted and measured seconds of all stages as Markdown. Of several runs the fastest
-counts, as in the calibration, since other programs only make runs slower. On a constantly busy
-machine, ``--clock undisturbed`` subtracts the time of other programs, stage by stage.
+script prints predicted and measured seconds as Markdown. Of several runs the fastest counts, as in
+the calibration, since other programs only make runs slower. On a constantly busy machine,
+``--clock undisturbed`` subtracts the time of other programs, stage by stage. ``--ship`` measures
+this machine for minutes, and writes the rates that a calibration starts from.
 """
 
 import argparse
@@ -19,7 +20,14 @@ import cvtgs
 from benchmarks.measuring import generated_scenes, machine
 from cvtgs import budget
 from cvtgs.budget import CostModel, Work, cost_model
-from cvtgs.budget.calibrate import CANDIDATES, SHIPPED_RATES, undisturbed_seconds
+from cvtgs.budget.calibrate import (
+    CANDIDATES,
+    SHIPPED_RATES,
+    Trial,
+    calibrate,
+    measured_seconds,
+    undisturbed_seconds,
+)
 from cvtgs.clock import StageCost
 from cvtgs.tradeoff.runs import Task, run_task
 
@@ -31,6 +39,8 @@ SCENES = (
 )
 RATIOS = (0.1, 0.01)
 SEED = 11
+SHIPPED_RATIOS = {"standard": (0.3, 0.1, 0.01, 0.001), "draft": RATIOS, "matched": RATIOS}
+MOST_WITH_IMAGES = 300_000
 CLOCKS: Mapping[str, Callable[[StageCost], float]] = {
     "wall": attrgetter("seconds"),
     "undisturbed": undisturbed_seconds,
@@ -67,12 +77,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--ship", action="store_true", help="write the rates that --shipped-rates uses"
     )
     options = parser.parse_args(arguments)
-    model = cost_model(recalibrate=options.recalibrate)
     if options.ship:
         path = Path(budget.__file__).with_name(SHIPPED_RATES)
-        path.write_text(model.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        text = shipped_rates().model_dump_json(indent=1)
+        path.write_text(text + "\n", encoding="utf-8")
         print(f"{machine()}; wrote {path}")
         return
+    model = cost_model(recalibrate=options.recalibrate)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scenes = [scene for scene in SCENES if scene[1] <= options.most]
@@ -80,6 +91,31 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows = [row for file in files for row in measured(file, folder, model, options)]
     print(f"{machine()}; {options.clock} seconds, the fastest of {options.runs} runs\n")
     print(report(rows))
+
+
+def shipped_rates() -> CostModel:
+    """Measure scenes of all sizes in full, without a prior."""
+    trials = [
+        Trial(preset=preset, kind=kind, count=count, sh_degree=degree, rho=rho, **images(preset))
+        for preset, ratios in SHIPPED_RATIOS.items()
+        for kind, count, degree in SCENES
+        for rho in ratios
+        if count <= MOST_WITH_IMAGES or not images(preset)
+    ]
+    kind, count, degree = SCENES[1]
+    trials.append(
+        Trial(preset="high", kind=kind, count=count, sh_degree=degree, rho=0.01, **images("high"))
+    )
+    return calibrate(
+        measured_seconds("cpu"), prior=CostModel(rates={}), trials=trials, cpu=lambda: 0.0
+    )
+
+
+def images(preset: str) -> dict[str, int]:
+    """Return number and size of a preset's images, and its steps; nothing if it uses none."""
+    config = cvtgs.SimplifyConfig.from_preset(preset)
+    seen, refine = config.visibility, config.refine
+    return {"views": seen.views, "size": seen.size, "steps": refine.steps} if seen.views else {}
 
 
 def measured(file: Path, folder: Path, model: CostModel, options: argparse.Namespace) -> list[Row]:
@@ -97,7 +133,7 @@ def measured(file: Path, folder: Path, model: CostModel, options: argparse.Names
                     scene=file.stem,
                     preset=preset,
                     rho=rho,
-                    predicted=model.seconds(preset, work),
+                    predicted=model.seconds(work, cvtgs.SimplifyConfig.from_preset(preset)),
                     measured=min(seconds),
                 )
             )

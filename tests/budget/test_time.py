@@ -4,7 +4,6 @@ import json
 import math
 import os
 import time
-from dataclasses import replace
 
 import pytest
 
@@ -13,128 +12,119 @@ from cvtgs.budget import CostModel, Work, choose_preset, cost_model
 from cvtgs.budget.calibrate import (
     CANDIDATES,
     LEAST_MEASURED,
-    SHORT,
     STALE_SECONDS,
+    TRIALS,
     Trial,
     cache_folder,
     calibrate,
     is_calibrated,
     measured_seconds,
 )
-from cvtgs.budget.costs import fit_rates
+from cvtgs.budget.costs import FEATURES
 from cvtgs.errors import ConfigError, DeviceError, GoalError, InvalidArgumentError
 
-TRIALS = [
-    Trial(kind="object", count=count, sh_degree=degree, ratios=ratios)
-    for count, degree, ratios in ((50, 0, (0.1, 0.5)), (200, 3, (0.05, 0.4)), (400, 1, (0.2, 0.1)))
+NO_PRIOR = CostModel(rates={})
+SMALL_TRIALS = [
+    Trial(preset="draft", kind="object", count=50, sh_degree=0, rho=0.1),
+    Trial(preset="standard", kind="object", count=50, sh_degree=0, rho=0.5),
+    Trial(preset="standard", kind="object", count=200, sh_degree=3, rho=0.05),
+    Trial(preset="draft", kind="object", count=200, sh_degree=3, rho=0.01),
+    Trial(
+        preset="matched", kind="object", count=50, sh_degree=0, rho=0.5, views=3, size=64, steps=4
+    ),
+    Trial(
+        preset="matched", kind="object", count=400, sh_degree=1, rho=0.2, views=5, size=96, steps=5
+    ),
+    Trial(preset="high", kind="object", count=400, sh_degree=1, rho=0.1, views=3, size=64, steps=9),
 ]
-SPEEDS = dict(zip(CANDIDATES, (1.0, 2.0, 4.0, 10.0, 50.0), strict=True))
 
 
 def made_up(config, scene, count) -> dict[str, float]:
     """Return seconds that follow the features exactly."""
-    speed = SPEEDS[config.preset] * 1e-6
+    work = Work.of(scene, count)
     seconds = {
-        "check": speed * len(scene),
-        "merge": speed * (2 * len(scene) + 3 * count),
-        "something new": 0.1 + speed * count,
+        "check": 1e-6 * len(scene),
+        "plan": 1e-6 * len(scene),
+        "filter": 1e-7 * len(scene),
+        "tessellate": 0.01 + 2e-7 * work.features("tessellate", config)["search"],
+        "merge": 1e-6 * (2 * len(scene) + 3 * count),
+        "something new": 0.1 + 1e-6 * count,
     }
+    if config.merge.network:
+        seconds["network"] = 1e-5 * count
     if config.visibility.views:
         seconds["visibility"] = 1e-6 * config.visibility.views * len(scene)
     if config.match.enabled:
-        work = Work(count=len(scene), target=count)
         seconds["match"] = 1e-3 + 1e-9 * work.features("match", config)["view_pixels"]
     if config.refine.enabled:
-        work = Work(count=len(scene), target=count)
-        seconds["refine"] = work.features("refine", config)["look_pixels"]
+        seconds["refine"] = 1e-6 * work.features("refine", config)["look_pixels"]
     return seconds
+
+
+def preset(name: str) -> cvtgs.SimplifyConfig:
+    return cvtgs.SimplifyConfig.from_preset(name)
 
 
 @pytest.fixture(scope="module")
 def model() -> CostModel:
-    return calibrate(made_up, trials=TRIALS)
+    return calibrate(made_up, trials=SMALL_TRIALS, prior=NO_PRIOR)
 
 
-def test_rates_are_fitted_and_never_negative():
-    rows = [{"once": 1.0, "n": n} for n in (1.0, 2.0, 4.0)]
-    assert fit_rates(rows, [5.0, 7.0, 11.0]) == pytest.approx({"once": 3.0, "n": 2.0})
-    falling = fit_rates(rows, [11.0, 7.0, 5.0])
-    assert min(falling.values()) >= 0.0
-    assert falling["n"] == 0.0
-
-
-def test_errors_are_weighted_relative_to_the_seconds():
-    """One second in a hundred counts as little as a tenth of a second in ten."""
-    rates = fit_rates([{"n": 1.0}, {"n": 10.0}], [1.0, 11.0])
-    assert 1.0 < rates["n"] < 1.1
-
-
-@pytest.mark.parametrize("preset", ["draft", "fast", "standard"])
-def test_seconds_that_follow_the_features_are_predicted_exactly(model, preset):
-    work = Work(count=1_000_000, target=10_000, colors=12)
-    wanted = 0.1 + SPEEDS[preset] * (3 + 0.03 + 0.01)
-    assert model.seconds(preset, work) == pytest.approx(wanted, rel=1e-3)
-    assert set(model.stage_seconds(preset, work)) == {"check", "merge", "something new"}
+@pytest.mark.parametrize("name", ["draft", "fast", "standard"])
+def test_seconds_that_follow_the_features_are_predicted_exactly(model, name):
+    work, config = Work(count=1_000_000, target=10_000, colors=12), preset(name)
+    search = work.features("tessellate", config)["search"]
+    wanted = 0.11 + 1e-6 * (4_100_000 + 40_000) + 2e-7 * search + 0.1 * (name == "standard")
+    assert model.seconds(work, config) == pytest.approx(wanted, rel=1e-3)
+    stages = {"check", "plan", "filter", "tessellate", "merge", "something new"}
+    wanted_stages = stages | {"network"} if name == "standard" else stages
+    assert set(model.stage_seconds(work, config)) == wanted_stages
 
 
 def test_the_cost_of_many_images_is_extrapolated_from_few(model):
-    high = cvtgs.SimplifyConfig.from_preset("high")
-    work = Work(count=100_000, target=1000)
-    stages = model.stage_seconds("high", work)
+    high, work = preset("high"), Work(count=100_000, target=1000)
+    stages = model.stage_seconds(work, high)
     assert stages["visibility"] == pytest.approx(0.1 * high.visibility.views, rel=0.01)
     pixels = work.features("refine", high)["look_pixels"]
-    assert stages["refine"] == pytest.approx(pixels, rel=0.01)
-    assert model.seconds("high", work) > model.seconds("matched", work)
+    assert stages["refine"] == pytest.approx(1e-6 * pixels, rel=0.01)
+    assert model.seconds(work, high) > model.seconds(work, preset("matched"))
 
 
 def test_the_cost_of_matching_is_extrapolated_from_few_images(model):
-    matched = cvtgs.SimplifyConfig.from_preset("matched")
-    work = Work(count=100_000, target=1000)
-    stages = model.stage_seconds("matched", work)
+    matched, work = preset("matched"), Work(count=100_000, target=1000)
     pixels = work.features("match", matched)["view_pixels"]
+    stages = model.stage_seconds(work, matched)
     assert stages["match"] == pytest.approx(1e-3 + 1e-9 * pixels, rel=0.02)
     unmatched = cvtgs.SimplifyConfig.compose(
         preset="matched", settings={"match.opacity_rounds": "0", "match.color_iterations": "0"}
     )
-    assert "match" not in model.stage_seconds("matched", work, config=unmatched)
-
-
-def test_pixel_gaussian_pairs_grow_with_the_square_root_of_both():
-    matched = cvtgs.SimplifyConfig.from_preset("matched")
-    few, many = (
-        Work(count=10**6, target=count).features("match", matched)["view_pairs"]
-        for count in (1000, 100_000)
-    )
-    assert few == pytest.approx(24 * 200 * math.sqrt(1000))
-    assert many == pytest.approx(10 * few)
+    assert "match" not in model.stage_seconds(work, unmatched)
 
 
 def test_settings_change_the_predicted_cost(model):
-    """Omitted stages cost nothing; added stages cost the same as in other presets."""
     work = Work(count=100_000, target=1000)
 
-    def stages(preset: str, **settings: str) -> dict[str, float]:
+    def stages(name: str, **settings: str) -> dict[str, float]:
         texts = {name.replace("_", ".", 1): text for name, text in settings.items()}
-        config = cvtgs.SimplifyConfig.compose(preset=preset, settings=texts)
-        return model.stage_seconds(preset, work, config=config)
+        return model.stage_seconds(work, cvtgs.SimplifyConfig.compose(preset=name, settings=texts))
 
-    high = model.stage_seconds("high", work)
+    high = stages("high")
     assert "refine" not in stages("high", refine_steps="0")
     for setting in ({"visibility_views": "0"}, {"effects_visibility": "off"}):
         assert set(high) - set(stages("high", **setting)) == {"visibility", "match"}
     few = stages("high", refine_steps=str(high_steps() // 2))
     assert 0.4 < few["refine"] / high["refine"] < 0.6
     assert 0.2 < stages("high", refine_size="200")["refine"] / high["refine"] < 0.3
-    refine = cvtgs.SimplifyConfig.from_preset("high").refine.model_dump(exclude={"rates"})
+    refine = preset("high").refine.model_dump(exclude={"rates"})
     added = stages("standard", **{f"refine_{name}": str(text) for name, text in refine.items()})
-    assert set(added) - set(model.stage_seconds("standard", work)) == {"refine"}
+    assert set(added) - set(stages("standard")) == {"refine"}
     assert 1.0 < added["refine"] / high["refine"] < 1.1  # it renders all its own images
     assert stages("draft", refine_seconds="7")["refine"] == 7.0
 
 
 def test_a_cheaper_setting_allows_a_better_preset(model):
     work = Work(count=1_000_000, target=10_000)
-    budget = 1.3 * model.seconds("high", work) - 1
+    budget = 1.3 * model.seconds(work, preset("high")) - 1
     assert choose_preset(work, budget, model=model).preset == "matched"
     fewer = {"refine.steps": str(high_steps() // 2)}
     choice = choose_preset(work, budget, settings=fewer, model=model)
@@ -145,21 +135,32 @@ def test_a_cheaper_setting_allows_a_better_preset(model):
 
 
 def high_steps() -> int:
-    return cvtgs.SimplifyConfig.from_preset("high").refine.steps
+    return preset("high").refine.steps
 
 
 def test_calibration_takes_few_images_and_steps():
     seen = []
 
     def run(config, scene, count):
-        seen.append(config)
+        seen.append((config, len(scene)))
         return made_up(config, scene, count)
 
-    calibrate(run, trials=TRIALS[:1])
-    assert "paper" not in {config.preset for config in seen}
-    most = max(short["steps"] for short in SHORT)
-    assert max(config.refine.steps for config in seen) == most
-    assert max(config.visibility.views for config in seen) <= max(one["views"] for one in SHORT)
+    model = calibrate(run)
+    assert set(FEATURES) <= set(model.rates)
+    assert max(config.refine.steps for config, _ in seen) < 10
+    assert max(config.visibility.views for config, _ in seen) < 10
+    assert max(size for _, size in seen) <= 100_000
+    assert sum(config.shares_images for config, _ in seen) == sum(
+        config.uses_renders for config, _ in seen
+    )
+
+
+def few(rhos: tuple[float, ...] = (0.1, 0.5), counts: tuple[int, ...] = (50, 200)) -> list[Trial]:
+    return [
+        Trial(preset="draft", kind="object", count=count, sh_degree=0, rho=rho)
+        for count in counts
+        for rho in rhos
+    ]
 
 
 def test_the_fastest_of_several_runs_counts():
@@ -169,8 +170,9 @@ def test_the_fastest_of_several_runs_counts():
         calls.append(config)
         return {"check": len(scene) * (1.0 if len(calls) % 3 == 0 else 3.0)}
 
-    model = calibrate(run, presets=["draft"], trials=TRIALS[:2], clock=lambda: 0.0)
-    assert model.stage_seconds("draft", Work(count=10, target=1))["check"] == pytest.approx(10.0)
+    model = calibrate(run, trials=few(), prior=NO_PRIOR, clock=lambda: 0.0)
+    check = model.stage_seconds(Work(count=10, target=1), preset("draft"))["check"]
+    assert check == pytest.approx(10.0)
     assert len(calls) == 1 + 3 * 4
 
 
@@ -181,7 +183,7 @@ def test_a_slow_machine_measures_once():
         calls.append(config)
         return {"check": 60.0}
 
-    calibrate(run, presets=["draft"], trials=TRIALS[:2], clock=lambda: float(next(clock)))
+    calibrate(run, trials=few(), prior=NO_PRIOR, clock=lambda: float(next(clock)))
     assert len(calls) == 1 + 4
 
 
@@ -195,42 +197,44 @@ def test_nothing_is_repeated_after_15_processor_seconds():
 
     calibrate(
         run,
-        presets=["draft"],
-        trials=TRIALS[:2],
+        trials=few(),
+        prior=NO_PRIOR,
         clock=lambda: 0.0,
         cpu=lambda: 3.0 * len(calls),
         listener=events.append,
     )
     assert len(calls) == 6
-    assert events[0].note == "load preset draft"
+    assert events[0].note == "load preset draft, 50 to 5 Gaussians"
     assert events[1].note == "preset draft, 50 to 5 Gaussians"
 
 
 def test_the_last_trials_are_skipped_when_time_is_up():
-    """Each preset is measured on a small and a large scene, however long that takes."""
+    """A small and a large scene are measured, however long that takes."""
     calls = []
 
     def run(config, scene, count):
-        calls.append((config.preset, len(scene), count))
+        calls.append((len(scene), count))
         return {"check": 9.0}
 
-    trials = [replace(trial, count=trial.count // 20) for trial in TRIALS]
     model = calibrate(
-        run,
-        presets=["draft", "fast"],
-        trials=trials,
-        clock=lambda: 0.0,
-        cpu=lambda: 9.0 * len(calls),
+        run, trials=few(), prior=NO_PRIOR, clock=lambda: 0.0, cpu=lambda: 9.0 * len(calls)
     )
-    assert len(calls) == 2 + 2 * LEAST_MEASURED
-    assert {size for _, size, _ in calls} == {trials[0].count, trials[1].count}
-    assert model.presets == ("draft", "fast")
+    assert calls == [(50, 5), (50, 5), (50, 25), (200, 20)]
+    assert len(calls) == 1 + LEAST_MEASURED
+    assert set(model.rates) == {"check"}
+
+
+def test_what_is_measured_in_any_case_has_every_stage():
+    stages = set()
+    for trial in TRIALS[:LEAST_MEASURED]:
+        stages |= made_up(trial.config, cvtgs.synthetic.scene("object", 20, sh_degree=0), 2).keys()
+    assert stages >= {"tessellate", "network", "visibility", "match", "refine"}
 
 
 def test_real_seconds_come_from_the_report():
     run = measured_seconds("cpu")
     scene = cvtgs.synthetic.scene("object", 200, sh_degree=0, seed=0)
-    seconds = run(cvtgs.SimplifyConfig.from_preset("draft"), scene, 20)
+    seconds = run(preset("draft"), scene, 20)
     assert {"check", "plan", "filter", "tessellate", "merge"} <= set(seconds)
     assert all(value >= 0 for value in seconds.values())
 
@@ -238,12 +242,12 @@ def test_real_seconds_come_from_the_report():
 def test_refinement_for_a_given_time_costs_that_time(model, monkeypatch):
     changed = {**cvtgs.PRESETS, "high": {"refine": {"seconds": 7.0}}}
     monkeypatch.setattr("cvtgs.config.simplify.PRESETS", changed)
-    assert model.stage_seconds("high", Work(count=1000, target=10))["refine"] == 7.0
+    assert model.stage_seconds(Work(count=1000, target=10), preset("high"))["refine"] == 7.0
 
 
 def test_the_best_preset_that_fits_is_chosen(model):
     work = Work(count=1_000_000, target=10_000)
-    costs = [model.seconds(name, work) for name in CANDIDATES]
+    costs = [model.seconds(work, preset(name)) for name in CANDIDATES]
     assert costs == sorted(costs)
     for name, cost in zip(CANDIDATES, costs, strict=True):
         assert choose_preset(work, 1.31 * cost, model=model) == (name, cost)
@@ -263,7 +267,7 @@ def test_a_time_too_short_for_every_preset_is_an_error(model):
     with pytest.raises(GoalError) as caught:
         choose_preset(work, 0.5, model=model)
     assert str(caught.value) == (
-        "no preset fits into 0.5 s: the fastest, draft, takes about 3.1 s to make 10,000 of "
+        "no preset fits into 0.5 s: the fastest, draft, takes about 7.5 s to make 10,000 of "
         "1,000,000 Gaussians, and 1.3 times that is reserved."
     )
 
@@ -275,8 +279,6 @@ def test_invalid_arguments_of_the_choice_are_refused(model):
             choose_preset(work, seconds, model=model)
     with pytest.raises(InvalidArgumentError, match="a Work has its target"):
         choose_preset(work, 1.0, rho=0.1, model=model)
-    with pytest.raises(ConfigError, match="whose cost was measured; found 'paper'"):
-        model.seconds("paper", work)
 
 
 class Calibration:
@@ -331,7 +333,8 @@ def changed(key: str, value: object):
         changed("version", 0),
         changed("key", {}),
         changed("model", {"rates": {}}),
-        changed("model", {"rates": {"draft": {"check": {"in": -1.0}}}}),
+        changed("model", {"rates": {name: {"in": -1.0} for name in FEATURES}}),
+        changed("model", {"rates": {"check": {"in": 1.0}}}),
     ],
 )
 def test_an_unusable_cache_is_measured_again(model, tmp_path, change):

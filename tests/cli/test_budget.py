@@ -9,16 +9,14 @@ import pytest
 import cvtgs
 from cvtgs.budget import CostModel
 from cvtgs.budget.calibrate import CANDIDATES
+from cvtgs.budget.costs import FEATURES
 from cvtgs.cli.main import build_parser, main
 from cvtgs.cli.simplify import check_goals
 from cvtgs.cli.time_budget import STARTED, choose_preset, read_seconds
 from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.progress import silent
 
-RATES = dict(zip(CANDIDATES, (1e-6, 1e-5, 1e-4, 1e-3, 1e-2), strict=True))
-MODEL = CostModel(
-    rates={name: {"check": {"in": rate, "in_values": 0.0}} for name, rate in RATES.items()}
-)
+MODEL = CostModel(rates={"check": {"in": 1e-6}, "refine": {"look_pixels": 2.5e-7}})
 
 
 def options(*words: str) -> argparse.Namespace:
@@ -146,9 +144,7 @@ def test_a_time_budget_chooses_a_preset_and_explains_it(scene):
     ],
 )
 def test_a_time_budget_accounts_for_the_other_settings(scene, monkeypatch, words, settings, preset):
-    nothing = {"check": {"in": 0.0}}
-    slow = {"network": {"once": 9.0}, "refine": {"look_pixels": 0.0}}
-    rates = {"fast": nothing, "standard": nothing | slow}
+    rates = {"network": {"once": 9.0}, "visibility": {"once": 999.0}, "refine": {"images_in": 0.0}}
     model = CostModel(rates=rates)
     monkeypatch.setattr(cvtgs.budget, "cost_model", lambda *_, **__: model)
     monkeypatch.setattr("cvtgs.budget.calibrate.is_calibrated", lambda device: True)
@@ -166,7 +162,7 @@ def test_the_machine_is_measured_once_or_on_request(scene, measured, capsys):
     words = ["--rho", "0.1", "--time-budget", "5s"]
     choose_preset(options(*words), scene, {}, silent)
     assert capsys.readouterr().err == (
-        "cvtgs: measuring this machine once, about 20 seconds (--shipped-rates skips this)\n"
+        "cvtgs: measuring this machine once, about 10 seconds (--shipped-rates skips this)\n"
     )
     choose_preset(options(*words), scene, {}, silent)
     assert capsys.readouterr().err == ""
@@ -199,9 +195,10 @@ def test_shipped_rates_need_no_measurement(scene, measured, capsys):
     assert chosen.name in CANDIDATES
     assert (measured, capsys.readouterr().err) == ([], "")
     model = cvtgs.budget.shipped_model()
-    assert set(model.presets) <= set(CANDIDATES)
+    assert set(FEATURES) <= set(model.rates)
     work = cvtgs.budget.Work(count=1_000_000, target=10_000)
-    seconds = [model.seconds(name, work) for name in ("draft", "standard", "matched", "high")]
+    presets = map(cvtgs.SimplifyConfig.from_preset, ("draft", "standard", "matched", "high"))
+    seconds = [model.seconds(work, config) for config in presets]
     assert sorted(seconds) == seconds
     assert 1 < seconds[0] < seconds[-1] < 3600
 

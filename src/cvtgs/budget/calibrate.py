@@ -16,9 +16,9 @@ from typing import Literal
 import torch
 
 import cvtgs
-from cvtgs.budget.costs import CostModel, Measurement, Work
+from cvtgs.budget.costs import FEATURES, CostModel, Measurement, Work, uses_images
 from cvtgs.clock import StageCost
-from cvtgs.config import PRESETS, RefineConfig, Section, SimplifyConfig
+from cvtgs.config import PRESETS, Section, SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.counts import target_count
 from cvtgs.devices import chosen_device, device_name
@@ -40,7 +40,7 @@ MOST_CPU_SECONDS = 15.0
 """CPU seconds after which nothing is repeated, and only mandatory trials are measured."""
 
 LEAST_MEASURED = 3
-"""Number of mandatory measurements of every preset: small and large, many cells and few."""
+"""Number of trials that are measured however long they take."""
 
 MOST_START_SECONDS = 1.0
 """Cap on loading time: anything beyond it was compilation, which happens once per installation."""
@@ -48,19 +48,10 @@ MOST_START_SECONDS = 1.0
 CANDIDATES = tuple(name for name in PRESETS if name != "paper")
 """Presets to choose from; ``paper`` is only for comparison."""
 
-SHORT = (
-    {"views": 3, "steps": 4, "batch": 4, "heldout": 2, "size": 256},
-    {"views": 5, "steps": 5, "batch": 5, "heldout": 2, "size": 352},
-)
-"""Reduced settings of images and refinements, used alternately to vary number and pixels."""
-
-SHORTEST = {"views": 1, "steps": 1, "batch": 4, "heldout": 1, "size": 32}
-"""Settings just large enough to load the libraries that a preset needs."""
-
 RENDERERS = ("gsplat", "numba")
 """Packages that render faster than torch; not imported to check, as that can outlast a run."""
 
-VERSION: Literal[3] = 3
+VERSION: Literal[4] = 4
 """Version of the cache file; raised when features change, so that older files are replaced."""
 
 SHIPPED_RATES = "rates.json"
@@ -77,26 +68,63 @@ Calibration = Callable[[], CostModel]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """A generated scene, and the ratios to simplify it to."""
+    """A simplification of a generated scene.
 
+    Attributes:
+        preset: The preset.
+        kind: Kind of the scene.
+        count: Number of Gaussians.
+        sh_degree: Degree of the scene.
+        rho: Ratio of Gaussians to keep.
+        views: Number of images, instead of those of the preset, if it uses images.
+        size: Side of the images, pixels.
+        steps: Number of steps of refinement.
+    """
+
+    preset: str
     kind: str
     count: int
     sh_degree: int
-    ratios: tuple[float, ...]
+    rho: float
+    views: int = 0
+    size: int = 0
+    steps: int = 0
+
+    @property
+    def config(self) -> SimplifyConfig:
+        """The preset, with fewer and smaller images."""
+        config = SimplifyConfig.from_preset(self.preset)
+        if not uses_images(config):
+            return config
+        images: dict[str, Section] = {
+            "visibility": config.visibility.model_copy(
+                update={"views": self.views, "size": self.size}
+            ),
+            "refine": config.refine.model_copy(update={"size": self.size, "steps": self.steps}),
+        }
+        return config.model_copy(update=images)
 
 
 TRIALS = (
-    Trial(kind="object", count=20_000, sh_degree=0, ratios=(0.02, 0.15)),
-    Trial(kind="room", count=100_000, sh_degree=3, ratios=(0.003, 0.05)),
-    Trial(kind="courtyard", count=60_000, sh_degree=1, ratios=(0.01, 0.2)),
-)
+    Trial(preset="standard", kind="object", count=20_000, sh_degree=0, rho=0.15),
+    Trial(
+        preset="matched", kind="object", count=20_000, sh_degree=0, rho=0.15,
+        views=4, size=256, steps=6,
+    ),
+    Trial(preset="standard", kind="room", count=100_000, sh_degree=3, rho=0.05),
+    Trial(
+        preset="matched", kind="courtyard", count=60_000, sh_degree=1, rho=0.2,
+        views=6, size=352, steps=8,
+    ),
+    Trial(preset="standard", kind="courtyard", count=60_000, sh_degree=1, rho=0.01),
+)  # fmt: skip
 """Small and large scenes, with few and many colour coefficients, and few and many cells."""
 
 
 class CachedModel(Record, allow_inf_nan=False):
     """The content of the cache file."""
 
-    version: Literal[3]
+    version: Literal[4]
     key: dict[str, str]
     made: float
     model: CostModel
@@ -119,7 +147,7 @@ def cost_model(
     Args:
         device: Device that the presets run on.
         recalibrate: Whether to measure again in any case.
-        calibration: Function that measures; None for the real one, which takes about 20 seconds.
+        calibration: Function that measures; None for the real one, which takes about 10 seconds.
         folder: Cache folder; None for ``cvtgs`` in the user's cache folder.
         listener: Called with progress events.
 
@@ -131,11 +159,11 @@ def cost_model(
 
     Example:
         >>> import tempfile
-        >>> rates = {"standard": {"check": {"in": 1e-6, "in_values": 0.0}}}
+        >>> rates = {"check": {"in": 1e-6, "in_values": 0.0}}
         >>> with tempfile.TemporaryDirectory() as name:
         ...     model = cost_model(calibration=lambda: CostModel(rates=rates), folder=Path(name))
-        >>> model.presets
-        ('standard',)
+        >>> list(model.rates)
+        ['check']
     """
     where = chosen_device(device)
     key = machine_key(where)
@@ -155,13 +183,13 @@ def cost_model(
 
 
 def shipped_model() -> CostModel:
-    """Return the cost of presets that comes with the package, without measuring.
+    """Return the cost that comes with the package, without measuring.
 
     Returns:
         The model, measured on two cores of a server without a GPU.
 
     Example:
-        >>> "standard" in shipped_model().presets
+        >>> "tessellate" in shipped_model().rates
         True
     """
     text = files("cvtgs.budget").joinpath(SHIPPED_RATES).read_text(encoding="utf-8")
@@ -215,7 +243,7 @@ def _read_cached(path: Path, key: Mapping[str, str]) -> CostModel | None:
     except (OSError, ValueError):
         return None
     fresh = 0 <= time.time() - record.made < STALE_SECONDS
-    complete = record.model.presets == CANDIDATES
+    complete = set(FEATURES) <= set(record.model.rates)
     return record.model if fresh and complete and record.key == key else None
 
 
@@ -246,89 +274,69 @@ def undisturbed_seconds(cost: StageCost) -> float:
 def calibrate(
     run: StageSeconds,
     *,
-    presets: Sequence[str] = CANDIDATES,
+    prior: CostModel | None = None,
     trials: Sequence[Trial] = TRIALS,
     clock: Callable[[], float] = time.perf_counter,
     cpu: Callable[[], float] = time.process_time,
     listener: ProgressListener = silent,
 ) -> CostModel:
-    """Measure presets on generated scenes, and fit their cost.
+    """Measure a few simplifications of generated scenes, and fit their cost.
 
-    Every preset is first run once to load its libraries. Then every trial is measured up to three
-    times, or once if that takes long; the fastest time of each stage counts, since other programs
-    can only slow it down. After 15 CPU seconds nothing is repeated, and the last trials are
-    skipped. Presets that use images get only a few small ones here. Presets that then have equal
-    settings are measured once.
+    The first trial without images, and the first with some, are run once more to load their
+    libraries. Then every trial is measured up to three times, or once if that takes long; the
+    fastest time of each stage counts, since other programs can only slow it down. After 15 CPU
+    seconds nothing is repeated, and the last trials are skipped.
+
+    Args:
+        run: Simplifies a scene, and returns the seconds of each stage.
+        prior: Rates that hold where the measurements leave them open; None for the shipped ones.
+        trials: What to measure.
+        clock: Returns wall-clock seconds.
+        cpu: Returns CPU seconds of this process.
+        listener: Called with progress events.
     """
-    first: dict[SimplifyConfig, str] = {}
-    measured_as = {
-        preset: first.setdefault(
-            _shortened(preset, SHORT[0]).model_copy(update={"preset": ""}), preset
-        )
-        for preset in presets
-    }
-    scenes = [make(trial.kind, trial.count, sh_degree=trial.sh_degree) for trial in trials]
-    tasks = [
-        (preset, _shortened(preset, SHORT[number % len(SHORT)]), scene, target_count(len(scene), r))
-        for scene, trial in zip(scenes, trials, strict=True)
-        for number, r in enumerate(trial.ratios)
-        for preset in first.values()
-    ]
-    total, begun = MOST_REPEATS * len(tasks), cpu()
-    loading = []
-    starting = {_uses_images(preset): preset for preset in reversed(first.values())}
-    for preset, config, scene, count in tasks[: len(first)]:  # every preset once
-        listener(ProgressEvent(stage=STAGE, done=0, total=total, note=f"load preset {preset}"))
-        tried = config if preset in starting.values() else _shortened(preset, SHORTEST)
-        loading.append(sum(run(tried, scene, count).values()))
-    best: list[dict[str, float]] = [{} for _ in tasks]
-    spent = [0.0 for _ in tasks]
+    kinds = {trial: (trial.kind, trial.count, trial.sh_degree) for trial in trials}
+    made = {key: make(key[0], key[1], sh_degree=key[2]) for key in dict.fromkeys(kinds.values())}
+    scenes = [made[kinds[trial]] for trial in trials]
+    total, begun = MOST_REPEATS * len(trials), cpu()
+
+    def measure(row: int, done: int, text: str) -> Mapping[str, float]:
+        trial, scene = trials[row], scenes[row]
+        count = target_count(len(scene), trial.rho)
+        note = f"{text} {trial.preset}, {len(scene):,} to {count:,} Gaussians"
+        listener(ProgressEvent(stage=STAGE, done=done, total=total, note=note))
+        return run(trial.config, scene, count)
+
+    first = {uses_images(trials[row].config): row for row in reversed(range(len(trials)))}
+    loading = {row: sum(measure(row, 0, "load preset").values()) for row in sorted(first.values())}
+    best: list[dict[str, float]] = [{} for _ in trials]
+    spent = [0.0 for _ in trials]
     for number in range(total):
-        row = number % len(tasks)
-        preset, config, scene, count = tasks[row]
-        must = number < LEAST_MEASURED * len(first)
-        if spent[row] <= PATIENCE_SECONDS and (must or cpu() - begun <= MOST_CPU_SECONDS):
-            note = f"preset {preset}, {len(scene):,} to {count:,} Gaussians"
-            listener(ProgressEvent(stage=STAGE, done=number, total=total, note=note))
+        row = number % len(trials)
+        if spent[row] <= PATIENCE_SECONDS and (
+            number < LEAST_MEASURED or cpu() - begun <= MOST_CPU_SECONDS
+        ):
             begin = clock()
-            for stage, seconds in run(config, scene, count).items():
+            for stage, seconds in measure(row, number, "preset").items():
                 best[row][stage] = min(seconds, best[row].get(stage, seconds))
             spent[row] += clock() - begin
         listener(ProgressEvent(stage=STAGE, done=number + 1, total=total))
-    measured: dict[str, list[Measurement]] = {preset: [] for preset in first.values()}
-    for (preset, config, scene, count), stages in zip(tasks, best, strict=True):
-        if stages:
-            work = Work.of(scene, count)
-            measured[preset].append(Measurement(work=work, config=config, seconds=stages))
-    # The loading time of a new process: from the first preset, and the first one with images.
-    starts = {False: 0.0, True: 0.0}
-    for preset, seconds, stages in reversed(list(zip(first.values(), loading, best, strict=False))):
-        excess = min(max(seconds - sum(stages.values()), 0.0), MOST_START_SECONDS)
-        starts[_uses_images(preset)] = excess
+    measured = [
+        Measurement(
+            work=Work.of(scene, target_count(len(scene), trial.rho)),
+            config=trial.config,
+            seconds=stages,
+        )
+        for trial, scene, stages in zip(trials, scenes, best, strict=True)
+        if stages
+    ]
+    starts = {
+        with_images: min(max(loading[row] - sum(best[row].values()), 0.0), MOST_START_SECONDS)
+        for with_images, row in first.items()
+    }
     return CostModel.fit(
-        {preset: measured[same] for preset, same in measured_as.items()},
-        {name: starts[False] + starts[True] * _uses_images(name) for name in presets},
+        measured,
+        prior=prior or shipped_model(),
+        start=starts.get(False, 0.0),
+        image_start=starts.get(True, 0.0),
     )
-
-
-def _shortened(preset: str, short: Mapping[str, int]) -> SimplifyConfig:
-    """Return a preset with reduced numbers of images and steps, if it has any."""
-    config = SimplifyConfig.from_preset(preset)
-    changes: dict[str, Section] = {}
-    if config.uses_renders:
-        changes["visibility"] = config.visibility.model_copy(update={"views": short["views"]})
-    if config.refine.enabled:
-        update = {name: short[name] for name in short if name != "views"} | {"seconds": 0}
-        update["half_after"] = RefineConfig().half_after  # it costs nothing
-        if config.shares_images:
-            seen = config.visibility.model_copy(
-                update={"views": short["views"], "size": short["size"]}
-            )
-            changes["visibility"] = seen
-        changes["refine"] = config.refine.model_copy(update=update)
-    return config.model_copy(update=changes)
-
-
-def _uses_images(preset: str) -> bool:
-    config = SimplifyConfig.from_preset(preset)
-    return config.uses_renders or config.refine.enabled

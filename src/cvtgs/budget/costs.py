@@ -11,7 +11,6 @@ import pydantic
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.cvt.tessellate import MIN_SAMPLES
-from cvtgs.errors import ConfigError
 from cvtgs.grouping import finer_count
 from cvtgs.scene import GaussianScene
 
@@ -41,6 +40,9 @@ STEPS_OF_A_BATCH = 8.0
 
 LEAST_SECONDS = 2e-3
 """Floor of measured seconds in the relative errors of a fit."""
+
+PRIOR_WEIGHT = 0.3
+"""Weight of each prior rate in a fit, in measurements."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,84 +138,69 @@ class Measurement:
 
 
 class CostModel(Record, allow_inf_nan=False):
-    """The cost of presets on one machine: seconds = sum of rates times amounts, for each stage.
+    """The cost of simplifications on one machine: seconds = sum of rates times amounts, by stage.
 
     Attributes:
-        rates: Seconds per unit, by preset, stage and feature.
-        starts: Additional seconds of the first simplification of a process, by preset, for loading
-            libraries.
+        rates: Seconds per unit, by stage and feature; they hold for all presets, since the amounts
+            follow from the configuration.
+        start: Additional seconds of the first simplification of a process, for loading libraries.
+        image_start: The same for libraries that only configurations with images need.
     """
 
-    rates: dict[str, dict[str, dict[str, pydantic.NonNegativeFloat]]]
-    starts: dict[str, pydantic.NonNegativeFloat] = pydantic.Field(default_factory=dict)
+    rates: dict[str, dict[str, pydantic.NonNegativeFloat]]
+    start: pydantic.NonNegativeFloat = 0.0
+    image_start: pydantic.NonNegativeFloat = 0.0
 
     @classmethod
     def fit(
         cls,
-        measured: Mapping[str, Sequence[Measurement]],
-        starts: Mapping[str, float] | None = None,
+        measured: Sequence[Measurement],
+        *,
+        prior: Self | None = None,
+        start: float = 0.0,
+        image_start: float = 0.0,
     ) -> Self:
         """Fit the rates to measurements.
 
         Args:
-            measured: Measurements of simplifications of different sizes, by preset.
-            starts: Additional seconds of the first simplification of a process, by preset.
+            measured: Measurements of simplifications of different sizes and configurations.
+            prior: Rates of another machine, whose ratios to one another hold where the
+                measurements leave them open; None if there are enough measurements.
+            start: Additional seconds of the first simplification of a process.
+            image_start: The same for libraries that only configurations with images need.
 
         Returns:
             The model.
         """
-        rates: dict[str, dict[str, dict[str, float]]] = {}
-        for preset, some in measured.items():
-            stages = dict.fromkeys(stage for one in some for stage in one.seconds)
-            rates[preset] = {
-                stage: fit_rates(
-                    [one.work.features(stage, one.config) for one in some],
-                    [one.seconds.get(stage, 0.0) for one in some],
-                )
-                for stage in stages
-            }
-        return cls(rates=rates, starts=dict(starts or {}))
+        rates = {} if prior is None else dict(prior.rates)
+        for stage in dict.fromkeys(stage for one in measured for stage in one.seconds):
+            having = [one for one in measured if stage in one.seconds]
+            rates[stage] = fit_rates(
+                [one.work.features(stage, one.config) for one in having],
+                [one.seconds[stage] for one in having],
+                prior=rates.get(stage),
+            )
+        return cls(rates=rates, start=start, image_start=image_start)
 
-    @property
-    def presets(self) -> tuple[str, ...]:
-        """The presets that were measured."""
-        return tuple(self.rates)
-
-    def stage_seconds(
-        self, preset: str, work: Work, *, config: SimplifyConfig | None = None
-    ) -> dict[str, float]:
-        """Predict the cost of each stage.
-
-        A stage that only the configuration has, but not the preset, is assumed to cost as much as
-        in the best preset that has it.
+    def stage_seconds(self, work: Work, config: SimplifyConfig) -> dict[str, float]:
+        """Predict the cost of each stage that a configuration has.
 
         Args:
-            preset: Name of the preset.
             work: Size of the simplification.
-            config: The preset with other settings changed; None for the preset as it is.
+            config: Configuration of the simplification.
 
         Returns:
             Wall-clock seconds by stage.
-
-        Raises:
-            ConfigError: The preset was not measured.
         """
-        if preset not in self.rates:
-            raise ConfigError(
-                f"preset must be one of {', '.join(self.rates)}, whose cost was measured; "
-                f"found {preset!r}."
-            )
-        config = config or SimplifyConfig.from_preset(preset)
         optional = {
             VISIBILITY: config.uses_renders,
             NETWORK: config.merge.network,
             MATCH: config.uses_renders and config.match.enabled,
             REFINE: config.refine.enabled,
         }
-        known = {stage: rates for name in self.rates for stage, rates in self.rates[name].items()}
         seconds = {}
-        for stage, rates in (known | self.rates[preset]).items():
-            if optional.get(stage, stage in self.rates[preset]):
+        for stage, rates in self.rates.items():
+            if optional.get(stage, True):
                 amounts = work.features(stage, config)
                 seconds[stage] = sum(rate * amounts[name] for name, rate in rates.items())
         limit = config.refine.seconds
@@ -221,30 +208,42 @@ class CostModel(Record, allow_inf_nan=False):
             seconds[REFINE] = min(seconds[REFINE], limit) if config.refine.steps else limit
         return seconds
 
-    def seconds(self, preset: str, work: Work, *, config: SimplifyConfig | None = None) -> float:
+    def seconds(self, work: Work, config: SimplifyConfig) -> float:
         """Predict the cost of a simplification.
 
         Args:
-            preset: Name of the preset.
             work: Size of the simplification.
-            config: The preset with other settings changed; None for the preset as it is.
+            config: Configuration of the simplification.
 
         Returns:
             Wall-clock seconds of the first simplification of a process, from the scene in memory
             to the small scene in memory.
 
-        Raises:
-            ConfigError: The preset was not measured.
+        Example:
+            >>> model = CostModel(rates={"check": {"in": 4e-6, "in_values": 0.0}}, start=0.5)
+            >>> model.seconds(Work(count=1_000_000, target=10_000), SimplifyConfig())
+            4.5
         """
-        stages = self.stage_seconds(preset, work, config=config)
-        return self.starts.get(preset, 0.0) + sum(stages.values())
+        start = self.start + (self.image_start if uses_images(config) else 0.0)
+        return start + sum(self.stage_seconds(work, config).values())
 
 
-def fit_rates(rows: Sequence[Mapping[str, float]], seconds: Sequence[float]) -> dict[str, float]:
+def uses_images(config: SimplifyConfig) -> bool:
+    """Check whether a configuration renders images of the scene."""
+    return config.uses_renders or config.refine.enabled
+
+
+def fit_rates(
+    rows: Sequence[Mapping[str, float]],
+    seconds: Sequence[float],
+    *,
+    prior: Mapping[str, float] | None = None,
+) -> dict[str, float]:
     """Fit the rate of each feature to measured seconds.
 
     This is non-negative least squares (Lawson and Hanson 1974) of relative errors. No rate is
-    negative, so no prediction for more work is below one for less.
+    negative, so no prediction for more work is below one for less. With a prior, its rates times
+    one factor take part like :data:`PRIOR_WEIGHT` measurements each (ridge regression).
     """
     from scipy.optimize import nnls  # noqa: PLC0415 (heavy, and only for a calibration)
 
@@ -252,6 +251,15 @@ def fit_rates(rows: Sequence[Mapping[str, float]], seconds: Sequence[float]) -> 
     amounts = np.array([[row[name] for name in names] for row in rows], dtype=np.float64)
     measured = np.array(seconds, dtype=np.float64)
     weights = 1 / np.maximum(measured, LEAST_SECONDS)
-    scales = np.maximum(amounts.max(axis=0), 1e-300)
-    rates, _ = nnls(amounts / scales * weights[:, None], measured * weights)
-    return dict(zip(names, (rates / scales).tolist(), strict=True))
+    scales = 1 / np.maximum(amounts.max(axis=0), 1e-300)
+    if prior is not None:
+        scales = np.array([prior.get(name, 0.0) for name in names])
+    table, wanted = amounts * scales * weights[:, None], measured * weights
+    if prior is not None:
+        predicted = np.maximum(amounts @ scales, 1e-300)
+        factor = np.exp(np.mean(np.log(np.maximum(measured, LEAST_SECONDS) / predicted)))
+        pull = math.sqrt(PRIOR_WEIGHT) / factor
+        table = np.concatenate([table, pull * np.eye(len(names))])
+        wanted = np.concatenate([wanted, np.full(len(names), pull * factor)])
+    rates, _ = nnls(table, wanted)
+    return dict(zip(names, (rates * scales).tolist(), strict=True))

@@ -7,7 +7,7 @@ from itertools import islice
 from statistics import fmean
 from typing import Literal, NamedTuple
 
-from cvtgs.budget.calibrate import cost_model
+from cvtgs.budget.calibrate import CANDIDATES, cost_model
 from cvtgs.budget.costs import CostModel, Work
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
@@ -316,7 +316,7 @@ def choose_preset(
         ConfigError: A setting is unknown or out of range.
 
     Example:
-        >>> rates = {"standard": {"check": {"in": 4e-6, "in_values": 0.0}}}
+        >>> rates = {"check": {"in": 4e-6}, "refine": {"looks_out": 1e-3}}
         >>> work = Work(count=1_000_000, target=10_000)
         >>> choose_preset(work, 9.0, model=CostModel(rates=rates))
         Choice(preset='standard', seconds=4.0)
@@ -329,10 +329,8 @@ def choose_preset(
         raise InvalidArgumentError("rho and count are for a scene only; a Work has its target.")
     known = cost_model() if model is None else model
     costs = {
-        name: known.seconds(
-            name, work, config=SimplifyConfig.compose(preset=name, settings=settings)
-        )
-        for name in known.presets
+        name: known.seconds(work, SimplifyConfig.compose(preset=name, settings=settings))
+        for name in CANDIDATES
     }
     fitting = [name for name, cost in costs.items() if MARGIN * cost <= seconds]
     if not fitting:

@@ -185,15 +185,18 @@ def merge_pairs(
         if total == count:
             break
         groups = group_moments(groups, target, total)
-        pairs = _distinct_pairs(target[pairs[0]], target[pairs[1]])
+        del costs
+        pairs = target[pairs[0]], target[pairs[1]]
+        pairs = _distinct_pairs(*pairs)
     return labels
 
 
 def _distinct_pairs(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     """Return each unordered pair of different groups once, in ascending order."""
-    low, high = torch.minimum(first, second), torch.maximum(first, second)
-    bits = int(high.amax()).bit_length() if len(high) else 1
-    keys = torch.unique(((low << bits) | high)[low < high])
+    bits = max(int(ends.amax()).bit_length() if len(ends) else 1 for ends in (first, second))
+    keys = torch.minimum(first, second).bitwise_left_shift_(bits)  # in place: there are many pairs
+    keys |= torch.maximum(first, second)
+    keys = torch.unique(keys[first != second])
     return keys >> bits, keys & ((1 << bits) - 1)
 
 

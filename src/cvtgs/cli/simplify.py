@@ -83,7 +83,7 @@ def add_simplify(add_parser: AddParser) -> None:
         "--time-budget",
         metavar="TIME",
         help="time limit, for example 20s or 2m, with the best preset that fits; the first use "
-        "measures this machine, which takes about 20 seconds and does not count",
+        "measures this machine, which takes about 10 seconds and does not count",
     )
     parser.add_argument(
         "--shipped-rates",

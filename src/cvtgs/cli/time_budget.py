@@ -91,7 +91,7 @@ def choose_preset(
         again = options.recalibrate or not is_calibrated(options.device)
         if again and not options.quiet:
             say(
-                "cvtgs: measuring this machine once, about 20 seconds (--shipped-rates skips this)",
+                "cvtgs: measuring this machine once, about 10 seconds (--shipped-rates skips this)",
                 file=sys.stderr,
             )
         model = cvtgs.budget.cost_model(options.device, recalibrate=again, listener=listener)

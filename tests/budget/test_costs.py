@@ -1,0 +1,68 @@
+"""The cost model: rates fitted to seconds, and what they predict; all seconds are made up."""
+
+import math
+
+import pytest
+
+from cvtgs import SimplifyConfig
+from cvtgs.budget import CostModel, Work
+from cvtgs.budget.costs import Measurement, fit_rates
+
+
+def preset(name: str) -> SimplifyConfig:
+    return SimplifyConfig.from_preset(name)
+
+
+def test_rates_are_fitted_and_never_negative():
+    rows = [{"once": 1.0, "n": n} for n in (1.0, 2.0, 4.0)]
+    assert fit_rates(rows, [5.0, 7.0, 11.0]) == pytest.approx({"once": 3.0, "n": 2.0})
+    falling = fit_rates(rows, [11.0, 7.0, 5.0])
+    assert min(falling.values()) >= 0.0
+    assert falling["n"] == 0.0
+
+
+def test_errors_are_weighted_relative_to_the_seconds():
+    """One second in a hundred counts as little as a tenth of a second in ten."""
+    rates = fit_rates([{"n": 1.0}, {"n": 10.0}], [1.0, 11.0])
+    assert 1.0 < rates["n"] < 1.1
+
+
+def test_a_prior_decides_what_measurements_leave_open():
+    """One measurement, twice the prior, cannot tell two features apart; both rates double."""
+    one = [{"once": 1.0, "n": 3.0}]
+    assert fit_rates(one, [8.0], prior={"once": 1.0, "n": 1.0}) == pytest.approx(
+        {"once": 2.0, "n": 2.0}
+    )
+    several = [{"once": 1.0, "n": float(n)} for n in (1, 10, 100, 1000) for _ in range(500)]
+    seconds = [6.0 + 0.5 * row["n"] for row in several]
+    assert fit_rates(several, seconds, prior={"once": 1.0, "n": 1.0}) == pytest.approx(
+        {"once": 6.0, "n": 0.5}, rel=0.05
+    )
+    open_rates = fit_rates(several, seconds, prior={"once": 0.0, "n": 1.0})
+    assert open_rates["once"] == 0.0
+
+
+def test_stages_that_were_not_measured_keep_the_prior():
+    prior = CostModel(rates={"merge": {"out": 3.0}, "check": {"in": 1.0, "in_values": 0.0}})
+    work = Work(count=10, target=5)
+    known = Measurement(work=work, config=preset("draft"), seconds={"check": 20.0})
+    found = CostModel.fit([known], prior=prior)
+    assert found.rates["merge"] == {"out": 3.0}
+    assert found.rates["check"]["in"] == pytest.approx(2.0)
+
+
+def test_loading_counts_once_and_images_need_more_libraries():
+    model = CostModel(rates={"check": {"in": 1.0}}, start=0.25, image_start=1.0)
+    work = Work(count=3, target=1)
+    assert model.seconds(work, preset("standard")) == 3.25
+    assert model.seconds(work, preset("matched")) == 4.25
+
+
+def test_pixel_gaussian_pairs_grow_with_the_square_root_of_both():
+    matched = preset("matched")
+    few, many = (
+        Work(count=10**6, target=count).features("match", matched)["view_pairs"]
+        for count in (1000, 100_000)
+    )
+    assert few == pytest.approx(24 * 200 * math.sqrt(1000))
+    assert many == pytest.approx(10 * few)
