@@ -23,6 +23,7 @@ from cvtgs.budget import CostModel, Work, cost_model
 from cvtgs.budget.calibrate import (
     CANDIDATES,
     SHIPPED_RATES,
+    TRIALS,
     Trial,
     calibrate,
     measured_seconds,
@@ -94,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def shipped_rates() -> CostModel:
-    """Measure scenes of all sizes in full, without a prior."""
+    """Measure scenes of all sizes in full, and what a calibration measures, without a prior."""
     trials = [
         Trial(preset=preset, kind=kind, count=count, sh_degree=degree, rho=rho, **images(preset))
         for preset, ratios in SHIPPED_RATIOS.items()
@@ -102,6 +103,7 @@ def shipped_rates() -> CostModel:
         for rho in ratios
         if count <= MOST_WITH_IMAGES or not images(preset)
     ]
+    trials += TRIALS
     kind, count, degree = SCENES[1]
     trials.append(
         Trial(preset="high", kind=kind, count=count, sh_degree=degree, rho=0.01, **images("high"))

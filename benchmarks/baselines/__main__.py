@@ -25,4 +25,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 if __name__ == "__main__":
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as in the command line of cvtgs
+    os.environ.setdefault("GOMP_SPINCOUNT", "20000")
     main()

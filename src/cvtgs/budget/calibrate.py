@@ -109,16 +109,19 @@ TRIALS = (
     Trial(preset="standard", kind="object", count=20_000, sh_degree=0, rho=0.15),
     Trial(
         preset="matched", kind="object", count=20_000, sh_degree=0, rho=0.15,
-        views=4, size=256, steps=6,
+        views=8, size=256, steps=6,
     ),
     Trial(preset="standard", kind="room", count=100_000, sh_degree=3, rho=0.05),
     Trial(
         preset="matched", kind="courtyard", count=60_000, sh_degree=1, rho=0.2,
-        views=6, size=352, steps=8,
+        views=8, size=352, steps=8,
     ),
     Trial(preset="standard", kind="courtyard", count=60_000, sh_degree=1, rho=0.01),
 )  # fmt: skip
-"""Small and large scenes, with few and many colour coefficients, and few and many cells."""
+"""Small and large scenes, with few and many colour coefficients, and few and many cells.
+
+Of fewer than eight images, matching would hold out all instead of every eighth.
+"""
 
 
 class CachedModel(Record, allow_inf_nan=False):

@@ -24,7 +24,7 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     "merge": ("once", "in", "in_values", "out", "out_values"),
     VISIBILITY: ("once", "view_pixels", "views_in"),
     MATCH: ("once", "view_pixels", "view_pairs", "view_values"),
-    REFINE: ("images_in", "look_pixels", "looks_out"),
+    REFINE: ("images_in", "looks", "look_pixels", "looks_out"),
     NETWORK: ("once", "in", "in_values", "out", "out_values"),
 }
 """Features of each stage; its seconds are linear in their amounts."""
@@ -114,6 +114,7 @@ class Work:
             "view_pairs": visibility.views * side * math.sqrt(self.target),
             "view_values": float(visibility.views * self.target * self.colors),
             "images_in": float((0 if shared else heldout) + new_images) * self.count,
+            "looks": renders,
             "look_pixels": renders * (refine.size / refine.stride) ** 2,
             "looks_out": renders * self.target,
             "search": searched * math.log2(cells + 2),

@@ -185,7 +185,7 @@ def merge_pairs(
         if total == count:
             break
         groups = group_moments(groups, target, total)
-        del costs
+        del costs  # frees memory, as does replacing the old pairs before duplicates are removed
         pairs = target[pairs[0]], target[pairs[1]]
         pairs = _distinct_pairs(*pairs)
     return labels

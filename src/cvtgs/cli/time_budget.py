@@ -97,9 +97,13 @@ def choose_preset(
         model = cvtgs.budget.cost_model(options.device, recalibrate=again, listener=listener)
     if options.ckpt == "none":
         settings = {**settings, "merge.network": "false"}
-    choice = cvtgs.budget.choose_preset(
-        cvtgs.budget.Work.of(scene, target), budget - spent, settings=settings, model=model
-    )
+    work = cvtgs.budget.Work.of(scene, target)
+    try:
+        choice = cvtgs.budget.choose_preset(work, budget - spent, settings=settings, model=model)
+    except GoalError as error:
+        raise GoalError(
+            f"{error} Starting and reading took {spent:.1f} of {budget:g} s."
+        ) from error
     reason = (
         f"Preset {choice.preset}, the best that fits into {budget:g} s: expected to take "
         f"{choice.seconds:.1f} s after {spent:.1f} s of starting and reading."
