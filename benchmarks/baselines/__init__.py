@@ -6,15 +6,16 @@ file. As in the comparisons of CVT-GS, results are not fine-tuned.
 
 from collections.abc import Mapping
 from importlib import import_module
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from cvtgs.scene import GaussianScene
+if TYPE_CHECKING:
+    from cvtgs.scene import GaussianScene  # loads torch, which is to start after its settings
 
 
 class Simplify(Protocol):
     """The signature of every baseline."""
 
-    def __call__(self, scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScene:
+    def __call__(self, scene: "GaussianScene", count: int, *, seed: int = 0) -> "GaussianScene":
         """Return exactly ``count`` valid standard Gaussians."""
         ...
 

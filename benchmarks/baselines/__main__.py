@@ -1,11 +1,11 @@
 """Run one baseline on a file: ``python -m benchmarks.baselines METHOD IN OUT --count M``."""
 
 import argparse
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.baselines import BASELINES, baseline
+from cvtgs.cli.main import limit_spinning
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -24,6 +24,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as in the command line of cvtgs
-    os.environ.setdefault("GOMP_SPINCOUNT", "20000")
+    limit_spinning()  # as the command line of cvtgs does
     main()

@@ -1,7 +1,10 @@
 """Baselines against their papers' descriptions: all of them, and those that prune."""
 
 import math
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -213,3 +216,8 @@ def test_sensitivity_is_the_log_determinant():
     tiny = pup_3dgs.sensitivity(fisher * 1e-60)
     assert tiny.tolist() == pytest.approx([value - 360 * math.log(10) for value in wanted])
     assert pup_3dgs.sensitivity(torch.zeros(1, 6, 6, dtype=torch.float64)).tolist() == [-math.inf]
+
+
+def test_torch_starts_after_its_settings():
+    code = "import benchmarks.baselines.__main__, sys; sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])

@@ -155,12 +155,11 @@ def test_calibration_takes_few_images_and_steps():
     )
 
 
-def few(rhos: tuple[float, ...] = (0.1, 0.5), counts: tuple[int, ...] = (50, 200)) -> list[Trial]:
-    return [
-        Trial(preset="draft", kind="object", count=count, sh_degree=0, rho=rho)
-        for count in counts
-        for rho in rhos
-    ]
+FEW = [
+    Trial(preset="draft", kind="object", count=count, sh_degree=0, rho=rho)
+    for count in (50, 200)
+    for rho in (0.1, 0.5)
+]
 
 
 def test_the_fastest_of_several_runs_counts():
@@ -170,7 +169,7 @@ def test_the_fastest_of_several_runs_counts():
         calls.append(config)
         return {"check": len(scene) * (1.0 if len(calls) % 3 == 0 else 3.0)}
 
-    model = calibrate(run, trials=few(), prior=NO_PRIOR, clock=lambda: 0.0)
+    model = calibrate(run, trials=FEW, prior=NO_PRIOR, clock=lambda: 0.0)
     check = model.stage_seconds(Work(count=10, target=1), preset("draft"))["check"]
     assert check == pytest.approx(10.0)
     assert len(calls) == 1 + 3 * 4
@@ -183,7 +182,7 @@ def test_a_slow_machine_measures_once():
         calls.append(config)
         return {"check": 60.0}
 
-    calibrate(run, trials=few(), prior=NO_PRIOR, clock=lambda: float(next(clock)))
+    calibrate(run, trials=FEW, prior=NO_PRIOR, clock=lambda: float(next(clock)))
     assert len(calls) == 1 + 4
 
 
@@ -197,7 +196,7 @@ def test_nothing_is_repeated_after_15_processor_seconds():
 
     calibrate(
         run,
-        trials=few(),
+        trials=FEW,
         prior=NO_PRIOR,
         clock=lambda: 0.0,
         cpu=lambda: 3.0 * len(calls),
@@ -217,7 +216,7 @@ def test_the_last_trials_are_skipped_when_time_is_up():
         return {"check": 9.0}
 
     model = calibrate(
-        run, trials=few(), prior=NO_PRIOR, clock=lambda: 0.0, cpu=lambda: 9.0 * len(calls)
+        run, trials=FEW, prior=NO_PRIOR, clock=lambda: 0.0, cpu=lambda: 9.0 * len(calls)
     )
     assert calls == [(50, 5), (50, 5), (50, 25), (200, 20)]
     assert len(calls) == 1 + LEAST_MEASURED

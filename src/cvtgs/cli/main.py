@@ -35,13 +35,20 @@ MEMORY_ADVICE = (
 )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command line and return its exit status."""
-    # Torch reads these when it starts. By default idle OpenMP threads spin for long and use much
-    # CPU time; if they never spin, waking them takes longer than many of the small operations.
+def limit_spinning() -> None:
+    """Let idle OpenMP threads sleep after a moment, unless the user has set a policy.
+
+    Torch reads this when it starts. By default they spin for long and use much CPU time; if they
+    never spin, waking them takes longer than many small operations.
+    """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
         os.environ.setdefault("GOMP_SPINCOUNT", "20000")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command line and return its exit status."""
+    limit_spinning()
     stop = _Stop()
     before = signal.signal(signal.SIGINT, stop), signal.signal(signal.SIGTERM, stop)
     hook, sys.unraisablehook = sys.unraisablehook, stop.notice

@@ -58,7 +58,7 @@ def rasterize(
     For each dtype the first call compiles for about five seconds, and the first backward pass for
     as long again. The code is cached on disk, from where a later process loads it in half a second.
     Results do not depend on the number of threads. Idle OpenMP threads spin for a while after each
-    loop; setting ``OMP_WAIT_POLICY=PASSIVE`` before Python starts saves that CPU time.
+    loop; the embedding page of the docs shows how to save that CPU time.
 
     Memory: ``11 n`` numbers for n Gaussians, ``12 p`` bytes for p intersections of splats and
     tiles, and the image. The backward pass needs ``10 p`` numbers at a time.
