@@ -14,7 +14,7 @@ from cvtgs.config import AllocationConfig
 from cvtgs.devices import chunk_length, in_threads
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.parameters import normalize_quats, quats_to_matrices
-from cvtgs.math.segments import label_argmin, label_sums, smallest_rows
+from cvtgs.math.segments import label_argmin, label_sums, smallest_rows, take_columns
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
@@ -56,14 +56,7 @@ class Moments(NamedTuple):
 
     def take(self, rows: Int[Tensor, "k"]) -> "Moments":
         """Return the moments of some rows."""
-        return Moments(
-            self.counts.index_select(0, rows),
-            self.weights.index_select(0, rows),
-            self.masses.index_select(0, rows),
-            self.means.index_select(1, rows),
-            self.covariances.index_select(1, rows),
-            self.colors.index_select(1, rows),
-        )
+        return Moments(*(take_columns(column, rows) for column in self))
 
 
 def gaussian_moments(
@@ -139,7 +132,7 @@ def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Mom
     shares = members.weights / sums[1].index_select(0, labels)
     columns = [shares * column for column in (*members.means, *members.colors)]
     means, colors = label_sums(columns, labels, count).T.contiguous().split(3)
-    shifts = members.means - means.index_select(1, labels)
+    shifts = members.means - take_columns(means, labels)
     columns = [
         shares * (covariance + shifts[i] * shifts[j])
         for covariance, (i, j) in zip(members.covariances, UPPER, strict=True)
@@ -310,12 +303,12 @@ def reassign(
         mean, covariance = members.means[:, part], members.covariances[:, part]
         color = members.colors[:, part]
         least, best = None, cells
-        for group in candidates.index_select(1, cells):
-            shifts = mean - groups.means.index_select(1, group)
-            matrix = inverse.index_select(1, group)
+        for group in take_columns(candidates, cells):
+            shifts = mean - take_columns(groups.means, group)
+            matrix = take_columns(inverse, group)
             cost = volumes.index_select(0, group)
             cost = cost + 2 * config.color * (
-                color - groups.colors.index_select(1, group)
+                color - take_columns(groups.colors, group)
             ).square().sum(0)
             for k, (r, c) in enumerate(UPPER):
                 twice = 1.0 if r == c else 2.0

@@ -7,7 +7,7 @@ from torch import Tensor
 from cvtgs.cells.partition import Partition
 from cvtgs.devices import chunk_length, in_threads
 from cvtgs.math import parameters
-from cvtgs.math.segments import gather_columns
+from cvtgs.math.segments import gather_columns, take_columns
 from cvtgs.scene import GaussianScene
 
 EQUAL_SHARE = 1e-2
@@ -179,7 +179,7 @@ def side_cover(
     means, rotations, scales = _frames(scene, rows)
     other_means, other_rotations, other_scales = _frames(scene, others)
     arms = (rotations * (PROBE_SIGMAS * scales)[:, None, :]).permute(1, 2, 0).flatten(0, 1)
-    table = torch.cat([means.T, arms]).index_select(1, ids)
+    table = take_columns(torch.cat([means.T, arms]), ids)
     shifts = project_on_axes(other_rotations, (table[:3].T - other_means)[:, :, None])
     arms = project_on_axes(other_rotations, table[3:].unflatten(0, (3, 3)).permute(2, 0, 1))
     logits = scene.logit_opacities.index_select(0, others).double()

@@ -19,6 +19,7 @@ from cvtgs.math.segments import (
     segment_ids,
     segment_max,
     segment_sum,
+    take_columns,
     true_rows,
 )
 from cvtgs.scene import GaussianScene
@@ -216,10 +217,10 @@ def mean_and_covariance(
     """
     offsets, cells = members.offsets, members.cells
     first = members.means.index_select(0, offsets[:-1]).T.contiguous()
-    local = members.means.T - first.index_select(1, cells)
+    local = members.means.T - take_columns(first, cells)
     shift = segment_sum(local.T, offsets, weights).T.contiguous()
     axes = parameters.quats_to_matrices(members.quats) * members.scales[:, None, :]
-    local = local - shift.index_select(1, cells)
+    local = local - take_columns(shift, cells)
     x, y, z = local
     # Sums of products of columns; batched products of small matrices take ten times as long.
     products = torch.cat([x * local, y * local[1:], z * local[2:]])

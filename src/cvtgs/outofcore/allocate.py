@@ -20,7 +20,7 @@ from cvtgs.devices import one_thread
 from cvtgs.grouping import REASSIGN, allocation_at
 from cvtgs.io import atomic_output
 from cvtgs.io.tensors import map_tensors, save_tensors
-from cvtgs.math.segments import segment_argmax, sort_by_label
+from cvtgs.math.segments import segment_argmax, sort_by_label, take_columns
 from cvtgs.outofcore.job import SENT_BYTES, Job
 from cvtgs.outofcore.rows import BlockRows, send_rows
 from cvtgs.outofcore.visibility import is_measured, read_apparent_rows
@@ -68,7 +68,6 @@ def _members(job: Job, rows: BlockRows) -> Moments:
     )
 
 
-@one_thread()
 def allocate(job: Job) -> None:
     """Choose the cells of all blocks that merge, and write the groups of every block."""
     if job.path("targets.json").exists() and all(
@@ -222,8 +221,8 @@ def _take(job: Job, keys: Int[Tensor, "k"], *names: str) -> list[Tensor]:
     for block, rows in _by_block(ascending):
         tensors, _ = map_tensors(job.groups_path(block))
         for name, values in zip(names, parts, strict=True):
-            values.append(tensors[name].index_select(-1, rows))
-    return [torch.cat(values, dim=-1).index_select(-1, inverse) for values in parts]
+            values.append(take_columns(tensors[name], rows))
+    return [take_columns(torch.cat(values, dim=-1), inverse) for values in parts]
 
 
 def _by_block(keys: Int[Tensor, "k"]) -> list[tuple[int, Tensor]]:
