@@ -19,7 +19,7 @@ TEXTS = {path: path.read_text(encoding="utf-8") for path in FILES}
 # shows the effect plan of `analysis`, so each stands above the module it needs; `devices` (names of
 # devices) and `cameras` (data) stand as low as their imports allow.
 LEVELS = [
-    {"errors", "progress", "text"},
+    {"errors", "progress", "startup", "text"},
     {"math", "clock", "devices", "plots", "counts", "boxes"},
     {"config", "scene", "cameras", "processes"},
     {"validity", "edit"},

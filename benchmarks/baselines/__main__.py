@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.baselines import BASELINES, baseline
-from cvtgs.cli.main import limit_spinning
+from cvtgs.startup import load_torch
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -24,5 +24,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    limit_spinning()  # as the command line of cvtgs does
+    load_torch()  # as the command line of cvtgs does
     main()

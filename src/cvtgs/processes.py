@@ -13,10 +13,8 @@ from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Self, TypeVar
 
-import torch
-
-from cvtgs.devices import core_count
 from cvtgs.errors import RunError
+from cvtgs.startup import load_torch
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -37,6 +35,8 @@ class LocalWorkers:
         self._count, self._remedy = count, remedy
 
     def __enter__(self) -> Self:
+        from cvtgs.devices import core_count  # noqa: PLC0415 (loads torch; see _begin)
+
         context = get_context("spawn")  # fork would copy locks that torch's threads hold
         self._watched, self._alive = context.Pipe(duplex=False)
         threads = max(1, core_count() // self._count)
@@ -99,7 +99,10 @@ def _begin(watched: Connection, threads: int) -> None:
     """Prepare a worker process: it leaves Ctrl-C to its parent, and ends when the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ["OMP_NUM_THREADS"] = str(threads)  # for searches and for libraries loaded later
-    torch.set_num_threads(threads)  # torch is already loaded
+    load_torch()
+    import torch  # noqa: PLC0415 (with these settings)
+
+    torch.set_num_threads(threads)  # the program of the parent may have loaded it
     threading.Thread(target=_end_with, args=(watched,), daemon=True).start()
 
 

@@ -43,27 +43,6 @@ def test_version_starts_with_that_of_cvtgs(capsys):
     assert capsys.readouterr().out.startswith(f"cvtgs {cvtgs.__version__}\n")
 
 
-@pytest.mark.parametrize(
-    ("given", "wanted"),
-    [
-        ({}, ("PASSIVE", "20000")),
-        ({"GOMP_SPINCOUNT": "7"}, ("PASSIVE", "7")),
-        ({"OMP_WAIT_POLICY": "ACTIVE"}, ("ACTIVE", None)),
-    ],
-)
-def test_idle_threads_spin_only_for_a_moment(given, wanted, monkeypatch, capsys):
-    names = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
-    for name in names:  # afterwards, monkeypatch also removes what main sets
-        monkeypatch.setenv(name, "")
-        monkeypatch.delenv(name)
-    for name, value in given.items():
-        monkeypatch.setenv(name, value)
-    with pytest.raises(SystemExit):
-        main(["--version"])
-    capsys.readouterr()
-    assert tuple(map(os.environ.get, names)) == wanted
-
-
 def test_help_imports_no_heavy_package():
     code = (
         "import sys; from cvtgs.cli.main import build_parser; build_parser().format_help();"

@@ -1,6 +1,7 @@
 """The program ``cvtgs``: parse the command line, run a command, turn errors into exit codes."""
 
 import argparse
+import gc
 import io
 import os
 import signal
@@ -24,9 +25,13 @@ from cvtgs.cli.simplify import add_simplify
 from cvtgs.cli.train import add_train
 from cvtgs.cli.view import add_view
 from cvtgs.errors import CvtgsError, memory_errors
+from cvtgs.startup import load_torch
 
 WRITE_SEVERAL = ("levels", "render", "compare", "tradeoff", "demo", "train")
 """Commands that write several files to one folder, which only one run at a time may do."""
+
+WITHOUT_TORCH = ("completion",)
+"""Commands that need no tensors, and start faster without them."""
 
 INTERRUPTED, TERMINATED, PIPE_CLOSED = 130, 143, 141
 MEMORY_ADVICE = (
@@ -35,20 +40,8 @@ MEMORY_ADVICE = (
 )
 
 
-def limit_spinning() -> None:
-    """Let idle OpenMP threads sleep after a moment, unless the user has set a policy.
-
-    Torch reads this when it starts. By default they spin for long and use much CPU time; if they
-    never spin, waking them takes longer than many small operations.
-    """
-    if "OMP_WAIT_POLICY" not in os.environ:
-        os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
-        os.environ.setdefault("GOMP_SPINCOUNT", "20000")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit status."""
-    limit_spinning()
     stop = _Stop()
     before = signal.signal(signal.SIGINT, stop), signal.signal(signal.SIGTERM, stop)
     hook, sys.unraisablehook = sys.unraisablehook, stop.notice
@@ -82,6 +75,8 @@ def _run(words: Sequence[str]) -> None:
     if not words:
         parser.exit(2, parser.format_help())
     options = parser.parse_args(words)
+    if options.command not in WITHOUT_TORCH:
+        load_torch()
     with memory_errors(f"cvtgs {options.command}", MEMORY_ADVICE), _lock(options):
         options.run(options)
     flush_output()
@@ -109,6 +104,7 @@ def run_process() -> NoReturn:
             sys.stdout.flush()
     except OSError:  # already reported; Python would report it again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    gc.freeze()  # the process ends faster without a collection of everything it has loaded
     sys.exit(code)
 
 

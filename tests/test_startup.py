@@ -1,0 +1,66 @@
+"""Loading torch: settings of idle threads and garbage collection."""
+
+import gc
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from cvtgs.startup import load_torch
+
+NAMES = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
+LOAD = f"""
+import gc, json, os, sys
+from cvtgs.startup import load_torch
+assert "torch" not in sys.modules
+load_torch()
+found = [os.environ.get(name) for name in {NAMES}]
+print(json.dumps([found, "torch" in sys.modules, gc.isenabled(), gc.get_freeze_count()]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [
+        ({}, ["PASSIVE", "20000"]),
+        ({"GOMP_SPINCOUNT": "7"}, ["PASSIVE", "7"]),
+        ({"OMP_WAIT_POLICY": "ACTIVE"}, ["ACTIVE", None]),
+    ],
+)
+def test_threads_spin_for_a_moment_and_collections_skip_loaded_modules(given, wanted):
+    environment = {name: value for name, value in os.environ.items() if name not in NAMES}
+    done = subprocess.run(
+        [sys.executable, "-c", LOAD],
+        env=environment | given,
+        capture_output=True,
+        check=True,
+        text=True,
+    )
+    found, is_loaded, collects, frozen = json.loads(done.stdout)
+    assert found == wanted
+    assert is_loaded
+    assert collects
+    assert frozen > 100_000
+
+
+def test_a_process_that_has_loaded_torch_keeps_its_settings(monkeypatch):
+    for name in NAMES:
+        monkeypatch.delenv(name, raising=False)
+    before = gc.get_freeze_count()
+    load_torch()
+    assert gc.get_freeze_count() == before
+    assert not any(name in os.environ for name in NAMES)
+
+
+def test_every_command_but_completion_loads_torch_this_way():
+    code = (
+        "import sys; from cvtgs.cli import main; main.load_torch = lambda: sys.exit('asked');"
+        "main.main(sys.argv[1:])"
+    )
+    for words, wanted in ((["doctor"], "asked\n"), (["completion", "bash"], "")):
+        done = subprocess.run(
+            [sys.executable, "-c", code, *words], capture_output=True, check=False, text=True
+        )
+        assert done.stderr == wanted
