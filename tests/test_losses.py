@@ -7,9 +7,17 @@ import sys
 
 import pytest
 import torch
+from kornia.metrics import ssim
 
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.losses import gradient_loss, image_loss, l1_loss, relative_loss, ssim_loss
+from cvtgs.losses import (
+    gradient_loss,
+    image_loss,
+    l1_loss,
+    mean_ssim,
+    relative_loss,
+    ssim_loss,
+)
 
 LOSSES = [l1_loss, ssim_loss, gradient_loss, image_loss]
 
@@ -86,6 +94,19 @@ def test_losses_are_scalars_that_are_zero_for_equal_images(loss, dtype) -> None:
     assert value.dtype == dtype
     assert value.item() > 0.05
     assert abs(loss(first, first).item()) < 1e-6
+
+
+def test_ssim_and_its_gradient_are_those_of_kornia() -> None:
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(2, 17, 23, 3, generator=generator, dtype=torch.float64)
+    image = target + 0.2 * torch.randn(target.shape, generator=generator, dtype=torch.float64)
+    image.requires_grad_()
+    ours = mean_ssim(image, target)
+    channels_first = (images.permute(0, 3, 1, 2) for images in (image, target))
+    theirs = ssim(*channels_first, 11, max_val=1.0, eps=0.0, padding="valid").mean(dim=(1, 2, 3))
+    torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-12)
+    gradients = [torch.autograd.grad(values.sum(), image)[0] for values in (ours, theirs)]
+    torch.testing.assert_close(*gradients, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (7, 1), (10, 40)])

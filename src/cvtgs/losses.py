@@ -2,6 +2,7 @@
 
 import math
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -10,8 +11,11 @@ from cvtgs.math.parameters import positive_log
 
 __all__ = ["gradient_loss", "image_loss", "l1_loss", "relative_loss", "ssim_loss"]
 
-SSIM_WINDOW = 11
-"""Side of the Gaussian window in pixels; its standard deviation is 1.5 pixels."""
+SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
+"""Side and standard deviation of the Gaussian window, pixels."""
+
+SSIM_K1, SSIM_K2 = 0.01, 0.03
+"""Stabilisers of the comparison of means and of the comparison of contrasts."""
 
 SSIM_WEIGHT = GRADIENT_WEIGHT = 0.2
 """Weights in the loss of CVT-GS."""
@@ -75,22 +79,24 @@ def mean_ssim(
 ) -> Float[Tensor, "c"]:
     """Return the structural similarity (SSIM) of each image (Wang, Bovik, Sheikh, Simoncelli 2004).
 
-    Window 11 x 11, Gaussian of 1.5 pixels, K1 = 0.01, K2 = 0.03, range of values 1, each channel
+    Window 11 x 11, Gaussian of 1.5 pixels, K1 = 0.01, K2 = 0.03, values from 0 to 1, each channel
     separately. Border "valid", as in the paper (section III-C, equation 13): only windows inside
-    the image count, so the mean is over ``(h - 10) * (w - 10)`` positions. Memory: about 12 copies
-    of one stack of images, and as much again for the gradient.
+    the image count, so the mean is over ``(h - 10) * (w - 10)`` positions. Memory: about 21 copies
+    of one stack of images, 30 with the gradient.
     """
     check_pair(prediction, target, least=SSIM_WINDOW)
-    from kornia.metrics import ssim  # noqa: PLC0415 (half a second)
+    from kornia.filters import filter2d_separable, get_gaussian_kernel1d  # noqa: PLC0415 (slow)
 
-    similarity = ssim(
-        prediction.permute(0, 3, 1, 2),
-        target.permute(0, 3, 1, 2),
-        SSIM_WINDOW,
-        max_val=1.0,
-        eps=0.0,
-        padding="valid",
-    )
+    x, y = (images.permute(0, 3, 1, 2) for images in (prediction, target))
+    kernel = get_gaussian_kernel1d(SSIM_WINDOW, SSIM_SIGMA, device=x.device, dtype=x.dtype)
+    # One convolution of 15 channels is twice as fast as five of three, as in `kornia.metrics.ssim`.
+    maps = torch.cat([x, y, x * x, y * y, x * y], dim=1)
+    filtered = filter2d_separable(maps, kernel, kernel, padding="valid")
+    mean_x, mean_y, xx, yy, xy = filtered.split(3, dim=1)
+    squares, product = mean_x.square() + mean_y.square(), mean_x * mean_y
+    low, high = SSIM_K1**2, SSIM_K2**2
+    similarity: Tensor = (2 * product + low) * (2 * (xy - product) + high)
+    similarity = similarity / ((squares + low) * (xx + yy - squares + high))
     return similarity.mean(dim=(1, 2, 3))
 
 
