@@ -34,6 +34,7 @@ PAGES = {
     "jaxtyping.Bool": JAXTYPING,
     "jaxtyping.Float": JAXTYPING,
     "jaxtyping.Int": JAXTYPING,
+    "jaxtyping.Shaped": JAXTYPING,
     "jaxtyping.UInt8": JAXTYPING,
     "pydantic.BaseModel": f"{PYDANTIC}/base_model/",
     "pydantic.ValidationError": f"{PYDANTIC}/pydantic_core/#pydantic_core.ValidationError",
