@@ -1,124 +1,51 @@
-"""Compiled loops that list the splats of each tile and composite them, forward and backward.
+"""Compiled loops that composite the splats of each tile, forward and backward.
 
-The lists are those of ``torch_backend``. Compositing visits the pixels that each splat reaches,
-splat by splat; its gradient also runs front to back.
+Compositing visits the pixels that each splat reaches, splat by splat; its gradient also runs front
+to back. Where surfaces are opaque, most splats are behind finished pixels, so a bit for each pixel
+that is not finished lets them be skipped.
 """
 
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cvtgs.rendering.compiled import Array, Ints, PixelBox, TileArrays, parallel, prange, serial
+from cvtgs.rendering.kernels_tiles import LOG_MIN_ALPHA, box_of, span, tile_at
 from cvtgs.rendering.projection import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
-SLACK = 1e-3
-LOG_MIN_ALPHA = math.log(MIN_ALPHA)
-STRIDE = 1009
-"""Prime step between tiles. Neighbouring tiles cost alike, so this balances the threads."""
+WIDEST = 1e9
+"""Half widths of splats beyond this, in pixels, count as this."""
+
+BATCH = 64
+"""Splats of a tile that are copied together; reads of scattered rows then overlap."""
 
 
 @serial
-def pixel_range(low: float, high: float, count: int) -> tuple[int, int]:
-    """Return the first and last of ``count`` pixels whose centres lie in an interval."""
-    slack = SLACK + 1e-6 * (high - low)
-    first = math.ceil(min(max(low - 0.5 - slack, 0.0), float(count)))
-    last = math.floor(min(max(high - 0.5 + slack, -1.0), count - 1.0))
-    return int(first), int(last)
+def copy_splats(packed: Array, lists: Ints, first: int, end: int, batch: Array) -> None:
+    """Copy the splats of some intersections of a tile to the start of ``batch``."""
+    for entry in range(first, end):
+        for number in range(packed.shape[1]):
+            batch[entry - first, number] = packed[lists[entry, 1], number]
 
 
 @serial
-def strip(
-    splat: Array, reach: float, size: tuple[int, int], rows: tuple[int, int]
-) -> tuple[int, int]:
-    """Return the first and last pixel column that a splat reaches within a range of rows."""
-    x, y = float(splat[0]), float(splat[1])
-    steep, shear, flat = -2.0 * splat[2], float(splat[3]), -2.0 * splat[4]
-    upper, lower = rows[0] + 0.5 - y, rows[1] + 0.5 - y
-    tip = 0.0
-    if reach > 0:
-        tip = -shear / flat * math.sqrt(reach / (1 / steep + shear * shear / flat))
-    high, low = min(max(tip, upper), lower), min(max(-tip, upper), lower)
-    right = -shear * high + math.sqrt(max(0.0, reach - flat * high * high) / steep)
-    left = -shear * low - math.sqrt(max(0.0, reach - flat * low * low) / steep)
-    return pixel_range(x + left, x + right, size[0])
+def all_open(box: PixelBox) -> Ints:
+    """Return a bit for every pixel of a tile, one integer per row."""
+    return np.full(box[3] - box[2], (np.int64(1) << (box[1] - box[0])) - 1, np.int64)
 
 
 @serial
-def tiles_of(splat: Array, size: tuple[int, int], side: int, out: Ints, start: int) -> int:
-    """Count the tiles of a splat; also write their indices unless ``start`` is negative."""
-    reach = max(0.0, 2.0 * (splat[5] - LOG_MIN_ALPHA))
-    half = math.sqrt(reach / (-2.0 * splat[4]))
-    top, bottom = pixel_range(splat[1] - half, splat[1] + half, size[1])
-    across = (size[0] + side - 1) // side
-    count = 0
-    if bottom < top:
-        return count
-    for row in range(top // side, bottom // side + 1):
-        rows = (max(top, row * side), min(bottom, row * side + side - 1))
-        first, last = strip(splat, reach, size, rows)
-        if last < first:
-            continue
-        for column in range(first // side, last // side + 1):
-            if start >= 0:
-                out[start + count] = row * across + column
-            count += 1
-    return count
+def reached_columns(splat: Array, room: float, box: PixelBox) -> int:
+    """Return a bit for every column of a tile that a splat reaches.
 
-
-@parallel
-def count_tiles(packed: Array, size: tuple[int, int], side: int, counts: Ints) -> None:
-    """Write the number of tiles that each splat touches."""
-    for i in prange(len(packed)):
-        counts[i] = tiles_of(packed[i], size, side, counts, -1)
-
-
-@parallel
-def write_tiles(
-    packed: Array, size: tuple[int, int], side: int, starts: Ints, tile_ids: Ints
-) -> None:
-    """Write the indices of the tiles that each splat touches."""
-    for i in prange(len(packed)):
-        tiles_of(packed[i], size, side, tile_ids, starts[i])
-
-
-@serial
-def sort_by_tile(tile_ids: Ints, splat_starts: Ints, tile_starts: Ints, lists: Ints) -> None:
-    """Write the tiles' lists by counting sort: index in splat order, and splat."""
-    for tile_id in tile_ids:
-        tile_starts[tile_id + 1] += 1
-    for tile in range(len(tile_starts) - 1):
-        tile_starts[tile + 1] += tile_starts[tile]
-    free = tile_starts.copy()
-    for splat in range(len(splat_starts) - 1):
-        for place in range(splat_starts[splat], splat_starts[splat + 1]):
-            at = free[tile_ids[place]]
-            free[tile_ids[place]] += 1
-            lists[at, 0] = place
-            lists[at, 1] = splat
-
-
-@serial
-def span(low: float, high: float, begin: int, end: int) -> tuple[int, int]:
-    """Return the half-open range of pixels in [begin, end) whose centres lie in an interval."""
-    first = math.ceil(max(low - 0.5 - SLACK, float(begin)))
-    last = math.floor(min(high - 0.5 + SLACK, end - 1.0))
-    return int(first), int(last) + 1
-
-
-@serial
-def tile_at(step: int, count: int) -> int:
-    """Return the tile of a step; each tile occurs once."""
-    number = np.int64(step)  # numba counts parallel loops in uint64, which % turns into floats
-    return int(number * STRIDE % count if count % STRIDE else number)
-
-
-@serial
-def box_of(tile: int, side: int, size: tuple[int, int]) -> PixelBox:
-    """Return the pixels of a tile, cropped to the image."""
-    across = (size[0] + side - 1) // side
-    x, y = tile % across * side, tile // across * side
-    return x, min(x + side, size[0]), y, min(y + side, size[1])
+    ``room`` is how far the exponent may fall below that of the peak, at most 0.
+    """
+    square = room / splat[2] + room * splat[3] * splat[3] / splat[4]
+    half = 1.00001 * math.sqrt(square) if square < WIDEST**2 else WIDEST  # also if it is NaN
+    first, end = span(splat[0] - half, splat[0] + half, box[0], box[1])
+    if end <= first:
+        return 0
+    return int((np.int64(1) << (end - box[0])) - (np.int64(1) << (first - box[0])))
 
 
 @parallel
@@ -136,22 +63,32 @@ def composite_all(
         tile = tile_at(step, len(starts) - 1)
         box = box_of(tile, side, (width, height))
         x0, x1, y0, y1 = box
-        is_open = np.ones((side, side), np.bool_)
         layers = image[y0:y1, x0:x1]
         for y in range(y1 - y0):
             for x in range(x1 - x0):
                 for channel in range(4):
                     layers[y, x, channel] = 0
                 layers[y, x, 4] = 1
-        pending = (y1 - y0) * (x1 - x0)
-        for entry in range(starts[tile], starts[tile + 1]):
-            splat = packed[lists[entry, 1]]
-            finished, total = blend(splat, box, centers, layers, is_open)
+        blend_list(packed, lists[starts[tile] : starts[tile + 1]], box, centers, layers, weights)
+
+
+@serial
+def blend_list(
+    packed: Array, lists: Ints, box: PixelBox, centers: Array, layers: Array, weights: Array
+) -> None:
+    """Blend the splats of a tile until all of its pixels are finished."""
+    pending, open_rows = (box[1] - box[0]) * (box[3] - box[2]), all_open(box)
+    batch = np.empty((BATCH, packed.shape[1]), packed.dtype)
+    for start in range(0, len(lists), BATCH):
+        end = min(start + BATCH, len(lists))
+        copy_splats(packed, lists, start, end, batch)
+        for entry in range(start, end):
+            finished, total = blend(batch[entry - start], box, centers, layers, open_rows)
             pending -= finished
             if len(weights):
                 weights[lists[entry, 0]] = total
             if pending == 0:
-                break
+                return
 
 
 @serial
@@ -160,24 +97,30 @@ def blend(
     box: PixelBox,
     centers: Array,
     layers: Array,
-    is_open: NDArray[np.bool_],
+    open_rows: Ints,
 ) -> tuple[int, float]:
     """Blend one splat into a tile; return the number of pixels finished, and its summed weight."""
     finished, total = 0, 0.0
     x0, x1, y0, y1 = box
     one, least = centers.dtype.type(1), centers.dtype.type(MIN_TRANSMITTANCE)
     faintest, most = centers.dtype.type(MIN_ALPHA), centers.dtype.type(MAX_ALPHA)
+    zero, lowest = centers.dtype.type(0), centers.dtype.type(LOG_MIN_ALPHA)  # float64 is slower
     square, shear, rest, log_opacity = splat[2], splat[3], splat[4], splat[5]
-    half = math.sqrt(max(0.0, (LOG_MIN_ALPHA - log_opacity) / rest))
+    room = min(zero, lowest - log_opacity)
+    half = math.sqrt(room / rest)
     top, bottom = span(splat[1] - half, splat[1] + half, y0, y1)
+    columns = reached_columns(splat, room, box)
     for y in range(top, bottom):
+        is_open = open_rows[y - y0]
+        if is_open & columns == 0:
+            continue
         down = centers[y] - splat[1]
         middle = splat[0] - shear * down
         exponent = log_opacity + rest * down * down
-        half = math.sqrt(max(0.0, (LOG_MIN_ALPHA - exponent) / square))
+        half = math.sqrt(max(zero, (lowest - exponent) / square))
         first, end = span(middle - half, middle + half, x0, x1)
         for x in range(first, end):
-            if not is_open[y - y0, x - x0]:
+            if (is_open >> (x - x0)) & 1 == 0:
                 continue
             along = centers[x] - middle
             alpha = min(most, math.exp(exponent + square * along * along))
@@ -186,7 +129,7 @@ def blend(
             pixel = layers[y - y0, x - x0]
             after = pixel[4] * (one - alpha)
             if after < least:
-                is_open[y - y0, x - x0] = False
+                open_rows[y - y0] &= ~(np.int64(1) << (x - x0))
                 finished += 1
                 continue
             weight = alpha * pixel[4]
@@ -213,19 +156,44 @@ def composite_all_gradient(
         tile = tile_at(step, len(starts) - 1)
         box = box_of(tile, side, (width, height))
         x0, x1, y0, y1 = box
-        transmittance = np.ones((side, side), image.dtype)
-        behind = np.zeros((side, side), image.dtype)
-        for y in range(y0, y1):
-            for x in range(x0, x1):
-                for channel in range(5):
-                    behind[y - y0, x - x0] += image[y, x, channel] * grad[y, x, channel]
-        pending = (y1 - y0) * (x1 - x0)
-        state = (transmittance, behind)
-        for entry in range(starts[tile], starts[tile + 1]):
-            splat, out = packed[lists[entry, 1]], per_intersection[lists[entry, 0]]
-            pending -= blend_gradient(splat, box, centers, grad[y0:y1, x0:x1], state, out)
+        blend_list_gradient(
+            packed,
+            lists[starts[tile] : starts[tile + 1]],
+            box,
+            centers,
+            (image[y0:y1, x0:x1], grad[y0:y1, x0:x1]),
+            per_intersection,
+        )
+
+
+@serial
+def blend_list_gradient(
+    packed: Array,
+    lists: Ints,
+    box: PixelBox,
+    centers: Array,
+    layers: tuple[Array, Array],
+    per_intersection: Array,
+) -> None:
+    """Write the gradients of the splats of a tile until all of its pixels are finished."""
+    image, grad = layers
+    height, width = image.shape[:2]
+    transmittance = np.ones((height, width), image.dtype)
+    behind = np.zeros((height, width), image.dtype)
+    for y in range(height):
+        for x in range(width):
+            for channel in range(5):
+                behind[y, x] += image[y, x, channel] * grad[y, x, channel]
+    pending, state = height * width, (transmittance, behind, all_open(box))
+    batch = np.empty((BATCH, packed.shape[1]), packed.dtype)
+    for start in range(0, len(lists), BATCH):
+        end = min(start + BATCH, len(lists))
+        copy_splats(packed, lists, start, end, batch)
+        for entry in range(start, end):
+            out = per_intersection[lists[entry, 0]]
+            pending -= blend_gradient(batch[entry - start], box, centers, grad, state, out)
             if pending == 0:
-                break
+                return
 
 
 @serial
@@ -234,25 +202,31 @@ def blend_gradient(
     box: PixelBox,
     centers: Array,
     grad: Array,
-    state: tuple[Array, Array],
+    state: tuple[Array, Array, Ints],
     out: Array,
 ) -> int:
     """Write the gradient of one splat in a tile; return the number of pixels it finished.
 
-    ``state`` holds for each pixel the transmittance in front of this splat (0 where finished), and
-    the gradient times all light from this splat and behind it. ``out`` must be 0 on entry.
+    ``state`` holds for each pixel the transmittance in front of this splat (0 where finished), the
+    gradient times all light from this splat and behind it, and a bit that is 0 where finished.
+    ``out`` must be 0 on entry.
     """
     finished = 0
-    transmittance, behind = state
+    transmittance, behind, open_rows = state
     x0, x1, y0, y1 = box
+    zero, lowest = centers.dtype.type(0), centers.dtype.type(LOG_MIN_ALPHA)
     square, shear, rest, log_opacity = splat[2], splat[3], splat[4], splat[5]
-    half = math.sqrt(max(0.0, (LOG_MIN_ALPHA - log_opacity) / rest))
+    room = min(zero, lowest - log_opacity)
+    half = math.sqrt(room / rest)
     top, bottom = span(splat[1] - half, splat[1] + half, y0, y1)
+    columns = reached_columns(splat, room, box)
     for y in range(top, bottom):
+        if open_rows[y - y0] & columns == 0:
+            continue
         down = centers[y] - splat[1]
         middle = splat[0] - shear * down
         exponent = log_opacity + rest * down * down
-        half = math.sqrt(max(0.0, (LOG_MIN_ALPHA - exponent) / square))
+        half = math.sqrt(max(zero, (lowest - exponent) / square))
         first, end = span(middle - half, middle + half, x0, x1)
         row = (
             transmittance[y - y0, first - x0 :],
@@ -262,7 +236,11 @@ def blend_gradient(
         done, zeroth, moment, second = blend_row_gradient(
             splat, exponent, centers[first:end] - middle, row, out
         )
-        finished += done
+        if done:
+            finished += done
+            for x in range(first, end):
+                if transmittance[y - y0, x - x0] == zero:
+                    open_rows[y - y0] &= ~(np.int64(1) << (x - x0))
         out[0] -= 2 * square * moment
         out[1] -= 2 * (square * shear * moment + rest * down * zeroth)
         out[2] += second

@@ -19,7 +19,7 @@ from cvtgs.rendering.compiled import (
     prange,
     serial,
 )
-from cvtgs.rendering.kernels_blending import LOG_MIN_ALPHA, box_of, span, tile_at
+from cvtgs.rendering.kernels_tiles import LOG_MIN_ALPHA, box_of, span, tile_at
 from cvtgs.rendering.projection import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
 

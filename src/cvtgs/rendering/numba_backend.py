@@ -21,14 +21,9 @@ from cvtgs.rendering.compiled import (
     TileArrays,
     use_threads_of_torch,
 )
-from cvtgs.rendering.kernels_blending import (
-    composite_all,
-    composite_all_gradient,
-    count_tiles,
-    sort_by_tile,
-    write_tiles,
-)
+from cvtgs.rendering.kernels_blending import composite_all, composite_all_gradient
 from cvtgs.rendering.kernels_projection import project_all, project_all_gradient
+from cvtgs.rendering.kernels_tiles import count_tiles, sort_by_tile, write_tiles
 from cvtgs.rendering.kernels_weights import TileWeights
 from cvtgs.rendering.projection import Pinhole, to_pinholes
 from cvtgs.scene import GaussianScene

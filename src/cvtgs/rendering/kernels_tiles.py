@@ -1,0 +1,119 @@
+"""Compiled loops that list the splats of each tile, and the pixels of tiles and splats.
+
+The lists are those of ``torch_backend``.
+"""
+
+import math
+
+import numpy as np
+
+from cvtgs.rendering.compiled import Array, Ints, PixelBox, parallel, prange, serial
+from cvtgs.rendering.projection import MIN_ALPHA
+
+SLACK = 1e-3
+LOG_MIN_ALPHA = math.log(MIN_ALPHA)
+STRIDE = 1009
+"""Prime step between tiles. Neighbouring tiles cost alike, so this balances the threads."""
+
+
+@serial
+def pixel_range(low: float, high: float, count: int) -> tuple[int, int]:
+    """Return the first and last of ``count`` pixels whose centres lie in an interval."""
+    slack = SLACK + 1e-6 * (high - low)
+    first = math.ceil(min(max(low - 0.5 - slack, 0.0), float(count)))
+    last = math.floor(min(max(high - 0.5 + slack, -1.0), count - 1.0))
+    return int(first), int(last)
+
+
+@serial
+def strip(
+    splat: Array, reach: float, size: tuple[int, int], rows: tuple[int, int]
+) -> tuple[int, int]:
+    """Return the first and last pixel column that a splat reaches within a range of rows."""
+    x, y = float(splat[0]), float(splat[1])
+    steep, shear, flat = -2.0 * splat[2], float(splat[3]), -2.0 * splat[4]
+    upper, lower = rows[0] + 0.5 - y, rows[1] + 0.5 - y
+    tip = 0.0
+    if reach > 0:
+        tip = -shear / flat * math.sqrt(reach / (1 / steep + shear * shear / flat))
+    high, low = min(max(tip, upper), lower), min(max(-tip, upper), lower)
+    right = -shear * high + math.sqrt(max(0.0, reach - flat * high * high) / steep)
+    left = -shear * low - math.sqrt(max(0.0, reach - flat * low * low) / steep)
+    return pixel_range(x + left, x + right, size[0])
+
+
+@serial
+def tiles_of(splat: Array, size: tuple[int, int], side: int, out: Ints, start: int) -> int:
+    """Count the tiles of a splat; also write their indices unless ``start`` is negative."""
+    reach = max(0.0, 2.0 * (splat[5] - LOG_MIN_ALPHA))
+    half = math.sqrt(reach / (-2.0 * splat[4]))
+    top, bottom = pixel_range(splat[1] - half, splat[1] + half, size[1])
+    across = (size[0] + side - 1) // side
+    count = 0
+    if bottom < top:
+        return count
+    for row in range(top // side, bottom // side + 1):
+        rows = (max(top, row * side), min(bottom, row * side + side - 1))
+        first, last = strip(splat, reach, size, rows)
+        if last < first:
+            continue
+        for column in range(first // side, last // side + 1):
+            if start >= 0:
+                out[start + count] = row * across + column
+            count += 1
+    return count
+
+
+@parallel
+def count_tiles(packed: Array, size: tuple[int, int], side: int, counts: Ints) -> None:
+    """Write the number of tiles that each splat touches."""
+    for i in prange(len(packed)):
+        counts[i] = tiles_of(packed[i], size, side, counts, -1)
+
+
+@parallel
+def write_tiles(
+    packed: Array, size: tuple[int, int], side: int, starts: Ints, tile_ids: Ints
+) -> None:
+    """Write the indices of the tiles that each splat touches."""
+    for i in prange(len(packed)):
+        tiles_of(packed[i], size, side, tile_ids, starts[i])
+
+
+@serial
+def sort_by_tile(tile_ids: Ints, splat_starts: Ints, tile_starts: Ints, lists: Ints) -> None:
+    """Write the tiles' lists by counting sort: index in splat order, and splat."""
+    for tile_id in tile_ids:
+        tile_starts[tile_id + 1] += 1
+    for tile in range(len(tile_starts) - 1):
+        tile_starts[tile + 1] += tile_starts[tile]
+    free = tile_starts.copy()
+    for splat in range(len(splat_starts) - 1):
+        for place in range(splat_starts[splat], splat_starts[splat + 1]):
+            at = free[tile_ids[place]]
+            free[tile_ids[place]] += 1
+            lists[at, 0] = place
+            lists[at, 1] = splat
+
+
+@serial
+def span(low: float, high: float, begin: int, end: int) -> tuple[int, int]:
+    """Return the half-open range of pixels in [begin, end) whose centres lie in an interval."""
+    first = math.ceil(max(low - 0.5 - SLACK, float(begin)))
+    last = math.floor(min(high - 0.5 + SLACK, end - 1.0))
+    return int(first), int(last) + 1
+
+
+@serial
+def tile_at(step: int, count: int) -> int:
+    """Return the tile of a step; each tile occurs once."""
+    number = np.int64(step)  # numba counts parallel loops in uint64, which % turns into floats
+    return int(number * STRIDE % count if count % STRIDE else number)
+
+
+@serial
+def box_of(tile: int, side: int, size: tuple[int, int]) -> PixelBox:
+    """Return the pixels of a tile, cropped to the image."""
+    across = (size[0] + side - 1) // side
+    x, y = tile % across * side, tile // across * side
+    return x, min(x + side, size[0]), y, min(y + side, size[1])
