@@ -93,10 +93,11 @@ def mean_ssim(
     maps = torch.cat([x, y, x * x, y * y, x * y], dim=1)
     filtered = filter2d_separable(maps, kernel, kernel, padding="valid")
     mean_x, mean_y, xx, yy, xy = filtered.split(3, dim=1)
-    squares, product = mean_x.square() + mean_y.square(), mean_x * mean_y
+    square_x, square_y, product = mean_x.square(), mean_y.square(), mean_x * mean_y
+    variances = (xx - square_x) + (yy - square_y)  # the sums of both would lose a digit
     low, high = SSIM_K1**2, SSIM_K2**2
     similarity: Tensor = (2 * product + low) * (2 * (xy - product) + high)
-    similarity = similarity / ((squares + low) * (xx + yy - squares + high))
+    similarity = similarity / ((square_x + square_y + low) * (variances + high))
     return similarity.mean(dim=(1, 2, 3))
 
 
