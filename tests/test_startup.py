@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib import import_module
 
 import pytest
 
@@ -48,6 +49,7 @@ def test_threads_spin_for_a_moment_and_collections_skip_loaded_modules(given, wa
 def test_a_process_that_has_loaded_torch_keeps_its_settings(monkeypatch):
     for name in NAMES:
         monkeypatch.delenv(name, raising=False)
+    import_module("torch")
     before = gc.get_freeze_count()
     load_torch()
     assert gc.get_freeze_count() == before

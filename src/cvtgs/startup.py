@@ -1,6 +1,6 @@
 """Start of a process: load torch without the waits that its defaults cause.
 
-Only for processes of our own: the settings apply to the whole process.
+For programs, not for libraries: the settings apply to the whole process.
 """
 
 import gc
@@ -11,8 +11,8 @@ import sys
 def load_torch() -> None:
     """Load torch, if it is not loaded, with settings for a process that ends with its work.
 
-    Garbage collections find nothing while modules load, but a third of the time goes into them, and
-    half a second into those when the process ends. Objects that exist after loading are excluded.
+    Garbage collections find nothing while modules load, nor among their objects when the process
+    ends, but take time; so none run meanwhile, and objects that exist after loading are excluded.
 
     Idle OpenMP threads sleep after a moment, unless the user has set a policy. By default they spin
     for long and use much CPU time; if they never spin, waking them takes longer than many small
