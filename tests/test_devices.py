@@ -16,6 +16,7 @@ from cvtgs.devices import (
     chunk_length,
     core_count,
     device_name,
+    in_chunks,
     in_threads,
     move_together,
     one_thread,
@@ -187,6 +188,14 @@ def test_one_thread_computes_in_the_calling_thread():
         assert set(found) == {threading.get_ident()}
 
 
+def test_ranges_of_rows_cover_all_rows_once_and_an_empty_table_is_one_range():
+    found = in_chunks(lambda part: (part.start, part.stop), 5, 2, HOST)
+    assert found == [(0, 2), (2, 4), (4, 5)]
+    assert in_chunks(lambda part: (part.start, part.stop), 0, 2, HOST) == [(0, 0)]
+    there = in_chunks(lambda part: part.stop, 100, 2, torch.device("meta"))  # longer chunks
+    assert there == [64, 100]
+
+
 @pytest.mark.slow
 def test_stages_give_the_same_bits_in_two_threads(two_threads, monkeypatch):
     for name in ("cells.allocate.CHUNK", "cells.inflate.CHUNK", "cells.merge.CHUNK_MEMBERS"):
@@ -197,8 +206,8 @@ def test_stages_give_the_same_bits_in_two_threads(two_threads, monkeypatch):
         handed_over.add(function.__name__)
         return in_threads(function, items, device)
 
-    for module in ("allocate", "inflate", "merge"):
-        monkeypatch.setattr(f"cvtgs.cells.{module}.in_threads", recorded)
+    for module in ("devices", "cells.inflate", "cells.merge"):
+        monkeypatch.setattr(f"cvtgs.{module}.in_threads", recorded)
     monkeypatch.setattr("cvtgs.mergenet.apply.CHUNK_MEMBERS", 100)
     scene = cvtgs.synthetic.scene("object", 2000, sh_degree=1, seed=0)
     two = cvtgs.Simplifier(device="cpu").simplify(scene, 0.1)

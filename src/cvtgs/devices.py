@@ -200,6 +200,30 @@ def in_threads(
     return _in_pool(function, items, min(threads, thread_count()))
 
 
+def in_chunks(
+    function: Callable[[slice], Result], total: int, length: int, device: torch.device
+) -> list[Result]:
+    """Call a function for consecutive ranges of rows, as :func:`in_threads` does.
+
+    Args:
+        function: Computes one range; must be thread-safe.
+        total: Number of rows.
+        length: Length of a range on a CPU; see :func:`chunk_length`.
+        device: Device of the computation.
+
+    Returns:
+        The results, in order; that of an empty range if there are no rows.
+
+    Example:
+        >>> in_chunks(lambda part: part.stop, 5, 2, torch.device("cpu"))
+        [2, 4, 5]
+    """
+    step = chunk_length(length, device)
+    starts = range(0, max(1, total), step)
+    parts = [slice(start, min(start + step, total)) for start in starts]
+    return list(in_threads(function, parts, device))
+
+
 def _in_pool(
     function: Callable[[Item], Result], items: Iterable[Item], threads: int
 ) -> Iterator[Result]:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.config import AllocationConfig
-from cvtgs.devices import chunk_length, in_threads
+from cvtgs.devices import in_chunks
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.parameters import normalize_quats, quats_to_matrices
 from cvtgs.math.segments import label_argmin, label_sums, smallest_rows, take_columns
@@ -56,7 +56,7 @@ class Moments(NamedTuple):
 
     def take(self, rows: Int[Tensor, "k"]) -> "Moments":
         """Return the moments of some rows."""
-        return Moments(*(take_columns(column, rows) for column in self))
+        return Moments(*take_columns(rows, *self))
 
 
 def gaussian_moments(
@@ -84,10 +84,8 @@ def gaussian_moments(
     count, device, center = len(rows), rows.device, frame.center.to(rows.device)
     means = torch.empty(3, count, dtype=torch.float64, device=device)
     covariances, colors = means.new_empty(6, count), torch.empty_like(means)
-    chunk = chunk_length(CHUNK, device)  # a few columns fit into a cache
 
-    def moments_of(start: int) -> None:
-        part = slice(start, start + chunk)
+    def moments_of(part: slice) -> None:
         some = rows[part]
         positions = scene.means.index_select(0, some).double() - center
         means[:, part] = (positions / frame.radius).T
@@ -99,8 +97,7 @@ def gaussian_moments(
         bands = scene.sh0.index_select(0, some)[:, 0]
         colors[:, part] = (0.5 + SH_C0 * bands.double()).clamp(0.0, 1.5).T
 
-    for _ in in_threads(moments_of, range(0, count, chunk), device):
-        pass
+    in_chunks(moments_of, count, CHUNK, device)  # a few columns of a chunk fit into a cache
     tiny = torch.finfo(torch.float64).tiny
     weights, masses = weights.double(), masses.double()
     units = [
@@ -132,7 +129,7 @@ def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Mom
     shares = members.weights / sums[1].index_select(0, labels)
     columns = [shares * column for column in (*members.means, *members.colors)]
     means, colors = label_sums(columns, labels, count).T.contiguous().split(3)
-    shifts = members.means - take_columns(means, labels)
+    shifts = members.means - take_columns(labels, means)[0]
     columns = [
         shares * (covariance + shifts[i] * shifts[j])
         for covariance, (i, j) in zip(members.covariances, UPPER, strict=True)
@@ -198,10 +195,9 @@ def _pair_costs(
 ) -> Float[Tensor, "p"]:
     """Return the cost of merging each pair."""
     volumes = _log_volume(groups.covariances)
-    chunk = chunk_length(CHUNK, first.device)
 
-    def costs_of(pairs: tuple[Tensor, Tensor]) -> Tensor:
-        i, j = pairs
+    def costs_of(part: slice) -> Tensor:
+        i, j = first[part], second[part]
         a, b = groups.take(i), groups.take(j)
         total = a.weights + b.weights
         share, other = a.weights / total, b.weights / total
@@ -218,8 +214,7 @@ def _pair_costs(
         costs: Tensor = cost * (a.counts + b.counts)
         return costs
 
-    parts = list(zip(first.split(chunk), second.split(chunk), strict=True))
-    return torch.cat([*in_threads(costs_of, parts, first.device)])
+    return torch.cat(in_chunks(costs_of, len(first), CHUNK, first.device))
 
 
 def _log_volume(covariances: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:
@@ -295,21 +290,17 @@ def reassign(
     inverse, volumes = _inverse(groups.covariances)
     found = labels.new_empty(len(labels) + 1)  # the last is for groups without members
     own_costs = torch.empty(len(labels), dtype=torch.float64, device=labels.device)
-    chunk = chunk_length(CHUNK, labels.device)
+    tables = groups.means, groups.colors, inverse, volumes
 
-    def search(start: int) -> None:
-        part = slice(start, min(start + chunk, len(labels)))
+    def search(part: slice) -> None:
         cells = labels[part]
         mean, covariance = members.means[:, part], members.covariances[:, part]
         color = members.colors[:, part]
         least, best = None, cells
-        for group in take_columns(candidates, cells):
-            shifts = mean - take_columns(groups.means, group)
-            matrix = take_columns(inverse, group)
-            cost = volumes.index_select(0, group)
-            cost = cost + 2 * config.color * (
-                color - take_columns(groups.colors, group)
-            ).square().sum(0)
+        for group in take_columns(cells, candidates)[0]:
+            center, tint, matrix, cost = take_columns(group, *tables)
+            shifts = mean - center
+            cost = cost + 2 * config.color * (color - tint).square().sum(0)
             for k, (r, c) in enumerate(UPPER):
                 twice = 1.0 if r == c else 2.0
                 cost.addcmul_(matrix[k], covariance[k] + shifts[r] * shifts[c], value=twice)
@@ -320,8 +311,7 @@ def reassign(
             least, best = torch.where(closer, cost, least), torch.where(closer, group, best)
         found[part] = best
 
-    for _ in in_threads(search, range(0, len(labels), chunk), labels.device):
-        pass
+    in_chunks(search, len(labels), CHUNK, labels.device)
     anchors = label_argmin(own_costs, labels, count)
     if must_stay is not None:
         anchors = torch.where(must_stay, anchors, len(labels))

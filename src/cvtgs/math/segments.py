@@ -76,12 +76,14 @@ def gather_columns(
         >>> gather_columns(torch.tensor([2, 0]), torch.eye(3))[0].tolist()
         [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
     """
-    return tuple(take_columns(table.T, rows).T for table in tables)
+    return tuple(columns.T for columns in take_columns(rows, *[table.T for table in tables]))
 
 
-def take_columns(table: Shaped[Tensor, "*c n"], rows: Int[Tensor, "r"]) -> Shaped[Tensor, "*c r"]:
+def take_columns(
+    rows: Int[Tensor, "r"], *tables: Shaped[Tensor, "*c n"]
+) -> list[Shaped[Tensor, "*c r"]]:
     """Return entries along the last dimension, in float64 four times as fast as index_select."""
-    return table.gather(-1, rows.expand(*table.shape[:-1], -1))
+    return [table.gather(-1, rows.expand(*table.shape[:-1], -1)) for table in tables]
 
 
 def running_sums(values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:

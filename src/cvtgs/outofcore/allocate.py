@@ -221,8 +221,8 @@ def _take(job: Job, keys: Int[Tensor, "k"], *names: str) -> list[Tensor]:
     for block, rows in _by_block(ascending):
         tensors, _ = map_tensors(job.groups_path(block))
         for name, values in zip(names, parts, strict=True):
-            values.append(take_columns(tensors[name], rows))
-    return [take_columns(torch.cat(values, dim=-1), inverse) for values in parts]
+            values.append(take_columns(rows, tensors[name])[0])
+    return take_columns(inverse, *[torch.cat(values, dim=-1) for values in parts])
 
 
 def _by_block(keys: Int[Tensor, "k"]) -> list[tuple[int, Tensor]]:
