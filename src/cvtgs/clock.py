@@ -94,9 +94,9 @@ def peak_memory_bytes() -> int:
         >>> peak_memory_bytes() >= 0
         True
     """
-    try:
-        import resource  # noqa: PLC0415 (not on Windows)
-    except ImportError:
+    if sys.platform == "win32":
         return 0
+    import resource  # noqa: PLC0415 (not on Windows)
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak

@@ -5,6 +5,7 @@ import errno
 import os
 import secrets
 import stat
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -191,7 +192,7 @@ def _open_temporary(target: Path) -> tuple[Path, BinaryIO]:
 
 def _lock(descriptor: int) -> bool:
     """Lock a file until it is closed; return False if another process holds the lock."""
-    if fcntl is None:
+    if sys.platform == "win32" or fcntl is None:
         return True
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -203,7 +204,7 @@ def _lock(descriptor: int) -> bool:
 def _remove_leftover(temporary: Path) -> None:
     """Remove the temporary file of a killed process, but not one that is still written to."""
     with suppress(OSError):
-        if fcntl is None:
+        if sys.platform == "win32" or fcntl is None:
             if time.time() - temporary.stat().st_mtime > _OLD_SECONDS:
                 temporary.unlink()
             return
