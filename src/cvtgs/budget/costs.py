@@ -24,7 +24,7 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     "merge": ("once", "in", "in_values", "out", "out_values"),
     VISIBILITY: ("once", "view_pixels", "views_in"),
     MATCH: ("once", "view_pixels", "view_pairs", "view_values"),
-    REFINE: ("images_in", "looks", "look_pixels", "looks_out"),
+    REFINE: ("once", "images_in", "looks", "look_pixels", "looks_out"),
     NETWORK: ("once", "in", "in_values", "out", "out_values"),
 }
 """Features of each stage; its seconds are linear in their amounts."""
