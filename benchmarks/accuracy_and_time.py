@@ -13,6 +13,7 @@ from pathlib import Path
 from statistics import mean
 
 import cvtgs
+from benchmarks.measuring import warm_up
 from benchmarks.quality import (
     CHOICES,
     Quality,
@@ -120,6 +121,7 @@ def main() -> None:
     parser.add_argument("--png", type=Path, help="draw the presets to this file")
     parser.add_argument("--table", choices=TABLES, help="print only this table")
     options = parser.parse_args()
+    warm_up()
     for name in [options.table] if options.table else TABLES:
         title, rows = TABLES[name]
         watches = {name: Stopwatch(configuration(options, row)) for name, row in rows.items()}

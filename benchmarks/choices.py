@@ -25,7 +25,7 @@ from statistics import fmean
 
 import cvtgs
 from benchmarks.cameras import CACHE, FullImages, cameras_beside
-from benchmarks.measuring import write_file
+from benchmarks.measuring import warm_up, write_file
 from cvtgs.cameras import Cameras
 from cvtgs.evaluation import EvaluationSettings, compare, write_comparison
 from cvtgs.evaluation.scorer import (
@@ -127,11 +127,6 @@ def settings_of(words: Sequence[str]) -> dict[str, str]:
     if wrong:
         raise SystemExit(f"a setting must be KEY=VALUE, found {wrong[0]!r}.")
     return dict(word.split("=", 1) for word in words)
-
-
-def warm_up() -> None:
-    """Compile and load code before anything is measured."""
-    cvtgs.Simplifier().simplify(cvtgs.synthetic.scene("object", 1000, sh_degree=0, seed=0), 0.1)
 
 
 def measure(

@@ -119,3 +119,10 @@ def renew_tables(page: Path, text: str, *, script: str) -> None:
     before, rest = page.read_text(encoding="utf-8").split(start)
     after = rest.split(end)[1]
     page.write_text(f"{before}{start}\n\n{text}\n{end}{after}", encoding="utf-8")
+
+
+def warm_up() -> None:
+    """Load libraries and compiled code, with and without images, before anything is measured."""
+    scene = cvtgs.synthetic.scene("object", 1000, sh_degree=0, seed=0)
+    for preset in ("standard", "matched"):
+        cvtgs.Simplifier(config=preset).simplify(scene, 0.1)
