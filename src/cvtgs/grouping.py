@@ -118,7 +118,7 @@ def group_rows(
         has_duplicates=analysis.plan.duplicates.active,
         on_iteration=on_iteration,
     )
-    sums = label_sums([points.weights], labels, target)[:, 0]
+    sums = label_sums([points.weights], labels, target)[0]
     return _grouping(tessellation, points.rows, labels, sums)
 
 
@@ -308,7 +308,7 @@ def group_cells(
     coarse[rows] = labels
     partition = grouping.partition
     of_rows = torch.repeat_interleave(coarse, partition.counts)
-    sums = label_sums([grouping.weights], coarse, target)[:, 0]
+    sums = label_sums([grouping.weights], coarse, target)[0]
     return _grouping(tessellation, partition.order, of_rows, sums)
 
 

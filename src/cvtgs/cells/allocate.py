@@ -124,18 +124,21 @@ def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Mom
     Returns:
         Moments of the groups.
     """
-    sums = label_sums([members.counts, members.weights, members.masses], labels, count).T
-    sums = sums.contiguous()
-    shares = members.weights / sums[1].index_select(0, labels)
-    columns = [shares * column for column in (*members.means, *members.colors)]
-    means, colors = label_sums(columns, labels, count).T.contiguous().split(3)
-    shifts = members.means - take_columns(labels, means)[0]
-    columns = [
-        shares * (covariance + shifts[i] * shifts[j])
+    columns = [members.counts, members.weights, members.masses]
+    counts, weights, masses = label_sums(columns, labels, count)
+    shares = members.weights / weights.index_select(0, labels)
+    buffer = torch.empty_like(shares)  # one for all columns: new memory is slow to write
+    values = *members.means, *members.colors
+    shared = (torch.mul(shares, column, out=buffer) for column in values)
+    means, colors = label_sums(shared, labels, count).split(3)
+    shifts = take_columns(labels, means)[0]
+    torch.sub(members.means, shifts, out=shifts)
+    products = (
+        torch.mul(shifts[i], shifts[j], out=buffer).add_(covariance).mul_(shares)
         for covariance, (i, j) in zip(members.covariances, UPPER, strict=True)
-    ]
-    covariances = label_sums(columns, labels, count).T.contiguous()
-    return Moments(sums[0], sums[1], sums[2], means, covariances, colors)
+    )
+    covariances = label_sums(products, labels, count)
+    return Moments(counts, weights, masses, means, covariances, colors)
 
 
 def merge_pairs(

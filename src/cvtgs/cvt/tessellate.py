@@ -248,11 +248,10 @@ def weighted_sums(
     count: int,
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m d"]]:
     """Return the sums of weights and of weighted points per label, in float64."""
-    columns = [weights.double()]
-    for column in points.unbind(1):
-        columns.append(column.double() * columns[0])
+    weights = weights.double()
+    columns = [weights, *(column.double() * weights for column in points.unbind(1))]
     sums = label_sums(columns, labels, count)
-    return sums[:, 0], sums[:, 1:]
+    return sums[0], sums[1:].T
 
 
 def centroids(

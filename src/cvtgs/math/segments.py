@@ -1,7 +1,7 @@
 """Segments, which are consecutive runs of rows (CSR): gathering and deterministic reductions."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -112,29 +112,29 @@ def running_sums(values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
 
 
 def label_sums(
-    columns: Sequence[Float[Tensor, "n"]], labels: Int[Tensor, "n"], count: int
-) -> Float[Tensor, "m k"]:
+    columns: Iterable[Float[Tensor, "n"]], labels: Int[Tensor, "n"], count: int
+) -> Float[Tensor, "k m"]:
     """Sum the rows of each label, in the order of the rows, in float64.
 
     Args:
-        columns: One tensor per column.
+        columns: One tensor per column; each is summed before the next is requested, so they may
+            share memory.
         labels: Label of every row, 0 to ``count - 1``.
         count: Number of labels, m.
 
     Returns:
-        One row per label; a label without rows gives 0. Every device gives the same bits.
+        One row per column; a label without rows gives 0. Every device gives the same bits.
 
     Example:
         >>> label_sums([torch.tensor([1.0, 2.0, 4.0])], torch.tensor([1, 0, 1]), 2).tolist()
-        [[2.0], [5.0]]
+        [[2.0, 5.0]]
     """
     if labels.device.type == "cpu":  # adds in order; CUDA would add in any order
-        sums = torch.empty(count, len(columns), dtype=torch.float64)
-        for number, column in enumerate(columns):
-            sums[:, number] = torch.bincount(labels, column.double(), minlength=count)
-        return sums
-    order, offsets = sort_by_label(labels, count)
-    return torch.stack([segment_sum(column.double()[order], offsets) for column in columns], dim=1)
+        sums = [torch.bincount(labels, column.double(), minlength=count) for column in columns]
+    else:
+        order, offsets = sort_by_label(labels, count)
+        sums = [segment_sum(column.double()[order], offsets) for column in columns]
+    return torch.stack(sums)
 
 
 def label_argmin(
