@@ -28,6 +28,10 @@ GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "h
         ({"width": 0}, "width and height must be at least 1 pixel, found 0 x 3."),
         ({"stride": 0}, "stride must be at least 1 pixel, found 0."),
         ({"names": ("a", "b")}, "names must hold one name per camera, 1; found 2."),
+        (
+            {"ignores_tag": (True, False)},
+            "ignores_tag must hold one choice per camera, 1; found 2.",
+        ),
     ],
 )
 def test_invalid_cameras_are_refused(changes, text):
@@ -73,3 +77,12 @@ def test_interleaved_cameras_start_at_their_own_first_pixels():
 def test_whether_a_point_is_in_an_image(point, is_seen):
     points = torch.tensor([[9.0, 9, 1], point])
     assert Cameras(**GOOD).shows_any(points) is is_seen
+
+
+def test_every_third_camera_ignores_the_tag():
+    four = Cameras(**GOOD).select(torch.zeros(4, dtype=torch.int64)).in_both_modes()
+    assert four.ignores_tag == (False, True, False, False)
+    assert four.select(torch.tensor([3, 1])).ignores_tag == (False, True)
+    single = four.every(2).to("cpu").singles()[1]
+    assert single.ignores_tag == (True,)
+    assert Cameras(**GOOD).singles()[0].ignores_tag == ()

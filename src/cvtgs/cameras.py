@@ -22,6 +22,8 @@ class Cameras:
         names: Name of each camera, such as its photograph's file name; empty if they have none.
         stride: If above 1, the images hold every ``stride``-th pixel of finer ones, in both
             directions; ``Ks``, width and height are those of the coarser grid (:meth:`every`).
+        ignores_tag: For each camera, whether images of scenes tagged ``SplatRenderMode: mip`` lack
+            its opacity compensation, as in viewers that ignore the tag; empty if no camera does.
 
     Raises:
         InvalidArgumentError: Shapes, dtypes, devices or sizes do not fit together.
@@ -40,6 +42,7 @@ class Cameras:
     height: int
     names: tuple[str, ...] = ()
     stride: int = 1
+    ignores_tag: tuple[bool, ...] = ()
 
     def __post_init__(self) -> None:
         count = len(self.viewmats)
@@ -63,10 +66,14 @@ class Cameras:
             )
         if self.stride < 1:
             raise InvalidArgumentError(f"stride must be at least 1 pixel, found {self.stride}.")
-        if self.names and len(self.names) != count:
-            raise InvalidArgumentError(
-                f"names must hold one name per camera, {count}; found {len(self.names)}."
-            )
+        for name, values, entry in (
+            ("names", self.names, "name"),
+            ("ignores_tag", self.ignores_tag, "choice"),
+        ):
+            if values and len(values) != count:
+                raise InvalidArgumentError(
+                    f"{name} must hold one {entry} per camera, {count}; found {len(values)}."
+                )
 
     def __len__(self) -> int:
         """Return the number of cameras."""
@@ -92,8 +99,17 @@ class Cameras:
         Returns:
             The selected cameras.
         """
-        names = tuple(self.names[row] for row in rows.tolist()) if self.names else ()
-        return replace(self, viewmats=self.viewmats[rows], Ks=self.Ks[rows], names=names)
+        names, ignores_tag = (
+            tuple(values[row] for row in rows.tolist()) if values else ()
+            for values in (self.names, self.ignores_tag)
+        )
+        return replace(
+            self,
+            viewmats=self.viewmats[rows],
+            Ks=self.Ks[rows],
+            names=names,
+            ignores_tag=ignores_tag,
+        )
 
     def singles(self) -> list[Self]:
         """Split into single cameras.
@@ -186,6 +202,15 @@ class Cameras:
         Ks[:, :2] /= stride
         Ks[:, :2, 2] += 0.5 - (firsts + 0.5) / stride
         return replace(self, Ks=Ks, width=width, height=height, stride=self.stride * stride)
+
+    def in_both_modes(self) -> Self:
+        """Return cameras of which every third one ignores the tag ``SplatRenderMode: mip``.
+
+        Returns:
+            The same cameras otherwise.
+        """
+        modes = tuple(row % 3 == 1 for row in range(len(self)))
+        return replace(self, ignores_tag=modes)
 
     def shows_any(self, points: Float[Tensor, "n 3"]) -> bool:
         """Check whether any point lies within any of the images.

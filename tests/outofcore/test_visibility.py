@@ -1,5 +1,7 @@
 """Visibility in blocks: the contributions of Gaussians are those of one piece."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -48,8 +50,11 @@ def paired(job, scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("boxes", [(), (BOX,)])
-def test_contributions_are_those_of_one_piece(scene, tmp_path, boxes):
+@pytest.mark.parametrize(
+    ("boxes", "comments"), [((), ()), ((BOX,), ()), ((), ("SplatRenderMode: mip",))]
+)
+def test_contributions_are_those_of_one_piece(scene, tmp_path, boxes, comments):
+    scene = replace(scene, comments=comments)
     config = SimplifyConfig.from_mapping(SETTINGS)
     job = run(scene, tmp_path, config, boxes=boxes)
     rows = paired(job, scene)

@@ -2,6 +2,7 @@
 
 import inspect
 import sys
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -252,6 +253,25 @@ def test_arguments_of_gsplat(monkeypatch, degree, comments):
         arguments["means"].double() @ rotation.T + shift, wanted, rtol=0, atol=1e-5
     )
     assert all(t.dtype == torch.float32 for t in arguments.values() if isinstance(t, torch.Tensor))
+
+
+def test_cameras_that_treat_the_tag_differently_are_rendered_one_by_one(monkeypatch):
+    modes = []
+
+    def rasterization(**options):
+        modes.append((len(options["viewmats"]), options["rasterize_mode"]))
+        return gsplat_stand_in.rasterization(**options)
+
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
+    scene = GaussianScene(**random_scene(5).tensors(), comments=MIP)
+    cameras = around(3)
+    gsplat_backend.rasterize(scene, cameras, sh_degree=0)
+    ignoring = replace(cameras, ignores_tag=(True, True, True))
+    gsplat_backend.rasterize(scene, ignoring, sh_degree=0)
+    output = gsplat_backend.rasterize(scene, cameras.in_both_modes(), sh_degree=0)
+    single = (1, "antialiased")
+    assert modes == [(3, "antialiased"), (3, "classic"), single, (1, "classic"), single]
+    assert output.rgb.shape == (3, cameras.height, cameras.width, 3)
 
 
 def documented(scene, cameras, **options):

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.rendering import render
+from cvtgs.rendering import blending_weights, contributions, observe, render
 from render_cases import MIP, around, backends, dtypes, scene_of, straight
 from scenes import random_scene
 
@@ -88,6 +88,28 @@ def test_antialiased_scenes_lose_what_the_dilation_adds(backend):
     for comments, alpha in (((), 0.8), (MIP, 0.8 / 1.3)):
         found = render(scene_of(row, comments=comments), straight(), backend=backend)
         assert found.alpha[0, 3, 4].item() == pytest.approx(alpha)
+
+
+@backends
+def test_a_camera_may_ignore_the_tag(backend):
+    """Image, contributions, both at once, and weights are then those of an untagged scene."""
+    plain = random_scene(20)
+    tagged = replace(plain, comments=MIP)
+    cameras = around(2)
+    mixed = replace(cameras, ignores_tag=(False, True))
+    found = render(tagged, mixed, backend=backend).rgb
+    assert torch.equal(found[0], render(tagged, cameras, backend=backend).rgb[0])
+    assert torch.equal(found[1], render(plain, cameras, backend=backend).rgb[1])
+    assert not torch.equal(found[1], render(tagged, cameras, backend=backend).rgb[1])
+    (_, ignoring), (_, second) = mixed.singles(), cameras.singles()
+    for measure in (contributions, lambda *a, **b: observe(*a, **b).contributions):
+        given = measure(tagged, ignoring, backend=backend)
+        assert torch.equal(given, measure(plain, second, backend=backend))
+    ours, theirs = (
+        blending_weights(scene, camera, backend=backend).powers()
+        for scene, camera in ((tagged, ignoring), (plain, second))
+    )
+    assert torch.equal(ours, theirs)
 
 
 # Shapes

@@ -154,8 +154,8 @@ def measure_visibility(
     Returns:
         The analysis with corrected apparent areas, and the haze effect decided by them.
     """
-    views = visibility_cameras(scene, config, cameras=cameras)
     used, observed = drop_unused_bands(scene, analysis.plan), None
+    views = visibility_cameras(used, config, cameras=cameras)
     if config.match.enabled:
         observed = observe(used, views)
         rendered = observed.contributions
@@ -189,7 +189,8 @@ def visibility_cameras(
         cameras: Cameras to choose from; None generates views.
 
     Returns:
-        The cameras of images of every ``config.visibility.stride``-th pixel.
+        The cameras of images of every ``config.visibility.stride``-th pixel; for a scene tagged
+        mip, every third one ignores the tag.
     """
     choices = config.visibility
     if cameras is None:
@@ -198,7 +199,8 @@ def visibility_cameras(
     else:
         longer, least = max(cameras.width, cameras.height), SSIM_WINDOW * choices.stride
         views = cameras.spread(choices.views).fitted(min(choices.size, longer), least=least)
-    return views.interleaved(choices.stride)
+    views = views.interleaved(choices.stride)
+    return views.in_both_modes() if scene.antialiased else views
 
 
 def measured_areas(

@@ -35,7 +35,12 @@ def write_views(job: Job, sample: GaussianScene, *, total: int) -> None:
     tensors = sample.with_sh_degree(0).tensors() | {"log_scales": enlarged}
     save_tensors(
         job.views_path,
-        {"viewmats": cameras.viewmats, "Ks": cameras.Ks, **add_prefix(SCENE, tensors)},
+        {
+            "viewmats": cameras.viewmats,
+            "Ks": cameras.Ks,
+            "ignores_tag": torch.tensor(cameras.ignores_tag, dtype=torch.bool),
+            **add_prefix(SCENE, tensors),
+        },
         {"width": str(cameras.width), "height": str(cameras.height)},
     )
 
@@ -53,6 +58,7 @@ def measure(job: Job, block: int) -> None:
         Ks=tensors["Ks"],
         width=int(facts["width"]),
         height=int(facts["height"]),
+        ignores_tag=tuple(tensors["ignores_tag"].tolist()),
     )
     sample = rows.scene.with_tensors(under_prefix(SCENE, tensors), {})
     blocks = scan.partition.blocks_of(scan.frame.contract(sample.means))

@@ -48,7 +48,8 @@ def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> 
     side = max(config.size, SSIM_WINDOW * config.stride)
 
     def batch(number: int, seed: int) -> list[Cameras]:
-        return mixed_views(positions, number, size=side, seed=seed).singles()
+        views = mixed_views(positions, number, size=side, seed=seed)
+        return (views.in_both_modes() if full.antialiased else views).singles()
 
     def training() -> Iterator[Cameras]:
         for number in count():

@@ -56,7 +56,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     that the image shows. The scene of highest PSNR on held-out views is returned, or the input
     scene if none is better. Number of Gaussians, SH degree, comments, layout and extra columns
     are kept. Gaussians that no image shows stay bit for bit, as do those that represent only
-    themselves.
+    themselves. Every third image of a scene tagged mip ignores the tag, as many viewers do.
 
     The same scenes, steps, configuration and seed give the same bits on a CPU; with ``seconds``
     the number of steps depends on the clock. The time includes everything, even the compilation
@@ -105,6 +105,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     ours, theirs = _on_device(small, full, place)
     if seconds is None and steps is None:
         steps = DEFAULT_STEPS
+    if cameras is not None and theirs.antialiased:
+        cameras = cameras.in_both_modes()
     limits, clock = Limits(seconds, steps=steps), StageClock(listener, place)
     with clock.stage(STAGE, limits.total):
         if observed is not None:

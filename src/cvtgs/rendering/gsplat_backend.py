@@ -60,14 +60,16 @@ def rasterize(
     sh_degree: int,
     listener: ProgressListener = silent,
 ) -> RasterOutput:
-    """Render all cameras at once with gsplat, in float32.
+    """Render all cameras at once with gsplat, in float32, if all of them treat tags alike.
 
     Memory: that of gsplat, linear in cameras times Gaussians and in intersections.
     """
     to_pinholes(cameras)  # validates the cameras
     listener(ProgressEvent(stage=STAGE, done=0, total=len(cameras)))
     if len(scene) and len(cameras):
-        layers, alpha = _rasterize_all(scene, cameras, sh_degree)
+        parts = cameras.singles() if len(set(cameras.ignores_tag)) > 1 else [cameras]
+        found = [_rasterize_all(scene, part, sh_degree) for part in parts]
+        layers, alpha = (torch.cat(images) for images in zip(*found, strict=True))
     else:
         layers = scene.means.new_zeros(len(cameras), cameras.height, cameras.width, 4)
         alpha = layers[..., :1]
@@ -94,13 +96,14 @@ def blending_weights(scene: GaussianScene, camera: Cameras) -> BlendingWeights:
 
 
 def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tuple[Tensor, Tensor]:
-    """Return weighted sums of colours and depths, and alpha."""
+    """Return weighted sums of colours and depths, and alpha; all cameras treat tags alike."""
     rest = scene.shN[:, : REST_COUNTS[sh_degree]]
     if sh_degree:
         colors = torch.cat([scene.sh0, rest], dim=1)
     else:
         colors = evaluate(scene.sh0, rest, scene.means)
     means, viewmats = _about_cameras(scene, cameras)
+    is_compensated = scene.antialiased and not any(cameras.ignores_tag)
     layers, alpha, _ = _gsplat().rasterization(
         means=means.float(),
         quats=scene.quats.float(),
@@ -116,7 +119,7 @@ def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tu
         sh_degree=sh_degree or None,
         packed=False,
         render_mode="RGB+D",
-        rasterize_mode="antialiased" if scene.antialiased else "classic",
+        rasterize_mode="antialiased" if is_compensated else "classic",
     )
     return layers, alpha
 

@@ -61,7 +61,7 @@ def rasterize(
     use_threads_of_torch()
     tensors = [tensor.contiguous() for tensor in scene.tensors().values()]
     images = [
-        partial(_Render.apply, _settings(camera, sh_degree, scene.antialiased), *tensors)
+        partial(_Render.apply, _settings(camera, sh_degree, scene), *tensors)
         for camera in to_pinholes(cameras)
     ]
     empty = scene.means.new_zeros(0, cameras.height, cameras.width, 5)
@@ -78,7 +78,7 @@ def observe(
 ) -> tuple[RasterOutput, Float[Tensor, "n"]]:
     """Render one image and sum each Gaussian's weights over it in the same pass."""
     (pinhole,) = to_pinholes(camera)
-    settings = _settings(pinhole, sh_degree, scene.antialiased)
+    settings = _settings(pinhole, sh_degree, scene)
     splats, tiles = _splats_by_tile(_arrays(scene), settings)
     image = np.empty((settings.size[1], settings.size[0], 5), splats.packed.dtype)
     weights = np.zeros(len(tiles.lists))
@@ -94,7 +94,7 @@ def observe(
 def blending_weights(scene: GaussianScene, camera: Cameras) -> TileWeights:
     """Return the weights of every Gaussian in every pixel of one image."""
     (pinhole,) = to_pinholes(camera)
-    settings = _settings(pinhole, 0, scene.antialiased)
+    settings = _settings(pinhole, 0, scene)
     splats, tiles = _splats_by_tile(_arrays(scene), settings)
     centers = (np.arange(max(settings.size)) + 0.5).astype(splats.packed.dtype)
     return TileWeights(splats, tiles, settings.size, centers=centers, count=len(scene))
@@ -157,11 +157,12 @@ def _splats_by_tile(
     return SplatArrays(rows, splat_starts, packed), TileArrays(tile_starts, lists, SIDE)
 
 
-def _settings(camera: Pinhole, sh_degree: int, antialiased: bool) -> RasterSettings:
+def _settings(camera: Pinhole, sh_degree: int, scene: GaussianScene) -> RasterSettings:
     pairs = (camera.focal, camera.principal, *camera.slopes)
     last = (*camera.size, camera.dilation)
     rows = [*camera.rotation, camera.center, *((*pair, 0.0) for pair in pairs), last]
-    return RasterSettings(np.array(rows), camera.size, sh_degree, antialiased)
+    compensated = scene.antialiased and not camera.ignores_tag
+    return RasterSettings(np.array(rows), camera.size, sh_degree, compensated)
 
 
 def _pixel_centers(image: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -45,6 +45,7 @@ class Pinhole:
         principal: Principal point, pixels.
         size: Width and height, pixels.
         dilation: Variance added to every projected Gaussian, squared pixels.
+        ignores_tag: Whether scenes tagged mip are rendered without compensation.
     """
 
     rotation: tuple[tuple[float, float, float], ...]
@@ -53,6 +54,7 @@ class Pinhole:
     principal: tuple[float, float]
     size: tuple[int, int]
     dilation: float = DILATION
+    ignores_tag: bool = False
 
     @property
     def slopes(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -98,6 +100,8 @@ def to_pinholes(cameras: Cameras) -> list[Pinhole]:
     viewmats, Ks = table[:, :16].view(-1, 4, 4), table[:, 16:].view(-1, 3, 3)  # noqa: N806 (as gsplat)
     _check(viewmats, Ks)
     centers = -torch.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[:, :, 0]
+    modes = cameras.ignores_tag or (False,) * len(cameras)
+    rows = zip(viewmats.tolist(), centers.tolist(), Ks.tolist(), modes, strict=True)
     return [
         Pinhole(
             rotation=tuple((row[0], row[1], row[2]) for row in viewmat[:3]),
@@ -106,8 +110,9 @@ def to_pinholes(cameras: Cameras) -> list[Pinhole]:
             principal=(K[0][2], K[1][2]),
             size=(cameras.width, cameras.height),
             dilation=DILATION / cameras.stride**2,
+            ignores_tag=ignores_tag,
         )
-        for viewmat, center, K in zip(viewmats.tolist(), centers.tolist(), Ks.tolist(), strict=True)
+        for viewmat, center, K, ignores_tag in rows
     ]
 
 
@@ -170,7 +175,7 @@ def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
     axes = _image_axes(scene, rows, local, beside)
     ellipses, survival = _ellipses(axes, camera.dilation)
     opacities = parameters.opacity_from_logit(scene.logit_opacities.index_select(0, rows))
-    if scene.antialiased:
+    if scene.antialiased and not camera.ignores_tag:
         opacities = opacities * survival
     slopes = local[:, :2] / local[:, 2:]
     centers = slopes * beside.focal + beside.principal
