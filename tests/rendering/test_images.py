@@ -91,6 +91,20 @@ def test_antialiased_scenes_lose_what_the_dilation_adds(backend):
 
 
 @backends
+def test_depths_that_are_equal_in_float32_still_decide_the_order(backend):
+    """The camera is turned by 1e-6, so the second Gaussian is 5e-8 units nearer, at depth 2."""
+    rows = [((x, 0, 2), (0.3, 0.3, 0.3), 0.9, color) for x, color in
+            ((0.0, (1.0, 0.0, 0.0)), (0.05, (0.0, 1.0, 0.0)))]  # fmt: skip
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[0, 2], turn[2, 0] = 1e-6, -1e-6
+    camera = replace(straight(), viewmats=turn[None], Ks=straight().Ks.double())
+    red, green, _ = render(scene_of(*rows, dtype=torch.float32), camera, backend=backend).rgb[
+        0, 3, 4
+    ]
+    assert float(green) > 5 * float(red)
+
+
+@backends
 def test_a_camera_may_ignore_the_tag(backend):
     """Image, contributions, both at once, and weights are then those of an untagged scene."""
     plain = random_scene(20)

@@ -165,9 +165,13 @@ def splat_of(axes: Array, local: Array, camera: Array, opacity: float, out: Arra
 
 @parallel
 def project_all(
-    gaussians: GaussianArrays, settings: RasterSettings, packed: Array, visible: NDArray[np.bool_]
+    gaussians: GaussianArrays,
+    settings: RasterSettings,
+    packed: Array,
+    depths: NDArray[np.float64],
+    visible: NDArray[np.bool_],
 ) -> None:
-    """Write the packed splat of every Gaussian, and whether it is in view."""
+    """Write the packed splat of every Gaussian, its depth, and whether it is in view."""
     means, quats, log_scales, logits, sh0, rest = gaussians
     camera, _, degree, antialiased = settings
     for chunk in prange((len(means) + CHUNK - 1) // CHUNK):
@@ -192,7 +196,7 @@ def project_all(
             color_of((sh0[i], rest[i]), offset, degree, basis, color)
             for channel in range(3):
                 packed[i, 6 + channel] = max(0.0, color[channel])
-            visible[i] = True
+            visible[i], depths[i] = True, local[2]
 
 
 @serial

@@ -142,9 +142,10 @@ def _splats_by_tile(
     """Project Gaussians, sort them by depth and list the splats of each tile."""
     count = len(gaussians.means)
     packed, visible = np.empty((count, 10), gaussians.means.dtype), np.empty(count, np.bool_)
-    project_all(gaussians, settings, packed, visible)
+    depths = np.empty(count)  # float32 would often be equal for different depths
+    project_all(gaussians, settings, packed, depths, visible)
     rows = np.flatnonzero(visible)
-    rows = rows[np.argsort(packed[rows, 9], kind="stable")]
+    rows = rows[np.argsort(depths[rows], kind="stable")]
     packed = packed[rows]
     splat_starts = np.zeros(len(rows) + 1, np.int64)
     count_tiles(packed, settings.size, SIDE, splat_starts[1:])

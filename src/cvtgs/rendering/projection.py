@@ -74,10 +74,14 @@ class Pinhole:
 
 
 class CameraTensors(NamedTuple):
-    """A pinhole camera as tensors on the scene's device; the bounds are those of ``slopes``."""
+    """A pinhole camera as tensors on the scene's device; the bounds are those of ``slopes``.
+
+    ``forward`` is the direction of depths; it and ``center`` are float64.
+    """
 
     rotation: Float[Tensor, "3 3"]
     center: Float[Tensor, "3"]
+    forward: Float[Tensor, "3"]
     focal: Float[Tensor, "2"]
     principal: Float[Tensor, "2"]
     low: Float[Tensor, "2"]
@@ -85,12 +89,12 @@ class CameraTensors(NamedTuple):
 
     @classmethod
     def of(cls, camera: Pinhole, like: Tensor) -> "CameraTensors":
-        """Convert a camera to the device and dtype of a tensor (centre: float64), in one copy."""
+        """Convert a camera to the device and dtype of a tensor, in one copy."""
         low, high = zip(*camera.slopes, strict=True)
         numbers = *camera.center, *chain(*camera.rotation), *camera.focal, *camera.principal
         table = torch.tensor([*numbers, *low, *high], dtype=torch.float64, device=like.device)
         rotation, *pairs = table[3:].to(like.dtype).split([9, 2, 2, 2, 2])
-        return cls(rotation.view(3, 3), table[:3], *pairs)
+        return cls(rotation.view(3, 3), table[:3], table[9:12], *pairs)
 
 
 def to_pinholes(cameras: Cameras) -> list[Pinhole]:
@@ -179,7 +183,8 @@ def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
         opacities = opacities * survival
     slopes = local[:, :2] / local[:, 2:]
     centers = slopes * beside.focal + beside.principal
-    order = _front_to_back(centers, ellipses, opacities, local[:, 2], camera)
+    depths = _depths(scene.means.index_select(0, rows), beside)
+    order = _front_to_back(centers, ellipses, opacities, depths, camera)
     return Splats(
         rows=rows[order],
         centers=centers[order],
@@ -216,6 +221,12 @@ def half_sizes(
 def _offsets(means: Float[Tensor, "n 3"], beside: CameraTensors) -> Float[Tensor, "n 3"]:
     """Return offsets from the camera, whose position float32 cannot hold far from the origin."""
     return (means.double() - beside.center).to(means.dtype)
+
+
+@torch.no_grad()
+def _depths(means: Float[Tensor, "n 3"], beside: CameraTensors) -> Float[Tensor, "n"]:
+    """Return depths to sort by; in float32, different ones would often be equal."""
+    return ((means.double() - beside.center) * beside.forward).sum(dim=1)
 
 
 @torch.no_grad()
