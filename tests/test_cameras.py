@@ -79,10 +79,19 @@ def test_whether_a_point_is_in_an_image(point, is_seen):
     assert Cameras(**GOOD).shows_any(points) is is_seen
 
 
-def test_every_third_camera_ignores_the_tag():
+def test_about_every_third_camera_ignores_the_tag():
     four = Cameras(**GOOD).select(torch.zeros(4, dtype=torch.int64)).in_both_modes()
-    assert four.ignores_tag == (False, True, False, False)
-    assert four.select(torch.tensor([3, 1])).ignores_tag == (False, True)
-    single = four.every(2).to("cpu").singles()[1]
+    assert four.ignores_tag == (False, False, True, False)
+    assert four.select(torch.tensor([3, 2])).ignores_tag == (False, True)
+    single = four.every(2).to("cpu").singles()[2]
     assert single.ignores_tag == (True,)
     assert Cameras(**GOOD).singles()[0].ignores_tag == ()
+
+
+@pytest.mark.parametrize("step", [1, 7, 8, 9, 10])
+def test_held_out_cameras_are_of_both_kinds(step):
+    many = Cameras(**GOOD).select(torch.zeros(300, dtype=torch.int64)).in_both_modes()
+    modes = many.ignores_tag[step // 2 :: step]
+    assert sum(modes) / len(modes) == pytest.approx(1 / 3, abs=0.07)
+    for first in range(0, len(modes) - 8):
+        assert len(set(modes[first : first + 8])) == 2

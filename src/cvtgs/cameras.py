@@ -1,5 +1,6 @@
 """Pinhole cameras, and view matrices from camera positions and targets."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -204,12 +205,15 @@ class Cameras:
         return replace(self, Ks=Ks, width=width, height=height, stride=self.stride * stride)
 
     def in_both_modes(self) -> Self:
-        """Return cameras of which every third one ignores the tag ``SplatRenderMode: mip``.
+        """Return cameras of which about every third one ignores the tag ``SplatRenderMode: mip``.
+
+        Multiples of an irrational number decide, so that every eighth or ninth camera, as is held
+        out elsewhere, is not always of the same kind.
 
         Returns:
             The same cameras otherwise.
         """
-        modes = tuple(row % 3 == 1 for row in range(len(self)))
+        modes = tuple(math.sqrt(2.0) * row % 1.0 < 1 / 3 for row in range(1, len(self) + 1))
         return replace(self, ignores_tag=modes)
 
     def shows_any(self, points: Float[Tensor, "n 3"]) -> bool:

@@ -105,7 +105,7 @@ def test_generated_views_are_endless_and_differ_from_held_out_ones():
     assert {(camera.width, camera.height) for camera in training} == {(32, 32)}
 
 
-def test_every_third_view_of_a_tagged_scene_ignores_the_tag():
+def test_some_views_of_a_tagged_scene_ignore_the_tag():
     plain = full_scene(50)
     tagged = replace(plain, comments=("SplatRenderMode: mip",))
     config = quick(heldout=3)

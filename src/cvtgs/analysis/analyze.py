@@ -190,7 +190,7 @@ def visibility_cameras(
 
     Returns:
         The cameras of images of every ``config.visibility.stride``-th pixel; for a scene tagged
-        mip, every third one ignores the tag.
+        mip, about every third one ignores the tag.
     """
     choices = config.visibility
     if cameras is None:

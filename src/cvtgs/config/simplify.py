@@ -29,27 +29,27 @@ def unknown_preset(name: object) -> ConfigError:
 
 
 MATCHED: Mapping[str, Any] = {
-    "visibility": {"views": 24, "size": 400, "stride": 2},
+    "visibility": {"views": 32, "size": 400, "stride": 2},
     "match": {"opacity_rounds": 1},
     "refine": {
-        "steps": 50,
+        "steps": 60,
         "rates": {"means": 0.03, "quats": 0.012, "log_scales": 0.015},
-        "half_after": 40,
+        "half_after": 48,
         "size": 400,
         "stride": 2,
         "steps_per_image": 100,
-        "check_every": 25,
+        "check_every": 30,
     },
 }
 
 THINNED: Mapping[str, Any] = {
-    "steps": 320,
-    "half_after": 77,
+    "steps": 480,
+    "half_after": 115,
     "cooling": 0.3,
     "size": 400,
     "stride": 2,
     "first_images": 32,
-    "steps_per_image": 320,
+    "steps_per_image": 480,
     "check_every": 50,
 }
 
@@ -60,7 +60,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "matched": MATCHED,
     "high": {
         **MATCHED,
-        "visibility": {**MATCHED["visibility"], "views": 48},
+        "visibility": {**MATCHED["visibility"], "views": 72},
         "refine": THINNED,
     },
     "paper": {
