@@ -118,7 +118,7 @@ class Cameras:
         Returns:
             One :class:`Cameras` per camera, in order.
         """
-        return [self.select(torch.tensor([row])) for row in range(len(self))]
+        return [self.select(torch.tensor([row], device="cpu")) for row in range(len(self))]
 
     def to(self, device: torch.device | str) -> Self:
         """Move the cameras to a device.
@@ -241,7 +241,9 @@ class Cameras:
         Returns:
             The selected cameras.
         """
-        return self.select(torch.tensor(spread_rows(len(self), count)))
+        return self.select(
+            torch.tensor(spread_rows(len(self), count), dtype=torch.int64, device="cpu")
+        )
 
 
 def spread_rows(length: int, count: int) -> tuple[int, ...]:

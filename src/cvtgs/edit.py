@@ -105,9 +105,9 @@ class Motion:
         Raises:
             InvalidArgumentError: A number is not finite, or the factor is not above 0.
         """
-        quat = torch.tensor([_NO_TURN], dtype=torch.float64)
+        quat = torch.tensor([_NO_TURN], dtype=torch.float64, device="cpu")
         for axis, angle in enumerate(angles):
-            turn = torch.zeros(1, 4, dtype=torch.float64)
+            turn = torch.zeros(1, 4, dtype=torch.float64, device="cpu")
             # exact for quarter turns, unlike the sine of rounded radians
             turn[0, 0], turn[0, 1 + axis] = _cos_sin(angle / 2)
             quat = multiply_quats(turn, quat)

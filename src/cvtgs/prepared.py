@@ -1,7 +1,8 @@
 """Prepared: a scene to simplify repeatedly, with a fallback if the device lacks memory."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool
@@ -35,6 +36,8 @@ from cvtgs.validity import (
     standardized,
     with_finite_opacities,
 )
+
+Result = TypeVar("Result")
 
 
 class Prepared:
@@ -91,6 +94,11 @@ class Prepared:
         self._ordered: OrderedRows | None = None
         self._has_run = False
 
+    @property
+    def scene(self) -> GaussianScene:
+        """The input scene."""
+        return self._scene
+
     def run(
         self,
         rho: float | None = None,
@@ -108,12 +116,21 @@ class Prepared:
         target = target_count(total, rho, count=count, max_count=max_count)
         if keep is not None:
             check_mask(keep, total)
-        return within_memory(
-            partial(self._run, target, keep),
-            self._device,
-            work=f"simplifying {total:,} Gaussians",
-            may_leave=self._may_leave,
-        )
+        return self._attempt(partial(self._run, target, keep))
+
+    def _attempt(self, compute: Callable[[torch.device, str], Result]) -> Result:
+        """Compute on the device, or elsewhere if it lacks memory.
+
+        Gradients and inference mode are off, whatever the program has set: results do not depend
+        on inputs in a differentiable way, and a refinement needs gradients of its own.
+        """
+        with torch.inference_mode(mode=False), torch.no_grad():
+            return within_memory(
+                compute,
+                self._device,
+                work=f"simplifying {self._total:,} Gaussians",
+                may_leave=self._may_leave,
+            )
 
     def _run(
         self, target: int, keep: Bool[Tensor, "n"] | None, device: torch.device, note: str
@@ -147,12 +164,7 @@ class Prepared:
         Args:
             rho: The largest ratio to expect.
         """
-        within_memory(
-            partial(self._warm_up, target_count(self._total, rho)),
-            self._device,
-            work=f"simplifying {self._total:,} Gaussians",
-            may_leave=self._may_leave,
-        )
+        self._attempt(partial(self._warm_up, target_count(self._total, rho)))
 
     def _warm_up(self, target: int, device: torch.device, note: str) -> None:
         self._begin(device, note)
@@ -170,12 +182,7 @@ class Prepared:
         targets = [target_count(self._total, rho) for rho in rhos]
         if not targets:
             raise InvalidArgumentError("levels need at least one ratio, found none.")
-        found = within_memory(
-            partial(self._run_levels, targets),
-            self._device,
-            work=f"simplifying {self._total:,} Gaussians",
-            may_leave=self._may_leave,
-        )
+        found = self._attempt(partial(self._run_levels, targets))
         return tuple(found[target] for target in targets)
 
     def _run_levels(
@@ -301,7 +308,8 @@ class Prepared:
         masses = [(analysis.areas * analysis.opacities).sum(), reduced.scene.masses.sum()]
         mass_in, mass_out = torch.stack(masses).tolist()
         views = "none"
-        if self._refines or analysis.plan.visibility.active:
+        is_whole = target >= total - checked.invalid_count
+        if not is_whole and (self._refines or analysis.plan.visibility.active):
             views = "found" if self._cameras is None else f"{len(self._cameras)} cameras"
         report = SimplifyReport(
             input_count=total,

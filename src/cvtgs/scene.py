@@ -217,7 +217,7 @@ class GaussianScene:
         if isinstance(rows, slice):
             these = range(len(self))[rows]
             stop = these.start + len(these) * these.step
-            rows = torch.arange(these.start, stop, these.step)
+            rows = torch.arange(these.start, stop, these.step, device="cpu")
         if isinstance(rows, int | str) or getattr(rows, "ndim", 1) != 1:
             hint = f"; write scene[[{rows}]] for a single Gaussian" if isinstance(rows, int) else ""
             raise InvalidArgumentError(

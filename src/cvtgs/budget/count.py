@@ -16,7 +16,7 @@ from cvtgs.errors import GoalError, InvalidArgumentError
 from cvtgs.evaluation.scorer import MOST_PSNR, Metrics, Scorer, scene_scores
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.report import Simplified, SimplifyReport
-from cvtgs.scene import GaussianScene, SceneLike, as_scene
+from cvtgs.scene import GaussianScene, SceneLike
 from cvtgs.simplifier import Simplifier
 from cvtgs.views import automatic_views
 
@@ -162,10 +162,9 @@ def find_count(
         >>> found.psnr >= 18 and len(found.scene) < 400
         True
     """
-    scene = as_scene(scene)
     target = checked_target(psnr, ssim=ssim)
-    scorer = heldout_scorer(scene, heldout, listener=listener)
     prepared = (simplifier or Simplifier()).prepare(scene, cameras=cameras)
+    total, scorer = len(prepared.scene), heldout_scorer(prepared.scene, heldout, listener=listener)
     tried: list[Tried] = []
     best: tuple[Simplified, Tried] | None = None
 
@@ -178,7 +177,7 @@ def find_count(
             best = made, tried[-1]
         return value
 
-    most = max(1, math.floor(MOST_SHARE * len(scene)))
+    most = max(1, math.floor(MOST_SHARE * total))
     tries = islice(smallest_enough(reach, target.value, most=most), MOST_TRIES)
     listener(ProgressEvent(stage=STAGE, done=0, total=MOST_TRIES))
     for done, (count, value) in enumerate(tries, start=1):
@@ -189,7 +188,7 @@ def find_count(
         nearest = max(tried, key=target.of)
         raise GoalError(
             f"no simplified scene reaches {target.text(target.value)}: the best one tried, with "
-            f"{nearest.count:,} of {len(scene):,} Gaussians, reaches "
+            f"{nearest.count:,} of {total:,} Gaussians, reaches "
             f"{target.text(target.of(nearest))}."
         )
     (small, report), quality = best

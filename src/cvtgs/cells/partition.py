@@ -173,7 +173,7 @@ class Partition:
             return
         first, costs = 0, self.offsets.cpu()
         if cell_cost:
-            costs = costs + cell_cost * torch.arange(len(costs))
+            costs = costs + cell_cost * torch.arange(len(costs), device="cpu")
         while first < len(self):
             fitting = torch.searchsorted(costs, costs[first] + max_members, right=True)
             last = max(first + 1, int(fitting) - 1)

@@ -106,7 +106,7 @@ def nearest_neighbors(sites: Float[Tensor, "m d"], count: int) -> Int[Tensor, "m
     apart = _apart(sites.cpu())
     rows, _ = _by_tree(apart, apart, with_self)
     # With coincident sites, the site itself may be anywhere or missing: then drop the last one.
-    is_self = rows == torch.arange(len(sites))[:, None]
+    is_self = rows == torch.arange(len(sites), device="cpu")[:, None]
     if bool(is_self[:, 0].all()):
         return rows[:, 1:].to(sites.device)
     others = torch.sort(is_self.to(torch.uint8), dim=1, stable=True).indices[:, : with_self - 1]

@@ -330,7 +330,7 @@ def weighted_seeds(
         >>> weighted_seeds(torch.tensor([0.0, 1.0]), 1, torch.Generator().manual_seed(0)).tolist()
         [1]
     """
-    uniform = torch.rand(len(weights), generator=generator, dtype=torch.float64)
+    uniform = torch.rand(len(weights), generator=generator, dtype=torch.float64, device="cpu")
     keys = -torch.log(uniform.clamp_min(1e-300)).to(weights.device) / weights.double()
     chosen = torch.sort(keys, stable=True).indices[:count]
     return torch.sort(chosen).values

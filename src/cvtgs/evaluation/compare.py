@@ -249,7 +249,7 @@ def _score_images(
         )
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
     for view in range(len(cameras)):
-        camera = cameras.select(torch.tensor([view]))
+        camera = cameras.select(torch.tensor([view], device="cpu"))
         truth: _RenderedImage | None = None
         for name, scene in scenes.items():
             rendered = render_view(scene, camera, backend=settings.backend)

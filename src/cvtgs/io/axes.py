@@ -23,7 +23,9 @@ SCENE_AXES = "rdf"
 _DIRECTIONS = {"r": (1, 0, 0), "u": (0, 1, 0), "b": (0, 0, 1)}
 _DIRECTIONS |= {"l": (-1, 0, 0), "d": (0, -1, 0), "f": (0, 0, -1)}
 
-_QUARTER_TURN = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]).double()
+_QUARTER_TURN = torch.tensor(
+    [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], device="cpu"
+).double()
 """(x, y, z) becomes (x, -z, y)."""
 
 
@@ -72,7 +74,7 @@ def change_axes(scene: GaussianScene, source: str, target: str) -> GaussianScene
 
 def _matrix(name: str) -> Float[Tensor, "3 3"]:
     """Return the axes as rows, in coordinates right, up and back."""
-    return torch.tensor([_DIRECTIONS[letter] for letter in name], dtype=torch.float64)
+    return torch.tensor([_DIRECTIONS[letter] for letter in name], dtype=torch.float64, device="cpu")
 
 
 def _with_signs(scene: GaussianScene, x: int, y: int, z: int) -> GaussianScene:
@@ -103,7 +105,7 @@ def _with_quarter_turn(scene: GaussianScene) -> GaussianScene:
 @cache
 def _sh_signs(x: int, y: int, z: int) -> Float[Tensor, "k"]:
     """Return the factor 1 or -1 of each SH function when coordinates change their signs."""
-    direction = torch.tensor([[0.2, 0.5, 0.9]], dtype=torch.float64)
+    direction = torch.tensor([[0.2, 0.5, 0.9]], dtype=torch.float64, device="cpu")
     turned = direction * direction.new_tensor([x, y, z])
     return (rest_basis(turned, 3) / rest_basis(direction, 3))[0].sign()
 
@@ -112,7 +114,7 @@ def _sh_signs(x: int, y: int, z: int) -> Float[Tensor, "k"]:
 def _sh_quarter_turn() -> Float[Tensor, "k k"]:
     """Return the SH matrix of the quarter turn; squares of entries are multiples of 1/16."""
     generator = torch.Generator().manual_seed(0)
-    directions = torch.randn(64, 3, generator=generator, dtype=torch.float64)
+    directions = torch.randn(64, 3, generator=generator, dtype=torch.float64, device="cpu")
     directions /= directions.norm(dim=1, keepdim=True)
     basis, turned = rest_basis(directions, 3), rest_basis(directions @ _QUARTER_TURN, 3)
     matrix: Tensor = torch.linalg.lstsq(basis, turned).solution

@@ -144,7 +144,7 @@ def load(
         raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {sh_degree!r}.")
     axes = None if axes is None else checked_axes(axes)
     if not isinstance(path, str | os.PathLike):
-        with file_of(path, format) as copy:
+        with file_of(path, _dotted(format)) as copy:
             return load(
                 copy,
                 format=format,
@@ -307,7 +307,9 @@ def check_save(path: str | os.PathLike[str], overwrite: bool = False) -> None:
 
 def _dotted(suffix: str | None) -> str | None:
     """Return the suffix of a format with a leading dot: ``ply`` means ``.ply``."""
-    return f".{suffix}" if suffix and "." not in suffix else suffix
+    if suffix and ("." not in suffix or f".{suffix.lower()}" in (*_READERS, *_WRITERS)):
+        return f".{suffix}"
+    return suffix
 
 
 def _suffix_of(path: str | os.PathLike[str], known: Iterable[str]) -> str:

@@ -168,7 +168,7 @@ def heldout_views(views: ObservedViews) -> ObservedViews:
     """Return every eighth view, or all views if there are fewer than eight."""
     count = len(views.cameras)
     first, step = (HELDOUT_EVERY // 2, HELDOUT_EVERY) if count >= HELDOUT_EVERY else (0, 1)
-    rows = torch.tensor(range(first, count, step))
+    rows = torch.tensor(range(first, count, step), device="cpu")
     cameras = views.cameras.select(rows)
     return replace(views, cameras=cameras, rgb=views.rgb[rows], alpha=views.alpha[rows])
 

@@ -155,7 +155,7 @@ def rotated_rest(
 def _rest_rotation(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "k k"]:
     """Return the rotation matrix of the bands, with rounding errors set to zero."""
     generator = torch.Generator().manual_seed(0)
-    directions = torch.randn(64, 3, generator=generator, dtype=torch.float64)
+    directions = torch.randn(64, 3, generator=generator, dtype=torch.float64, device="cpu")
     directions /= directions.norm(dim=1, keepdim=True)
     new, old = rest_basis(directions, degree), rest_basis(directions @ rotation, degree)
     matrix: Tensor = torch.linalg.lstsq(new, old).solution

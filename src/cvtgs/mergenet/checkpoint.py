@@ -246,15 +246,16 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
 def build_network(
     architecture: Architecture | PublishedArchitecture,
 ) -> MergeNet | PublishedMergeNet:
-    """Build an untrained network, which changes nothing.
+    """Build an untrained network in float32 on the CPU, which changes nothing.
 
     Example:
         >>> type(build_network(Architecture())).__name__
         'MergeNet'
     """
-    if isinstance(architecture, PublishedArchitecture):
-        return PublishedMergeNet(architecture)
-    return MergeNet(architecture)
+    with torch.device("cpu"):  # the program may have other defaults
+        if isinstance(architecture, PublishedArchitecture):
+            return PublishedMergeNet(architecture).float()
+        return MergeNet(architecture).float()
 
 
 def _build_net(

@@ -314,9 +314,10 @@ class KnownRange(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("low", torch.full((SUMMARY_FEATURES,), -WIDEST))
-        self.register_buffer("high", torch.full((SUMMARY_FEATURES,), WIDEST))
-        self.register_buffer("margin", torch.ones(SUMMARY_FEATURES))
+        widest = torch.full((SUMMARY_FEATURES,), WIDEST, dtype=torch.float32, device="cpu")
+        self.register_buffer("low", -widest)
+        self.register_buffer("high", widest)
+        self.register_buffer("margin", torch.ones_like(widest))
 
     def forward(self, summaries: Float[Tensor, "m f"]) -> Float[Tensor, "m"]:
         """Return the factor of the residual of every cell, 0 to 1.

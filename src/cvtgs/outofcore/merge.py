@@ -51,8 +51,8 @@ class BlockCells(NamedTuple):
     """The Gaussians in the cells of a block.
 
     Attributes:
-        original: The Gaussians with all columns that the effects select.
-        scene: The same with only the SH bands that are used.
+        original: The Gaussians with all of their columns.
+        scene: The same with only the columns and SH bands that are used.
         visibility: ``(n,)`` ambient visibility, 0 to 1.
         partition: Rows of every cell.
     """
@@ -105,7 +105,7 @@ def inflate(job: Job, block: int) -> None:
     paths = {other: job.merged_path(other) for other in job.blocks_with_cells() if other != block}
     others = other_blocks(paths, name="means")
     remote = halo_cells(own["means"], others, count=near)
-    merged, _, own_count = _with_halo(job, block, remote, job.merged_path)
+    merged, _, own_count = _with_halo(block, remote, job.merged_path)
     neighbors = cvt.nearest_neighbors(merged.means, near)[:own_count]
     # Only the number of members per cell matters here, so their rows are left out.
     offsets = torch.nn.functional.pad(own["sizes"].cumsum(0), (1, 0))
@@ -126,7 +126,7 @@ def correct(job: Job, block: int) -> None:
     original, scene, visibility, partition = read_cells(job, block)
     own, _ = map_tensors(job.inflated_path(block))
     shown = partition.keep_only(own["representatives"])
-    small, sizes, own_count = _with_halo(job, block, own["remote"], job.inflated_path)
+    small, sizes, own_count = _with_halo(block, own["remote"], job.inflated_path)
     checkpoint = job.read_network()
     if checkpoint is not None:
         small = correct_cells(
@@ -172,19 +172,19 @@ def simplify_block(job: Job, block: int) -> None:
         mass_out=float(reduced.scene.masses.sum()),
         **reduced.statistics.model_dump(),
     )
-    write_block(job, block, reduced.scene, report)
+    write_block(job, block, restore_columns(reduced.scene, rows.scene, scan.plan), report)
 
 
 def read_cells(job: Job, block: int) -> BlockCells:
     """Read the Gaussians in the cells of a block."""
     rows, labels = read_members(job, block)
-    original = select_columns(rows.scene, job.config.effects)
-    scene = drop_unused_bands(original, job.read_scan().plan)
+    used = select_columns(rows.scene, job.config.effects)
+    scene = drop_unused_bands(used, job.read_scan().plan)
     partition = cells.Partition.from_labels(labels, job.targets[block])
-    return BlockCells(original, scene, rows.visibility, partition)
+    return BlockCells(rows.scene, scene, rows.visibility, partition)
 
 
-def _with_halo(job: Job, block: int, remote: Tensor, path: Callable[[int], Path]) -> WithHalo:
+def _with_halo(block: int, remote: Tensor, path: Callable[[int], Path]) -> WithHalo:
     """Read the merged Gaussians of a block, then the remote ones in the order of their blocks."""
     own, _ = map_tensors(path(block))
     names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN", "sizes")

@@ -4,12 +4,12 @@ import math
 import os
 import shutil
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from cvtgs.analysis import select_columns
+from cvtgs.analysis import restore_columns, select_columns
 from cvtgs.boxes import Box
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
@@ -43,7 +43,7 @@ from cvtgs.outofcore.visibility import add_contributions, measure
 from cvtgs.outofcore.workers import Result, Workers, begin, sequentially, with_progress
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport
-from cvtgs.scene import concatenate
+from cvtgs.scene import GaussianScene, concatenate
 from cvtgs.simplifier import Simplifier
 
 RANGE_ROWS, MOST_RANGES = 1 << 18, 64
@@ -284,8 +284,7 @@ def assemble_blocks(
         with atomic_output(output, overwrite=overwrite) as file:
             join_plys([*_kept_files(job), *blocks], file)
         return
-    kept = [job.source.scene(rows) for rows in kept_rows(job)]
-    scene = concatenate([*kept, *map(load, blocks)])
+    scene = concatenate([*_kept_scenes(job), *map(load, blocks)])
     save(scene, output, overwrite=overwrite, axes=axes)
 
 
@@ -295,12 +294,19 @@ def is_plain_ply(output: str | os.PathLike[str]) -> bool:
     return name.endswith(".ply") and not name.endswith(".compressed.ply")
 
 
+def _kept_scenes(job: Job) -> Iterator[GaussianScene]:
+    """Yield the protected rows, with the columns of blocks."""
+    plan = job.read_scan().plan
+    for rows in kept_rows(job):
+        scene = job.source.scene(rows)
+        yield restore_columns(select_columns(scene, job.config.effects), scene, plan)
+
+
 def _kept_files(job: Job) -> list[Path]:
     """Write the protected rows in files with the columns and axes of blocks."""
     paths = []
-    for number, rows in enumerate(kept_rows(job)):
+    for number, scene in enumerate(_kept_scenes(job)):
         paths.append(job.path(f"unchanged_{number:05d}.ply"))
-        scene = select_columns(job.source.scene(rows), job.config.effects)
         save(scene, paths[-1], overwrite=True, axes=job.axes)
     return paths
 

@@ -110,7 +110,9 @@ def step_factor(limits: Limits, config: RefineConfig) -> float:
 
 def heldout_psnr(scene: GaussianScene, scorer: Scorer) -> Float[Tensor, "p"]:
     """Return the PSNR of each held-out image, dB, in float64."""
-    return torch.tensor([image.psnr for image in scorer.score(scene)], dtype=torch.float64)
+    return torch.tensor(
+        [image.psnr for image in scorer.score(scene)], dtype=torch.float64, device="cpu"
+    )
 
 
 def psnr_cap(first: Float[Tensor, "p"]) -> float:

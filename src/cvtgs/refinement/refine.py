@@ -108,7 +108,12 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     if cameras is not None and theirs.antialiased:
         cameras = cameras.in_both_modes()
     limits, clock = Limits(seconds, steps=steps), StageClock(listener, place)
-    with clock.stage(STAGE, limits.total):
+    # The program may have disabled gradients, or be in inference mode.
+    with (
+        torch.inference_mode(mode=False),
+        torch.enable_grad(),
+        clock.stage(STAGE, limits.total),
+    ):
         if observed is not None:
             views = shared_views(observed, theirs, cameras, config=config, seed=seed)
         elif cameras is None:

@@ -151,10 +151,15 @@ def contributions_by_gradient(
     rasterize: Callable[..., RasterOutput], scene: GaussianScene, camera: Cameras
 ) -> Float[Tensor, "n"]:
     """Compute contributions as the gradient of the summed image with respect to the colours."""
-    with torch.enable_grad():
+    with torch.inference_mode(mode=False), torch.enable_grad():
         # Mid-grey, so that no colour is clipped; the higher SH bands do not matter here.
         sh0 = torch.zeros_like(scene.sh0).requires_grad_()
-        gray = scene.with_tensors({"sh0": sh0, "shN": scene.shN[:, :0]}, {})
+        tensors = scene.tensors() | {"sh0": sh0, "shN": scene.shN[:, :0]}
+        tensors = {
+            name: tensor.clone() if tensor.is_inference() else tensor  # as autograd demands
+            for name, tensor in tensors.items()
+        }
+        gray = scene.with_tensors(tensors, {})
         image = rasterize(gray, camera, sh_degree=0).rgb
         (gradient,) = torch.autograd.grad(image[..., 0].sum(), sh0)
     return gradient[:, 0, 0].double().clamp_min(0.0) / SH_C0

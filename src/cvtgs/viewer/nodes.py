@@ -79,7 +79,9 @@ class SceneNode:
             visible=visible,
         )
         frame = robust_frame(part.means)
-        above = (frame.center.double() - torch.tensor([0.0, _ABOVE * frame.radius, 0.0])).tolist()
+        above = (
+            frame.center.double() - torch.tensor([0.0, _ABOVE * frame.radius, 0.0], device="cpu")
+        ).tolist()
         self._server.scene.add_label(
             f"{self._path}/name", f"{self._name}: {len(part):,} Gaussians", position=tuple(above)
         )

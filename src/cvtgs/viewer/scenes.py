@@ -163,18 +163,18 @@ def camera_of(
     Returns:
         One camera, with images of at most ``SCORE_SIDE`` pixels.
     """
-    quat = torch.tensor([wxyz], dtype=torch.float64)
+    quat = torch.tensor([wxyz], dtype=torch.float64, device="cpu")
     rotation = rotation_matrices(quat)[0]
-    view = torch.eye(4, dtype=torch.float64)
+    view = torch.eye(4, dtype=torch.float64, device="cpu")
     view[:3, :3] = rotation.T
-    view[:3, 3] = -rotation.T @ torch.tensor(position, dtype=torch.float64)
+    view[:3, 3] = -rotation.T @ torch.tensor(position, dtype=torch.float64, device="cpu")
     width = SCORE_SIDE if aspect >= 1 else max(16, round(SCORE_SIDE * aspect))
     height = max(16, round(width / aspect))
     focal = height / 2 / math.tan(fov / 2)
     intrinsics = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
     return Cameras(
         viewmats=view.float()[None],
-        Ks=torch.tensor([intrinsics], dtype=torch.float32),
+        Ks=torch.tensor([intrinsics], dtype=torch.float32, device="cpu"),
         width=width,
         height=height,
     )

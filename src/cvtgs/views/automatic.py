@@ -104,7 +104,7 @@ def outside_candidates(
                 field=OUTSIDE_FIELD,
             )
         )
-        distances.append(torch.full((count,), distance * factor))
+        distances.append(torch.full((count,), distance * factor, dtype=torch.float32, device="cpu"))
     return CandidateCameras(inside=False, rounds=tuple(rounds), distances=tuple(distances))
 
 
@@ -143,7 +143,7 @@ def found_candidates(
     cameras = cameras_at(
         eyes, directions, layout.up, size=size, field=INSIDE_FIELD if inside else OUTSIDE_FIELD
     )
-    rows = torch.arange(len(eyes)).split(count)
+    rows = torch.arange(len(eyes), device="cpu").split(count)
     distances = torch.linalg.vector_norm(directions, dim=1)
     return CandidateCameras(
         inside=inside,
@@ -169,7 +169,7 @@ def _distances_to_walls(
 
 def _level_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     """Return two level directions, fixed by ``up`` alone."""
-    least = torch.eye(3, dtype=up.dtype)[up.abs().argmin()]
+    least = torch.eye(3, dtype=up.dtype, device="cpu")[up.abs().argmin()]
     right = torch.nn.functional.normalize(torch.linalg.cross(up, least), dim=0)
     return right, torch.linalg.cross(right, up)
 
@@ -244,8 +244,8 @@ def _best(positions: CameraPositions, candidates: Sequence[CandidateCameras]) ->
     """Return the first good candidate of every view, or else that of lowest penalty."""
     first = candidates[0].rounds[0]
     viewmats = first.viewmats.clone()
-    waiting = torch.arange(len(first))
-    least = torch.full((len(first),), math.inf, dtype=torch.float64)
+    waiting = torch.arange(len(first), device="cpu")
+    least = torch.full((len(first),), math.inf, dtype=torch.float64, device="cpu")
     rounds = [pair for each in candidates for pair in zip(each.rounds, each.distances, strict=True)]
     for cameras, distances in rounds:
         rows = waiting[positions.admit(cameras.centers[waiting])]

@@ -72,9 +72,9 @@ def find_room(
     heights = points @ up
     low, high = heights.quantile(heights.new_tensor([0.02, 0.98])).tolist()
     center = middle - (middle @ up) * up
-    steps = torch.linspace(-0.3, 0.3, 5, dtype=points.dtype)
+    steps = torch.linspace(-0.3, 0.3, 5, dtype=points.dtype, device="cpu")
     offsets = torch.cartesian_prod(steps, steps) @ torch.linalg.svd(up[None]).Vh[1:]
-    lifts = torch.tensor([0.45, 0.55, 0.65], dtype=points.dtype) * (high - low) + low
+    lifts = torch.tensor([0.45, 0.55, 0.65], dtype=points.dtype, device="cpu") * (high - low) + low
     eyes = ((center + offsets)[:, None] + lifts[:, None] * up).reshape(-1, 3)
     clearance = torch.cdist(eyes, points).amin(dim=1)
     best = eyes[clearance.argmax()]
@@ -100,7 +100,7 @@ def enclosure(
     x, y = (directions @ axes.T).unbind(1)
     sectors = ((torch.atan2(y, x) / math.tau + 0.5) * _SECTORS).long().clamp(0, _SECTORS - 1)
     bands = (rise * _BANDS).long().clamp(0, _BANDS - 1)  # bands of equal solid angle
-    filled = torch.zeros(_BANDS, _SECTORS, dtype=torch.bool)
+    filled = torch.zeros(_BANDS, _SECTORS, dtype=torch.bool, device="cpu")
     filled[bands[rise > 0], sectors[rise > 0]] = True
     return float(filled.double().mean())
 

@@ -71,7 +71,11 @@ def random_views(
     eyes = positions.near(count, reach, seed)
     targets, field = _targets(positions, eyes, seed), _FIELD if layout.room is None else _ROOM_FIELD
     focal = 0.5 * size / math.tan(math.radians(0.5 * field))
-    intrinsics = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
+    intrinsics = torch.tensor(
+        [[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]],
+        dtype=torch.float32,
+        device="cpu",
+    )
     return Cameras(
         viewmats=look_at(eyes, targets, layout.up),
         Ks=intrinsics.double().repeat(count, 1, 1),
@@ -88,10 +92,12 @@ def _targets(
     center, radius = layout.frame.center, layout.frame.radius
     generator = torch.Generator().manual_seed(seed + 1)
     if layout.room is None:
-        return center + _AIM * radius * (torch.rand(len(eyes), 3, generator=generator) - 0.5)
+        return center + _AIM * radius * (
+            torch.rand(len(eyes), 3, generator=generator, dtype=torch.float32, device="cpu") - 0.5
+        )
     points = center + radius * layout.voxels.points
     far = torch.cdist(eyes, points) > _LEAST_AIM * radius
-    order = torch.rand(far.shape, generator=generator) * far
+    order = torch.rand(far.shape, generator=generator, dtype=torch.float32, device="cpu") * far
     return points[order.argmax(dim=1)]
 
 
@@ -157,7 +163,7 @@ def _sharp_ones(positions: CameraPositions, tried: Sequence[tuple[Cameras, int]]
         too_near = closeness / (TOO_NEAR * closeness.quantile(0.25))
         faults = torch.maximum(too_near, size.in_scene / largest).clamp_min(1.0)
         # Automatic views are ordered by angle: take one of each three first, then the others.
-        spread = torch.arange(len(cameras)).view(wanted, TRIED).T.flatten()
+        spread = torch.arange(len(cameras), device="cpu").view(wanted, TRIED).T.flatten()
         best = faults[spread].sort(stable=True).indices[:wanted]
         chosen.append(cameras.select(spread[best].sort().values))
     return chosen

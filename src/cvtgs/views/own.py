@@ -86,7 +86,7 @@ def _looking(cameras: Cameras, scene: GaussianScene) -> Bool[Tensor, "c"]:
     points = scene.means[rows].double().cpu()
     points = points[torch.isfinite(points).all(dim=1)]
     if len(points) == 0:
-        return torch.zeros(len(cameras), dtype=torch.bool)
+        return torch.zeros(len(cameras), dtype=torch.bool, device="cpu")
     viewmats, intrinsics = cameras.viewmats.double().cpu(), cameras.Ks.double().cpu()
     local = points @ viewmats[:, :3, :3].transpose(1, 2) + viewmats[:, None, :3, 3]
     x, y, z = (local @ intrinsics.transpose(1, 2)).unbind(2)

@@ -85,9 +85,13 @@ class CameraPositions:
         low, high = reach
         beyond = (low - self.distances).clamp_min(self.distances - high).clamp_min(0)
         within = (beyond <= beyond.amin()).nonzero()[:, 0]
-        picked = within[torch.randint(len(within), (count,), generator=generator)]
+        picked = within[torch.randint(len(within), (count,), generator=generator, device="cpu")]
         eyes = self.eyes[picked]
-        shifts = 0.1 * self.layout.frame.radius * (torch.rand(count, 3, generator=generator) - 0.5)
+        shifts = (
+            0.1
+            * self.layout.frame.radius
+            * (torch.rand(count, 3, generator=generator, dtype=torch.float32, device="cpu") - 0.5)
+        )
         moved = eyes + shifts
         return torch.where(self.admit(moved)[:, None], moved, eyes)
 
@@ -114,9 +118,9 @@ def find_view_positions(scene: SceneLike) -> CameraPositions:
     layout = find_layout(as_scene(scene))
     generator = torch.Generator().manual_seed(_SEED)
     directions = torch.nn.functional.normalize(
-        torch.randn(_TRIED, 3, generator=generator, dtype=torch.float64), dim=1
+        torch.randn(_TRIED, 3, generator=generator, dtype=torch.float64, device="cpu"), dim=1
     )
-    steps = torch.rand(_TRIED, 1, generator=generator, dtype=torch.float64)
+    steps = torch.rand(_TRIED, 1, generator=generator, dtype=torch.float64, device="cpu")
     low, high = REACH
     radius, center = layout.frame.radius, layout.frame.center
     eyes = lifted(layout, center + radius * (low + (high - low) * steps) * directions)
@@ -154,7 +158,7 @@ def lifted(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Float[Tensor, "c 
 def stand_free(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor, "c"]:
     """Return which positions are above the floor, free, and not inside matter."""
     radius, points = layout.frame.radius, layout.voxels.points
-    free = torch.ones(len(eyes), dtype=torch.bool)
+    free = torch.ones(len(eyes), dtype=torch.bool, device="cpu")
     if layout.floor is not None:
         free &= eyes @ layout.up >= layout.floor + _ABOVE * radius
     if len(points) == 0:
@@ -178,7 +182,7 @@ def _sharp_sides(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Bool[Tensor
     """
     directions = _side_directions()
     sides, is_outside = _sides(layout, eyes)
-    sharp = torch.zeros(len(directions), dtype=torch.bool)
+    sharp = torch.zeros(len(directions), dtype=torch.bool, device="cpu")
     if layout.room is None:
         sharp[sides[is_outside]] = True
     sharp &= directions @ layout.up >= 0
@@ -214,7 +218,7 @@ def _sides(
 
 def _side_directions() -> Float[Tensor, "d 3"]:
     """Return evenly spread unit vectors (a Fibonacci lattice, Gonzalez 2010)."""
-    steps = torch.arange(_SIDES, dtype=torch.float64) + 0.5
+    steps = torch.arange(_SIDES, dtype=torch.float64, device="cpu") + 0.5
     heights, angles = 1 - 2 * steps / _SIDES, steps * math.pi * (3 - math.sqrt(5))
     widths = (1 - heights.square()).sqrt()
     return torch.stack([widths * angles.cos(), widths * angles.sin(), heights], dim=1)
@@ -222,4 +226,4 @@ def _side_directions() -> Float[Tensor, "d 3"]:
 
 def _growths(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Float[Tensor, "c"]:
     growths = [size_growth(layout.sized, eye, layout.frame.radius) for eye in eyes]
-    return torch.tensor(growths, dtype=torch.float64)
+    return torch.tensor(growths, dtype=torch.float64, device="cpu")

@@ -53,7 +53,7 @@ def cameras_at(
     intrinsics = [[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]]
     return Cameras(
         viewmats=look_at(eyes, eyes + directions, up),
-        Ks=torch.tensor(intrinsics, dtype=eyes.dtype).repeat(len(eyes), 1, 1),
+        Ks=torch.tensor(intrinsics, dtype=eyes.dtype, device="cpu").repeat(len(eyes), 1, 1),
         width=width,
         height=height,
     )
@@ -124,7 +124,7 @@ class SplatSizes(NamedTuple):
 def splat_sizes(layout: SceneLayout, cameras: Cameras) -> SplatSizes:
     """Return the median size of the splats that each camera shows, for at least one camera."""
     small, step = _small(cameras), _SPARSE if len(layout.sample) >= _FEW else 1
-    sample = layout.sample.select(torch.arange(0, len(layout.sample), step))
+    sample = layout.sample.select(torch.arange(0, len(layout.sample), step, device="cpu"))
     means = sample.means.double()
     widths = sample.log_scales.double().sort(dim=1).values[:, 1:].mean(dim=1).exp()
     enlarged = sample.log_scales + 0.5 * math.log(step)
@@ -160,7 +160,7 @@ def _inside_gaussians(layout: SceneLayout, cameras: Cameras) -> Bool[Tensor, "c"
         local = (frames.transpose(1, 2) @ offsets[near][:, :, None])[:, :, 0]
         squares = (local / sample.scales[near].clamp_min(1e-12)).square().sum(dim=1)
         found.append(bool((squares < _ENCLOSING**2).any()))
-    return torch.tensor(found)
+    return torch.tensor(found, device="cpu")
 
 
 def _visible_voxels(

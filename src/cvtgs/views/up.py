@@ -108,8 +108,10 @@ def among_others(points: Float[Tensor, "v 3"]) -> Bool[Tensor, "v"]:
     """Return which voxels have at least two others within two steps along every axis."""
     side = round(2 * _EXTENT / VOXEL_SIZE) + 1
     cells = ((points + _EXTENT) / VOXEL_SIZE).long().clamp(0, side - 1)
-    grid = torch.zeros(1, side, side, side)
-    grid[0].index_put_(tuple(cells.T), torch.ones(len(cells)), accumulate=True)
+    grid = torch.zeros(1, side, side, side, dtype=torch.float32, device="cpu")
+    grid[0].index_put_(
+        tuple(cells.T), torch.ones(len(cells), dtype=torch.float32, device="cpu"), accumulate=True
+    )
     counts = 5**3 * torch.nn.functional.avg_pool3d(grid, 5, stride=1, padding=2)[0]
     return counts[tuple(cells.T)] > 2.5
 
@@ -153,7 +155,7 @@ def find_up(voxels: Voxels, far: Float[Tensor, "k 3"]) -> Float[Tensor, "3"]:
     if len(voxels.points) < 8:
         return usual[0]
     voxels = _thinned(voxels)
-    axes = torch.eye(3, dtype=usual.dtype)
+    axes = torch.eye(3, dtype=usual.dtype, device="cpu")
     ups = torch.cat([axes, 0.0 - axes])
     ground = _ground(voxels)
     if ground is not None and float((ups @ ground.normal).amax()) < _SNAP_COSINE:
@@ -193,7 +195,9 @@ def _lowest_level(voxels: Voxels, up: Float[Tensor, "3"]) -> Floor:
     level = (voxels.normals @ up).abs()[lowest]
     level = ends.scatter_reduce(0, column[lowest], level, "amax", include_self=False)
     order = torch.sort(low).values
-    counts = torch.searchsorted(order, order + 2 * _THICKNESS) - torch.arange(len(order))
+    counts = torch.searchsorted(order, order + 2 * _THICKNESS) - torch.arange(
+        len(order), device="cpu"
+    )
     height = float(order[counts.argmax()]) + _THICKNESS
     ending = ((low - height).abs() <= _THICKNESS) & (level > _LEVEL)
     beneath = float((heights < height - 1.5 * _THICKNESS).double().mean())
@@ -237,8 +241,8 @@ def _ground(voxels: Voxels) -> _Plane | None:
 
 
 def _refined(voxels: Voxels, normal: Tensor, height: float) -> _Plane:
-    spread = torch.zeros(3, dtype=normal.dtype)
-    axes = torch.eye(3, dtype=normal.dtype)
+    spread = torch.zeros(3, dtype=normal.dtype, device="cpu")
+    axes = torch.eye(3, dtype=normal.dtype, device="cpu")
     for _ in range(3):
         points = voxels.points[_members(voxels, normal, height)]
         if len(points) < 3:

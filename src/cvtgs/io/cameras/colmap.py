@@ -93,7 +93,9 @@ def _views(images: Sequence[_Image], lenses: Mapping[int, Lens], path: Path) -> 
                 f"{path}: image {shown(image.name)} must refer to a camera in the camera file, "
                 f"found camera {image.camera}."
             )
-    quats = torch.tensor([image.quat for image in images], dtype=torch.float64).reshape(-1, 4)
+    quats = torch.tensor(
+        [image.quat for image in images], dtype=torch.float64, device="cpu"
+    ).reshape(-1, 4)
     viewmats = np.tile(np.eye(4), (len(images), 1, 1))
     viewmats[:, :3, :3] = parameters.rotation_matrices(quats).numpy()
     viewmats[:, :3, 3] = np.array([image.translation for image in images]).reshape(-1, 3)

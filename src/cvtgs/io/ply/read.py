@@ -111,7 +111,7 @@ def assemble(
     types = dict(layout)
     tensors = _empty_tensors(count, rest_count_of(types) or 0, dtype_of(layout))
     extras = {
-        name: torch.empty(count, dtype=SCALARS[kind].dtype)
+        name: torch.empty(count, dtype=SCALARS[kind].dtype, device="cpu")
         for name, kind in layout
         if with_extras and not is_standard(name) and name not in NORMALS
     }
@@ -130,7 +130,8 @@ def assemble(
         stop = start + len(rows)
         if not normals and any(rows[name].any() for name in normal_names):
             normals = {
-                name: torch.zeros(count, dtype=SCALARS[types[name]].dtype) for name in normal_names
+                name: torch.zeros(count, dtype=SCALARS[types[name]].dtype, device="cpu")
+                for name in normal_names
             }
             columns.update({name: normal.numpy() for name, normal in normals.items()})
         with np.errstate(over="ignore", invalid="ignore"):
@@ -155,7 +156,7 @@ def _empty_tensors(count: int, rest_count: int, dtype: torch.dtype) -> dict[str,
         "sh0": (count, 1, 3),
         "shN": (count, rest_count, 3),
     }
-    return {name: torch.empty(shape, dtype=dtype) for name, shape in shapes.items()}
+    return {name: torch.empty(shape, dtype=dtype, device="cpu") for name, shape in shapes.items()}
 
 
 def _standard_columns(

@@ -170,4 +170,6 @@ def _read_rows(source: Path, parts: Sequence[_Range], *, trust_sizes: bool) -> G
         )
     if not parts or sum(part.end - part.start for part in parts) == len(scene):
         return scene
-    return scene.select(torch.cat([torch.arange(part.start, part.end) for part in parts]))
+    return scene.select(
+        torch.cat([torch.arange(part.start, part.end, device="cpu") for part in parts])
+    )

@@ -241,7 +241,10 @@ def palette(rows: Float[np.ndarray, "n d"], most: int | None = None) -> Palette:
     middle = rows.mean(axis=0)  # centred, so that squares lose no digits
     shifted = torch.from_numpy(rows - middle)
     squares = shifted.square()
-    order, starts = torch.arange(len(rows)), torch.zeros(1, dtype=torch.int64)
+    order, starts = (
+        torch.arange(len(rows), device="cpu"),
+        torch.zeros(1, dtype=torch.int64, device="cpu"),
+    )
     before = 0
     while before < len(starts) < most:
         before = len(starts)
@@ -260,7 +263,7 @@ def _split(
     variances = torch.where(variances > _RELATIVE_ROUNDING * mean_squares, variances, 0.0)
     errors = variances.sum(dim=1) * torch.diff(starts, append=starts.new_tensor([len(rows)]))
     count = min(most - len(starts), max(1, len(starts) // 2), int((errors > 0).sum()))
-    chosen = torch.zeros(len(starts), dtype=torch.bool)
+    chosen = torch.zeros(len(starts), dtype=torch.bool, device="cpu")
     chosen[torch.sort(errors, descending=True, stable=True).indices[:count]] = True
     column, groups = variances.argmax(dim=1), _groups(starts, len(rows))
     above = rows[order, column[groups]] > means.gather(1, column[:, None])[groups, 0]

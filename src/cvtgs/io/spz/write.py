@@ -151,7 +151,8 @@ def _blocks(arrays: Arrays, header: SpzHeader) -> Iterator[Iterator[UInt8[np.nda
 
 
 def _means(means: Float[np.ndarray, "n 3"], bits: int) -> UInt8[np.ndarray, "n b"]:
-    steps = np.clip(np.rint(means * np.float32(2**bits)), -_STEPS, _STEPS - 1).astype("<i4")
+    steps = np.clip(np.rint(means * np.float32(2**bits)), -_STEPS, _STEPS - 1)
+    steps = steps.astype("<i4", order="C")
     return np.ascontiguousarray(steps.view(np.uint8).reshape(len(means), 3, 4)[:, :, :3])
 
 

@@ -1,0 +1,115 @@
+"""Results do not depend on settings of torch that a program may have changed."""
+
+from contextlib import contextmanager
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.rendering import contributions
+from cvtgs.synthetic import scene as make
+from cvtgs.views import automatic_views, mixed_views
+from scenes import same_bits
+
+IMAGES = {
+    "preset": "matched",
+    "visibility": {"views": 8, "size": 48, "stride": 1},
+    "refine": {"steps": 6, "size": 48, "stride": 1, "check_every": 3},
+}
+
+
+@contextmanager
+def another_dtype():
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def another_device():
+    """A default device that holds no values: whatever lands there fails at once."""
+    return torch.device("meta")
+
+
+settings = pytest.mark.parametrize(
+    "setting", [torch.no_grad, torch.inference_mode, another_dtype, another_device]
+)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make("object", 500, sh_degree=1, seed=0)
+
+
+def simplify(scene):
+    keep = scene.means[:, 0] > scene.means[:, 0].median()
+    simplifier = Simplifier("standard", device="cpu")
+    kept = simplifier.simplify(scene, 0.6, keep=keep)
+    return [*[level.scene for level in simplifier.levels(scene, [0.3, 0.05])], kept]
+
+
+def simplify_by_images(scene):
+    """The steps of a refinement need gradients of their own."""
+    result = Simplifier(config=SimplifyConfig.from_mapping(IMAGES), device="cpu").run(scene, 0.2)
+    refined = result.report.refinement
+    assert refined is not None
+    assert refined.gain > 0
+    return [result.scene]
+
+
+def simplify_as_published(scene):
+    return [Simplifier("paper", device="cpu").simplify(scene, 0.1)]
+
+
+def through_a_file(scene, folder):
+    cvtgs.save(scene, folder / "scene.sog", overwrite=True)
+    return [cvtgs.load(folder / "scene.sog"), scene[3:7]]
+
+
+@settings
+@pytest.mark.parametrize("work", [simplify, simplify_by_images, simplify_as_published])
+def test_simplification(scene, setting, work):
+    wanted = work(scene)
+    with setting():
+        found = work(scene)
+    assert all(same_bits(one, other) for one, other in zip(found, wanted, strict=True))
+
+
+@settings
+def test_files_and_rows(scene, setting, tmp_path):
+    wanted = through_a_file(scene, tmp_path)
+    with setting():
+        found = through_a_file(scene, tmp_path)
+    assert all(same_bits(one, other) for one, other in zip(found, wanted, strict=True))
+
+
+@settings
+@pytest.mark.parametrize("find", [automatic_views, mixed_views])
+def test_views(scene, setting, find):
+    size = {"size": 32} if find is mixed_views else {"width": 32, "height": 32}
+    wanted = find(scene, 3, **size)
+    with setting():
+        found = find(scene, 3, **size)
+    assert torch.equal(found.viewmats, wanted.viewmats)
+    assert torch.equal(found.Ks, wanted.Ks)
+
+
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+@settings
+def test_contributions(scene, setting, backend):
+    cameras = automatic_views(scene, 2, width=32, height=32)
+    wanted = contributions(scene, cameras, backend=backend)
+    with setting():
+        again = scene.select(scene.means[:, 0] > -torch.inf)  # made with the setting
+        found = contributions(again, cameras, backend=backend)
+    assert torch.equal(found, wanted)
+
+
+@pytest.mark.parametrize("work", [simplify, simplify_by_images])
+def test_scenes_that_require_gradients(scene, work):
+    leaves = {name: values.clone().requires_grad_() for name, values in scene.tensors().items()}
+    found = work(scene.with_tensors(leaves, {}))
+    assert all(same_bits(one, other) for one, other in zip(found, work(scene), strict=True))
+    assert not any(values.requires_grad for values in found[0].tensors().values())
