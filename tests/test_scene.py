@@ -241,6 +241,16 @@ def test_extra_columns_of_the_wrong_shape_are_errors():
     )
 
 
+def test_extra_columns_that_cannot_be_selected_from_are_errors():
+    text = "extra column 'id' must be a tensor of floats, bool, uint8 or signed integers, found "
+    assert error_of(extras={"id": torch.zeros(4, dtype=torch.uint16)}) == f"{text}torch.uint16."
+    assert error_of(extras={"id": [1, 2, 3, 4]}) == f"{text}list."
+
+
+def test_a_tensor_without_rows_is_an_error():
+    assert error_of(means=torch.tensor(1.0)) == "means must have shape (0, 3), found ()."
+
+
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda scene: pickle.loads(pickle.dumps(scene))])
 def test_scenes_can_be_copied_and_sent_to_other_processes(copied):
     scene = random_scene(3, seed=0).with_tensors({}, {"label": torch.arange(3)})

@@ -1,6 +1,7 @@
 """The number of Gaussians to keep: parsing ratios and counts, and splitting a count."""
 
 import math
+import operator
 import re
 from collections.abc import Sequence
 from decimal import Decimal
@@ -90,21 +91,44 @@ def target_count(
         found = " and ".join(given) or "none"
         raise InvalidArgumentError(f"give one of rho, count and max_count, found {found}.")
     if max_count is not None:
-        if isinstance(max_count, bool) or not isinstance(max_count, int) or max_count < 1:
+        most = _whole(max_count)
+        if most < 1:
             raise InvalidArgumentError(
                 f"max_count must be a whole number above 0; found {max_count!r}."
             )
-        return min(max_count, total)
+        return min(most, total)
     if count is not None:
-        if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= total:
+        number = _whole(count)
+        if not 1 <= number <= total:
             raise InvalidArgumentError(
                 f"count must be a whole number between 1 and the {total} Gaussians of the scene; "
                 f"found {count!r}."
             )
-        return count
+        return number
     if not 0.0 < float(rho or 0.0) <= 1.0:
         raise InvalidArgumentError(f"rho must be above 0 and at most 1; found {rho!r}.")
-    return math.ceil(Fraction(str(float(rho or 0.0))) * total)
+    return math.ceil(Fraction(written(rho or 0.0)) * total)
+
+
+def written(number: float) -> str:
+    """Return a number as it would be written, also one of numpy, whose float32 are shorter.
+
+    Example:
+        >>> import numpy as np
+        >>> written(0.1), written(np.float32(0.1))
+        ('0.1', '0.1')
+    """
+    return str(number) if "float" in type(number).__name__ else str(float(number))
+
+
+def _whole(number: object) -> int:
+    """Return a whole number of any type, or -1 if it is none."""
+    if isinstance(number, bool) or not hasattr(number, "__index__"):
+        return -1
+    try:
+        return operator.index(number)
+    except TypeError:  # a tensor of several or fractional numbers
+        return -1
 
 
 def shortfall(valid: int, total: int, target: int) -> str:

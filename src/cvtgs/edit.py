@@ -147,7 +147,7 @@ def crop(scene: GaussianScene, regions: Sequence[Box | Sphere]) -> GaussianScene
     for region in regions:
         if isinstance(region, Sphere):
             away = scene.means.double() - scene.means.new_tensor(region.center).double()
-            keep |= away.square().sum(dim=1) <= region.radius**2
+            keep |= away.square().sum(dim=1) <= region.radius * region.radius
     return _kept(scene, keep)
 
 

@@ -9,6 +9,7 @@ import pydantic
 import torch
 
 from cvtgs.config.base import Record, explain
+from cvtgs.counts import written
 from cvtgs.errors import FileFormatError, InvalidArgumentError
 from cvtgs.evaluation import Evaluation, SceneScores
 from cvtgs.evaluation.report import mean_of
@@ -154,7 +155,7 @@ def level_names(rhos: Sequence[float], suffix: str = ".ply") -> tuple[str, ...]:
         >>> level_names([0.1, 0.001])
         ('rho_0.1.ply', 'rho_0.001.ply')
     """
-    return tuple(f"rho_{rho!r}{suffix}" for rho in rhos)
+    return tuple(f"rho_{written(rho)}{suffix}" for rho in rhos)
 
 
 def check_levels(

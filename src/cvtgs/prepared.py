@@ -56,6 +56,9 @@ class Prepared:
         device: Device to compute on; None chooses as ``auto`` does.
         cameras: Cameras for presets that render the scene; None generates views.
         listener: Called with progress events.
+
+    Raises:
+        InvalidArgumentError: There are too few cameras for a preset that renders the scene.
     """
 
     def __init__(
@@ -68,6 +71,14 @@ class Prepared:
         cameras: Cameras | None = None,
         listener: ProgressListener = silent,
     ) -> None:
+        least = 2 if config.refine.enabled else 1
+        uses_images = config.uses_renders or config.refine.enabled
+        if cameras is not None and uses_images and len(cameras) < least:
+            raise InvalidArgumentError(
+                f"preset {config.preset} needs at least {least} "
+                f"{'cameras, one of them to be held out' if least > 1 else 'camera'}; "
+                f"found {len(cameras)}."
+            )
         self._scene, self._config, self._checkpoint = scene, config, checkpoint
         self._total = len(scene)
         self._refines = config.refine.enabled

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pkgutil import resolve_name
 from types import MappingProxyType
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO, Literal, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -22,6 +22,7 @@ FLAT_LOG_SCALE = -20.0
 """Third log-scale of Gaussians with two scales (2DGS): two billionths of a scene unit."""
 
 _CHUNK = 1 << 16
+_NOT_INDEXABLE = (torch.uint16, torch.uint32, torch.uint64)  # torch cannot select their rows
 
 _TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
@@ -40,7 +41,7 @@ class GaussianScene:
         logit_opacities: ``(n,)`` logits of the opacities; infinities are valid.
         sh0: ``(n, 1, 3)`` constant SH band of red, green, blue.
         shN: ``(n, k, 3)`` view-dependent SH bands, k in {0, 3, 8, 15}.
-        extras: Further columns ``(n,)`` by name, of any dtype; they are carried along.
+        extras: Further columns ``(n,)`` by name, of types that torch can index; carried along.
         comments: Comment lines of the file, such as ``SplatRenderMode: mip``.
         layout: Property names and types of the file, in order; empty if there was no file.
             ``cvtgs.io`` writes the scene with the same layout; a file without a third scale holds
@@ -77,7 +78,8 @@ class GaussianScene:
                     f"{name} must be a torch.Tensor, found {type(tensor).__name__}; "
                     f"use cvtgs.from_dict for numpy arrays."
                 )
-        n, dtype, device = len(self.means), self.means.dtype, self.means.device
+        n = len(self.means) if self.means.ndim else 0
+        dtype, device = self.means.dtype, self.means.device
         if dtype not in (torch.float32, torch.float64):
             raise InvalidSceneError(f"means must be float32 or float64, found {dtype}.")
         bands = self.shN.shape[1] if self.shN.ndim == 3 else 0
@@ -99,6 +101,10 @@ class GaussianScene:
                 f"shN must hold 0, 3, 8 or 15 coefficients per channel, found {bands}."
             )
         for name, column in self.extras.items():
+            found = getattr(column, "dtype", type(column).__name__)
+            if not isinstance(column, Tensor) or found in _NOT_INDEXABLE:
+                wanted = "a tensor of floats, bool, uint8 or signed integers"
+                raise InvalidSceneError(f"extra column {name!r} must be {wanted}, found {found}.")
             if column.shape != (n,) or column.device != device:
                 raise InvalidSceneError(
                     f"extra column {name!r} must have shape ({n},) on {device}, "
@@ -241,6 +247,7 @@ class GaussianScene:
         format: str | None = None,
         overwrite: bool = False,
         axes: str | None = None,
+        spz_version: Literal[2, 3, 4] = 4,
     ) -> None:
         """Write the scene to a file, as :func:`cvtgs.save` does.
 
@@ -249,9 +256,10 @@ class GaussianScene:
             format: Suffix of the format, if the file name does not have it.
             overwrite: Whether an existing file may be replaced.
             axes: Directions of x, y and z in the file; None for the axes of the format.
+            spz_version: Version of the format in a ``.spz``: 2, 3 or 4.
         """
         resolve_name("cvtgs.io.formats:save")(
-            self, path, format=format, overwrite=overwrite, axes=axes
+            self, path, format=format, overwrite=overwrite, axes=axes, spz_version=spz_version
         )
 
     def with_sh_degree(self, degree: int) -> Self:

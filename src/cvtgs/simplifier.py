@@ -92,7 +92,7 @@ class Simplifier:
 
         Returns:
             A scene of exactly ``ceil(rho * N)`` (or the count) Gaussians; fewer only if invalid
-            rows leave fewer. With ``rho = 1``, the scene's own valid rows.
+            rows leave fewer. With ``rho = 1``, the scene's own valid rows, in its memory.
 
         Raises:
             InvalidArgumentError: Ratio or count is out of range, or not exactly one is given.

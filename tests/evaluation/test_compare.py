@@ -189,6 +189,14 @@ def test_photographs_are_found_by_stem_suffix_and_last_part(tmp_path, cameras):
     assert (photographs[:, 18, 24, 0] * 255).round().tolist() == [50, 100, 150]
 
 
+def test_cameras_of_the_same_name_share_a_photograph(tmp_path, cameras):
+    twice = cvtgs.Cameras(
+        viewmats=cameras.viewmats[:2], Ks=cameras.Ks[:2], width=48, height=36, names=("a", "a")
+    )
+    (tmp_path / "a.png").write_bytes(encode(np.full((36, 48, 3), 50, np.uint8), "png"))
+    assert load_photographs(tmp_path, twice).shape == (2, 36, 48, 3)
+
+
 def test_transparent_pixels_show_the_background(tmp_path, cameras):
     from PIL import Image  # noqa: PLC0415
 

@@ -264,6 +264,24 @@ def test_the_format_argument_overrides_the_suffix(tmp_path: Path) -> None:
     assert same_bits(cvtgs.load(tmp_path / "b.data", format="ply"), scene)
 
 
+@pytest.mark.parametrize("name", ["compressed.ply", "spz.glb", "splat"])
+def test_a_format_may_be_named_without_its_first_dot(tmp_path: Path, name: str) -> None:
+    scene = replace(storable_scene(40, degree=0), comments=())
+    for number, written in enumerate((name, f".{name}")):
+        cvtgs.save(scene, tmp_path / f"{number}", format=written)
+    assert (tmp_path / "0").read_bytes() == (tmp_path / "1").read_bytes()
+    assert len(cvtgs.load(io.BytesIO((tmp_path / "0").read_bytes()), format=name)) == 40
+
+
+@pytest.mark.parametrize("end", [".ply", ".spz", ".spz.glb", ".sog", ".splat", ".compressed.ply"])
+def test_tensors_of_any_memory_layout_are_written(tmp_path: Path, end: str) -> None:
+    scene = replace(storable_scene(40, degree=0), comments=())
+    turned = scene.with_tensors({"means": scene.means.T.contiguous().T}, {})
+    cvtgs.save(scene, tmp_path / f"a{end}")
+    cvtgs.save(turned, tmp_path / f"b{end}")
+    assert (tmp_path / f"a{end}").read_bytes() == (tmp_path / f"b{end}").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("content", "error", "text"),
     [

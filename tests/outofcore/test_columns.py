@@ -1,11 +1,13 @@
 """SH degrees, axes and the row counts of the report are the same in blocks as in one piece."""
 
+import warnings
+
 import pytest
 import torch
 
 import cvtgs
-from cvtgs import Simplifier
-from cvtgs.boxes import Box
+from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.boxes import Box, inside
 from cvtgs.cli.main import main
 from cvtgs.outofcore import simplify_file
 from scenes import random_scene, same_bits
@@ -32,6 +34,28 @@ def test_dropped_sh_bands_give_the_bytes_of_a_scene_without_them(scene, tmp_path
     assert 10 < report.kept_count < 200
     assert found.read_bytes() == wanted.read_bytes()
     assert cvtgs.load(found).sh_degree == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("blocks", [1, 3])
+@pytest.mark.parametrize("name", ["out.ply", "out.splat", "out.spz"])
+def test_effects_switched_off_leave_the_columns_of_one_piece(scene, tmp_path, name, blocks):
+    """SH bands are zeros, extra columns are gone, also for protected rows."""
+    full = scene.with_tensors({}, {"heat": scene.means[:, 0]})
+    cvtgs.save(full, tmp_path / "in.ply")
+    config = SimplifyConfig.from_mapping({"effects": {"sh": 1, "extras": "off"}})
+    simplifier = Simplifier(config=config, device="cpu")
+    wanted = simplifier.simplify(full, 0.3, keep=inside([BOX], full.means))
+    options = {"simplifier": simplifier, "blocks": blocks, "boxes": [BOX]}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a .splat holds no SH bands
+        simplify_file(tmp_path / "in.ply", tmp_path / name, 0.3, **options)
+    found = cvtgs.load(tmp_path / name)
+    assert len(found) == len(wanted) == 210
+    assert found.extras == wanted.extras == {}
+    assert found.sh_degree == (0 if name.endswith(".splat") else 2)
+    assert not found.shN[:, 3:].any()
+    assert not wanted.shN[:, 3:].any()
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 import math
 import weakref
-from dataclasses import replace
 from itertools import chain
 
 import pydantic
@@ -103,17 +102,6 @@ def test_generated_views_are_endless_and_differ_from_held_out_ones():
     different = {tuple(camera.flatten().tolist()) for camera in cameras}
     assert len(different) == 14
     assert {(camera.width, camera.height) for camera in training} == {(32, 32)}
-
-
-def test_some_views_of_a_tagged_scene_ignore_the_tag():
-    plain = full_scene(50)
-    tagged = replace(plain, comments=("SplatRenderMode: mip",))
-    config = quick(heldout=3)
-    for full, modes in ((plain, {()}), (tagged, {(False,), (True,)})):
-        views = generated_views(full, config=config, seed=0)
-        training = [next(views.training) for _ in range(6)]
-        for some in (views.heldout, training):
-            assert {camera.ignores_tag for camera in some} == modes
 
 
 def test_the_seed_decides_the_views():

@@ -1,6 +1,7 @@
 """Refinement as a whole: gains, unchanged parts, limits, progress and reports."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from cvtgs.config import Rates, SimplifyConfig
 from cvtgs.errors import DeviceError, InvalidArgumentError, InvalidSceneError
 from cvtgs.progress import ProgressEvent
 from cvtgs.refinement import RefineConfig, join_reports, refine
+from cvtgs.refinement.images import generated_views
 from refine_cases import discolored, full_scene, quick, ring, small_scene
 from scenes import same_bits
 
@@ -206,3 +208,14 @@ def test_rates_of_zero_change_nothing():
     refined = refine(small, full, steps=3, config=quick(rates=still))
     assert refined.scene is small
     assert RefineConfig().rates != still
+
+
+def test_some_views_of_a_tagged_scene_ignore_the_tag():
+    plain = full_scene(50)
+    tagged = replace(plain, comments=("SplatRenderMode: mip",))
+    config = quick(heldout=3)
+    for full, modes in ((plain, {()}), (tagged, {(False,), (True,)})):
+        views = generated_views(full, config=config, seed=0)
+        training = [next(views.training) for _ in range(6)]
+        for some in (views.heldout, training):
+            assert {camera.ignores_tag for camera in some} == modes

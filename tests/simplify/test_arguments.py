@@ -66,6 +66,21 @@ def test_paths_are_accepted_wherever_scenes_are(tmp_path):
     assert cvtgs.budget.find_count(path, psnr=1.0, simplifier=simplifier).psnr >= 1
 
 
+@pytest.mark.parametrize(("preset", "count"), [("matched", 1), ("high", 0)])
+def test_too_few_cameras_are_refused_before_the_work(preset, count):
+    scene = random_scene(30)
+    cameras = cvtgs.views.automatic_views(scene, 1, width=32, height=24).spread(max(1, count))
+    cameras = cameras.select(torch.arange(count))
+    with pytest.raises(InvalidArgumentError, match=f"at least 2 cameras, .*; found {count}"):
+        Simplifier(config=preset, device="cpu").prepare(scene, cameras=cameras)
+    assert len(Simplifier(device="cpu").simplify(scene, 0.1, cameras=cameras)) == 3
+
+
+def test_the_report_names_no_views_where_nothing_is_rendered():
+    simplifier = Simplifier(config="matched", device="cpu")
+    assert simplifier.run(random_scene(30), 1.0).report.views == "none"
+
+
 def test_the_error_names_an_argument_that_is_not_a_scene():
     with pytest.raises(InvalidArgumentError, match="scene must be a GaussianScene or the path of"):
         Simplifier(device="cpu").levels(3, [0.1])

@@ -3,6 +3,7 @@
 import math
 from fractions import Fraction
 
+import numpy as np
 import pytest
 import torch
 
@@ -43,6 +44,8 @@ def with_bad_rows(scene: GaussianScene, rows: list[int]) -> GaussianScene:
         (7, 1.0, 7),
         (7, 1, 7),
         (6_000_000, 0.01, 60_000),
+        (600, np.float32(0.1), 60),  # as a double slightly more
+        (7, np.int64(1), 7),
     ],
 )
 def test_count_of_known_ratios(total, rho, wanted):
@@ -235,3 +238,16 @@ def test_counts_are_parsed(text, count):
 def test_invalid_counts_are_refused(text):
     with pytest.raises(InvalidArgumentError, match="a count must be a whole number above 0"):
         read_count(text)
+
+
+@pytest.mark.parametrize("number", [np.int64(6), np.uint8(6), torch.tensor(6)])
+def test_counts_may_be_whole_numbers_of_numpy_and_torch(number):
+    assert target_count(10, None, count=number) == 6
+    assert type(target_count(10, None, max_count=number)) is int
+
+
+@pytest.mark.parametrize("number", [6.0, True, np.float64(6), torch.tensor([6, 6]), "6"])
+def test_counts_of_other_types_are_errors(number):
+    for wish in ("count", "max_count"):
+        with pytest.raises(InvalidArgumentError, match=f"{wish} must be a whole number"):
+            target_count(10, None, **{wish: number})

@@ -184,6 +184,12 @@ def test_axes_and_sh_degree_are_applied(tmp_path: Path) -> None:
     assert float(torch.cdist(flipped, turned.means).amin(dim=1).max()) < 0.05
 
 
+def test_an_unknown_kind_is_refused_before_the_work(tmp_path: Path, source: Path) -> None:
+    with pytest.raises(InvalidArgumentError, match="must be sog or 3dtiles, found 'tiles'"):
+        stream_file(source, tmp_path / "out", [0.5, 0.1], kind="tiles", simplifier=FAST)
+    assert names_in(tmp_path) == ["scene.ply"]
+
+
 def test_levels_of_equal_size_are_refused(tmp_path: Path, source: Path) -> None:
     with pytest.raises(InvalidArgumentError, match="needs levels of different sizes"):
         stream_file(source, tmp_path / "out", [0.1, 0.1], kind="sog", simplifier=FAST)

@@ -99,3 +99,16 @@ def test_a_preset_that_renders_uses_and_reports_the_cameras(tmp_path, scene, cap
     words = ["simplify", str(file), str(tmp_path / "small.ply"), "--count", "20", "--ckpt", "none"]
     assert main([*words, "--set", "visibility.views=4"]) == 0
     assert "5 cameras of" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_search_for_a_count_uses_the_cameras_beside_a_file(tmp_path, scene):
+    cvtgs.save(scene, tmp_path / "scene.ply")
+    cameras = automatic_views(scene, 8, width=32, height=24)
+    write_transforms(tmp_path / "transforms.json", cameras)
+    settings = {"preset": "matched", "refine": {"steps": 2}}
+    simplifier = cvtgs.Simplifier(config=cvtgs.SimplifyConfig.from_mapping(settings), device="cpu")
+    few = automatic_views(scene, 2, width=32, height=24, seed=5)
+    found = cvtgs.budget.find_count(
+        tmp_path / "scene.ply", psnr=1.0, simplifier=simplifier, heldout=few
+    )
+    assert found.report.views == "8 cameras"

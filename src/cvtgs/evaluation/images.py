@@ -268,14 +268,14 @@ def _find_all(place: Path, cameras: Cameras) -> list[Path]:
         )
     if not place.is_dir():
         raise InputNotFoundError(f"{place}: the folder of photographs must exist, found none.")
-    found = {name: _find(place, name) for name in cameras.names}
-    missing = [name for name, path in found.items() if path is None]
+    found = [_find(place, name) for name in cameras.names]  # names may repeat
+    missing = [name for name, path in zip(cameras.names, found, strict=True) if path is None]
     if missing:
         raise InputNotFoundError(
             f"{place}: must hold a photograph of every camera; {len(missing)} of "
             f"{len(found)} cameras have none, the first is {missing[0]!r}."
         )
-    return [path for path in found.values() if path]
+    return [path for path in found if path]
 
 
 def _find(folder: Path, name: str) -> Path | None:

@@ -153,9 +153,8 @@ def splat_of(axes: Array, local: Array, camera: Array, opacity: float, out: Arra
     y = camera[4, 1] * local[1] / local[2] + camera[5, 1]
     reach = 2 * math.log(opacity / MIN_ALPHA)
     wide, high = math.sqrt(reach * a), math.sqrt(reach * d)
-    if not (x + wide >= 0 and x - wide <= camera[8, 0] and schur < math.inf):
-        return False
-    if not (y + high >= 0 and y - high <= camera[8, 1]):
+    is_beside = x + wide >= 0 and x - wide <= camera[8, 0] and schur < math.inf
+    if not (is_beside and y + high >= 0 and y - high <= camera[8, 1]):
         return False
     out[0], out[1], out[9] = x, y, local[2]
     out[2], out[3], out[4] = -0.5 / schur, -b / d, -0.5 / d

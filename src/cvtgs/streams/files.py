@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from cvtgs.config.base import Record
-from cvtgs.errors import OutputError, OutputExistsError, reason_of
+from cvtgs.errors import InvalidArgumentError, OutputError, OutputExistsError, reason_of
 from cvtgs.io import atomic_output, check_output
 from cvtgs.io.atomic import make_folder
 from cvtgs.progress import ProgressListener
@@ -173,6 +173,7 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
         overwrite: Whether files of an earlier stream may be replaced.
 
     Raises:
+        InvalidArgumentError: There is no such kind of stream.
         OutputExistsError: The folder holds a stream that may not be replaced, or other files but
             no stream of this kind.
         OutputError: The folder cannot be written to.
@@ -182,6 +183,9 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
         >>> with tempfile.TemporaryDirectory() as parent:
         ...     check_stream(Path(parent) / "new", "sog")
     """
+    if kind not in INDEX_NAMES:
+        names = " or ".join(INDEX_NAMES)
+        raise InvalidArgumentError(f"kind of a stream must be {names}, found {kind!r}.")
     place = Path(folder)
     if not place.exists():
         check_output(place)  # checks that its parent exists and is writable
