@@ -178,6 +178,7 @@ def test_reports_are_joined():
         ({"seconds": math.nan}, InvalidArgumentError, "above 0 and finite, found nan."),
         ({"seconds": math.inf}, InvalidArgumentError, "above 0 and finite, found inf."),
         ({"steps": 0}, InvalidArgumentError, "a whole number of at least 1, found 0."),
+        ({"steps": 1, "frozen": -1}, InvalidArgumentError, "the number of Gaussians; found -1."),
         ({"steps": 2.5}, InvalidArgumentError, "a whole number of at least 1, found 2.5."),
         ({"steps": True}, InvalidArgumentError, "a whole number of at least 1, found True."),
         ({"cameras": ring(1)}, InvalidArgumentError, "at least 2 cameras, one of them to be held"),

@@ -7,6 +7,7 @@ import torch
 
 import cvtgs
 from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.io import axes as axes_module
 from cvtgs.rendering import contributions
 from cvtgs.synthetic import scene as make
 from cvtgs.views import automatic_views, mixed_views
@@ -105,6 +106,19 @@ def test_contributions(scene, setting, backend):
         again = scene.select(scene.means[:, 0] > -torch.inf)  # made with the setting
         found = contributions(again, cameras, backend=backend)
     assert torch.equal(found, wanted)
+
+
+def test_axes_first_used_in_inference_mode_work_with_gradients(scene):
+    scene = scene.with_tensors({name: x.double() for name, x in scene.tensors().items()}, {})
+    axes_module._sh_signs.cache_clear()
+    axes_module._sh_quarter_turn.cache_clear()
+    for axes in ("rub", "rfu"):
+        with torch.inference_mode():
+            axes_module.change_axes(scene, "rdf", axes)
+        leaf = scene.shN.clone().requires_grad_()
+        turned = axes_module.change_axes(scene.with_tensors({"shN": leaf}, {}), "rdf", axes)
+        turned.shN.square().sum().backward()
+        torch.testing.assert_close(leaf.grad, 2 * scene.shN)
 
 
 @pytest.mark.parametrize("work", [simplify, simplify_by_images])

@@ -103,6 +103,7 @@ def _with_quarter_turn(scene: GaussianScene) -> GaussianScene:
 
 
 @cache
+@torch.inference_mode(mode=False)  # later calls may need tensors that autograd can save
 def _sh_signs(x: int, y: int, z: int) -> Float[Tensor, "k"]:
     """Return the factor 1 or -1 of each SH function when coordinates change their signs."""
     direction = torch.tensor([[0.2, 0.5, 0.9]], dtype=torch.float64, device="cpu")
@@ -111,6 +112,7 @@ def _sh_signs(x: int, y: int, z: int) -> Float[Tensor, "k"]:
 
 
 @cache
+@torch.inference_mode(mode=False)
 def _sh_quarter_turn() -> Float[Tensor, "k k"]:
     """Return the SH matrix of the quarter turn; squares of entries are multiples of 1/16."""
     generator = torch.Generator().manual_seed(0)

@@ -8,7 +8,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import RefineConfig
 from cvtgs.devices import chosen_device
-from cvtgs.errors import InvalidSceneError
+from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.refinement.images import ImageBuffer, generated_views, shared_views, split_views
@@ -85,7 +85,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         The scene and the report.
 
     Raises:
-        InvalidArgumentError: Seconds or steps are not positive, or there is only one camera.
+        InvalidArgumentError: Seconds or steps are not positive, there is only one camera, or
+            ``frozen`` is out of range.
         InvalidSceneError: A scene has no valid row.
         DeviceError: There is no such device.
 
@@ -101,6 +102,10 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     if seconds is None and steps is None:
         seconds, steps = config.seconds or None, config.steps or None
     check_limits(seconds, steps=steps)
+    if not 0 <= frozen <= len(small):
+        raise InvalidArgumentError(
+            f"frozen must be from 0 to {len(small)}, the number of Gaussians; found {frozen}."
+        )
     place = chosen_device(device, small.device)
     ours, theirs = _on_device(small, full, place)
     if seconds is None and steps is None:
