@@ -145,5 +145,5 @@ def morton_order(
 def _spread_bits(values: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
     """Insert two zero bits between any two adjacent bits of the low 21."""
     for shift, mask in _SPREAD:
-        values = (values | (values << shift)) & mask
+        values = (values << shift).bitwise_or_(values).bitwise_and_(mask)
     return values
