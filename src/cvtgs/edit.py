@@ -81,7 +81,11 @@ class Motion:
     def __post_init__(self) -> None:
         numbers = (*self.quat, self.scale, *self.shift)
         if len(numbers) != 8 or not all(map(math.isfinite, numbers)):
-            raise InvalidArgumentError(f"a motion must consist of finite numbers, found {self}.")
+            found = ", ".join(f"{number:g}" for number in numbers)
+            raise InvalidArgumentError(
+                f"a motion must consist of finite numbers (4 of a quaternion, a scale, 3 of a "
+                f"shift), found {found}."
+            )
         if self.scale <= 0 or not any(self.quat):
             raise InvalidArgumentError(
                 f"a motion needs a scale above 0 and a quaternion other than 0, "

@@ -64,5 +64,5 @@ def test_pixel_gaussian_pairs_grow_with_the_square_root_of_both():
         Work(count=10**6, target=count).features("match", matched)["view_pairs"]
         for count in (1000, 100_000)
     )
-    assert few == pytest.approx(24 * 200 * math.sqrt(1000))
+    assert few == pytest.approx(32 * 200 * math.sqrt(1000))
     assert many == pytest.approx(10 * few)

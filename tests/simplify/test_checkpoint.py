@@ -197,5 +197,6 @@ def test_a_checkpoint_for_a_configuration_without_network_is_an_error():
     with pytest.raises(ConfigError) as caught:
         Simplifier("standard", config=config)
     assert str(caught.value) == (
-        "merge.network is false, so ckpt must be None or auto; found 'standard'."
+        "without a network (merge.network is false, as in draft and fast), the checkpoint must be "
+        "auto or none; found 'standard'."
     )

@@ -33,7 +33,7 @@ _cvtgs() {{
     if [ -n "$words" ]; then
         COMPREPLY=($(compgen -W "$words" -- "$current"))
     else
-        COMPREPLY=($(compgen -f -- "$current"))
+        mapfile -t COMPREPLY < <(compgen -f -- "$current")
     fi
 }}
 complete -o filenames -F _cvtgs cvtgs

@@ -8,7 +8,7 @@ from pathlib import PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING, NamedTuple
 
 import cvtgs
-from cvtgs.cli.display import progress_bars, say, size_text
+from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
 from cvtgs.cli.options import (
     AddParser,
     add_options,
@@ -305,6 +305,13 @@ def tradeoff(options: argparse.Namespace) -> None:
         )
     if not options.quiet:
         _print_tradeoff(measured.tradeoff)
+        results = measured.tradeoff.results
+        fitted = sorted({one.preset for one in results if one.report.views.endswith("cameras")})
+        if fitted and options.cameras is None:
+            say_wrapped(
+                f"Fitted to the cameras beside {options.input.name}, which also score them: "
+                f"{', '.join(fitted)}. Give other --cameras for a fair comparison."
+            )
         names = ", ".join(path.name for path in paths)
         say(f"Wrote {names}. Open {paths[-1]} in a browser.")
         if note:

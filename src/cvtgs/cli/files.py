@@ -12,6 +12,7 @@ from cvtgs.cli.edits import SceneEdits, add_edit_options
 from cvtgs.cli.jobs import Outcome, SceneJob, add_paths, check_paths, open_jobs, run_jobs
 from cvtgs.cli.options import AddParser, add_options, read_axes, read_scene, read_settings
 from cvtgs.errors import DroppedDataWarning
+from cvtgs.text import printable
 
 if TYPE_CHECKING:
     from cvtgs.analysis import Effect
@@ -173,8 +174,13 @@ def _convert_one(job: SceneJob, edits: SceneEdits) -> Outcome:
         cvtgs.io.load(path, axes=axes.source, trust_sizes=options.trust_sizes, lod=lod)
         for path, lod in [(options.input, options.lod), *((path, None) for path in options.merge)]
     ]
-    scene = scenes[0] if len(scenes) == 1 else cvtgs.edit.merge(scenes)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DroppedDataWarning)  # printed below instead
+        scene = scenes[0] if len(scenes) == 1 else cvtgs.edit.merge(scenes)
+    left = sorted({name for one in scenes for name in one.extras} - set(scene.extras))
     scene, phrases = edits.apply(scene)
+    if left:
+        phrases.append(f"columns that not all scenes have ({', '.join(map(printable, left))})")
     if options.sh_degree is not None and options.sh_degree < scene.sh_degree:
         scene = scene.with_sh_degree(options.sh_degree)
         phrases += [f"SH bands above degree {options.sh_degree} (--sh-degree)"]

@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import takewhile
+from itertools import pairwise, takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
@@ -142,8 +142,12 @@ class CommandParser(argparse.ArgumentParser):
     check: "Callable[[CommandParser, argparse.Namespace], None] | None" = None
     """For commands with any number of paths: exits if paths and options do not fit together."""
 
+    _words: Sequence[str] = ()
+    """The words that are parsed, for messages."""
+
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse the words; report an unknown option even if a required one is missing, too."""
+        self._words = args or ()
         if self._subparsers is None:  # the parser of one command
             options = self._option_string_actions
             for word in takewhile(lambda word: word != "--", args or ()):
@@ -166,6 +170,10 @@ class CommandParser(argparse.ArgumentParser):
         wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
         if wrong:
             message += suggestion(wrong[1], re.findall(r"[\w-]+", wrong[2]))
+        lacks = re.fullmatch(r"argument (?:.*/)?(--[\w-]+): expected one argument", message)
+        for option, value in pairwise(self._words):
+            if lacks and option == lacks[1] and re.match(r"-[\d.]", value):
+                message += f"; with a minus sign, write {option}={value}"
         super().error(message)
 
 

@@ -34,6 +34,7 @@ from cvtgs.progress import ProgressListener, silent
 
 if TYPE_CHECKING:
     from cvtgs.config import SimplifyConfig
+    from cvtgs.io.ply import PlyRows
     from cvtgs.report import SimplifyReport
     from cvtgs.simplifier import Simplifier
 
@@ -174,12 +175,20 @@ def _simplify_one(
             report, notes = _simplify_in_memory(options, checkpoint, config, settings, listener)
     if options.report is not None:
         _write_report(options, report)
+    searched = _has_target(options)
     if not job.is_one_of_many and report.stages:
         seconds = (f"{stage.stage}{TIE}{stage.seconds:.2f}" for stage in report.stages)
-        notes.insert(0, f"Seconds: {', '.join(seconds)}.")
+        of_what = " of the chosen try" if searched else ""
+        notes.insert(0, f"Seconds{of_what}: {', '.join(seconds)}.")
+    if memory is None and options.memory is not None and _rows_of(options.input) is None:
+        notes.append("In one piece: --memory has an effect on binary .ply files only.")
+    if options.keep is not None:
+        kept = f"{report.kept_count:,} Gaussians" if report.kept_count else "No Gaussian"
+        notes.append(f"{kept} in the boxes of --keep.")
+    total = time.perf_counter() - options.begun if searched else report.seconds
     return Outcome(
         f"{report.input_count:,} -> {report.output_count:,} Gaussians",
-        f"{report.seconds:.2f} s",
+        f"{total:.2f} s",
         notes + _report_notes(report),
     )
 
@@ -204,8 +213,11 @@ def _simplify_in_memory(
         own = cvtgs.views.find_own_cameras(scene, options.input)
         if own is not None and axes.source is None:
             cameras = own.cameras
-            notes.append(f"Rendered from the {len(cameras)} cameras of {own.source}.")
+            notes.append(f"Rendered from {len(cameras)} cameras found in {own.source.resolve()}.")
     search = _has_target(options)
+    renders = config.uses_renders or config.refine.enabled
+    if options.cameras is not None and not (search or renders):
+        notes.append(f"--cameras was not used: {config.preset} renders no images.")
     simplifier = cvtgs.Simplifier(
         checkpoint, config=config, device=options.device, listener=silent if search else listener
     )
@@ -216,12 +228,14 @@ def _simplify_in_memory(
             ssim=options.target_ssim,
             simplifier=simplifier,
             cameras=cameras,
+            heldout=None if renders or options.cameras is None else cameras,
             listener=listener,
         )
         small, report = found.scene, found.report
+        views = "automatic views" if renders or options.cameras is None else "the given cameras"
         notes.append(
             f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f}, alpha error "
-            f"{found.alpha_error:.4f} (bias {found.alpha_bias:+.4f}) over held-out views; "
+            f"{found.alpha_error:.4f} (bias {found.alpha_bias:+.4f}) over {views}; "
             f"found in {len(found.tried)} tries."
         )
     else:
@@ -283,11 +297,15 @@ def _report_notes(report: "SimplifyReport") -> list[str]:
         )
     if report.refinement is not None:
         refined = report.refinement
-        notes.append(
-            f"Refined in {refined.steps:,} {'step' if refined.steps == 1 else 'steps'}: "
-            f"{refined.gain:+.2f} dB on held-out views, "
-            f"{refined.psnr_before:.2f} -> {refined.psnr_after:.2f}."
-        )
+        steps = f"{refined.steps:,} {'step' if refined.steps == 1 else 'steps'}"
+        change = f"{refined.psnr_before:.2f} -> {refined.psnr_after:.2f}"
+        if refined.stopped == "time" and refined.steps == 0:
+            notes.append("Not refined: the time was used up before the first step.")
+        elif refined.gain == 0.0 and refined.stopped != "perfect":
+            notes.append(f"Not refined: none of {steps} improved the held-out images.")
+        else:
+            gain = f"{refined.gain:+.2f} dB on held-out images"
+            notes.append(f"Refined in {steps}: {gain}, {change}.")
     return notes
 
 
@@ -308,29 +326,49 @@ def check_goals(options: argparse.Namespace) -> None:
 
 def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int | None:
     """Return the bytes for simplifying in blocks; None if blocks are not needed or not possible."""
-    from cvtgs.io.ply import open_rows
-    from cvtgs.outofcore import block_count, check_config
+    from cvtgs.outofcore import check_config
 
     memory = memory_of(options)
     names = ("target_psnr", "target_ssim", "time_budget", "cameras")
     excluded = [name for name in names if getattr(options, name) is not None]
+    if options.scheduler is None and not _needs_blocks(options, memory):
+        return None
     if options.memory is None and options.scheduler is None:
         try:
-            if excluded or block_count(open_rows(options.input), memory) == 1:
-                return None
             check_config(config)
-        except (InputError, FileFormatError, ConfigError):
+        except ConfigError:
             return None
-        return memory
-    if options.scheduler is None and block_count(open_rows(options.input), memory) == 1:
-        return None
+        return None if excluded else memory
     if excluded:
         words = ", ".join("--" + name.replace("_", "-") for name in excluded)
         raise InvalidArgumentError(
-            f"blocks cannot be used with {words}, which need the whole scene."
+            f"{words} cannot be used with blocks: the whole scene is needed at once."
         )
     check_config(config)
     return memory
+
+
+def _needs_blocks(options: argparse.Namespace, memory: int) -> bool:
+    """Return whether a file does not fit; only binary PLYs can be read in parts, and simplified."""
+    from cvtgs.outofcore import block_count
+
+    rows = _rows_of(options.input)
+    if rows is None or block_count(rows, memory) == 1:
+        return False
+    sizes = {"count": options.count, "max_count": options.max_count}
+    if options.rho is None and set(sizes.values()) == {None}:  # a quality is wanted
+        return True
+    return cvtgs.target_count(rows.count, options.rho, **sizes) < rows.count
+
+
+def _rows_of(path: Path) -> "PlyRows | None":
+    """Open a binary PLY, which can be read in parts; return None for other files."""
+    from cvtgs.io.ply import open_rows
+
+    try:
+        return open_rows(path)
+    except (InputError, FileFormatError):
+        return None
 
 
 def _simplify_blocks(

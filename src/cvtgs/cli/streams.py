@@ -52,7 +52,7 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--transform",
-        metavar="16 NUMBERS",
+        metavar="N,N,...",
         help="column-major transform of the root of 3D Tiles, instead of --place",
     )
     add_block_options(parser)

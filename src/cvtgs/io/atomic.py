@@ -73,11 +73,12 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
             )
         if target.exists() and not overwrite:
             raise _exists(path)
-        if not target.parent.is_dir():
-            raise OutputError(
-                f"{os.fspath(path)}: the output must be in an existing directory, "
-                f"found no directory {os.fspath(target.parent)}."
-            )
+        for folder in (target.parent, Path(path).parent):  # "missing/.." is not resolved by name
+            if not folder.is_dir():
+                raise OutputError(
+                    f"{os.fspath(path)}: the output must be in an existing directory, "
+                    f"found no directory {os.fspath(folder)}."
+                )
         if not os.access(target.parent, os.W_OK | os.X_OK):
             raise OutputError(
                 f"{os.fspath(path)}: the output must be in a writable directory, "

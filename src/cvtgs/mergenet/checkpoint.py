@@ -298,7 +298,8 @@ def checkpoint_for(
         if ckpt == "auto":
             return None
         raise ConfigError(
-            f"merge.network is false, so ckpt must be None or auto; found {os.fspath(ckpt)!r}."
+            f"without a network (merge.network is false, as in draft and fast), the checkpoint "
+            f"must be auto or none; found {os.fspath(ckpt)!r}."
         )
     if ckpt == "auto":
         preset = "standard" if config is None else config.preset

@@ -1,0 +1,130 @@
+"""What commands report besides their result, so that no option is ignored silently."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import cvtgs
+from cvtgs.cli.main import main
+from scenes import random_scene
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    cvtgs.save(random_scene(300), tmp_path / "in.ply")
+    return tmp_path / "in.ply"
+
+
+def printed(capsys: pytest.CaptureFixture[str], *words: object, status: int = 0) -> str:
+    """Run a command; return what it prints, without line breaks."""
+    try:
+        found = main([str(word) for word in words])
+    except SystemExit as exit_:
+        found = exit_.code
+    assert found == status
+    captured = capsys.readouterr()
+    return " ".join((captured.out + captured.err).split())
+
+
+def simplified(capsys: pytest.CaptureFixture[str], source: Path, *words: object) -> str:
+    output = source.with_name("out.ply")
+    return printed(capsys, "simplify", source, output, "--preset", "draft", "--overwrite", *words)
+
+
+def write_cameras(path: Path) -> Path:
+    """Write two cameras around the scene."""
+    frames = [
+        {
+            "file_path": f"{row}.png",
+            "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4 + row], [0, 0, 0, 1]],
+        }
+        for row in range(2)
+    ]
+    path.write_text(json.dumps({"w": 48, "h": 36, "fl_x": 40.0, "frames": frames}))
+    return path
+
+
+def test_memory_has_no_effect_on_formats_that_are_read_whole(capsys, source):
+    glb = source.with_name("in.glb")
+    cvtgs.save(cvtgs.load(source), glb)
+    assert "In one piece: --memory" in simplified(capsys, glb, "--rho", "0.1", "--memory", "4GB")
+    assert "In one piece" not in simplified(capsys, source, "--rho", "0.1", "--memory", "4GB")
+
+
+@pytest.mark.parametrize("words", [["--max-count", "1M"], ["--rho", "1"]])
+def test_a_whole_scene_is_copied_whatever_the_memory(capsys, source, monkeypatch, words):
+    monkeypatch.setattr("cvtgs.outofcore.memory.BASE_BYTES", 10)
+    monkeypatch.setattr("cvtgs.outofcore.memory.LEAST_BYTES", 20)
+    text = simplified(capsys, source, *words, "--memory", "20kB", "--workers", "1")
+    assert "blocks" not in text
+    assert source.with_name("out.ply").read_bytes() == source.read_bytes()
+
+
+def test_the_number_of_kept_gaussians_is_printed(capsys, source):
+    boxes = source.with_name("boxes.json")
+    boxes.write_text('{"min": [1e5, 1e5, 1e5], "max": [2e5, 2e5, 2e5]}')
+    words = ["--rho", "0.9", "--keep", boxes]
+    assert "No Gaussian in the boxes of --keep." in simplified(capsys, source, *words)
+    boxes.write_text('{"min": [0, -1e9, -1e9], "max": [1e9, 1e9, 1e9]}')
+    kept = int((cvtgs.load(source).means[:, 0] >= 0).sum())
+    assert f"{kept} Gaussians in the boxes of --keep." in simplified(capsys, source, *words)
+
+
+def test_a_target_is_measured_over_the_given_cameras(capsys, source):
+    cameras = write_cameras(source.with_name("views.json"))
+    text = simplified(capsys, source, "--target-psnr", "12", "--cameras", cameras)
+    assert "over the given cameras; found in" in text
+    assert "Seconds of the chosen try: " in text
+    small = cvtgs.load(source.with_name("out.ply"))
+    settings = cvtgs.evaluation.EvaluationSettings(lpips="off")
+    views = cvtgs.load_cameras(cameras)
+    found = cvtgs.evaluate(source, {"small": small}, views, settings=settings).scenes[0]
+    assert f"PSNR {found.psnr.mean:.2f} dB" in text
+
+
+def test_cameras_that_are_not_used_are_mentioned(capsys, source):
+    cameras = write_cameras(source.with_name("views.json"))
+    text = simplified(capsys, source, "--rho", "0.1", "--cameras", cameras)
+    assert "--cameras was not used: draft renders no images." in text
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--refine", "1e-6"], "Not refined: the time was used up before the first step."),
+        (["--refine-steps", "1", "--set", "refine.rates.means=90"], "Not refined: none of 1 step"),
+    ],
+)
+def test_a_refinement_without_effect_says_why(capsys, source, words, text):
+    assert text in simplified(capsys, source, "--rho", "0.9", "--set", "refine.size=48", *words)
+
+
+def test_a_folder_that_does_not_exist_is_not_skipped_by_dots(capsys, source):
+    output = source.parent / "missing" / ".." / "out.ply"
+    text = printed(capsys, "convert", source, output, status=1)
+    assert "the output must be in an existing directory" in text
+    assert not source.with_name("out.ply").exists()
+
+
+def test_a_value_with_a_minus_gets_a_hint(capsys, source):
+    words = ["convert", source, "out.ply", "--translate", "-1,0,0"]
+    assert "with a minus sign, write --translate=-1,0,0" in printed(capsys, *words, status=2)
+
+
+def test_columns_that_a_merge_leaves_out_are_listed_as_lost(capsys, source):
+    scene = cvtgs.load(source)
+    more = scene.with_tensors({}, {"heat": torch.zeros(300), "id": torch.zeros(300)})
+    cvtgs.save(more, source.with_name("more.ply"))
+    words = ["convert", source.with_name("more.ply"), source.with_name("out.ply")]
+    text = printed(capsys, *words, "--merge", source)
+    assert "Lost: columns that not all scenes have (heat, id)." in text
+
+
+def test_presets_that_were_fitted_to_the_scoring_cameras_are_named(capsys, source):
+    write_cameras(source.with_name("transforms.json"))
+    words = ["tradeoff", source, "-o", source.with_name("t"), "--presets", "draft,matched"]
+    words += ["--rho", "0.3", "--size", "48", "--lpips", "off"]
+    text = printed(capsys, *words)
+    assert "Fitted to the cameras beside in.ply, which also score them: matched." in text
