@@ -56,3 +56,8 @@ def suggestion(word: str, choices: Iterable[str], *, likeness: float = 0.6) -> s
     """Return "; did you mean X?" with the choice closest to a word; empty if none is close."""
     near = get_close_matches(word, list(choices), n=1, cutoff=likeness)
     return f"; did you mean {near[0]}?" if near else ""
+
+
+def counted(number: int, word: str) -> str:
+    """Return a number of things in words: ``1 view``, ``2 views``."""
+    return f"{number:,} {word}" if number == 1 else f"{number:,} {word}s"

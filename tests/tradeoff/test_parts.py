@@ -171,7 +171,7 @@ def test_the_texts_of_the_table():
     assert cells(made, covered)["alpha error"] == "0.0123"
     assert cells(made, covered)["alpha bias"] == "-0.0100"
     assert heading(made, 0.01) == "rho 0.01: 50 of 500 Gaussians"
-    assert "1 views of 64 x 48 pixels" in how_measured(made)
+    assert "1 view of 64 x 48 pixels" in how_measured(made)
     assert how_measured(made).endswith(" on abacus.")
     network = made.evaluation.model_copy(update={"lpips_network": "vgg", "lpips_note": ""})
     named = made.model_copy(update={"evaluation": network})

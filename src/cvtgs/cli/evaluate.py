@@ -27,7 +27,7 @@ from cvtgs.cli.view_options import (
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import windows_fault
 from cvtgs.progress import ProgressEvent
-from cvtgs.text import printable
+from cvtgs.text import counted, printable
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation, SceneScores
@@ -86,7 +86,8 @@ def render(options: argparse.Namespace) -> None:
                 file.write(encode(as_bytes(image), "png"))
         listener(ProgressEvent(stage="render", done=len(paths), total=len(paths)))
     if not options.quiet:
-        say(f"{len(paths)} images of {cameras.width} x {cameras.height} pixels in {options.output}")
+        images = counted(len(paths), "image")
+        say(f"{images} of {cameras.width} x {cameras.height} pixels in {options.output}")
 
 
 def file_names(views: Sequence[str]) -> list[str]:
@@ -177,8 +178,8 @@ def evaluate(options: argparse.Namespace) -> None:
 
 def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
     say(
-        f"{len(evaluation.views)} views of {evaluation.width} x {evaluation.height} pixels, "
-        f"rendered by {evaluation.backend}"
+        f"{counted(len(evaluation.views), 'view')} "
+        f"of {evaluation.width} x {evaluation.height} pixels, rendered by {evaluation.backend}"
     )
     say(f"against {evaluation.reference}, {evaluation.reference_count:,} Gaussians:")
     _print_score_table(evaluation.scenes, sizes)

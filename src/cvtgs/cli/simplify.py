@@ -31,6 +31,7 @@ from cvtgs.errors import (
     OutputExistsError,
 )
 from cvtgs.progress import ProgressListener, silent
+from cvtgs.text import counted
 
 if TYPE_CHECKING:
     from cvtgs.config import SimplifyConfig
@@ -297,7 +298,7 @@ def _report_notes(report: "SimplifyReport") -> list[str]:
         )
     if report.refinement is not None:
         refined = report.refinement
-        steps = f"{refined.steps:,} {'step' if refined.steps == 1 else 'steps'}"
+        steps = counted(refined.steps, "step")
         change = f"{refined.psnr_before:.2f} -> {refined.psnr_after:.2f}"
         if refined.stopped == "time" and refined.steps == 0:
             notes.append("Not refined: the time was used up before the first step.")

@@ -1,10 +1,12 @@
 """Options for cameras, images and scores, and functions that read their values."""
 
 import argparse
+import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import cvtgs
+from cvtgs.cli.display import say
 from cvtgs.cli.options import add_options
 from cvtgs.errors import InvalidArgumentError
 
@@ -92,6 +94,8 @@ def choose_cameras(
     path = options.reference if "reference" in options else options.input
     own = cvtgs.views.find_own_cameras(scene, path)
     if own is not None:
+        if not options.quiet:
+            say(f"Views: cameras found in {own.source.resolve()}.", file=sys.stderr)
         return own.cameras.spread(views).fitted(size)
     height = max(1, round(0.75 * size))
     return cvtgs.views.automatic_views(scene, views, width=size, height=height)

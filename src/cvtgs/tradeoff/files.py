@@ -13,6 +13,7 @@ from cvtgs.io import atomic_output, check_output
 from cvtgs.io.atomic import make_folder
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
+from cvtgs.text import counted
 from cvtgs.tradeoff.measure import Measured
 from cvtgs.tradeoff.results import Tradeoff, TradeoffResult
 
@@ -235,8 +236,8 @@ def how_measured(tradeoff: Tradeoff) -> str:
         "",
     )
     return (
-        f"{len(evaluation.views)} views of {evaluation.width} x {evaluation.height} pixels, "
-        f"rendered by {evaluation.backend}. Every run is a separate process on "
+        f"{counted(len(evaluation.views), 'view')} "
+        f"of {evaluation.width} x {evaluation.height} pixels, rendered by {evaluation.backend}. Every run is a separate process on "
         f"{tradeoff.machine}. {against}{evaluation.lpips_sentence}"
     ).rstrip()
 
