@@ -238,7 +238,8 @@ def how_measured(tradeoff: Tradeoff) -> str:
     return (
         f"{counted(len(evaluation.views), 'view')} "
         f"of {evaluation.width} x {evaluation.height} pixels, rendered by {evaluation.backend}. "
-        f"Every run is a separate process on {tradeoff.machine}. {against}{evaluation.lpips_sentence}"
+        f"Every run is a separate process on {tradeoff.machine}. "
+        f"{against}{evaluation.lpips_sentence}"
     ).rstrip()
 
 
