@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.blocks import add_block_options, block_workers, memory_of
-from cvtgs.cli.display import progress_bars, say, size_text
+from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
 from cvtgs.errors import ConfigError, FileFormatError, InputError, InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -215,3 +215,12 @@ def _print_levels(
     for one, error in zip_longest(levels, errors):
         last = "" if error is None else f"  {error:>9.3g}"
         say(f"  {one.gaussians:>12,}  {size_text(one.bytes):>9}  {one.files:>6,}{last}")
+    if options.environment is not None:
+        say_wrapped(
+            f"Not counted: the environment beyond {options.environment:g} times the robust radius, "
+            "which all levels share."
+        )
+    if any(one.gaussians == 0 for one in levels):
+        say_wrapped(
+            "Levels of 0 Gaussians are in no tile: the tree is less deep than there are levels."
+        )
