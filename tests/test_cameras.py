@@ -83,6 +83,7 @@ def test_about_every_third_camera_ignores_the_tag():
     four = Cameras(**GOOD).select(torch.zeros(4, dtype=torch.int64)).in_both_modes()
     assert four.ignores_tag == (False, False, True, False)
     assert four.select(torch.tensor([3, 2])).ignores_tag == (False, True)
+    assert four.in_both_modes() is four
     single = four.every(2).to("cpu").singles()[2]
     assert single.ignores_tag == (True,)
     assert Cameras(**GOOD).singles()[0].ignores_tag == ()

@@ -211,8 +211,10 @@ class Cameras:
         out elsewhere, is not always of the same kind.
 
         Returns:
-            The same cameras otherwise.
+            The same cameras otherwise; unchanged if ``ignores_tag`` is given.
         """
+        if self.ignores_tag:
+            return self
         modes = tuple(math.sqrt(2.0) * row % 1.0 < 1 / 3 for row in range(1, len(self) + 1))
         return replace(self, ignores_tag=modes)
 
