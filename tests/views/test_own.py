@@ -98,7 +98,7 @@ def test_a_preset_that_renders_uses_and_reports_the_cameras(tmp_path, scene, cap
     assert plain.prepare(file).run(count=20).report.views == "none"
     words = ["simplify", str(file), str(tmp_path / "small.ply"), "--count", "20", "--ckpt", "none"]
     assert main([*words, "--set", "visibility.views=4"]) == 0
-    assert "5 cameras of" in " ".join(capsys.readouterr().out.split())
+    assert "5 cameras found in" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_search_for_a_count_uses_the_cameras_beside_a_file(tmp_path, scene):
