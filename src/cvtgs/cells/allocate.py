@@ -127,17 +127,14 @@ def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Mom
     columns = [members.counts, members.weights, members.masses]
     counts, weights, masses = label_sums(columns, labels, count)
     shares = members.weights / weights.index_select(0, labels)
-    buffer = torch.empty_like(shares)  # one for all columns: new memory is slow to write
-    values = *members.means, *members.colors
-    shared = (torch.mul(shares, column, out=buffer) for column in values)
-    means, colors = label_sums(shared, labels, count).split(3)
+    columns = [*members.means, *members.colors]
+    means, colors = label_sums(columns, labels, count, shares).split(3)
     shifts = take_columns(labels, means)[0]
     torch.sub(members.means, shifts, out=shifts)
-    products = (
-        torch.mul(shifts[i], shifts[j], out=buffer).add_(covariance).mul_(shares)
-        for covariance, (i, j) in zip(members.covariances, UPPER, strict=True)
-    )
-    covariances = label_sums(products, labels, count)
+    products = torch.empty_like(members.covariances)
+    for product, (i, j) in zip(products, UPPER, strict=True):
+        torch.mul(shifts[i], shifts[j], out=product)
+    covariances = label_sums(products.add_(members.covariances), labels, count, shares)
     return Moments(counts, weights, masses, means, covariances, colors)
 
 

@@ -112,7 +112,10 @@ def running_sums(values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
 
 
 def label_sums(
-    columns: Iterable[Float[Tensor, "n"]], labels: Int[Tensor, "n"], count: int
+    columns: Iterable[Float[Tensor, "n"]],
+    labels: Int[Tensor, "n"],
+    count: int,
+    weights: Float[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "k m"]:
     """Sum the rows of each label, in the order of the rows, in float64.
 
@@ -121,6 +124,7 @@ def label_sums(
             share memory.
         labels: Label of every row, 0 to ``count - 1``.
         count: Number of labels, m.
+        weights: Factors of the rows, float64.
 
     Returns:
         One row per column; a label without rows gives 0. Every device gives the same bits.
@@ -129,11 +133,16 @@ def label_sums(
         >>> label_sums([torch.tensor([1.0, 2.0, 4.0])], torch.tensor([1, 0, 1]), 2).tolist()
         [[2.0, 5.0]]
     """
-    if labels.device.type == "cpu":  # adds in order; CUDA would add in any order
-        sums = [torch.bincount(labels, column.double(), minlength=count) for column in columns]
-    else:
-        order, offsets = sort_by_label(labels, count)
-        sums = [segment_sum(column.double()[order], offsets) for column in columns]
+    on_host = labels.device.type == "cpu"  # adds in order; CUDA would add in any order
+    order, offsets = (labels, labels) if on_host else sort_by_label(labels, count)
+    buffer = None if weights is None else torch.empty_like(weights)  # new memory is slow to write
+    sums = []
+    for column in columns:
+        values = column.double() if weights is None else torch.mul(weights, column, out=buffer)
+        if on_host:
+            sums.append(torch.bincount(labels, values, minlength=count))
+        else:
+            sums.append(segment_sum(values[order], offsets))
     return torch.stack(sums)
 
 
