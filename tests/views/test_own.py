@@ -80,7 +80,8 @@ def test_foreign_damaged_and_single_cameras_are_not_used(tmp_path, scene):
     write_inria(path, cvtgs.Cameras(viewmats=moved, Ks=cameras.Ks, width=64, height=48))
     assert find_own_cameras(scene, file) is None
     path.write_text("[{")
-    assert find_own_cameras(scene, file) is None
+    with pytest.warns(UserWarning, match=r"cameras are not used: .*cameras\.json: must be JSON"):
+        assert find_own_cameras(scene, file) is None
     write_inria(path, cameras.select(torch.tensor([0])))
     assert find_own_cameras(scene, file) is None
     assert find_own_cameras(scene, tmp_path / "nowhere.ply") is None

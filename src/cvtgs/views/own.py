@@ -1,6 +1,7 @@
 """The cameras of a capture, if they are in the folder of its model."""
 
 import os
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +11,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.errors import CvtgsError
+from cvtgs.errors import CvtgsError, FileFormatError
 from cvtgs.scene import GaussianScene
 
 _LEAST_SEEN = 0.01
@@ -34,7 +35,7 @@ def find_own_cameras(scene: GaussianScene, path: str | os.PathLike[str]) -> OwnC
     The folder of the model (in INRIA's layout the one above ``point_cloud``) and then the folder of
     the file are searched for formats that :func:`cvtgs.io.load_cameras` reads. Cameras of another
     world frame, as after a capture was moved or scaled, are rejected: at least half of the cameras
-    must have a hundredth of the visible Gaussians in their images.
+    must have a hundredth of the visible Gaussians in their images. A damaged file causes a warning.
 
     Args:
         scene: The scene, as it was read.
@@ -52,11 +53,16 @@ def find_own_cameras(scene: GaussianScene, path: str | os.PathLike[str]) -> OwnC
     """
     from cvtgs.io import load_cameras  # noqa: PLC0415 (a scene in memory needs no formats)
 
-    place = Path(path)
+    place, faults = Path(path), set[str]()
     for source in _sources(place) if place.exists() else ():
         try:
             cameras = load_cameras(source)
-        except CvtgsError:
+        except FileFormatError as error:
+            if str(error) not in faults:
+                faults.add(str(error))
+                warnings.warn(f"cameras are not used: {error}", UserWarning, stacklevel=2)
+            continue
+        except CvtgsError:  # there are none
             continue
         looking = float(_looking(cameras, scene).double().mean())
         if len(cameras) > 1 and looking >= _LEAST_LOOKING:
