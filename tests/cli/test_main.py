@@ -268,7 +268,7 @@ def completed(script: str, *words: str) -> list[str]:
     line += 'printf "%s\\n" "${COMPREPLY[@]}"'
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)
     assert done.stderr == ""
-    return done.stdout.split()
+    return done.stdout.splitlines()
 
 
 @pytest.fixture
@@ -280,7 +280,8 @@ def bash(capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def test_bash_completes_commands_options_values_and_files(bash, tmp_path, monkeypatch):
-    (tmp_path / "scan.ply").write_text("")
+    for name in ("scan.ply", "my scan.ply"):
+        (tmp_path / name).write_text("")
     monkeypatch.chdir(tmp_path)
     assert completed(bash, "cvtgs", "si") == ["simplify"]
     assert completed(bash, "cvtgs", "simplify", "in.ply", "--max") == ["--max-count"]
@@ -289,6 +290,7 @@ def test_bash_completes_commands_options_values_and_files(bash, tmp_path, monkey
     assert completed(bash, "cvtgs", "completion", "f") == ["fish"]
     assert completed(bash, "cvtgs", "simplify", "sc") == ["scan.ply"]
     assert completed(bash, "cvtgs", "simplify", "--report", "sc") == ["scan.ply"]
+    assert completed(bash, "cvtgs", "info", "my") == ["my scan.ply"]
 
 
 def test_every_option_of_every_command_is_in_every_script(capsys):

@@ -33,7 +33,8 @@ _cvtgs() {{
     if [ -n "$words" ]; then
         COMPREPLY=($(compgen -W "$words" -- "$current"))
     else
-        mapfile -t COMPREPLY < <(compgen -f -- "$current")
+        local IFS=$'\n'  # names may hold spaces
+        COMPREPLY=($(compgen -f -- "$current"))
     fi
 }}
 complete -o filenames -F _cvtgs cvtgs
