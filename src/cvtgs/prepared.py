@@ -72,8 +72,7 @@ class Prepared:
         listener: ProgressListener = silent,
     ) -> None:
         least = 2 if config.refine.enabled else 1
-        uses_images = config.uses_renders or config.refine.enabled
-        if cameras is not None and uses_images and len(cameras) < least:
+        if cameras is not None and config.uses_images and len(cameras) < least:
             raise InvalidArgumentError(
                 f"preset {config.preset} needs at least {least} "
                 f"{'cameras, one of them to be held out' if least > 1 else 'camera'}; "

@@ -175,7 +175,7 @@ class Simplifier:
         full, config = as_scene(scene), self.config
         if cameras is None and not isinstance(scene, GaussianScene):
             own = None
-            if config.uses_renders or config.refine.enabled:
+            if config.uses_images:
                 own = find_own_cameras(full, scene)
             cameras = None if own is None else own.cameras
         return Prepared(

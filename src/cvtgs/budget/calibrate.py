@@ -16,7 +16,7 @@ from typing import Literal
 import torch
 
 import cvtgs
-from cvtgs.budget.costs import FEATURES, CostModel, Measurement, Work, uses_images
+from cvtgs.budget.costs import FEATURES, CostModel, Measurement, Work
 from cvtgs.clock import StageCost
 from cvtgs.config import PRESETS, Section, SimplifyConfig
 from cvtgs.config.base import Record
@@ -94,7 +94,7 @@ class Trial:
     def config(self) -> SimplifyConfig:
         """The preset, with fewer and smaller images."""
         config = SimplifyConfig.from_preset(self.preset)
-        if not uses_images(config):
+        if not config.uses_images:
             return config
         images: dict[str, Section] = {
             "visibility": config.visibility.model_copy(
@@ -310,7 +310,7 @@ def calibrate(
         listener(ProgressEvent(stage=STAGE, done=done, total=total, note=note))
         return run(trial.config, scene, count)
 
-    first = {uses_images(trials[row].config): row for row in reversed(range(len(trials)))}
+    first = {trials[row].config.uses_images: row for row in reversed(range(len(trials)))}
     loading = {row: sum(measure(row, 0, "load preset").values()) for row in sorted(first.values())}
     best: list[dict[str, float]] = [{} for _ in trials]
     spent = [0.0 for _ in trials]

@@ -225,13 +225,8 @@ class CostModel(Record, allow_inf_nan=False):
             >>> model.seconds(Work(count=1_000_000, target=10_000), SimplifyConfig())
             4.5
         """
-        start = self.start + (self.image_start if uses_images(config) else 0.0)
+        start = self.start + (self.image_start if config.uses_images else 0.0)
         return start + sum(self.stage_seconds(work, config).values())
-
-
-def uses_images(config: SimplifyConfig) -> bool:
-    """Check whether a configuration renders images of the scene."""
-    return config.uses_renders or config.refine.enabled
 
 
 def fit_rates(

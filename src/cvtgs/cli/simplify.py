@@ -184,7 +184,7 @@ def _simplify_one(
     if memory is None and options.memory is not None and _rows_of(options.input) is None:
         notes.append("In one piece: --memory has an effect on binary .ply files only.")
     if options.keep is not None:
-        kept = f"{report.kept_count:,} Gaussians" if report.kept_count else "No Gaussian"
+        kept = counted(report.kept_count, "Gaussian") if report.kept_count else "No Gaussian"
         notes.append(f"{kept} in the boxes of --keep.")
     total = time.perf_counter() - options.begun if searched else report.seconds
     return Outcome(
@@ -210,14 +210,13 @@ def _simplify_in_memory(
         chosen = choose_preset(options, scene, settings, listener)
         config = cvtgs.SimplifyConfig.compose(preset=chosen.name, settings=settings)
         notes.append(chosen.reason)
-    if cameras is None and (config.uses_renders or config.refine.enabled):
+    if cameras is None and config.uses_images:
         own = cvtgs.views.find_own_cameras(scene, options.input)
         if own is not None and axes.source is None:
             cameras = own.cameras
             notes.append(f"Rendered from {len(cameras)} cameras found in {own.source.resolve()}.")
     search = _has_target(options)
-    renders = config.uses_renders or config.refine.enabled
-    if options.cameras is not None and not (search or renders):
+    if options.cameras is not None and not (search or config.uses_images):
         notes.append(f"--cameras was not used: {config.preset} renders no images.")
     simplifier = cvtgs.Simplifier(
         checkpoint, config=config, device=options.device, listener=silent if search else listener
@@ -229,11 +228,12 @@ def _simplify_in_memory(
             ssim=options.target_ssim,
             simplifier=simplifier,
             cameras=cameras,
-            heldout=None if renders or options.cameras is None else cameras,
+            heldout=None if config.uses_images else cameras,
             listener=listener,
         )
         small, report = found.scene, found.report
-        views = "automatic views" if renders or options.cameras is None else "the given cameras"
+        is_given = options.cameras is not None and not config.uses_images
+        views = "the given cameras" if is_given else "automatic views"
         notes.append(
             f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f}, alpha error "
             f"{found.alpha_error:.4f} (bias {found.alpha_bias:+.4f}) over {views}; "

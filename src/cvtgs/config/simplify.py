@@ -132,6 +132,11 @@ class SimplifyConfig(Section):
         return self.visibility.views > 0 and self.effects.visibility != "off"
 
     @property
+    def uses_images(self) -> bool:
+        """Whether images of the scene are rendered at all, for contributions or a refinement."""
+        return self.uses_renders or self.refine.enabled
+
+    @property
     def shares_images(self) -> bool:
         """Whether a refinement trains on the images that opacities are matched to."""
         ours, theirs = self.visibility, self.refine

@@ -125,7 +125,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     rows = replace(rows, path=str(Path(rows.path).absolute()))  # for workers in other folders
     target = target_count(rows.count, rho, count=count, max_count=max_count)
     room = memory or memory_to_plan(available_memory())
-    if simplifier.config.uses_renders or simplifier.config.refine.enabled:
+    if simplifier.config.uses_images:
         room -= IMAGE_BYTES
         if memory is not None and room < LEAST_BYTES:
             raise InvalidArgumentError(
@@ -179,7 +179,7 @@ def check_config(config: SimplifyConfig, *, with_images: bool = True) -> None:
         ConfigError: The configuration uses images of the scene where it may not, or refines for a
             time in seconds, which would give different bits in every run.
     """
-    if not with_images and (config.uses_renders or config.refine.enabled):
+    if not with_images and config.uses_images:
         raise ConfigError(
             "blocks need a preset that uses no images of the scene (draft, fast, standard, "
             f"paper) and no refinement; found {config.preset!r} with {config.visibility.views} "
