@@ -43,6 +43,7 @@ def test_a_small_stream_is_one_chunk(words: list[str], capsys: pytest.CaptureFix
     ("more", "said"),
     [
         (["--stream", "sog", "--suffix", ".spz"], "--suffix cannot be used with --stream"),
+        (["--stream", "sog", "--views", "4"], "--views cannot be used with --stream"),
         (["--chunk", "300"], "--chunk needs --stream."),
         (["--stream", "3dtiles", "--environment", "9"], "and needs --stream sog; found 9."),
         (["--stream", "sog", "--environment", "-1"], "--environment must be above 0"),

@@ -33,14 +33,14 @@ def simplified(capsys: pytest.CaptureFixture[str], source: Path, *words: object)
     return printed(capsys, "simplify", source, output, "--preset", "draft", "--overwrite", *words)
 
 
-def write_cameras(path: Path) -> Path:
-    """Write two cameras around the scene."""
+def write_cameras(path: Path, count: int = 2) -> Path:
+    """Write cameras in front of the scene."""
     frames = [
         {
             "file_path": f"{row}.png",
-            "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4 + row], [0, 0, 0, 1]],
+            "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4 + row / 4], [0, 0, 0, 1]],
         }
-        for row in range(2)
+        for row in range(count)
     ]
     path.write_text(json.dumps({"w": 48, "h": 36, "fl_x": 40.0, "frames": frames}))
     return path
@@ -122,9 +122,25 @@ def test_columns_that_a_merge_leaves_out_are_listed_as_lost(capsys, source):
     assert "Lost: columns that not all scenes have (heat, id)." in text
 
 
-def test_presets_that_were_fitted_to_the_scoring_cameras_are_named(capsys, source):
-    write_cameras(source.with_name("transforms.json"))
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [
+        (2, "Fitted to all cameras beside in.ply, which favours them if these score: matched."),
+        (32, "Fitted to the training cameras beside in.ply: matched."),
+    ],
+)
+def test_presets_that_were_fitted_to_cameras_are_named(capsys, source, count, text):
+    write_cameras(source.with_name("transforms.json"), count)
     words = ["tradeoff", source, "-o", source.with_name("t"), "--presets", "draft,matched"]
     words += ["--rho", "0.3", "--size", "48", "--lpips", "off"]
-    text = printed(capsys, *words)
-    assert "Fitted to the cameras beside in.ply, which also score them: matched." in text
+    assert text in printed(capsys, *words)
+    found = json.loads((source.with_name("t") / "tradeoff.json").read_text())
+    assert found["held_out"] == (count == 32)
+    views = found["evaluation"]["views"]
+    fitted = found["results"][1]["report"]["views"]
+    if count == 32:
+        assert views == ["0.png", "16.png", "23.png", "30.png"], "every eighth by name"
+        assert fitted == "28 cameras"
+    else:
+        assert (views, fitted) == (["0.png", "1.png"], "2 cameras")

@@ -71,6 +71,17 @@ def test_cameras_beside_a_file_are_found(tmp_path, scene):
     assert (len(own.cameras), own.source) == (3, tmp_path)
 
 
+@pytest.mark.parametrize(("count", "held_out"), [(24, None), (25, [0, 8, 16, 24])])
+def test_every_eighth_camera_is_for_testing(tmp_path, scene, count, held_out):
+    cvtgs.save(scene, tmp_path / "scene.ply")
+    few = automatic_views(scene, 5, width=64, height=48)
+    cameras = few.select(torch.arange(count) % 5)
+    write_inria(tmp_path / "cameras.json", cameras)
+    test = find_own_cameras(scene, tmp_path / "scene.ply").test_cameras()
+    names = None if held_out is None else [f"{row:05}" for row in held_out]
+    assert names == (None if test is None else list(test.names))
+
+
 def test_foreign_damaged_and_single_cameras_are_not_used(tmp_path, scene):
     file = model_of(tmp_path, scene)
     cameras = automatic_views(scene, 4, width=64, height=48)

@@ -189,8 +189,8 @@ def visibility_cameras(
         cameras: Cameras to choose from; None generates views.
 
     Returns:
-        The cameras of images of every ``config.visibility.stride``-th pixel; for a scene tagged
-        mip, about every third one ignores the tag.
+        The cameras of images of every ``config.visibility.stride``-th pixel; about every
+        third one ignores the tag mip.
     """
     choices = config.visibility
     if cameras is None:
@@ -199,8 +199,7 @@ def visibility_cameras(
     else:
         longer, least = max(cameras.width, cameras.height), SSIM_WINDOW * choices.stride
         views = cameras.spread(choices.views).fitted(min(choices.size, longer), least=least)
-    views = views.interleaved(choices.stride)
-    return views.in_both_modes() if scene.antialiased else views
+    return views.interleaved(choices.stride).in_both_modes()
 
 
 def measured_areas(

@@ -8,7 +8,7 @@ from pathlib import PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING, NamedTuple
 
 import cvtgs
-from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
+from cvtgs.cli.display import progress_bars, say, size_text
 from cvtgs.cli.options import (
     AddParser,
     add_options,
@@ -265,7 +265,9 @@ def add_tradeoff(add_parser: AddParser) -> None:
         description="Simplify IN with every preset, each run in its own process, score the results "
         "against IN, print a table, and write tradeoff.csv, tradeoff.json, tradeoff.png and "
         f"index.html, a single file that works offline. At most {MOST_CAMERAS} of the --cameras "
-        "are used, unless --views sets another number.",
+        "are used, unless --views sets another number. If the cameras beside IN have a test split "
+        "(every eighth, for example), it scores, and presets that use images are fitted to the "
+        "others.",
     )
     parser.set_defaults(run=tradeoff)
     add_options(parser, "input", "--rho")
@@ -293,7 +295,7 @@ def tradeoff(options: argparse.Namespace) -> None:
             options.input,
             presets=presets,
             ratios=ratios,
-            cameras=lambda scene: choose_cameras(options, scene, most=MOST_CAMERAS),
+            cameras=lambda scene: choose_cameras(options, scene, most=MOST_CAMERAS, held_out=True),
             photographs=None if options.images is None else partial(read_photographs, options),
             settings=evaluation_settings(options),
             device=options.device,
@@ -306,13 +308,6 @@ def tradeoff(options: argparse.Namespace) -> None:
         )
     if not options.quiet:
         _print_tradeoff(measured.tradeoff)
-        results = measured.tradeoff.results
-        fitted = sorted({one.preset for one in results if one.report.views.endswith("cameras")})
-        if fitted and options.cameras is None:
-            say_wrapped(
-                f"Fitted to the cameras beside {options.input.name}, which also score them: "
-                f"{', '.join(fitted)}. Give other --cameras for a fair comparison."
-            )
         names = ", ".join(path.name for path in paths)
         say(f"Wrote {names}. Open {paths[-1]} in a browser.")
         if note:

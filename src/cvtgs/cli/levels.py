@@ -92,7 +92,9 @@ def levels(options: argparse.Namespace) -> None:
         scene = cvtgs.load(options.input, axes=axes.source, trust_sizes=options.trust_sizes)
         if options.sh_degree is not None:
             scene = scene.with_sh_degree(options.sh_degree)
-        cameras = None if options.cameras is None else cvtgs.load_cameras(options.cameras)
+        cameras = None
+        if options.cameras is not None:  # scores are by the split, so levels do not learn from it
+            cameras = cvtgs.load_cameras(options.cameras, split=options.split and "train")
         if cameras is None and axes.source is None:
             own = cvtgs.views.find_own_cameras(scene, options.input)
             cameras = None if own is None else own.cameras

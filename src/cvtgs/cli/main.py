@@ -8,8 +8,9 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from pathlib import Path
 from types import FrameType
 from typing import NoReturn, TextIO
 
@@ -77,7 +78,8 @@ def _run(words: Sequence[str]) -> None:
     options = parser.parse_args(words)
     if options.command not in WITHOUT_TORCH:
         load_torch()
-    with memory_errors(f"cvtgs {options.command}", MEMORY_ADVICE), _lock(options):
+    advised = memory_errors(f"cvtgs {options.command}", MEMORY_ADVICE)
+    with advised, _without_empty_folder(options), _lock(options):
         options.run(options)
     flush_output()
 
@@ -89,6 +91,20 @@ def _lock(options: argparse.Namespace) -> AbstractContextManager[None]:
     from cvtgs.io.locks import folder_lock
 
     return folder_lock(options.output)
+
+
+@contextmanager
+def _without_empty_folder(options: argparse.Namespace) -> Iterator[None]:
+    """After an error, remove the output folder if the command made it and left it empty."""
+    folder: Path = getattr(options, "folder", None) or getattr(options, "output", Path())
+    is_new = not folder.exists()
+    try:
+        yield
+    except BaseException:
+        if is_new:
+            with suppress(OSError):
+                folder.rmdir()
+        raise
 
 
 def run_process() -> NoReturn:

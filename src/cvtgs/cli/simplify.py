@@ -22,6 +22,7 @@ from cvtgs.cli.options import (
     read_settings,
 )
 from cvtgs.cli.time_budget import STARTED, check_time_budget, choose_preset
+from cvtgs.cli.view_options import check_split, read_cameras
 from cvtgs.errors import (
     ConfigError,
     FileFormatError,
@@ -115,6 +116,7 @@ def add_simplify(add_parser: AddParser) -> None:
         f"{CAMERA_FILES} (default: those beside IN or in its folder, if they show the scene, "
         "else automatic views)",
     )
+    add_options(parser, "--split")
     parser.add_argument(
         "--keep",
         type=Path,
@@ -126,21 +128,14 @@ def add_simplify(add_parser: AddParser) -> None:
     parser.add_argument(
         "--report", type=Path, metavar="R.json", help="file for a JSON report of the run"
     )
-    add_options(
-        parser,
-        "--sh-degree",
-        "--axes",
-        "--lod",
-        "--device",
-        "--trust-sizes",
-        "--overwrite",
-        "--quiet",
-    )
+    add_options(parser, "--sh-degree", "--axes", "--lod", "--device", "--trust-sizes")
+    add_options(parser, "--overwrite", "--quiet")
 
 
 def simplify(options: argparse.Namespace) -> None:
     """Run ``cvtgs simplify``."""
     read_axes(options.axes)
+    check_split(options)
     check_goals(options)
     checkpoint = None if options.ckpt == "none" else options.ckpt
     preset = options.preset
@@ -205,7 +200,7 @@ def _simplify_in_memory(
     notes = []
     axes = read_axes(options.axes)
     scene = read_scene(options, config, axes=axes.source)
-    cameras = None if options.cameras is None else cvtgs.load_cameras(options.cameras)
+    cameras = read_cameras(options)
     if options.time_budget is not None:
         chosen = choose_preset(options, scene, settings, listener)
         config = cvtgs.SimplifyConfig.compose(preset=chosen.name, settings=settings)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 STREAMS = ("sog", "3dtiles")
 OF_STREAMS = ("chunk", "environment", "memory", "workers", "scheduler", "place", "transform")
+OF_SCORES = ("views", "size")
 
 
 def add_stream_options(parser: argparse.ArgumentParser) -> None:
@@ -73,6 +74,11 @@ def check_stream_options(options: argparse.Namespace) -> None:
         )
     if options.suffix is not None:
         raise InvalidArgumentError("--suffix cannot be used with --stream, which sets the format.")
+    scoring = [name for name in OF_SCORES if getattr(options, name) is not None]
+    if scoring:
+        raise InvalidArgumentError(
+            f"--{scoring[0]} cannot be used with --stream, since streams are not scored."
+        )
     if options.chunk is not None and options.chunk < 1:
         raise InvalidArgumentError(f"--chunk must be at least 1, found {options.chunk}.")
     far = options.environment

@@ -46,11 +46,23 @@ def check_view_options(options: argparse.Namespace) -> None:
         value = getattr(options, name)
         if value is not None and value < 1:
             raise InvalidArgumentError(f"--{name} must be at least 1, found {value}.")
-    if options.split is not None and options.cameras is None:
-        raise InvalidArgumentError("--split chooses among cameras and needs --cameras.")
+    check_split(options)
     if getattr(options, "images", None) is not None and options.cameras is None:
         raise InvalidArgumentError("--images needs the cameras of the photographs: --cameras.")
     background_color(options)
+
+
+def check_split(options: argparse.Namespace) -> None:
+    """Check that ``--split`` has cameras to choose from."""
+    if options.split is not None and options.cameras is None:
+        raise InvalidArgumentError("--split chooses among cameras and needs --cameras.")
+
+
+def read_cameras(options: argparse.Namespace) -> "Cameras | None":
+    """Read ``--cameras`` and ``--split``; None if not given."""
+    if options.cameras is None:
+        return None
+    return cvtgs.load_cameras(options.cameras, split=options.split)
 
 
 def background_color(options: argparse.Namespace) -> Color:
@@ -80,12 +92,19 @@ def evaluation_settings(options: argparse.Namespace) -> "EvaluationSettings":
 
 
 def choose_cameras(
-    options: argparse.Namespace, scene: "GaussianScene", *, most: int | None = None
+    options: argparse.Namespace,
+    scene: "GaussianScene",
+    *,
+    most: int | None = None,
+    held_out: bool = False,
 ) -> "Cameras":
-    """Read ``--cameras`` or the cameras beside the scene; otherwise choose automatic views."""
+    """Read ``--cameras`` or the cameras beside the scene; otherwise choose automatic views.
+
+    With ``held_out``, only the test split of the cameras beside the scene is used, if there is one.
+    """
     size, views = options.size or options.default_size, options.views or AUTOMATIC_VIEWS
-    if options.cameras is not None:
-        cameras = cvtgs.load_cameras(options.cameras, split=options.split)
+    cameras = read_cameras(options)
+    if cameras is not None:
         cameras = cameras.spread(options.views or most or len(cameras))
         images = getattr(options, "images", None)
         if images is not None and options.size is None:
@@ -94,9 +113,11 @@ def choose_cameras(
     path = options.reference if "reference" in options else options.input
     own = cvtgs.views.find_own_cameras(scene, path)
     if own is not None:
+        test = own.test_cameras() if held_out else None
         if not options.quiet:
-            say(f"Views: cameras found in {own.source.resolve()}.", file=sys.stderr)
-        return own.cameras.spread(views).fitted(size)
+            of_what = "cameras" if test is None else "test cameras"
+            say(f"Views: {of_what} found in {own.source.resolve()}.", file=sys.stderr)
+        return (test or own.cameras).spread(views).fitted(size)
     height = max(1, round(0.75 * size))
     return cvtgs.views.automatic_views(scene, views, width=size, height=height)
 

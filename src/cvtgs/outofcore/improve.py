@@ -62,9 +62,7 @@ def improve(job: Job, block: int) -> None:
         views = mixed_views(
             drawn.positions, choices.views, size=choices.size, seed=config.seed, sharp=False
         )
-        views = views.interleaved(choices.stride)
-        if drawn.full.antialiased:
-            views = views.in_both_modes()
+        views = views.interleaved(choices.stride).in_both_modes()
         observed = observe(drawn.full, views)
         targets = cell_contributions(observed.contributions[drawn.fixed :], found.partition)
         small, changes["matching"] = match_views(

@@ -49,7 +49,7 @@ def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> 
 
     def batch(number: int, seed: int) -> list[Cameras]:
         views = mixed_views(positions, number, size=side, seed=seed)
-        return (views.in_both_modes() if full.antialiased else views).singles()
+        return views.in_both_modes().singles()
 
     def training() -> Iterator[Cameras]:
         for number in count():

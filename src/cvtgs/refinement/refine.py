@@ -110,8 +110,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     ours, theirs = _on_device(small, full, place)
     if seconds is None and steps is None:
         steps = DEFAULT_STEPS
-    if cameras is not None and theirs.antialiased:
-        cameras = cameras.in_both_modes()
+    cameras = None if cameras is None else cameras.in_both_modes()
     limits, clock = Limits(seconds, steps=steps), StageClock(listener, place)
     # The program may have disabled gradients, or be in inference mode.
     with (

@@ -67,7 +67,8 @@ def rasterize(
     to_pinholes(cameras)  # validates the cameras
     listener(ProgressEvent(stage=STAGE, done=0, total=len(cameras)))
     if len(scene) and len(cameras):
-        parts = cameras.singles() if len(set(cameras.ignores_tag)) > 1 else [cameras]
+        are_mixed = scene.antialiased and len(set(cameras.ignores_tag)) > 1
+        parts = cameras.singles() if are_mixed else [cameras]
         found = [_rasterize_all(scene, part, sh_degree) for part in parts]
         layers, alpha = (torch.cat(images) for images in zip(*found, strict=True))
     else:

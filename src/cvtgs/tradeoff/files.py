@@ -239,8 +239,22 @@ def how_measured(tradeoff: Tradeoff) -> str:
         f"{counted(len(evaluation.views), 'view')} "
         f"of {evaluation.width} x {evaluation.height} pixels, rendered by {evaluation.backend}. "
         f"Every run is a separate process on {tradeoff.machine}. "
-        f"{against}{evaluation.lpips_sentence}"
+        f"{fitted_to(tradeoff)}{against}{evaluation.lpips_sentence}"
     ).rstrip()
+
+
+def fitted_to(tradeoff: Tradeoff) -> str:
+    """Return a sentence on the presets that were fitted to cameras of the scene; "" if none was."""
+    results = [one for one in tradeoff.results if one.report.views.endswith("cameras")]
+    if not results:
+        return ""
+    fitted = ", ".join(dict.fromkeys(one.preset for one in results))
+    if tradeoff.held_out:
+        return f"Fitted to the training cameras beside {tradeoff.source}: {fitted}. "
+    return (
+        f"Fitted to all cameras beside {tradeoff.source}, which favours them if these score: "
+        f"{fitted}. "
+    )
 
 
 def _against_photograph(tradeoff: Tradeoff, name: str) -> Mapping[str, str]:

@@ -23,7 +23,7 @@ from cvtgs.progress import ProgressListener, silent
 from cvtgs.scene import GaussianScene
 from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult, with_fronts
 from cvtgs.tradeoff.runs import Run, run_tasks, start_seconds, tasks_of
-from cvtgs.views import automatic_views
+from cvtgs.views import automatic_views, find_own_cameras
 
 RATIOS = (0.1, 0.01, 0.001)
 
@@ -65,6 +65,10 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
     users see. Then all results are rendered from the same views. A run that fails causes a warning
     and is listed; the others go on.
 
+    Presets that use images are fitted to the cameras beside the source, but not to their test split
+    (:meth:`cvtgs.views.OwnCameras.test_cameras`), if there is one. Score by this split, so that no
+    preset is scored by what it learned from.
+
     Memory: that of :func:`cvtgs.evaluation.compare` in this process, plus that of one run at a
     time.
 
@@ -104,14 +108,21 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
     tasks = tasks_of(presets, ratios)
     where = chosen_device(device)
     full = load(source, trust_sizes=trust_sizes).to(where)
-    views = cameras(full)
+    views, own = cameras(full), find_own_cameras(full, source)
+    held_out = own is not None and own.test_cameras() is not None
     kept = None if folder is None else nullcontext(folder)
     with kept or TemporaryDirectory(prefix="cvtgs-") as name:
         place = Path(name)
         start = start_seconds()
         done = list(
             run_tasks(
-                source, tasks, place, device=device, trust_sizes=trust_sizes, listener=listener
+                source,
+                tasks,
+                place,
+                training=own.source if own is not None and held_out else None,
+                device=device,
+                trust_sizes=trust_sizes,
+                listener=listener,
             )
         )
         runs = [one for one in done if isinstance(one, Run)]
@@ -160,5 +171,6 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
         evaluation=comparison.evaluation,
         results=tuple(with_fronts(results)),
         failures=failures,
+        held_out=held_out,
     )
     return Measured(tradeoff, comparison)

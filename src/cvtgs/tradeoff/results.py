@@ -76,6 +76,7 @@ class Tradeoff(Record):
         evaluation: The views, and the scores per view.
         results: One per ratio and preset, ratio by ratio.
         failures: Runs that failed.
+        held_out: Whether the cameras beside the scene have a test split, to which no run is fitted.
     """
 
     source: str
@@ -86,6 +87,7 @@ class Tradeoff(Record):
     evaluation: Evaluation
     results: tuple[TradeoffResult, ...]
     failures: tuple[Failure, ...] = ()
+    held_out: bool = False
 
     @property
     def ratios(self) -> tuple[float, ...]:

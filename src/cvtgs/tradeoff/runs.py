@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cvtgs.config import PRESETS
+from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.config.simplify import unknown_preset
 from cvtgs.counts import target_count
 from cvtgs.errors import InvalidArgumentError, RunError
@@ -130,16 +130,23 @@ def run_tasks(
     tasks: Sequence[Task],
     folder: Path,
     *,
+    training: Path | None,
     device: str,
     trust_sizes: bool,
     listener: ProgressListener,
 ) -> Iterator[Run | Failure]:
-    """Run every task in its own process, one after another."""
+    """Run every task in its own process, one after another.
+
+    ``training`` has the cameras to whose training split presets that use images are fitted; without
+    it, these presets find their cameras themselves.
+    """
     warned: set[str] = set()
     for done, task in enumerate(tasks):
         listener(ProgressEvent(stage=STAGE, done=done, total=len(tasks), note=task.name))
         try:
-            run = run_task(source, task, folder, device=device, trust_sizes=trust_sizes)
+            run = run_task(
+                source, task, folder, training=training, device=device, trust_sizes=trust_sizes
+            )
         except RunError as error:
             yield Failure(name=task.name, reason=str(error))
         else:
@@ -153,6 +160,7 @@ def run_task(
     task: Task,
     folder: Path,
     *,
+    training: Path | None = None,
     device: str = "auto",
     trust_sizes: bool = False,
 ) -> Run:
@@ -161,6 +169,8 @@ def run_task(
     words = ["--rho", repr(task.rho), "--preset", task.preset, "--device", device]
     words += ["--report", str(report), "--overwrite", "--quiet"]
     words += ["--trust-sizes"] * trust_sizes
+    if training is not None and SimplifyConfig.from_preset(task.preset).uses_images:
+        words += ["--cameras", str(training), "--split", "train"]
     try:
         cost = run_process(
             [sys.executable, "-m", "cvtgs", "simplify", os.fspath(source), str(path), *words]

@@ -22,11 +22,29 @@ _MOST_POINTS = 2000
 _VISIBLE = 0.1
 
 
+_LEAST_TEST = 4
+"""A test split of fewer cameras is not used: their mean would tell little."""
+
+
 class OwnCameras(NamedTuple):
     """Cameras of a capture, and the file or folder that holds them."""
 
     cameras: Cameras
     source: Path
+
+    def test_cameras(self) -> Cameras | None:
+        """Return the test split: every eighth by name, unless the files have their own.
+
+        Returns:
+            The cameras; None if the files have no test split, or one of fewer than four cameras.
+        """
+        from cvtgs.io import load_cameras  # noqa: PLC0415 (a scene in memory needs no formats)
+
+        try:
+            cameras = load_cameras(self.source, split="test")
+        except CvtgsError:
+            return None
+        return cameras if _LEAST_TEST <= len(cameras) < len(self.cameras) else None
 
 
 def find_own_cameras(scene: GaussianScene, path: str | os.PathLike[str]) -> OwnCameras | None:
