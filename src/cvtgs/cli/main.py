@@ -96,7 +96,8 @@ def _lock(options: argparse.Namespace) -> AbstractContextManager[None]:
 @contextmanager
 def _without_empty_folder(options: argparse.Namespace) -> Iterator[None]:
     """After an error, remove the output folder if the command made it and left it empty."""
-    folder: Path = getattr(options, "folder", None) or getattr(options, "output", Path())
+    named = (getattr(options, name, None) for name in ("folder", "output"))
+    folder = next((path for path in named if path is not None), Path())
     is_new = not folder.exists()
     try:
         yield
