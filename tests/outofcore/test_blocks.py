@@ -19,6 +19,7 @@ from cvtgs.math.frames import robust_frame
 from cvtgs.outofcore import block_count, read_bytes, simplify_file
 from cvtgs.outofcore.scan import RowRange, add_totals, partition_space, scan_range
 from cvtgs.views import automatic_views
+from hard_scenes import ball
 from scenes import random_scene, same_bits
 
 
@@ -197,6 +198,20 @@ def test_gaussians_of_blocks_without_cells_are_merged(tmp_path):
     assert report.filtered_count == 0
     assert report.largest_cell >= (500 - kept) / 2
     assert report.energy > 0
+
+
+@pytest.mark.parametrize("blocks", [2, 8])
+def test_a_site_without_points_of_its_block_gets_a_near_one(tmp_path, blocks):
+    """A far point would make a huge cell, together with points of other blocks."""
+    scene, path = ball(1500, torch.float32), tmp_path / "in.ply"
+    cvtgs.save(scene, path)
+    simplifier = Simplifier(None, preset="paper", device="cpu")
+    report = simplify_file(
+        path, tmp_path / "out.ply", count=100, blocks=blocks, simplifier=simplifier
+    )
+    assert report.refilled_cells >= 1
+    largest = cvtgs.load(tmp_path / "out.ply").log_scales.max()
+    assert largest < simplifier.simplify(scene, count=100).log_scales.max() + 0.2
 
 
 def test_a_filter_that_leaves_too_few_is_switched_off(tmp_path):

@@ -10,14 +10,15 @@ from cvtgs.cvt import (
     centroids,
     choose_search,
     choose_seeds,
-    fill_empty_cells,
     gaussian_weights,
+    nearest_scipy,
     sample_points,
     weighted_sums,
 )
 from cvtgs.devices import one_thread
 from cvtgs.grouping import curve_order, embed_rows
 from cvtgs.io.tensors import map_tensors, save_tensors
+from cvtgs.math.segments import label_argmin
 from cvtgs.outofcore.allocate import cell_parts
 from cvtgs.outofcore.halo import Assignment, assign_points, bounding_box, other_blocks
 from cvtgs.outofcore.job import Job
@@ -67,7 +68,8 @@ def accumulate(job: Job, iteration: int, block: int) -> float:
         return float(map_tensors(path)[0]["energy"])
     tensors, _ = map_tensors(job.sample_path(block))
     points, weights = tensors["points"], tensors["weights"]
-    count, found = _assign(job, iteration, block, points)
+    sites, found = _assign(job, iteration, block, points)
+    count = len(sites)
     # Remote sites are numbered after the own ones.
     away = (found.blocks >= 0).nonzero()[:, 0]
     pairs = torch.stack([found.blocks[away], found.labels[away]], dim=1)
@@ -113,8 +115,8 @@ def assign(job: Job, iterations: int, block: int) -> None:
         return
     order = map_tensors(job.sample_path(block))[0]["order"]
     order, points, weights = _embedded_rows(job, block, order)
-    count, found = _assign(job, iterations, block, points)
-    found, refilled = _fill_empty(found, count, weights)
+    sites, found = _assign(job, iterations, block, points)
+    found, refilled = _fill_empty(found, points, sites, weights)
     energy = (weights * found.squared).sum()
     rows = order.long()
     owners, labels = torch.empty_like(rows), torch.empty_like(rows)
@@ -149,8 +151,8 @@ def _embedded_rows(job: Job, block: int, order: Tensor | None = None) -> Embedde
     return EmbeddedRows(order, points, weights)
 
 
-def _assign(job: Job, iteration: int, block: int, points: Tensor) -> tuple[int, Assignment]:
-    """Return the number of own sites, and the nearest site of any block for every point."""
+def _assign(job: Job, iteration: int, block: int, points: Tensor) -> tuple[Tensor, Assignment]:
+    """Return the own sites, and the nearest site of any block for every point."""
     has_duplicates = job.read_scan().plan.duplicates.active
     nearest = choose_search(has_duplicates=has_duplicates)
     sites = points[:0].double()
@@ -162,21 +164,39 @@ def _assign(job: Job, iteration: int, block: int, points: Tensor) -> tuple[int, 
         if other != block
     }
     others = other_blocks(paths, name="sites")
-    return len(sites), assign_points(points, sites, others, nearest=nearest)
+    return sites, assign_points(points, sites, others, nearest=nearest)
 
 
-def _fill_empty(found: Assignment, count: int, weights: Tensor) -> tuple[Assignment, int]:
-    """Assign a point of the block to every empty own site; also return the number of these."""
-    if count == len(weights):  # then all points are seeds, in the same order
+def _fill_empty(
+    found: Assignment, points: Tensor, sites: Tensor, weights: Tensor
+) -> tuple[Assignment, int]:
+    """Assign a point of the block to every own site without one; also return their number.
+
+    Each gets the nearest point that its cell can spare. Unlike in one piece, it may have points of
+    other blocks, so a far point, such as the costliest one, would make a huge cell.
+    """
+    count = len(sites)
+    if count == len(points):  # then all points are seeds, in the same order
         own = torch.arange(count)
         return Assignment(torch.full_like(own, -1), own, torch.zeros_like(found.squared)), 0
-    away = found.blocks >= 0
-    labels = torch.where(away, count, found.labels)
-    total = count + int(away.any())
-    labels, squared, refilled = fill_empty_cells(labels, weights, found.squared, total)
-    stays = labels < count
-    blocks = torch.where(stays, -1, found.blocks)
-    return Assignment(blocks, torch.where(stays, labels, found.labels), squared), refilled
+    owned = torch.where(found.blocks < 0, found.labels, count)
+    stays = label_argmin(weights * found.squared, owned, count + 1)[:count]
+    empty = left = (stays == len(points)).nonzero()[:, 0]
+    blocks, labels, squared = found.blocks.clone(), found.labels.clone(), found.squared.clone()
+    movable = torch.ones(len(points), dtype=torch.bool)
+    movable[stays[stays < len(points)]] = False
+    while len(left):
+        rows = movable.nonzero()[:, 0]
+        near, distances = nearest_scipy(sites[left], points[rows])
+        several, numbers = torch.unique(near, return_inverse=True)
+        closest = label_argmin(distances, numbers, len(several))  # a point for one site only
+        moved = rows[several]
+        blocks[moved], labels[moved], squared[moved] = -1, left[closest], distances[closest]
+        movable[moved] = False
+        remains = torch.ones(len(left), dtype=torch.bool)
+        remains[closest] = False
+        left = left[remains]
+    return Assignment(blocks, labels, squared), len(empty)
 
 
 def _save_sites(job: Job, iteration: int, block: int, sites: Tensor) -> None:
