@@ -166,7 +166,7 @@ def with_finite_opacities(scene: GaussianScene) -> GaussianScene:
 
 
 def standardized(scene: GaussianScene) -> GaussianScene:
-    """Clamp opacities to strictly inside (0, 1) and normalize quaternions.
+    """Clamp opacities to strictly inside (0, 1), and scales to finite ones; normalize quaternions.
 
     Args:
         scene: A scene with valid rows.
@@ -184,7 +184,9 @@ def standardized(scene: GaussianScene) -> GaussianScene:
     is_unit = ((squared_norms - 1).abs() <= UNIT_TOLERANCE)[:, None]
     quats = torch.where(is_unit, scene.quats, parameters.normalize_quats(scene.quats))
     logits = parameters.clamp_logits(scene.logit_opacities)
-    return scene.with_tensors({"quats": quats, "logit_opacities": logits}, scene.extras)
+    log_scales = scene.log_scales.clamp(max=MAX_LOG_SCALE)
+    tensors = {"quats": quats, "log_scales": log_scales, "logit_opacities": logits}
+    return scene.with_tensors(tensors, scene.extras)
 
 
 def warn_of_lost_digits(scene: GaussianScene) -> None:

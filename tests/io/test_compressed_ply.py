@@ -114,6 +114,26 @@ def test_large_scenes_are_split_into_small_chunks(tmp_path: Path) -> None:
     assert float(error.median()) < 1.5e-3
 
 
+@pytest.mark.parametrize("far", [1e2, 1e4, 1e6])
+@pytest.mark.parametrize("rows", [[0], [5, 900, 2000]])
+def test_flyaways_round_only_what_is_hardly_visible(
+    tmp_path: Path, far: float, rows: list[int]
+) -> None:
+    scene = storable_scene(2100, degree=0, seed=3)
+    means, logits = scene.means.clone(), scene.logit_opacities.clone()
+    means[rows] = far
+    logits[1000:1400] = -9.0
+    scene = scene.with_tensors(means=means, logit_opacities=logits)
+    path = tmp_path / "far.compressed.ply"
+    save(scene, path)
+    found = load(path)
+    near = (means < far).all(dim=1) & (logits > -9)
+    found_means = found.means[(found.means < 0.9 * far).all(dim=1)]
+    nearest = torch.cdist(means[near].double(), found_means.double()).amin(dim=1)
+    assert nearest.max() < 0.01 * means[near].std()
+    assert (found.means > 0.9 * far).all(dim=1).sum() == len(rows)
+
+
 def test_equal_gaussians_are_stored_exactly(tmp_path: Path) -> None:
     path = tmp_path / "a.compressed.ply"
     scene = storable_scene(1).select(torch.zeros(300, dtype=torch.int64))

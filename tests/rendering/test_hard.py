@@ -89,6 +89,16 @@ def test_hard_gaussians_have_finite_gradients(backend, dtype):
 
 
 @backends
+@dtypes
+@pytest.mark.parametrize("log_scale", [20.0, 44.0, 80.0, 88.7])
+def test_a_gaussian_of_any_valid_scale_is_drawn(backend, dtype, log_scale):
+    scene = scene_of(((0.3, 0, 5), (1.0, 1.0, 1.0), 0.5, (1.0, 0.5, 0)), dtype=dtype)
+    scene = scene.with_tensors({"log_scales": torch.full_like(scene.log_scales, log_scale)})
+    alpha = render(scene, straight(), backend=backend).alpha
+    torch.testing.assert_close(alpha, torch.full_like(alpha, 0.5))
+
+
+@backends
 def test_rows_that_are_not_finite_are_not_rendered(backend):
     good = random_scene(10, degree=0, size=0.3)
     for name in ("means", "quats", "log_scales", "logit_opacities"):

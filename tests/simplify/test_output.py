@@ -7,6 +7,7 @@ import torch
 
 from cvtgs import GaussianScene, ProgressEvent, Simplifier, SimplifyConfig
 from cvtgs.errors import CvtgsError, DeviceError
+from cvtgs.validity import invalid_rows
 from scenes import assert_standard, random_scene, same_bits
 
 each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])
@@ -56,6 +57,14 @@ def test_infinite_opacities_are_valid_input():
         result = Simplifier(device="cpu").run(scene, rho)
         assert result.report.invalid_count == 0
         assert bool(result.scene.logit_opacities.isfinite().all())
+
+
+@pytest.mark.parametrize("preset", ["draft", "standard", "paper"])
+def test_the_largest_valid_scales_stay_valid(preset):
+    scene = random_scene(300, degree=0)
+    scene = scene.with_tensors(log_scales=torch.full((300, 3), 88.5))
+    small = Simplifier(preset=preset, device="cpu").simplify(scene, count=15)
+    assert not invalid_rows(small)
 
 
 def test_mass_of_haze_is_conserved_without_inflation_and_network():

@@ -138,11 +138,16 @@ def restore_largest(
     return quats
 
 
+def in_radii(means: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Return positions about the middle of the scene, in radii that contain 90 %."""
+    away = means - np.median(means, axis=0)
+    radius = np.quantile(np.abs(away).max(axis=1), 0.9) or 1.0
+    return away / np.float32(radius)
+
+
 def morton_rows(means: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
     """Return the order along a Morton curve; distant Gaussians do not coarsen it."""
-    middle = np.median(means, axis=0)
-    away = means - middle
-    radius = np.quantile(np.abs(away).max(axis=1), 0.9) or 1.0
-    inside = np.sign(away) * np.log1p(np.abs(away) / np.float32(radius))
+    away = in_radii(means)
+    inside = np.sign(away) * np.log1p(np.abs(away))
     order: Int[np.ndarray, n] = morton_order(torch.from_numpy(inside)).numpy()
     return order

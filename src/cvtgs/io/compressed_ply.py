@@ -15,6 +15,7 @@ from cvtgs.io.arrays import (
     arrays_of,
     colors_of_sh0,
     drop_largest,
+    in_radii,
     logits_of_bytes,
     morton_rows,
     opacity_bytes,
@@ -40,6 +41,9 @@ Rows = NDArray[Any]
 
 _CHUNK_ROWS = 256
 """Gaussians in a chunk, which share its ranges."""
+
+_FLYAWAY_RADII = 30.0
+"""Distance of a flyaway from the middle, in radii that contain 90 % of the scene."""
 
 _RANGES = tuple(
     f"{end}_{name}"
@@ -204,10 +208,10 @@ def write_compressed_ply(scene: GaussianScene, file: BinaryIO) -> None:
     """Write a compressed PLY file.
 
     Rows are sorted along a Morton curve, so that the 256 Gaussians of a chunk lie close together
-    and their common ranges are small.
+    and their common ranges are small. Flyaways come last.
     """
     arrays = arrays_of(scene)
-    order = morton_rows(arrays.means)
+    order = _flyaways_last(arrays, morton_rows(arrays.means))
     rest = arrays.shN[order].transpose(0, 2, 1).reshape(len(order), -1)
     elements = [
         ("chunk", -(-len(order) // _CHUNK_ROWS), tuple((name, "float") for name in _RANGES)),
@@ -221,6 +225,26 @@ def write_compressed_ply(scene: GaussianScene, file: BinaryIO) -> None:
     file.write(ranges.astype("<f4").tobytes())
     file.write(words.astype("<u4").tobytes())
     file.write(_rest_bytes(rest).tobytes())
+
+
+def _flyaways_last(arrays: Arrays, order: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Move flyaways to the last chunks, whose positions they round coarsely.
+
+    Chunks are full except the last one, so the first of these also gets other Gaussians: those that
+    are least visible.
+    """
+    far = np.abs(in_radii(arrays.means)).max(axis=1) > _FLYAWAY_RADII
+    count, total = int(far.sum()), len(order)
+    others = (total - count) % _CHUNK_ROWS
+    if count == 0 or others == total - count:
+        return order
+    areas = np.sort(arrays.log_scales, axis=1)[:, 1:].sum(axis=1)
+    visible = areas + np.minimum(arrays.logit_opacities, 0)  # about the logarithm of the mass
+    visible[far] = np.inf
+    last = far.copy()
+    last[np.argsort(visible, kind="stable")[:others]] = True
+    faint, far = (last & ~far)[order], far[order]
+    return np.concatenate([order[~last[order]], order[faint], order[far]])
 
 
 def _packed(

@@ -236,13 +236,12 @@ def _candidates(scene: GaussianScene, camera: Pinhole, beside: CameraTensors) ->
     x, y, z = (_offsets(scene.means, beside) @ rotation.T).unbind(1)
     steepest = sum(max(abs(low), abs(high)) ** 2 for low, high in camera.slopes)
     stretch = rotation.norm() * max(camera.focal) * (1 + steepest) ** 0.5 / z
-    deviation = stretch * scene.log_scales.amax(dim=1).exp()
+    largest = scene.log_scales.amax(dim=1).exp()
     # At 3.33 standard deviations even an opacity of 1 falls to 1/255.
-    radius = 3.34 * deviation + 3.34 * camera.dilation**0.5
+    radius = 3.34 * stretch * largest + 3.34 * camera.dilation**0.5
     quats = scene.quats.abs().amax(dim=1)
-    # Squares of larger deviations would overflow.
-    keep: Tensor = deviation < torch.finfo(scene.dtype).max ** 0.5 / 4
-    keep &= (z >= NEAR_PLANE) & torch.isfinite(z) & torch.isfinite(quats) & (quats > 0)
+    keep: Tensor = torch.isfinite(largest) & torch.isfinite(quats) & (quats > 0)
+    keep &= (z >= NEAR_PLANE) & torch.isfinite(z)
     for way, focal, principal, size in zip(
         (x, y), camera.focal, camera.principal, camera.size, strict=True
     ):
@@ -261,7 +260,9 @@ def _image_axes(
     slopes = torch.minimum(torch.maximum(local[:, :2] / local[:, 2:], beside.low), beside.high)
     stretch = beside.focal / local[:, 2:]
     jacobian = stretch[:, :, None] * (turned[:, :2] - slopes[:, :, None] * turned[:, 2:])
-    return jacobian * torch.exp(scene.log_scales.index_select(0, rows))[:, None, :]
+    axes = jacobian * torch.exp(scene.log_scales.index_select(0, rows))[:, None, :]
+    longest = torch.finfo(axes.dtype).max ** 0.5 / 4  # squares of longer axes would overflow
+    return axes.clamp(-longest, longest)
 
 
 def _ellipses(axes: Float[Tensor, "m 2 3"], dilation: float) -> tuple[Tensor, Tensor]:
