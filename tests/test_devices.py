@@ -20,7 +20,6 @@ from cvtgs.devices import (
     in_threads,
     move_together,
     one_thread,
-    resolve_device,
     thread_count,
     usable_device,
     within_memory,
@@ -63,7 +62,6 @@ def test_tensors_that_are_there_do_not_move():
 )
 def test_auto_is_cuda_for_data_on_the_cpu(monkeypatch, has_cuda, home, found):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: has_cuda)
-    assert resolve_device("auto") is None
     assert chosen_device("auto", home) == torch.device(found)
 
 
@@ -117,7 +115,7 @@ def test_other_errors_are_raised_at_once(where):
 
 @pytest.mark.parametrize("name", ["tpu9", "cpu:seven"])
 def test_a_missing_device_is_an_error(name):
-    for choose in (usable_device, resolve_device, chosen_device):
+    for choose in (usable_device, chosen_device):
         with pytest.raises(DeviceError, match=f"device '{name}' cannot be used here: "):
             choose(name)
 

@@ -105,3 +105,11 @@ def test_no_valid_row_is_an_error(count):
     with pytest.raises(InvalidSceneError) as caught:
         describe(scene)
     assert str(caught.value) == f"none of the {count} Gaussians is valid."
+
+
+def test_figures_that_overflow_can_be_read_back():
+    """The squares of such coefficients are infinite in float32."""
+    bright = random_scene(50)
+    found = describe(bright.with_tensors(shN=torch.full_like(bright.shN, 1e30)))
+    assert found.plan.sh.figure == float("inf")
+    assert type(found).model_validate_json(found.model_dump_json()) == found

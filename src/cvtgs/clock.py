@@ -34,12 +34,7 @@ class StageCost(pydantic.BaseModel):
 
 
 class StageClock:
-    """A clock that measures consecutive stages and reports progress to a listener.
-
-    Args:
-        listener: Called when a stage starts, advances and ends.
-        device: Device that the stages compute on; CUDA is synchronised at the end of each.
-    """
+    """A clock that measures consecutive stages and reports progress; CUDA is synchronised."""
 
     def __init__(self, listener: ProgressListener, device: torch.device) -> None:
         self._listener = listener
@@ -48,15 +43,7 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str, total: int = 1) -> Iterator[Callable[[int], None]]:
-        """Measure the body of the ``with`` statement.
-
-        Args:
-            name: Name of the stage.
-            total: Number of steps of the stage.
-
-        Yields:
-            A function to call with the number of finished steps.
-        """
+        """Measure the body of the ``with`` statement; yield a function of the finished steps."""
 
         def advance(done: int) -> None:
             if self._listener is not silent:
@@ -85,15 +72,7 @@ class StageClock:
 
 
 def peak_memory_bytes() -> int:
-    """Return the peak resident size of this process so far.
-
-    Returns:
-        Bytes; 0 if the system does not report it (Windows).
-
-    Example:
-        >>> peak_memory_bytes() >= 0
-        True
-    """
+    """Return the peak resident size of this process so far; 0 on Windows, which has none."""
     if sys.platform == "win32":
         return 0
     import resource  # noqa: PLC0415 (not on Windows)

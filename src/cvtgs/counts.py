@@ -13,21 +13,7 @@ _UNITS = {"": 1, "k": 1000, "m": 1_000_000}
 
 
 def read_ratio(text: str) -> float:
-    """Parse a ratio that is written as a number or in per cent.
-
-    Args:
-        text: For example ``0.05`` or ``5%``.
-
-    Returns:
-        The ratio, which may be out of range.
-
-    Raises:
-        InvalidArgumentError: The text is not a number.
-
-    Example:
-        >>> read_ratio("0.7%")
-        0.007
-    """
+    """Parse a ratio such as ``0.05`` or ``5%``, which may be out of range."""
     match = re.fullmatch(
         r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|nan|inf)\s*(%?)\s*", text, re.I
     )
@@ -37,21 +23,7 @@ def read_ratio(text: str) -> float:
 
 
 def read_count(text: str) -> int:
-    """Parse a number of Gaussians; k stands for thousands and M for millions.
-
-    Args:
-        text: For example ``50000``, ``50_000``, ``50k`` or ``1.5M``.
-
-    Returns:
-        The count, at least 1.
-
-    Raises:
-        InvalidArgumentError: The text is not a whole number above 0.
-
-    Example:
-        >>> read_count("50k"), read_count("1.5M")
-        (50000, 1500000)
-    """
+    """Parse a number of Gaussians such as ``50_000``, ``50k`` or ``1.5M``; at least 1."""
     match = re.fullmatch(r"\s*(\d[\d_]*(?:\.\d+)?)\s*([km]?)\s*", text.lower())
     count = Decimal(match[1]) * _UNITS[match[2]] if match else Decimal(0)
     if count < 1 or count != int(count):
@@ -111,13 +83,7 @@ def target_count(
 
 
 def written(number: float) -> str:
-    """Return a number as it would be written, also one of numpy, whose float32 are shorter.
-
-    Example:
-        >>> import numpy as np
-        >>> written(0.1), written(np.float32(0.1))
-        ('0.1', '0.1')
-    """
+    """Return a number as it would be written, also one of numpy, whose float32 are shorter."""
     return str(number) if "float" in type(number).__name__ else str(float(number))
 
 
@@ -132,42 +98,14 @@ def _whole(number: object) -> int:
 
 
 def shortfall(valid: int, total: int, target: int) -> str:
-    """Return the reason why fewer Gaussians are kept than asked for; empty if there is none.
-
-    Args:
-        valid: Number of valid Gaussians.
-        total: Number of Gaussians.
-        target: Number of Gaussians to keep.
-
-    Returns:
-        One sentence without its full stop.
-
-    Example:
-        >>> shortfall(9, 10, 10)
-        'only 9 of 10 Gaussians are valid'
-    """
+    """Return the reason why fewer Gaussians are kept than asked for; empty if there is none."""
     return f"only {valid} of {total} Gaussians are valid" if valid < target else ""
 
 
 def shared_out(total: int, shares: Sequence[float], *, rooms: Sequence[int]) -> list[int]:
     """Split a count in proportion to shares by largest remainder, with an upper limit for each.
 
-    Args:
-        total: Count to split; at least the number of limits above 0, at most their sum.
-        shares: Numbers, at least 0.
-        rooms: Upper limit for each; where it is above 0, at least 1 is given.
-
-    Returns:
-        One count per share; they add up to ``total``. Of equal remainders the first wins.
-
-    Raises:
-        InvalidArgumentError: The total cannot be split within the limits.
-
-    Example:
-        >>> shared_out(10, [1.0, 1.0, 2.0], rooms=[9, 9, 9])
-        [3, 2, 5]
-        >>> shared_out(10, [0.0, 9.0, 1.0], rooms=[5, 3, 9])
-        [1, 3, 6]
+    Where the limit is above 0, at least 1 is given. Of equal remainders the first wins.
     """
     least = [min(1, room) for room in rooms]
     if not sum(least) <= total <= sum(rooms):

@@ -33,11 +33,6 @@ Result = TypeVar("Result")
 _SHORT_CHUNKS = ContextVar("short_chunks", default=False)
 
 
-def resolve_device(device: str | torch.device) -> torch.device | None:
-    """Return the named device, None for ``auto``; raise DeviceError if it cannot be used."""
-    return None if device == "auto" else usable_device(device)
-
-
 def usable_device(device: str | torch.device) -> torch.device:
     """Return the named device; raise DeviceError if it cannot be used."""
     try:
@@ -51,9 +46,9 @@ def usable_device(device: str | torch.device) -> torch.device:
 
 def chosen_device(device: str | torch.device, home: str | torch.device = "cpu") -> torch.device:
     """Return the named device; for ``auto``, CUDA (if any) for data on the CPU, else ``home``."""
-    resolved, home = resolve_device(device), torch.device(home)
-    if resolved is not None:
-        return resolved
+    if device != "auto":
+        return usable_device(device)
+    home = torch.device(home)
     return torch.device("cuda") if home.type == "cpu" and torch.cuda.is_available() else home
 
 
@@ -85,23 +80,12 @@ def move_together(tensors: Sequence[Tensor], device: torch.device) -> list[Tenso
 
 
 def chunk_length(length: int, device: torch.device) -> int:
-    """Return the length of a chunk on a device.
+    """Return the length of a chunk on a device, given its length on a CPU.
 
     A chunk that fits the caches of a CPU is too short for a GPU, where every chunk costs kernel
-    launches. The length depends on the total memory of the device, not on its free memory, so that
-    the same device gives the same bits.
-
-    Args:
-        length: Length of a chunk on a CPU.
-        device: Device to compute on.
-
-    Returns:
-        The same length on a CPU, and in the second attempt of :func:`within_memory`; elsewhere 32
-        times as much, or less on CUDA devices with less than 8 GiB.
-
-    Example:
-        >>> chunk_length(100, torch.device("cpu"))
-        100
+    launches; it is 32 times as long there, or less on CUDA devices with less than 8 GiB. The length
+    depends on the total memory of the device, not on its free memory, so that the same device gives
+    the same bits. In the second attempt of :func:`within_memory`, it is that of a CPU.
     """
     if device.type == "cpu" or _SHORT_CHUNKS.get():
         return length
@@ -120,24 +104,7 @@ def within_memory(
 ) -> Result:
     """Compute on a device; if it runs out of memory, retry with short chunks, then on the CPU.
 
-    Args:
-        compute: Takes the device and a note for the report, which is empty in the first attempt.
-        device: Device to compute on.
-        work: Description of the computation, for the error message.
-        may_leave: Whether to fall back to the CPU.
-
-    Returns:
-        The result of ``compute``.
-
-    Raises:
-        OutOfMemoryError: The device has too little memory, and the CPU may not be used.
-
-    Example:
-        >>> within_memory(
-        ...     lambda device, note: f"{device}{note}", torch.device("cpu"), work="a test",
-        ...     may_leave=False,
-        ... )
-        'cpu'
+    ``compute`` takes the device and a note for the report, which is empty in the first attempt.
     """
     note = ""
     for is_short in (False, True):
@@ -180,19 +147,8 @@ def in_threads(
     """Call a function for chunks in as many threads as torch uses; each call uses one thread.
 
     Chunks are too short for torch to parallelise its operations on them well. Every chunk gives
-    the same bits, whatever the number of threads.
-
-    Args:
-        function: Computes one chunk; must be thread-safe.
-        items: The chunks.
-        device: Device of the computation; on other devices than CPUs, chunks run sequentially.
-
-    Returns:
-        The results, in the order of the items, each computed when it is requested or earlier.
-
-    Example:
-        >>> list(in_threads(abs, [-1, 2, -3], torch.device("cpu")))
-        [1, 2, 3]
+    the same bits, whatever the number of threads. On other devices than CPUs, chunks run
+    sequentially. Results come in the order of the items, computed when requested or earlier.
     """
     threads = torch.get_num_threads()
     if device.type != "cpu" or threads == 1 or thread_count() == 1:
@@ -205,18 +161,7 @@ def in_chunks(
 ) -> list[Result]:
     """Call a function for consecutive ranges of rows, as :func:`in_threads` does.
 
-    Args:
-        function: Computes one range; must be thread-safe.
-        total: Number of rows.
-        length: Length of a range on a CPU; see :func:`chunk_length`.
-        device: Device of the computation.
-
-    Returns:
-        The results, in order; that of an empty range if there are no rows.
-
-    Example:
-        >>> in_chunks(lambda part: part.stop, 5, 2, torch.device("cpu"))
-        [2, 4, 5]
+    ``length`` is that on a CPU. Without rows, there is one empty range.
     """
     step = chunk_length(length, device)
     starts = range(0, max(1, total), step)

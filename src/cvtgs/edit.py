@@ -242,7 +242,7 @@ def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
         changes["log_scales"] = log_scales.to(scene.dtype)
     if motion.shift != _NO_SHIFT:
         means = means + means.new_tensor(motion.shift)
-    return scene.with_tensors({"means": means.to(scene.dtype), **changes}, scene.extras)
+    return scene.with_tensors({"means": means.to(scene.dtype), **changes})
 
 
 def merge(scenes: Sequence[GaussianScene]) -> GaussianScene:

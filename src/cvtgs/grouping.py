@@ -13,6 +13,7 @@ from cvtgs import cells, cvt
 from cvtgs.analysis import SceneAnalysis
 from cvtgs.config import AllocationConfig, SimplifyConfig
 from cvtgs.devices import HOST, move_together
+from cvtgs.filters import filter_rows
 from cvtgs.math.frames import RobustFrame, morton_order
 from cvtgs.math.segments import label_sums
 from cvtgs.scene import GaussianScene
@@ -36,7 +37,6 @@ class Grouping(NamedTuple):
         refilled: Number of cells that were empty after Lloyd and took a Gaussian from another.
         energies: Energy before every Lloyd iteration, over the Gaussians that Lloyd samples.
         energy: Energy of the final cells, over all Gaussians.
-        backend: Name of the nearest-site search.
     """
 
     partition: cells.Partition
@@ -44,7 +44,6 @@ class Grouping(NamedTuple):
     refilled: int
     energies: tuple[float, ...]
     energy: float
-    backend: str
 
 
 class WeightedRows(NamedTuple):
@@ -323,7 +322,6 @@ def _grouping(
         refilled=tessellation.refilled,
         energies=tessellation.energies,
         energy=tessellation.energy,
-        backend=tessellation.backend,
     )
 
 
@@ -360,22 +358,22 @@ def embed_rows(
 
 
 def order_rows(
-    scene: GaussianScene,
-    rows: Int[Tensor, "k"],
-    analysis: SceneAnalysis,
-    config: SimplifyConfig,
+    scene: GaussianScene, analysis: SceneAnalysis, config: SimplifyConfig
 ) -> OrderedRows:
     """Compute the part of grouping that does not depend on the number of cells, for reuse.
 
+    :func:`group_rows` uses it only if the filter leaves enough rows for its target; otherwise the
+    filter brings some rows back, and this part is computed again.
+
     Args:
         scene: The Gaussians.
-        rows: Rows that passed the filter.
         analysis: Frame, apparent areas and effect plan.
-        config: Weights.
+        config: Filter and weights.
 
     Returns:
         The argument ``ordered`` of :func:`group_rows`; 160 bytes per Gaussian.
     """
+    rows = filter_rows(scene, analysis, 1, config.filter).rows
     points = _weighted(scene, rows, analysis, config)
     return OrderedRows(rows, points._replace(moments=_moments(points, analysis)))
 

@@ -1,12 +1,12 @@
 """SceneInfo: facts about a scene, without simplifying it."""
 
-import pydantic
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.analysis import EffectPlan, analyze, select_columns
 from cvtgs.config import SimplifyConfig
+from cvtgs.config.base import Record
 from cvtgs.errors import InvalidSceneError
 from cvtgs.math import parameters
 from cvtgs.scene import SceneLike, as_scene
@@ -18,7 +18,7 @@ FAINT = 0.1
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 
 
-class SceneInfo(pydantic.BaseModel):
+class SceneInfo(Record):
     """Facts about a scene; statistics of values are over its valid rows.
 
     Attributes:
@@ -40,8 +40,6 @@ class SceneInfo(pydantic.BaseModel):
         extra_columns: Names of the columns beyond the standard ones.
         plan: The effects that the scene calls for.
     """
-
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
     count: int
     sh_degree: int
@@ -93,7 +91,7 @@ def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInf
     valid = scene.select(~bad) if invalid else scene
     config = config or SimplifyConfig()
     analysis = analyze(select_columns(valid, config.effects), config)
-    frame, opacities = analysis.frame, valid.opacities
+    frame, opacities = analysis.frame, analysis.opacities
     masses = analysis.areas * opacities
     faint = opacities < FAINT
     total = masses.sum()

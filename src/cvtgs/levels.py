@@ -8,6 +8,7 @@ from typing import Self
 import pydantic
 import torch
 
+from cvtgs.boxes import Corner
 from cvtgs.config.base import Record, explain
 from cvtgs.counts import written
 from cvtgs.errors import FileFormatError, InvalidArgumentError
@@ -23,8 +24,6 @@ __all__ = ["INDEX_NAME", "LevelEntry", "LevelsIndex", "add_scores", "level_names
 
 INDEX_NAME = "levels.json"
 """Name of the index file, in the folder of the levels."""
-
-Corner = tuple[float, float, float]
 
 
 class LevelEntry(Record):
@@ -84,8 +83,8 @@ class LevelEntry(Record):
             count=len(stored),
             bytes=path.stat().st_size,
             geometric_error=level.geometric_error,
-            box_min=_corner(lowest),
-            box_max=_corner(highest),
+            box_min=tuple(lowest.tolist()),
+            box_max=tuple(highest.tolist()),
             nested=level.nested,
             seconds=level.report.seconds,
         )
@@ -134,11 +133,6 @@ class LevelsIndex(Record):
             JSON text that ends with a line break.
         """
         return self.model_dump_json(indent=2) + "\n"
-
-
-def _corner(point: torch.Tensor) -> Corner:
-    x, y, z = point.tolist()
-    return x, y, z
 
 
 def level_names(rhos: Sequence[float], suffix: str = ".ply") -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from cvtgs.clock import StageClock
 from cvtgs.config import MergeConfig, SimplifyConfig
 from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
-from cvtgs.grouping import Grouping, OrderedRows, group_cells, group_rows, order_rows
+from cvtgs.grouping import Grouping, OrderedRows, group_cells, group_rows
 from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import MergeNet, PublishedMergeNet, correct_cells
 from cvtgs.report import CellStatistics, MatchReport
@@ -70,7 +70,7 @@ class Reduced(NamedTuple):
     matching: MatchReport | None = None
 
 
-def reduce_scene(
+def reduce_scene(  # noqa: PLR0913 (options by name)
     scene: GaussianScene,
     analysis: SceneAnalysis,
     target: int,
@@ -78,6 +78,7 @@ def reduce_scene(
     *,
     net: MergeNet | PublishedMergeNet | None,
     clock: StageClock,
+    total: int = 0,
     finest: Reduced | None = None,
     ordered: OrderedRows | None = None,
 ) -> Reduced:
@@ -90,14 +91,16 @@ def reduce_scene(
         config: The configuration.
         net: Network that corrects merged Gaussians, on the same device; None for no correction.
         clock: Measures each stage.
+        total: Number of Gaussians before invalid rows were dropped.
         finest: A finer level of the same scene, whose cells are grouped; None groups Gaussians.
-        ordered: Result of :func:`order_gaussians` for the scene; None computes it.
+        ordered: Result of :func:`cvtgs.grouping.order_rows` for the scene; None computes it.
 
     Returns:
-        The small scene, with its cells; all Gaussians, with finite opacities, if all are kept.
+        The small scene, with its cells. If all Gaussians are kept, they have finite opacities, and
+        are standardized if the target is below ``total``.
     """
     if target >= len(scene.means):
-        return Reduced(with_finite_opacities(scene))
+        return Reduced(standardized(scene) if target < total else with_finite_opacities(scene))
     used = drop_unused_bands(scene, analysis.plan)
     iterations = config.cvt.iterations + 1
     if finest is None or finest.merged is None or finest.grouping is None:
@@ -146,21 +149,9 @@ def reduce_scene(
         refilled_cells=grouping.refilled,
         energies=grouping.energies,
         energy=grouping.energy,
-        backend=grouping.backend,
+        backend=cvt.SEARCH,
     )
     return Reduced(small, statistics, grouping, merged)
-
-
-def order_gaussians(
-    scene: GaussianScene, analysis: SceneAnalysis, config: SimplifyConfig
-) -> OrderedRows:
-    """Compute the target-independent part of grouping, for :func:`reduce_scene`.
-
-    It is used only if the filter leaves enough rows for the target; otherwise the filter brings
-    some rows back, and grouping computes this part again.
-    """
-    filtered = filter_rows(scene, analysis, 1, config.filter)
-    return order_rows(scene, filtered.rows, analysis, config)
 
 
 def merge_and_inflate(
@@ -228,28 +219,16 @@ def shape_merged(
     )
 
 
-class LevelFacts(NamedTuple):
-    """The error of a level, and the assignment of its Gaussians.
-
-    Attributes:
-        geometric_error: Root mean square distance from Gaussians to those that replace them,
-            weighted by apparent mass; 0 if all are kept.
-        assignment: ``(n,)`` row of the small Gaussian that represents each input row, int32, on
-            the CPU; -1 for dropped rows. None if all are kept.
-    """
-
-    geometric_error: float = 0.0
-    assignment: Int[Tensor, "n"] | None = None
-
-
-def level_facts(scene: GaussianScene, analysis: SceneAnalysis, reduced: Reduced) -> LevelFacts:
-    """Compute the geometric error of a small scene, and the assignment of rows to its Gaussians."""
+def level_facts(
+    scene: GaussianScene, analysis: SceneAnalysis, reduced: Reduced
+) -> tuple[float, Int[Tensor, "n"] | None]:
+    """Compute error and assignment of a level, as in :class:`cvtgs.Level`, on the CPU."""
     if reduced.grouping is None:
-        return LevelFacts()
+        return 0.0, None
     partition = reduced.grouping.partition
     masses = analysis.apparent_areas * analysis.opacities
     error = geometric_error(scene, reduced.scene, partition, masses=masses)
-    return LevelFacts(error, partition.labels(len(scene)).cpu())
+    return error, partition.labels(len(scene)).cpu()
 
 
 def nests_in(target: int, finest: Reduced | None) -> bool:

@@ -88,28 +88,9 @@ def line_chart(
     width: int = 1000,
     height: int = 500,
 ) -> bytes:
-    """Draw panels of lines under one legend.
+    """Draw panels of lines, row by row and under one legend, as a PNG file.
 
-    Args:
-        panels: Panels, row by row.
-        columns: Number of panels in a row.
-        share_y: Whether the panels of a row share their y axis.
-        width: Image width in pixels, at least 100.
-        height: Image height in pixels, at least 100.
-
-    Returns:
-        A PNG file; the same arguments give the same bytes with the same matplotlib.
-
-    Raises:
-        InvalidArgumentError: There is nothing to draw; the x, y, labels or hollow flags of a series
-            differ in number; there are more names than styles; the size is too small; or a value
-            on a logarithmic axis is not positive.
-        MissingDependencyError: matplotlib is not installed.
-
-    Example:
-        >>> loss = Series(name="loss", x=[0, 1, 2], y=[1.0, 0.5, 0.4])
-        >>> line_chart([Panel(series=[loss], x_label="step")], width=400, height=300)[1:4]
-        b'PNG'
+    The same arguments give the same bytes with the same matplotlib.
     """
     _check(panels, columns, size=(width, height))
     figure = _figure(width / DPI, height / DPI)

@@ -24,18 +24,13 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shortfall, target_count
 from cvtgs.devices import chosen_device, within_memory
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.grouping import OrderedRows, add_neighbors
+from cvtgs.grouping import OrderedRows, add_neighbors, order_rows
 from cvtgs.mergenet import Checkpoint, MergeNet, PublishedMergeNet
-from cvtgs.pipeline import Reduced, level_facts, nests_in, order_gaussians, reduce_scene
+from cvtgs.pipeline import Reduced, level_facts, nests_in, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified, SimplifyReport
 from cvtgs.scene import GaussianScene, concatenate
-from cvtgs.validity import (
-    CheckedScene,
-    check_rows,
-    standardized,
-    with_finite_opacities,
-)
+from cvtgs.validity import CheckedScene, check_rows, with_finite_opacities
 
 Result = TypeVar("Result")
 
@@ -43,7 +38,7 @@ Result = TypeVar("Result")
 class Prepared:
     """A scene to simplify repeatedly; results that do not depend on the count are cached.
 
-    From the second run or ``warm_up`` on, 152 more bytes per Gaussian are cached, and another 48
+    From the second run or ``warm_up`` on, 160 more bytes per Gaussian are cached, and another 48
     once such a run keeps more than an eighth of the Gaussians.
 
     ``Simplifier.prepare`` creates instances. Every run gives the bits of ``Simplifier.run``; the
@@ -82,7 +77,7 @@ class Prepared:
         self._total = len(scene)
         self._refines = config.refine.enabled
         self._cameras, self._listener = cameras, listener
-        self._device = chosen_device(device or "auto", scene.device)
+        self._device = device or chosen_device("auto", scene.device)
         self._may_leave = device is None
         self._device_note = ""  # for the current run
         self._move_note = ""  # for all runs after a fallback to another device
@@ -152,7 +147,16 @@ class Prepared:
         if keep is None or not bool(keep.any()):
             self._order(valid, analysis, target, clock)
             self._has_run = True
-            reduced = self._reduce(valid, analysis, target, clock, ordered=self._ordered)
+            reduced = reduce_scene(
+                valid,
+                analysis,
+                target,
+                self._config,
+                net=self._net,
+                clock=clock,
+                total=self._total,
+                ordered=self._ordered,
+            )
             reduced = self._match(reduced, analysis, clock)
             return self._result(reduced, checked, analysis, target, clock)
         keep = keep.to(valid.device)
@@ -205,8 +209,16 @@ class Prepared:
             clock = StageClock(self._listener, device)
             checked, analysis = self._analyze(target, clock)
             valid, nested = checked.scene, nests_in(target, finest)
-            start = finest if nested else None
-            reduced = self._reduce(valid, analysis, target, clock, finest=start)
+            reduced = reduce_scene(
+                valid,
+                analysis,
+                target,
+                self._config,
+                net=self._net,
+                clock=clock,
+                total=self._total,
+                finest=finest if nested else None,
+            )
             if reduced.grouping is not None:
                 finest = finest or reduced
             error, assignment = level_facts(valid, analysis, reduced)
@@ -246,37 +258,9 @@ class Prepared:
         """Cache the target-independent part of grouping, from the second run on."""
         if self._has_run and self._ordered is None and target < len(valid):
             with clock.stage("order"):
-                self._ordered = order_gaussians(valid, analysis, self._config)
+                self._ordered = order_rows(valid, analysis, self._config)
         if self._ordered is not None:
             self._ordered = add_neighbors(self._ordered, target, self._config.allocation)
-
-    def _reduce(
-        self,
-        valid: GaussianScene,
-        analysis: SceneAnalysis,
-        target: int,
-        clock: StageClock,
-        *,
-        finest: Reduced | None = None,
-        ordered: OrderedRows | None = None,
-    ) -> Reduced:
-        """Reduce all valid Gaussians; if all can be kept, they stay unchanged.
-
-        If the target is below N but dropping invalid rows meets it, the others are standardized.
-        """
-        if target >= len(valid):
-            is_whole = target == self._total
-            return Reduced(with_finite_opacities(valid) if is_whole else standardized(valid))
-        return reduce_scene(
-            valid,
-            analysis,
-            target,
-            self._config,
-            net=self._net,
-            clock=clock,
-            finest=finest,
-            ordered=ordered,
-        )
 
     def _match(self, reduced: Reduced, analysis: SceneAnalysis, clock: StageClock) -> Reduced:
         """Match the small scene to the images of the analysis, if there are any."""

@@ -26,11 +26,4 @@ ProgressListener = Callable[[ProgressEvent], None]
 
 
 def silent(event: ProgressEvent) -> None:
-    """Ignore a progress event; the default listener.
-
-    Args:
-        event: The event to ignore.
-
-    Example:
-        >>> silent(ProgressEvent(stage="read", done=0, total=1))
-    """
+    """Ignore a progress event; the default listener."""

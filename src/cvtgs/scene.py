@@ -176,14 +176,7 @@ class GaussianScene:
         Returns:
             A new dictionary: means, quats, log_scales, logit_opacities, sh0, shN.
         """
-        return {
-            "means": self.means,
-            "quats": self.quats,
-            "log_scales": self.log_scales,
-            "logit_opacities": self.logit_opacities,
-            "sh0": self.sh0,
-            "shN": self.shN,
-        }
+        return {name: getattr(self, name) for name in _TENSORS}
 
     def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> Self:
         """Return some of the Gaussians, with all their tensors and extra columns.
@@ -196,15 +189,9 @@ class GaussianScene:
         """
         if rows.dtype == torch.bool:
             rows = rows.nonzero()[:, 0]
-        return replace(
-            self,
-            means=self.means.index_select(0, rows),
-            quats=self.quats.index_select(0, rows),
-            log_scales=self.log_scales.index_select(0, rows),
-            logit_opacities=self.logit_opacities.index_select(0, rows),
-            sh0=self.sh0.index_select(0, rows),
-            shN=self.shN.index_select(0, rows),
-            extras={name: column.index_select(0, rows) for name, column in self.extras.items()},
+        return self.with_tensors(
+            {name: tensor.index_select(0, rows) for name, tensor in self.tensors().items()},
+            {name: column.index_select(0, rows) for name, column in self.extras.items()},
         )
 
     def __getitem__(self, rows: slice | Sequence[int] | Tensor) -> Self:
@@ -280,7 +267,7 @@ class GaussianScene:
             return self
         count = spherical_harmonics.REST_COUNTS[degree]
         # A contiguous copy, since sums over cells read whole rows.
-        return self.with_tensors({"shN": self.shN[:, :count].contiguous()}, self.extras)
+        return self.with_tensors({"shN": self.shN[:, :count].contiguous()})
 
     def with_tensors(
         self,

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
-from cvtgs.devices import resolve_device
+from cvtgs.devices import usable_device
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.mergenet.checkpoint import checkpoint_for
 from cvtgs.prepared import Prepared
@@ -62,7 +62,7 @@ class Simplifier:
         self.config = config or SimplifyConfig.from_preset(
             "standard" if self.checkpoint is None else self.checkpoint.info.preset
         )
-        self._device = resolve_device(device)
+        self._device = None if device == "auto" else usable_device(device)
         self._listener = listener
 
     def __repr__(self) -> str:
@@ -172,15 +172,13 @@ class Simplifier:
             >>> [len(prepared.run(count=count).scene) for count in (10, 20)]
             [10, 20]
         """
-        full, config = as_scene(scene), self.config
-        if cameras is None and not isinstance(scene, GaussianScene):
-            own = None
-            if config.uses_images:
-                own = find_own_cameras(full, scene)
+        full = as_scene(scene)
+        if cameras is None and not isinstance(scene, GaussianScene) and self.config.uses_images:
+            own = find_own_cameras(full, scene)
             cameras = None if own is None else own.cameras
         return Prepared(
             full,
-            config,
+            self.config,
             checkpoint=self.checkpoint,
             device=self._device,
             cameras=cameras,

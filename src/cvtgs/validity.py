@@ -162,7 +162,7 @@ def with_finite_opacities(scene: GaussianScene) -> GaussianScene:
     if not bool(infinite.any()):
         return scene
     finite = torch.where(infinite, parameters.clamp_logits(logits), logits)
-    return scene.with_tensors({"logit_opacities": finite}, scene.extras)
+    return scene.with_tensors({"logit_opacities": finite})
 
 
 def standardized(scene: GaussianScene) -> GaussianScene:
@@ -186,7 +186,7 @@ def standardized(scene: GaussianScene) -> GaussianScene:
     logits = parameters.clamp_logits(scene.logit_opacities)
     log_scales = scene.log_scales.clamp(max=MAX_LOG_SCALE)
     tensors = {"quats": quats, "log_scales": log_scales, "logit_opacities": logits}
-    return scene.with_tensors(tensors, scene.extras)
+    return scene.with_tensors(tensors)
 
 
 def warn_of_lost_digits(scene: GaussianScene) -> None:

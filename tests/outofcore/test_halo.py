@@ -8,10 +8,12 @@ import torch
 import cvtgs
 from block_jobs import unfinished_job
 from cvtgs import cells, cvt, validity
+from cvtgs.cells.allocate import Moments
 from cvtgs.cvt import nearest_several
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.grouping import REASSIGN, allocate, allocation_at
 from cvtgs.io.tensors import map_tensors
+from cvtgs.math.segments import take_columns
 from cvtgs.mergenet import correct_cells
 from cvtgs.outofcore import simplify_file
 from cvtgs.outofcore.halo import Balls, OtherBlock, assign_points, bounding_box, halo_cells
@@ -205,7 +207,7 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
     for block, part in zip(job.blocks_with_rows(), scenes, strict=True):
         rows = torch.arange(start, start + len(part))
         must_stay = blocks[heaviest] == block
-        some, own = members.take(rows), merged[labels][rows]
+        some, own = Moments(*take_columns(rows, *members)), merged[labels][rows]
         final.append(cells.reassign(some, own, wanted, near, config, must_stay=must_stay))
         start += len(part)
     sizes = torch.cat([read_cells(job, block)[3].counts for block in job.blocks_with_cells()])

@@ -330,5 +330,5 @@ def restore_columns(small: GaussianScene, scene: GaussianScene, plan: EffectPlan
         flat[:, 2].clamp_(max=FLAT_LOG_SCALE)
         changes["log_scales"] = flat
     if changes:
-        small = small.with_tensors(changes, small.extras)
+        small = small.with_tensors(changes)
     return small if small.comments == scene.comments else replace(small, comments=scene.comments)

@@ -3,12 +3,12 @@
 import math
 from itertools import pairwise
 
-import pydantic
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.config import SimplifyConfig
+from cvtgs.config.base import Record
 from cvtgs.devices import chunk_length
 from cvtgs.math.parameters import divide, opacity_from_logit
 from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
@@ -41,7 +41,7 @@ LEAST_CONTRAST = 1e-6
 """Floor of the contrast, for scenes of a single colour."""
 
 
-class Effect(pydantic.BaseModel):
+class Effect(Record):
     """The decision on one effect, and the figure that decided.
 
     Attributes:
@@ -50,8 +50,6 @@ class Effect(pydantic.BaseModel):
         meaning: Meaning of the figure, and its threshold.
         forced: Whether the configuration decided instead of the figure.
     """
-
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
     active: bool
     figure: float
@@ -81,7 +79,7 @@ class GradedEffect(Effect):
     strength: float
 
 
-class EffectPlan(pydantic.BaseModel):
+class EffectPlan(Record):
     """The effects that a scene calls for, named as in :class:`cvtgs.config.EffectsConfig`.
 
     Attributes:
@@ -95,8 +93,6 @@ class EffectPlan(pydantic.BaseModel):
         extras: Columns beyond the standard ones are carried along.
         visibility: Images measure the contribution of each Gaussian.
     """
-
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
     sh: BandsEffect
     mip: Effect

@@ -54,10 +54,6 @@ class Moments(NamedTuple):
     covariances: Float[Tensor, "6 n"]
     colors: Float[Tensor, "3 n"]
 
-    def take(self, rows: Int[Tensor, "k"]) -> "Moments":
-        """Return the moments of some rows."""
-        return Moments(*take_columns(rows, *self))
-
 
 def gaussian_moments(
     scene: GaussianScene,
@@ -198,7 +194,7 @@ def _pair_costs(
 
     def costs_of(part: slice) -> Tensor:
         i, j = first[part], second[part]
-        a, b = groups.take(i), groups.take(j)
+        a, b = Moments(*take_columns(i, *groups)), Moments(*take_columns(j, *groups))
         total = a.weights + b.weights
         share, other = a.weights / total, b.weights / total
         product = share * other

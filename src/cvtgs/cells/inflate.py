@@ -71,7 +71,7 @@ def align_axes(
         name: getattr(merged, name).index_copy(0, rows, values.to(merged.means.dtype))
         for name, values in changes.items()
     }
-    return merged.with_tensors(tensors, merged.extras)
+    return merged.with_tensors(tensors)
 
 
 def _pulls(
@@ -151,7 +151,7 @@ def inflate_cells(
 
     for _ in in_threads(inflate, partition.several().split(chunk), counts.device):
         pass
-    return merged.with_tensors({"log_scales": log_scales}, merged.extras)
+    return merged.with_tensors({"log_scales": log_scales})
 
 
 def side_cover(

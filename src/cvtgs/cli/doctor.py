@@ -79,20 +79,19 @@ def doctor(options: argparse.Namespace) -> None:
     """Run ``cvtgs doctor``."""
     import torch
 
-    from cvtgs.devices import chosen_device, device_name, resolve_device
+    from cvtgs.devices import chosen_device, device_name
 
     say("\n".join(version_lines()))
-    device = resolve_device(options.device)
+    default = chosen_device(options.device)
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     devices = [torch.device("cpu"), *(torch.device("cuda", number) for number in range(gpus))]
-    for one in devices if device is None else [device]:
+    for one in devices if options.device == "auto" else [default]:
         say(f"\n{one}: {device_name(one)}")
         taken = cvtgs.rendering.choose_backend("auto", one)[0]
         for name in RENDERERS:
             use = " (used: the fastest that works here)" if name == taken else ""
             say(f"  images by {name:<7} {_renderer_state(name, one)}{use}")
         say(f"  nearest site by {cvtgs.cvt.SEARCH} (a k-d tree on the host, whatever the device)")
-    default = chosen_device(options.device)
     say(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one image")
     try:
         for line in _small_run(default):

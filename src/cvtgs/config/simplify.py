@@ -156,8 +156,6 @@ class SimplifyConfig(Section):
         Raises:
             ConfigError: There is no such preset.
         """
-        if name not in PRESETS:
-            raise unknown_preset(name)
         return cls.from_mapping({"preset": name})
 
     @classmethod

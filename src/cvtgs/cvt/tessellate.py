@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from cvtgs.config import TessellationConfig
-from cvtgs.cvt.nearest import SEARCH, NearestSite, nearest_scipy, search_once_per_position
+from cvtgs.cvt.nearest import NearestSite, nearest_scipy, search_once_per_position
 from cvtgs.devices import HOST, move_together
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.segments import label_argmin, label_sums, smallest_rows
@@ -27,7 +27,6 @@ class Tessellation:
         energies: ``sum w |x - site|^2`` before every Lloyd iteration.
         energy: The same for the final labels, over all points.
         refilled: Number of empty cells that received a point from another cell.
-        backend: Name of the nearest-site search.
     """
 
     labels: Int[Tensor, "n"]
@@ -35,7 +34,6 @@ class Tessellation:
     energies: tuple[float, ...]
     energy: float
     refilled: int
-    backend: str
 
 
 def tessellate(
@@ -85,7 +83,6 @@ def tessellate(
             energies=(0.0,),
             energy=0.0,
             refilled=0,
-            backend=SEARCH,
         )
     nearest = choose_search(has_duplicates=has_duplicates)
     points, weights = move_together([points, weights], HOST)  # where the tree is
@@ -109,7 +106,6 @@ def tessellate(
         energies=settled.energies,
         energy=float((weights * squared).sum()),
         refilled=refilled,
-        backend=SEARCH,
     )
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras, spread_rows
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.evaluation.images import alpha_as_bytes, as_bytes
+from cvtgs.evaluation.images import as_bytes
 from cvtgs.evaluation.report import Evaluation, SceneScores
 from cvtgs.evaluation.scorer import (
     EvaluationSettings,
@@ -43,11 +43,6 @@ class SceneImages(NamedTuple):
 
     colors: Images
     alphas: Alphas
-
-
-class _RenderedImage(NamedTuple):
-    color: Float[Tensor, "1 h w 3"]
-    alpha: Float[Tensor, "1 h w"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -188,10 +183,10 @@ def compare(  # noqa: PLR0913 (options by name)
     }
     places = {view: place for place, view in enumerate(shown)}
 
-    def keep(name: str, view: int, image: _RenderedImage) -> None:
+    def keep(name: str, view: int, color: Tensor, alpha: Tensor) -> None:
         if view in places:
-            images[name].colors[places[view]] = as_bytes(image.color[0])
-            images[name].alphas[places[view]] = alpha_as_bytes(image.alpha[0])
+            images[name].colors[places[view]] = as_bytes(color[0])
+            images[name].alphas[places[view]] = as_bytes(alpha[0])
 
     evaluation = _score_images(
         scenes,
@@ -225,7 +220,7 @@ def _score_images(
     cameras: Cameras,
     *,
     photographs: Float[Tensor, "c h w 3"] | None = None,
-    keep: Callable[[str, int, _RenderedImage], None] = lambda name, view, image: None,
+    keep: Callable[[str, int, Tensor, Tensor], None] = lambda name, view, color, alpha: None,
     settings: EvaluationSettings,
     listener: ProgressListener,
 ) -> Evaluation:
@@ -250,18 +245,18 @@ def _score_images(
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
     for view in range(len(cameras)):
         camera = cameras.select(torch.tensor([view], device="cpu"))
-        truth: _RenderedImage | None = None
+        truth: tuple[Tensor, Tensor] | None = None
         for name, scene in scenes.items():
             rendered = render_view(scene, camera, backend=settings.backend)
             backend = rendered.backend
             color = rendered.over(scene.means.new_tensor(settings.background)).clamp(0, 1)
-            image = _RenderedImage(color, rendered.alpha)
-            keep(name, view, image)
+            alpha = rendered.alpha
+            keep(name, view, color, alpha)
             if truth is None:
-                truth = image
+                truth = color, alpha
             else:
-                alphas = (image.alpha, truth.alpha.to(image.alpha))
-                against_full[name].append(metrics.compare(color, truth.color, alphas=alphas))
+                alphas = alpha, truth[1].to(alpha)
+                against_full[name].append(metrics.compare(color, truth[0], alphas=alphas))
             if photographs is not None:
                 found = metrics.compare(color, photographs[view : view + 1])
                 against_photographs[name].append(found)

@@ -4,7 +4,7 @@ import base64
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -318,17 +318,15 @@ def _page_data(comparison: Comparison, quality: int, factor: float) -> dict[str,
     evaluation = comparison.evaluation
     small = []
     for scores in evaluation.scenes:
-        full, images = comparison.full, comparison.small[scores.name]
-        maps = {
-            "errors": map(error_map, full.colors, images.colors),
-            "alpha_errors": map(alpha_error_map, full.alphas, images.alphas),
-        }
+        errors, alpha_errors = error_maps(comparison, scores.name)
+        images = comparison.small[scores.name].colors
         small.append(
             {
                 **json.loads(scores.model_dump_json()),  # encodes infinity as a string
                 "bytes": comparison.sizes.get(scores.name),
-                "images": _data_urls(images.colors, quality, factor),
-                **{name: _data_urls(part, quality - 10, factor) for name, part in maps.items()},
+                "images": _data_urls(images, quality, factor),
+                "errors": _data_urls(errors, quality - 10, factor),
+                "alpha_errors": _data_urls(alpha_errors, quality - 10, factor),
             }
         )
     return {
@@ -349,9 +347,7 @@ def _page_data(comparison: Comparison, quality: int, factor: float) -> dict[str,
     }
 
 
-def _data_urls(
-    images: Iterable[UInt8[np.ndarray, "h w 3"]], quality: int, factor: float
-) -> list[str]:
+def _data_urls(images: Images, quality: int, factor: float) -> list[str]:
     urls = []
     for image in images:
         height, width, _ = image.shape

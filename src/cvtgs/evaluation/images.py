@@ -69,17 +69,10 @@ CSS_GRADIENT, CSS_ALPHA_GRADIENT = _css_gradient(_MAGMA), _css_gradient(_ALPHA)
 """CSS gradients of the colour maps, from left to right."""
 
 
-def as_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Round colours to 8 bits."""
-    rounded = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8)
-    array: UInt8[np.ndarray, "h w 3"] = rounded.cpu().numpy()
-    return array
-
-
-def alpha_as_bytes(alpha: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    """Round accumulated alpha to 8 bits."""
-    rounded = (alpha.detach().clamp(0, 1) * 255).round().to(torch.uint8)
-    array: UInt8[np.ndarray, "h w"] = rounded.cpu().numpy()
+def as_bytes(values: Float[Tensor, "h w *c"]) -> UInt8[np.ndarray, "h w *c"]:
+    """Round colours or accumulated alpha to 8 bits."""
+    rounded = (values.detach().clamp(0, 1) * 255).round().to(torch.uint8)
+    array: UInt8[np.ndarray, "h w *c"] = rounded.cpu().numpy()
     return array
 
 

@@ -142,12 +142,13 @@ def in_radii(means: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Return positions about the middle of the scene, in radii that contain 90 %."""
     away = means - np.median(means, axis=0)
     radius = np.quantile(np.abs(away).max(axis=1), 0.9) or 1.0
-    return away / np.float32(radius)
+    inside: Float[np.ndarray, "n 3"] = away / np.float32(radius)
+    return inside
 
 
 def morton_rows(means: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
     """Return the order along a Morton curve; distant Gaussians do not coarsen it."""
     away = in_radii(means)
-    inside = np.sign(away) * np.log1p(np.abs(away))
-    order: Int[np.ndarray, n] = morton_order(torch.from_numpy(inside)).numpy()
+    shrunk = np.sign(away) * np.log1p(np.abs(away))
+    order: Int[np.ndarray, n] = morton_order(torch.from_numpy(shrunk)).numpy()
     return order

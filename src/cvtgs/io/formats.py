@@ -181,7 +181,7 @@ def load(
         if suffix != ".ply" and sh_degree is not None and sh_degree < scene.sh_degree:
             rest = scene.shN.clone()
             rest[:, REST_COUNTS[sh_degree] :] = 0.0
-            scene = scene.with_tensors({"shN": rest}, scene.extras)
+            scene = scene.with_tensors({"shN": rest})
         return scene.to(device)
 
 

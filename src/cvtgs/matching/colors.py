@@ -111,8 +111,9 @@ def fit_colors(
         linear_view(small, camera, image)
         for camera, image in zip(views.cameras.singles(), views.rgb, strict=True)
     ]
-    heldout = linear[HELDOUT_EVERY // 2 :: HELDOUT_EVERY] if len(linear) >= HELDOUT_EVERY else []
-    seen = [view for row, view in enumerate(linear) if not _is_heldout(row, len(linear))]
+    rows = heldout_rows(len(linear))
+    heldout = [linear[row] for row in rows]
+    seen = [view for row, view in enumerate(linear) if row not in rows]
     problem = LeastSquares(seen, config=config, frozen=frozen)
     changes = problem.solve(config.color_iterations)
     if heldout:
@@ -123,11 +124,12 @@ def fit_colors(
         else:
             changes = step * changes
     tensors = {"sh0": small.sh0 + changes[:, :1], "shN": small.shN + changes[:, 1:]}
-    return small.with_tensors(tensors, small.extras)
+    return small.with_tensors(tensors)
 
 
-def _is_heldout(row: int, count: int) -> bool:
-    return count >= HELDOUT_EVERY and row % HELDOUT_EVERY == HELDOUT_EVERY // 2
+def heldout_rows(count: int) -> range:
+    """Return the row numbers of the held-out images: every eighth, none of fewer than eight."""
+    return range(HELDOUT_EVERY // 2, count if count >= HELDOUT_EVERY else 0, HELDOUT_EVERY)
 
 
 def best_step(views: Sequence[LinearView], changes: Float[Tensor, "m k 3"]) -> float:

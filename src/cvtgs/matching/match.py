@@ -11,7 +11,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras
 from cvtgs.cells import Partition
 from cvtgs.config import MatchConfig
-from cvtgs.matching.colors import HELDOUT_EVERY, fit_colors
+from cvtgs.matching.colors import fit_colors, heldout_rows
 from cvtgs.math import parameters
 from cvtgs.math.segments import segment_sum
 from cvtgs.rendering import ObservedViews, contributions, render
@@ -161,14 +161,13 @@ def with_deeper_opacities(small: GaussianScene, factors: Float[Tensor, "m"]) -> 
     deeper = torch.minimum(depths * factors, depths.clamp_min(LARGEST_DEPTH))
     logits = parameters.logit_from_optical_depth(deeper).to(small.dtype)
     changed = torch.where(factors == 1.0, small.logit_opacities, logits)
-    return small.with_tensors({"logit_opacities": changed}, small.extras)
+    return small.with_tensors({"logit_opacities": changed})
 
 
 def heldout_views(views: ObservedViews) -> ObservedViews:
     """Return every eighth view, or all views if there are fewer than eight."""
     count = len(views.cameras)
-    first, step = (HELDOUT_EVERY // 2, HELDOUT_EVERY) if count >= HELDOUT_EVERY else (0, 1)
-    rows = torch.tensor(range(first, count, step), device="cpu")
+    rows = torch.tensor(heldout_rows(count) or range(count), device="cpu")
     cameras = views.cameras.select(rows)
     return replace(views, cameras=cameras, rgb=views.rgb[rows], alpha=views.alpha[rows])
 

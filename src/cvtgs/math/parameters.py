@@ -1,6 +1,6 @@
 """Parameters of Gaussians: stored and activated values, rotations, covariances and areas.
 
-Every logit, logarithm and guarded division of the package is in this file.
+Values that may be 0 or infinite pass through the guarded logarithms, logits and divisions here.
 """
 
 import math

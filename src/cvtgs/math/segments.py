@@ -302,12 +302,7 @@ def segment_argmax(
         >>> segment_argmax(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0, 2, 3])).tolist()
         [1, 2]
     """
-    ids = segment_ids(offsets, len(values))
-    is_top = values == segment_max(values, offsets)[ids]
-    rows = torch.arange(len(values), device=values.device)
-    candidates = torch.where(is_top, rows, len(values))
-    first = torch.full((len(offsets) - 1,), len(values), device=values.device)
-    return first.scatter_reduce(0, ids, candidates, "amin")
+    return label_argmin(-values, segment_ids(offsets, len(values)), len(offsets) - 1)
 
 
 class _SumOfRuns(torch.autograd.Function):

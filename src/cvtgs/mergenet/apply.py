@@ -96,7 +96,7 @@ def correct_cells(
         name: torch.where(values.isfinite(), values, originals[name])
         for name, values in tensors.items()
     }
-    return merged.with_tensors(tensors, merged.extras)
+    return merged.with_tensors(tensors)
 
 
 def _correct_gated(

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from cvtgs.config import PRESETS, SimplifyConfig
+from cvtgs.config.base import Record
 from cvtgs.errors import CheckpointError, ConfigError, FileFormatError, reason_of
 from cvtgs.io.tensors import pack_tensors, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet
@@ -32,7 +33,7 @@ LARGEST_FILE = 1 << 26
 """Files above 64 MiB are not read; a MergeNet has less than 1 MiB."""
 
 
-class LearnedScene(pydantic.BaseModel):
+class LearnedScene(Record):
     """A scene that was used in training or validation.
 
     Attributes:
@@ -42,8 +43,6 @@ class LearnedScene(pydantic.BaseModel):
             name, count and version of cvtgs.
         is_validation: Whether it was used for validation only.
     """
-
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
     name: str
     count: int
@@ -63,7 +62,7 @@ class _Described(pydantic.BaseModel):
     architecture: _Kind
 
 
-class CheckpointInfo(pydantic.BaseModel):
+class CheckpointInfo(Record):
     """Description of a checkpoint.
 
     Attributes:
@@ -77,8 +76,6 @@ class CheckpointInfo(pydantic.BaseModel):
         start: Digest of the checkpoint from which training started; empty for none.
         scenes: Scenes of training and validation.
     """
-
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
     architecture: Architecture | PublishedArchitecture
     preset: str
@@ -126,7 +123,9 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
         'standard'
     """
     name = os.fspath(source)
-    path = _shipped_path(name) if name in SHIPPED else Path(name)
+    path = Path(name)
+    if name in SHIPPED:
+        path = Path(str(resources.files("cvtgs.mergenet") / "data" / f"{name}.safetensors"))
     content = _read(path, name)
     tensors, metadata = _unpack(content, name)
     info = _parse_info(metadata, name)
@@ -170,10 +169,6 @@ def save_checkpoint(net: MergeNet | PublishedMergeNet, info: CheckpointInfo) -> 
         "info": described,
     }
     return pack_tensors(tensors, metadata)
-
-
-def _shipped_path(name: str) -> Path:
-    return Path(str(resources.files("cvtgs.mergenet").joinpath("data", f"{name}.safetensors")))
 
 
 def _read(path: Path, name: str) -> bytes:

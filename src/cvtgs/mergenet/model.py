@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES, Descriptors
+from cvtgs.config.base import Record
 from cvtgs.devices import move_together
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
 
@@ -50,7 +51,7 @@ WIDEST = 1e30
 """Absolute value of both ends of the range before it is fitted."""
 
 
-class Architecture(pydantic.BaseModel):
+class Architecture(Record):
     """The architecture of a MergeNet.
 
     Attributes:
@@ -62,8 +63,6 @@ class Architecture(pydantic.BaseModel):
         cell_width: Units of the layers of cells.
         largest_growth: Largest change of a log scale.
     """
-
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["gated"] = "gated"
     member_features: int = MEMBER_FEATURES
@@ -107,26 +106,6 @@ class Residuals:
             self.d_means.clamp(-1, 1),
         ]
         return torch.stack([part.square().mean() for part in parts]).mean()
-
-    def scaled(self, shares: Float[Tensor, "m"], ids: Int[Tensor, "n"]) -> "Residuals":
-        """Return the residuals with the changes of every cell multiplied by its share.
-
-        Args:
-            shares: One factor per cell; 0 leaves the cell unchanged.
-            ids: The cell of every member.
-
-        Returns:
-            The scaled residuals.
-        """
-        by_cell = shares[:, None]
-        return Residuals(
-            d_means=self.d_means * by_cell,
-            d_log_scales=self.d_log_scales * by_cell,
-            d_rotvecs=self.d_rotvecs * by_cell,
-            d_logit_opacities=self.d_logit_opacities * shares,
-            member_colors=self.member_colors * shares.index_select(0, ids),
-            pair_colors=self.pair_colors * by_cell,
-        )
 
 
 class CellNetwork(nn.Module):
@@ -174,9 +153,9 @@ class MergeNet(CellNetwork):
         self.architecture = architecture
         width, cell_width = architecture.width, architecture.cell_width
         pooled = architecture.cell_features + 5 * width
-        self.member_layers = _layers(architecture.member_features, width)
-        self.pair_layers = _layers(architecture.pair_features, width)
-        self.cell_layers = _layers(pooled, cell_width)
+        self.member_layers = two_layers(architecture.member_features, width)
+        self.pair_layers = two_layers(architecture.pair_features, width)
+        self.cell_layers = two_layers(pooled, cell_width)
         self.decoder = nn.Linear(cell_width, 4)
         self.member_gates = _Gates(width, cell_width)
         self.pair_gates = _Gates(width, cell_width)
@@ -216,15 +195,16 @@ class MergeNet(CellNetwork):
         others = _pulls(of_pairs, pair_positions, near).unflatten(0, shape).sum(dim=1)
         # Doubled, so that neighbours can turn a cell as much as a gate of 1 does.
         twists = pulls[:, 3:] + 2 * others[:, 3:]
-        residuals = Residuals(
-            d_means=pulls[:, :3] + others[:, :3],
-            d_log_scales=self.architecture.largest_growth * torch.tanh(sizes[:, :3]),
-            d_rotvecs=LARGEST_TURN * torch.tanh(twists),
-            d_logit_opacities=LARGEST_LOGIT_CHANGE * torch.tanh(0.5 * sizes[:, 3]),
-            member_colors=of_members[:, 1] * weights,
-            pair_colors=of_pairs[:, 1].unflatten(0, shape),
+        known = self.known(summarize(descriptors))
+        by_cell = known[:, None]
+        return Residuals(
+            d_means=(pulls[:, :3] + others[:, :3]) * by_cell,
+            d_log_scales=self.architecture.largest_growth * torch.tanh(sizes[:, :3]) * by_cell,
+            d_rotvecs=LARGEST_TURN * torch.tanh(twists) * by_cell,
+            d_logit_opacities=LARGEST_LOGIT_CHANGE * torch.tanh(0.5 * sizes[:, 3]) * known,
+            member_colors=of_members[:, 1] * weights * known.index_select(0, ids),
+            pair_colors=of_pairs[:, 1].unflatten(0, shape) * by_cell,
         )
-        return residuals.scaled(self.known(summarize(descriptors)), ids)
 
 
 class _SiLU(nn.Module):
@@ -254,7 +234,8 @@ class _Gates(nn.Module):
         return torch.tanh(torch.addmm(self.gates.bias[:, None], self.gates.weight, hidden.T)).T
 
 
-def _layers(features: int, width: int) -> nn.Sequential:
+def two_layers(features: int, width: int) -> nn.Sequential:
+    """Return two linear layers of a width, each with its activation."""
     return nn.Sequential(nn.Linear(features, width), _SiLU(), nn.Linear(width, width), _SiLU())
 
 

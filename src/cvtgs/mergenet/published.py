@@ -9,9 +9,10 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from cvtgs.cells import Partition
+from cvtgs.config.base import Record
 from cvtgs.math import parameters
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
-from cvtgs.mergenet.model import CellNetwork
+from cvtgs.mergenet.model import CellNetwork, two_layers
 from cvtgs.scene import GaussianScene
 
 SH_COEFFICIENTS = 16
@@ -27,7 +28,7 @@ LARGEST_FEATURE = 50.0
 """Positions and differences of log scales are clamped to this, so that all values stay finite."""
 
 
-class PublishedArchitecture(pydantic.BaseModel):
+class PublishedArchitecture(Record):
     """The architecture of a MergeNet as published; the publication does not give its widths.
 
     Attributes:
@@ -36,8 +37,6 @@ class PublishedArchitecture(pydantic.BaseModel):
         width: Units of the layers of members.
         cell_width: Units of the layers of the decoder.
     """
-
-    model_config = pydantic.ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["published"] = "published"
     member_features: int = PUBLISHED_FEATURES
@@ -118,14 +117,13 @@ def describe_published(
     quats = parameters.normalize_quats(scene.quats.index_select(0, rows))
     relative = parameters.multiply_quats(own_quats * own_quats.new_tensor([1, -1, -1, -1]), quats)
     relative = torch.where(relative[:, :1] < 0, -relative, relative)
-    opacities = torch.sigmoid(parameters.clamp_logits(scene.logit_opacities.index_select(0, rows)))
+    opacities = parameters.opacity_from_logit(scene.logit_opacities.index_select(0, rows))
+    growths = scene.log_scales.index_select(0, rows) - log_scales
     totals = segment_sum(opacities.double(), part.offsets).to(opacities.dtype)
     shares = opacities / totals.index_select(0, ids)
     columns = [
         positions.clamp(-LARGEST_FEATURE, LARGEST_FEATURE),
-        (scene.log_scales.index_select(0, rows) - log_scales).clamp(
-            -LARGEST_FEATURE, LARGEST_FEATURE
-        ),
+        growths.clamp(-LARGEST_FEATURE, LARGEST_FEATURE),
         relative,
         opacities[:, None],
         shares[:, None],
@@ -167,18 +165,8 @@ class PublishedMergeNet(CellNetwork):
         super().__init__()
         self.architecture = architecture
         width, cell_width = architecture.width, architecture.cell_width
-        self.member_layers = nn.Sequential(
-            nn.Linear(architecture.member_features, width),
-            nn.SiLU(),
-            nn.Linear(width, width),
-            nn.SiLU(),
-        )
-        self.decoder = nn.Sequential(
-            nn.Linear(3 * width, cell_width),
-            nn.SiLU(),
-            nn.Linear(cell_width, cell_width),
-            nn.SiLU(),
-        )
+        self.member_layers = two_layers(architecture.member_features, width)
+        self.decoder = two_layers(3 * width, cell_width)
         self.residuals = nn.Linear(cell_width, PUBLISHED_RESIDUALS)
         nn.init.zeros_(self.residuals.weight)
         nn.init.zeros_(self.residuals.bias)

@@ -154,7 +154,7 @@ def _add_parts(job: Job, region: Sequence[int]) -> Moments:
         tensors, _ = map_tensors(job.parts_path(block))
         owners, numbers = _cells_of_parts(job, block, tensors["remote"])
         rows = (starts[owners] >= 0).nonzero()[:, 0]
-        found.append(Moments(*(tensors[name] for name in Moments._fields)).take(rows))
+        found.append(Moments(*take_columns(rows, *(tensors[name] for name in Moments._fields))))
         labels.append(starts[owners[rows]] + numbers[rows])
     joined = Moments(*(torch.cat(columns, dim=-1) for columns in zip(*found, strict=True)))
     return cells.group_moments(joined, torch.cat(labels), total)

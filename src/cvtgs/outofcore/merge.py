@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import pydantic
 import torch
 from torch import Tensor
 
@@ -38,8 +37,6 @@ class BlockReport(CellStatistics):
         matching: Report of the matching to images; None if there was none.
         refinement: Report of the refinement; None if there was none.
     """
-
-    model_config = pydantic.ConfigDict(ser_json_inf_nan="constants")
 
     input_count: int
     mass_out: float

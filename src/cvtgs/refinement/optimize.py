@@ -164,7 +164,7 @@ class SceneOptimizer:
         turns = parameters.multiply_quats(self._start["quats"], shifts["quats"])
         shifts |= {"means": means, "quats": turns}
         tensors = {name: start + shifts[name] for name, start in self._start.items()}
-        return self._scene.with_tensors(tensors, self._scene.extras)
+        return self._scene.with_tensors(tensors)
 
     def step(self, loss: Tensor, *, factor: float) -> None:
         """Move every Gaussian with a finite nonzero gradient."""
@@ -199,7 +199,7 @@ class SceneOptimizer:
             name: torch.where(_like(moved, old), now.tensors()[name], old)
             for name, old in self._scene.tensors().items()
         }
-        return self._scene.with_tensors(tensors, self._scene.extras)
+        return self._scene.with_tensors(tensors)
 
 
 def _units(scene: GaussianScene, scale: Float[Tensor, "n"]) -> dict[str, Tensor]:

@@ -100,7 +100,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     small, full = as_scene(small, "small"), as_scene(full, "full")
     config = config or RefineConfig()
     if seconds is None and steps is None:
-        seconds, steps = config.seconds or None, config.steps or None
+        seconds = config.seconds or None
+        steps = config.steps or (DEFAULT_STEPS if seconds is None else None)
     check_limits(seconds, steps=steps)
     if not 0 <= frozen <= len(small):
         raise InvalidArgumentError(
@@ -108,8 +109,6 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         )
     place = chosen_device(device, small.device)
     ours, theirs = _on_device(small, full, place)
-    if seconds is None and steps is None:
-        steps = DEFAULT_STEPS
     cameras = None if cameras is None else cameras.in_both_modes()
     limits, clock = Limits(seconds, steps=steps), StageClock(listener, place)
     # The program may have disabled gradients, or be in inference mode.
@@ -193,13 +192,13 @@ def _on_device(
     small: GaussianScene, full: GaussianScene, device: torch.device
 ) -> tuple[GaussianScene, GaussianScene]:
     """Move both scenes to one device and dtype, and drop invalid rows of the full one."""
-    for name, scene in (("simplified", small), ("full", full)):
-        if not bool(valid_rows(scene).any()):
+    valid = valid_rows(full)
+    for name, scene, rows in (("simplified", small, valid_rows(small)), ("full", full, valid)):
+        if not bool(rows.any()):
             raise InvalidSceneError(
                 f"a refinement needs valid Gaussians in both scenes; none of the {len(scene)} of "
                 f"the {name} scene is valid."
             )
-    valid = valid_rows(full)
     whole = full if bool(valid.all()) else full.select(valid)
     tensors = {name: tensor.to(device, small.dtype) for name, tensor in whole.tensors().items()}
     return small.to(device), whole.with_tensors(tensors, {})
