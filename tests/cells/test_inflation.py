@@ -169,6 +169,14 @@ def test_a_ball_turns_its_first_axis_to_its_only_neighbour():
         assert axes[:, 0].abs().tolist() == pytest.approx([0.0, 0.6, 0.8], abs=1e-9)
 
 
+def test_near_neighbours_pull_by_the_inverse_square_of_their_distance():
+    """One at 2 units outweighs two at 3 units on another axis: 1/4 against 2/9."""
+    scene = cells_of(SHAPES["balls"]).select(torch.arange(4))
+    means = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0, -3, 0]]).double()
+    axes = axes_of(settled(scene.with_tensors({"means": means}, {})))[0]
+    assert axes[:, 0].abs().tolist() == pytest.approx([1.0, 0.0, 0.0], abs=1e-9)
+
+
 def test_a_pancake_turns_within_its_plane_only():
     scene = random_scene(3, dtype=torch.float64)
     means = torch.tensor([[0.0, 0, 0], [3, 4, 9], [-3, -4, 9]]).double()
