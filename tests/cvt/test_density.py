@@ -8,6 +8,7 @@ import torch
 from cvtgs.analysis import perspective_falloff
 from cvtgs.cvt import embed, tessellation_weights
 from cvtgs.math.frames import RobustFrame, robust_frame
+from cvtgs.math.spherical_harmonics import SH_C0
 
 FRAME = RobustFrame(center=torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), radius=2.0)
 
@@ -76,6 +77,12 @@ def test_extreme_colours_hardly_separate_points():
     sh0 = torch.tensor([[[1e4, -1e4, 0.0]], [[-1e30, 1e30, 0.0]]])
     points = embed(torch.zeros(2, 3), sh0, frame=FRAME, color=0.05)
     assert float((points[0] - points[1]).abs().amax()) < 0.2
+
+
+def test_colours_are_clamped_at_black_and_at_one_and_a_half():
+    sh0 = torch.tensor([[[-2.0, 0.8, 3.0]]]).double() / SH_C0
+    points = embed(torch.zeros(1, 3).double(), sh0, frame=FRAME, color=0.1)
+    assert points[0, 3:].tolist() == pytest.approx([-0.05, 0.08, 0.1])
 
 
 @pytest.mark.parametrize("size", [1e-300, 1.0, 1e300])

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from cvtgs.cvt import stratified_seeds, weighted_seeds
+from cvtgs.cvt import sample_points, stratified_seeds, weighted_seeds
 
 
 def weights_of(kind: str, count: int) -> torch.Tensor:
@@ -70,6 +70,14 @@ def test_shares_sum_to_the_total_weight(kind, subtests):
         with subtests.test(total=total, count=count):
             assert bool((shares >= 0).all())
             assert float(shares.sum()) == pytest.approx(float(weights.sum()), rel=1e-9)
+
+
+def test_points_of_a_sample_weigh_as_much_as_those_that_they_represent(monkeypatch):
+    monkeypatch.setitem(sample_points.__globals__, "MIN_SAMPLES", 1)
+    points, weights = torch.arange(8.0)[:, None], torch.tensor([1.0] * 7 + [9.0])
+    sample, shares = sample_points(points, weights, 3)
+    assert sample[:, 0].tolist() == [1.0, 5.0, 7.0]
+    assert shares.tolist() == [3.5, 3.5, 9.0]
 
 
 def test_points_above_one_step_are_always_taken():
