@@ -7,6 +7,8 @@ import cvtgs
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.config import MatchConfig
 from cvtgs.matching import cell_contributions, colors, fit_colors, match_opacities, match_views
+from cvtgs.matching.match import with_deeper_opacities
+from cvtgs.math import parameters
 from cvtgs.rendering import contributions, observe, render
 from cvtgs.views import automatic_views, mixed_views, random_views
 from render_cases import backends
@@ -71,6 +73,23 @@ def test_the_ridge_keeps_colours_of_hidden_gaussians(scene, views):
     assert not torch.equal(found.sh0, dull.sh0)
 
 
+@pytest.mark.parametrize("band_ridge", [1.0, 8.0])
+def test_the_ridge_of_view_dependent_bands_is_stronger_by_its_factor(band_ridge):
+    """For one Gaussian in one image, changes are the SH basis divided by the ridge, up to scale."""
+    scene = random_scene(1, degree=1, dtype=torch.float64)
+    scene = scene.with_tensors({"sh0": torch.ones_like(scene.sh0)}, {})
+    views = observe(scene, automatic_views(scene, 1, width=48, height=48))
+    dull = scene.with_tensors({"sh0": 0.5 * scene.sh0}, {})
+    config = MatchConfig(color_iterations=20, band_ridge=band_ridge)
+    found = fit_colors(dull, views, config=config)
+    basis = colors.linear_view(dull, views.cameras, views.rgb[0]).basis[0, :, None]
+    unit = (found.sh0 - dull.sh0)[0] / basis[0]
+    assert bool((unit > 0.1).all())
+    wanted = basis[1:] * unit / band_ridge
+    assert float(wanted.amax()) > 0.01
+    torch.testing.assert_close((found.shN - dull.shN)[0], wanted, rtol=1e-4, atol=1e-6)
+
+
 @backends
 def test_backends_find_the_same_colours(scene, views, backend, monkeypatch):
     plain = colors.blending_weights
@@ -97,6 +116,15 @@ def test_matched_opacities_restore_contributions(scene, views):
     ]
     assert errors[0] > 0.3
     assert errors[1] < 0.15 * errors[0]
+
+
+def test_optical_depths_rise_to_six_and_deeper_ones_can_only_fall():
+    depths = torch.tensor([1.0, 1.0, 5.0, 8.0, 8.0]).double()
+    logits = parameters.logit_from_optical_depth(depths)
+    scene = random_scene(5, dtype=torch.float64).with_tensors({"logit_opacities": logits}, {})
+    deeper = with_deeper_opacities(scene, torch.tensor([2.0, 100.0, 1.1, 2.0, 0.5]).double())
+    found = parameters.optical_depth_from_logit(deeper.logit_opacities)
+    assert found.tolist() == pytest.approx([2.0, 6.0, 5.5, 8.0, 4.0])
 
 
 def test_contributions_of_cells_are_sums_over_their_members(scene, views):
@@ -171,6 +199,23 @@ def test_protected_gaussians_stay_bit_for_bit(scene):
     assert len(small) == 150
     assert same_bits(small.select(torch.arange(15)), scene.select(keep))
     assert report.matching.psnr_after > report.matching.psnr_before
+
+
+def test_targets_belong_to_cells_and_not_to_protected_gaussians(monkeypatch):
+    """Protected Gaussians come first, and together the others are to show what their cells do."""
+    scene, seen = random_scene(200), []
+
+    def noted(small, views, targets, **words):
+        seen.append((views.contributions, targets))
+        return match_views(small, views, targets, **words)
+
+    monkeypatch.setattr("cvtgs.matching.match_views", noted)
+    keep = torch.arange(200) < 7
+    Simplifier(config=preset(), device="cpu").run(scene, 0.1, keep=keep)
+    ((shown, targets),) = seen
+    assert targets[:7].tolist() == [0.0] * 7
+    assert len(targets) == 20
+    assert float(targets.sum()) == pytest.approx(float(shown.sum()), rel=0.05)
 
 
 @pytest.mark.slow
