@@ -1,6 +1,7 @@
 """Where cameras may be: above a floor, in a room, where images were taken, not inside matter."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,8 +10,10 @@ from torch import Tensor
 import cvtgs
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.math import parameters
+from cvtgs.math.frames import RobustFrame
 from cvtgs.refinement.images import generated_views
 from cvtgs.views import automatic_views, find_view_positions, mixed_views, random_views
+from cvtgs.views.automatic import inside_candidates
 from cvtgs.views.layout import find_layout, hidden_share
 from cvtgs.views.mixed import NEAR
 from cvtgs.views.scoring import splat_sizes
@@ -243,3 +246,22 @@ def test_the_share_hidden_behind_walls_by_hand() -> None:
     eye = torch.zeros(3, dtype=torch.float64)
     assert hidden_share(eye, ring) == 0.0
     assert math.isclose(hidden_share(eye, torch.cat([ring, 1.8 * ring])), 0.5)
+
+
+def test_cameras_in_a_room_stand_back_by_a_share_of_the_way_to_the_wall_behind() -> None:
+    """Walls are 0.5 from the eye on one side, 1.4 on the other, and 1 between."""
+    right, up = torch.tensor([1.0, 0, 0]).double(), torch.tensor([0.0, 0, 1]).double()
+    walls = torch.tensor([[1.4, 0, 0], [-0.5, 0, 0], [0, 1, 0], [0, -1, 0]]).double()
+    layout = replace(
+        find_layout(blobs(sphere(100), torch.full((100,), -3.0))),
+        frame=RobustFrame(center=torch.zeros(3).double(), radius=1.0),
+        voxels=Voxels(points=walls, normals=walls, log_sizes=walls[:, 0]),
+        up=up,
+    )
+    found = inside_candidates(layout, torch.zeros(3).double(), 4, size=(64, 64), turn=0.0)
+    cameras = found.rounds[0]
+    ahead = cameras.viewmats[:, 2, :3].double() @ right
+    for side, wall in ((1.0, 0.5), (-1.0, 1.4)):
+        (row,) = (side * ahead > 0.9).nonzero()[:, 0].tolist()
+        assert cameras.centers[row].tolist() == pytest.approx([-0.65 * wall * side, 0, 0], abs=1e-6)
+        assert float(found.distances[0][row]) == pytest.approx(0.65 * wall + 0.5)
