@@ -135,6 +135,13 @@ def test_a_halo_holds_all_possible_neighbours(count):
         assert set(wanted[starts[own] : starts[own + 1]].flatten().tolist()) <= held
 
 
+@pytest.mark.parametrize(("place", "cells_found"), [(3.0, [[7, 0]]), (5.0, [])])
+def test_a_halo_reaches_as_far_as_the_last_own_neighbour(place, cells_found):
+    centers, theirs = torch.tensor([[0.0, 0, 0], [0, 0, 4]]), torch.tensor([[place, 0.0, 0.0]])
+    others = [OtherBlock(7, bounding_box(theirs), lambda: theirs)]
+    assert halo_cells(centers, others, count=1).tolist() == cells_found
+
+
 @pytest.mark.slow
 def test_sites_move_as_in_one_piece(job):
     points = of_all(job, job.sample_path, "points")

@@ -1,6 +1,7 @@
 """Visibility in blocks: the contributions of Gaussians are those of one piece."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,10 +14,11 @@ from cvtgs.boxes import Box, inside
 from cvtgs.io.tensors import map_tensors
 from cvtgs.outofcore import simplify_file
 from cvtgs.outofcore.rows import read_rows
-from cvtgs.outofcore.visibility import is_measured, read_apparent_rows
+from cvtgs.outofcore.visibility import is_measured, read_apparent_rows, write_views
 from cvtgs.progress import silent
 from cvtgs.rendering import contributions
 from cvtgs.scene import concatenate
+from refine_cases import ring
 from scenes import same_bits
 
 COUNT, BLOCKS, TARGET = 3000, 3, 150
@@ -75,6 +77,16 @@ def test_invalid_rows_do_not_enlarge_the_sample(scene, tmp_path):
     job = run(concatenate([broken, scene]), tmp_path, config)
     wanted = contributions(scene, visibility_cameras(scene, config))[paired(job, scene)]
     torch.testing.assert_close(contributions_of(job), wanted, rtol=1e-3, atol=1e-3)
+
+
+def test_gaussians_of_a_sample_are_enlarged_to_the_mass_of_the_scene(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("cvtgs.outofcore.visibility.visibility_cameras", lambda *_: ring())
+    job = SimpleNamespace(config=SimplifyConfig(), views_path=tmp_path / "views")
+    sample = scene.select(torch.arange(0, COUNT, 4))
+    write_views(job, sample, total=COUNT)
+    log_scales = map_tensors(job.views_path)[0]["scene/log_scales"]
+    drawn = sample.with_tensors({"log_scales": log_scales}, {})
+    torch.testing.assert_close(drawn.masses, 4 * sample.masses)
 
 
 @pytest.mark.slow
