@@ -8,11 +8,13 @@ import torch
 
 import cvtgs
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig, filters, pipeline
+from cvtgs.analysis import analyze, measure_visibility
 from cvtgs.cells import features
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.mergenet import MergeNet
 from cvtgs.scene import ANTIALIASED_TAG
+from refine_cases import ring
 from scenes import random_scene, same_bits
 
 PRESETS = ("standard", "paper")
@@ -252,6 +254,21 @@ def test_images_are_compensated_as_planned_and_the_tag_stays(is_tagged, choice, 
     assert report.plan.mip.active is active
     assert set(taken) == {active}
     assert small.comments == scene.comments
+
+
+def test_images_decide_on_haze_by_the_mass_that_they_show():
+    config = SimplifyConfig.from_mapping({"visibility": {"views": 2, "size": 32}})
+    scene = random_scene(100, dtype=torch.float64)
+    logits = scene.logit_opacities.index_fill(0, torch.arange(50), -6.0)
+    scene = scene.with_tensors({"logit_opacities": logits}, {})
+    before = analyze(scene, config)
+    found = measure_visibility(scene, before, config, cameras=ring(2))
+    areas, shares = found.apparent_areas, []
+    for values in (areas * found.opacities, areas):
+        shares.append(float(values[:50].sum() / values.sum()))
+    assert found.plan.haze.figure == pytest.approx(shares[0])
+    assert found.plan.haze.figure != pytest.approx(before.plan.haze.figure, rel=1e-2)
+    assert shares[1] > 2 * shares[0]
 
 
 def test_without_images_the_tag_changes_opacities_unless_mip_is_off():
