@@ -11,7 +11,8 @@ from cvtgs.analysis import analyze
 from cvtgs.cli.main import main
 from cvtgs.clock import StageClock
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
-from cvtgs.levels import LevelsIndex, level_names, write_levels
+from cvtgs.evaluation.scorer import ImageScores, scene_scores
+from cvtgs.levels import LevelEntry, LevelsIndex, level_names, write_levels
 from cvtgs.pipeline import reduce_scene
 from scenes import random_scene, same_bits
 
@@ -73,6 +74,20 @@ def test_coarse_cells_consist_of_whole_fine_ones(scene):
     levels = cvtgs.Simplifier(None, device="cpu").levels(scene, [600 / len(scene), 60 / len(scene)])
     assert [level.nested for level in levels] == [False, True]
     assert same_bits(levels[1].scene, coarser.scene)
+
+
+def test_errors_are_weighted_by_the_mass_as_seen_from_the_middle():
+    scene = random_scene(300)
+    (level,) = Simplifier(None, device="cpu").levels(scene, [0.1])
+    analysis, rows = analyze(scene, cvtgs.SimplifyConfig()), level.assignment.long()
+    shifts = scene.means - level.scene.means[rows.clamp_min(0)]
+    errors = [
+        ((masses * shifts.square().sum(dim=1)).sum() / masses.sum()).sqrt()
+        for areas in (analysis.apparent_areas, analysis.areas)
+        for masses in [(areas * analysis.opacities).where(rows >= 0, 0.0)]
+    ]
+    assert level.geometric_error == pytest.approx(float(errors[0]), rel=1e-4)
+    assert level.geometric_error != pytest.approx(float(errors[1]), rel=1e-2)
 
 
 def test_invalid_rows_are_counted_once_in_every_report(simplifier):
@@ -156,6 +171,17 @@ def mean_distance(scene, small):
     """Return the RMS distance to the nearest Gaussian of the small scene, weighted by mass."""
     squares = torch.cdist(scene.means, small.means).amin(dim=1).double() ** 2
     return float(((scene.masses * squares).sum() / scene.masses.sum()).sqrt())
+
+
+def test_every_score_has_its_own_place_in_the_index():
+    corner = (0.0, 0.0, 0.0)
+    entry = LevelEntry(
+        file="a.ply", rho=0.1, count=9, bytes=1, geometric_error=0.0, box_min=corner,
+        box_max=corner, nested=False, seconds=0.0,
+    )  # fmt: skip
+    values = {"psnr": 30.0, "ssim": 0.9, "lpips": 0.1, "alpha_error": 0.02, "alpha_bias": -0.01}
+    found = entry.with_scores(scene_scores("a.ply", 9, [ImageScores(**values)]))
+    assert {name: getattr(found, name) for name in values} == values
 
 
 @pytest.mark.slow
