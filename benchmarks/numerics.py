@@ -22,7 +22,7 @@ from cvtgs.cvt import embed, nearest_neighbors, tessellate
 from cvtgs.math import parameters
 from cvtgs.math.frames import morton_order, robust_frame
 from cvtgs.mergenet import correct_cells
-from cvtgs.validity import invalid_rows
+from cvtgs.validity import valid_part
 from cvtgs.views import automatic_views
 
 COUNT = 2000
@@ -111,7 +111,7 @@ def cpu_seconds(
 
 def figures(make: Callable[[int, torch.dtype], GaussianScene], count: int) -> Figures:
     """Run the stages on one scene in both precisions, with the cells of float64."""
-    single = valid(make(count, torch.float32))
+    single = valid_part(make(count, torch.float32))
     double = in_float64(single)
     target = max(1, len(single) // 10)
     labels, energy = grouped(double, target)
@@ -137,11 +137,6 @@ def figures(make: Callable[[int, torch.dtype], GaussianScene], count: int) -> Fi
         network=worst((approximate - corrected).abs()),
         images=image_error(first, second),
     )
-
-
-def valid(scene: GaussianScene) -> GaussianScene:
-    bad = [mask[:, None] for mask in invalid_rows(scene).values()]
-    return scene.select(~torch.cat(bad, dim=1).any(dim=1)) if bad else scene
 
 
 def in_float64(scene: GaussianScene) -> GaussianScene:

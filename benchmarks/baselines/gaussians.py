@@ -9,7 +9,7 @@ from torch import Tensor
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
-from cvtgs.validity import invalid_rows, standardized
+from cvtgs.validity import standardized, valid_part
 
 
 def usable(scene: GaussianScene, count: int) -> GaussianScene:
@@ -21,14 +21,12 @@ def usable(scene: GaussianScene, count: int) -> GaussianScene:
     Raises:
         InvalidArgumentError: ``count`` is below 1 or exceeds the number of valid rows.
     """
-    valid = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
-    for mask in invalid_rows(scene).values():
-        valid &= ~mask
-    if not 1 <= count <= int(valid.sum()):
+    valid = valid_part(replace(scene, extras={}, layout=()))
+    if not 1 <= count <= len(valid):
         raise InvalidArgumentError(
-            f"count must be between 1 and the {int(valid.sum())} valid Gaussians, found {count}."
+            f"count must be between 1 and the {len(valid)} valid Gaussians, found {count}."
         )
-    return standardized(replace(scene, extras={}, layout=()).select(valid))
+    return standardized(valid)
 
 
 def keep_largest(scene: GaussianScene, scores: Float[Tensor, "n"], *, count: int) -> GaussianScene:

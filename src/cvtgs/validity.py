@@ -126,6 +126,12 @@ def valid_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
     return valid
 
 
+def valid_part(scene: GaussianScene) -> GaussianScene:
+    """Return the rows that renderers can draw, without a warning; the scene itself if all are."""
+    valid = valid_rows(scene)
+    return scene if bool(valid.all()) else scene.select(valid)
+
+
 def writable_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
     """Return a mask of the rows that compact formats can hold.
 

@@ -133,7 +133,7 @@ def _score(
     from cvtgs.devices import chosen_device
 
     device = chosen_device(options.device)
-    full = scene.select(cvtgs.validity.valid_rows(scene)).to(device)
+    full = cvtgs.validity.valid_part(scene).to(device)
     return cvtgs.evaluate(
         full,
         {name: level.to(device) for name, level in levels.items()},

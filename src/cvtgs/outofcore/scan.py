@@ -211,9 +211,7 @@ def read_sample(source: PlyRows, count: int = SAMPLE_ROWS) -> GaussianScene:
     rows = step * max(1, MAPPED_ROWS // step)
     starts = range(0, source.count, rows)
     parts = (source.read(start, min(start + rows, source.count), step) for start in starts)
-    sample = source.assemble(parts, -(-source.count // step))
-    valid = validity.valid_rows(sample)
-    return sample if bool(valid.all()) else sample.select(valid)
+    return validity.valid_part(source.assemble(parts, -(-source.count // step)))
 
 
 @one_thread()

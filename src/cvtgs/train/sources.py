@@ -17,7 +17,7 @@ from cvtgs.math.parameters import positive_log
 from cvtgs.mergenet import LearnedScene
 from cvtgs.scene import GaussianScene
 from cvtgs.train.config import DataConfig
-from cvtgs.validity import valid_rows
+from cvtgs.validity import valid_part
 
 VALIDATION_SEED = 1_000_000
 """First seed of generated validation scenes."""
@@ -125,9 +125,7 @@ def _from_files(
 
 
 def _load_valid(path: Path) -> GaussianScene:
-    scene = load(path)
-    valid = valid_rows(scene)
-    return scene if bool(valid.all()) else scene.select(valid)
+    return valid_part(load(path))
 
 
 def _block_of(source: Source, count: int, seed: int) -> GaussianScene:

@@ -16,7 +16,7 @@ from cvtgs.math.frames import robust_frame
 from cvtgs.math.parameters import build_covariances, normalize_quats
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
-from cvtgs.validity import valid_rows
+from cvtgs.validity import valid_part
 from cvtgs.views import automatic_views
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class SceneNode:
 
     def draw(self, scene: GaussianScene, *, visible: bool) -> None:
         """Draw a scene in place of the current one."""
-        part = scene.select(valid_rows(scene)).to("cpu")
+        part = valid_part(scene).to("cpu")
         covariances = build_covariances(part.scales, normalize_quats(part.quats))
         self._splats = self._server.scene.add_gaussian_splats(
             self._path,

@@ -16,7 +16,7 @@ from cvtgs.prepared import Prepared
 from cvtgs.rendering import render
 from cvtgs.scene import GaussianScene
 from cvtgs.simplifier import Simplifier
-from cvtgs.validity import valid_rows
+from cvtgs.validity import valid_part
 
 __all__ = ["SceneViewer", "ShownScene"]
 
@@ -119,7 +119,7 @@ class SceneViewer:
             The mean over the cameras; infinite for the full scene itself.
         """
         images = [
-            render(one.select(valid_rows(one)), cameras).rgb.clamp(0, 1)
+            render(valid_part(one), cameras).rgb.clamp(0, 1)
             for one in (self.scenes[name].scene, self._scene)
         ]
         return float(psnr(*images).mean())
