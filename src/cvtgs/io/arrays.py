@@ -93,16 +93,31 @@ def to_bytes(values: Float[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
     return whole
 
 
+def log_scales_of(scales: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Return the logarithms of scales; those below the smallest float32 count as that."""
+    with np.errstate(invalid="ignore"):  # of NaN; rows are checked later
+        logs: Floats = np.log(np.maximum(scales, np.finfo(np.float32).tiny))
+        return logs
+
+
+def opacities_of(logits: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Return the opacities of logits."""
+    return parameters.opacity_from_logit(torch.from_numpy(logits)).numpy()
+
+
+def logits_of(opacities: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Return the logits of opacities."""
+    return parameters.logit_from_opacity(torch.from_numpy(opacities)).numpy()
+
+
 def opacity_bytes(logits: Float[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
     """Return the opacities of logits as bytes."""
-    return to_bytes(255 * parameters.opacity_from_logit(torch.from_numpy(logits)).numpy())
+    return to_bytes(255 * opacities_of(logits))
 
 
 def logits_of_bytes(opacities: UInt8[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Return the logits of opacities that are stored as bytes."""
-    values = torch.from_numpy(opacities.astype(np.float32) / np.float32(255))
-    logits: Floats = parameters.logit_from_opacity(values).numpy()
-    return logits
+    return logits_of(opacities.astype(np.float32) / np.float32(255))
 
 
 def colors_of_sh0(sh0: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -187,6 +187,7 @@ Whole = Annotated[
     BeforeValidator(_without_point),  # 800.0
     Field(ge=-_MOST_WHOLE, le=_MOST_WHOLE, description="a whole number"),
 ]
+Size = Annotated[Whole, Field(ge=0, description="a whole number of at least 0")]
 Text = Annotated[str, Strict(), Field(description="a string")]
 Flag = Annotated[bool, Strict(), Field(description="true or false")]
 Items = Annotated[list[Any], Field(description="a list")]

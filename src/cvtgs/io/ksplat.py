@@ -10,7 +10,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from cvtgs.errors import FileFormatError
-from cvtgs.io.arrays import Arrays, logits_of_bytes, scene_of, sh0_of_colors, unit_quats
+from cvtgs.io.arrays import (
+    Arrays,
+    log_scales_of,
+    logits_of_bytes,
+    scene_of,
+    sh0_of_colors,
+    unit_quats,
+)
 from cvtgs.io.files import open_input
 from cvtgs.scene import GaussianScene
 
@@ -153,13 +160,10 @@ def _read_section(
     stored = rows["sh"].astype(np.float32)
     if level == 2:  # bytes
         stored = sh_range[0] + stored / np.float32(255) * np.float32(sh_range[1] - sh_range[0])
-    with np.errstate(all="ignore"):
-        log_scales = np.log(np.maximum(rows["scale"].astype(np.float32), np.finfo(np.float32).tiny))
-        quats = unit_quats(rows["quat"].astype(np.float32))
     return Arrays(
         means=means,
-        quats=quats,
-        log_scales=log_scales,
+        quats=unit_quats(rows["quat"].astype(np.float32)),
+        log_scales=log_scales_of(rows["scale"].astype(np.float32)),
         logit_opacities=logits_of_bytes(rows["rgba"][:, 3]),
         sh0=sh0_of_colors(rows["rgba"][:, :3].astype(np.float32) / np.float32(255)),
         shN=_rest(stored, degree),

@@ -8,6 +8,7 @@ import torch
 
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
+from cvtgs.text import counted
 from cvtgs.validity import writable_rows
 
 
@@ -138,7 +139,7 @@ def losses_within(scene: GaussianScene, limits: FormatLimits) -> Losses:
     changed = list(limits.changed)
     others = [line for line in scene.comments if ANTIALIASED_TAG.lower() not in line.lower()]
     if others and not limits.comments:
-        changed.append(f"without {_counted(len(others), 'comment')}")
+        changed.append(f"without {counted(len(others), 'comment')}")
     return Losses(
         dropped=tuple(_dropped(scene, limits)),
         changed=tuple(changed),
@@ -161,7 +162,7 @@ def _dropped(scene: GaussianScene, limits: FormatLimits) -> Iterator[str]:
     if not bool(rows.all()):
         count = int((~rows).sum())
         verbs = "is not finite or has" if count == 1 else "are not finite or have"
-        yield f"{_counted(count, 'Gaussian')} that {verbs} no rotation"
+        yield f"{counted(count, 'Gaussian')} that {verbs} no rotation"
     ranges = dict(limits.ranges)
     if limits.largest_coordinate is not None:
         largest = limits.largest_coordinate(scene)
@@ -174,9 +175,5 @@ def _dropped(scene: GaussianScene, limits: FormatLimits) -> Iterator[str]:
         if count:
             yield (
                 f"{_VALUES[name]} outside [{low:.5g}, {high:.5g}], which are clamped "
-                f"({_counted(count, 'Gaussian')})"
+                f"({counted(count, 'Gaussian')})"
             )
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count:,} {what}{'' if count == 1 else 's'}"

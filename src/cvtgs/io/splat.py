@@ -11,6 +11,7 @@ from cvtgs.io.arrays import (
     Arrays,
     arrays_of,
     colors_of_sh0,
+    log_scales_of,
     logits_of_bytes,
     opacity_bytes,
     scene_of,
@@ -31,7 +32,6 @@ _ROW = np.dtype(
     ]
 )
 _CHUNK_ROWS = 1 << 16
-_LEAST_SCALE = np.finfo(np.float32).tiny
 
 
 def read_splat(path: Path) -> GaussianScene:
@@ -48,13 +48,11 @@ def read_splat(path: Path) -> GaussianScene:
                 f"each, found {size:,} bytes."
             )
         rows = np.fromfile(file, _ROW)
-    with np.errstate(invalid="ignore"):
-        log_scales = np.log(np.maximum(rows["scale"], _LEAST_SCALE))
     return scene_of(
         Arrays(
             means=rows["mean"],
             quats=unit_quats((rows["quat"].astype(np.float32) - 128) / np.float32(128)),
-            log_scales=log_scales,
+            log_scales=log_scales_of(rows["scale"]),
             logit_opacities=logits_of_bytes(rows["opacity"]),
             sh0=sh0_of_colors(rows["rgb"].astype(np.float32) / np.float32(255)),
             shN=np.empty((len(rows), 0, 3), np.float32),

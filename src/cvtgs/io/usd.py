@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from cvtgs.io.arrays import Arrays, Floats, arrays_of
-from cvtgs.math.parameters import build_covariances, opacity_from_logit
+from cvtgs.io.arrays import Arrays, Floats, arrays_of, opacities_of
+from cvtgs.math.parameters import build_covariances
 from cvtgs.math.spherical_harmonics import degree_of
 from cvtgs.scene import GaussianScene
 from cvtgs.text import printable
@@ -22,26 +22,8 @@ _SIGMAS = 3.0
 
 
 def write_usda(scene: GaussianScene, file: BinaryIO) -> None:
-    """Write a stage with one prim, in the scene's order and axes; numbers keep float32 precision.
-
-    Args:
-        scene: The scene, on any device.
-        file: The output, open for writing.
-
-    Raises:
-        InvalidSceneError: No Gaussian of the scene is finite.
-        OSError: The file cannot be written.
-
-    Example:
-        >>> import io
-        >>> from cvtgs.synthetic import scene
-        >>> file = io.BytesIO()
-        >>> write_usda(scene("object", 5, sh_degree=0, seed=0), file)
-        >>> file.getvalue().splitlines()[0]
-        b'#usda 1.0'
-    """
-    arrays = arrays_of(scene)
-    for text in _document(scene, arrays):
+    """Write a stage with one prim, in the order and axes of the scene, with float32 precision."""
+    for text in _document(scene, arrays_of(scene)):
         file.write(text.encode())
 
 
@@ -55,8 +37,7 @@ def _document(scene: GaussianScene, arrays: Arrays) -> Iterator[str]:
     yield from _array("point3f[] positions", arrays.means)
     yield from _array("quatf[] orientations", arrays.quats)
     yield from _array("float3[] scales", np.exp(arrays.log_scales))
-    logits = torch.from_numpy(arrays.logit_opacities)
-    yield from _array("float[] opacities", opacity_from_logit(logits).numpy())
+    yield from _array("float[] opacities", opacities_of(arrays.logit_opacities))
     degree = degree_of(arrays.shN.shape[1])
     yield f"    uniform int radiance:sphericalHarmonicsDegree = {degree}\n"
     bands = np.concatenate([arrays.sh0[:, None], arrays.shN], axis=1).reshape(-1, 3)

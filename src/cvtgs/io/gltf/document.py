@@ -16,6 +16,7 @@ from cvtgs.io.files import (
     AnyDocument,
     Document,
     Flag,
+    Size,
     Text,
     Whole,
     open_input,
@@ -73,7 +74,6 @@ def coefficient(degree: int, number: int) -> str:
     return f"{SPLATS}:SH_DEGREE_{degree}_COEF_{number}"
 
 
-Size = Annotated[Whole, Field(ge=0, description="a whole number of at least 0")]
 Entry = Annotated[dict[str, Any], Field(default_factory=dict, description="a JSON object")]
 Entries = Annotated[list[Any], Field(default_factory=list, description="a list")]
 

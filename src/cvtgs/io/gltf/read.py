@@ -13,9 +13,19 @@ from pydantic import Field
 
 from cvtgs.edit import Motion, merge, move
 from cvtgs.errors import DroppedDataWarning
-from cvtgs.io.arrays import Arrays, scene_of, unit_quats
-from cvtgs.io.axes import SCENE_AXES, change_axes, checked_axes
-from cvtgs.io.files import Document, Items, Number, Text, Whole, check_expansion, validated
+from cvtgs.io.arrays import Arrays, log_scales_of, logits_of, scene_of, unit_quats
+from cvtgs.io.axes import SCENE_AXES, change_axes
+from cvtgs.io.files import (
+    Document,
+    Items,
+    Number,
+    Size,
+    Text,
+    Vector,
+    Whole,
+    check_expansion,
+    validated,
+)
 from cvtgs.io.gltf.document import (
     AXES,
     COLOR_SPACE,
@@ -30,12 +40,11 @@ from cvtgs.io.gltf.document import (
     Entries,
     Entry,
     GltfFile,
-    Size,
     coefficient,
     open_gltf,
 )
 from cvtgs.io.spz import decode_spz
-from cvtgs.math.parameters import logit_from_opacity, matrices_to_quats
+from cvtgs.math.parameters import matrices_to_quats
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
 from cvtgs.text import printable, shown
@@ -44,8 +53,6 @@ _KNOWN = (SPLATS, SPZ, QUANTIZATION)
 _POINTS = 0
 _EVENNESS = 1e-4
 """Tolerance for the scale of a node to count as uniform, relative to it."""
-
-_TINY = np.finfo(np.float32).tiny
 
 Matrix = Float[np.ndarray, "4 4"]
 
@@ -60,11 +67,11 @@ class _Node(Document):
     matrix: Annotated[list[Number], Field(min_length=16, max_length=16)] | None = Field(
         None, description="16 finite numbers"
     )
-    translation: tuple[Number, Number, Number] = Field((0, 0, 0), description="3 finite numbers")
+    translation: Vector = (0, 0, 0)
     rotation: tuple[Number, Number, Number, Number] = Field(
         (0, 0, 0, 1), description="4 finite numbers"
     )
-    scale: tuple[Number, Number, Number] = Field((1, 1, 1), description="3 finite numbers")
+    scale: Vector = (1, 1, 1)
 
 
 class _Mesh(Document):
@@ -99,7 +106,6 @@ class _Placed(NamedTuple):
 
 def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False) -> GaussianScene:
     """Read the Gaussians of a ``.glb`` or ``.gltf``."""
-    axes = AXES if axes is None else checked_axes(axes)
     file = open_gltf(path)
     strange = [name for name in file.root.extensionsRequired if name not in _KNOWN]
     if strange:
@@ -115,7 +121,7 @@ def read_gltf(path: Path, *, axes: str | None = None, trust_sizes: bool = False)
     for one in placed:  # a comprehension adds a stack level in Python 3.11 only
         scenes.append(_read_primitive(file, one, trust_sizes=trust_sizes))
     scene = scenes[0] if len(scenes) == 1 else merge(scenes)
-    return change_axes(scene, axes, SCENE_AXES)
+    return change_axes(scene, AXES if axes is None else axes, SCENE_AXES)
 
 
 def _splats(file: GltfFile) -> Iterator[_Placed]:
@@ -232,21 +238,19 @@ def _read_attributes(file: GltfFile, one: _Placed) -> GaussianScene:
         raise file.error(
             f"{SCALE} must not be negative, found {scales[row].min():.4g} in element {row:,}"
         )
-    opacities = torch.from_numpy(rows(OPACITY, "SCALAR")[:, 0])
+    opacities = rows(OPACITY, "SCALAR")[:, 0]
     degree = _degree(file, one)
     rest = [
         rows(coefficient(band, number), "VEC3")
         for band in range(1, degree + 1)
         for number in range(2 * band + 1)
     ]
-    with np.errstate(invalid="ignore"):  # of NaN; rows are checked later
-        log_scales = np.log(np.maximum(scales, _TINY))
     return scene_of(
         Arrays(
             means=means,
             quats=unit_quats(np.roll(quats, 1, axis=1)),
-            log_scales=log_scales,
-            logit_opacities=logit_from_opacity(opacities).numpy(),
+            log_scales=log_scales_of(scales),
+            logit_opacities=logits_of(opacities),
             sh0=rows(coefficient(0, 0), "VEC3"),
             shN=np.stack(rest, axis=1) if rest else np.empty((len(means), 0, 3), np.float32),
         )

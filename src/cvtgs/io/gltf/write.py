@@ -8,11 +8,18 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO, Final
 
 import numpy as np
-import torch
 from jaxtyping import Float, Shaped
 
 from cvtgs.errors import InvalidSceneError
-from cvtgs.io.arrays import Arrays, Bytes, arrays_of, colors_of_sh0, opacity_bytes, to_bytes
+from cvtgs.io.arrays import (
+    Arrays,
+    Bytes,
+    arrays_of,
+    colors_of_sh0,
+    opacities_of,
+    opacity_bytes,
+    to_bytes,
+)
 from cvtgs.io.gltf.document import (
     BINARY_CHUNK,
     CHUNK,
@@ -35,7 +42,6 @@ from cvtgs.io.gltf.document import (
     coefficient,
 )
 from cvtgs.io.spz import write_spz
-from cvtgs.math.parameters import opacity_from_logit
 from cvtgs.math.spherical_harmonics import degree_of
 from cvtgs.scene import GaussianScene
 
@@ -121,10 +127,6 @@ def _attributes(arrays: Arrays) -> list[_Attribute]:
         rgb = to_bytes(255 * colors_of_sh0(arrays.sh0[part]))
         return np.column_stack([rgb, opacity_bytes(arrays.logit_opacities[part])])
 
-    def opacities(part: slice) -> Float[np.ndarray, "n 1"]:
-        logits = torch.from_numpy(arrays.logit_opacities[part])
-        return opacity_from_logit(logits).numpy()[:, None]
-
     def coefficients(number: int) -> Callable[[slice], Float[np.ndarray, "n 3"]]:
         return lambda part: arrays.shN[part, number]
 
@@ -133,7 +135,7 @@ def _attributes(arrays: Arrays) -> list[_Attribute]:
         _Attribute(name=COLOR, kind="VEC4", component=UNSIGNED_BYTE, values=colors),
         floats(ROTATION, "VEC4", lambda part: np.roll(arrays.quats[part], -1, axis=1)),
         floats(SCALE, "VEC3", lambda part: np.exp(arrays.log_scales[part])),
-        floats(OPACITY, "SCALAR", opacities),
+        floats(OPACITY, "SCALAR", lambda part: opacities_of(arrays.logit_opacities[part])),
         floats(coefficient(0, 0), "VEC3", lambda part: arrays.sh0[part]),
     ]
     number = 0

@@ -10,29 +10,26 @@ from pydantic import Field
 
 from cvtgs.edit import merge
 from cvtgs.errors import FileFormatError, InvalidArgumentError
-from cvtgs.io.files import Document, Text, Whole, open_input, parse_json, validated
+from cvtgs.io.files import Document, Size, Text, Whole, read_json, validated
 from cvtgs.io.sog.container import META
 from cvtgs.io.sog.read import read_sog
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
 
-_Size = Annotated[Whole, Field(ge=0, description="a whole number of at least 0")]
-_Object = Annotated[dict[str, Any], Field(description="a JSON object")]
-
 
 class _LodMeta(Document):
     version: Annotated[Whole, Field(ge=1, le=1, description="1")] | None = None
     lodLevels: Annotated[Whole, Field(ge=1, description="1 or more")]  # noqa: N815
-    counts: Annotated[list[_Size], Field(description="a list of whole numbers")] | None = None
+    counts: Annotated[list[Size], Field(description="a list of whole numbers")] | None = None
     filenames: Annotated[list[Text], Field(description="a list of strings")]
     environment: Text | None = None
-    tree: _Object
+    tree: Annotated[dict[str, Any], Field(description="a JSON object")]
 
 
 class _Rows(Document):
-    file: _Size
-    offset: _Size = 0
-    count: _Size
+    file: Size
+    offset: Size = 0
+    count: Size
 
 
 class _Range(NamedTuple):
@@ -58,9 +55,7 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
         FileFormatError: It is not a streamed SOG, damaged, or names files outside its folder.
         InvalidArgumentError: The level does not exist.
     """
-    with open_input(path) as file:
-        content = parse_json(file.read(), path)
-    meta = validated(_LodMeta, content, str(path))
+    meta = validated(_LodMeta, read_json(path), str(path))
     if not 0 <= lod < meta.lodLevels:
         raise InvalidArgumentError(
             f"lod must be from 0 to {meta.lodLevels - 1}, the levels of {path}, found {lod}."

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 
 from cvtgs.errors import DroppedDataWarning, FileFormatError
 from cvtgs.io.arrays import HALF_RANGE, Arrays, logits_of_bytes, restore_largest, scene_of
-from cvtgs.io.axes import AXES, SCENE_AXES, change_axes, checked_axes
+from cvtgs.io.axes import AXES, SCENE_AXES, change_axes
 from cvtgs.io.files import check_expansion, open_input
 from cvtgs.io.spz.layout import (
     AXES_EXTENSION,
@@ -67,7 +67,6 @@ def read_spz(path: Path, *, axes: str | None = None, trust_sizes: bool = False) 
         FileFormatError: It is not an ``.spz`` file, or damaged.
         InvalidArgumentError: The name of the axes is unknown.
     """
-    axes = None if axes is None else checked_axes(axes)
     with open_input(path) as file:
         content = file.read()
     return decode_spz(content, path, axes=axes, trust_sizes=trust_sizes)
