@@ -8,7 +8,7 @@ from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import multiply_quats
-from cvtgs.math.spherical_harmonics import rest_basis
+from cvtgs.math.spherical_harmonics import rest_basis, rotated_rest
 from cvtgs.scene import GaussianScene
 
 AXES = (
@@ -91,12 +91,11 @@ def _with_signs(scene: GaussianScene, x: int, y: int, z: int) -> GaussianScene:
 
 def _with_quarter_turn(scene: GaussianScene) -> GaussianScene:
     turn = scene.quats.new_tensor([[0.5**0.5, 0.5**0.5, 0.0, 0.0]]).expand(len(scene), 4)
-    bands = _sh_quarter_turn().to(scene.shN)[: scene.shN.shape[1], : scene.shN.shape[1]]
     return scene.with_tensors(
         {
             "means": scene.means @ _QUARTER_TURN.T.to(scene.means),
             "quats": multiply_quats(turn, scene.quats),
-            "shN": torch.einsum("jk,nkc->njc", bands, scene.shN),
+            "shN": rotated_rest(scene.shN, _QUARTER_TURN),
         },
         scene.extras,
     )
@@ -109,15 +108,3 @@ def _sh_signs(x: int, y: int, z: int) -> Float[Tensor, "k"]:
     direction = torch.tensor([[0.2, 0.5, 0.9]], dtype=torch.float64, device="cpu")
     turned = direction * direction.new_tensor([x, y, z])
     return (rest_basis(turned, 3) / rest_basis(direction, 3))[0].sign()
-
-
-@cache
-@torch.inference_mode(mode=False)
-def _sh_quarter_turn() -> Float[Tensor, "k k"]:
-    """Return the SH matrix of the quarter turn; squares of entries are multiples of 1/16."""
-    generator = torch.Generator().manual_seed(0)
-    directions = torch.randn(64, 3, generator=generator, dtype=torch.float64, device="cpu")
-    directions /= directions.norm(dim=1, keepdim=True)
-    basis, turned = rest_basis(directions, 3), rest_basis(directions @ _QUARTER_TURN, 3)
-    matrix: Tensor = torch.linalg.lstsq(basis, turned).solution
-    return matrix.sign() * ((16 * matrix**2).round() / 16).sqrt()
