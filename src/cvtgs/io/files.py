@@ -6,7 +6,7 @@ import re
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, BinaryIO, TypeVar, get_args
 
 import pydantic
@@ -27,6 +27,8 @@ FREE_BYTES = 1 << 26
 """A scene of at most this many bytes in memory may come from a file of any size."""
 MOST_EXPANSION = 64
 """Beyond that, a scene may take this many times the bytes of its file; real ones take 4 to 13."""
+LONGEST_NAME = 255
+"""Characters that file systems allow in a name."""
 _FLOATS = 14
 """Numbers of a Gaussian without view-dependent SH coefficients."""
 _MOST_WHOLE = 1 << 53
@@ -216,6 +218,13 @@ def _sentence(model: type[Document], value: Any, keys: Sequence[int | str], wher
     required = schema.get("description") or schema["anyOf"][0]["description"]  # X, X | None
     found = shown(value[key]) if key in value else "none"
     return f"{where}: {key!r} must be {required}, found {found}."
+
+
+def is_within(name: str) -> bool:
+    """Return whether a file that another one names is in its folder or below, on every system."""
+    path = PurePosixPath(name)
+    plain = name.isprintable() and not set(name) & set("\\:")
+    return plain and path.name != "" and not path.is_absolute() and ".." not in path.parts
 
 
 def read_json(path: Path) -> Any:

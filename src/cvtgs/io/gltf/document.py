@@ -13,12 +13,14 @@ from pydantic import Field
 
 from cvtgs.errors import FileFormatError
 from cvtgs.io.files import (
+    LONGEST_NAME,
     AnyDocument,
     Document,
     Flag,
     Size,
     Text,
     Whole,
+    is_within,
     open_input,
     parse_json,
     validated,
@@ -66,7 +68,6 @@ _ENCODINGS = {
 attributes may be floats; those that are not listed must be."""
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _MOST_STRIDE = 252
-_LONGEST_NAME = 255
 
 
 def coefficient(degree: int, number: int) -> str:
@@ -234,14 +235,13 @@ class GltfFile:
 
     def _beside(self, uri: str, index: int, length: int) -> bytes:
         parts = urlsplit(uri)
-        name = PurePosixPath(unquote(parts.path))
-        outside = name.is_absolute() or ".." in name.parts or not name.parts or "\\" in str(name)
-        outside |= len(uri) > _LONGEST_NAME  # such as a damaged data URI
-        if parts.scheme or parts.netloc or parts.query or outside or not str(name).isprintable():
+        name = unquote(parts.path)
+        outside = not is_within(name) or len(uri) > LONGEST_NAME  # such as a damaged data URI
+        if parts.scheme or parts.netloc or parts.query or outside:
             raise self.error(
                 f"buffers[{index}] must be in the folder of the file, found {shown(uri)}"
             )
-        with open_input(self.path.parent / name) as file:
+        with open_input(self.path.parent / PurePosixPath(name)) as file:
             content = file.read(length)
         self.stored += len(content)
         return content

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from cvtgs.errors import FileFormatError, is_out_of_memory
-from cvtgs.io.files import is_file, open_input
+from cvtgs.io.files import LONGEST_NAME, is_file, is_within, open_input
 from cvtgs.text import shown
 
 META = "meta.json"
@@ -21,9 +21,6 @@ MOST_META_BYTES = 1 << 20
 
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compression methods whose output zipfile bounds; it unpacks blocks of bzip2 or LZMA whole."""
-
-_LONGEST_NAME = 255
-"""Characters that file systems allow in a name."""
 
 PALETTE_COLUMNS = 64
 """Entries of the SH palette per row of its image."""
@@ -105,14 +102,13 @@ def _reason(error: Exception) -> str:
 
 
 def _check_name(name: str, path: Path) -> None:
-    plain = name.isprintable() and name not in ("", "..") and not set(name) & set("\\:")
-    if PurePosixPath(name).name != name or not plain:
+    if PurePosixPath(name).name != name or not is_within(name):
         raise FileFormatError(
             f"{path}: the files of a SOG must have names without folders, found {shown(name)}."
         )
-    if len(name) > _LONGEST_NAME:
+    if len(name) > LONGEST_NAME:
         raise FileFormatError(
-            f"{path}: the files of a SOG must have names of at most {_LONGEST_NAME} characters, "
+            f"{path}: the files of a SOG must have names of at most {LONGEST_NAME} characters, "
             f"found {shown(name)}."
         )
 

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from cvtgs.edit import merge
 from cvtgs.errors import FileFormatError, InvalidArgumentError
-from cvtgs.io.files import Document, Size, Text, Whole, read_json, validated
+from cvtgs.io.files import Document, Size, Text, Whole, is_within, read_json, validated
 from cvtgs.io.sog.container import META
 from cvtgs.io.sog.read import read_sog
 from cvtgs.scene import GaussianScene
@@ -143,8 +143,7 @@ def _check_count(
 def _inside(path: Path, name: str) -> Path:
     """Return the path of a SOG of the stream, which must be in its folder."""
     pure = PurePosixPath(name)
-    plain = name.isprintable() and not set(name) & set("\\:") and name != ""
-    if not plain or pure.is_absolute() or ".." in pure.parts:
+    if not is_within(name):
         raise FileFormatError(
             f"{path}: the files of a stream must be in its folder, found {shown(name)}."
         )
