@@ -21,6 +21,7 @@ from cvtgs.grouping import REASSIGN, allocation_at
 from cvtgs.io import atomic_output
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.math.segments import segment_argmax, sort_by_label, take_columns
+from cvtgs.outofcore.halo import number_remote
 from cvtgs.outofcore.job import SENT_BYTES, Job
 from cvtgs.outofcore.rows import BlockRows, send_rows
 from cvtgs.outofcore.visibility import is_measured, read_apparent_rows
@@ -32,25 +33,12 @@ KEY = 1 << 32
 def cell_parts(
     job: Job, block: int, rows: BlockRows, owners: Int[Tensor, "n"], labels: Int[Tensor, "n"]
 ) -> dict[str, Tensor]:
-    """Return the parts of cells in a block, as tensors by name.
+    """Return the part of a cell that each Gaussian of a block belongs to, and all parts' moments.
 
-    Args:
-        job: The job.
-        block: The block.
-        rows: Gaussians of the block.
-        owners: Block of the cell of each Gaussian; -1 is this block.
-        labels: Number of the cell of each Gaussian in the block of the cell.
-
-    Returns:
-        ``parts``: the part that each Gaussian belongs to; parts of own cells come first.
-        ``remote``: block and number of the cell of every other part. The moments of all parts.
+    Parts are numbered by :func:`number_remote`; ``owners`` and ``labels`` are as there.
     """
     count = job.cells[block]
-    away = (owners >= 0).nonzero()[:, 0]
-    pairs = torch.stack([owners[away], labels[away]], dim=1)
-    remote, numbers = torch.unique(pairs, dim=0, return_inverse=True)
-    parts = labels.clone()
-    parts[away] = count + numbers
+    parts, remote = number_remote(owners, labels, count)
     moments = cells.group_moments(_members(job, rows), parts, count + len(remote))
     return {"parts": parts.int(), "remote": remote, **moments._asdict()}
 

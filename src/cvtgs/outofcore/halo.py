@@ -135,6 +135,20 @@ def assign_points(
     return Assignment(blocks, labels, squared)
 
 
+def number_remote(
+    owners: Int[Tensor, "n"], labels: Int[Tensor, "n"], count: int
+) -> tuple[Int[Tensor, "n"], Int[Tensor, "r 2"]]:
+    """Number the remote sites or cells of a block's points after its ``count`` own ones.
+
+    ``owners`` are their blocks, -1 for this one, and ``labels`` their numbers there. Also returns
+    block and number of each remote one.
+    """
+    away = (owners >= 0).nonzero()[:, 0]
+    pairs = torch.stack([owners[away], labels[away]], dim=1)
+    remote, numbers = torch.unique(pairs, dim=0, return_inverse=True)
+    return labels.index_copy(0, away, count + numbers), remote
+
+
 def halo_cells(
     centers: Float[Tensor, "m 3"], others: Iterable[OtherBlock], *, count: int
 ) -> Int[Tensor, "h 2"]:

@@ -20,7 +20,13 @@ from cvtgs.grouping import curve_order, embed_rows
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.math.segments import label_argmin
 from cvtgs.outofcore.allocate import cell_parts
-from cvtgs.outofcore.halo import Assignment, assign_points, bounding_box, other_blocks
+from cvtgs.outofcore.halo import (
+    Assignment,
+    assign_points,
+    bounding_box,
+    number_remote,
+    other_blocks,
+)
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.visibility import read_apparent_rows
 
@@ -70,12 +76,7 @@ def accumulate(job: Job, iteration: int, block: int) -> float:
     points, weights = tensors["points"], tensors["weights"]
     sites, found = _assign(job, iteration, block, points)
     count = len(sites)
-    # Remote sites are numbered after the own ones.
-    away = (found.blocks >= 0).nonzero()[:, 0]
-    pairs = torch.stack([found.blocks[away], found.labels[away]], dim=1)
-    remote, numbers = torch.unique(pairs, dim=0, return_inverse=True)
-    labels = found.labels.clone()
-    labels[away] = count + numbers
+    labels, remote = number_remote(found.blocks, found.labels, count)
     totals, sums = weighted_sums(points, weights, labels, count + len(remote))
     energy = (weights * found.squared).sum()
     result = {"totals": totals, "sums": sums, "remote": remote, "energy": energy}

@@ -45,21 +45,7 @@ class SortedBlocks(NamedTuple):
 def sort_into_blocks(
     job: Job, workers: Workers, clock: StageClock, *, keep_all: bool = False
 ) -> SortedBlocks:
-    """Scan the file and sort its rows into blocks.
-
-    Args:
-        job: The job; its folder must be empty.
-        workers: Call functions for ranges of the file.
-        clock: Measures both stages.
-        keep_all: Whether the filter is turned off.
-
-    Returns:
-        The numbers of Gaussians and the weights of the blocks.
-
-    Raises:
-        InvalidSceneError: No row is valid.
-        InvalidArgumentError: No Gaussian is left besides those in boxes.
-    """
+    """Scan the file and sort its rows into blocks; ``keep_all`` turns the filter off."""
     ranges = job.ranges()
     with clock.stage("scan", len(ranges)) as advance:
         rest, scan = _scan(job, workers, ranges, advance)

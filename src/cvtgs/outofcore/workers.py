@@ -1,7 +1,7 @@
 """Workers, which call functions for ranges of a file and for blocks, here or elsewhere."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, TypeVar
 
 from cvtgs.clock import StageClock
 from cvtgs.devices import core_count
@@ -31,31 +31,16 @@ class Workers(Protocol):
         ...
 
 
-@runtime_checkable
-class CheckedWorkers(Workers, Protocol):
-    """Workers that may be on other machines, and are checked before a job."""
-
-    def check(self, job: Job) -> int:
-        """Raise if a worker cannot do a job.
-
-        Args:
-            job: The job; its folder must exist.
-
-        Returns:
-            The number of workers.
-        """
-        ...
-
-
 def begin(
     job: Job, workers: Workers, clock: StageClock, checkpoint: Checkpoint | None, *, resumes: bool
 ) -> None:
     """Make the folder of a job and write its network, unless it resumes; check the workers."""
     if not resumes:
         job.start_over()
-    if isinstance(workers, CheckedWorkers):
+    check: Callable[[Job], object] | None = getattr(workers, "check", None)
+    if check is not None:  # workers on other machines
         with clock.stage("workers"):
-            workers.check(job)
+            check(job)
     if not resumes and checkpoint is not None:
         job.write_network(checkpoint)
 

@@ -111,7 +111,7 @@ class StreamJob:
         """Return the written part of a block; None unless all its files are complete."""
         try:
             part = StreamPart.model_validate_json(self.part_path(block).read_bytes())
-            sizes = [_bytes_of((self.folder / name), self.form.kind) for name in part.names]
+            sizes = [_bytes_of(self.folder / name, self.form.kind) for name in part.names]
             if part.environment is not None and not (self.folder / part.environment).exists():
                 return None
         except (OSError, ValueError):
@@ -319,18 +319,7 @@ def reduce_levels(
     *,
     net: MergeNet | PublishedMergeNet | None,
 ) -> list[BlockLevel]:
-    """Simplify a scene to several sizes, the finest first; coarse ones merge cells of the finest.
-
-    Args:
-        scene: The Gaussians; all rows must be valid.
-        analysis: Their analysis.
-        targets: The sizes, descending.
-        config: The configuration.
-        net: Network that corrects merged Gaussians; None for no correction.
-
-    Returns:
-        One level per size.
-    """
+    """Simplify valid Gaussians to descending sizes; coarse levels merge cells of the finest."""
     found: list[BlockLevel] = []
     finest: Reduced | None = None
     clock = StageClock(silent, scene.device)

@@ -14,7 +14,7 @@ from cvtgs.errors import InvalidArgumentError, OutputError, OutputExistsError, r
 from cvtgs.io import atomic_output, check_output
 from cvtgs.io.atomic import make_folder
 from cvtgs.progress import ProgressListener
-from cvtgs.streams.plan import Corner, StreamPlan
+from cvtgs.streams.plan import Corner, StreamPlan, join_boxes
 
 __all__ = ["INDEX_NAMES", "StreamLevel", "check_stream"]
 
@@ -73,28 +73,13 @@ class StreamFormat(Protocol):
     def write_part(
         self, plan: StreamPlan, folder: Path, *, part: int, listener: ProgressListener
     ) -> StreamPart:
-        """Write the chunks of a part under names that no other part uses.
-
-        Args:
-            plan: Levels and chunks of the part.
-            folder: Folder to write to.
-            part: Number of the part.
-            listener: Called after each file.
-
-        Returns:
-            The written part.
-        """
+        """Write the chunks of a part, by its number, under names that no other part uses."""
         ...
 
     def index(self, parts: Sequence[StreamPart], folder: Path) -> dict[str, Any]:
-        """Return the content of the index.
+        """Return the content of the index, and write files that all parts share to their folder.
 
-        Args:
-            parts: All parts, ordered so that consecutive ones are close in space.
-            folder: Folder of the parts; files that all parts share are written to it.
-
-        Returns:
-            The content, to be written as JSON.
+        Consecutive parts must be close in space.
         """
         ...
 
@@ -135,33 +120,20 @@ def join_trees(
     leaf: Callable[[int], dict[str, Any]],
     inner: Callable[[Corner, Corner, list[dict[str, Any]]], dict[str, Any]],
 ) -> dict[str, Any]:
-    """Build the tree above parts; each node has half of the parts of its parent.
+    """Build the tree above parts and return its root; a node has half of the parts of its parent.
 
-    Args:
-        parts: The parts.
-        leaf: Returns the node of the part with a given number.
-        inner: Returns an inner node from its box corners and its children.
-
-    Returns:
-        The root.
+    ``leaf`` returns the node of a part by its number; ``inner`` an inner node from the corners of
+    its box and its children.
     """
 
     def node(numbers: range) -> dict[str, Any]:
         if len(numbers) == 1:
             return leaf(numbers[0])
         middle = len(numbers) // 2
-        own = [parts[number] for number in numbers]
-        low, high = join_boxes([part.box_min for part in own], [part.box_max for part in own])
+        low, high = join_boxes((parts[k].box_min, parts[k].box_max) for k in numbers)
         return inner(low, high, [node(numbers[:middle]), node(numbers[middle:])])
 
     return node(range(len(parts)))
-
-
-def join_boxes(lows: Sequence[Corner], highs: Sequence[Corner]) -> tuple[Corner, Corner]:
-    """Return the bounding box of boxes."""
-    x, y, z = map(min, zip(*lows, strict=True))
-    right, down, far = map(max, zip(*highs, strict=True))
-    return (x, y, z), (right, down, far)
 
 
 def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool = False) -> None:

@@ -288,10 +288,14 @@ def _node(cut: _Cut, chunks: Sequence[StreamChunk]) -> StreamNode:
     if cut.chunk is not None:
         chunk = chunks[cut.chunk]
         return StreamNode(chunk.box_min, chunk.box_max, chunk=cut.chunk)
-    first, second = (_node(side, chunks) for side in cut.sides)
-    low = map(min, zip(first.box_min, second.box_min, strict=True))
-    high = map(max, zip(first.box_max, second.box_max, strict=True))
-    return StreamNode(_three(low), _three(high), (first, second))
+    sides = tuple(_node(side, chunks) for side in cut.sides)
+    return StreamNode(*join_boxes((side.box_min, side.box_max) for side in sides), sides)
+
+
+def join_boxes(boxes: Iterable[tuple[Corner, Corner]]) -> tuple[Corner, Corner]:
+    """Return the minimum and maximum corners of the bounding box of boxes."""
+    lows, highs = zip(*boxes, strict=True)
+    return _three(map(min, zip(*lows, strict=True))), _three(map(max, zip(*highs, strict=True)))
 
 
 def _three(numbers: Iterable[float]) -> Corner:

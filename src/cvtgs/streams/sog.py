@@ -55,7 +55,7 @@ class SogFormat:
     kind: str = "sog"
 
     def write_part(
-        self, plan: StreamPlan, folder: Path, *, part: int = 0, listener: ProgressListener = silent
+        self, plan: StreamPlan, folder: Path, *, part: int, listener: ProgressListener
     ) -> StreamPart:
         """Write the chunks of a level consecutively, so that nearby chunks share a file."""
         units = list(_units(plan, part, self.file_gaussians))

@@ -15,8 +15,8 @@ from cvtgs.io.axes import SCENE_AXES, change_axes
 from cvtgs.io.gltf import write_spz_glb
 from cvtgs.io.gltf.document import AXES, SPLATS, SPZ
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
-from cvtgs.streams.files import StreamLevel, StreamPart, join_boxes, join_trees, write_stream
-from cvtgs.streams.plan import Corner, StreamNode, StreamPlan
+from cvtgs.streams.files import StreamLevel, StreamPart, join_trees, write_stream
+from cvtgs.streams.plan import Corner, StreamNode, StreamPlan, join_boxes
 
 __all__ = ["check_transform", "geo_transform", "write_tiles"]
 
@@ -57,7 +57,7 @@ class TilesFormat:
     kind: str = "3dtiles"
 
     def write_part(
-        self, plan: StreamPlan, folder: Path, *, part: int = 0, listener: ProgressListener = silent
+        self, plan: StreamPlan, folder: Path, *, part: int, listener: ProgressListener
     ) -> StreamPart:
         """Write the tiles of a part; the first holds the coarsest level of the whole part."""
         root = _tiles(plan, self.tile_gaussians)
@@ -86,7 +86,7 @@ class TilesFormat:
 
     def index(self, parts: Sequence[StreamPart], folder: Path) -> dict[str, Any]:
         """Return the content of ``tileset.json``; tiles share no other file."""
-        low, high = join_boxes([part.box_min for part in parts], [part.box_max for part in parts])
+        low, high = join_boxes((part.box_min, part.box_max) for part in parts)
         root = join_trees(parts, lambda part: parts[part].tree, _parent)
         placed = {} if self.transform is None else {"transform": list(self.transform)}
         extensions = {"extensionsUsed": [SPLATS, SPZ], "extensionsRequired": [SPLATS, SPZ]}
