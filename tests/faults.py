@@ -36,7 +36,6 @@ EARLY = 75
 """Exit status of a fork that a signal ends before ``main`` handles signals or writes files."""
 
 BUSY = ("only one run at a time may work on it", "must not exist yet", "must be")
-MOST_SECONDS = 300.0
 
 
 class FaultError(Exception):

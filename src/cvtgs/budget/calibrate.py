@@ -288,15 +288,8 @@ def calibrate(
     The first trial without images, and the first with some, are run once more to load their
     libraries. Then every trial is measured up to three times, or once if that takes long; the
     fastest time of each stage counts, since other programs can only slow it down. After 15 CPU
-    seconds nothing is repeated, and the last trials are skipped.
-
-    Args:
-        run: Simplifies a scene, and returns the seconds of each stage.
-        prior: Rates that hold where the measurements leave them open; None for the shipped ones.
-        trials: What to measure.
-        clock: Returns wall-clock seconds.
-        cpu: Returns CPU seconds of this process.
-        listener: Called with progress events.
+    seconds nothing is repeated, and the last trials are skipped. Where the measurements leave rates
+    open, those of ``prior`` hold; None is the shipped model.
     """
     kinds = {trial: (trial.kind, trial.count, trial.sh_degree) for trial in trials}
     made = {key: make(key[0], key[1], sh_degree=key[2]) for key in dict.fromkeys(kinds.values())}

@@ -150,7 +150,7 @@ def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> N
             sizes = f"{size_text(bytes_in)} -> {size_text(bytes_out)}"
             facts = ", ".join(filter(None, (outcome.counts, sizes, outcome.seconds)))
             room = max(8, WIDTH - len(place) - len(facts) - 2)
-            say(f"{place}{without_middle(printable(target.name), room)}: {facts}", flush=True)
+            say(f"{place}{without_middle(target.name, room)}: {facts}", flush=True)
             for note in outcome.notes:
                 say_wrapped(note, indent=len(place))
     done = len(jobs) - failed

@@ -174,7 +174,8 @@ def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
     """
     beside = CameraTensors.of(camera, scene.means)
     rows = _candidates(scene, camera, beside)
-    offsets = _offsets(scene.means.index_select(0, rows), beside)
+    means = scene.means.index_select(0, rows)
+    offsets = _offsets(means, beside)
     local = offsets @ beside.rotation.T
     axes = _image_axes(scene, rows, local, beside)
     ellipses, survival = _ellipses(axes, camera.dilation)
@@ -183,8 +184,7 @@ def project(scene: GaussianScene, camera: Pinhole, sh_degree: int) -> Splats:
         opacities = opacities * survival
     slopes = local[:, :2] / local[:, 2:]
     centers = slopes * beside.focal + beside.principal
-    depths = _depths(scene.means.index_select(0, rows), beside)
-    order = _front_to_back(centers, ellipses, opacities, depths, camera)
+    order = _front_to_back(centers, ellipses, opacities, _depths(means, beside), camera)
     return Splats(
         rows=rows[order],
         centers=centers[order],

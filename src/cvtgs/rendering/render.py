@@ -135,10 +135,8 @@ def contributions(
         ((500,), True, True)
     """
     chosen = choose_backend(backend, scene.device)[1]
-    placed = cameras.to(scene.device)
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
-    for number in range(len(cameras)):
-        camera = placed.select(torch.tensor([number], device=scene.device))
+    for camera in cameras.to(scene.device).singles():
         total += chosen.contributions(scene, camera)
     return total
 

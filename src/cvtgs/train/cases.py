@@ -1,7 +1,7 @@
 """Training cases: scenes simplified to a ratio, and images of full scenes as targets."""
 
 from collections import OrderedDict
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -60,19 +60,9 @@ def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> Me
     rows = filter_rows(valid, analysis, target, config.filter).rows
     grouping = group_rows(valid, rows, analysis, target, config)
     merged = merge_and_inflate(
-        valid,
-        grouping.partition,
-        config.merge,
-        areas=analysis.areas,
-        with_network=True,
+        valid, grouping.partition, config.merge, areas=analysis.areas, with_network=True
     )
-    return MergedScene(
-        valid,
-        merged.scene,
-        merged.partition,
-        merged.neighbors,
-        analysis.visibility,
-    )
+    return MergedScene(valid, merged.scene, merged.partition, merged.neighbors, analysis.visibility)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -102,10 +92,8 @@ class Case:
 
     def select(self, rows: Int[Tensor, "s"]) -> "Case":
         """Return the case restricted to some of its cells."""
-        return Case(
-            scene_name=self.scene_name,
-            ratio=self.ratio,
-            reference=self.reference,
+        return replace(
+            self,
             cells=self.cells[rows],
             part=self.part.select(rows),
             descriptors=self.descriptors.select(rows),
@@ -147,22 +135,20 @@ class Case:
 
     def to(self, device: torch.device) -> "Case":
         """Return the case on a device."""
-        reference, part = self.reference, self.part
+        reference = self.reference
         if reference.scene.device == device:
             return self
-        moved = MergedScene(
-            scene=reference.scene.to(device),
-            merged=reference.merged.to(device),
-            partition=reference.partition.to(device),
-            neighbors=reference.neighbors.to(device),
-            visibility=reference.visibility.to(device),
-        )
-        return Case(
-            scene_name=self.scene_name,
-            ratio=self.ratio,
-            reference=moved,
+        return replace(
+            self,
+            reference=MergedScene(
+                scene=reference.scene.to(device),
+                merged=reference.merged.to(device),
+                partition=reference.partition.to(device),
+                neighbors=reference.neighbors.to(device),
+                visibility=reference.visibility.to(device),
+            ),
             cells=self.cells.to(device),
-            part=part.to(device),
+            part=self.part.to(device),
             descriptors=self.descriptors.to(device),
         )
 
@@ -244,10 +230,7 @@ Item = TypeVar("Item", Case, TargetViews)
 class DeviceCopies:
     """A cache of copies of cases and images on a device; the least recently used are evicted.
 
-    Args:
-        device: Device of the copies.
-        room: Largest total size of the copies, bytes; None is half of the free memory on CUDA, and
-            1 GB elsewhere.
+    The copies take at most ``room`` bytes: by default half of the free memory on CUDA, else 1 GB.
     """
 
     def __init__(self, device: torch.device, room: int | None = None) -> None:

@@ -134,10 +134,7 @@ def local_loss(
     residuals: Residuals = net(chosen.descriptors)
     corrected = chosen.correct_cells(residuals)
     grid = lay_out_cells(chosen.reference, chosen.cells, chosen.part, corrected, rng=rng)
-    background = _random_color(rng, case)
-    with torch.no_grad():
-        target = render(grid.members, grid.camera, background=background).rgb
-    image = render(grid.corrected, grid.camera, background=background).rgb
+    image, target = _render_grid(grid, _random_color(rng, case))
     return view_loss(image, target, config.loss) + _residual_penalty(residuals, config.loss)
 
 
@@ -158,10 +155,8 @@ def published_loss(
     grid = lay_out_cells(
         case.reference, cells, part, corrected, rng=rng, tile=config.tile, apart=2, all_bands=True
     )
-    with torch.no_grad():
-        target = render(grid.members, grid.camera, background=background).rgb
-    image = render(grid.corrected, grid.camera, background=background).rgb
-    return image_loss(*(cut_crops(one, len(rows), config.tile, 2) for one in (image, target)))
+    images = _render_grid(grid, background)
+    return image_loss(*(cut_crops(one, len(rows), config.tile, 2) for one in images))
 
 
 def _draw_cells(counts: Int[Tensor, "r"], config: TrainConfig, rng: random.Random) -> Tensor:
@@ -287,9 +282,7 @@ class _Placement:
     positions: Float[Tensor, "m 3"]
 
     @classmethod
-    def draw(
-        cls, merged: GaussianScene, side: int, rng: random.Random, apart: int = 1
-    ) -> "_Placement":
+    def draw(cls, merged: GaussianScene, side: int, rng: random.Random, apart: int) -> "_Placement":
         count = len(merged)
         generator = torch.Generator().manual_seed(rng.getrandbits(62))
         quats = torch.randn(count, 4, generator=generator)
@@ -314,7 +307,7 @@ class _Placement:
         )
 
     def apply(
-        self, tensors: dict[str, Tensor], ids: Int[Tensor, "n"], *, all_bands: bool = False
+        self, tensors: dict[str, Tensor], ids: Int[Tensor, "n"], *, all_bands: bool
     ) -> GaussianScene:
         quats, zooms = self.quats[ids], self.zooms[ids]
         local = (tensors["means"] - self.centers[ids]) * zooms[:, None]
@@ -333,6 +326,13 @@ class _Placement:
             sh0=sh0,
             shN=sh0[:, :0],
         )
+
+
+def _render_grid(grid: CellGrid, background: Float[Tensor, "3"]) -> tuple[Tensor, Tensor]:
+    """Return the image of the corrected Gaussians, and that of the members without gradients."""
+    with torch.no_grad():
+        target = render(grid.members, grid.camera, background=background).rgb
+    return render(grid.corrected, grid.camera, background=background).rgb, target
 
 
 def _grid_camera(side: int, like: Tensor, tile: int) -> Cameras:

@@ -13,7 +13,6 @@ from cvtgs import synthetic
 from cvtgs.errors import ConfigError
 from cvtgs.io import load
 from cvtgs.math import parameters
-from cvtgs.math.parameters import positive_log
 from cvtgs.mergenet import LearnedScene
 from cvtgs.scene import GaussianScene
 from cvtgs.train.config import DataConfig
@@ -195,7 +194,7 @@ def perturb(scene: GaussianScene, rng: random.Random) -> GaussianScene:
     return kept.with_tensors(
         {
             "means": kept.means * stretch,
-            "log_scales": positive_log(scales).to(scene.dtype),
+            "log_scales": parameters.positive_log(scales).to(scene.dtype),
             "quats": turned.to(scene.dtype),
             "logit_opacities": kept.logit_opacities + rng.triangular(-2.0, 4.0, 0.0),
             "sh0": kept.sh0 @ mix,
