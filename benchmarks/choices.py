@@ -26,8 +26,10 @@ from statistics import fmean
 import cvtgs
 from benchmarks.cameras import CACHE, FullImages, cameras_beside
 from benchmarks.measuring import warm_up, write_file
+from benchmarks.quality import mean_or_none
 from cvtgs.cameras import Cameras
 from cvtgs.evaluation import EvaluationSettings, compare, write_comparison
+from cvtgs.evaluation.report import mean_of
 from cvtgs.evaluation.scorer import (
     BLACK,
     ImageScores,
@@ -155,7 +157,7 @@ def measure(
                 name=name,
                 psnr=scores.psnr.mean,
                 ssim=scores.ssim.mean,
-                lpips=scores.lpips.mean if scores.lpips else None,
+                lpips=mean_of(scores.lpips),
                 alpha_error=scores.alpha_error.mean,
                 alpha_bias=scores.alpha_bias.mean,
                 seconds=seconds,
@@ -192,14 +194,13 @@ def means(rows: Sequence[Row]) -> Iterator[Row]:
     """Average over the scenes, for every ratio and configuration in their order."""
     for rho, name in dict.fromkeys((row.rho, row.name) for row in rows):
         some = [row for row in rows if (row.rho, row.name) == (rho, name)]
-        distances = [row.lpips for row in some if row.lpips is not None]
         yield Row(
             scene=MEAN,
             rho=rho,
             name=name,
             psnr=fmean(row.psnr for row in some),
             ssim=fmean(row.ssim for row in some),
-            lpips=fmean(distances) if len(distances) == len(some) else None,
+            lpips=mean_or_none([row.lpips for row in some]),
             alpha_error=fmean(row.alpha_error for row in some),
             alpha_bias=fmean(row.alpha_bias for row in some),
             seconds=fmean(row.seconds for row in some),

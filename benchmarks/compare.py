@@ -122,12 +122,15 @@ def own_methods(settings: Sequence[str]) -> dict[str, list[str]]:
     }
 
 
+def baseline_methods() -> dict[str, list[str]]:
+    """Return the commands of the baselines, by name."""
+    command, places = [sys.executable, "-m", "benchmarks.baselines"], ["{IN}", "{OUT}"]
+    return {name: [*command, name, *places, "--count", "{COUNT}"] for name in BASELINES}
+
+
 def commands_of(options: argparse.Namespace) -> dict[str, list[str]]:
     """Return the command of every method, with placeholders, by name."""
-    run_baseline = [sys.executable, "-m", "benchmarks.baselines"]
-    methods = own_methods(options.set) | {
-        name: [*run_baseline, name, "{IN}", "{OUT}", "--count", "{COUNT}"] for name in BASELINES
-    }
+    methods = own_methods(options.set) | baseline_methods()
     names = list(methods) if options.methods is None else options.methods
     commands = {name: methods[name] for name in names}
     for tool in options.tool:

@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import mean
 from typing import Literal
 
-from benchmarks.quality import Quality, markdown_rows
+from benchmarks.quality import Quality, markdown_rows, mean_or_none
 from cvtgs.plots import Panel, Series, line_chart
 
 Clock = Literal["wall", "cpu"]
@@ -148,8 +148,8 @@ def _at(row: Mapping[float, Result | None]) -> Iterable[Result]:
 
 def _cell(values: Sequence[float | None], form: str) -> str:
     """Format the mean of values, or return a dash if a value is missing."""
-    known = [value for value in values if value is not None]
-    return f"{mean(known):{form}}" if len(known) == len(values) else "-"
+    found = mean_or_none(values)
+    return "-" if found is None else f"{found:{form}}"
 
 
 def wrong_counts(table: Table) -> str:

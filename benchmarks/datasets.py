@@ -130,17 +130,17 @@ class TestViews(NamedTuple):
     folder: Path
 
 
-def find_captures(root: Path, datasets: Sequence[Dataset] = DATASETS) -> Found:
+def find_captures(root: Path) -> Found:
     """Find the scenes of the datasets below a folder, and the model of each."""
     if not root.is_dir():
         raise SystemExit(f"{root}: must be a folder of datasets, found none.")
-    known = {name for dataset in datasets for name in dataset.scenes}
+    known = {name for dataset in DATASETS for name in dataset.scenes}
     folders: dict[str, list[Path]] = {name: [] for name in known}
     for folder in _folders(root):
         if folder.name.lower() in known:
             folders[folder.name.lower()].append(folder)
     captures, notes = [], []
-    for dataset in datasets:
+    for dataset in DATASETS:
         there = {
             name: [path for path in folders[name] if _has_cameras(path)] for name in dataset.scenes
         }

@@ -21,6 +21,7 @@ from benchmarks.measuring import fastest, machine, renew_tables, run_python
 from benchmarks.quality import score_views
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.analysis import BAND_LOSS, band_losses, duplicate_share, far_share, haze_share
+from cvtgs.clock import peak_memory_bytes
 from cvtgs.math.frames import robust_frame
 from cvtgs.scene import ANTIALIASED_TAG, FLAT_LOG_SCALE
 from cvtgs.synthetic import scene as make
@@ -187,7 +188,7 @@ def run_child(
         scene = cvtgs.load(path, sh_degree=degree, extras=choices.extras != "off")
         small, report = simplifier.run(scene, options.rho)
         seconds.append(resource.getrusage(resource.RUSAGE_SELF).ru_utime - start)
-    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    peak = peak_memory_bytes()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about a third scale that the file cannot hold
         cvtgs.save(small, Path(path).with_suffix(f".{choice}.ply"), overwrite=True)

@@ -25,7 +25,6 @@ from benchmarks.quality import score_views
 from cvtgs.outofcore import read_bytes, simplify_file
 from cvtgs.views import automatic_views
 
-KINDS = ("object", "room", "landscape", "haze", "thin", "courtyard")
 RATIOS = (0.1, 0.01, 0.001)
 SHARES = (0.97, 0.985, 1.0, 1.015, 1.03)
 
@@ -35,7 +34,8 @@ def main() -> None:
     parser.add_argument("what", choices=("levels", "seams", "blocks", "make"))
     parser.add_argument("files", nargs="*", type=Path, help="PLYs; generated scenes if none")
     parser.add_argument("--count", type=int, default=200_000, help="Gaussians of generated scenes")
-    parser.add_argument("--kinds", default=",".join(KINDS), help="kinds of generated scenes")
+    kinds = ",".join(cvtgs.synthetic.KINDS)
+    parser.add_argument("--kinds", default=kinds, help="kinds of generated scenes")
     parser.add_argument("--blocks", default="4,16", help="numbers of blocks to compare")
     parser.add_argument("--presets", default="standard", help="presets to compare by blocks")
     parser.add_argument(

@@ -10,7 +10,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
 import cvtgs
+from cvtgs.devices import device_name
 from cvtgs.errors import RunError
 from cvtgs.io import atomic_output
 from cvtgs.tradeoff.runs import run_process
@@ -84,13 +87,7 @@ def spread(values: Sequence[float]) -> str:
 
 def machine() -> str:
     """Return the names of processor and Python."""
-    model = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
-    model = names[0] if names else model
+    model = device_name(torch.device("cpu"))
     return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}"
 
 

@@ -23,7 +23,7 @@ import pydantic
 
 import cvtgs
 from benchmarks.baselines import BASELINES
-from benchmarks.compare import Task, attempt, own_methods
+from benchmarks.compare import Task, attempt, baseline_methods, own_methods
 from benchmarks.compare_tables import Result, Table, joined, markdown, read_results, results_json
 from benchmarks.datasets import (
     DATASETS,
@@ -121,13 +121,12 @@ def parser() -> argparse.ArgumentParser:
 def commands(methods: Sequence[str]) -> dict[str, list[str]]:
     """Return the command of every method, with placeholders."""
     own = own_methods([])
-    baseline = [sys.executable, "-m", "benchmarks.baselines"]
     known = {
         "paper": own["paper"],
         MERGED: [*own["paper"], "--set", "merge.network=false"],
         "standard": own["standard"],
-    } | {name: [*baseline, name, "{IN}", "{OUT}", "--count", "{COUNT}"] for name in BASELINES}
-    return {name: known[name] for name in methods}
+    }
+    return {name: (known | baseline_methods())[name] for name in methods}
 
 
 def measure(

@@ -7,9 +7,7 @@ first images, which may compile, are timed separately.
 import argparse
 import json
 import math
-import resource
 import statistics
-import sys
 import tempfile
 import time
 from importlib.util import find_spec
@@ -20,6 +18,7 @@ import torch
 import cvtgs
 from benchmarks.measuring import generated_scenes, machine, run_python, spread
 from cvtgs.cameras import Cameras, look_at
+from cvtgs.clock import peak_memory_bytes
 from cvtgs.rendering import BackendName, render
 
 SCENES = (("courtyard", 150_000, 0), ("courtyard", 150_000, 3), ("object", 150_000, 3))
@@ -66,17 +65,12 @@ def costs(options: argparse.Namespace) -> dict[str, float | list[float]]:
     """Measure one backend on one scene, in this process."""
     scene = cvtgs.load(options.files[0]).to(options.device)
     cameras = orbit(scene, options.views, options.size)
-    first = seconds(scene, cameras.select(torch.tensor([0])), options.child, backward=True)
-    views = [cameras.select(torch.tensor([view])) for view in range(options.views)]
+    views = cameras.singles()
+    first = seconds(scene, views[0], options.child, backward=True)
     forward = [seconds(scene, view, options.child, backward=False) for view in views]
     both = [seconds(scene, view, options.child, backward=True) for view in views]
-    unit = 1 if sys.platform == "darwin" else 1024
-    return {
-        "first": first,
-        "forward": forward,
-        "both": both,
-        "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit,
-    }
+    peak = peak_memory_bytes()
+    return {"first": first, "forward": forward, "both": both, "peak_bytes": peak}
 
 
 def orbit(scene: cvtgs.GaussianScene, count: int, size: int) -> Cameras:

@@ -43,9 +43,9 @@ def simplify(scene: GaussianScene, count: int, *, seed: int = 0) -> GaussianScen
     cameras = automatic_views(valid, VIEWS, width=SIZE, height=SIZE, seed=seed + 1)
     generator = torch.Generator().manual_seed(seed)
     fisher = torch.zeros(len(valid), 6, 6, dtype=torch.float64, device=valid.device)
-    for view in range(len(cameras)):
+    for camera in cameras.singles():
         signs = random_signs((PROBES, SIZE, SIZE, 3), generator).to(valid.device)
-        fisher += projected_fisher(valid, cameras.select(torch.tensor([view])), signs)
+        fisher += projected_fisher(valid, camera, signs)
     return keep_largest(valid, sensitivity(fisher), count=count)
 
 
