@@ -62,16 +62,17 @@ def allocate(job: Job) -> None:
         job.groups_path(block).exists() for block in job.blocks_with_sites()
     ):
         return
-    regions = _regions(job)
+    manifest = job.read_manifest()
+    regions = _regions(manifest.cells, manifest.cell_room)
     if len(regions) > 1:
         warnings.warn(
-            f"{sum(job.cells)} cells do not fit into memory together, so merge costs are only "
+            f"{sum(manifest.cells)} cells do not fit into memory together, so merge costs are only "
             f"compared within {len(regions)} parts of the scene; raise --memory if possible.",
             UserWarning,
             stacklevel=4,
         )
-    sizes = [sum(job.cells[block] for block in region) for region in regions]
-    counts = shared_out(job.total, sizes, rooms=sizes)
+    sizes = [sum(manifest.cells[block] for block in region) for region in regions]
+    counts = shared_out(manifest.total, sizes, rooms=sizes)
     targets = [0] * job.blocks
     for region, count in zip(regions, counts, strict=True):
         for block, target in zip(region, _allocate_region(job, region, count), strict=True):
@@ -80,23 +81,24 @@ def allocate(job: Job) -> None:
         file.write(json.dumps(targets).encode())
 
 
-def _regions(job: Job) -> list[list[int]]:
+def _regions(counts: Sequence[int], room: int) -> list[list[int]]:
     """Return runs of blocks whose cells fit into memory together; a single run if all fit."""
     regions: list[list[int]] = []
     held = 0
-    for block in job.blocks_with_sites():
-        held += job.cells[block]
-        if not regions or held > job.cell_room:
-            regions.append([])
-            held = job.cells[block]
-        regions[-1].append(block)
+    for block, count in enumerate(counts):
+        if count:
+            held += count
+            if not regions or held > room:
+                regions.append([])
+                held = count
+            regions[-1].append(block)
     return regions
 
 
 def _allocate_region(job: Job, region: Sequence[int], count: int) -> list[int]:
     """Merge the cells of a region, write its groups, and return the number of groups per block."""
     config = _costs(job)
-    sizes = torch.tensor([job.cells[block] for block in region])
+    sizes = torch.tensor(job.cells)[list(region)]
     fine = _add_parts(job, region)
     labels = torch.arange(len(fine.weights))
     if len(labels) > count:
@@ -127,16 +129,16 @@ def _allocate_region(job: Job, region: Sequence[int], count: int) -> list[int]:
 
 def _costs(job: Job) -> AllocationConfig:
     """Return the costs of merging at the ratio of the whole scene."""
-    ratio = job.total / job.read_scan().row_count
+    ratio = job.read_manifest().total / job.read_scan().row_count
     return allocation_at(ratio, job.config, is_measured=is_measured(job))
 
 
 def _add_parts(job: Job, region: Sequence[int]) -> Moments:
     """Return the moments of the cells of a region, including their parts in other blocks."""
-    starts, total = torch.full((job.blocks,), -1), 0
+    starts, total, sizes = torch.full((job.blocks,), -1), 0, job.cells
     for block in region:
         starts[block] = total
-        total += job.cells[block]
+        total += sizes[block]
     found, labels = list[Moments](), list[Tensor]()
     for block in job.blocks_with_rows():
         tensors, _ = map_tensors(job.parts_path(block))

@@ -176,20 +176,15 @@ class Job:
         return [RowRange(k, start, min(start + step, total)) for k, start in enumerate(starts)]
 
     @property
-    def total(self) -> int:
-        """Number of Gaussians that all blocks keep together."""
-        return self._manifest().total
-
-    @property
     def cells(self) -> tuple[int, ...]:
         """Number of cells of the tessellation in each block."""
-        return self._manifest().cells
+        return self.read_manifest().cells
 
     @property
     def targets(self) -> tuple[int, ...]:
         """Number of Gaussians that each block keeps; known once the groups are."""
         if not self.goes_by_steps:
-            return (self.total,)
+            return (self.read_manifest().total,)
         return tuple(json.loads(self.path("targets.json").read_bytes()))
 
     def blocks_with_sites(self) -> list[int]:
@@ -257,7 +252,7 @@ class Job:
             self.read_scan()
             if self.config.uses_renders:
                 map_tensors(self.views_path)
-            if self._manifest().key != key or not self.has_sorted_rows():
+            if self.read_manifest().key != key or not self.has_sorted_rows():
                 return False
         except (OSError, ValueError, KeyError, TypeError):
             return False
@@ -307,15 +302,9 @@ class Job:
         with atomic_output(self.path("sorted.json"), overwrite=True) as output:
             output.write(json.dumps(facts).encode())
 
-    @property
-    def cell_room(self) -> int:
-        """Number of cells that may merge together in one process."""
-        return self._manifest().cell_room
-
-    @property
-    def left_out_mass(self) -> float:
-        """Mass of the Gaussians that the filter leaves out, squared scene units."""
-        return self._manifest().left_out_mass
+    def read_manifest(self) -> Manifest:
+        """Read the manifest."""
+        return Manifest.model_validate_json(self.path("manifest.json").read_bytes())
 
     def write_manifest(self, manifest: Manifest) -> None:
         """Write the manifest, which marks all rows as sorted."""
@@ -361,9 +350,6 @@ class Job:
                 whole = False
             if not whole:
                 name.unlink(missing_ok=True)
-
-    def _manifest(self) -> Manifest:
-        return Manifest.model_validate_json(self.path("manifest.json").read_bytes())
 
 
 def job_folder(output: str | os.PathLike[str], key: str) -> str:

@@ -345,7 +345,7 @@ def report_blocks(
         invalid_count=total - valid,
         shortfall=shortfall(valid, total, job.target),
         filtered_count=scan.row_count - sum(report.input_count for report in reports),
-        filtered_mass_share=job.left_out_mass / (scan.mass or 1.0),
+        filtered_mass_share=job.read_manifest().left_out_mass / (scan.mass or 1.0),
         kept_count=scan.kept_count,
         single_member_cells=sum(report.single_member_cells for report in reports),
         largest_cell=max((report.largest_cell for report in reports), default=0),
