@@ -72,7 +72,7 @@ def from_dict(
         >>> scene.log_scales[0].tolist(), scene.logit_opacities.tolist()
         ([0.0, 0.0, 0.0], [0.0, 0.0])
     """
-    mapping = {key: mapping[key] for key in mapping}
+    mapping = dict(mapping)
     tensors = {name: _as_tensor(key, mapping[key]) for name, key in _keys(mapping).items()}
     double = any(tensor.dtype == torch.float64 for tensor in tensors.values())
     dtype = torch.float64 if double else torch.float32

@@ -86,7 +86,7 @@ def write_glb(scene: GaussianScene, file: BinaryIO) -> None:
 
 
 def write_gltf(scene: GaussianScene, file: BinaryIO) -> None:
-    r"""Write a ``.gltf`` like :func:`write_glb`, but as one JSON text with numbers in base64."""
+    """Write a ``.gltf`` like :func:`write_glb`, but as one JSON text with numbers in base64."""
     arrays = arrays_of(scene)
     attributes, count = _attributes(arrays), len(arrays.means)
     document = _document(scene, arrays, attributes)

@@ -128,7 +128,7 @@ class Header:
 
 
 def read_header(file: BinaryIO, path: str) -> Header:
-    r"""Parse the header of a PLY file.
+    """Parse the header of a PLY file.
 
     Lines may end in LF, CRLF or CR and have trailing blanks; blank lines are skipped.
     """

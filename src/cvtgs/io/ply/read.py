@@ -65,7 +65,9 @@ def read_ply(path: Path, *, sh_degree: int | None = None, extras: bool = True) -
         if can_map(header):
             chunks = _mapped_chunks(file, header)
         else:
-            chunks = _parsed_chunks(file, header, vertex=vertex, path=where)
+            rows = _parsed_rows(file, header, vertex=vertex, path=where)
+            starts = range(0, vertex.count, _CHUNK_ROWS)
+            chunks = (rows[start : start + _CHUNK_ROWS] for start in starts)
         scene = assemble(
             chunks,
             count=vertex.count,
@@ -200,19 +202,8 @@ def _mapped_chunks(file: BinaryIO, header: Header) -> Iterator[NDArray[Any]]:
         yield np.memmap(file, dtype, "r", offset, shape).view(np.ndarray)
 
 
-def _parsed_chunks(
-    file: BinaryIO, header: Header, *, vertex: Element, path: str
-) -> Iterator[NDArray[Any]]:
-    """Read the vertex rows of any PLY file.
-
-    ASCII rows and rows with lists are held in memory completely; others are mapped.
-    """
-    rows = _read_rows(file, header, vertex=vertex, path=path)
-    for start in range(0, vertex.count, _CHUNK_ROWS):
-        yield rows[start : start + _CHUNK_ROWS]
-
-
-def _read_rows(file: BinaryIO, header: Header, *, vertex: Element, path: str) -> NDArray[Any]:
+def _parsed_rows(file: BinaryIO, header: Header, *, vertex: Element, path: str) -> NDArray[Any]:
+    """Read the vertex rows of any PLY file; ASCII rows and rows with lists are held in memory."""
     from plyfile import PlyData, PlyElementParseError, PlyParseError  # noqa: PLC0415
 
     needed = header.elements[: header.elements.index(vertex) + 1]
