@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import import_module
 
 import pytest
 import torch
@@ -37,7 +38,14 @@ from cvtgs.tradeoff.files import (
     tradeoff_chart,
 )
 from cvtgs.tradeoff.results import with_fronts
-from cvtgs.tradeoff.runs import WARNING, pass_warnings_on, run_process, tasks_of
+from cvtgs.tradeoff.runs import (
+    WARNING,
+    ProcessCost,
+    Run,
+    pass_warnings_on,
+    run_process,
+    tasks_of,
+)
 from cvtgs.views import automatic_views
 
 
@@ -286,6 +294,30 @@ def test_presets_and_ratios_are_checked():
         tasks_of(["standard"], [0.1, 0.10])
     with pytest.raises(InvalidArgumentError, match="at least one preset and one ratio"):
         tasks_of([], [0.1])
+
+
+def test_the_size_of_a_folder_is_that_of_its_scene(tmp_path, monkeypatch):
+    def run(source, tasks, folder, **options):
+        path = folder / tasks[0].file_name
+        cvtgs.save(cvtgs.load(source), path)
+        cost = ProcessCost(
+            wall_seconds=1.0, user_seconds=1.0, peak_memory_bytes=0, output="", errors=""
+        )
+        yield Run(task=tasks[0], path=path, cost=cost, report=MADE[0].report)
+
+    module = import_module("cvtgs.tradeoff.measure")
+    monkeypatch.setattr(module, "run_tasks", run)
+    monkeypatch.setattr(module, "start_seconds", lambda: 0.0)
+    file = tmp_path / "point_cloud.ply"
+    cvtgs.save(cvtgs.synthetic.scene("object", 200, sh_degree=0, seed=0), file)
+    found = measure_tradeoff(
+        tmp_path,
+        presets=["draft"],
+        ratios=[0.1],
+        cameras=lambda scene: automatic_views(scene, 1, width=32, height=24),
+        settings=EvaluationSettings(lpips="off"),
+    )
+    assert found.tradeoff.source_bytes == file.stat().st_size
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import RunError
 from cvtgs.evaluation import Comparison, EvaluationSettings, compare
 from cvtgs.evaluation.report import mean_of
-from cvtgs.io import load
+from cvtgs.io import load, scene_size
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.scene import GaussianScene
 from cvtgs.tradeoff.results import Failure, Tradeoff, TradeoffResult, with_fronts
@@ -138,7 +138,7 @@ def measure_tradeoff(  # noqa: PLR0913 (options by name)
             {run.task.name: load(run.path).to(where) for run in runs},
             views,
             reference_name=source_name,
-            sizes=sizes | {source_name: Path(source).stat().st_size},
+            sizes=sizes | {source_name: scene_size(source)},
             photographs=None if photographs is None else photographs(views),
             settings=settings,
             listener=listener,

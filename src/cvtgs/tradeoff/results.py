@@ -70,7 +70,7 @@ class Tradeoff(Record):
     Attributes:
         source: Name of the file of the full scene.
         source_count: Number of Gaussians of the full scene.
-        source_bytes: Size of that file.
+        source_bytes: Its size on the disk, as :func:`cvtgs.io.scene_size` returns it.
         start_seconds: Start-up seconds of every process: Python and the imports of torch and cvtgs.
         machine: The machine of the measurement.
         evaluation: The views, and the scores per view.
