@@ -237,14 +237,14 @@ def gains_table(table: Table, ratios: Sequence[float]) -> str:
                 for rows in table.values()
             ]
             found = [one.quality.psnr - two.quality.psnr for one, two in pairs if one and two]
-            told = gain.psnr.get(f"{rho:g}")
+            claimed = gain.psnr.get(f"{rho:g}")
             lines.append(
                 [
                     gain.name,
                     f"{rho:g}",
                     f"{mean(found):+.2f}" if found else "-",
                     str(len(found)),
-                    "-" if told is None else f"{told:+.2f}",
+                    "-" if claimed is None else f"{claimed:+.2f}",
                 ]
             )
     heads = ["gain, dB", "ratio", "here", "scenes", "published"]

@@ -96,8 +96,8 @@ def nerfstudio_world(path: Path) -> World:
     place = next((place for place in places if place.is_file()), None)
     if place is None:
         return World()
-    told = json.loads(place.read_text(encoding="utf-8"))
-    transform = torch.tensor(told["transform"], dtype=torch.float64) * float(told["scale"])
+    stored = json.loads(place.read_text(encoding="utf-8"))
+    transform = torch.tensor(stored["transform"], dtype=torch.float64) * float(stored["scale"])
     return World(transform[:, :3], transform[:, 3])
 
 

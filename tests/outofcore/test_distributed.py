@@ -165,7 +165,7 @@ def test_a_worker_reports_which_files_it_can_see(tmp_path):
     folder.mkdir(parents=True)
     (tmp_path / "in.ply").write_bytes(b"12345")
     (folder / "probe").write_text("token")
-    look = distributed._look
+    look = distributed._inspect
     assert look(str(tmp_path / "in.ply"), str(folder / "probe"), "token") == (
         distributed._versions(), 5, True,
     )  # fmt: skip

@@ -122,7 +122,7 @@ def _versions() -> dict[str, str]:
     return {"cvtgs": cvtgs.__version__, "torch": torch.__version__, "Python": python}
 
 
-def _look(source: str, probe: str, token: str) -> _Worker:
+def _inspect(source: str, probe: str, token: str) -> _Worker:
     """Return the state of the worker that this runs on; wait for shared disks to show the probe."""
     path, deadline = Path(probe), time.monotonic() + _SHARE_SECONDS
     while not path.exists() and path.parent.parent.parent.is_dir() and time.monotonic() < deadline:
@@ -193,7 +193,7 @@ class ClusterWorkers:
         probe.write_text(token, encoding="ascii")
         arguments = (job.source.path, str(probe), token)
         futures = {
-            address: self._client.submit(_look, *arguments, workers=[address], pure=False)
+            address: self._client.submit(_inspect, *arguments, workers=[address], pure=False)
             for address in addresses
         }
         with suppress(TimeoutError):  # workers without an answer are named below
@@ -217,7 +217,7 @@ class ClusterWorkers:
         with suppress(TimeoutError):
             wait(list(answers.values()), timeout=ANSWER_SECONDS)
         for address, future in answers.items():
-            found = _told(future.exception()) if future.status == "error" else None
+            found = _message_of(future.exception()) if future.status == "error" else None
             if future.status == "finished" and future.result() != cvtgs.__version__:
                 found = str(future.result())
             if found is not None:
@@ -278,14 +278,14 @@ class ClusterWorkers:
         from distributed import KilledWorker, wait  # noqa: PLC0415 (optional)
 
         for _ in range(MAX_DEATHS):
-            lonely = 0
+            unanswered = 0
             while True:
                 try:
                     wait([future], timeout=ANSWER_SECONDS)
                     break
                 except TimeoutError as error:
-                    lonely = 0 if self._is_at_work() else lonely + 1
-                    if lonely > 1:
+                    unanswered = 0 if self._is_at_work() else unanswered + 1
+                    if unanswered > 1:
                         raise _gone() from error
             try:
                 return future.result()
@@ -297,8 +297,8 @@ class ClusterWorkers:
                 if future.status in ("cancelled", "lost"):
                     raise _gone() from error
                 raise RunError(
-                    f"a worker failed: {_told(error)}; all workers need the same packages and "
-                    "access to input and output; run the same command again to continue."
+                    f"a worker failed: {_message_of(error)}; all workers need the same packages "
+                    "and access to input and output; run the same command again to continue."
                 ) from error
         raise RunError(
             f"{MAX_DEATHS} rounds of workers died on the same task; give them more memory or lower "
@@ -315,7 +315,7 @@ def _check_answer(address: str, future: "Future[Any]", job: Job) -> None:
     if future.status == "error":
         raise RunError(
             f"{address}: this worker must have cvtgs {cvtgs.__version__}, found: "
-            f"{_told(future.exception())}."
+            f"{_message_of(future.exception())}."
         )
     if future.status != "finished":
         raise RunError(
@@ -358,7 +358,7 @@ def _gone() -> RunError:
     )
 
 
-def _told(error: BaseException | None) -> str:
+def _message_of(error: BaseException | None) -> str:
     """Return the message of a library's error in one line."""
     lines = [line for line in str(error).splitlines() if line.strip()]
     text = f"{type(error).__name__}: {lines[0].strip()}" if lines else type(error).__name__

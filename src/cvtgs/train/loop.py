@@ -267,7 +267,7 @@ def _validate(
 
 def _description(state: TrainState, config: TrainConfig) -> CheckpointInfo:
     # Without paths, and without the note, which has its own field.
-    told = config.model_dump_json(exclude={"start": True, "note": True, "data": {"folders"}})
+    settings = config.model_dump_json(exclude={"start": True, "note": True, "data": {"folders"}})
     return CheckpointInfo(
         architecture=state.net.architecture,
         preset=config.preset,
@@ -275,7 +275,7 @@ def _description(state: TrainState, config: TrainConfig) -> CheckpointInfo:
         seed=config.seed,
         steps=state.step,
         version=cvtgs.__version__,
-        config=told,
+        config=settings,
         start="" if config.start is None else load_checkpoint(config.start).digest,
         scenes=state.scenes,
     )
