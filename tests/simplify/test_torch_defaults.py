@@ -111,7 +111,6 @@ def test_contributions(scene, setting, backend):
 def test_axes_first_used_in_inference_mode_work_with_gradients(scene):
     scene = scene.with_tensors({name: x.double() for name, x in scene.tensors().items()}, {})
     axes_module._sh_signs.cache_clear()
-    axes_module._sh_quarter_turn.cache_clear()
     for axes in ("rub", "rfu"):
         with torch.inference_mode():
             axes_module.change_axes(scene, "rdf", axes)

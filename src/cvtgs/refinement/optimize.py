@@ -193,8 +193,8 @@ class SceneOptimizer:
     @torch.no_grad()
     def result(self) -> GaussianScene:
         """Return the scene as it would be saved."""
-        now = standardized(self.scene())
-        moved = self._moved & valid_rows(now)
+        current = self.scene()
+        moved, now = self._moved & valid_rows(current), standardized(current)
         tensors = {
             name: torch.where(_like(moved, old), now.tensors()[name], old)
             for name, old in self._scene.tensors().items()
