@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -47,6 +48,18 @@ def test_evaluate_prints_a_row_per_scene(scenes, capsys):
         r"0\.1\.ply +200 +[\d.]+ kB +\d+\.\d\d +0\.\d{4}  +-  0\.\d{4}  [+-]0\.\d{4}\n", printed
     )
     assert "LPIPS" in printed
+
+
+def test_the_note_on_missing_lpips_weights_is_wrapped(scenes, tmp_path, capsys, monkeypatch):
+    monkeypatch.delenv("CVTGS_LPIPS_WEIGHTS", raising=False)
+    monkeypatch.setattr(sys.modules["cvtgs.evaluation.lpips"], "find_spec", lambda name: None)
+    assert main(["evaluate", *scenes[:2], *SMALL]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    start = next(row for row, line in enumerate(lines) if line.startswith("LPIPS was not"))
+    assert max(map(len, lines[start:])) <= 80
+    text = " ".join(" ".join(lines[start:]).split())
+    assert text.startswith("LPIPS was not measured: the weights must be at the path ")
+    assert text.count(":") == 1
 
 
 def test_evaluate_as_json(scenes, capsys):

@@ -89,7 +89,7 @@ def test_a_missing_backbone_is_an_error_with_advice(tmp_path, monkeypatch) -> No
     with pytest.raises(MissingDependencyError) as error:
         load_lpips("alex")
     assert str(error.value) == (
-        f"LPIPS needs {backbone}, found none; fetch it once with: "
+        f"the weights must include {backbone}, found none; fetch it once with: "
         f"python -c \"import lpips; lpips.LPIPS(net='alex')\"."
     )
 
@@ -97,12 +97,13 @@ def test_a_missing_backbone_is_an_error_with_advice(tmp_path, monkeypatch) -> No
 def test_missing_weights_are_an_error_with_advice(monkeypatch) -> None:
     monkeypatch.delenv(LPIPS_VARIABLE, raising=False)
     monkeypatch.setattr(sys.modules["cvtgs.evaluation.lpips"], "find_spec", lambda name: None)
+    monkeypatch.setattr("torch.__version__", "2.13.0+cpu")
     first, second = random_images(31, 31)
     with pytest.raises(MissingDependencyError) as error:
         lpips(first, second)
     assert str(error.value) == (
-        "LPIPS needs weights: set CVTGS_LPIPS_WEIGHTS to a file of them, or in Python pass "
-        "weights=, or install the extra with: pip install 'cvtgs[lpips]'; found none."
+        "the weights must be at the path CVTGS_LPIPS_WEIGHTS or in the package lpips, found "
+        "neither; pip install 'cvtgs[lpips]' torch==2.13.0 installs it and keeps this torch."
     )
 
 

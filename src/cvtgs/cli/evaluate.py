@@ -8,7 +8,7 @@ from pathlib import PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING, NamedTuple
 
 import cvtgs
-from cvtgs.cli.display import progress_bars, say, size_text
+from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
 from cvtgs.cli.options import (
     AddParser,
     add_options,
@@ -188,7 +188,7 @@ def _print_scores(evaluation: "Evaluation", sizes: dict[str, int]) -> None:
         say("against photographs:")
         _print_score_table(evaluation.photographs, sizes)
     if evaluation.lpips_sentence:
-        say(evaluation.lpips_sentence)
+        say_wrapped(evaluation.lpips_sentence)
 
 
 def _print_score_table(scenes: "tuple[SceneScores, ...]", sizes: dict[str, int]) -> None:
@@ -328,4 +328,4 @@ def _print_tradeoff(tradeoff: "Tradeoff") -> None:
             )
             say(f"  {name:{left}}  {'  '.join(words)}".rstrip())
     say(MARK_MEANS)
-    say(how_measured(tradeoff))
+    say_wrapped(how_measured(tradeoff))

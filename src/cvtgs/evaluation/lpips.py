@@ -269,16 +269,17 @@ def _weight_files(network: LpipsNetwork, path: str | os.PathLike[str] | None) ->
     # Not imported: that would load torchvision, and creating its model would download files.
     spec = find_spec("lpips")
     if spec is None or spec.origin is None:
+        mine = torch.__version__.partition("+")[0]
         raise MissingDependencyError(
-            f"LPIPS needs weights: set {LPIPS_VARIABLE} to a file of them, or in Python pass "
-            f"weights=, or install the extra with: pip install 'cvtgs[lpips]'; found none."
+            f"the weights must be at the path {LPIPS_VARIABLE} or in the package lpips, found "
+            f"neither; pip install 'cvtgs[lpips]' torch=={mine} installs it and keeps this torch."
         )
     backbone = Path(torch.hub.get_dir()) / "checkpoints" / _BACKBONES[network]
     files = backbone, Path(spec.origin).parent / "weights" / "v0.1" / f"{network}.pth"
     for file in files:
         if not file.is_file():
             raise MissingDependencyError(
-                f"LPIPS needs {file}, found none; fetch it once with: "
+                f"the weights must include {file}, found none; fetch it once with: "
                 f"python -c \"import lpips; lpips.LPIPS(net='{network}')\"."
             )
     return files
