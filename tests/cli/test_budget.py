@@ -1,16 +1,18 @@
 """Goals on the command line: valid combinations, time budgets, and printed notes."""
 
 import argparse
+import re
 from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
 import cvtgs
-from cvtgs.budget import CostModel
+from cvtgs.budget import CostModel, Found
 from cvtgs.budget.calibrate import CANDIDATES
 from cvtgs.budget.costs import FEATURES
 from cvtgs.cli.main import build_parser, main
+from cvtgs.cli.notes import target_note
 from cvtgs.cli.simplify import check_goals
 from cvtgs.cli.time_budget import STARTED, choose_preset, read_seconds
 from cvtgs.errors import GoalError, InvalidArgumentError
@@ -131,6 +133,10 @@ def test_a_time_budget_chooses_a_preset_and_explains_it(scene):
     chosen = choose_preset(options("--rho", "0.1", "--time-budget", "8s"), scene, {}, silent)
     assert chosen.name == "high"
     assert chosen.reason.startswith("Preset high, the best that fits into 8 s: expected to take 5")
+    assert chosen.late_note(8.0) == []
+    assert chosen.late_note(44.0) == [
+        "The run took 44.0 s, where 8.0 s were left; --recalibrate measures this machine again."
+    ]
 
 
 @pytest.mark.parametrize(
@@ -186,8 +192,31 @@ def test_a_target_is_searched_and_reported(source, capsys, shown):
     text = " ".join(" ".join(lines).split())
     assert f"300 -> {len(small)} Gaussians, " in text
     assert len(small) < 300
-    assert "over automatic views; found in" in text
+    assert "over the automatic views of cvtgs evaluate; found in" in text
     assert "tessellate" not in shown
+
+
+@pytest.mark.slow
+def test_a_target_is_measured_over_the_views_of_evaluate(source, capsys):
+    simplified(source, "--target-psnr", "15")
+    found = re.search(r"PSNR ([\d.]+) dB, SSIM ([\d.]+)", capsys.readouterr().out)
+    scenes = [str(source), str(source.with_name("out.ply"))]
+    assert main(["evaluate", *scenes, "--lpips", "off"]) == 0
+    assert "  ".join(found.groups()) in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("preset", "is_given", "views"),
+    [
+        ("draft", False, "the automatic views of cvtgs evaluate"),
+        ("draft", True, "the given cameras"),
+        ("high", True, "automatic views that high does not use"),
+    ],
+)
+def test_the_views_of_a_target_are_named(scene, preset, is_given, views):
+    found = Found(scene, None, 30.0, 0.9, 0.1, -0.1, tried=())
+    config = cvtgs.SimplifyConfig.from_preset(preset)
+    assert f" over {views}; found" in target_note(found, config, is_given=is_given)
 
 
 def test_shipped_rates_need_no_measurement(scene, measured, capsys):

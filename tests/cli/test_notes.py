@@ -93,7 +93,7 @@ def test_cameras_that_are_not_used_are_mentioned(capsys, source):
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--refine", "1e-6"], "Not refined: the time was used up before the first step."),
+        (["--refine", "1e-6"], "Not refined: rendering 8 held-out images first took "),
         (["--refine-steps", "1", "--set", "refine.rates.means=90"], "Not refined: none of 1 step"),
     ],
 )

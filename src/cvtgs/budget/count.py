@@ -23,7 +23,7 @@ from cvtgs.views import automatic_views
 STAGE = "search"
 
 HELDOUT_SEED = 307
-"""Seed of views that differ from those of evaluations, presets and refinements."""
+"""Seed of the views for presets that use images: none of them is of a preset or refinement."""
 
 VIEWS, WIDTH, HEIGHT = 8, 640, 480
 """Number and size of views, as in ``cvtgs evaluate``: scores depend on the size of images."""
@@ -129,9 +129,10 @@ def find_count(
 ) -> Found:
     """Find the smallest number of Gaussians that reaches a quality, to within 3 %.
 
-    Quality is measured over eight automatic views that no preset uses. The full scene is
-    rendered, checked and analyzed once; a search takes six to ten simplifications. If quality
-    does not rise monotonically with the count, a smaller count may also reach it.
+    Quality is measured over the eight automatic views of ``cvtgs evaluate``; for presets that use
+    images, over eight others, which no preset uses. The full scene is rendered, checked and
+    analyzed once; a search takes six to ten simplifications. If quality does not rise
+    monotonically with the count, a smaller count may also reach it.
 
     Memory: that of a simplification, one small scene, and ``12 c h w`` bytes of images.
 
@@ -163,8 +164,13 @@ def find_count(
         True
     """
     target = checked_target(psnr, ssim=ssim)
-    prepared = (simplifier or Simplifier()).prepare(scene, cameras=cameras)
-    total, scorer = len(prepared.scene), heldout_scorer(prepared.scene, heldout, listener=listener)
+    simplifier = simplifier or Simplifier()
+    prepared = simplifier.prepare(scene, cameras=cameras)
+    total, full = len(prepared.scene), prepared.scene
+    if heldout is None:
+        seed = HELDOUT_SEED if simplifier.config.uses_images else 0
+        heldout = automatic_views(full, VIEWS, width=WIDTH, height=HEIGHT, seed=seed)
+    scorer = heldout_scorer(full, heldout, listener=listener)
     tried: list[Tried] = []
     best: tuple[Simplified, Tried] | None = None
 
@@ -203,12 +209,8 @@ def find_count(
     )
 
 
-def heldout_scorer(
-    full: GaussianScene, cameras: Cameras | None, *, listener: ProgressListener
-) -> Scorer:
-    """Return a scorer against the full scene over held-out views; None uses automatic views."""
-    if cameras is None:
-        cameras = automatic_views(full, VIEWS, width=WIDTH, height=HEIGHT, seed=HELDOUT_SEED)
+def heldout_scorer(full: GaussianScene, cameras: Cameras, *, listener: ProgressListener) -> Scorer:
+    """Return a scorer against the full scene over held-out views."""
     total = len(cameras)
     return Scorer(
         full,

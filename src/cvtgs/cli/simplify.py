@@ -10,6 +10,7 @@ import cvtgs
 from cvtgs.cli.blocks import add_block_options, block_workers, memory_of
 from cvtgs.cli.display import TIE, progress_bars
 from cvtgs.cli.jobs import Outcome, SceneJob, add_paths, check_paths, open_jobs, run_jobs
+from cvtgs.cli.notes import report_notes, target_note
 from cvtgs.cli.options import (
     CAMERA_FILES,
     AddParser,
@@ -74,7 +75,8 @@ def add_simplify(add_parser: AddParser) -> None:
         "--target-psnr",
         type=float,
         metavar="DB",
-        help="PSNR to reach over held-out views with as few Gaussians as possible",
+        help="PSNR to reach with as few Gaussians as possible, over --cameras or the automatic "
+        "views of cvtgs evaluate; for presets that use images, over other automatic views",
     )
     size.add_argument(
         "--target-ssim",
@@ -85,8 +87,8 @@ def add_simplify(add_parser: AddParser) -> None:
     parser.add_argument(
         "--time-budget",
         metavar="TIME",
-        help="time limit, for example 20s or 2m, with the best preset that fits; the first use "
-        "measures this machine, which takes about 10 seconds and does not count",
+        help="use the best preset that is predicted to take at most this time, for example 20s or "
+        "2m; the first use measures this machine, which takes about 10 seconds and does not count",
     )
     parser.add_argument(
         "--shipped-rates",
@@ -103,7 +105,7 @@ def add_simplify(add_parser: AddParser) -> None:
         type=float,
         metavar="SECONDS",
         help="time limit of refining the result against images of IN, as long as held-out views "
-        "improve; 0 turns off the refinement of a preset",
+        "improve; rendering the first images counts; 0 turns off the refinement of a preset",
     )
     parser.add_argument(
         "--refine-steps", type=int, metavar="N", help="step limit of refining the result"
@@ -185,7 +187,7 @@ def _simplify_one(
     return Outcome(
         f"{report.input_count:,} -> {report.output_count:,} Gaussians",
         f"{total:.2f} s",
-        notes + _report_notes(report),
+        notes + report_notes(report),
     )
 
 
@@ -200,7 +202,7 @@ def _simplify_in_memory(
     notes = []
     axes = read_axes(options.axes)
     scene = read_scene(options, config, axes=axes.source)
-    cameras = read_cameras(options)
+    cameras, chosen = read_cameras(options), None
     if options.time_budget is not None:
         chosen = choose_preset(options, scene, settings, listener)
         config = cvtgs.SimplifyConfig.compose(preset=chosen.name, settings=settings)
@@ -227,13 +229,7 @@ def _simplify_in_memory(
             listener=listener,
         )
         small, report = found.scene, found.report
-        is_given = options.cameras is not None and not config.uses_images
-        views = "the given cameras" if is_given else "automatic views"
-        notes.append(
-            f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f}, alpha error "
-            f"{found.alpha_error:.4f} (bias {found.alpha_bias:+.4f}) over {views}; "
-            f"found in {len(found.tried)} tries."
-        )
+        notes.append(target_note(found, config, is_given=options.cameras is not None))
     else:
         keep = None
         if options.keep is not None:
@@ -246,6 +242,7 @@ def _simplify_in_memory(
             cameras=cameras,
             keep=keep,
         )
+    notes += [] if chosen is None else chosen.late_note(report.seconds)
     cvtgs.io.save(small, options.output, overwrite=options.overwrite, axes=axes.target)
     return report, notes
 
@@ -269,40 +266,6 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
         return {}
     steps, seconds = options.refine_steps or 0, options.refine or 0.0
     return {"refine.steps": str(steps), "refine.seconds": str(seconds)}
-
-
-def _report_notes(report: "SimplifyReport") -> list[str]:
-    """Return the sentences to print besides counts, sizes and seconds."""
-    notes = []
-    if report.device_note:
-        notes.append(f"{report.device_note}.")
-    if report.blocks > 1:
-        resumed = (
-            f", {report.resumed_blocks} of them from an earlier run"
-            if report.resumed_blocks
-            else ""
-        )
-        notes.append(f"In {report.blocks} blocks{resumed}.")
-    if report.shortfall:
-        notes.append(f"Fewer than the requested {report.target_count:,}: {report.shortfall}.")
-    if report.matching is not None:
-        matched = report.matching
-        notes.append(
-            f"Matched to {matched.views} images of the scene: "
-            f"{matched.psnr_before:.2f} -> {matched.psnr_after:.2f} dB on every eighth of them."
-        )
-    if report.refinement is not None:
-        refined = report.refinement
-        steps = counted(refined.steps, "step")
-        change = f"{refined.psnr_before:.2f} -> {refined.psnr_after:.2f}"
-        if refined.stopped == "time" and refined.steps == 0:
-            notes.append("Not refined: the time was used up before the first step.")
-        elif refined.gain == 0.0 and refined.stopped != "perfect":
-            notes.append(f"Not refined: none of {steps} improved the held-out images.")
-        else:
-            gain = f"{refined.gain:+.2f} dB on held-out images"
-            notes.append(f"Refined in {steps}: {gain}, {change}.")
-    return notes
 
 
 def _has_target(options: argparse.Namespace) -> bool:

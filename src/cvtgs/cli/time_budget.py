@@ -22,10 +22,20 @@ UNITS = {"s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 
 
 class ChosenPreset(NamedTuple):
-    """A preset, and the sentence that explains the choice."""
+    """A preset, the sentence that explains the choice, and the time that is left for the run."""
 
     name: str
     reason: str
+    left: float
+
+    def late_note(self, seconds: float) -> list[str]:
+        """Return a sentence if a run took longer than the time that was left."""
+        if seconds <= self.left:
+            return []
+        return [
+            f"The run took {seconds:.1f} s, where {self.left:.1f} s were left; --recalibrate "
+            "measures this machine again."
+        ]
 
 
 def check_time_budget(options: argparse.Namespace, *, has_target: bool) -> None:
@@ -108,4 +118,4 @@ def choose_preset(
         f"Preset {choice.preset}, the best that fits into {budget:g} s: expected to take "
         f"{choice.seconds:.1f} s after {spent:.1f} s of starting and reading."
     )
-    return ChosenPreset(choice.preset, reason)
+    return ChosenPreset(choice.preset, reason, budget - spent)
