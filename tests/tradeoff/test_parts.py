@@ -237,6 +237,8 @@ def test_files_are_written_completely_and_replaced_only_when_asked(measured, tmp
     assert note == ""
     page = paths[-1].read_text(encoding="utf-8")
     assert 'id="tradeoff"' in page
+    assert ": comparison of presets</title>" in page
+    assert '"named":true' in page, "cards are headed by presets, which share their ratios"
     assert "sheet.png" not in page
     with pytest.raises(cvtgs.errors.OutputExistsError):
         write_tradeoff(measured, tmp_path / "new")
@@ -382,6 +384,8 @@ def test_the_page_has_plot_table_and_slider(page):
     assert "<th>draft</th>" in table
     assert 'class="chart" src="data:image/png;base64,' in html
     assert "50 Gaussians" in html
+    assert "<b>draft 0.1</b>" in html
+    assert "<b>fast 0.1</b>" in html
 
 
 @needs_browser

@@ -267,11 +267,14 @@ def comparison_page(
     *,
     summary: str = "",
     viewer: str = "",
+    topic: str = "Before and after",
+    is_named: bool = False,
     most_bytes: int = MOST_BYTES,
 ) -> str:
     """Return the HTML page, with ``summary`` (made by :func:`render_template`) above the images.
 
-    It links to the page ``viewer`` with the scenes in 3D, unless that is empty.
+    The cards of the simplified scenes are headed by their names if ``is_named``, else by ratios. It
+    links to the page ``viewer`` with the scenes in 3D, unless that is empty.
 
     The page has a slider between the full and a simplified scene, selectors of scene and view,
     counts, bytes and scores, and maps of the colour and alpha errors. The URL fragment
@@ -286,7 +289,8 @@ def comparison_page(
     for quality, factor in _TRIES:
         page = render_template(
             texts["html"],
-            title=f"{comparison.evaluation.reference}: before and after",
+            title=f"{comparison.evaluation.reference}: {topic.lower()}",
+            topic=topic,
             style=texts["css"],
             script=texts["js"],
             gradient=CSS_GRADIENT,
@@ -295,7 +299,7 @@ def comparison_page(
             alpha_scale=f"{ALPHA_SCALE:g}",
             summary=summary,
             viewer=viewer,
-            data=_page_data(comparison, quality, factor),
+            data=_page_data(comparison, quality, factor) | {"named": is_named},
         )
         if len(page) <= most_bytes:
             break

@@ -111,7 +111,12 @@ def write_tradeoff(
         chart = tradeoff_chart(tradeoff)
     except MissingDependencyError as error:
         note = str(error)
-    page = comparison_page(measured.comparison, summary=page_summary(tradeoff, chart))
+    page = comparison_page(
+        measured.comparison,
+        summary=page_summary(tradeoff, chart),
+        topic="Comparison of presets",
+        is_named=True,
+    )
     contents = {
         CSV: tradeoff.to_csv().encode(),
         JSON: tradeoff.to_json().encode(),

@@ -43,7 +43,7 @@
   ].filter(([, of]) => data.small.every((scene) => of(scene)));
 
   const maps = [
-    { key: "images", tag: (scene) => `Simplified · ${count(scene.count)}`, alt: (scene, name) => `${name} of ${scene.name}, ${count(scene.count)} Gaussians` },
+    { key: "images", tag: (scene) => `${data.named ? scene.name : "Simplified"} · ${count(scene.count)}`, alt: (scene, name) => `${name} of ${scene.name}, ${count(scene.count)} Gaussians` },
     { key: "errors", tag: () => "Colour error", alt: (scene, name) => `Where colours of ${scene.name} differ from the full scene in ${name}` },
     { key: "alpha_errors", tag: () => "Alpha error", alt: (scene, name) => `Where ${scene.name} covers less or more than the full scene in ${name}` },
   ];
@@ -80,9 +80,9 @@
       `, next to ${small.length === 1 ? "a simplified version" : small.length + " simplified versions"}` +
       ` from ${views.length === 1 ? "one view" : views.length + " views"}. Drag the divider: full on the left, simplified on the right.`;
     at("scenes").append(...small.map((scene, index) => choice("small", index + 1, [
-      make("b", fewer(scene)),
+      make("b", data.named ? scene.name : fewer(scene)),
       make("span", decibels(scene.psnr.mean), { class: "psnr" }),
-      make("small", join(count(scene.count) + " Gaussians", bytes(scene.bytes), scene.name)),
+      make("small", join(count(scene.count) + " Gaussians", bytes(scene.bytes), data.named ? "" : scene.name)),
     ])));
     at("views").append(...views.map((name, index) => choice("view", index + 1, [
       make("img", undefined, { src: data.full[index], alt: name, title: name, loading: "lazy" }),
