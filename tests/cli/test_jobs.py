@@ -93,11 +93,14 @@ def test_a_scene_that_fails_does_not_stop_the_others(
     assert main(["convert", "missing.ply", *NAMES, "-o", "out"]) == 1
     printed = capsys.readouterr()
     first, second, last = printed.err.splitlines()
-    assert first.startswith("cvtgs: error: missing.ply: ")
-    assert second.startswith("cvtgs: error: b.compressed.ply: ")
+    assert first.startswith("cvtgs: error: [1/4] missing.ply: ")
+    assert second.startswith("cvtgs: error: [3/4] b.compressed.ply: ")
     assert last == "cvtgs: error: 2 of 4 scenes failed; 2 are in out."
     assert {path.name for path in Path("out").iterdir()} == {"a.ply", "c.spz"}
     assert [line[:5] for line in printed.out.splitlines()] == ["[2/4]", "[4/4]"]
+    assert main(["convert", "missing.ply", "a.ply", "-o", "new"]) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == "cvtgs: error: 1 of 2 scenes failed; 1 is in new."
 
 
 @pytest.mark.parametrize(
@@ -139,6 +142,32 @@ def test_invalid_combinations_of_paths_are_usage_errors(
 ) -> None:
     assert wrong_usage("convert", *words) == 2
     assert "usage: cvtgs convert IN OUT " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (NAMES, "to write into a folder any number of IN and -o DIR; found 3 paths (a.ply, "),
+        (["a.ply", "folder"], "OUT must be a file; to write into a folder, use -o folder\n"),
+        (["a.ply", "new/"], "OUT must be a file; to write into a folder, use -o new/\n"),
+    ],
+)
+def test_a_forgotten_o_is_mentioned(
+    scenes: Path, capsys: pytest.CaptureFixture[str], words: list[str], text: str
+) -> None:
+    Path("folder").mkdir()
+    assert wrong_usage("convert", *words) == 2
+    assert text in capsys.readouterr().err
+
+
+def test_a_folder_of_scenes_is_not_one_scene(
+    scenes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = "cvtgs: error: .: must be one scene, found a folder of 3 scenes; "
+    assert main(["info", "."]) == 1
+    assert capsys.readouterr().err == f"{found}give one of them, for example ./a.ply.\n"
+    assert main(["convert", ".", "out.ply"]) == 1
+    assert capsys.readouterr().err == f"{found}to write into a folder, use -o DIR.\n"
 
 
 def test_the_last_line_names_the_output(scenes: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -88,6 +88,11 @@ def test_without_a_command_the_help_is_printed(capsys):
         (["simplify", "in.ply", "out.ply", "--rhoo=0.1"], ": --rhoo; did you mean --rho?\n"),
         (["evaluate", "a.ply", "b.ply", "--backend", "numbaa"], "; did you mean numba?\n"),
         (["info", "a.ply", "--zzz"], "unrecognized argument: --zzz\n"),
+        (["info", "a.ply", "b.ply"], "cvtgs info: error: unrecognized arguments: b.ply\n"),
+        (
+            ["levels", "a.ply", "-o", "l", "--rho", "0.1", "0.01"],
+            "unrecognized arguments: 0.01; separate ratios by commas: --rho 0.1,0.01\n",
+        ),
     ],
 )
 def test_mistyped_words_get_a_suggestion(words, end, capsys):

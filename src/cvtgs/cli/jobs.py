@@ -23,7 +23,7 @@ from cvtgs.errors import (
     OutputError,
     RunError,
 )
-from cvtgs.text import printable
+from cvtgs.text import counted, printable, shortened
 
 STREAM = "-"
 """The path that stands for standard input or output."""
@@ -93,8 +93,14 @@ def add_paths(parser: CommandParser, *, options: str) -> None:
 def check_paths(parser: CommandParser, options: argparse.Namespace) -> None:
     """Exit with a usage error if the paths do not match the use of -o and --suffix."""
     if options.folder is None and len(options.paths) != 2:
-        found = f"{len(options.paths)} {'path' if len(options.paths) == 1 else 'paths'}"
-        parser.error(f"give IN and OUT, or any number of IN with -o DIR; found {found}")
+        found = f"{counted(len(options.paths), 'path')} ({shortened(', '.join(options.paths), 60)})"
+        parser.error(
+            f"give IN and OUT, or to write into a folder any number of IN and -o DIR; found {found}"
+        )
+    if options.folder is None and (
+        os.path.isdir(options.paths[1]) or options.paths[1].endswith(("/", os.sep))  # noqa: PTH112
+    ):
+        parser.error(f"OUT must be a file; to write into a folder, use -o {options.paths[1]}")
     if options.folder is not None and STREAM in options.paths:
         parser.error("- cannot be used with -o DIR; give IN and OUT")
     if options.suffix and options.folder is None and options.paths[1] != STREAM:
@@ -110,6 +116,7 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
         yield _folder_jobs(options)
         return
     source, target = options.paths
+    check_one_scene(source, "to write into a folder, use -o DIR")
     to_stream = target == STREAM
     with ExitStack() as stack:
         if to_stream:
@@ -142,7 +149,7 @@ def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> N
             outcome = work(job)
         except CvtgsError as error:
             failed += 1
-            say(f"cvtgs: error: {error}", file=sys.stderr)
+            say(f"cvtgs: error: {place}{error}", file=sys.stderr)
             continue
         bytes_out = cvtgs.io.scene_size(target)
         before, after = before + bytes_in, after + bytes_out
@@ -155,9 +162,12 @@ def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> N
                 say_wrapped(note, indent=len(place))
     done = len(jobs) - failed
     if failed:
-        raise RunError(f"{failed} of {len(jobs)} scenes failed; {done} are in {folder}.")
+        are = "is" if done == 1 else "are"
+        raise RunError(
+            f"{failed} of {counted(len(jobs), 'scene')} failed; {done} {are} in {folder}."
+        )
     if not quiet:
-        scenes = "1 scene" if done == 1 else f"{done} scenes"
+        scenes = counted(done, "scene")
         say(f"{scenes} in {folder}, {size_text(before)} -> {size_text(after)}")
 
 
@@ -240,6 +250,16 @@ def _in_folder(folder: str) -> list[str]:
         if scenes:
             return scenes
     return [folder]
+
+
+def check_one_scene(path: str | Path, advice: str = "") -> None:
+    """Raise an error with advice if a path is a folder of scenes, and not a scene itself."""
+    found = _in_folder(str(path)) if os.path.isdir(path) else [str(path)]  # noqa: PTH112
+    if found != [str(path)]:
+        raise InputError(
+            f"{path}: must be one scene, found a folder of {counted(len(found), 'scene')}; "
+            f"{advice or f'give one of them, for example {found[0]}'}."
+        )
 
 
 def _output_name(source: Path, suffix: str | None) -> str:

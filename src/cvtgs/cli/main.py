@@ -20,6 +20,7 @@ from cvtgs.cli.display import flush_output, say
 from cvtgs.cli.doctor import ShowVersions, add_doctor
 from cvtgs.cli.evaluate import add_compare, add_evaluate, add_render, add_tradeoff
 from cvtgs.cli.files import add_convert, add_info
+from cvtgs.cli.jobs import check_one_scene
 from cvtgs.cli.levels import add_levels
 from cvtgs.cli.options import CommandParser
 from cvtgs.cli.simplify import add_simplify
@@ -80,6 +81,8 @@ def _run(words: Sequence[str]) -> None:
         load_torch()
     advised = memory_errors(f"cvtgs {options.command}", MEMORY_ADVICE)
     with advised, _without_empty_folder(options), _lock(options):
+        for name in ("input", "reference"):
+            check_one_scene(getattr(options, name, ""))
         options.run(options)
     flush_output()
 

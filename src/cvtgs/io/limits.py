@@ -43,6 +43,8 @@ class FormatLimits:
     """Computes the largest coordinate that a file of a scene can hold; None if unlimited."""
     changed: tuple[str, ...]
     """Phrases for data that are rounded or reordered."""
+    changed_bands: str = ""
+    """The same for the SH bands above the constant one."""
 
 
 def _largest_spz_coordinate(scene: GaussianScene) -> float:
@@ -66,8 +68,8 @@ _SPZ = FormatLimits(  # of versions 3 and 4
         "rotations in steps of 1/723 per component",
         "opacities in steps of 1/255",
         "colours in steps of 0.0074",
-        "view-dependent SH coefficients in steps of 1/16 (degree 1) and 1/8",
     ),
+    changed_bands="view-dependent SH coefficients in steps of 1/16 (degree 1) and 1/8",
 )
 
 _GLTF = FormatLimits(
@@ -91,8 +93,8 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
                 "minimum and maximum of each 256 Gaussians",
                 "rotations in steps of 1/723 per component",
                 "opacities in steps of 1/255",
-                "view-dependent SH coefficients in steps of 1/32",
             ),
+            changed_bands="view-dependent SH coefficients in steps of 1/32",
         ),
         ".spz": _SPZ,
         ".spz.glb": replace(_SPZ, comments=True),
@@ -118,9 +120,9 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
                 "scales, colours and SH coefficients limited to 256 different values each",
                 "rotations in steps of 1/180 per component",
                 "opacities in steps of 1/255",
-                "view-dependent colours from a palette of half as many entries or more, at most "
-                "65,536",
             ),
+            changed_bands="view-dependent colours from a palette of half as many entries or more, "
+            "at most 65,536",
         ),
     }
 )
@@ -136,7 +138,9 @@ _VALUES = {
 
 def losses_within(scene: GaussianScene, limits: FormatLimits) -> Losses:
     """Report which data of a scene a format loses."""
-    changed = list(limits.changed)
+    changed = [*limits.changed, limits.changed_bands]
+    if scene.sh_degree == 0 or not limits.changed_bands:
+        changed.pop()
     others = [line for line in scene.comments if ANTIALIASED_TAG.lower() not in line.lower()]
     if others and not limits.comments:
         changed.append(f"without {counted(len(others), 'comment')}")
