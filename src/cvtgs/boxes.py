@@ -142,6 +142,6 @@ def check_room(kept: int, *, target: int, total: int) -> None:
     needed = kept + (1 if kept < total else 0)
     if kept and min(target, total) < needed:
         raise InvalidArgumentError(
-            f"{kept} Gaussians are protected, so the target must be at least {needed} of the "
-            f"{total} Gaussians (rho {needed / total:.4g} or more), found {target}."
+            f"{kept:,} Gaussians are protected, so the target must be at least {needed:,} of the "
+            f"{total:,} Gaussians (rho {needed / total:.4g} or more), found {target:,}."
         )

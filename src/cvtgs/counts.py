@@ -10,6 +10,7 @@ from fractions import Fraction
 from cvtgs.errors import InvalidArgumentError
 
 _UNITS = {"": 1, "k": 1000, "m": 1_000_000}
+_COUNT = re.compile(r"\s*(\d{1,3}(?:,\d{3})+|\d[\d_]*(?:\.\d+)?(?:e\+?\d\d?)?)\s*([km]?)\s*")
 
 
 def read_ratio(text: str) -> float:
@@ -23,9 +24,9 @@ def read_ratio(text: str) -> float:
 
 
 def read_count(text: str) -> int:
-    """Parse a number of Gaussians such as ``50_000``, ``50k`` or ``1.5M``; at least 1."""
-    match = re.fullmatch(r"\s*(\d[\d_]*(?:\.\d+)?)\s*([km]?)\s*", text.lower())
-    count = Decimal(match[1]) * _UNITS[match[2]] if match else Decimal(0)
+    """Parse a number of Gaussians such as ``50,000``, ``5e4``, ``50k`` or ``1.5M``; at least 1."""
+    match = _COUNT.fullmatch(text.lower())
+    count = Decimal(match[1].replace(",", "")) * _UNITS[match[2]] if match else Decimal(0)
     if count < 1 or count != int(count):
         raise InvalidArgumentError(
             f"a count must be a whole number above 0 such as 50000, 50k or 1.5M, found {text!r}."
@@ -73,8 +74,9 @@ def target_count(
         number = _whole(count)
         if not 1 <= number <= total:
             raise InvalidArgumentError(
-                f"count must be a whole number between 1 and the {total} Gaussians of the scene; "
-                f"found {count!r}."
+                f"count must be a whole number between 1 and the {total:,} Gaussians of the scene; "
+                f"found {f'{number:,}' if number > 0 else repr(count)}; "
+                f"max_count (--max-count) may be larger."
             )
         return number
     if not 0.0 < float(rho or 0.0) <= 1.0:

@@ -107,6 +107,10 @@ def test_losses_depend_on_the_format() -> None:
     assert losses(scene, "A.SPLAT").sh_degree == 0
     other = replace(scene, comments=("made by hand", "SplatRenderMode: mip"))
     assert losses(other, "a.spz").changed[-1] == "without 1 comment"
+    flat = replace(scene, shN=scene.shN[:, :0], extras={})
+    for name in ("a.spz", "a.sog", "a.compressed.ply"):
+        assert any("view-dependent" in phrase for phrase in losses(scene, name).changed)
+        assert not any("view-dependent" in phrase for phrase in losses(flat, name).changed)
     assert losses(other, "a.spz").dropped == ()
 
 

@@ -88,6 +88,13 @@ def test_without_a_command_the_help_is_printed(capsys):
         (["simplify", "in.ply", "out.ply", "--rhoo=0.1"], ": --rhoo; did you mean --rho?\n"),
         (["evaluate", "a.ply", "b.ply", "--backend", "numbaa"], "; did you mean numba?\n"),
         (["info", "a.ply", "--zzz"], "unrecognized argument: --zzz\n"),
+        *(
+            (
+                ["simplify", "in.ply", "out.ply", "--rho", rho],
+                f"argument --rho: rho must be above 0 and at most 1 (100%), found '{rho}'\n",
+            )
+            for rho in ("150%", "0", "nan", "1.5")
+        ),
         (["info", "a.ply", "b.ply"], "cvtgs info: error: unrecognized arguments: b.ply\n"),
         (
             ["levels", "a.ply", "-o", "l", "--rho", "0.1", "0.01"],

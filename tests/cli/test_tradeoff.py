@@ -67,7 +67,7 @@ def test_a_failed_run_is_reported_and_the_others_continue(source, tmp_path, caps
             ["--rho", "0.1,many"],
             "--rho must be different numbers separated by commas, ",
         ),
-        (["--rho", "2"], "rho must be above 0 and at most 1; found 2.0."),
+        (["--rho", "2"], "rho must be above 0 and at most 1 (100%), found '2'."),
         (["--presets", "best"], "preset must be one of "),
         (["--views", "0"], "--views must be at least 1, found 0."),
     ],

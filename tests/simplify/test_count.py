@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from cvtgs import GaussianScene, Simplifier, target_count
+from cvtgs.boxes import check_room
 from cvtgs.counts import read_count, read_ratio
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
 from scenes import random_scene, same_bits
@@ -180,8 +181,16 @@ def test_counts_out_of_range_are_errors(count):
     with pytest.raises(InvalidArgumentError) as caught:
         simplifier("standard").simplify(random_scene(5), count=count)
     assert str(caught.value) == (
-        f"count must be a whole number between 1 and the 5 Gaussians of the scene; found {count!r}."
+        f"count must be a whole number between 1 and the 5 Gaussians of the scene; "
+        f"found {count!r}; max_count (--max-count) may be larger."
     )
+
+
+def test_large_counts_are_grouped_in_errors():
+    with pytest.raises(InvalidArgumentError, match=r"the 4,000 Gaussians of .* found 500,000; "):
+        target_count(4000, None, count=500_000)
+    with pytest.raises(InvalidArgumentError, match=r"^3,000 Gaussians .* 3,001 of the 4,000 "):
+        check_room(3000, target=2000, total=4000)
 
 
 @pytest.mark.parametrize(
@@ -228,13 +237,25 @@ def test_invalid_ratios_are_refused(text):
 
 @pytest.mark.parametrize(
     ("text", "count"),
-    [("50000", 50_000), ("50_000", 50_000), ("50k", 50_000), ("1.5M", 1_500_000), ("2 K", 2000)],
+    [
+        ("50000", 50_000),
+        ("50_000", 50_000),
+        ("50,000", 50_000),
+        ("1,500,000", 1_500_000),
+        ("1e5", 100_000),
+        ("2.5e+3", 2500),
+        ("50k", 50_000),
+        ("1.5M", 1_500_000),
+        ("2 K", 2000),
+    ],
 )
 def test_counts_are_parsed(text, count):
     assert read_count(text) == count
 
 
-@pytest.mark.parametrize("text", ["", "k", "0", "-5", "1.5", "0.1234k", "5g", "1e3"])
+@pytest.mark.parametrize(
+    "text", ["", "k", "0", "-5", "1.5", "0.1234k", "5g", "1.5e0", "1,5", "50,00", "1e999", "1e-3"]
+)
 def test_invalid_counts_are_refused(text):
     with pytest.raises(InvalidArgumentError, match="a count must be a whole number above 0"):
         read_count(text)

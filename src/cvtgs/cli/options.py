@@ -205,10 +205,13 @@ def read_ratios(text: str) -> list[float]:
     """Read the list of ratios of ``--rho``."""
     from cvtgs.counts import read_ratio
 
+    words = read_words(text)
     try:
-        ratios = [read_ratio(word) for word in read_words(text)]
+        ratios = [read_ratio(word) for word in words]
     except InvalidArgumentError:
         ratios = []
+    for word, number in zip(words, ratios, strict=False):
+        _check_range(number, word)
     if not ratios or len(set(ratios)) < len(ratios):
         raise InvalidArgumentError(
             f"--rho must be different numbers separated by commas, for example 0.1,0.01 or 10%,1%; "
@@ -222,7 +225,15 @@ def ratio(text: str) -> float:
     from cvtgs.counts import read_ratio
 
     with _usage_errors():
-        return read_ratio(text)
+        number = read_ratio(text)
+        _check_range(number, text)
+        return number
+
+
+def _check_range(number: float, text: str) -> None:
+    """Raise if a ratio is out of range; the message quotes the words that were typed."""
+    if not 0 < number <= 1:
+        raise InvalidArgumentError(f"rho must be above 0 and at most 1 (100%), found {text!r}.")
 
 
 def count(text: str) -> int:

@@ -63,7 +63,7 @@ def add_simplify(add_parser: AddParser) -> None:
         "--count",
         type=count,
         metavar="M",
-        help="number of Gaussians to keep, for example 50000, 50k or 1.5M",
+        help="number of Gaussians to keep, for example 50000, 50,000, 5e4, 50k or 1.5M",
     )
     size.add_argument(
         "--max-count",

@@ -138,9 +138,9 @@ _VALUES = {
 
 def losses_within(scene: GaussianScene, limits: FormatLimits) -> Losses:
     """Report which data of a scene a format loses."""
-    changed = [*limits.changed, limits.changed_bands]
-    if scene.sh_degree == 0 or not limits.changed_bands:
-        changed.pop()
+    changed = list(limits.changed)
+    if scene.sh_degree > 0 and limits.changed_bands:
+        changed.append(limits.changed_bands)
     others = [line for line in scene.comments if ANTIALIASED_TAG.lower() not in line.lower()]
     if others and not limits.comments:
         changed.append(f"without {counted(len(others), 'comment')}")

@@ -77,7 +77,7 @@ def _scan(
     check_room(kept, target=job.target, total=valid)
     if kept == valid:
         raise InvalidArgumentError(
-            f"all {kept} valid Gaussians are protected, so there is nothing to simplify."
+            f"all {kept:,} valid Gaussians are protected, so there is nothing to simplify."
         )
     if job.config.uses_renders:
         write_views(job, sample, total=valid)
