@@ -50,7 +50,8 @@ def test_doctor_reports_a_working_machine(capsys):
     assert main(["doctor", "--device", "cpu"]) == 0
     printed = capsys.readouterr().out
     assert "images by torch   yes" in printed
-    assert "images by gsplat  no: " in printed
+    assert "images by gsplat  no: needs CUDA\n" in printed
+    assert "cuda" not in printed.split("images by")[1], "only the CPU was asked for"
     used = "numba" if version_of("numba") != "not installed" else "torch"
     assert f"images by {used:<7} yes (used: the fastest that works here)\n" in printed
     assert printed.count("(used: the fastest") == 1
@@ -66,7 +67,8 @@ def test_every_device_is_checked(capsys):
     assert main(["doctor"]) == 0
     printed = capsys.readouterr().out
     assert "\ncpu: " in printed
-    assert printed.count("\ncuda:") == torch.cuda.device_count()
+    assert printed.count("\ncuda:") == max(1, torch.cuda.device_count())
+    assert ("\ncuda: not available\n" in printed) == (torch.cuda.device_count() == 0)
 
 
 @pytest.mark.usefixtures("_small")

@@ -92,6 +92,8 @@ def doctor(options: argparse.Namespace) -> None:
             use = " (used: the fastest that works here)" if name == taken else ""
             say(f"  images by {name:<7} {_renderer_state(name, one)}{use}")
         say(f"  nearest site by {cvtgs.cvt.SEARCH} (a k-d tree on the host, whatever the device)")
+    if options.device == "auto" and not gpus:
+        say("\ncuda: not available")
     say(f"\nA small run on {default}: {COUNT:,} generated Gaussians to {RHO:.0%}, one image")
     try:
         for line in _small_run(default):
@@ -106,6 +108,8 @@ def doctor(options: argparse.Namespace) -> None:
 
 def _renderer_state(name: str, device: "torch.device") -> str:
     """Return whether a renderer works on a device, and if not, why."""
+    if name == "gsplat" and device.type != "cuda":
+        return "no: needs CUDA"
     try:
         cvtgs.rendering.choose_backend(cast("BackendName", name), device)
     except CvtgsError as error:
