@@ -1,6 +1,6 @@
 """Score presets on a scene without photographs, and write a page that shows them side by side.
 
-python examples/compare.py scene.ply page --rho 0.01 --presets draft standard high
+python examples/compare.py scene.ply page --rho 0.01 --presets draft,standard,high
 """
 
 import argparse
@@ -16,13 +16,13 @@ def main() -> None:
     parser.add_argument("input", type=Path)
     parser.add_argument("output", type=Path, help="folder for index.html")
     parser.add_argument("--rho", type=float, default=0.01)
-    parser.add_argument("--presets", nargs="+", default=["draft", "standard"])
+    parser.add_argument("--presets", default="draft,standard", help="separated by commas")
     parser.add_argument("--size", type=int, default=480, help="side of the images, pixels")
     options = parser.parse_args()
     scene = cvtgs.load(options.input)
     small = {
         preset: cvtgs.Simplifier(config=preset).simplify(scene, options.rho)
-        for preset in options.presets
+        for preset in options.presets.split(",")
     }
     views = cvtgs.views.automatic_views(scene, 4, width=options.size, height=options.size)
     # lpips="auto" also measures LPIPS if its weights are found.

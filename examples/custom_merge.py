@@ -28,6 +28,8 @@ def main() -> None:
     parser.add_argument("--rho", type=float, default=0.05)
     options = parser.parse_args()
     scene = cvtgs.load(options.input)
+    if not scene.extras:
+        parser.error(f"{options.input} must have an extra column of labels, found none")
     if options.column not in scene.extras:
         parser.error(f"--column must be one of {list(scene.extras)}, found {options.column!r}")
     cvtgs.save(merge_within(scene, scene.extras[options.column], options.rho), options.output)

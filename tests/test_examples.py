@@ -77,7 +77,7 @@ def test_simplify(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_compare(tmp_path: Path) -> None:
     source, page = scene_file(tmp_path / "scene.ply"), tmp_path / "page"
-    words = ("--rho", 0.1, "--presets", "draft", "fast", "--size", 64)
+    words = ("--rho", 0.1, "--presets", "draft,fast", "--size", 64)
     printed = run("compare.py", source, page, *words)
     assert (page / "index.html").is_file()
     assert [line.split()[0] for line in printed.splitlines()] == ["draft", "fast"]
@@ -96,6 +96,14 @@ def test_custom_merge_keeps_labels_apart(tmp_path: Path) -> None:
     assert set(merged.extras["label"].tolist()) == {0, 1}
     # Means of 0 and 1 within a cell would lie between them.
     assert merged.extras["share"].tolist() == pytest.approx(merged.extras["label"].tolist())
+
+
+@pytest.mark.slow
+def test_custom_merge_needs_a_column(tmp_path: Path) -> None:
+    source = scene_file(tmp_path / "scene.ply")
+    with pytest.raises(subprocess.CalledProcessError) as failed:
+        run("custom_merge.py", source, tmp_path / "small.ply")
+    assert "must have an extra column of labels, found none\n" in failed.value.stderr
 
 
 @pytest.mark.long
@@ -117,7 +125,7 @@ def test_gsplat_loop() -> None:
 @pytest.mark.slow
 def test_levels(tmp_path: Path) -> None:
     source, folder = scene_file(tmp_path / "scene.ply"), tmp_path / "levels"
-    run("levels.py", source, folder, "--rho", 0.25, 0.05, "--suffix", ".spz")
+    run("levels.py", source, folder, "--rho", "0.25,0.05", "--suffix", ".spz")
     assert len(cvtgs.load(folder / "level0.spz")) == 100
     assert len(cvtgs.load(folder / "level1.spz")) == 20
 
@@ -125,7 +133,7 @@ def test_levels(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_tradeoff(tmp_path: Path) -> None:
     source, page = scene_file(tmp_path / "scene.ply"), tmp_path / "page"
-    words = ("--rho", 0.1, "--presets", "draft", "fast", "--size", 64)
+    words = ("--rho", 0.1, "--presets", "draft,fast", "--size", 64)
     printed = run("tradeoff.py", source, page, *words)
     assert (page / "index.html").is_file()
     assert [line.split()[0] for line in printed.splitlines()] == ["draft", "fast"]
