@@ -293,11 +293,11 @@ def test_the_plan_and_the_configuration_have_the_same_names():
     assert list(EffectPlan.model_fields) == names
 
 
-def test_every_effect_says_what_its_figure_means():
+def test_every_effect_says_when_it_is_on():
     plan = plan_of(random_scene(50))
     for name in EffectPlan.model_fields:
         effect = getattr(plan, name)
-        assert "on " in effect.meaning, name
+        assert effect.meaning.startswith("on if "), name
 
 
 def test_a_plan_is_frozen():

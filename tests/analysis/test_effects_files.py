@@ -105,11 +105,11 @@ def test_info_lists_every_effect_with_its_evidence(source, capsys):
     assert main(["info", str(source), "--effects", "haze=on"]) == 0
     lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
     for name in cvtgs.EffectPlan.model_fields:
-        assert lines[name].split()[1] in ("on", "off")
-        assert "on above" in lines[name] or "on at" in lines[name]
-    assert "up to degree 2" in lines["sh"]
-    assert lines["haze"].split()[1] == "on"
-    assert "forced" in lines["haze"]
+        assert lines[name].split()[1].rstrip(",") in ("on", "off")
+        assert " on if " in lines[name]
+    assert lines["effect"].split() == ["effect", "state", "measured", "rule"]
+    assert "on, to degree 2 " in lines["sh"]
+    assert "on, forced " in lines["haze"]
     assert "forced" not in lines["sh"]
 
 
@@ -119,7 +119,7 @@ def test_info_lists_every_effect_with_its_evidence(source, capsys):
         ("sh", "--effects needs NAME=VALUE, for example sh=1,mip=off; found 'sh'."),
         ("sh=1,,", "--effects needs NAME=VALUE, for example sh=1,mip=off; found ''."),
         ("fog=on", "effects.fog: is not a known setting."),
-        ("sh=4", "effects.sh: input should be 'auto', 0, 1, 2 or 3, found '4'."),
+        ("sh=4", "effects.sh: input should be 'auto', 'on', 'off', 0, 1, 2 or 3, found '4'."),
         ("mip=maybe", "effects.mip: input should be 'auto', 'on' or 'off', found 'maybe'."),
         ("flat=on", "effects.flat: input should be 'auto' or 'off', found 'on'."),
     ],

@@ -24,6 +24,16 @@ def test_info_prints_counts_and_statistics(tmp_path, capsys):
         assert text in printed
 
 
+def test_info_names_the_file_of_a_folder(tmp_path, capsys):
+    scene = cvtgs.synthetic.scene("object", 50, sh_degree=0, seed=0)
+    for number in (7000, 30000):
+        folder = tmp_path / "point_cloud" / f"iteration_{number}"
+        folder.mkdir(parents=True)
+        cvtgs.save(scene, folder / "point_cloud.ply")
+    assert main(["info", str(tmp_path)]) == 0
+    assert f"{folder / 'point_cloud.ply'}, " in capsys.readouterr().out.splitlines()[0]
+
+
 def test_info_as_json_equals_describe(tmp_path, capsys):
     path = tmp_path / "in.ply"
     scene = cvtgs.synthetic.scene("room", 300, sh_degree=0, seed=0)

@@ -246,7 +246,7 @@ def select_columns(scene: GaussianScene, choices: EffectsConfig) -> GaussianScen
         >>> select_columns(scene, EffectsConfig()) is scene
         True
     """
-    if choices.sh != "auto":
+    if isinstance(choices.sh, int):
         scene = scene.with_sh_degree(choices.sh)
     if choices.extras == "off" and scene.extras:
         scene = scene.with_tensors({}, {})

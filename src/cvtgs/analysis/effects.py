@@ -47,7 +47,7 @@ class Effect(Record):
     Attributes:
         active: Whether the effect is computed.
         figure: Figure that was measured on the scene.
-        meaning: Meaning of the figure, and its threshold.
+        meaning: The threshold in words, which say what the figure is.
         forced: Whether the configuration decided instead of the figure.
     """
 
@@ -142,14 +142,14 @@ def plan_effects(
     far, hazy, duplicates = torch.stack(shares).tolist()  # one synchronization with the device
     antialiased, two_scales = scene.antialiased, scene.has_two_scales
     above = (far - UNBOUNDED_SHARE) / (FULLY_UNBOUNDED_SHARE - UNBOUNDED_SHARE)
-    beyond = f"share of mass beyond {UNBOUNDED_DISTANCE:g} robust radii"
+    beyond = f"of the mass is beyond {UNBOUNDED_DISTANCE:g} robust radii"
     unbounded = _by_share(far, choices.unbounded, UNBOUNDED_SHARE, beyond)
     return EffectPlan(
         sh=_plan_bands(scene, choices.sh),
         mip=Effect(
             active=antialiased and choices.mip != "off",
             figure=float(antialiased),
-            meaning="1 if the comment SplatRenderMode: mip is present, on at 1",
+            meaning="on if the comment SplatRenderMode: mip is present (1)",
             forced=choices.mip != "auto",
         ),
         unbounded=GradedEffect(
@@ -160,25 +160,25 @@ def plan_effects(
         flat=Effect(
             active=two_scales and choices.flat != "off",
             figure=float(two_scales),
-            meaning="1 if the file has two scales per Gaussian, on at 1",
+            meaning="on if the file has two scales per Gaussian (1)",
             forced=choices.flat != "auto",
         ),
         duplicates=_by_share(
             duplicates,
             choices.duplicates,
             DUPLICATE_SHARE,
-            "share of Gaussians that coincide with others of the same colour",
+            "of the Gaussians coincide with others of the same colour",
         ),
         extras=Effect(
             active=bool(scene.extras),
             figure=len(scene.extras),
-            meaning="columns beyond the standard ones, on above 0",
+            meaning="on if there are columns beyond the standard ones",
             forced=choices.extras != "auto",
         ),
         visibility=Effect(
             active=config.uses_renders,
             figure=config.visibility.views,
-            meaning="images that the preset asks for, on above 0",
+            meaning="on if the preset asks for images",
             forced=choices.visibility != "auto",
         ),
     )
@@ -199,7 +199,7 @@ def plan_haze(share: float, config: SimplifyConfig) -> Effect:
     return Effect(
         active=share > most if choice == "auto" else choice == "on",
         figure=share,
-        meaning=f"share of apparent mass with opacity below {below:g}, on above {most:g}",
+        meaning=f"on if more than {most:g} of the apparent mass has an opacity below {below:g}",
         forced=choice != "auto",
     )
 
@@ -215,20 +215,19 @@ def _plan_bands(scene: GaussianScene, choice: str | int) -> BandsEffect:
     return BandsEffect(
         active=degree > 0,
         figure=max(losses, default=0.0),
-        meaning="largest change of colour by a band, in standard deviations of colour; "
-        f"bands on above {BAND_LOSS:g}",
+        meaning=f"on if bands change colours by more than {BAND_LOSS:g} standard deviations",
         forced=choice != "auto",
         degree=degree,
         bands=losses,
     )
 
 
-def _by_share(share: float, choice: str, least: float, meaning: str) -> Effect:
+def _by_share(share: float, choice: str, least: float, what: str) -> Effect:
     """Decide on an effect: on above the share ``least``, or above 0 if it is forced on."""
     return Effect(
         active=share > (least if choice == "auto" else 0.0) and choice != "off",
         figure=share,
-        meaning=f"{meaning}, on above {least:g}",
+        meaning=f"on if more than {least:g} {what}",
         forced=choice != "auto",
     )
 

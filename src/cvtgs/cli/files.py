@@ -88,7 +88,7 @@ def _rows(facts: "SceneInfo", path: Path) -> list[tuple[str, str]]:
 
     invalid = ", ".join(f"{name} {number:,}" for name, number in facts.invalid_rows.items())
     rows = [
-        ("file", f"{path}, {file_size(path)}"),
+        ("file", f"{cvtgs.io.scene_file(path)}, {file_size(path)}"),
         ("Gaussians", f"{facts.count:,}"),
         ("SH degree", f"{facts.sh_degree}"),
         ("bounds", f"{_vector(facts.bounds[0])} to {_vector(facts.bounds[1])}"),
@@ -111,17 +111,24 @@ def _rows(facts: "SceneInfo", path: Path) -> list[tuple[str, str]]:
         ("comments", "; ".join(facts.comments) or "none"),
         ("extra columns", ", ".join(facts.extra_columns) or "none"),
     ]
-    return rows + [(name, _effect_text(effect)) for name, effect in facts.plan]
+    table = [("effect", ("state", "measured", "rule"))]
+    table += [(name, _effect_cells(effect)) for name, effect in facts.plan]
+    left, middle, _ = (max(map(len, column)) for column in zip(*dict(table).values(), strict=True))
+    return rows + [
+        (name, f"{state:{left}}  {figures:{middle}}  {rule}")
+        for name, (state, figures, rule) in table
+    ]
 
 
-def _effect_text(effect: "Effect") -> str:
+def _effect_cells(effect: "Effect") -> tuple[str, str, str]:
+    """Return the state of an effect, the measured figures, and the rule that decides."""
     from cvtgs.analysis import BandsEffect
 
-    state, figures = "on " if effect.active else "off", f"{effect.figure:.3g}"
+    state, figures = "on" if effect.active else "off", f"{effect.figure:.3g}"
     if isinstance(effect, BandsEffect) and effect.bands:
-        state += f" up to degree {effect.degree}" if effect.active else ""
+        state += f", to degree {effect.degree}" if effect.active else ""
         figures = ", ".join(f"{loss:.3g}" for loss in effect.bands)
-    return f"{state} {figures} ({effect.meaning}{'; forced' if effect.forced else ''})"
+    return state + (", forced" if effect.forced else ""), figures, effect.meaning
 
 
 def _labelled(shares: tuple[float, ...], values: tuple[float, ...], form: str) -> str:

@@ -13,13 +13,22 @@ Choice = Literal["auto", "on", "off"]
 Less = Literal["auto", "off"]
 
 
-def _degree_of_text(value: object) -> object:
-    """Parse a degree given as text: a number, ``on`` (all bands) or ``off`` (none)."""
-    names = {"on": 3, "off": 0, **{str(degree): degree for degree in range(4)}}
-    return names.get(value, value) if isinstance(value, str) else value
+def _number_of_text(value: object) -> object:
+    """Parse a degree given as text."""
+    numbers = {str(degree): degree for degree in range(4)}
+    return numbers.get(value, value) if isinstance(value, str) else value
 
 
-Degree = Annotated[Literal["auto", 0, 1, 2, 3], pydantic.BeforeValidator(_degree_of_text)]
+def _degree_of_word(value: str | int) -> str | int:
+    """Return the degree of ``on`` (all bands) and ``off`` (none)."""
+    return {"on": 3, "off": 0}.get(str(value), value)
+
+
+Degree = Annotated[
+    Literal["auto", "on", "off", 0, 1, 2, 3],
+    pydantic.BeforeValidator(_number_of_text),
+    pydantic.AfterValidator(_degree_of_word),
+]
 
 
 class EffectsConfig(Section):
