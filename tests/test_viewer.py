@@ -139,6 +139,10 @@ def test_a_standalone_page_starts_in_view_of_the_scene(scene: GaussianScene) -> 
     middle = scene.means.median(dim=0).values.tolist()
     assert math.dist(eye, target) == pytest.approx(math.dist(eye, middle), rel=0.3)
     assert sum(x * (m - e) for x, m, e in zip(toward, middle, eye, strict=True)) > 0
+    for place in stand.scene.positions:  # labels are in the image, above its middle
+        high = math.dist(place, target) / math.dist(eye, target)
+        assert high == pytest.approx(0.85 * math.tan(stand.initial_camera.fov / 2), rel=1e-3)
+        assert place[1] < target[1], "y points down"
 
 
 @pytest.mark.slow

@@ -59,6 +59,7 @@ class Gui:
 class Scene:
     def __init__(self, server):
         self.server, self.nodes, self.labels, self.up = server, {}, {}, None
+        self.positions = []
 
     def set_up_direction(self, direction):
         self.up = direction
@@ -67,6 +68,7 @@ class Scene:
         assert name.rpartition("/")[0] in self.nodes
         assert len(position) == 3
         self.labels[name] = text
+        self.positions.append(position)
 
     def add_gaussian_splats(self, name, centers, covariances, rgbs, opacities, *, visible):
         n = len(centers)

@@ -24,14 +24,16 @@ if TYPE_CHECKING:
 
 __all__ = ["check_viewer", "scene_page"]
 
+Point = tuple[float, float, float]
+
 _FLIP_SECONDS = 2.0
 """Seconds for which a standalone page shows each scene."""
 
 _ANY_PORT = 8999
 """First port tried for the temporary server that records a standalone page."""
 
-_ABOVE = 1.8
-"""Height of a label above the centre of its scene, in robust radii."""
+_ABOVE = 0.85
+"""Height of labels in the initial view, as a share of half the image; all scenes share it."""
 
 
 def scene_page(scenes: Mapping[str, GaussianScene]) -> str:
@@ -50,10 +52,13 @@ def scene_page(scenes: Mapping[str, GaussianScene]) -> str:
     """
     server = start_server("127.0.0.1", _ANY_PORT)
     try:
-        nodes = {name: SceneNode(server, name, f"/scene {k}") for k, name in enumerate(scenes)}
+        place = look_at(server, next(iter(scenes.values())))
+        nodes = {
+            name: SceneNode(server, name, f"/scene {k}", label=place)
+            for k, name in enumerate(scenes)
+        }
         for name, scene in scenes.items():
             nodes[name].draw(scene, visible=False)
-        look_at(server, next(iter(scenes.values())))
         return record_page(server, list(nodes.values()))
     finally:
         stop_server(server)
@@ -62,8 +67,8 @@ def scene_page(scenes: Mapping[str, GaussianScene]) -> str:
 class SceneNode:
     """A scene on a server, and a label with its name that is shown and hidden with it."""
 
-    def __init__(self, server: "viser.ViserServer", name: str, path: str) -> None:
-        self._server, self._name, self._path = server, name, path
+    def __init__(self, server: "viser.ViserServer", name: str, path: str, *, label: Point) -> None:
+        self._server, self._name, self._path, self._label = server, name, path, label
         self._splats: Any = None
 
     def draw(self, scene: GaussianScene, *, visible: bool) -> None:
@@ -78,12 +83,8 @@ class SceneNode:
             opacities=part.opacities[:, None].float().numpy(),
             visible=visible,
         )
-        frame = robust_frame(part.means)
-        above = (
-            frame.center.double() - torch.tensor([0.0, _ABOVE * frame.radius, 0.0], device="cpu")
-        ).tolist()
         self._server.scene.add_label(
-            f"{self._path}/name", f"{self._name}: {len(part):,} Gaussians", position=tuple(above)
+            f"{self._path}/name", f"{self._name}: {len(part):,} Gaussians", position=self._label
         )
 
     def show(self, visible: bool) -> None:
@@ -101,18 +102,20 @@ def record_page(server: "viser.ViserServer", nodes: Sequence[SceneNode]) -> str:
     return str(recorder.as_html(dark_mode=True))
 
 
-def look_at(server: "viser.ViserServer", scene: GaussianScene) -> None:
-    """Set the initial camera to a good view of the scene."""
+def look_at(server: "viser.ViserServer", scene: GaussianScene) -> Point:
+    """Set the initial camera to a good view of the scene; return the place of labels in it."""
     camera = automatic_views(scene.to("cpu"), 1)
     rotation, center = camera.viewmats[0, :3, :3], camera.centers[0]
     depth = float(rotation[2] @ (robust_frame(scene.means).center.cpu().double() - center))
-    target = center + rotation[2] * max(depth, 1e-3)
+    depth = max(depth, 1e-3)
+    target, half = center + rotation[2] * depth, camera.height / 2 / float(camera.Ks[0, 1, 1])
     server.initial_camera.position = _three(center)
     server.initial_camera.look_at = _three(target)
-    server.initial_camera.fov = 2 * math.atan(camera.height / 2 / float(camera.Ks[0, 1, 1]))
+    server.initial_camera.fov = 2 * math.atan(half)
+    return _three(target - rotation[1] * (_ABOVE * half * depth))
 
 
-def _three(point: torch.Tensor) -> tuple[float, float, float]:
+def _three(point: torch.Tensor) -> Point:
     x, y, z = point.tolist()
     return x, y, z
 

@@ -54,7 +54,7 @@ class ViewerServer:
         self._viewer, self._wanted = viewer, threading.Event()
         self._closed, self._first = False, threading.Event()
         self._server = start_server(host, port)
-        look_at(self._server, viewer.scenes[FULL].scene)
+        self._label = look_at(self._server, viewer.scenes[FULL].scene)
         gui, low, high, step = self._server.gui, *SLIDER
         self._facts = gui.add_markdown("")
         start = min(max(math.log10(rho), low), high)
@@ -137,7 +137,8 @@ class ViewerServer:
 
     def _draw(self, name: str, scene: GaussianScene) -> None:
         if name not in self._nodes:
-            self._nodes[name] = SceneNode(self._server, name, f"/scene {len(self._nodes)}")
+            path = f"/scene {len(self._nodes)}"
+            self._nodes[name] = SceneNode(self._server, name, path, label=self._label)
         self._nodes[name].draw(scene, visible=self._shown.value == name)
 
     def _show(self) -> None:
