@@ -181,7 +181,7 @@ def run_child(
     values = {**json.loads(settings), "effects": {name: choice}}
     config = SimplifyConfig.from_mapping(values)
     choices = config.effects
-    degree = None if choices.sh == "auto" else choices.sh
+    degree = choices.sh if isinstance(choices.sh, int) else None
     simplifier, seconds = Simplifier(config=config, device="cpu"), []
     for _ in range(options.runs):
         start = resource.getrusage(resource.RUSAGE_SELF).ru_utime
