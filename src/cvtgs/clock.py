@@ -34,7 +34,12 @@ class StageCost(pydantic.BaseModel):
 
 
 class StageClock:
-    """A clock that measures consecutive stages and reports progress; CUDA is synchronised."""
+    """A clock that measures consecutive stages and reports progress; CUDA is synchronised.
+
+    Args:
+        listener: Called at the start and the end of each stage.
+        device: Device whose memory is measured.
+    """
 
     def __init__(self, listener: ProgressListener, device: torch.device) -> None:
         self._listener = listener
