@@ -22,7 +22,7 @@ class InvalidArgumentError(CvtgsError, ValueError):
 
 
 class InvalidSceneError(CvtgsError, ValueError):
-    """The tensors given do not make up a scene (wrong shape, dtype or device)."""
+    """A scene cannot be used (wrong shape, dtype or device, no valid row)."""
 
 
 class ConfigError(CvtgsError, ValueError):
@@ -82,7 +82,7 @@ class MissingDependencyError(CvtgsError, ImportError):
 
 
 class DroppedDataWarning(UserWarning):
-    """Something in the input was dropped; the message says what, how much and why."""
+    """Data of a scene were dropped or clamped; the message says what, how much and why."""
 
 
 def reason_of(error: Exception) -> str:

@@ -36,6 +36,7 @@ class Simplifier:
         CheckpointError: The checkpoint cannot be used.
         ConfigError: There is no such preset, or it has no network but a checkpoint is given.
         DeviceError: The device cannot be used.
+        InvalidArgumentError: Both a configuration and a preset are given.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -127,7 +128,7 @@ class Simplifier:
         *,
         cameras: Cameras | None = None,
     ) -> tuple[Level, ...]:
-        """Simplify a scene to several levels, in little more time than the finest takes.
+        """Simplify a scene to several levels, in about 1.5 times the time of the finest.
 
         The finest level equals the result of :meth:`run`, bit for bit. The cells of a level that is
         at least four times as coarse consist of whole cells of the finest level.
@@ -215,6 +216,7 @@ def simplify(
         InputError: The file cannot be read.
         FileFormatError: The file violates its format.
         ConfigError: There is no such preset.
+        DeviceError: The device cannot be used.
         InvalidArgumentError: Ratio or count is out of range, or not exactly one is given.
         InvalidSceneError: The scene has no valid row.
 

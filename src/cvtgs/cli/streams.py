@@ -35,7 +35,7 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
         "--chunk",
         type=int,
         metavar="N",
-        help="Gaussians per chunk of a stream at its finest level (default 32768)",
+        help="most Gaussians per chunk of a stream, at its finest level (default 32768)",
     )
     parser.add_argument(
         "--environment",

@@ -64,7 +64,7 @@ class FilterConfig(Section):
         min_opacity: Gaussians with an opacity below this are faint and may be dropped. The default
             is what 3DGS itself prunes at while it trains.
         max_mass_share: Faint Gaussians are dropped, faintest first, as long as they hold at most
-            this share of the scene's mass; 1 drops all of them.
+            this share of the apparent mass of the scene; 1 drops all of them.
         max_flyaway_share: Gaussians beyond 100 robust radii are dropped, lightest first, as long
             as they hold at most this share of the mass as seen from the middle of the scene.
     """

@@ -24,7 +24,8 @@ class Tessellation:
     Attributes:
         labels: ``(n,)`` cell of every point, 0 to m - 1; every cell has a point.
         sites: ``(m, d)`` sites that the labels refer to, on the CPU.
-        energies: ``sum w |x - site|^2`` before every Lloyd iteration.
+        energies: ``sum w |x - site|^2`` before every Lloyd iteration, over the points that Lloyd
+            samples.
         energy: The same for the final labels, over all points.
         refilled: Number of empty cells that received a point from another cell.
     """

@@ -104,6 +104,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         InvalidArgumentError: Ratio, count or boxes cannot be met.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
+        OutputExistsError: The output exists and may not be replaced.
         OutputBusyError: Another run is writing this output.
 
     Example:

@@ -70,15 +70,15 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         full: The scene that it was made from.
         seconds: Largest wall-clock time, seconds.
         steps: Largest number of steps; if neither is given, the configuration decides, else 500.
-        cameras: The views, at least 2; every eighth is held out. None finds new views: automatic
-            ones, and others from all around.
+        cameras: The views, at least 2; an eighth of them, from 1 to ``config.heldout``, is held
+            out. None finds new views: automatic ones, and others from all around.
         config: All other settings; None for the defaults.
         seed: Seed of the choice and order of views.
         device: Device to compute on: ``auto`` is that of the small scene, or CUDA, if available,
             for scenes on the CPU. The result is on the device of the small scene.
         frozen: Number of Gaussians at the start of the scene that stay bit for bit.
         observed: Existing images of the full scene, with the size and stride of the configuration.
-            They are used first, and every eighth of them is held out.
+            They are used first; as many are held out as of cameras.
         listener: Called after every step, with the gain so far as its note.
 
     Returns:
