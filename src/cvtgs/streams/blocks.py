@@ -163,7 +163,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
         kind: ``sog`` or ``3dtiles``.
         memory: Bytes that one process may use; None for all free memory.
         blocks: Number of blocks, instead of ``memory``.
-        chunk_gaussians: Gaussians of the finest level in a chunk.
+        chunk_gaussians: Maximum number of Gaussians of the finest level in a chunk.
         environment_radii: Gaussians farther from the centre than this, in robust radii, are the
             environment of a streamed SOG, which all levels share; None for no environment.
         transform: Root transform of 3D Tiles (:func:`cvtgs.streams.geo_transform`).
