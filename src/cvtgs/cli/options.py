@@ -114,8 +114,8 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     "--axes": {
         "metavar": "IN[:OUT]",
         "help": "axes of the files: where x, y and z point, for example rub (right, up, back) or "
-        "rub:rub (default: rdf, that is right, down, forward; luf for glTF; unless IN states its "
-        "own)",
+        "rub:rub (default: rdf, that is right, down, forward; luf for glTF, rub for .usda; unless "
+        "IN states its own)",
     },
     "--lod": {
         "metavar": "N",
