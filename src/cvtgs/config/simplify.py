@@ -49,7 +49,7 @@ THINNED: Mapping[str, Any] = {
     "size": 400,
     "stride": 2,
     "first_images": 32,
-    "steps_per_image": 480,
+    "steps_per_image": 1000,
     "check_every": 50,
 }
 
