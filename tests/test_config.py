@@ -1,10 +1,12 @@
 """SimplifyConfig: frozen, with presets; unknown keys and values are errors."""
 
+import pickle
+
 import pydantic
 import pytest
 
 from cvtgs import PRESETS, SimplifyConfig
-from cvtgs.config import FilterConfig, MergeConfig, TessellationConfig
+from cvtgs.config import FilterConfig, MergeConfig, RefineConfig, TessellationConfig
 from cvtgs.errors import ConfigError
 
 
@@ -121,8 +123,22 @@ def test_configurations_are_frozen():
 
 def test_sections_can_be_used_on_their_own():
     assert TessellationConfig(iterations=0).iterations == 0
-    with pytest.raises(pydantic.ValidationError):
+    with pytest.raises(ConfigError, match=r"^iteration: is not a known setting\.$"):
         TessellationConfig(iteration=0)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_the_constructor_starts_from_the_preset(name):
+    preset = SimplifyConfig.from_preset(name)
+    assert SimplifyConfig(preset=name) == SimplifyConfig.model_validate({"preset": name}) == preset
+    changed = SimplifyConfig(preset=name, cvt={"iterations": 9})
+    cvt = preset.cvt.model_copy(update={"iterations": 9})
+    assert changed == preset.model_copy(update={"cvt": cvt})
+    # a dump holds all values, so those of the preset do not return
+    edited = preset.model_copy(update={"filter": FilterConfig(), "refine": RefineConfig()})
+    assert SimplifyConfig(**edited.model_dump()) == edited
+    assert SimplifyConfig.model_validate_json(edited.model_dump_json()) == edited
+    assert pickle.loads(pickle.dumps(edited)) == edited
 
 
 @pytest.mark.parametrize(
@@ -150,6 +166,9 @@ def test_sections_can_be_used_on_their_own():
 )
 def test_unknown_keys_and_values_are_errors(values, message):
     assert error_of(values) == message
+    with pytest.raises(ConfigError) as caught:
+        SimplifyConfig(**values)
+    assert str(caught.value) == message
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
@@ -163,6 +182,8 @@ def test_numbers_that_are_not_finite_are_errors(key, value):
 def test_unknown_presets_are_errors(name):
     wanted = f"preset must be one of {', '.join(PRESETS)}; found {name!r}."
     assert error_of({"preset": name}) == wanted
+    with pytest.raises(pydantic.ValidationError, match="preset must be one of"):
+        SimplifyConfig.model_validate({"preset": name})
 
 
 def test_a_mistyped_preset_gets_a_suggestion():

@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pydantic
 import torch
@@ -11,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from cvtgs.errors import InputError, InputNotFoundError, InvalidArgumentError, reason_of
-from cvtgs.text import MOST_LETTERS, shortened
+from cvtgs.text import MOST_LETTERS, shortened, shown
 
 Corner = tuple[float, float, float]
 
@@ -23,6 +24,10 @@ class Box(pydantic.BaseModel):
         min: Least coordinates, scene units.
         max: Largest coordinates, none below those of ``min``.
 
+    Raises:
+        InvalidArgumentError: A corner does not consist of three finite numbers, or ``min`` is above
+            ``max``.
+
     Example:
         >>> Box(min=(0, 0, 0), max=(1, 1, 1)).max
         (1.0, 1.0, 1.0)
@@ -32,6 +37,19 @@ class Box(pydantic.BaseModel):
 
     min: Corner
     max: Corner
+
+    def __init__(self, /, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except pydantic.ValidationError:
+            found = ", ".join(f"{name}={shown(value)}" for name, value in values.items())
+            raise InvalidArgumentError(
+                "a box must have a min and a max of three finite numbers each, min nowhere above "
+                f"max, found {found or 'neither'}."
+            ) from None
+
+    # Boxes of files are checked without a call of __init__, so errors name the place in the file.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
     @pydantic.model_validator(mode="after")
     def _in_order(self) -> "Box":

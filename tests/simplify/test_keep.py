@@ -1,6 +1,7 @@
 """Protected regions: kept bit for bit, counted, and an error if they do not fit the target."""
 
 import json
+import pickle
 
 import pytest
 import torch
@@ -81,6 +82,14 @@ def test_boxes_include_their_faces():
     points = torch.tensor([[0.0, 0, 0], [1, 1, 1], [1.0001, 0, 0], [-1, 0, 0]])
     assert inside([box], points).tolist() == [True, True, False, False]
     assert inside([], points).tolist() == [False] * 4
+
+
+@pytest.mark.parametrize("corners", [{"min": (1, 0, 0), "max": (0, 0, 0)}, {"min": (0, 0)}, {}])
+def test_bad_boxes_are_refused(corners):
+    with pytest.raises(InvalidArgumentError, match="a box must have a min and a max of three"):
+        Box(**corners)
+    box = Box(min=(0, 0, 0), max=(1, 1, 1))
+    assert pickle.loads(pickle.dumps(box)) == Box.model_validate_json(box.model_dump_json()) == box
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,16 @@ class Section(pydantic.BaseModel):
         frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
     )
 
+    def __init__(self, /, **values: Any) -> None:
+        """Check the values; raise ConfigError with the first problems."""
+        try:
+            super().__init__(**values)
+        except pydantic.ValidationError as error:
+            raise ConfigError(explain(error)) from None
+
+    # Sections in other sections are checked without a call of __init__, so keys keep their path.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file.
@@ -61,17 +71,20 @@ def explain(error: pydantic.ValidationError) -> str:
         The first problems, each with its key and value, long ones shortened.
     """
     problems, count = [], error.error_count()
-    for problem in error.errors(include_url=False, include_context=False)[:MOST_PROBLEMS]:
+    for problem in error.errors(include_url=False)[:MOST_PROBLEMS]:
         key = named(".".join(str(part) for part in problem["loc"]))
         if problem["type"] == "extra_forbidden":
             problems.append(f"{key}: is not a known setting")
+        elif problem["type"] == "value_error":  # raised by cvtgs, as a whole sentence
+            problems.append(str(problem["ctx"]["error"]).removesuffix("."))
         else:
             problems.append(
                 f"{key}: {problem['msg'].lower()}, found {shown(problem['input'], 120)}"
             )
     if count > MOST_PROBLEMS:
         problems.append(f"and {count - MOST_PROBLEMS:,} more")
-    return "; ".join(problems) + "."
+    text = "; ".join(problems)
+    return text if text.endswith("?") else f"{text}."
 
 
 def named(key: str) -> str:

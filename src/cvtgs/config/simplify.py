@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import pydantic
 
-from cvtgs.config.base import Section, explain, named, read_toml
+from cvtgs.config.base import Section, named, read_toml
 from cvtgs.config.sections import (
     AllocationConfig,
     EffectsConfig,
@@ -98,8 +98,11 @@ page lists the details that the publication leaves open.
 class SimplifyConfig(Section):
     """The configuration of a simplification; frozen, unknown keys are errors.
 
+    Values that are not given are those of the preset, also within sections that are given as
+    mappings: ``SimplifyConfig(preset="paper", cvt={"iterations": 10})``.
+
     Attributes:
-        preset: Name of the preset that the values started from.
+        preset: Name of the preset that the values start from.
         seed: Seed of all random draws.
         effects: Effects to force on or off, whatever the scene calls for.
         filter: Gaussians to drop before the tessellation.
@@ -109,6 +112,9 @@ class SimplifyConfig(Section):
         merge: How a cell becomes one Gaussian.
         match: How opacities and colours are matched to images of the scene, if at all.
         refine: How the result is refined by images of the scene, if at all.
+
+    Raises:
+        ConfigError: There is no such preset, a key is unknown, or a value is out of range.
 
     Example:
         >>> SimplifyConfig.from_preset("paper").filter.max_mass_share
@@ -125,6 +131,16 @@ class SimplifyConfig(Section):
     merge: MergeConfig = MergeConfig()
     match: MatchConfig = MatchConfig()
     refine: RefineConfig = RefineConfig()
+
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _start_from_preset(cls, values: Any) -> Any:
+        if not isinstance(values, Mapping):
+            return values
+        name = values.get("preset", "standard")
+        if not isinstance(name, str) or name not in PRESETS:
+            raise unknown_preset(name)
+        return _merged(PRESETS[name], values)
 
     @property
     def uses_renders(self) -> bool:
@@ -156,7 +172,7 @@ class SimplifyConfig(Section):
         Raises:
             ConfigError: There is no such preset.
         """
-        return cls.from_mapping({"preset": name})
+        return cls(preset=name)
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> Self:
@@ -171,13 +187,7 @@ class SimplifyConfig(Section):
         Raises:
             ConfigError: A key is unknown or a value is out of range; the message names it.
         """
-        name = values.get("preset", "standard")
-        if not isinstance(name, str) or name not in PRESETS:
-            raise unknown_preset(name)
-        try:
-            return cls.model_validate(_merged(PRESETS[name], values))
-        except pydantic.ValidationError as error:
-            raise ConfigError(explain(error)) from None
+        return cls(**values)
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
