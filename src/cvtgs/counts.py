@@ -6,6 +6,9 @@ import re
 from collections.abc import Sequence
 from decimal import Decimal
 from fractions import Fraction
+from typing import cast
+
+from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError
 
@@ -52,12 +55,15 @@ def target_count(
         ``ceil(rho * N)``, or ``count``, or ``min(max_count, N)``.
 
     Raises:
-        InvalidArgumentError: A value is out of range, or not exactly one of the three is given.
+        InvalidArgumentError: A value is out of range or of another type, or not exactly one of the
+            three is given.
 
     Example:
         >>> target_count(250, 0.01), target_count(10, 1e-9)
         (3, 1)
     """
+    if _whole(total) < 0:
+        raise InvalidArgumentError(f"total must be a whole number, at least 0; found {total!r}.")
     values = {"rho": rho, "count": count, "max_count": max_count}
     given = [name for name, value in values.items() if value is not None]
     if len(given) != 1:
@@ -79,14 +85,24 @@ def target_count(
                 f"max_count (--max-count) may be larger."
             )
         return number
-    if not 0.0 < float(rho or 0.0) <= 1.0:
-        raise InvalidArgumentError(f"rho must be above 0 and at most 1; found {rho!r}.")
-    return math.ceil(Fraction(written(rho or 0.0)) * total)
+    if rho is None or not _is_ratio(rho):
+        kind = "" if isinstance(rho, int | float) else "a number "
+        raise InvalidArgumentError(f"rho must be {kind}above 0 and at most 1; found {rho!r}.")
+    return math.ceil(Fraction(written(rho)) * total)
 
 
-def written(number: float) -> str:
-    """Return a number as it would be written, also one of numpy, whose float32 are shorter."""
+def written(number: float | Tensor) -> str:
+    """Return a number as it would be written, also of numpy and torch, whose float32 are shorter."""
+    if isinstance(number, Tensor):
+        number = cast(float, number.detach().cpu().numpy().reshape(())[()])
     return str(number) if "float" in type(number).__name__ else str(float(number))
+
+
+def _is_ratio(value: object) -> bool:
+    try:
+        return not isinstance(value, str) and 0.0 < float(value) <= 1.0  # type: ignore[arg-type]
+    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor of several numbers
+        return False
 
 
 def _whole(number: object) -> int:

@@ -35,6 +35,10 @@ _SHORT_CHUNKS = ContextVar("short_chunks", default=False)
 
 def usable_device(device: str | torch.device) -> torch.device:
     """Return the named device; raise DeviceError if it cannot be used."""
+    if not isinstance(device, str | torch.device | int):
+        raise DeviceError(
+            f"device must be 'auto', a name such as 'cpu', or a torch.device, found {device!r}."
+        )
     try:
         resolved = torch.device(device)
         torch.empty(0, device=resolved)

@@ -16,6 +16,7 @@ from cvtgs.prepared import Prepared
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
+from cvtgs.text import shown
 from cvtgs.views import find_own_cameras
 
 
@@ -25,7 +26,7 @@ class Simplifier:
     Args:
         ckpt: MergeNet checkpoint: ``standard`` or ``paper``, which come with the package, or a
             file. ``auto`` takes the shipped one that fits the preset of the configuration;
-            ``None`` merges by moments alone.
+            None or ``none`` merges by moments alone.
         config: A configuration, or the name of a preset; None takes the preset of the checkpoint.
         preset: The name of a preset, instead of a configuration.
         device: Any torch device, or ``auto``: the device of the scene, but CUDA, if available, for
@@ -36,7 +37,7 @@ class Simplifier:
         CheckpointError: The checkpoint cannot be used.
         ConfigError: There is no such preset, or it has no network but a checkpoint is given.
         DeviceError: The device cannot be used.
-        InvalidArgumentError: Both a configuration and a preset are given.
+        InvalidArgumentError: An argument has another type, or both preset and config are given.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -54,14 +55,14 @@ class Simplifier:
         device: str | torch.device = "auto",
         listener: ProgressListener = silent,
     ) -> None:
-        if preset is not None and config is not None:
-            raise InvalidArgumentError("give either preset or config, found both.")
-        config = config if preset is None else preset
-        if isinstance(config, str):
-            config = SimplifyConfig.from_preset(config)
-        self.checkpoint = checkpoint_for(ckpt, config)
-        self.config = config or SimplifyConfig.from_preset(
-            "standard" if self.checkpoint is None else self.checkpoint.info.preset
+        if not callable(listener):
+            raise InvalidArgumentError(
+                f"listener must be a function of a progress event, found {shown(listener)}."
+            )
+        chosen = _chosen_config(config, preset)
+        self.checkpoint = checkpoint_for(ckpt, chosen)
+        self.config = chosen or SimplifyConfig(
+            preset="standard" if self.checkpoint is None else self.checkpoint.info.preset
         )
         self._device = None if device == "auto" else usable_device(device)
         self._listener = listener
@@ -185,6 +186,22 @@ class Simplifier:
             cameras=cameras,
             listener=self._listener,
         )
+
+
+def _chosen_config(
+    config: SimplifyConfig | str | None, preset: str | None
+) -> SimplifyConfig | None:
+    if preset is not None and config is not None:
+        raise InvalidArgumentError("give either preset or config, found both.")
+    if preset is not None:
+        return SimplifyConfig(preset=preset)
+    if isinstance(config, str):
+        return SimplifyConfig(preset=config)
+    if config is None or isinstance(config, SimplifyConfig):
+        return config
+    raise InvalidArgumentError(
+        f"config must be a SimplifyConfig or the name of a preset, found {shown(config)}."
+    )
 
 
 def simplify(

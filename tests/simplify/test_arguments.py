@@ -7,8 +7,14 @@ import pytest
 import torch
 
 import cvtgs
-from cvtgs import Simplifier
-from cvtgs.errors import CheckpointError, ConfigError, InputNotFoundError, InvalidArgumentError
+from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.errors import (
+    CheckpointError,
+    ConfigError,
+    CvtgsError,
+    InputNotFoundError,
+    InvalidArgumentError,
+)
 from cvtgs.refinement import RefineConfig
 from scenes import random_scene, same_bits
 
@@ -40,6 +46,32 @@ def test_one_call_takes_a_scene_or_a_path(tmp_path):
 def test_a_preset_given_as_the_checkpoint_is_an_error():
     with pytest.raises(CheckpointError, match="For the preset, write preset='fast'"):
         Simplifier("fast")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"config": {}}, r"config must be a SimplifyConfig or the name of a preset, found {}\."),
+        ({"config": 3}, "config must be a SimplifyConfig or the name of a preset, found 3"),
+        ({"preset": 3}, "preset must be one of draft, .*; found 3"),
+        ({"ckpt": 3}, r"ckpt must be the name of a checkpoint, a file or None, found int\."),
+        ({"ckpt": SimplifyConfig()}, "found SimplifyConfig; for a configuration, write config="),
+        ({"listener": None}, "listener must be a function of a progress event, found None"),
+        ({"device": None}, "device must be 'auto', a name such as 'cpu', .*, found None"),
+    ],
+)
+def test_arguments_of_other_types_are_errors(arguments, message):
+    with pytest.raises(CvtgsError, match=message):
+        Simplifier(**arguments)
+
+
+@pytest.mark.parametrize("preset", ["standard", "fast"])
+def test_a_report_says_how_to_repeat_the_run(preset):
+    """Also without a network, where the checkpoint of the report is "none"."""
+    scene = random_scene(300)
+    small, report = Simplifier(None, config=preset, device="cpu").run(scene, 0.1)
+    again = Simplifier(report.checkpoint, config=report.config, device="cpu")
+    assert same_bits(again.simplify(scene, 0.1), small)
 
 
 @pytest.mark.slow

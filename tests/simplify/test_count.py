@@ -46,6 +46,7 @@ def with_bad_rows(scene: GaussianScene, rows: list[int]) -> GaussianScene:
         (7, 1, 7),
         (6_000_000, 0.01, 60_000),
         (600, np.float32(0.1), 60),  # as a double slightly more
+        (600, torch.tensor(0.1), 60),
         (7, np.int64(1), 7),
     ],
 )
@@ -174,6 +175,18 @@ def test_ratios_out_of_range_are_errors(rho):
     with pytest.raises(InvalidArgumentError) as caught:
         simplifier("standard").simplify(random_scene(5), rho)
     assert str(caught.value) == f"rho must be above 0 and at most 1; found {rho!r}."
+
+
+@pytest.mark.parametrize("rho", ["1%", "0.1", [0.1], torch.tensor([0.1, 0.2])])
+def test_ratios_of_other_types_are_errors(rho):
+    with pytest.raises(InvalidArgumentError, match="rho must be a number above 0 and at most 1"):
+        target_count(5, rho)
+
+
+@pytest.mark.parametrize("total", [-1, 100.5, "100"])
+def test_totals_that_are_no_count_are_errors(total):
+    with pytest.raises(InvalidArgumentError, match="total must be a whole number, at least 0"):
+        target_count(total, 0.1)
 
 
 @pytest.mark.parametrize("count", [0, -1, 6, 2.0, True, "3"])

@@ -13,7 +13,13 @@ from torch import Tensor
 
 from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.config.base import Record
-from cvtgs.errors import CheckpointError, ConfigError, FileFormatError, reason_of
+from cvtgs.errors import (
+    CheckpointError,
+    ConfigError,
+    FileFormatError,
+    InvalidArgumentError,
+    reason_of,
+)
 from cvtgs.io.tensors import pack_tensors, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet
 from cvtgs.mergenet.published import PublishedArchitecture, PublishedMergeNet
@@ -287,8 +293,14 @@ def checkpoint_for(
     ckpt: str | os.PathLike[str] | None, config: SimplifyConfig | None
 ) -> Checkpoint | None:
     """Return the checkpoint for a name or file and a configuration, or None for no network."""
-    if ckpt is None:
+    if ckpt is None or ckpt == "none":
         return None
+    if not isinstance(ckpt, str | os.PathLike):
+        hint = "; for a configuration, write config=..." if isinstance(ckpt, SimplifyConfig) else ""
+        raise InvalidArgumentError(
+            f"ckpt must be the name of a checkpoint, a file or None, found "
+            f"{type(ckpt).__name__}{hint}."
+        )
     if config is not None and not config.merge.network:
         if ckpt == "auto":
             return None
