@@ -62,6 +62,18 @@ def test_interleaved_cameras_start_at_their_own_first_pixels():
     assert five.interleaved(1) is five
 
 
+def test_cameras_are_selected_by_rows_and_by_masks():
+    views = torch.eye(4).repeat(3, 1, 1) * torch.tensor([1.0, 2, 3])[:, None, None]
+    three = Cameras(**GOOD | {"viewmats": views, "Ks": torch.eye(3).repeat(3, 1, 1)}, names="abc")
+    for rows in (torch.tensor([0, 2]), torch.tensor([True, False, True]), [0, -1]):
+        found = three.select(rows)
+        assert (found.names, found.viewmats[:, 0, 0].tolist()) == (("a", "c"), [1, 3])
+    with pytest.raises(InvalidArgumentError, match="for each of 3 cameras, found 2"):
+        three.select(torch.tensor([True, False]))
+    with pytest.raises(InvalidArgumentError, match="must be from -3 to 2, found 3"):
+        three.select(torch.tensor([3]))
+
+
 @pytest.mark.parametrize(
     ("point", "is_seen"),
     [

@@ -37,6 +37,10 @@ def test_crop_keeps_the_rows_inside_unchanged() -> None:
     assert crop(scene, [Sphere(center=(0.0, 0.0, 0.0), radius=100.0)]) is scene
     with pytest.raises(InvalidArgumentError, match="needs at least one box or sphere, found none"):
         crop(scene, [])
+    assert same_bits(crop(scene, ball), crop(scene, [ball]))
+    for wrong in (["x"], [((-1, -1, -1), (0, 1, 1))], "x"):
+        with pytest.raises(InvalidArgumentError, match="regions must be boxes or spheres, found"):
+            crop(scene, wrong)
 
 
 def test_points_on_its_surface_belong_to_a_sphere() -> None:

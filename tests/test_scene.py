@@ -83,12 +83,17 @@ def test_scenes_are_indexed_like_tensors():
     for small, rows in taken:
         assert small.extras["label"].tolist() == rows
         assert torch.equal(small.means, scene.means[torch.tensor(rows, dtype=torch.int64)])
-    with pytest.raises(InvalidArgumentError, match=r"found -2; write scene\[\[-2\]\] for a single"):
+    with pytest.raises(InvalidArgumentError, match=r"found -2; write \[-2\] for a single one"):
         scene[-2]
     with pytest.raises(InvalidArgumentError, match=r"or row numbers, found 'label'\.$"):
         scene["label"]
     with pytest.raises(InvalidArgumentError, match="for each of 9 Gaussians, found 8"):
         scene[mask[:8]]
+    for rows in ([9], [0, -10], torch.tensor([12])):
+        with pytest.raises(
+            InvalidArgumentError, match="of 9 Gaussians must be from -9 to 8, found"
+        ):
+            scene[rows]
 
 
 def test_a_scene_can_be_saved(tmp_path):
@@ -121,6 +126,11 @@ def test_select_by_rows_and_by_mask():
     assert torch.equal(rows.means, scene.means[[4, 0, 0]])
     mask = torch.tensor([True, False, False, True, False])
     assert same_bits(scene.select(mask), scene.select(torch.tensor([0, 3])))
+    for wrong in (mask[:3], torch.cat([mask, mask])):
+        with pytest.raises(InvalidArgumentError, match="an entry for each of 5 Gaussians, found"):
+            scene.select(wrong)
+    with pytest.raises(InvalidArgumentError, match="must be from -5 to 4, found 5"):
+        scene.select(torch.tensor([0, 5]))
 
 
 def test_select_copies():

@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.selection import row_numbers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,15 +92,20 @@ class Cameras:
         rotations, shifts = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3:]
         return -(rotations.transpose(1, 2) @ shifts)[:, :, 0]
 
-    def select(self, rows: Int[Tensor, "m"]) -> Self:
+    def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "c"]) -> Self:
         """Return some of the cameras.
 
         Args:
-            rows: Indices of the cameras.
+            rows: Indices of the cameras, or a mask.
 
         Returns:
             The selected cameras.
+
+        Raises:
+            InvalidArgumentError: A mask has not one entry per camera, or an index is out of range.
         """
+        device = rows.device if isinstance(rows, Tensor) else torch.device("cpu")
+        rows = row_numbers(rows, len(self), things="cameras", device=device)
         names, ignores_tag = (
             tuple(values[row] for row in rows.tolist()) if values else ()
             for values in (self.names, self.ignores_tag)

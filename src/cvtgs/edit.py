@@ -13,6 +13,7 @@ from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneE
 from cvtgs.math.parameters import multiply_quats, rotation_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS, rotated_rest
 from cvtgs.scene import GaussianScene, concatenate
+from cvtgs.text import shown
 
 __all__ = [
     "Motion",
@@ -126,18 +127,18 @@ def _cos_sin(degrees: float) -> tuple[float, float]:
     return math.cos(radians), math.sin(radians)
 
 
-def crop(scene: GaussianScene, regions: Sequence[Box | Sphere]) -> GaussianScene:
+def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -> GaussianScene:
     """Keep the Gaussians whose centres lie in a region.
 
     Args:
         scene: The scene; it is not changed.
-        regions: Boxes and spheres, at least one; Gaussians in any of them are kept.
+        regions: A box or sphere, or several; Gaussians in any of them are kept.
 
     Returns:
         The kept Gaussians, in their order, bit for bit; the same object if all are kept.
 
     Raises:
-        InvalidArgumentError: There is no region.
+        InvalidArgumentError: There is no region, or one is neither a box nor a sphere.
 
     Example:
         >>> from cvtgs.synthetic import scene as make
@@ -145,6 +146,10 @@ def crop(scene: GaussianScene, regions: Sequence[Box | Sphere]) -> GaussianScene
         >>> len(crop(scene, [Sphere(center=(0.0, 0.0, 0.0), radius=1e6)]))
         100
     """
+    regions = [regions] if isinstance(regions, Box | Sphere) else regions
+    for region in regions:
+        if not isinstance(region, Box | Sphere):
+            raise InvalidArgumentError(f"regions must be boxes or spheres, found {shown(region)}.")
     if not regions:
         raise InvalidArgumentError("crop needs at least one box or sphere, found none.")
     keep = inside([region for region in regions if isinstance(region, Box)], scene.means)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.math import parameters, spherical_harmonics
+from cvtgs.selection import row_numbers
 
 ANTIALIASED_TAG = "SplatRenderMode: mip"
 """The comment of scenes that were trained with anti-aliasing (Mip-Splatting)."""
@@ -186,9 +187,12 @@ class GaussianScene:
 
         Returns:
             A scene with a copy of those rows.
+
+        Raises:
+            InvalidArgumentError: A mask has not one entry per Gaussian, or a number is out of range
+                (which is checked on a CPU only).
         """
-        if rows.dtype == torch.bool:
-            rows = rows.nonzero()[:, 0]
+        rows = row_numbers(rows, len(self), things="Gaussians", device=self.device)
         return self.with_tensors(
             {name: tensor.index_select(0, rows) for name, tensor in self.tensors().items()},
             {name: column.index_select(0, rows) for name, column in self.extras.items()},
@@ -204,28 +208,9 @@ class GaussianScene:
             A scene with a copy of those rows.
 
         Raises:
-            InvalidArgumentError: A mask has not one entry per Gaussian, or ``rows`` is a single
-                number or a string.
+            InvalidArgumentError: As for :meth:`select`, or ``rows`` is a single number.
         """
-        if isinstance(rows, slice):
-            these = range(len(self))[rows]
-            stop = these.start + len(these) * these.step
-            rows = torch.arange(these.start, stop, these.step, device="cpu")
-        if isinstance(rows, int | str) or getattr(rows, "ndim", 1) != 1:
-            hint = f"; write scene[[{rows}]] for a single Gaussian" if isinstance(rows, int) else ""
-            raise InvalidArgumentError(
-                f"rows of a scene must be a slice, a mask or row numbers, found {rows!r}{hint}."
-            )
-        picked = torch.as_tensor(rows, device=self.device)
-        if picked.dtype == torch.bool and len(picked) != len(self):
-            raise InvalidArgumentError(
-                f"a mask must have an entry for each of {len(self):,} Gaussians, "
-                f"found {len(picked):,}."
-            )
-        picked = picked if len(picked) else picked.to(torch.int64)
-        if picked.dtype != torch.bool:
-            picked = torch.where(picked < 0, picked + len(self), picked)
-        return self.select(picked)
+        return self.select(rows)  # type: ignore[arg-type]
 
     def save(
         self,

@@ -140,6 +140,15 @@ def test_photographs_are_scored_for_every_scene(scene, small, cameras):
     assert tenth.psnr.mean < full.psnr.mean < 40
     with pytest.raises(ValueError, match=r"photographs must have shape \(3, 36, 48, 3\)"):
         evaluate(scene, small, cameras, settings=OFF, photographs=photographs[:2])
+    refused = [
+        ((photographs * 255).byte(), r"of floats in \[0, 1\], found Tensor of torch\.uint8"),
+        (photographs.numpy(), r"of floats in \[0, 1\], found ndarray of float32"),
+        (photographs * 255, r"must be in \[0, 1\], found values from 0 to"),
+        (photographs * math.nan, r"must be in \[0, 1\], found values from nan to nan"),
+    ]
+    for wrong, message in refused:
+        with pytest.raises(InvalidArgumentError, match=message):
+            evaluate(scene, small, cameras, settings=OFF, photographs=wrong)
 
 
 def test_evaluate_refuses_invalid_arguments(scene, cameras):

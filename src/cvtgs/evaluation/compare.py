@@ -29,6 +29,9 @@ STAGE = "evaluate"
 LEAST_COVER = 1e-4
 """Mean alpha that one image must reach if all Gaussian centres are outside every image."""
 
+ROUNDING = 1e-3
+"""Values of photographs may be outside [0, 1] by this much, as in half precision."""
+
 Images = UInt8[np.ndarray, "c h w 3"]
 Alphas = UInt8[np.ndarray, "c h w"]
 
@@ -109,7 +112,8 @@ def evaluate(
 
     Raises:
         InvalidArgumentError: There is no camera, or none sees anything of the full scene; two
-            scenes share a name, or the photographs do not have the shape of the images.
+            scenes share a name, or the photographs do not have the shape of the images or are no
+            floats in [0, 1].
         DeviceError: The backend does not work on a scene's device.
         MissingDependencyError: The backend's package or the chosen LPIPS is missing.
 
@@ -214,6 +218,24 @@ def _named_scenes(
     return {reference_name: as_scene(reference, "reference"), **read}
 
 
+def _check_photographs(photographs: Float[Tensor, "c h w 3"], cameras: Cameras) -> None:
+    if not isinstance(photographs, Tensor) or not photographs.is_floating_point():
+        found = f"{type(photographs).__name__} of {getattr(photographs, 'dtype', 'unknown type')}"
+        raise InvalidArgumentError(
+            f"photographs must be a torch.Tensor of floats in [0, 1], found {found}."
+        )
+    wanted = (len(cameras), cameras.height, cameras.width, 3)
+    if tuple(photographs.shape) != wanted:
+        raise InvalidArgumentError(
+            f"photographs must have shape {wanted}, found {tuple(photographs.shape)}."
+        )
+    low, high = (float(end) for end in photographs.aminmax())
+    if not -ROUNDING <= low <= high <= 1 + ROUNDING:
+        raise InvalidArgumentError(
+            f"photographs must be in [0, 1], found values from {low:g} to {high:g}."
+        )
+
+
 @torch.no_grad()
 def _score_images(
     scenes: Mapping[str, GaussianScene],
@@ -227,11 +249,8 @@ def _score_images(
     """Score all scenes against the first, view by view; pass every image to ``keep``."""
     if len(cameras) == 0:
         raise InvalidArgumentError("an evaluation needs at least one camera, found none.")
-    wanted = (len(cameras), cameras.height, cameras.width, 3)
-    if photographs is not None and tuple(photographs.shape) != wanted:
-        raise InvalidArgumentError(
-            f"photographs must have shape {wanted}, found {tuple(photographs.shape)}."
-        )
+    if photographs is not None:
+        _check_photographs(photographs, cameras)
     metrics = chosen_metrics(settings.lpips, (cameras.width, cameras.height))
     (reference_name, reference), *_ = scenes.items()
     against_full: dict[str, list[ImageScores]] = {name: [] for name in scenes}

@@ -1,0 +1,67 @@
+"""Row numbers that slices, masks and numbers stand for, in scenes and cameras."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from cvtgs.errors import InvalidArgumentError
+
+
+def row_numbers(
+    rows: slice | Sequence[int] | Tensor, count: int, *, things: str, device: torch.device
+) -> Int[Tensor, "m"]:
+    """Return the numbers of the selected rows, from 0 on.
+
+    Args:
+        rows: A slice, a mask, or row numbers, of which negative ones count from the end.
+        count: Number of rows to select from.
+        things: Name of the rows in errors, in the plural.
+        device: Device of the result. Numbers on other devices than CPUs are not checked, since
+            that would wait for the device.
+
+    Returns:
+        Row numbers, int32 or int64.
+
+    Raises:
+        InvalidArgumentError: A mask has not one entry per row, a number is out of range, or
+            ``rows`` is something else.
+    """
+    if isinstance(rows, slice):
+        these = range(count)[rows]
+        stop = these.start + len(these) * these.step
+        return torch.arange(these.start, stop, these.step, device=device)
+    if isinstance(rows, int | str) or getattr(rows, "ndim", 1) != 1:
+        single = f"; write [{rows}] for a single one" if isinstance(rows, int) else ""
+        raise _error(rows, things, single)
+    try:
+        picked = torch.as_tensor(rows, device=device)
+    except (TypeError, ValueError, RuntimeError):
+        raise _error(rows, things) from None
+    if picked.dtype == torch.bool:
+        if len(picked) != count:
+            raise InvalidArgumentError(
+                f"a mask must have an entry for each of {count:,} {things}, found {len(picked):,}."
+            )
+        return picked.nonzero()[:, 0]
+    if len(picked) and (picked.is_floating_point() or picked.is_complex() or picked.ndim != 1):
+        raise _error(rows, things)
+    if picked.dtype not in (torch.int32, torch.int64):
+        picked = picked.to(torch.int64)
+    if device.type == "cpu" and len(picked):
+        low, high = (int(end) for end in picked.aminmax())
+        if low < -count or high >= count:
+            raise InvalidArgumentError(
+                f"row numbers of {count:,} {things} must be from {-count} to {count - 1}, "
+                f"found {low if low < -count else high}."
+            )
+        if low >= 0:
+            return picked
+    return torch.where(picked < 0, picked + count, picked)
+
+
+def _error(rows: object, things: str, hint: str = "") -> InvalidArgumentError:
+    return InvalidArgumentError(
+        f"rows of {things} must be a slice, a mask or row numbers, found {rows!r}{hint}."
+    )
