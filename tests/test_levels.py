@@ -100,6 +100,10 @@ def test_invalid_rows_are_counted_once_in_every_report(simplifier):
     assert [len(level.scene) for level in levels] == [199, 100, 10]
     assert [level.report.invalid_count for level in levels] == [1, 1, 1]
     assert [bool(level.report.shortfall) for level in levels] == [True, False, False]
+    whole, half, _ = (level.assignment.tolist() for level in levels)
+    assert whole == [0, 1, 2, -1, *range(3, 199)]
+    assert (len(half), half[3], sorted(set(half))) == (200, -1, list(range(-1, 100)))
+    assert simplifier.levels(random_scene(20), [1.0])[0].assignment is None
 
 
 def test_no_ratio_and_bad_ratios_are_refused(scene, simplifier):
@@ -125,6 +129,18 @@ def test_the_index_describes_the_files(scene, simplifier, tmp_path):
         assert level.psnr is None
     with pytest.raises(OutputExistsError):
         write_levels(simplifier.levels(scene, RHOS), folder, rhos=RHOS, source="scene.ply")
+
+
+def test_wrong_arguments_are_refused_before_files_are_written(scene, simplifier, tmp_path):
+    levels = simplifier.levels(scene, [0.01, 0.02])
+    for those, rhos, message in (
+        ([], [], "levels to write must be at least one, found none"),
+        (levels, [0.01], r"rhos must hold one ratio per level, 2; found 1\."),
+        (levels, [0.01, 0.01], r"rhos must differ, since they name the files, found 0\.01 twice"),
+    ):
+        with pytest.raises(InvalidArgumentError, match=message):
+            write_levels(those, tmp_path / "out", rhos=rhos, source="a.ply")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")

@@ -199,6 +199,7 @@ def write_levels(
         The index, the finest level first.
 
     Raises:
+        InvalidArgumentError: There is no level, or the ratios are not one per level, all different.
         OutputExistsError: A file exists and may not be replaced.
         OutputError: A file cannot be written.
 
@@ -211,7 +212,18 @@ def write_levels(
         >>> [(level.file, level.count) for level in index.levels]
         [('rho_0.1.ply', 50), ('rho_0.02.ply', 10)]
     """
+    if not levels:
+        raise InvalidArgumentError("levels to write must be at least one, found none.")
+    if len(rhos) != len(levels):
+        raise InvalidArgumentError(
+            f"rhos must hold one ratio per level, {len(levels)}; found {len(rhos)}."
+        )
     place, names = Path(folder), level_names(rhos, suffix)
+    twice = [written(rho) for rho, name in zip(rhos, names, strict=True) if names.count(name) > 1]
+    if twice:
+        raise InvalidArgumentError(
+            f"rhos must differ, since they name the files, found {twice[0]} twice."
+        )
     check_levels(place, names, overwrite=overwrite)
     place.mkdir(exist_ok=True)
     entries = []

@@ -7,7 +7,8 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from jaxtyping import Float, Int
+import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs import cells, cvt
@@ -220,15 +221,32 @@ def shape_merged(
 
 
 def level_facts(
-    scene: GaussianScene, analysis: SceneAnalysis, reduced: Reduced
+    scene: GaussianScene,
+    analysis: SceneAnalysis,
+    reduced: Reduced,
+    *,
+    is_valid: Bool[Tensor, "n"] | None = None,
 ) -> tuple[float, Int[Tensor, "n"] | None]:
-    """Compute error and assignment of a level, as in :class:`cvtgs.Level`, on the CPU."""
+    """Compute error and assignment of a level, as in :class:`cvtgs.Level`, on the CPU.
+
+    ``is_valid`` says which input rows the scene has; None if it has all of them.
+    """
     if reduced.grouping is None:
-        return 0.0, None
+        kept = torch.arange(len(scene), dtype=torch.int32, device=scene.device)
+        return 0.0, None if is_valid is None else _of_input(kept, is_valid)
     partition = reduced.grouping.partition
     masses = analysis.apparent_areas * analysis.opacities
     error = geometric_error(scene, reduced.scene, partition, masses=masses)
-    return error, partition.labels(len(scene)).cpu()
+    return error, _of_input(partition.labels(len(scene)), is_valid)
+
+
+def _of_input(labels: Int[Tensor, "v"], is_valid: Bool[Tensor, "n"] | None) -> Int[Tensor, "n"]:
+    """Return labels of valid rows as labels of all input rows, on the CPU."""
+    if is_valid is None:
+        return labels.cpu()
+    found = labels.new_full((len(is_valid),), -1)
+    found[is_valid] = labels
+    return found.cpu()
 
 
 def nests_in(target: int, finest: Reduced | None) -> bool:

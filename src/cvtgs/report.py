@@ -193,8 +193,8 @@ class Level(NamedTuple):
         geometric_error: Root mean square distance from Gaussians to the small ones that replace
             them, weighted by apparent mass; scene units.
         nested: Whether every cell consists of whole cells of the finest level.
-        assignment: ``(n,)`` row of the small Gaussian that represents each valid input row, int32;
-            -1 for dropped rows. None if all are kept.
+        assignment: ``(n,)`` row of the small Gaussian that represents each input row, int32, on the
+            CPU; -1 for invalid and dropped rows. None if all rows are kept unchanged.
     """
 
     scene: GaussianScene
