@@ -6,7 +6,7 @@ import platform
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TypeVar
@@ -195,6 +195,16 @@ def _in_pool(
             for future in waiting:
                 future.cancel()
             torch.set_num_threads(before)  # threads started later would also be limited to one
+
+
+@contextmanager
+def without_autocast() -> Iterator[None]:
+    """Compute in the dtypes of the tensors, even if the program has switched autocast on."""
+    with ExitStack() as stack:
+        for kind in ("cpu", "cuda"):
+            if torch.is_autocast_enabled(kind):
+                stack.enter_context(torch.autocast(kind, enabled=False))
+        yield
 
 
 @contextmanager

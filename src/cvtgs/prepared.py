@@ -22,7 +22,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shortfall, target_count
-from cvtgs.devices import chosen_device, within_memory
+from cvtgs.devices import chosen_device, within_memory, without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.grouping import OrderedRows, add_neighbors, order_rows
 from cvtgs.mergenet import Checkpoint, MergeNet, PublishedMergeNet
@@ -126,10 +126,10 @@ class Prepared:
     def _attempt(self, compute: Callable[[torch.device, str], Result]) -> Result:
         """Compute on the device, or elsewhere if it lacks memory.
 
-        Gradients and inference mode are off, whatever the program has set: results do not depend
-        on inputs in a differentiable way, and a refinement needs gradients of its own.
+        Gradients, inference mode and autocast are off, whatever the program has set: results do not
+        depend on inputs in a differentiable way, and a refinement needs gradients of its own.
         """
-        with torch.inference_mode(mode=False), torch.no_grad():
+        with torch.inference_mode(mode=False), torch.no_grad(), without_autocast():
             return within_memory(
                 compute,
                 self._device,

@@ -34,8 +34,12 @@ def another_device():
     return torch.device("meta")
 
 
+def autocast():
+    return torch.autocast("cpu", dtype=torch.bfloat16)
+
+
 settings = pytest.mark.parametrize(
-    "setting", [torch.no_grad, torch.inference_mode, another_dtype, another_device]
+    "setting", [torch.no_grad, torch.inference_mode, autocast, another_dtype, another_device]
 )
 
 

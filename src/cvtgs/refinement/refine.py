@@ -7,7 +7,7 @@ import torch
 from cvtgs.cameras import Cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import RefineConfig
-from cvtgs.devices import chosen_device
+from cvtgs.devices import chosen_device, without_autocast
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer
 from cvtgs.progress import ProgressListener, silent
@@ -111,8 +111,9 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     ours, theirs = _on_device(small, full, place)
     cameras = None if cameras is None else cameras.in_both_modes()
     limits, clock = Limits(seconds, steps=steps), StageClock(listener, place)
-    # The program may have disabled gradients, or be in inference mode.
+    # The program may have disabled gradients, or be in inference mode or autocast.
     with (
+        without_autocast(),
         torch.inference_mode(mode=False),
         torch.enable_grad(),
         clock.stage(STAGE, limits.total),

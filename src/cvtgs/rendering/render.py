@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
+from cvtgs.devices import without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import parameters
 from cvtgs.progress import ProgressListener, silent
@@ -33,6 +34,7 @@ class Rendering:
     backend: str
 
 
+@without_autocast()
 def render(
     scene: SceneLike,
     cameras: Cameras,
@@ -53,7 +55,7 @@ def render(
 
     Images are differentiable with respect to means, quats, log scales, opacity logits, sh0, shN and
     the background; cameras are constants. Gaussians with a non-finite position, shape or opacity
-    contribute nothing.
+    contribute nothing. Autocast of torch has no effect.
 
     Memory: cameras are rendered one by one; each backend's ``rasterize`` states its formula.
 
@@ -103,6 +105,7 @@ def render(
     return Rendering(rgb=rgb, alpha=output.alpha, depth=depths, backend=name)
 
 
+@without_autocast()
 def contributions(
     scene: GaussianScene, cameras: Cameras, *, backend: BackendName = "auto"
 ) -> Float[Tensor, "n"]:
@@ -161,6 +164,7 @@ class ObservedViews:
 
 
 @torch.no_grad()
+@without_autocast()
 def observe(
     scene: GaussianScene, cameras: Cameras, *, backend: BackendName = "auto"
 ) -> ObservedViews:
@@ -204,6 +208,7 @@ def observe(
     )
 
 
+@without_autocast()
 def blending_weights(
     scene: GaussianScene, camera: Cameras, *, backend: BackendName = "auto"
 ) -> BlendingWeights:
