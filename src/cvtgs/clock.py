@@ -48,14 +48,21 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str, total: int = 1) -> Iterator[Callable[[int], None]]:
-        """Measure the body of the ``with`` statement; yield a function of the finished steps."""
+        """Measure the body of the ``with`` statement; yield a function of the finished steps.
 
-        def advance(done: int) -> None:
+        The event of the last step is sent when the stage ends.
+        """
+
+        def send(done: int) -> None:
             if self._listener is not silent:
                 self._listener(ProgressEvent(stage=name, done=done, total=total))
 
+        def advance(done: int) -> None:
+            if done < total:
+                send(done)
+
         on_cuda = self._device.type == "cuda"
-        advance(0)
+        send(0)
         if on_cuda and torch.cuda.is_initialized():  # fails otherwise; there is no peak yet
             torch.cuda.reset_peak_memory_stats(self._device)
         wall, cpu = time.perf_counter(), time.process_time()
@@ -73,7 +80,7 @@ class StageClock:
                 ),
             )
         )
-        advance(total)
+        send(total)
 
 
 def peak_memory_bytes() -> int:

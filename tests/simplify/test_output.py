@@ -112,6 +112,7 @@ def test_the_listener_hears_every_stage_from_start_to_end(preset):
         assert of_stage[0].done == 0
         assert of_stage[-1].done == of_stage[-1].total > 0
         done = [event.done for event in of_stage]
+        assert done.count(of_stage[-1].total) == 1
         assert done == sorted(done)
         assert len({event.total for event in of_stage}) == 1
 

@@ -188,6 +188,7 @@ def find_count(
     listener(ProgressEvent(stage=STAGE, done=0, total=MOST_TRIES))
     for done, (count, value) in enumerate(tries, start=1):
         note = f"{count:,}: {target.text(value)}"
+        done = min(done, MOST_TRIES - 1)  # the last event follows
         listener(ProgressEvent(stage=STAGE, done=done, total=MOST_TRIES, note=note))
     listener(ProgressEvent(stage=STAGE, done=MOST_TRIES, total=MOST_TRIES))
     if best is None:
