@@ -1,9 +1,11 @@
 """Cameras: invalid ones are refused; selection of every ``stride``-th pixel."""
 
+import math
+
 import pytest
 import torch
 
-from cvtgs.cameras import Cameras
+from cvtgs.cameras import Cameras, look_at
 from cvtgs.errors import InvalidArgumentError
 
 GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "height": 3}
@@ -72,6 +74,27 @@ def test_cameras_are_selected_by_rows_and_by_masks():
         three.select(torch.tensor([True, False]))
     with pytest.raises(InvalidArgumentError, match="must be from -3 to 2, found 3"):
         three.select(torch.tensor([3]))
+
+
+@pytest.mark.parametrize(
+    ("target", "up", "text"),
+    [
+        ((1.0, 2, 3), (0.0, 1, 0), "targets must be finite and differ from the positions"),
+        ((math.nan, 2, 3), (0.0, 1, 0), "targets must be finite and differ from the positions"),
+        ((0.0, 0, 0), (0.0, 0, 0), "up must be a finite direction other than 0"),
+    ],
+)
+def test_directions_that_do_not_exist_are_refused(target, up, text):
+    eyes, targets = torch.tensor([[0.0, 9, 0], [1, 2, 3]]), torch.tensor([[0.0] * 3, target])
+    with pytest.raises(InvalidArgumentError, match=text):
+        look_at(eyes, targets, torch.tensor(up))
+
+
+def test_a_camera_may_look_along_its_up_direction():
+    found = look_at(torch.zeros(1, 3), torch.tensor([[0.0, 5, 0]]), torch.tensor([0.0, -2, 0]))
+    rotation = found[0, :3, :3]
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3))
+    assert rotation[2].tolist() == [0, 1, 0]
 
 
 @pytest.mark.parametrize(

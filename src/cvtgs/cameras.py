@@ -268,11 +268,15 @@ def look_at(
     Args:
         eyes: Positions of the cameras.
         targets: Point in the middle of each image; must differ from the position of the camera.
-        up: Direction that is up in the images; need not be of unit length.
+        up: Direction that is up in the images, of any length but 0.
 
     Returns:
         World-to-camera matrices with OpenCV axes. For a camera that looks along ``up``, another
         direction is taken as up.
+
+    Raises:
+        InvalidArgumentError: A target is at the position of its camera, ``up`` is 0, or a number is
+            not finite.
 
     Example:
         >>> up = torch.tensor([0.0, -1.0, 0.0])
@@ -281,6 +285,16 @@ def look_at(
     """
     forward = torch.nn.functional.normalize(targets - eyes, dim=1)
     upright = torch.nn.functional.normalize(up, dim=0).expand_as(forward)
+    for vectors, wish in (
+        (forward, "targets must be finite and differ from the positions of their cameras"),
+        (upright, "up must be a finite direction other than 0"),
+    ):
+        bad = (~(vectors.norm(dim=1) > 0.5)).nonzero()[:, 0].tolist()
+        if bad:
+            raise InvalidArgumentError(
+                f"{wish}; found {len(bad)} of {len(vectors)} cameras for which this does not hold, "
+                f"the first is camera {bad[0]}."
+            )
     parallel = (forward * upright).sum(dim=1, keepdim=True).abs() > 1 - 1e-6
     other = torch.eye(3, dtype=eyes.dtype, device=eyes.device)[upright.abs().argmin(dim=1)]
     upright = torch.where(parallel, other, upright)

@@ -206,7 +206,19 @@ def test_wrong_arguments_are_refused(options, text):
     ("changes", "wish"),
     [
         ({"viewmats": torch.full((1, 4, 4), math.nan)}, "finite viewmats and Ks"),
-        ({"viewmats": torch.zeros(1, 4, 4)}, "viewmats that have an inverse"),
+        ({"viewmats": torch.zeros(1, 4, 4)}, "viewmats that rotate without scaling or reflection"),
+        (
+            {"viewmats": torch.diag(torch.tensor([2.0, 2, 2, 1]))[None]},
+            "viewmats that rotate without scaling or reflection",
+        ),
+        (
+            {"viewmats": torch.diag(torch.tensor([-1.0, 1, 1, 1]))[None]},
+            "viewmats that rotate without scaling or reflection",
+        ),
+        (
+            {"viewmats": torch.diag(torch.tensor([1.0, 1, 1, 2]))[None]},
+            "viewmats with the last row 0, 0, 0, 1",
+        ),
         (
             {"Ks": torch.tensor([[[9.0, 1, 4], [0, 9, 4], [0, 0, 1]]])},
             "Ks of pinhole cameras, focal lengths above 0 and no skew",

@@ -33,6 +33,9 @@ MIN_ALPHA = 1 / 255
 MIN_TRANSMITTANCE = 1e-4
 """A pixel is finished before the Gaussian that would lower its transmittance below this."""
 
+SKEW = 1e-3
+"""Entries of the product of a rotation and its transpose may differ from the identity by this."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pinhole:
@@ -122,11 +125,16 @@ def to_pinholes(cameras: Cameras) -> list[Pinhole]:
 
 def _check(viewmats: Tensor, Ks: Tensor) -> None:  # noqa: N803 (the name that gsplat gives it)
     finite = torch.isfinite(viewmats).all(dim=(1, 2)) & torch.isfinite(Ks).all(dim=(1, 2))
-    upright = torch.linalg.det(viewmats[:, :3, :3]).abs() > 0
+    rotations, last = viewmats[:, :3, :3], viewmats.new_tensor([0.0, 0.0, 0.0, 1.0])
+    unit = torch.eye(3, dtype=viewmats.dtype, device=viewmats.device)
+    skews = (rotations @ rotations.mT - unit).abs().amax(dim=(1, 2))
+    upright = (skews <= SKEW) & (torch.linalg.det(rotations) > 0)
+    affine = (viewmats[:, 3] - last).abs().amax(dim=1) <= SKEW
     pinhole = (Ks[:, 0, 0] > 0) & (Ks[:, 1, 1] > 0) & (Ks[:, 0, 1] == 0) & (Ks[:, 1, 0] == 0)
     for good, wish in (
         (finite, "finite viewmats and Ks"),
-        (upright, "viewmats that have an inverse"),
+        (upright, "viewmats that rotate without scaling or reflection"),
+        (affine, "viewmats with the last row 0, 0, 0, 1"),
         (pinhole, "Ks of pinhole cameras, focal lengths above 0 and no skew"),
     ):
         bad = (~good).nonzero()[:, 0].tolist()
