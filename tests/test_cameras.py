@@ -27,8 +27,13 @@ GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "h
             "viewmats and Ks must share device and dtype, found torch.float32 on cpu and "
             "torch.float64 on cpu.",
         ),
-        ({"width": 0}, "width and height must be at least 1 pixel, found 0 x 3."),
-        ({"stride": 0}, "stride must be at least 1 pixel, found 0."),
+        ({"width": 0}, "width must be a whole number above 0, found 0."),
+        ({"height": 2.5}, "height must be a whole number above 0, found 2.5."),
+        ({"stride": 0}, "stride must be a whole number above 0, found 0."),
+        (
+            {"viewmats": torch.eye(4)[None].numpy()},
+            "viewmats must be a torch.Tensor, found ndarray.",
+        ),
         ({"names": ("a", "b")}, "names must hold one name per camera, 1; found 2."),
         (
             {"ignores_tag": (True, False)},
@@ -39,6 +44,22 @@ GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "h
 def test_invalid_cameras_are_refused(changes, text):
     with pytest.raises(InvalidArgumentError) as caught:
         Cameras(**GOOD | changes)
+    assert str(caught.value) == text
+
+
+@pytest.mark.parametrize(
+    ("work", "text"),
+    [
+        (lambda camera: camera.every(0), "stride must be a whole number above 0, found 0."),
+        (lambda camera: camera.interleaved(0), "stride must be a whole number above 0, found 0."),
+        (lambda camera: camera.fitted(-5), "side must be a whole number above 0, found -5."),
+        (lambda camera: camera.spread(-1), "count must be a whole number above 0, found -1."),
+        (lambda camera: camera.resized(8.5, 6), "width must be a whole number above 0, found 8.5."),
+    ],
+)
+def test_sizes_that_are_no_whole_numbers_are_refused(work, text):
+    with pytest.raises(InvalidArgumentError) as caught:
+        work(Cameras(**GOOD))
     assert str(caught.value) == text
 
 

@@ -166,9 +166,11 @@ def test_merge_widens_unlike_scenes_and_warns() -> None:
     [
         (
             lambda: Motion(scale=0.0),
-            "needs a scale above 0 and a quaternion other than 0, found 0.0",
+            "needs a scale above 0 and a quaternion of length 1e-100 to 1e100, found 0.0",
         ),
-        (lambda: Motion(quat=(0.0,) * 4), "a quaternion other than 0, found 1.0 and"),
+        (lambda: Motion(quat=(0.0,) * 4), "a quaternion of length 1e-100 to 1e100, found 1.0 and"),
+        (lambda: Motion(quat=(1e-200,) * 4), "a quaternion of length 1e-100 to 1e100"),
+        (lambda: Motion(quat=(1e200,) * 4), "a quaternion of length 1e-100 to 1e100"),
         (lambda: Motion(shift=(math.nan, 0, 0)), "must consist of finite numbers"),
         (lambda: Motion.of_angles((math.inf, 0, 0)), "must consist of finite numbers"),
         (lambda: Sphere(center=(0.0, 0.0, 0.0), radius=-1), "a radius of at least 0"),

@@ -47,7 +47,12 @@ class Cameras:
     ignores_tag: tuple[bool, ...] = ()
 
     def __post_init__(self) -> None:
-        count = len(self.viewmats)
+        for name, tensor in (("viewmats", self.viewmats), ("Ks", self.Ks)):
+            if not isinstance(tensor, Tensor):
+                raise InvalidArgumentError(
+                    f"{name} must be a torch.Tensor, found {type(tensor).__name__}."
+                )
+        count = len(self.viewmats) if self.viewmats.ndim else 0
         for name, tensor, shape in (
             ("viewmats", self.viewmats, (count, 4, 4)),
             ("Ks", self.Ks, (count, 3, 3)),
@@ -62,12 +67,8 @@ class Cameras:
                 f"viewmats and Ks must share device and dtype, found {self.viewmats.dtype} on "
                 f"{self.viewmats.device} and {self.Ks.dtype} on {self.Ks.device}."
             )
-        if self.width < 1 or self.height < 1:
-            raise InvalidArgumentError(
-                f"width and height must be at least 1 pixel, found {self.width} x {self.height}."
-            )
-        if self.stride < 1:
-            raise InvalidArgumentError(f"stride must be at least 1 pixel, found {self.stride}.")
+        for name in ("width", "height", "stride"):
+            _check_whole(getattr(self, name), name)
         for name, values, entry in (
             ("names", self.names, "name"),
             ("ignores_tag", self.ignores_tag, "choice"),
@@ -159,7 +160,12 @@ class Cameras:
 
         Returns:
             Cameras with scaled intrinsics.
+
+        Raises:
+            InvalidArgumentError: A length is no whole number above 0.
         """
+        _check_whole(side, "side")
+        _check_whole(least, "least")
         factor = side / max(self.width, self.height)
         return self.resized(
             max(least, round(factor * self.width)), max(least, round(factor * self.height))
@@ -177,7 +183,11 @@ class Cameras:
 
         Returns:
             Cameras of smaller images.
+
+        Raises:
+            InvalidArgumentError: The stride is no whole number above 0.
         """
+        _check_whole(stride, "stride")
         return self._strided(
             stride,
             self.Ks.new_tensor([first]),
@@ -193,7 +203,11 @@ class Cameras:
 
         Returns:
             Cameras of smaller images, all of one size; see :meth:`every`.
+
+        Raises:
+            InvalidArgumentError: The stride is no whole number above 0.
         """
+        _check_whole(stride, "stride")
         if stride == 1:
             return self
         rows = torch.arange(len(self), device=self.Ks.device)
@@ -248,10 +262,19 @@ class Cameras:
 
         Returns:
             The selected cameras.
+
+        Raises:
+            InvalidArgumentError: The count is no whole number above 0.
         """
+        _check_whole(count, "count")
         return self.select(
             torch.tensor(spread_rows(len(self), count), dtype=torch.int64, device="cpu")
         )
+
+
+def _check_whole(value: object, name: str) -> None:
+    if not hasattr(value, "__index__") or not value >= 1:  # type: ignore[operator]
+        raise InvalidArgumentError(f"{name} must be a whole number above 0, found {value!r}.")
 
 
 def spread_rows(length: int, count: int) -> tuple[int, ...]:

@@ -62,13 +62,13 @@ class Motion:
     """A similarity transform: ``x`` becomes ``scale * R x + shift``.
 
     Attributes:
-        quat: The rotation ``R`` as a quaternion, w first, of any length but 0.
+        quat: The rotation ``R`` as a quaternion, w first, of any length from 1e-100 to 1e100.
         scale: Factor of all lengths, above 0.
         shift: Translation, scene units, applied last.
 
     Raises:
         InvalidArgumentError: A number is not finite, the factor is not above 0, or the quaternion
-            is 0.
+            is too short or too long.
 
     Example:
         >>> Motion(scale=2.0).shift
@@ -87,9 +87,10 @@ class Motion:
                 f"a motion must consist of finite numbers (4 of a quaternion, a scale, 3 of a "
                 f"shift), found {found}."
             )
-        if self.scale <= 0 or not any(self.quat):
+        # the square of the length must be a float64
+        if self.scale <= 0 or not 1e-100 <= math.hypot(*self.quat) <= 1e100:
             raise InvalidArgumentError(
-                f"a motion needs a scale above 0 and a quaternion other than 0, "
+                f"a motion needs a scale above 0 and a quaternion of length 1e-100 to 1e100, "
                 f"found {self.scale} and {self.quat}."
             )
 

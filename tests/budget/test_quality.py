@@ -30,6 +30,13 @@ def answer(tried: list[tuple[int, float]], wanted: float) -> int | None:
     return min((count for count, value in tried if value >= wanted), default=None)
 
 
+def test_no_heldout_camera_is_refused():
+    scene = cvtgs.synthetic.scene("object", 50, sh_degree=0)
+    none = automatic_views(scene, 1, width=32, height=24).select(torch.arange(0))
+    with pytest.raises(InvalidArgumentError, match="heldout must hold at least one camera, found"):
+        find_count(scene, psnr=20.0, heldout=none)
+
+
 @pytest.mark.parametrize("wanted", [3.0, 17.0, 25.0, 31.4, 44.0])
 @pytest.mark.parametrize("most", [100, 9_000, 900_000])
 @pytest.mark.parametrize(

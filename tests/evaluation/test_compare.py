@@ -172,6 +172,12 @@ def test_cameras_that_miss_the_scene_are_refused(scene, cameras):
     assert evaluate(scene, {"a": scene}, mixed, settings=OFF).scenes
 
 
+@pytest.mark.parametrize("color", [(0.0, 1.0), (math.nan, 0, 0), (2, 0, 0), "white", "red", 1.0])
+def test_a_background_that_is_no_color_is_refused(color):
+    with pytest.raises(InvalidArgumentError, match=r"must be three numbers in \[0, 1\], found"):
+        EvaluationSettings(background=color)
+
+
 def test_the_background_shows_through(scene, small, cameras):
     settings = EvaluationSettings(lpips="off", background=(1.0, 1.0, 1.0))
     white = compare(scene, small, cameras, settings=settings)

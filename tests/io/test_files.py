@@ -28,7 +28,7 @@ from cvtgs.errors import (
     InvalidArgumentError,
     OutputError,
 )
-from cvtgs.io import scene_file, scene_size
+from cvtgs.io import losses, scene_file, scene_size
 from cvtgs.io.files import Document, _sentence
 from format_cases import DATA, storable_scene
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
@@ -271,6 +271,22 @@ def test_a_format_may_be_named_without_its_first_dot(tmp_path: Path, name: str) 
         cvtgs.save(scene, tmp_path / f"{number}", format=written)
     assert (tmp_path / "0").read_bytes() == (tmp_path / "1").read_bytes()
     assert len(cvtgs.load(io.BytesIO((tmp_path / "0").read_bytes()), format=name)) == 40
+
+
+def test_an_unknown_format_is_named(tmp_path: Path) -> None:
+    scene = storable_scene(5)
+    cvtgs.save(scene, tmp_path / "a.ply")
+    for target in (io.BytesIO(), tmp_path / "b.ply"):
+        with pytest.raises(FileFormatError, match=r"^format must be .*, found 'xyz'\.$"):
+            cvtgs.save(scene, target, format="xyz")
+    with pytest.raises(FileFormatError, match=r"^format must be .*, found 'xyz'\.$"):
+        cvtgs.load(tmp_path / "a.ply", format="xyz")
+    assert losses(scene, "spz") == losses(scene, ".spz") == losses(scene, "a.spz")
+
+
+def test_the_size_of_a_missing_file_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(InputNotFoundError, match=r"no\.ply: the file to read must exist, found"):
+        scene_size(tmp_path / "no.ply")
 
 
 @pytest.mark.parametrize("end", [".ply", ".spz", ".spz.glb", ".sog", ".splat", ".compressed.ply"])

@@ -7,6 +7,7 @@ import cvtgs
 from baseline_cases import gaussians
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.cameras import Cameras, look_at
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.rendering import blending_weights, contributions, observe, render
 from cvtgs.views import automatic_views
 from render_cases import around, backends, one_camera
@@ -30,6 +31,14 @@ def test_contributions_are_alpha_times_transmittance_over_all_pixels(backend):
         through = through * (1 - alone[row])
     found = contributions(scene, cameras, backend=backend)
     assert found.tolist() == pytest.approx([wanted[row] for row in range(3)], rel=1e-9)
+
+
+def test_wrong_numbers_of_cameras_are_refused():
+    scene, cameras = random_scene(3), automatic_views(random_scene(30), 2, width=32, height=24)
+    with pytest.raises(InvalidArgumentError, match="must hold at least one camera, found none"):
+        observe(scene, cameras.select(torch.arange(0)))
+    with pytest.raises(InvalidArgumentError, match="camera must be a single camera, found 2"):
+        blending_weights(scene, cameras)
 
 
 @pytest.mark.parametrize("backend", ["torch", "numba"])

@@ -151,7 +151,8 @@ def find_count(
     Raises:
         GoalError: Even nine tenths of the Gaussians do not reach it; the message names the best
             result.
-        InvalidArgumentError: Both or neither are given, or one is out of range.
+        InvalidArgumentError: Both or neither are given, one is out of range, or ``heldout`` is
+            empty.
         InvalidSceneError: The scene has no valid row.
 
     Example:
@@ -186,9 +187,9 @@ def find_count(
     most = max(1, math.floor(MOST_SHARE * total))
     tries = islice(smallest_enough(reach, target.value, most=most), MOST_TRIES)
     listener(ProgressEvent(stage=STAGE, done=0, total=MOST_TRIES))
-    for done, (count, value) in enumerate(tries, start=1):
+    for number, (count, value) in enumerate(tries, start=1):
         note = f"{count:,}: {target.text(value)}"
-        done = min(done, MOST_TRIES - 1)  # the last event follows
+        done = min(number, MOST_TRIES - 1)  # the last event follows
         listener(ProgressEvent(stage=STAGE, done=done, total=MOST_TRIES, note=note))
     listener(ProgressEvent(stage=STAGE, done=MOST_TRIES, total=MOST_TRIES))
     if best is None:
@@ -213,6 +214,8 @@ def find_count(
 def heldout_scorer(full: GaussianScene, cameras: Cameras, *, listener: ProgressListener) -> Scorer:
     """Return a scorer against the full scene over held-out views."""
     total = len(cameras)
+    if total == 0:
+        raise InvalidArgumentError("heldout must hold at least one camera, found none.")
     return Scorer(
         full,
         cameras.singles(),

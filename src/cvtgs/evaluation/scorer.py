@@ -16,6 +16,7 @@ from cvtgs.evaluation.metrics import alpha_bias, alpha_error, pair_psnr, ssim
 from cvtgs.evaluation.report import NOT_ASKED_FOR, SceneScores, Score
 from cvtgs.rendering import BackendName, render
 from cvtgs.scene import GaussianScene
+from cvtgs.text import shown
 
 LpipsChoice = Literal["auto", "vgg", "alex", "off"]
 """``auto``: VGG if its weights are available, else Alex, else none."""
@@ -37,6 +38,9 @@ class EvaluationSettings:
             are no weights.
         backend: The rendering backend.
 
+    Raises:
+        InvalidArgumentError: The background does not consist of three numbers in [0, 1].
+
     Example:
         >>> EvaluationSettings(lpips="off").background
         (0.0, 0.0, 0.0)
@@ -45,6 +49,19 @@ class EvaluationSettings:
     background: Color = BLACK
     lpips: LpipsChoice = "auto"
     backend: BackendName = "auto"
+
+    def __post_init__(self) -> None:
+        if not _is_color(self.background):
+            raise InvalidArgumentError(
+                f"background must be three numbers in [0, 1], found {shown(self.background)}."
+            )
+
+
+def _is_color(value: Sequence[float]) -> bool:
+    try:
+        return len(value) == 3 and all(0 <= channel <= 1 for channel in value)
+    except TypeError:  # a number or a text
+        return False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

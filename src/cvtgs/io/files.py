@@ -38,7 +38,7 @@ _MOST_WHOLE = 1 << 53
 @contextmanager
 def open_input(path: Path) -> Iterator[BinaryIO]:
     """Open a regular file; system errors, also on reading, become input errors of cvtgs."""
-    try:
+    with input_errors(path):
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):  # opening a pipe would wait for ever
             kind = "directory" if stat.S_ISDIR(mode) else "device or a pipe"
@@ -50,6 +50,13 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
                     "file with: git lfs pull."
                 )
             yield file
+
+
+@contextmanager
+def input_errors(path: Path) -> Iterator[None]:
+    """Turn system errors about a file into input errors of cvtgs."""
+    try:
+        yield
     except CvtgsError:
         raise
     except FileNotFoundError as error:
@@ -114,6 +121,10 @@ def scene_size(path: str | os.PathLike[str]) -> int:
     Returns:
         Bytes of its file; for an unbundled or a streamed SOG, also those of its other files.
 
+    Raises:
+        InputNotFoundError: There is no such file.
+        InputError: The folder holds no scene, or cannot be read.
+
     Example:
         >>> import tempfile
         >>> with tempfile.NamedTemporaryFile(suffix=".splat") as file:
@@ -124,7 +135,8 @@ def scene_size(path: str | os.PathLike[str]) -> int:
     streamed = ("**/*.webp", "**/*.sog", "**/meta.json")
     patterns = {"meta.json": ("*.webp",), "lod-meta.json": streamed}.get(file.name, ())
     parts = [part for pattern in patterns for part in file.parent.glob(pattern)]
-    return sum(part.stat().st_size for part in (file, *parts))
+    with input_errors(file):
+        return sum(part.stat().st_size for part in (file, *parts))
 
 
 def _scenes(folder: Path) -> Iterator[Path]:

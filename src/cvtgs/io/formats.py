@@ -25,6 +25,7 @@ from cvtgs.io.limits import FORMAT_LIMITS, Losses, losses_within
 from cvtgs.io.streams import ByteSink, ByteSource, file_of, name_of, written_to
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import GaussianScene
+from cvtgs.text import shown
 
 _READERS: Mapping[str, str] = MappingProxyType(
     {
@@ -157,7 +158,8 @@ def load(
             )
     source = scene_file(path)
     named = _dotted(format) or source
-    suffix = _suffix_of(named, _READERS) if is_file(source) else ".ply"  # the PLY reader raises
+    # the PLY reader raises if there is no file
+    suffix = _suffix_of(named, _READERS, format=format) if is_file(source) else ".ply"
     if suffix.endswith(".ply"):
         from cvtgs.io.ply.header import is_compressed_ply  # noqa: PLC0415 (loaded as readers are)
 
@@ -241,7 +243,7 @@ def save(
     else:
         name, named = name_of(path), _dotted(format) or ".ply"
         output = written_to(path)
-    suffix = _suffix_of(named, _WRITERS)
+    suffix = _suffix_of(named, _WRITERS, format=format)
     if isinstance(path, str | os.PathLike):
         check_output(path, overwrite)
     axes = axes or _FILE_AXES.get(suffix, SCENE_AXES)
@@ -264,7 +266,7 @@ def losses(scene: GaussianScene, path: str | os.PathLike[str]) -> Losses:
 
     Args:
         scene: The scene.
-        path: The file; only its name is used.
+        path: The file, of which only the name is used, or the suffix of a format.
 
     Returns:
         The data that would be dropped, and rounded or reordered (none for a ``.ply``), and the
@@ -278,7 +280,9 @@ def losses(scene: GaussianScene, path: str | os.PathLike[str]) -> Losses:
         >>> losses(scene("object", 10, sh_degree=1, seed=0), "small.splat").dropped
         ('SH bands above degree 0 (the scene has degree 1)',)
     """
-    limits = FORMAT_LIMITS.get(_suffix_of(path, _WRITERS))
+    dotted = f".{os.fspath(path)}"
+    named = dotted if dotted.lower() in _WRITERS else path
+    limits = FORMAT_LIMITS.get(_suffix_of(named, _WRITERS))
     if limits is None:
         return Losses(dropped=(), changed=(), count=len(scene), sh_degree=scene.sh_degree)
     return losses_within(scene, limits)
@@ -312,13 +316,19 @@ def _dotted(suffix: str | None) -> str | None:
     return suffix
 
 
-def _suffix_of(path: str | os.PathLike[str], known: Iterable[str]) -> str:
+def _suffix_of(
+    path: str | os.PathLike[str], known: Iterable[str], *, format: str | None = None
+) -> str:
     """Return the suffix, or the whole file name, that selects the format."""
     path = Path(path)
     for suffix in known:
         if path.name.lower().endswith(suffix):
             return suffix
     *others, last = known
+    if format is not None:
+        raise FileFormatError(
+            f"format must be {', '.join(others)} or {last}, found {shown(format)}."
+        )
     raise FileFormatError(
         f"{path}: the file name must end in {', '.join(others)} or {last}, "
         f"found {f'the suffix {path.suffix!r}' if path.suffix else 'no suffix'}."

@@ -180,7 +180,8 @@ def observe(
         without gradients.
 
     Raises:
-        InvalidArgumentError: A camera is no pinhole camera, or there is no such backend.
+        InvalidArgumentError: There is no camera, one is no pinhole camera, or there is no such
+            backend.
         DeviceError: The backend does not work on the scene's device.
         MissingDependencyError: The backend's package is missing.
 
@@ -192,6 +193,8 @@ def observe(
         >>> views.rgb.shape, bool((views.alpha.sum() - views.contributions.sum()).abs() < 1e-2)
         (torch.Size([2, 32, 32, 3]), True)
     """
+    if len(cameras) == 0:
+        raise InvalidArgumentError("cameras must hold at least one camera, found none.")
     name, chosen = choose_backend(backend, scene.device)
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
     outputs = []
@@ -225,7 +228,8 @@ def blending_weights(
         The weights, as a matrix to multiply with.
 
     Raises:
-        InvalidArgumentError: The camera is no pinhole camera, or there is no such backend.
+        InvalidArgumentError: There is not one camera, it is no pinhole camera, or there is no such
+            backend.
         DeviceError: The backend does not work on the scene's device.
         MissingDependencyError: The backend's package is missing.
 
@@ -237,6 +241,8 @@ def blending_weights(
         >>> weights.paint(torch.ones(500, 3)).shape
         torch.Size([32, 32, 3])
     """
+    if len(camera) != 1:
+        raise InvalidArgumentError(f"camera must be a single camera, found {len(camera)}.")
     chosen = choose_backend(backend, scene.device)[1]
     return chosen.blending_weights(scene, camera.to(scene.device))
 
