@@ -107,6 +107,29 @@ STAGES = {
         "mixed_views",
         "random_views",
     },
+    "boxes": {"Box", "inside", "read_boxes"},
+    "filters": {"FLYAWAY_RADII", "FilteredRows", "filter_rows", "flyaway_rows", "visible_rows"},
+    "math": {"depths", "frames", "parameters", "segments", "spherical_harmonics"},
+    "pipeline": {
+        "LevelFacts",
+        "Merged",
+        "Reduced",
+        "level_facts",
+        "merge_and_inflate",
+        "order_gaussians",
+        "reduce_scene",
+    },
+    "validity": {
+        "MAX_LOG_SCALE",
+        "UNIT_TOLERANCE",
+        "CheckedScene",
+        "check_rows",
+        "invalid_rows",
+        "standardized",
+        "valid_rows",
+        "with_finite_opacities",
+        "writable_rows",
+    },
     "cvt": {
         "LloydResult",
         "Tessellation",
@@ -338,6 +361,7 @@ def test_every_error_is_also_the_builtin_it_specialises():
         if isinstance(value, type) and issubclass(value, cvtgs.CvtgsError)
     }
     assert set(classes) == {"CvtgsError", *ERRORS}
+    assert set(cvtgs.errors.__all__) == {"DroppedDataWarning", *classes}
     for name, builtin in ERRORS.items():
         assert issubclass(classes[name], builtin)
     assert issubclass(cvtgs.errors.DroppedDataWarning, UserWarning)

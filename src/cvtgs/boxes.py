@@ -14,6 +14,12 @@ from torch import Tensor
 from cvtgs.errors import InputError, InputNotFoundError, InvalidArgumentError, reason_of
 from cvtgs.text import MOST_LETTERS, shortened, shown
 
+__all__ = [
+    "Box",
+    "inside",
+    "read_boxes",
+]
+
 Corner = tuple[float, float, float]
 
 

@@ -5,6 +5,27 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+__all__ = [
+    "CheckpointError",
+    "ConfigError",
+    "CvtgsError",
+    "DeviceError",
+    "DroppedDataWarning",
+    "FileFormatError",
+    "GoalError",
+    "InputError",
+    "InputNotFoundError",
+    "InvalidArgumentError",
+    "InvalidSceneError",
+    "MissingDependencyError",
+    "OutOfMemoryError",
+    "OutputBusyError",
+    "OutputError",
+    "OutputExistsError",
+    "RunError",
+    "TrainingError",
+]
+
 _NO_MEMORY = re.compile(
     r"(?i)(can.?not|can't|not enough|out of|failed to) (allocate )?memory|bad.?alloc|"
     r"ALLOC_FAILED|failed to map segment|can't start new thread|could not allocate|"

@@ -28,6 +28,16 @@ from cvtgs.report import CellStatistics, MatchReport
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities
 
+__all__ = [
+    "LevelFacts",
+    "Merged",
+    "Reduced",
+    "level_facts",
+    "merge_and_inflate",
+    "order_gaussians",
+    "reduce_scene",
+]
+
 NEIGHBORS = 8
 """Number of neighbouring cells that may cover the ends of a cell, and that the network sees."""
 

@@ -12,6 +12,18 @@ from cvtgs.errors import DroppedDataWarning, InvalidSceneError
 from cvtgs.math import parameters
 from cvtgs.scene import GaussianScene
 
+__all__ = [
+    "MAX_LOG_SCALE",
+    "UNIT_TOLERANCE",
+    "CheckedScene",
+    "check_rows",
+    "invalid_rows",
+    "standardized",
+    "valid_rows",
+    "with_finite_opacities",
+    "writable_rows",
+]
+
 UNIT_TOLERANCE = 1e-5
 """Quaternions whose squared length differs from 1 by at most this count as unit quaternions."""
 
