@@ -111,12 +111,10 @@ STAGES = {
     "filters": {"FLYAWAY_RADII", "FilteredRows", "filter_rows", "flyaway_rows", "visible_rows"},
     "math": {"depths", "frames", "parameters", "segments", "spherical_harmonics"},
     "pipeline": {
-        "LevelFacts",
         "Merged",
         "Reduced",
         "level_facts",
         "merge_and_inflate",
-        "order_gaussians",
         "reduce_scene",
     },
     "validity": {

@@ -92,7 +92,7 @@ def target_count(
 
 
 def written(number: float | Tensor) -> str:
-    """Return a number as it would be written, also of numpy and torch, whose float32 are shorter."""
+    """Return a number as it would be written, also one of numpy or torch in float32."""
     if isinstance(number, Tensor):
         number = cast(float, number.detach().cpu().numpy().reshape(())[()])
     return str(number) if "float" in type(number).__name__ else str(float(number))

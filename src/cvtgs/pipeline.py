@@ -29,12 +29,10 @@ from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities
 
 __all__ = [
-    "LevelFacts",
     "Merged",
     "Reduced",
     "level_facts",
     "merge_and_inflate",
-    "order_gaussians",
     "reduce_scene",
 ]
 

@@ -221,10 +221,10 @@ class Prepared:
             )
             if reduced.grouping is not None:
                 finest = finest or reduced
-            facts = level_facts(valid, analysis, reduced, is_valid=checked.is_valid)
+            error, assignment = level_facts(valid, analysis, reduced, is_valid=checked.is_valid)
             matched = self._match(reduced, analysis, clock)
             result = self._result(matched, checked, analysis, target, clock)
-            found[target] = Level(*result, facts.geometric_error, nested, facts.assignment)
+            found[target] = Level(*result, error, nested, assignment)
         return found
 
     def _analyze(self, target: int, clock: StageClock) -> tuple[CheckedScene, SceneAnalysis]:

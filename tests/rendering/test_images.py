@@ -206,14 +206,17 @@ def test_wrong_arguments_are_refused(options, text):
     ("changes", "wish"),
     [
         ({"viewmats": torch.full((1, 4, 4), math.nan)}, "finite viewmats and Ks"),
-        ({"viewmats": torch.zeros(1, 4, 4)}, "viewmats that rotate without scaling or reflection"),
         (
-            {"viewmats": torch.diag(torch.tensor([2.0, 2, 2, 1]))[None]},
-            "viewmats that rotate without scaling or reflection",
+            {"viewmats": torch.zeros(1, 4, 4)},
+            "viewmats that rotate, with at most a uniform scale",
+        ),
+        (
+            {"viewmats": torch.diag(torch.tensor([2.0, 2, 1, 1]))[None]},
+            "viewmats that rotate, with at most a uniform scale",
         ),
         (
             {"viewmats": torch.diag(torch.tensor([-1.0, 1, 1, 1]))[None]},
-            "viewmats that rotate without scaling or reflection",
+            "viewmats that rotate, with at most a uniform scale",
         ),
         (
             {"viewmats": torch.diag(torch.tensor([1.0, 1, 1, 2]))[None]},

@@ -34,7 +34,8 @@ MIN_TRANSMITTANCE = 1e-4
 """A pixel is finished before the Gaussian that would lower its transmittance below this."""
 
 SKEW = 1e-3
-"""Entries of the product of a rotation and its transpose may differ from the identity by this."""
+"""Entries of the product of a rotation and its transpose may differ from the identity by this,
+after a uniform scale of the view is divided out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,13 +128,15 @@ def _check(viewmats: Tensor, Ks: Tensor) -> None:  # noqa: N803 (the name that g
     finite = torch.isfinite(viewmats).all(dim=(1, 2)) & torch.isfinite(Ks).all(dim=(1, 2))
     rotations, last = viewmats[:, :3, :3], viewmats.new_tensor([0.0, 0.0, 0.0, 1.0])
     unit = torch.eye(3, dtype=viewmats.dtype, device=viewmats.device)
-    skews = (rotations @ rotations.mT - unit).abs().amax(dim=(1, 2))
-    upright = (skews <= SKEW) & (torch.linalg.det(rotations) > 0)
+    volumes = torch.linalg.det(rotations)
+    sizes = volumes.abs().clamp_min(1e-30)[:, None, None] ** (2 / 3)
+    skews = (rotations @ rotations.mT / sizes - unit).abs().amax(dim=(1, 2))
+    upright = (skews <= SKEW) & (volumes > 0)
     affine = (viewmats[:, 3] - last).abs().amax(dim=1) <= SKEW
     pinhole = (Ks[:, 0, 0] > 0) & (Ks[:, 1, 1] > 0) & (Ks[:, 0, 1] == 0) & (Ks[:, 1, 0] == 0)
     for good, wish in (
         (finite, "finite viewmats and Ks"),
-        (upright, "viewmats that rotate without scaling or reflection"),
+        (upright, "viewmats that rotate, with at most a uniform scale"),
         (affine, "viewmats with the last row 0, 0, 0, 1"),
         (pinhole, "Ks of pinhole cameras, focal lengths above 0 and no skew"),
     ):
