@@ -1,0 +1,192 @@
+"""Small parts of the search for views, with answers found by hand."""
+
+import math
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from cvtgs.cameras import Cameras, look_at
+from cvtgs.math.frames import RobustFrame
+from cvtgs.views import CameraPositions, automatic, layout, mixed, positions, scoring, up
+from cvtgs.views.automatic import CandidateCameras
+from cvtgs.views.layout import SceneLayout
+from cvtgs.views.scoring import CameraScores, SplatSizes
+from cvtgs.views.up import Voxels
+from scenes import random_scene
+
+UP = torch.tensor([0.0, 0.0, 1.0]).double()
+CENTER = torch.tensor([1.0, -2.0, 3.0]).double()
+
+
+@cache
+def some_layout() -> SceneLayout:
+    return layout.find_layout(random_scene(50))
+
+
+def layout_of(**changes) -> SceneLayout:
+    """Return the layout of a small scene with other values, in the unit of robust radii."""
+    frame = RobustFrame(center=torch.zeros(3).double(), radius=1.0)
+    return replace(some_layout(), **{"frame": frame, "up": UP} | changes)
+
+
+def test_cameras_around_a_scene_rise_by_the_elevation_and_show_all_of_it():
+    """At 45 degrees of view, a ball of radius 2 fills the image from ``2 / sin(22.5)`` away."""
+    found = automatic.outside_candidates(
+        layout_of(bounded=True, center=CENTER, radius=2.0), 4, size=(64, 48), turn=0.0
+    )
+    away = 2 / math.sin(math.radians(22.5))
+    for number, lift, factor in ((0, 0, 1.0), (1, 12, 1.0), (4, 8, 0.75), (11, 50, 1.5)):
+        offsets = found.rounds[number].centers.double() - CENTER
+        lengths = torch.linalg.vector_norm(offsets, dim=1)
+        assert lengths.tolist() == pytest.approx([factor * away] * 4)
+        assert found.distances[number].tolist() == pytest.approx([factor * away] * 4)
+        rises = torch.rad2deg(torch.asin(offsets @ UP / lengths))
+        wanted = [min(80, elevation + lift) for elevation in (20, 35, 12, 28)]
+        assert rises.tolist() == pytest.approx(wanted)
+        ahead = found.rounds[number].viewmats[:, 2, :3].double()
+        torch.testing.assert_close(ahead, -offsets / lengths[:, None], atol=1e-6, rtol=0)
+
+
+def test_cameras_in_a_room_look_down_a_little():
+    found = automatic.inside_candidates(layout_of(), CENTER, 3, size=(64, 48), turn=0.25)
+    for cameras in found.rounds:
+        falls = torch.rad2deg(torch.asin(cameras.viewmats[:, 2, :3].double() @ UP))
+        assert falls.tolist() == pytest.approx([-10.0] * 3)
+
+
+def cameras_on_a_line(places: list[float]) -> Cameras:
+    eyes = torch.zeros(len(places), 3).double()
+    eyes[:, 0] = torch.tensor(places)
+    return Cameras(
+        viewmats=look_at(eyes, eyes + torch.tensor([0.0, 1.0, 0.0]).double(), UP),
+        Ks=torch.eye(3).double().repeat(len(places), 1, 1),
+        width=8,
+        height=8,
+    )
+
+
+@pytest.mark.parametrize(
+    ("penalties", "good", "best"),
+    [
+        ([0.5, 0.2, 0.4, 0.3], [0, 0, 0, 0], 1),
+        ([0.5, 0.2, 0.4, 0.3], [0, 0, 1, 1], 2),
+        ([0.0, 0.2, 0.4, 0.3], [1, 1, 0, 0], 0),
+    ],
+)
+def test_the_first_good_camera_is_taken_or_else_that_of_least_penalty(
+    monkeypatch, penalties, good, best
+):
+    def scored(_, cameras, **__):
+        (number,) = cameras.centers[:, 0].round().long().tolist()
+        return CameraScores(
+            good=torch.tensor([bool(good[number])]),
+            penalties=torch.tensor([penalties[number]]).double(),
+            visible=torch.zeros(1, 0, dtype=torch.bool),
+        )
+
+    monkeypatch.setattr(automatic, "score_cameras", scored)
+    every = SimpleNamespace(layout=None, admit=lambda eyes: torch.ones(len(eyes)).bool())
+    rounds = tuple(cameras_on_a_line([float(number)]) for number in range(4))
+    candidates = CandidateCameras(inside=False, rounds=rounds, distances=(torch.ones(1),) * 4)
+    found = vars(automatic)["_best"](every, [candidates])
+    assert found.centers[0, 0].item() == best
+
+
+def test_every_cell_of_the_cube_has_a_number_of_its_own():
+    side = (torch.arange(10).double() + 0.5) / 5 - 1
+    cells = torch.cartesian_prod(side, side)
+    ends = torch.ones(100, 1).double()
+    faces = [
+        torch.cat([cells[:, :axis], sign * ends, cells[:, axis:]], dim=1)
+        for axis in range(3)
+        for sign in (-1, 1)
+    ]
+    numbers = vars(layout)["_cells_of_cube"](3.0 * torch.cat(faces))
+    assert sorted(numbers.tolist()) == list(range(600))
+
+
+def test_only_far_content_of_two_percent_shows_the_sky():
+    places = torch.zeros(100, 3).double()
+    places[:3, 2] = 8.0
+    directions = vars(layout)["_far_directions"]
+    assert directions(places, places.norm(dim=1)).tolist() == [[0.0, 0.0, 1.0]] * 3
+    assert len(directions(places[2:], places[2:].norm(dim=1))) == 0
+
+
+def test_sizes_that_shrink_upwards_show_what_is_up():
+    """Parts that no image shows, mostly undersides, have larger Gaussians."""
+    g = torch.Generator().manual_seed(0)
+    points = torch.cat([torch.rand(50, 3, generator=g)] * 2).double()
+    points[50:, :2] *= -1  # so that x and y are not correlated with the sizes
+    points[:, :2] -= points[:, :2].mean(dim=0)
+    voxels = Voxels(points=points, normals=points, log_sizes=-3 * points[:, 2])
+    growth = vars(up)["_growth"](voxels)
+    assert growth[2].item() == pytest.approx(1.0)
+    assert float(growth[:2].abs().amax()) < 0.3
+
+
+def test_positions_that_are_too_low_are_mirrored_at_the_least_height():
+    """The least height is 0.1 above a floor at -1: 0.4 below it becomes 0.4 above it."""
+    eyes = torch.tensor([[5, 6, -1.3], [5, 6, -0.8]], dtype=torch.float64)
+    found = positions.lifted(layout_of(floor=-1.0), eyes)
+    assert found.tolist() == [pytest.approx([5, 6, -0.5]), [5, 6, -0.8]]
+    assert positions.lifted(layout_of(floor=None), eyes) is eyes
+
+
+@pytest.mark.parametrize(
+    ("reach", "wanted"),
+    [((0.9, 2.5), {1.0, 2.0}), ((0.1, 0.2), {0.5}), ((5.0, 9.0), {4.0}), ((2.6, 3.1), {2.0})],
+)
+def test_positions_within_a_range_of_distances_or_else_nearest_to_it(monkeypatch, reach, wanted):
+    monkeypatch.setattr(CameraPositions, "admit", lambda _, eyes: torch.zeros(len(eyes)).bool())
+    distances = torch.tensor([0.5, 1.0, 2.0, 4.0]).double()
+    found = CameraPositions(
+        layout=layout_of(),
+        least_growth=0.0,
+        sharp_sides=torch.zeros(32).bool(),
+        eyes=distances[:, None] * UP,
+        distances=distances,
+    ).near(40, reach, seed=0)
+    assert set(found[:, 2].tolist()) == wanted
+
+
+@pytest.mark.parametrize(("other", "chosen"), [(1.9, 0), (2.1, 1)])
+def test_a_view_is_too_close_at_less_than_half_of_the_usual_distance(monkeypatch, other, chosen):
+    """Splats of one size at distances of 1 and, twice, of another."""
+
+    def sizes(*_) -> SplatSizes:
+        distances = torch.tensor([1.0, other, other]).double()
+        return SplatSizes(0.01 / distances, torch.full((3,), 0.01).double())
+
+    monkeypatch.setattr(mixed, "splat_sizes", sizes)
+    tried = [(cameras_on_a_line([0.0, 1.0, 2.0]), 1)]
+    (found,) = vars(mixed)["_sharp_ones"](SimpleNamespace(layout=None), tried)
+    assert found.centers[:, 0].tolist() == [chosen]
+
+
+@pytest.mark.parametrize(
+    ("subject", "least", "most"), [(2.0, 0, 0), (4.3, 0, 0), (6.0, 1, 1), (8.0, 1.3, 3)]
+)
+def test_what_is_much_nearer_than_the_subject_is_an_obstacle(subject, least, most):
+    """A ball two units ahead hides the middle if the subject is more than ``2 / 0.45`` away.
+
+    If it is more than ``2 / 0.3`` away, the ball is before the lens, too.
+    """
+    ball = random_scene(1, degree=0).with_tensors(
+        {
+            "means": torch.zeros(1, 3),
+            "log_scales": torch.full((1, 3), math.log(0.5)),
+            "logit_opacities": torch.full((1,), 5.0),
+        },
+        {},
+    )
+    eyes, distances = torch.tensor([[2.0, 0, 0]]).double(), torch.tensor([subject])
+    cameras = scoring.cameras_at(eyes, -eyes, UP, size=(32, 32), field=45.0)
+    found = scoring.score_cameras(
+        layout_of(sample=ball), cameras, distances=distances, inside=False
+    )
+    assert bool(found.good) is (most == 0)
+    assert least <= float(found.penalties) <= most
