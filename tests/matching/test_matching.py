@@ -1,5 +1,7 @@
 """Matching to images without gradients: opacities by contributions, colours by least squares."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -11,6 +13,7 @@ from cvtgs.matching.match import with_deeper_opacities
 from cvtgs.math import parameters
 from cvtgs.rendering import contributions, observe, render
 from cvtgs.views import automatic_views, mixed_views, random_views
+from refine_cases import ring
 from render_cases import backends
 from scenes import random_scene, same_bits
 
@@ -116,6 +119,46 @@ def test_matched_opacities_restore_contributions(scene, views):
     ]
     assert errors[0] > 0.3
     assert errors[1] < 0.15 * errors[0]
+
+
+def test_a_round_changes_depths_by_a_power_of_the_ratio_of_contributions(monkeypatch):
+    """One pixel is added to both, and no ratio is above 3 or below a third."""
+    own = torch.tensor([1.0, 3.0, 4.0, 99.0, 0.0]).double()
+    monkeypatch.setattr("cvtgs.matching.match.contributions", lambda *_: own)
+    depths = torch.full((5,), 0.1).double()
+    logits = parameters.logit_from_optical_depth(depths)
+    scene = random_scene(5, dtype=torch.float64).with_tensors({"logit_opacities": logits}, {})
+    wanted = torch.tensor([3.0, 1.0, 4.0, 0.0, 99.0]).double()
+    matched = match_opacities(scene, ring(), wanted, config=MatchConfig(opacity_rounds=1))
+    found = parameters.optical_depth_from_logit(matched.logit_opacities)
+    ratios = [2.0, 0.5, 1.0, 1 / 3, 3.0]
+    assert found.tolist() == pytest.approx([0.1 * ratio**0.7 for ratio in ratios])
+
+
+@pytest.mark.parametrize(("residual", "step"), [(0.3, 0.3), (2.0, 1.0), (-1.0, 0.0)])
+def test_steps_towards_held_out_images_are_from_none_to_the_whole(residual, step):
+    """The change paints an image of ones."""
+    view = SimpleNamespace(
+        paint=lambda _: torch.ones(4, 5, 3), residual=torch.full((4, 5, 3), residual)
+    )
+    assert colors.best_step([view, view], torch.zeros(1, 1, 3)) == pytest.approx(step)
+    blank = SimpleNamespace(paint=lambda _: torch.zeros(4, 5, 3), residual=view.residual)
+    assert colors.best_step([blank], torch.zeros(1, 1, 3)) == 0.0
+
+
+def test_the_solution_is_found_from_any_start():
+    scene = random_scene(6, degree=0, dtype=torch.float64)
+    cameras = ring(8)
+    dull = scene.with_tensors({"sh0": scene.sh0 + 0.2}, {})
+    linear = [
+        colors.linear_view(dull, camera, image)
+        for camera, image in zip(cameras.singles(), render(scene, cameras).rgb, strict=True)
+    ]
+    problem = colors.LeastSquares(linear, config=MatchConfig(), frozen=0)
+    found = problem.solve(20)
+    assert float(found.abs().amax()) > 0.05
+    for start in (found, torch.ones_like(found)):
+        torch.testing.assert_close(problem.solve(20, start=start), found, rtol=0, atol=1e-4)
 
 
 def test_optical_depths_rise_to_six_and_deeper_ones_can_only_fall():
