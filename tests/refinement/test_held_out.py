@@ -1,0 +1,52 @@
+"""Held-out images: which they are, and how they decide."""
+
+import pytest
+import torch
+
+from cvtgs.progress import silent
+from cvtgs.refinement import RefineConfig, optimize
+from cvtgs.refinement.images import ImageBuffer, RefineViews, split_views
+from cvtgs.refinement.limits import Limits
+from refine_cases import discolored, full_scene, quick, ring
+
+
+def test_the_middles_of_equal_parts_are_held_out():
+    cameras = ring(16)
+    views = split_views(cameras, config=RefineConfig(size=32, heldout=4, stride=1), seed=0)
+    assert len(views.heldout) == 2
+    for held, row in zip(views.heldout, (4, 12), strict=True):
+        assert torch.equal(held.viewmats[0], cameras.viewmats[row])
+
+
+def test_thinned_views_start_at_every_first_pixel_in_turn():
+    held = split_views(ring(40), config=RefineConfig(size=32, stride=2), seed=0).heldout
+    shifts = [tuple((one.Ks - held[0].Ks)[0, :2, 2].tolist()) for one in held]
+    assert shifts == [(0, 0), (-0.5, 0), (0, -0.5), (-0.5, -0.5), (0, 0)]
+
+
+@pytest.mark.parametrize(
+    ("later", "after"), [((19, 58), 22.5), ((22, 26), 23.0), ((21, 31), 23.25)]
+)
+def test_a_far_better_view_counts_as_ten_decibels_above_the_median(monkeypatch, later, after):
+    """At first 20 dB in three views and 50 in the last, which counts as 30: 22.5 on average."""
+    scores = iter([(20, 50), later])
+
+    def scored(*_) -> torch.Tensor:
+        usual, last = next(scores)
+        return torch.tensor([usual, usual, usual, last], dtype=torch.float64)
+
+    monkeypatch.setattr(optimize, "heldout_psnr", scored)
+    full, config = full_scene(50), quick()
+    small = discolored(full)
+    views = RefineViews(heldout=(), training=iter(ring(1).singles()), endless=False)
+    found = optimize.optimize(
+        small,
+        ImageBuffer(full, views, config=config, seed=0),
+        None,
+        limits=Limits(None, steps=1),
+        config=config,
+        learning_rate_scale=torch.ones(50),
+        listener=silent,
+    )
+    assert (found.before, found.after) == (22.5, after)
+    assert (found.scene is small) == (after == 22.5)
