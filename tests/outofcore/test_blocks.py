@@ -17,7 +17,8 @@ from cvtgs.evaluation import EvaluationSettings
 from cvtgs.io.ply import open_rows
 from cvtgs.math.frames import robust_frame
 from cvtgs.outofcore import block_count, read_bytes, simplify_file
-from cvtgs.outofcore.scan import RowRange, add_totals, partition_space, scan_range
+from cvtgs.outofcore import scan as scan_module
+from cvtgs.outofcore.scan import RangeTotals, RowRange, add_totals, partition_space, scan_range
 from cvtgs.views import automatic_views
 from hard_scenes import ball
 from scenes import random_scene, same_bits
@@ -74,6 +75,23 @@ def test_blocks_have_equal_measure_despite_far_outliers(count):
     sums = torch.bincount(blocks, measure, minlength=count)
     assert len(sums) == count
     assert float((sums / sums.sum() * count - 1).abs().max()) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("share", "most"), [(0.07, 4.0), (0.0699, 2.0), (0.01, 1.0), (0.009, -1.0), (0.0, -1.0)]
+)
+def test_the_lightest_flyaways_are_left_out_up_to_their_share_of_the_mass(share, most):
+    """Those of 1, 2 and 4 make up 7 % of a mass of 100."""
+    totals = RangeTotals(
+        depths=torch.zeros(0, dtype=torch.int64),
+        masses=(1e9,),
+        falloff_masses=(60.0, 40.0),
+        far_masses=torch.tensor([4.0, 50.0, 1.0, 2.0]).double(),
+        invalid_rows={},
+        valid_count=9,
+        kept_count=0,
+    )
+    assert vars(scan_module)["_max_flyaway_mass"](totals, share) == most
 
 
 def test_coincident_points_lie_in_one_block():

@@ -7,7 +7,7 @@ import torch
 
 import cvtgs
 from block_jobs import unfinished_job
-from cvtgs import cells, cvt, validity
+from cvtgs import SimplifyConfig, cells, cvt, validity
 from cvtgs.cells.allocate import Moments
 from cvtgs.cvt import nearest_several
 from cvtgs.evaluation import EvaluationSettings
@@ -30,7 +30,9 @@ COUNT, BLOCKS, TARGET = 4000, 5, 120
 @pytest.fixture(scope="module")
 def job(tmp_path_factory):
     scene = cvtgs.synthetic.scene("courtyard", COUNT, sh_degree=1, seed=8)
-    return unfinished_job(scene, tmp_path_factory.mktemp("borders"), count=TARGET, blocks=BLOCKS)
+    config = SimplifyConfig.from_mapping({"cvt": {"weight_floor": 0.03}})  # some are below it
+    folder = tmp_path_factory.mktemp("borders")
+    return unfinished_job(scene, folder, count=TARGET, blocks=BLOCKS, config=config)
 
 
 def of_all(job, path, name):
@@ -140,6 +142,19 @@ def test_a_halo_reaches_as_far_as_the_last_own_neighbour(place, cells_found):
     centers, theirs = torch.tensor([[0.0, 0, 0], [0, 0, 4]]), torch.tensor([[place, 0.0, 0.0]])
     others = [OtherBlock(7, bounding_box(theirs), lambda: theirs)]
     assert halo_cells(centers, others, count=1).tolist() == cells_found
+
+
+def test_points_weigh_as_in_one_piece(job):
+    config, parts = job.config.cvt, []
+    for block in job.blocks_with_rows():
+        rows, order = read_rows(job, block), map_tensors(job.sample_path(block))[0]["order"]
+        parts.append((rows.scene.opacities[order.long()], rows.apparent_areas[order.long()]))
+    opacities, areas = (torch.cat(values) for values in zip(*parts, strict=True))
+    wanted = cvt.tessellation_weights(
+        opacities, areas, area_power=config.area_power, floor=config.weight_floor
+    )
+    assert int((wanted == config.weight_floor).sum()) > 10
+    torch.testing.assert_close(of_all(job, job.sample_path, "weights"), wanted)
 
 
 @pytest.mark.slow

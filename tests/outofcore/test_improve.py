@@ -9,6 +9,7 @@ from cvtgs.boxes import Box
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.outofcore import LocalWorkers, simplify_file
+from cvtgs.outofcore import improve as module
 from cvtgs.views import automatic_views
 
 COUNT = 200
@@ -104,6 +105,14 @@ def test_the_order_of_blocks_does_not_matter(source, tmp_path, settings):
     in_blocks(source, tmp_path / "a.ply", settings, blocks=2)
     in_blocks(source, tmp_path / "b.ply", settings, blocks=2, workers=backwards)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_what_is_near_a_block_reaches_half_of_its_diagonal_beyond_it():
+    """The box is 3 x 4 x 0, so its diagonal is 5."""
+    own = torch.tensor([[0.0, 0, 0], [3, 4, 0], [1, 1, 0]])
+    places = [[-2.4, 0, 0], [5.4, 6.4, 2.4], [1, 1, 0], [-2.6, 0, 0], [1, 6.6, 0], [1, 1, -2.6]]
+    near = vars(module)["_near"](torch.tensor(places), own)
+    assert near.tolist() == [True, True, True, False, False, False]
 
 
 def test_images_raise_the_least_memory(source, tmp_path):
