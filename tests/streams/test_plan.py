@@ -1,0 +1,82 @@
+"""Chunks and shares of streams by hand."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from cvtgs.streams import StreamPlan, blocks, write_tiles
+from cvtgs.streams.plan import plan_part
+from scenes import random_scene
+
+
+def level(places: list[float], owners: list[int] | None, error: float = 0.0) -> SimpleNamespace:
+    """Return a level of Gaussians on a line."""
+    means = torch.zeros(len(places), 3)
+    means[:, 0] = torch.tensor(places)
+    return SimpleNamespace(
+        scene=random_scene(len(places)).with_tensors({"means": means}, {}),
+        geometric_error=error,
+        assignment=None if owners is None else torch.tensor(owners, dtype=torch.int32),
+    )
+
+
+def planned(*levels: SimpleNamespace, most: int) -> StreamPlan:
+    near = torch.ones(len(levels[-1].scene), dtype=torch.bool)
+    return plan_part(levels, near, chunk_gaussians=most)
+
+
+@pytest.mark.parametrize(("owners", "chunk"), [([0, 1, 1], 1), ([1, 0, 0], 0), ([0, 0, 1], 0)])
+def test_a_gaussian_is_in_the_chunk_of_the_coarse_one_with_most_of_its_rows(owners, chunk):
+    """Wherever it lies: here, nearer to the first."""
+    fine = level([0.1, 5.0], [0, 0, 0, 1])
+    coarse = level([0.0, 5.0], [*owners, 1])
+    rows = [one.rows for one in planned(fine, coarse, most=1).chunks]
+    assert [own[1].tolist() for own in rows] == [[0], [1]]
+    assert [0 in own[0].tolist() for own in rows] == [chunk == 0, chunk == 1]
+
+
+def test_parts_of_about_equally_many_fine_gaussians():
+    """Of 1, 1, 1 and 9 Gaussians, the last are a chunk of their own."""
+    owners = [0, 1, 2, *[3] * 9]
+    fine, coarse = level([float(row) for row in range(12)], None), level([0.0, 1, 2, 7], owners)
+    chunks = planned(fine, coarse, most=9).chunks
+    assert [own.rows[1].tolist() for own in chunks] == [[0, 1, 2], [3]]
+    assert [len(own.rows[0]) for own in chunks] == [3, 9]
+
+
+def test_a_box_reaches_three_deviations_along_every_axis():
+    """A needle along its own x, turned by 90 degrees about z, is one along y."""
+    one = level([4.0], None)
+    tensors = {
+        "quats": torch.tensor([[0.5**0.5, 0, 0, 0.5**0.5]]),
+        "log_scales": torch.tensor([[2.0, 0.5, 0.1]]).log(),
+    }
+    one.scene = one.scene.with_tensors(tensors, {})
+    (chunk,) = planned(one, most=1).chunks
+    assert chunk.box_min == pytest.approx((2.5, -6.0, -0.3), abs=1e-5)
+    assert chunk.box_max == pytest.approx((5.5, 6.0, 0.3), abs=1e-5)
+
+
+def test_tiles_state_the_largest_error_of_their_level_and_all_finer_ones(tmp_path: Path) -> None:
+    """The middle level is off by 5, the coarsest only by 3; viewers take a sixteenth."""
+    owners = list(range(4))
+    levels = (
+        level([0.0, 1, 2, 3], None),
+        level([0.0, 1, 2], [*owners[:3], 2], error=5.0),
+        level([0.0, 2], [0, 0, 1, 1], error=3.0),
+    )
+    write_tiles(planned(*levels, most=2), tmp_path, tile_gaussians=2)
+    root = json.loads((tmp_path / "tileset.json").read_text())["root"]
+    assert root["geometricError"] == 16 * 5.0
+    assert {child["geometricError"] for child in root["children"]} == {0.0}
+
+
+def test_every_block_with_rows_has_a_gaussian_at_every_level(tmp_path: Path) -> None:
+    job = SimpleNamespace(source=SimpleNamespace(count=14), path=lambda name: tmp_path / name)
+    share = vars(blocks)["_write_targets"]
+    share(SimpleNamespace(job=job), [14, 6, 2], [12, 0, 1, 1], [12.0, 0.0, 1.0, 1.0])
+    found = json.loads((tmp_path / "targets.json").read_text())["targets"]
+    assert found == [[12, 4, 1], [0, 0, 0], [1, 1, 1], [1, 1, 1]]
