@@ -4,8 +4,9 @@ import pytest
 import torch
 
 import cvtgs
+from cvtgs.analysis import analyze
 from cvtgs.evaluation import psnr
-from cvtgs.filters import flyaway_rows, visible_rows
+from cvtgs.filters import filter_rows, flyaway_rows, visible_rows
 from cvtgs.validity import invalid_rows, standardized, with_finite_opacities
 from cvtgs.views import automatic_views
 from scenes import random_scene, same_bits
@@ -159,6 +160,18 @@ def test_flyaways_are_far_and_hold_little_mass():
     found = flyaway_rows(distances, masses, max_share=1e-3)
     assert found.tolist() == [False, False, True, True, False]
     assert not bool(flyaway_rows(distances, masses, max_share=0.0).any())
+
+
+@pytest.mark.parametrize(("target", "kept"), [(1, 100), (100, 100), (101, 104)])
+def test_flyaways_stay_if_the_target_needs_them(target, kept):
+    scene = random_scene(104)
+    means, logits = scene.means.clone(), torch.full((104,), 3.0)
+    means[100:] *= 1e4
+    scene = scene.with_tensors({"means": means, "logit_opacities": logits}, {})
+    config = cvtgs.SimplifyConfig()
+    found = filter_rows(scene, analyze(scene, config), target, config.filter)
+    assert found.rows.tolist() == list(range(kept))
+    assert found.left_out == 104 - kept
 
 
 def test_flyaways_are_dropped_only_up_to_their_share_of_mass():

@@ -42,6 +42,17 @@ def test_one_wall_blocks_only_its_own_direction():
     assert found.item() == pytest.approx((5 + math.exp(-depth)) / 6, rel=1e-5)
 
 
+def test_walls_that_contraction_shrinks_block_less():
+    """A distance d above 1 becomes ``1 + log d``, so areas shrink by ``((1 + log d) / d)^2``."""
+    places, depth = (2.02, 2.10), 0.5
+    near, wall = (
+        torch.tensor([[math.exp(place - 1), 0.001, 0.001]], dtype=torch.float64) for place in places
+    )
+    shrinkage = places[1] / math.exp(places[1] - 1)
+    found = light(near, wall, mass=depth * (0.04 / shrinkage) ** 2)
+    assert found.item() == pytest.approx((5 + math.exp(-depth)) / 6, rel=1e-5)
+
+
 def test_matter_beyond_the_reach_is_ignored():
     points = torch.tensor([[0.02, 0.02, 0.02]], dtype=torch.float64)
     assert light(points, points + torch.tensor([6 * 0.04, 0, 0]), mass=1.0).item() < 0.9

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from itertools import pairwise
 
 import pytest
 import torch
@@ -71,6 +72,21 @@ def test_steps_never_leave_the_range():
     tried = search(lambda count: float(count == 900), 1.0, 900)
     assert all(1 <= count <= 900 for count, _ in tried)
     assert answer(tried, 1.0) == 900
+
+
+@pytest.mark.parametrize("high", [1e3, 1.001])
+def test_every_try_between_two_bounds_leaves_at_most_85_percent_of_them(high):
+    """A step from 0 to ``high`` at 70,000: straight lines point to an end of the range."""
+    tried = search(lambda count: high * (count >= 70_000), 1.0, 900_000)
+    widths, bounds = [], [0, 900_001]
+    for count, value in tried:
+        bounds[value > 0] = count
+        if bounds[0] > 0 and bounds[1] <= 900_000:
+            widths.append(math.log(bounds[1] / bounds[0]))
+    assert widths[-1] <= math.log(CLOSE)
+    assert len(widths) > 8
+    for before, after in pairwise(widths):
+        assert after < 0.851 * before
 
 
 @pytest.fixture(scope="module")
