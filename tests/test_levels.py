@@ -12,6 +12,7 @@ from cvtgs.cli.main import main
 from cvtgs.clock import StageClock
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
 from cvtgs.evaluation.scorer import ImageScores, scene_scores
+from cvtgs.grouping import allocation_at
 from cvtgs.levels import LevelEntry, LevelsIndex, level_names, write_levels
 from cvtgs.pipeline import reduce_scene
 from scenes import random_scene, same_bits
@@ -52,6 +53,21 @@ def test_close_sizes_get_separate_tessellations(scene, simplifier):
     levels = simplifier.levels(scene, [0.2, 0.1, 0.05])
     assert [level.nested for level in levels] == [False, False, True]
     assert same_bits(levels[1].scene, simplifier.simplify(scene, 0.1))
+
+
+def test_costs_of_every_level_are_at_its_ratio_to_the_gaussians_of_the_scene(scene, monkeypatch):
+    """Cells of a nested level are made from cells, but stand for all Gaussians in them."""
+    ratios = []
+
+    def noted(ratio, config, *, is_measured):
+        ratios.append(ratio)
+        return allocation_at(ratio, config, is_measured=is_measured)
+
+    monkeypatch.setattr("cvtgs.grouping.allocation_at", noted)
+    config = cvtgs.SimplifyConfig.from_mapping({"filter": {"min_opacity": 0.0}})
+    levels = Simplifier(None, config=config, device="cpu").levels(scene, [0.2, 0.02])
+    assert [level.nested for level in levels] == [False, True]
+    assert ratios == pytest.approx([0.2, 0.02])
 
 
 def test_errors_grow_and_are_zero_at_a_ratio_of_one(scene, simplifier):

@@ -10,8 +10,10 @@ from torch import Tensor
 import oracles
 from cvtgs import GaussianScene
 from cvtgs.cells import Partition, align_axes, inflate_cells, side_cover
+from cvtgs.config import MergeConfig
 from cvtgs.cvt import nearest_neighbors
 from cvtgs.math import parameters
+from cvtgs.pipeline import shape_merged
 from hard_scenes import ball
 from mergenet_cases import case_of, lively_net
 from scenes import assert_same_gaussians, covariances_of, moved, random_scene, same_bits
@@ -95,6 +97,17 @@ def test_inflation_equals_the_oracle():
         ]
         wanted = [1.0] * 3 if counts[row] == 1 else wanted
         assert ratio[row].tolist() == pytest.approx(wanted, rel=1e-9)
+
+
+@pytest.mark.parametrize("growth", [(0.1, 0.0), (0.0, 0.4), (0.0, 0.0)])
+def test_each_kind_of_growth_can_be_used_alone(growth):
+    scene, cells = opaque_scene(9), crowded([10] * 9)
+    neighbors = nearest_neighbors(scene.means, 8)
+    config = MergeConfig(inflation=growth[0], covered_inflation=growth[1], align_axes=False)
+    found = shape_merged(scene, cells, neighbors, config)
+    wanted = inflate_cells(scene, cells, neighbors, everywhere=growth[0], covered=growth[1])
+    assert same_bits(found, wanted)
+    assert torch.equal(found.log_scales, scene.log_scales) == (growth == (0.0, 0.0))
 
 
 def test_only_scales_of_cells_with_several_members_change():
