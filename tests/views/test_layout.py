@@ -1,0 +1,163 @@
+"""What the layout of a scene is read from, with answers found by hand."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import Tensor
+
+from cvtgs.cameras import Cameras
+from cvtgs.math.frames import RobustFrame
+from cvtgs.views import automatic, layout, mixed, own, positions, scoring, up
+from cvtgs.views.layout import SceneLayout
+from cvtgs.views.scoring import SplatSizes
+from cvtgs.views.up import Voxels
+from scenes import random_scene
+
+UP = torch.tensor([0.0, 0.0, 1.0]).double()
+
+
+def sphere(count: int = 2000) -> Tensor:
+    """Return evenly spread unit vectors."""
+    steps = torch.arange(count).double() + 0.5
+    heights, angles = 1 - 2 * steps / count, steps * math.pi * (3 - math.sqrt(5))
+    widths = (1 - heights.square()).sqrt()
+    return torch.stack([widths * angles.cos(), widths * angles.sin(), heights], dim=1)
+
+
+def voxels_at(points: Tensor, normals: Tensor | None = None) -> Voxels:
+    return Voxels(
+        points=points,
+        normals=points if normals is None else normals.expand_as(points),
+        log_sizes=torch.zeros(len(points)).double(),
+    )
+
+
+def layout_of(**changes) -> SceneLayout:
+    frame = RobustFrame(center=torch.zeros(3).double(), radius=1.0)
+    plain = {"frame": frame, "up": UP, "floor": None, "room": None}
+    return replace(layout.find_layout(random_scene(20)), **plain | changes)
+
+
+def test_surfaces_beneath_do_not_enclose():
+    directions, eye = sphere(), torch.zeros(3).double()
+    assert layout.enclosure(eye, directions[directions @ UP < 0], UP) == 0.0
+    assert layout.enclosure(eye, directions, UP) == 1.0
+    one = torch.tensor([[0.5, 0.1, 0.9]]).double()
+    assert layout.enclosure(eye, one, UP) == pytest.approx(1 / 60)
+
+
+@pytest.mark.parametrize(("least_height", "is_free"), [(-1.0, False), (0.0, True), (0.5, True)])
+def test_only_what_is_hidden_from_above_and_below_is_inside_matter(least_height, is_free):
+    points = sphere()
+    points = points[points @ UP > least_height]
+    eye = torch.zeros(1, 3).double()
+    assert positions.stand_free(layout_of(voxels=voxels_at(points)), eye).tolist() == [is_free]
+
+
+def test_sides_seen_from_below_are_not_sharp(monkeypatch):
+    def smallest(_, cameras) -> SplatSizes:
+        return SplatSizes(torch.zeros(len(cameras)), torch.zeros(len(cameras)))
+
+    monkeypatch.setattr(positions, "splat_sizes", smallest)
+    directions = vars(positions)["_side_directions"]()
+    sharp = vars(positions)["_sharp_sides"](layout_of(), 2 * directions)
+    assert sharp.tolist() == (directions @ UP >= 0).tolist()
+    assert int(sharp.sum()) == 16
+
+
+def test_what_lies_beneath_a_floor_speaks_against_it():
+    """Of 100 columns, 10 end one unit lower; 20 others carry something one unit above."""
+    side = 0.15 * (torch.arange(10).double() + 0.5)
+    floor = torch.nn.functional.pad(torch.cartesian_prod(side, side), (0, 1))
+    points = torch.cat([floor, floor[:10] - UP, floor[10:30] + UP])
+    found = vars(up)["_lowest_level"](voxels_at(points, UP), UP)
+    trust = 1 - 3 * 10 / 130
+    assert found.height == pytest.approx(0.1)
+    assert found.share == pytest.approx(0.9 * trust)
+    assert found.bare == pytest.approx(0.7 * trust)
+
+
+def test_a_plane_is_fitted_to_its_points():
+    """It rises by 0.2 along x, and the first guess is level."""
+    side = torch.linspace(-2, 2, 41).double()
+    points = torch.nn.functional.pad(torch.cartesian_prod(side, side), (0, 1))
+    points[:, 2] = 0.2 * points[:, 0]
+    found = vars(up)["_refined"](voxels_at(points, UP), UP, 0.0)
+    wanted = torch.tensor([-0.2, 0.0, 1.0]).double() / math.sqrt(1.04)
+    assert float((found.normal @ wanted).abs()) == pytest.approx(1.0)
+    assert found.height == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("sky", [[0.0, 0, 1], [0.0, 0, -1], [1.0, 0, 0]])
+def test_a_sky_shows_what_is_up(sky):
+    found = up.find_up(voxels_at(sphere()), torch.tensor([sky] * 9).double())
+    assert found.tolist() == sky
+
+
+def test_a_floor_moves_with_the_scene(monkeypatch):
+    monkeypatch.setattr(layout, "find_floor", lambda *_: -0.25)
+    monkeypatch.setattr(layout, "find_up", lambda *_: UP)
+    scene = random_scene(20)
+    shifted = scene.with_tensors({"means": scene.means + torch.tensor([5.0, 6.0, 7.0])}, {})
+    heights = [layout.find_layout(one).floor for one in (scene, shifted)]
+    assert heights[1] - heights[0] == pytest.approx(7.0, abs=1e-5)
+
+
+def test_a_camera_is_inside_a_needle_only_along_it():
+    """The needle points along x = y; its deviations are 2 and 0.1."""
+    turn = math.radians(45) / 2
+    needle = random_scene(1, degree=0).with_tensors(
+        {
+            "means": torch.zeros(1, 3),
+            "quats": torch.tensor([[math.cos(turn), 0, 0, math.sin(turn)]]),
+            "log_scales": torch.tensor([[2.0, 0.1, 0.1]]).log(),
+            "logit_opacities": torch.full((1,), 3.0),
+        },
+        {},
+    )
+    eyes = torch.tensor([[1.5, 1.5, 0], [1.5, -1.5, 0], [4.0, 4.0, 0]]).double()
+    cameras = scoring.cameras_at(eyes, eyes, UP, size=(8, 8), field=45.0)
+    found = vars(scoring)["_inside_gaussians"](layout_of(sample=needle), cameras)
+    assert found.tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize(("room", "least"), [(None, 1.4), (UP, 0.2)])
+def test_alternates_around_a_scene_are_not_near(room, least):
+    reaches = []
+
+    def near(count: int, reach: tuple[float, float], seed: int) -> Tensor:
+        reaches.append((reach, seed))
+        return 2 * torch.eye(3)[:count].double()
+
+    place = SimpleNamespace(layout=layout_of(room=room), near=near)
+    found = automatic.found_candidates(place, 2, size=(8, 8), seed=5)
+    assert reaches == [((least, 3.0), 5), ((least, 3.0), 6)]
+    assert [len(cameras) for cameras in found.rounds] == [2, 2]
+
+
+def test_random_views_aim_at_an_eighth_of_a_radius_around_the_middle():
+    frame = RobustFrame(center=torch.tensor([5.0, 6.0, 7.0]).double(), radius=2.0)
+    place = SimpleNamespace(layout=layout_of(frame=frame))
+    aims = vars(mixed)["_targets"](place, torch.zeros(2000, 3).double(), 0) - frame.center
+    torch.testing.assert_close(aims.amax(dim=0), torch.full((3,), 0.25).double(), rtol=0.02, atol=0)
+    torch.testing.assert_close(-aims.amin(dim=0), aims.amax(dim=0), rtol=0.02, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("pixel", "is_seen"),
+    [((90, 40), True), ((90, 60), False), ((110, 40), False), ((5, -1), False)],
+)
+def test_a_camera_looks_at_what_is_in_its_image(pixel, is_seen):
+    cameras = Cameras(
+        viewmats=torch.eye(4)[None],
+        Ks=torch.tensor([[[100.0, 0, 50], [0, 100, 25], [0, 0, 1]]]),
+        width=100,
+        height=50,
+    )
+    place = torch.tensor([[2 * (pixel[0] - 50) / 100, 2 * (pixel[1] - 25) / 100, 2.0]])
+    tensors = {"means": place, "logit_opacities": torch.ones(1)}
+    scene = random_scene(1).with_tensors(tensors, {})
+    assert vars(own)["_looking"](cameras, scene).tolist() == [is_seen]
