@@ -146,6 +146,50 @@ def test_steps_towards_held_out_images_are_from_none_to_the_whole(residual, step
     assert colors.best_step([blank], torch.zeros(1, 1, 3)) == 0.0
 
 
+def test_the_ridge_has_a_floor_of_a_fiftieth_of_the_median_weight():
+    """Weights add up to 2, their squares to 1.5: the solution is ``3 / (1.5 + 0.5 * 2.04)``."""
+    weights = SimpleNamespace(powers=lambda: torch.tensor([[2.0, 1.5]]).double())
+    view = SimpleNamespace(
+        weights=weights,
+        basis=torch.ones(1, 1).double(),
+        normal=lambda changes: 1.5 * changes,
+        gradient=lambda: torch.full((1, 1, 3), 3.0).double(),
+    )
+    config = MatchConfig(color_ridge=0.5)
+    found = colors.LeastSquares([view], config=config, frozen=0).solve(3)
+    assert found.flatten().tolist() == pytest.approx([3 / 2.52] * 3)
+
+
+@pytest.mark.parametrize(("step", "solved"), [(0.6, [14, 16]), (0.4, [14])])
+def test_held_out_images_help_only_once_the_others_have_proved_right(monkeypatch, step, solved):
+    counts, plain = [], colors.LeastSquares
+
+    def noted(linear, **words):
+        counts.append(len(linear))
+        return plain(linear, **words)
+
+    monkeypatch.setattr(colors, "LeastSquares", noted)
+    monkeypatch.setattr(colors, "best_step", lambda heldout, _: step * (len(heldout) == 2))
+    scene = random_scene(5, degree=0)
+    fit_colors(scene, observe(scene, ring(16)), config=MatchConfig(color_iterations=1))
+    assert counts == solved
+
+
+def test_only_held_out_images_decide_on_opacities(monkeypatch):
+    scene, judged = random_scene(5, degree=0), []
+    views = observe(scene, ring(16))
+
+    def noted(_, views) -> float:
+        judged.append(views.cameras.centers)
+        return 0.1
+
+    monkeypatch.setattr("cvtgs.matching.match.mean_squared_error", noted)
+    config = MatchConfig(opacity_rounds=1, color_iterations=1)
+    match_views(scene, views, views.contributions, config=config)
+    assert len(judged) == 3
+    assert all(torch.equal(centers, ring(16).centers[[4, 12]]) for centers in judged)
+
+
 def test_the_solution_is_found_from_any_start():
     scene = random_scene(6, degree=0, dtype=torch.float64)
     cameras = ring(8)
