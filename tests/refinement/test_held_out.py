@@ -1,4 +1,4 @@
-"""Held-out images: which they are, and how they decide."""
+"""Held-out images: which they are, and how they decide; what a step compares."""
 
 import pytest
 import torch
@@ -50,3 +50,42 @@ def test_a_far_better_view_counts_as_ten_decibels_above_the_median(monkeypatch, 
     )
     assert (found.before, found.after) == (22.5, after)
     assert (found.scene is small) == (after == 22.5)
+
+
+def test_an_equal_scene_looks_equal_over_every_background(monkeypatch):
+    """And the weights of the two losses are those of the configuration."""
+    seen = []
+
+    def noted(image, target, **weights) -> torch.Tensor:
+        seen.append((float((image.detach() - target).abs().max()), float(target.mean()), weights))
+        return image.sum() * 0
+
+    monkeypatch.setattr(optimize, "relative_loss", noted)
+    monkeypatch.setattr(optimize, "heldout_psnr", lambda *_: torch.full((2,), 30.0).double())
+    full, config = full_scene(50), quick(mse_weight=0.2, image_weight=0.7)
+    views = RefineViews(heldout=(), training=iter(ring(4).singles()), endless=False)
+    optimize.optimize(
+        full,
+        ImageBuffer(full, views, config=config, seed=0),
+        None,
+        limits=Limits(None, steps=4),
+        config=config,
+        learning_rate_scale=torch.ones(50),
+        listener=silent,
+    )
+    errors, means, weights = zip(*seen, strict=True)
+    assert max(errors) < 2e-3
+    assert len(set(means)) == 4
+    assert weights == ({"squared_weight": 0.2, "image_weight": 0.7},) * 4
+
+
+def test_old_images_leave_the_buffer_in_random_order():
+    """Often another image than the one that was just used."""
+    config = quick(images=4, steps_per_image=2)
+    views = RefineViews(heldout=(), training=iter(ring(80).singles()), endless=True)
+    images = ImageBuffer(full_scene(50), views, config=config, seed=0)
+    eyes = [tuple(images.draw().camera.centers[0].tolist()) for _ in range(140)]
+    assert images.rendered > 50
+    assert not set(eyes[:20]) & set(eyes[100:])
+    new = [step for step in range(20, 130) if eyes[step] not in eyes[:step]]
+    assert any(eyes[step - 1] in eyes[step:] for step in new)

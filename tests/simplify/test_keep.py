@@ -11,6 +11,7 @@ from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.boxes import Box, inside, read_boxes
 from cvtgs.cli.main import main
 from cvtgs.errors import InputNotFoundError, InvalidArgumentError
+from cvtgs.refinement import refine
 from scenes import random_scene, same_bits
 
 EACH = pytest.mark.parametrize("preset", ["standard", "paper", "draft"])
@@ -75,6 +76,27 @@ def test_refinement_leaves_kept_rows_alone(scene):
     config = SimplifyConfig.from_mapping({"refine": {"steps": 2, "size": 32, "heldout": 2}})
     small = Simplifier(config=config, device="cpu").simplify(scene, 0.2, keep=keep)
     assert same_bits(small.select(torch.arange(30)), scene.select(keep))
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_refinement_is_told_what_to_keep_and_reuses_only_images_of_its_kind(
+    scene, monkeypatch, stride
+):
+    told = []
+
+    def noted(small, full, **words):
+        told.append((words["frozen"], words["observed"] is not None))
+        return refine(small, full, **words)
+
+    monkeypatch.setattr("cvtgs.refinement.refine", noted)
+    config = SimplifyConfig.from_mapping({
+        "preset": "matched",
+        "visibility": {"views": 8, "size": 32, "stride": 1},
+        "match": {"color_iterations": 1},
+        "refine": {"steps": 1, "size": 32, "heldout": 1, "stride": stride},
+    })  # fmt: skip
+    Simplifier(config=config, device="cpu").simplify(scene, 0.2, keep=torch.arange(400) < 30)
+    assert told == [(30, stride == 1)]
 
 
 def test_boxes_include_their_faces():
