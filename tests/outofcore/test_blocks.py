@@ -2,7 +2,9 @@
 
 import json
 from itertools import pairwise
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,9 +18,18 @@ from cvtgs.errors import ConfigError, FileFormatError, InvalidArgumentError, Inv
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.io.ply import open_rows
 from cvtgs.math.frames import robust_frame
-from cvtgs.outofcore import block_count, read_bytes, simplify_file
+from cvtgs.outofcore import allocate, block_count, lloyd, read_bytes, simplify_file
 from cvtgs.outofcore import scan as scan_module
-from cvtgs.outofcore.scan import RangeTotals, RowRange, add_totals, partition_space, scan_range
+from cvtgs.outofcore.halo import Assignment
+from cvtgs.outofcore.memory import needed_memory
+from cvtgs.outofcore.scan import (
+    RangeTotals,
+    RowRange,
+    add_totals,
+    partition_space,
+    scan_range,
+    scan_scene,
+)
 from cvtgs.views import automatic_views
 from hard_scenes import ball
 from scenes import random_scene, same_bits
@@ -92,6 +103,47 @@ def test_the_lightest_flyaways_are_left_out_up_to_their_share_of_the_mass(share,
         kept_count=0,
     )
     assert vars(scan_module)["_max_flyaway_mass"](totals, share) == most
+
+
+def test_no_block_has_much_more_than_twice_the_average_of_rows_or_weight(tmp_path):
+    """Nine tenths of the Gaussians are tiny, and the others lie beside them."""
+    scene, config, tiny = random_scene(1000), SimplifyConfig(), torch.arange(1000)[:, None] < 900
+    tensors = {
+        "means": scene.means + torch.where(tiny, 0.0, torch.tensor([9.0, 0.0, 0.0])),
+        "log_scales": torch.where(tiny, -8.0, -1.0).expand(1000, 3),
+        "logit_opacities": torch.full((1000,), 2.0),
+    }
+    scene = scene.with_tensors(tensors, {})
+    cvtgs.save(scene, tmp_path / "in.ply")
+    frame = robust_frame(scene.means)
+    found = scan_scene(
+        scene,
+        scan_range(open_rows(tmp_path / "in.ply"), frame, (), RowRange(0, 0, 1000)),
+        boxes=(),
+        target=100,
+        cells=100,
+        blocks=4,
+        config=config,
+        frame=frame,
+    )
+    blocks = found.partition.blocks_of(frame.contract(scene.means))
+    for weights in (torch.ones(1000), scene.areas**config.cvt.area_power):
+        sums = torch.bincount(blocks, weights.double(), minlength=4)
+        assert float(sums.max()) < 2.1 * float(sums.mean())
+
+
+def test_an_empty_site_gets_a_point_that_its_cell_can_spare():
+    """Site 0 keeps its second point: it is farther, but costs less. The last is a remote one's."""
+    points = torch.tensor([[0.1], [0.2], [-9.0]])
+    found = Assignment(
+        torch.tensor([-1, -1, 3]), torch.tensor([0, 0, 7]), torch.tensor([0.01, 0.04, 0.1]).double()
+    )
+    weights, sites = torch.tensor([10.0, 1.0, 1.0]).double(), torch.tensor([[0.0], [5.0]]).double()
+    filled, refilled = vars(lloyd)["_fill_empty"](found, points, sites, weights)
+    assert refilled == 1
+    assert filled.blocks.tolist() == [-1, -1, 3]
+    assert filled.labels.tolist() == [1, 0, 7]
+    assert filled.squared.tolist() == pytest.approx([4.9**2, 0.04, 0.1])
 
 
 def test_coincident_points_lie_in_one_block():
@@ -293,6 +345,28 @@ def test_amounts_of_memory_are_parsed(text, wanted):
 def test_bad_amounts_of_memory_are_refused(text):
     with pytest.raises(InvalidArgumentError, match="memory must be"):
         read_bytes(text)
+
+
+@pytest.mark.parametrize(
+    ("counts", "regions"),
+    [
+        ([4, 4, 4], [[0], [1], [2]]),
+        ([3, 3, 0, 5, 1], [[0, 1], [3, 4]]),
+        ([9, 2, 4], [[0], [1, 2]]),
+        ([0, 6], [[1]]),
+    ],
+)
+def test_neighbouring_blocks_whose_cells_fit_together_are_a_region(counts, regions):
+    assert vars(allocate)["_regions"](counts, 6) == regions
+
+
+@pytest.mark.parametrize("memory", [10**9, 4 * 10**9, 32 * 10**9])
+def test_a_block_of_twice_the_mean_size_fits_into_memory(memory):
+    rows = SimpleNamespace(count=10**8, dtype=np.dtype([("x", "u1", 248)]))
+    blocks = block_count(rows, memory)
+    assert blocks % 4 == 0
+    sizes = [needed_memory(rows, 2 * rows.count // number) for number in (blocks - 4, blocks)]
+    assert sizes[1] <= memory < sizes[0]
 
 
 def test_less_memory_makes_more_blocks(source):

@@ -157,7 +157,6 @@ def test_points_weigh_as_in_one_piece(job):
     torch.testing.assert_close(of_all(job, job.sample_path, "weights"), wanted)
 
 
-@pytest.mark.slow
 def test_sites_move_as_in_one_piece(job):
     points = of_all(job, job.sample_path, "points")
     weights = of_all(job, job.sample_path, "weights")
@@ -171,7 +170,6 @@ def test_sites_move_as_in_one_piece(job):
     torch.testing.assert_close(moved, whole.sites)
 
 
-@pytest.mark.slow
 def test_gaussians_go_to_cells_of_other_blocks(job):
     labels = [map_tensors(job.labels_path(block))[0] for block in job.blocks_with_cells()]
     left = sum(int((one["labels"] < 0).sum()) for one in labels)

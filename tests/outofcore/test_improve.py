@@ -10,6 +10,7 @@ from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.outofcore import LocalWorkers, simplify_file
 from cvtgs.outofcore import improve as module
+from cvtgs.report import MatchReport
 from cvtgs.views import automatic_views
 
 COUNT = 200
@@ -113,6 +114,14 @@ def test_what_is_near_a_block_reaches_half_of_its_diagonal_beyond_it():
     places = [[-2.4, 0, 0], [5.4, 6.4, 2.4], [1, 1, 0], [-2.6, 0, 0], [1, 6.6, 0], [1, 1, -2.6]]
     near = vars(module)["_near"](torch.tensor(places), own)
     assert near.tolist() == [True, True, True, False, False, False]
+
+
+def test_reports_of_matched_blocks_are_joined():
+    shared = {"backend": "numba"}
+    one = MatchReport(views=3, opacities_kept=True, psnr_before=20.0, psnr_after=23.0, **shared)
+    two = MatchReport(views=5, opacities_kept=False, psnr_before=24.0, psnr_after=30.0, **shared)
+    wanted = MatchReport(views=8, opacities_kept=False, psnr_before=22.0, psnr_after=26.5, **shared)
+    assert module.join_matchings([one, two]) == wanted
 
 
 def test_images_raise_the_least_memory(source, tmp_path):
