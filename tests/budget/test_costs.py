@@ -66,3 +66,20 @@ def test_pixel_gaussian_pairs_grow_with_the_square_root_of_both():
     )
     assert few == pytest.approx(32 * 200 * math.sqrt(1000))
     assert many == pytest.approx(10 * few)
+
+
+@pytest.mark.parametrize("name", ["matched", "high"])
+def test_a_refinement_with_images_of_its_own_renders_held_out_ones_too(name):
+    """Images that were made to match colours serve it as well, held-out ones included."""
+    shared = preset(name)
+    changes = {"visibility.size": str(2 * shared.visibility.size)}
+    alone = SimplifyConfig.compose(preset=name, settings=changes)
+    assert (shared.shares_images, alone.shares_images) == (True, False)
+    counts = [
+        Work(count=1000, target=9).features("refine", one)["images_in"] / 1000
+        for one in (shared, alone)
+    ]
+    refine = shared.refine
+    views = shared.visibility.views
+    assert counts[0] == refine.new_images(refine.steps, given=views - refine.heldout_of(views))
+    assert counts[1] == refine.new_images(refine.steps) + refine.heldout

@@ -17,6 +17,7 @@ from cvtgs.evaluation import (
     alpha_bias,
     alpha_error,
     compare,
+    comparison_files,
     evaluate,
     fit_cameras,
     load_photographs,
@@ -131,13 +132,15 @@ def test_missing_lpips_weights_are_fatal_only_if_requested(
 
 
 def test_photographs_are_scored_for_every_scene(scene, small, cameras):
-    photographs = render(scene, cameras).rgb.clamp(0, 1) * 0.9
+    images = render(scene, cameras).rgb.clamp(0, 1)
+    photographs = images * torch.tensor([0.9, 0.92, 0.94])[:, None, None, None]
     evaluation = evaluate(scene, small, cameras, settings=OFF, photographs=photographs)
     assert [scores.name for scores in evaluation.photographs] == ["full", "0.1", "0.01"]
     full, tenth, _ = evaluation.photographs
     assert tenth.alpha_error is None
     assert tenth.alpha_bias is None
     assert tenth.psnr.mean < full.psnr.mean < 40
+    assert full.psnr.views == pytest.approx(psnr(images, photographs).tolist(), rel=1e-4)
     with pytest.raises(ValueError, match=r"photographs must have shape \(3, 36, 48, 3\)"):
         evaluate(scene, small, cameras, settings=OFF, photographs=photographs[:2])
     refused = [
@@ -288,6 +291,13 @@ def test_all_views_are_scored_even_if_few_images_are_kept(scene, small, cameras)
     assert (data["views"], data["shown"], data["scored"]) == (["a", "b"], [0, 1], 3)
     with pytest.raises(ValueError, match="most_images must be at least 1, found 0"):
         compare(scene, small, cameras, most_images=0, settings=OFF)
+
+
+def test_captions_are_those_of_the_shown_views(comparison):
+    scores = comparison.evaluation.scenes[0]
+    row = vars(comparison_files)["_small_row"](replace(comparison, shown=(2, 0)), scores, None)
+    views = scores.psnr.views
+    assert row.captions == [f"{views[2]:.2f} dB", f"{views[0]:.2f} dB"]
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from cvtgs.streams import StreamPlan, blocks, write_tiles
+from cvtgs.streams import StreamPlan, blocks, sog, write_tiles
 from cvtgs.streams.plan import plan_part
 from scenes import random_scene
 
@@ -72,6 +72,19 @@ def test_tiles_state_the_largest_error_of_their_level_and_all_finer_ones(tmp_pat
     root = json.loads((tmp_path / "tileset.json").read_text())["root"]
     assert root["geometricError"] == 16 * 5.0
     assert {child["geometricError"] for child in root["children"]} == {0.0}
+
+
+@pytest.mark.parametrize(
+    ("counts", "files"),
+    [
+        ([2, 2, 2], [(0, 2), (2, 3)]),
+        ([5, 1, 3], [(0, 1), (1, 3)]),
+        ([1, 9, 1], [(0, 1), (1, 2), (2, 3)]),
+    ],
+)
+def test_files_hold_as_many_chunks_as_fit_or_one(counts, files):
+    found = vars(sog)["_packed"](counts, 4)
+    assert [(chunks.start, chunks.stop) for chunks in found] == files
 
 
 def test_every_block_with_rows_has_a_gaussian_at_every_level(tmp_path: Path) -> None:
