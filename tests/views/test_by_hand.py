@@ -84,7 +84,6 @@ def test_the_first_good_camera_is_taken_or_else_that_of_least_penalty(
         return CameraScores(
             good=torch.tensor([bool(good[number])]),
             penalties=torch.tensor([penalties[number]]).double(),
-            visible=torch.zeros(1, 0, dtype=torch.bool),
         )
 
     monkeypatch.setattr(automatic, "score_cameras", scored)

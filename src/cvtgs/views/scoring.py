@@ -12,7 +12,6 @@ from cvtgs.cameras import Cameras, look_at
 from cvtgs.math import parameters
 from cvtgs.rendering import observe, render
 from cvtgs.views.layout import SceneLayout
-from cvtgs.views.up import VOXEL_SIZE
 
 PIXELS = 64
 """Longer side of the small images."""
@@ -66,12 +65,10 @@ class CameraScores:
     Attributes:
         good: ``(c,)`` whether each camera has an unobstructed view of the scene.
         penalties: ``(c,)`` penalties to choose among bad cameras; 0 is best.
-        visible: ``(c, v)`` whether each camera sees each voxel of the layout.
     """
 
     good: Bool[Tensor, "c"]
     penalties: Float[Tensor, "c"]
-    visible: Bool[Tensor, "c v"]
 
 
 def score_cameras(
@@ -95,11 +92,7 @@ def score_cameras(
     enclosed = _inside_gaussians(layout, small)
     good = (near_share <= _MOST_NEAR) & (blocked <= _MOST_BLOCKED) & (lacking == 0) & ~enclosed
     penalties = 2 * near_share + blocked + 2 * lacking + enclosed.double()
-    return CameraScores(
-        good=good,
-        penalties=penalties,
-        visible=_visible_voxels(layout, small, images.alpha, depth=depth),
-    )
+    return CameraScores(good=good, penalties=penalties)
 
 
 def _small(cameras: Cameras) -> Cameras:
@@ -161,26 +154,3 @@ def _inside_gaussians(layout: SceneLayout, cameras: Cameras) -> Bool[Tensor, "c"
         squares = (local / sample.scales[near].clamp_min(1e-12)).square().sum(dim=1)
         found.append(bool((squares < _ENCLOSING**2).any()))
     return torch.tensor(found, device="cpu")
-
-
-def _visible_voxels(
-    layout: SceneLayout,
-    cameras: Cameras,
-    alpha: Float[Tensor, "c h w"],
-    *,
-    depth: Float[Tensor, "c h w"],
-) -> Bool[Tensor, "c v"]:
-    """Return which voxels are in the images and not occluded there."""
-    points = layout.frame.center + layout.frame.radius * layout.voxels.points
-    rotations, shifts = cameras.viewmats[:, :3, :3].double(), cameras.viewmats[:, :3, 3].double()
-    local = points @ rotations.transpose(1, 2) + shifts[:, None]
-    projected = local @ cameras.Ks.double().transpose(1, 2)
-    ahead = local[:, :, 2] > 0
-    pixels = (projected[:, :, :2] / projected[:, :, 2:].clamp_min(1e-9)).floor().long()
-    x, y = pixels.unbind(2)
-    framed = ahead & (x >= 0) & (x < cameras.width) & (y >= 0) & (y < cameras.height)
-    flat = (y * cameras.width + x).clamp(0, cameras.width * cameras.height - 1)
-    surface = depth.flatten(1).double().gather(1, flat)
-    solid = alpha.flatten(1).gather(1, flat) > _SOLID
-    slack = 1.5 * VOXEL_SIZE * layout.frame.radius
-    return framed & (~solid | (local[:, :, 2] < 1.05 * surface + slack))
