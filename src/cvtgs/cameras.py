@@ -306,8 +306,9 @@ def look_at(
         >>> look_at(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 5.0]]), up)[0, 2, :3].tolist()
         [0.0, 0.0, 1.0]
     """
-    forward = torch.nn.functional.normalize(targets - eyes, dim=1)
-    upright = torch.nn.functional.normalize(up, dim=0).expand_as(forward)
+    tiny = torch.finfo(eyes.dtype).tiny  # by default, normalize leaves short vectors short
+    forward = torch.nn.functional.normalize(targets - eyes, dim=1, eps=tiny)
+    upright = torch.nn.functional.normalize(up, dim=0, eps=tiny).expand_as(forward)
     for vectors, wish in (
         (forward, "targets must be finite and differ from the positions of their cameras"),
         (upright, "up must be a finite direction other than 0"),
