@@ -56,13 +56,22 @@ def test_a_process_that_has_loaded_torch_keeps_its_settings(monkeypatch):
     assert not any(name in os.environ for name in NAMES)
 
 
-def test_every_command_but_completion_loads_torch_this_way():
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        (["doctor"], "asked before\n"),
+        (["simplify", "in.ply", "out.ply", "--rho", "0.1"], "asked before\n"),
+        (["simplify", "in.ply", "out.ply", "--count", "50k"], "asked before\n"),
+        (["completion", "bash"], ""),
+    ],
+)
+def test_every_command_but_completion_loads_torch_this_way(words, wanted):
     code = (
-        "import sys; from cvtgs.cli import main; main.load_torch = lambda: sys.exit('asked');"
-        "main.main(sys.argv[1:])"
+        "import sys; from cvtgs.cli import main\n"
+        "def asked(): sys.exit('asked ' + ('after' if 'torch' in sys.modules else 'before'))\n"
+        "main.load_torch = asked; main.main(sys.argv[1:])"
     )
-    for words, wanted in ((["doctor"], "asked\n"), (["completion", "bash"], "")):
-        done = subprocess.run(
-            [sys.executable, "-c", code, *words], capture_output=True, check=False, text=True
-        )
-        assert done.stderr == wanted
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, check=False, text=True
+    )
+    assert done.stderr == wanted

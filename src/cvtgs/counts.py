@@ -6,11 +6,12 @@ import re
 from collections.abc import Sequence
 from decimal import Decimal
 from fractions import Fraction
-from typing import cast
-
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from cvtgs.errors import InvalidArgumentError
+
+if TYPE_CHECKING:  # the command line reads ratios before it sets up and loads torch
+    from torch import Tensor
 
 _UNITS = {"": 1, "k": 1000, "m": 1_000_000}
 _COUNT = re.compile(r"\s*(\d{1,3}(?:,\d{3})+|\d[\d_]*(?:\.\d+)?(?:e\+?\d\d?)?)\s*([km]?)\s*")
@@ -91,11 +92,14 @@ def target_count(
     return math.ceil(Fraction(written(rho)) * total)
 
 
-def written(number: float | Tensor) -> str:
+def written(number: "float | Tensor") -> str:
     """Return a number as it would be written, also one of numpy or torch in float32."""
-    if isinstance(number, Tensor):
-        number = cast(float, number.detach().cpu().numpy().reshape(())[()])
-    return str(number) if "float" in type(number).__name__ else str(float(number))
+    value: Any = number
+    if hasattr(value, "detach"):  # a tensor
+        value = value.detach().cpu()
+        lacking = str(value.dtype) == "torch.bfloat16"  # in numpy
+        value = (value.float() if lacking else value).numpy().reshape(())[()]
+    return str(value) if "float" in type(value).__name__ else str(float(value))
 
 
 def _is_ratio(value: object) -> bool:

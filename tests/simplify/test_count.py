@@ -47,6 +47,7 @@ def with_bad_rows(scene: GaussianScene, rows: list[int]) -> GaussianScene:
         (6_000_000, 0.01, 60_000),
         (600, np.float32(0.1), 60),  # as a double slightly more
         (600, torch.tensor(0.1), 60),
+        (600, torch.tensor(0.25).bfloat16(), 150),
         (7, np.int64(1), 7),
     ],
 )
