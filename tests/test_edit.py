@@ -38,6 +38,7 @@ def test_crop_keeps_the_rows_inside_unchanged() -> None:
     with pytest.raises(InvalidArgumentError, match="needs at least one box or sphere, found none"):
         crop(scene, [])
     assert same_bits(crop(scene, ball), crop(scene, [ball]))
+    assert same_bits(crop(scene, iter([box, ball])), found)  # type: ignore[arg-type]
     for wrong in (["x"], [((-1, -1, -1), (0, 1, 1))], "x"):
         with pytest.raises(InvalidArgumentError, match="regions must be boxes or spheres, found"):
             crop(scene, wrong)

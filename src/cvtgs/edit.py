@@ -147,7 +147,7 @@ def crop(scene: GaussianScene, regions: Sequence[Box | Sphere] | Box | Sphere) -
         >>> len(crop(scene, [Sphere(center=(0.0, 0.0, 0.0), radius=1e6)]))
         100
     """
-    regions = [regions] if isinstance(regions, Box | Sphere) else regions
+    regions = [regions] if isinstance(regions, Box | Sphere) else list(regions)
     for region in regions:
         if not isinstance(region, Box | Sphere):
             raise InvalidArgumentError(f"regions must be boxes or spheres, found {shown(region)}.")
