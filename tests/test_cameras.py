@@ -31,6 +31,10 @@ GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "h
         ({"height": 2.5}, "height must be a whole number above 0, found 2.5."),
         ({"stride": 0}, "stride must be a whole number above 0, found 0."),
         (
+            {"width": torch.tensor(2.5)},
+            "width must be a whole number above 0, found tensor(2.5000).",
+        ),
+        (
             {"viewmats": torch.eye(4)[None].numpy()},
             "viewmats must be a torch.Tensor, found ndarray.",
         ),

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from cvtgs.counts import whole_number
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.selection import row_numbers
 
@@ -273,7 +274,7 @@ class Cameras:
 
 
 def _check_whole(value: object, name: str) -> None:
-    if not hasattr(value, "__index__") or not value >= 1:  # type: ignore[operator]
+    if whole_number(value) < 1:
         raise InvalidArgumentError(f"{name} must be a whole number above 0, found {value!r}.")
 
 

@@ -63,7 +63,7 @@ def target_count(
         >>> target_count(250, 0.01), target_count(10, 1e-9)
         (3, 1)
     """
-    if _whole(total) < 0:
+    if whole_number(total) < 0:
         raise InvalidArgumentError(f"total must be a whole number, at least 0; found {total!r}.")
     values = {"rho": rho, "count": count, "max_count": max_count}
     given = [name for name, value in values.items() if value is not None]
@@ -71,19 +71,22 @@ def target_count(
         found = " and ".join(given) or "none"
         raise InvalidArgumentError(f"give one of rho, count and max_count, found {found}.")
     if max_count is not None:
-        most = _whole(max_count)
+        most = whole_number(max_count)
         if most < 1:
             raise InvalidArgumentError(
                 f"max_count must be a whole number above 0; found {max_count!r}."
             )
         return min(most, total)
     if count is not None:
-        number = _whole(count)
+        number = whole_number(count)
         if not 1 <= number <= total:
+            is_larger = number > total
+            found = (
+                f"{number:,}; max_count (--max-count) may be larger" if is_larger else repr(count)
+            )
             raise InvalidArgumentError(
                 f"count must be a whole number between 1 and the {total:,} Gaussians of the scene; "
-                f"found {f'{number:,}' if number > 0 else repr(count)}; "
-                f"max_count (--max-count) may be larger."
+                f"found {found}."
             )
         return number
     if rho is None or not _is_ratio(rho):
@@ -109,7 +112,7 @@ def _is_ratio(value: object) -> bool:
         return False
 
 
-def _whole(number: object) -> int:
+def whole_number(number: object) -> int:
     """Return a whole number of any type, or -1 if it is none."""
     if isinstance(number, bool) or not hasattr(number, "__index__"):
         return -1
