@@ -171,6 +171,10 @@ def test_unknown_keys_and_values_are_errors(values, message):
     assert str(caught.value) == message
 
 
+def test_keys_that_are_no_text_are_errors():
+    assert error_of({1: 2}) == "1: is not a known setting."
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 @pytest.mark.parametrize("key", ["color", "weight_floor", "tolerance"])
 def test_numbers_that_are_not_finite_are_errors(key, value):

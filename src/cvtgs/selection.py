@@ -7,6 +7,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.text import shown
 
 
 def row_numbers(
@@ -63,5 +64,5 @@ def row_numbers(
 
 def _error(rows: object, things: str, hint: str = "") -> InvalidArgumentError:
     return InvalidArgumentError(
-        f"rows of {things} must be a slice, a mask or row numbers, found {rows!r}{hint}."
+        f"rows of {things} must be a slice, a mask or row numbers, found {shown(rows)}{hint}."
     )

@@ -127,6 +127,13 @@ def test_invalid_jobs_are_refused_before_the_work(
     assert not list(Path().glob("out/*"))
 
 
+def test_a_folder_with_an_impossible_name_is_one_sentence(
+    scenes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["convert", "a.ply", "-o", "x" * 300]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_a_report_needs_exactly_one_scene(scenes: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["simplify", *NAMES, "-o", "out", "--rho", "0.1", "--report", "r.json", *SMALL]
     assert main(words) == 1
@@ -147,7 +154,7 @@ def test_invalid_combinations_of_paths_are_usage_errors(
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (NAMES, "to write into a folder any number of IN and -o DIR; found 3 paths (a.ply, "),
+        (NAMES, "any number of IN and -o DIR to write into a folder; found 3 paths (a.ply, "),
         (["a.ply", "folder"], "OUT must be a file; to write into a folder, use -o folder\n"),
         (["a.ply", "new/"], "OUT must be a file; to write into a folder, use -o new/\n"),
     ],

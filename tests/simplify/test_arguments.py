@@ -55,7 +55,7 @@ def test_a_preset_given_as_the_checkpoint_is_an_error():
         ({"config": 3}, "config must be a SimplifyConfig or the name of a preset, found 3"),
         ({"preset": 3}, "preset must be one of draft, .*; found 3"),
         ({"ckpt": 3}, r"ckpt must be the name of a checkpoint, a file or None, found int\."),
-        ({"ckpt": SimplifyConfig()}, "found SimplifyConfig; for a configuration, write config="),
+        ({"ckpt": SimplifyConfig()}, "found SimplifyConfig; for a configuration, give config."),
         ({"listener": None}, "listener must be a function of a progress event, found None"),
         ({"device": None}, "device must be 'auto', a name such as 'cpu', .*, found None"),
     ],

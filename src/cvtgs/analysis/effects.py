@@ -47,7 +47,7 @@ class Effect(Record):
     Attributes:
         active: Whether the effect is computed.
         figure: Figure that was measured on the scene.
-        meaning: The threshold in words, which say what the figure is.
+        meaning: What the figure is, and from where on the effect is on.
         forced: Whether the configuration decided instead of the figure.
     """
 

@@ -95,7 +95,7 @@ def check_paths(parser: CommandParser, options: argparse.Namespace) -> None:
     if options.folder is None and len(options.paths) != 2:
         found = f"{counted(len(options.paths), 'path')} ({shortened(', '.join(options.paths), 60)})"
         parser.error(
-            f"give IN and OUT, or to write into a folder any number of IN and -o DIR; found {found}"
+            f"give IN and OUT, or any number of IN and -o DIR to write into a folder; found {found}"
         )
     if options.folder is None and (
         os.path.isdir(options.paths[1]) or options.paths[1].endswith(("/", os.sep))  # noqa: PTH112

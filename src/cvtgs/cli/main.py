@@ -101,7 +101,7 @@ def _without_empty_folder(options: argparse.Namespace) -> Iterator[None]:
     """After an error, remove the output folder if the command made it and left it empty."""
     named = (getattr(options, name, None) for name in ("folder", "output"))
     folder = next((path for path in named if path is not None), Path())
-    is_new = not folder.exists()
+    is_new = not os.path.exists(folder)  # noqa: PTH110 (false for impossible names)
     try:
         yield
     except BaseException:

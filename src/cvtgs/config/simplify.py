@@ -187,7 +187,7 @@ class SimplifyConfig(Section):
         Raises:
             ConfigError: A key is unknown or a value is out of range; the message names it.
         """
-        return cls(**values)
+        return cls(**{str(key): value for key, value in values.items()})
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:

@@ -296,7 +296,7 @@ def checkpoint_for(
     if ckpt is None or ckpt == "none":
         return None
     if not isinstance(ckpt, str | os.PathLike):
-        hint = "; for a configuration, write config=..." if isinstance(ckpt, SimplifyConfig) else ""
+        hint = "; for a configuration, give config" if isinstance(ckpt, SimplifyConfig) else ""
         raise InvalidArgumentError(
             f"ckpt must be the name of a checkpoint, a file or None, found "
             f"{type(ckpt).__name__}{hint}."
