@@ -9,12 +9,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+from cvtgs.boxes import Corner
 from cvtgs.config.base import Record
 from cvtgs.errors import InvalidArgumentError, OutputError, OutputExistsError, reason_of
 from cvtgs.io import atomic_output, check_output
 from cvtgs.io.atomic import make_folder
 from cvtgs.progress import ProgressListener
-from cvtgs.streams.plan import Corner, StreamPlan, join_boxes
+from cvtgs.streams.plan import StreamPlan, join_boxes
 
 __all__ = ["INDEX_NAMES", "StreamLevel", "check_stream"]
 

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from cvtgs.boxes import Corner
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.arrays import morton_rows
 from cvtgs.math.frames import RobustFrame, robust_frame
@@ -34,8 +35,6 @@ _SPREAD = (0.05, 0.95)
 
 _SAMPLE = 1 << 16
 """Points used for these quantiles."""
-
-Corner = tuple[float, float, float]
 
 
 class StreamedLevel(Protocol):

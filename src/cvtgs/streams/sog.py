@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from cvtgs.boxes import Corner
 from cvtgs.io import atomic_output, load, save
 from cvtgs.io.atomic import make_folder
 from cvtgs.io.sog import encode_sog
@@ -22,7 +23,7 @@ from cvtgs.streams.files import (
     join_trees,
     write_stream,
 )
-from cvtgs.streams.plan import Corner, StreamNode, StreamPlan
+from cvtgs.streams.plan import StreamNode, StreamPlan
 
 __all__ = ["write_sog_stream"]
 

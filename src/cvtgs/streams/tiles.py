@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from cvtgs.boxes import Corner
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io import atomic_output
 from cvtgs.io.axes import SCENE_AXES, change_axes
@@ -16,7 +17,7 @@ from cvtgs.io.gltf import write_spz_glb
 from cvtgs.io.gltf.document import AXES, SPLATS, SPZ
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.streams.files import StreamLevel, StreamPart, join_trees, write_stream
-from cvtgs.streams.plan import Corner, StreamNode, StreamPlan, join_boxes
+from cvtgs.streams.plan import StreamNode, StreamPlan, join_boxes
 
 __all__ = ["check_transform", "geo_transform", "write_tiles"]
 
