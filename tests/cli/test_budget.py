@@ -210,7 +210,7 @@ def test_a_target_is_measured_over_the_views_of_evaluate(source, capsys):
     [
         ("draft", False, "the automatic views of cvtgs evaluate"),
         ("draft", True, "the given cameras"),
-        ("high", True, "automatic views that high does not use"),
+        ("high", True, "automatic views that it was not fitted to"),
     ],
 )
 def test_the_views_of_a_target_are_named(scene, preset, is_given, views):

@@ -14,7 +14,7 @@ def target_note(found: "Found", config: "SimplifyConfig", *, is_given: bool) -> 
     """Return the scores of a search, and the views that they are measured over."""
     views = "the given cameras" if is_given else "the automatic views of cvtgs evaluate"
     if config.uses_images:
-        views = f"automatic views that {config.preset} does not use"
+        views = "automatic views that it was not fitted to"
     return (
         f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f}, alpha error {found.alpha_error:.4f} "
         f"(bias {found.alpha_bias:+.4f}) over {views}; found in {len(found.tried)} tries."
