@@ -101,7 +101,8 @@ def span(low: float, high: float, begin: int, end: int) -> tuple[int, int]:
     """Return the half-open range of pixels in [begin, end) whose centres lie in an interval."""
     first = math.ceil(max(low - 0.5 - SLACK, float(begin)))
     last = math.floor(min(high - 0.5 + SLACK, end - 1.0))
-    return int(first), int(last) + 1
+    # A negative end would count from the end of an array.
+    return int(first), max(int(first), int(last) + 1)
 
 
 @serial
