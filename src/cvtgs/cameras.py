@@ -126,6 +126,8 @@ class Cameras:
         Returns:
             One :class:`Cameras` per camera, in order.
         """
+        if len(self) == 1:  # a selection would copy the row number to the device
+            return [self]
         return [self.select(torch.tensor([row], device="cpu")) for row in range(len(self))]
 
     def to(self, device: torch.device | str) -> Self:
