@@ -7,7 +7,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from types import TracebackType
@@ -79,8 +79,10 @@ class LocalWorkers:
         Raises:
             RunError: A process ended unexpectedly.
         """
-        futures = deque(self._pool.submit(_call, pickle.dumps((function, one))) for one in items)
+        futures = deque[Future[bytes]]()
         try:
+            for one in items:  # the pool refuses work if a process ended since the last call
+                futures.append(self._pool.submit(_call, pickle.dumps((function, one))))
             while futures:  # drops results once yielded: a scan has dozens of megabytes
                 result: Result = pickle.loads(futures.popleft().result())
                 yield result
