@@ -37,8 +37,8 @@ class StageClock:
     """A clock that measures consecutive stages and reports progress; CUDA is synchronised.
 
     Args:
-        listener: Called at the start and the end of each stage.
-        device: Device whose memory is measured.
+        listener: Called when a stage starts, advances and ends.
+        device: Device that the stages compute on, whose memory is measured.
     """
 
     def __init__(self, listener: ProgressListener, device: torch.device) -> None:

@@ -192,7 +192,7 @@ def test_a_target_is_searched_and_reported(source, capsys, shown):
     text = " ".join(" ".join(lines).split())
     assert f"300 -> {len(small)} Gaussians, " in text
     assert len(small) < 300
-    assert "over the automatic views of cvtgs evaluate; found in" in text
+    assert "over automatic views; found in" in text
     assert "tessellate" not in shown
 
 
@@ -208,7 +208,7 @@ def test_a_target_is_measured_over_the_views_of_evaluate(source, capsys):
 @pytest.mark.parametrize(
     ("preset", "is_given", "views"),
     [
-        ("draft", False, "the automatic views of cvtgs evaluate"),
+        ("draft", False, "automatic views"),
         ("draft", True, "the given cameras"),
         ("high", True, "automatic views that it was not fitted to"),
     ],

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 def target_note(found: "Found", config: "SimplifyConfig", *, is_given: bool) -> str:
     """Return the scores of a search, and the views that they are measured over."""
-    views = "the given cameras" if is_given else "the automatic views of cvtgs evaluate"
+    views = "the given cameras" if is_given else "automatic views"
     if config.uses_images:
         views = "automatic views that it was not fitted to"
     return (

@@ -242,7 +242,8 @@ def _simplify_in_memory(
             cameras=cameras,
             keep=keep,
         )
-    notes += [] if chosen is None else chosen.late_note(report.seconds)
+    if chosen is not None:
+        notes += chosen.late_note(report.seconds)
     cvtgs.io.save(small, options.output, overwrite=options.overwrite, axes=axes.target)
     return report, notes
 
