@@ -1,6 +1,8 @@
-"""Functions that worker processes run in tests; a module, so that they can import them."""
+"""Functions that worker processes run in tests, and programs in fresh interpreters."""
 
 import os
+import subprocess
+import sys
 import time
 
 import torch
@@ -23,3 +25,16 @@ def die(number: int) -> None:
 def wait(folder: str, number: int) -> None:
     os.close(os.open(f"{folder}/{os.getpid()}", os.O_CREAT))
     time.sleep(600)
+
+
+def python(program: str, **variables: str) -> list[str]:
+    """Run a program in a fresh interpreter; return the lines that it prints."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), **variables}
+    result = subprocess.run(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        env=environment,
+    )
+    return result.stdout.splitlines()

@@ -1,8 +1,6 @@
 """The choice of a backend, absent packages, and what importing the renderer loads."""
 
 import math
-import os
-import subprocess
 import sys
 import tomllib
 from importlib.util import find_spec
@@ -16,6 +14,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.errors import DeviceError, InvalidArgumentError
 from cvtgs.progress import ProgressEvent
 from cvtgs.rendering import choose_backend, render
+from process_cases import python
 from scenes import random_scene
 
 ROOT = Path(__file__).parents[2]
@@ -25,19 +24,6 @@ CAMERAS = Cameras(
     width=8,
     height=6,
 )
-
-
-def python(program):
-    """Run a program in a fresh interpreter; return the lines that it prints."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    result = subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=environment,
-    )
-    return result.stdout.splitlines()
 
 
 def test_auto_takes_numba_on_a_cpu_if_it_is_there():

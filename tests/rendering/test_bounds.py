@@ -1,14 +1,11 @@
 """Compiled kernels stay within their arrays, which numba does not check by default."""
 
-import os
-import subprocess
-import sys
-
 import pytest
 
 pytest.importorskip("numba")
 
 from cvtgs.rendering.kernels_tiles import span
+from process_cases import python
 
 PROGRAM = """
 import torch
@@ -47,16 +44,5 @@ def test_a_span_is_never_negative(low, high, pixels):
 
 @pytest.mark.long
 def test_no_kernel_leaves_its_arrays(tmp_path):
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
-        "NUMBA_BOUNDSCHECK": "1",
-        "NUMBA_CACHE_DIR": str(tmp_path),
-    }
-    found = subprocess.run(
-        [sys.executable, "-c", PROGRAM],
-        capture_output=True,
-        text=True,
-        env=environment,
-        check=False,
-    )
-    assert found.stdout == "within bounds\n", found.stderr
+    variables = {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
+    assert python(PROGRAM, **variables) == ["within bounds"]
