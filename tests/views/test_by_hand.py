@@ -146,6 +146,7 @@ def test_positions_within_a_range_of_distances_or_else_nearest_to_it(monkeypatch
         layout=layout_of(),
         least_growth=0.0,
         sharp_sides=torch.zeros(32).bool(),
+        cluttered=torch.zeros(0, 3).double(),
         eyes=distances[:, None] * UP,
         distances=distances,
     ).near(40, reach, seed=0)
@@ -158,7 +159,8 @@ def test_a_view_is_too_close_at_less_than_half_of_the_usual_distance(monkeypatch
 
     def sizes(*_) -> SplatSizes:
         distances = torch.tensor([1.0, other, other]).double()
-        return SplatSizes(0.01 / distances, torch.full((3,), 0.01).double())
+        same = torch.full((3,), 0.01).double()
+        return SplatSizes(0.01 / distances, same, same)
 
     monkeypatch.setattr(mixed, "splat_sizes", sizes)
     tried = [(cameras_on_a_line([0.0, 1.0, 2.0]), 1)]

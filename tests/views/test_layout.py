@@ -59,7 +59,7 @@ def test_only_what_is_hidden_from_above_and_below_is_inside_matter(least_height,
 
 def test_sides_seen_from_below_are_not_sharp(monkeypatch):
     def smallest(_, cameras) -> SplatSizes:
-        return SplatSizes(torch.zeros(len(cameras)), torch.zeros(len(cameras)))
+        return SplatSizes(*torch.zeros(3, len(cameras)))
 
     monkeypatch.setattr(positions, "splat_sizes", smallest)
     directions = vars(positions)["_side_directions"]()

@@ -16,7 +16,7 @@ from cvtgs.views import automatic_views, find_view_positions, mixed_views, rando
 from cvtgs.views.automatic import inside_candidates
 from cvtgs.views.layout import find_layout, hidden_share
 from cvtgs.views.mixed import NEAR
-from cvtgs.views.scoring import splat_sizes
+from cvtgs.views.scoring import measure_splats, splat_sizes
 from cvtgs.views.up import Voxels, find_up
 
 HALF = math.sqrt(0.5)
@@ -143,6 +143,25 @@ def test_splat_sizes_are_those_in_the_image():
     sizes = splat_sizes(layout, cameras)
     assert sizes.in_image.tolist() == pytest.approx([0.5 * 0.1 / 2], rel=1e-5)
     assert sizes.in_scene.tolist() == pytest.approx([0.1 / layout.frame.radius], rel=1e-5)
+
+
+@pytest.mark.parametrize(("small", "finest"), [(1, 0.1), (3, 0.04)])
+def test_the_finest_splats_are_the_lower_decile_of_what_is_seen(small, finest):
+    """Each small splat paints some 6 % of what the large one does: one is less than a tenth."""
+    means = torch.tensor([[0.0, 0, 0], [0.6, 0, 0], [0.9, 0, 0], [1.2, 0, 0]])[: 1 + small]
+    widths = torch.tensor([0.1] + [0.04] * small).double()
+    camera = Cameras(
+        viewmats=look_at(
+            torch.tensor([[0.0, 0, -2]]).double(), torch.zeros(1, 3).double(), DOWN.double()
+        ),
+        Ks=torch.tensor([[[200.0, 0, 100], [0, 200, 100], [0, 0, 1]]]).double(),
+        width=200,
+        height=200,
+    )
+    scene = blobs(means, torch.tensor([0.1] + [0.025] * small).log())
+    sizes = measure_splats(scene, widths, 2.0, camera)
+    assert sizes.finest.tolist() == pytest.approx([finest / 2.0])
+    assert sizes.in_scene.tolist() == pytest.approx([0.1 / 2.0])
 
 
 def test_every_fourth_gaussian_shows_nearly_the_same_sizes(monkeypatch):

@@ -202,8 +202,9 @@ def find_layout(scene: GaussianScene) -> SceneLayout:
 
     Memory: a mask per attribute, and a sample of at most 30,000 Gaussians.
     """
-    valid = _valid(scene)
-    sample, positions = _sample(valid), _visible_positions(valid)
+    valid = valid_part(scene)
+    sample, _ = covering_sample(valid, SAMPLE_SIZE)
+    positions = _visible_positions(valid)
     frame = robust_frame(positions)
     voxels, local = voxelize(sample, frame), frame.normalize(positions)
     distances = torch.linalg.vector_norm(local, dim=1)
@@ -237,7 +238,8 @@ def find_layout(scene: GaussianScene) -> SceneLayout:
     )
 
 
-def _valid(scene: GaussianScene) -> GaussianScene:
+def valid_part(scene: GaussianScene) -> GaussianScene:
+    """Return the valid rows of a scene that has some."""
     valid = valid_rows(scene)
     if not bool(valid.any()):
         raise InvalidSceneError(
@@ -262,16 +264,27 @@ def _far_directions(
     return torch.nn.functional.normalize(far[:0] if few else far, dim=1)
 
 
-def _sample(scene: GaussianScene) -> GaussianScene:
-    """Return the heaviest Gaussians and every k-th other, enlarged to cover for omitted ones."""
+def covering_sample(scene: GaussianScene, count: int) -> tuple[GaussianScene, Float[Tensor, "k 1"]]:
+    """Return the heaviest Gaussians and every k-th other, enlarged to cover for omitted ones.
+
+    Args:
+        scene: The scene; only valid rows.
+        count: Largest number of Gaussians of the sample.
+
+    Returns:
+        The scene or a sample of it, SH degree 0, on the CPU; and how much was added to log scales.
+    """
     plain = scene.with_tensors({"shN": scene.shN[:, :0]}, {})
-    if len(scene) > SAMPLE_SIZE:
+    enlargement = torch.zeros(len(scene), 1, dtype=scene.dtype, device=scene.device)
+    if len(scene) > count:
         heaviest_first = torch.sort(scene.masses, descending=True, stable=True).indices
         rest = torch.sort(heaviest_first[_HEAVIEST:]).values
-        step = -(-len(rest) // (SAMPLE_SIZE - _HEAVIEST))
+        step = -(-len(rest) // (count - _HEAVIEST))
         rows = torch.cat([heaviest_first[:_HEAVIEST], rest[::step]])
-        inflation = torch.zeros(len(rows), 1, dtype=scene.dtype, device=scene.device)
-        inflation[_HEAVIEST:] = 0.5 * torch.log(inflation.new_tensor(len(rest) / len(rest[::step])))
+        enlargement = enlargement[: len(rows)]
+        enlargement[_HEAVIEST:] = 0.5 * torch.log(
+            enlargement.new_tensor(len(rest) / len(rest[::step]))
+        )
         plain = plain.select(rows)
-        plain = plain.with_tensors({"log_scales": plain.log_scales + inflation}, {})
-    return with_finite_opacities(plain.to("cpu"))
+        plain = plain.with_tensors({"log_scales": plain.log_scales + enlargement}, {})
+    return with_finite_opacities(plain.to("cpu")), enlargement.cpu()

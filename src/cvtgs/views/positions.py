@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.scene import SceneLike, as_scene
+from cvtgs.views.clutter import split_by_clutter
 from cvtgs.views.layout import ENCLOSED, FREE, SceneLayout, enclosure, find_layout, size_growth
 from cvtgs.views.scoring import PIXELS, SMOOTH, cameras_at, splat_sizes
 
@@ -43,6 +44,8 @@ class CameraPositions:
         layout: Layout of the scene.
         least_growth: Least mean correlation of Gaussian size with distance at a good position.
         sharp_sides: ``(32,)`` whether the scene is sharp from each of 32 evenly spread directions.
+        cluttered: ``(k, 3)`` positions with clutter before the scene, scene units; none unless a
+            scene is clear from one side only.
         eyes: ``(p, 3)`` good positions among the candidates, scene units; at least one.
         distances: ``(p,)`` their distances from the centre of the frame, in robust radii.
     """
@@ -50,6 +53,7 @@ class CameraPositions:
     layout: SceneLayout
     least_growth: float
     sharp_sides: Bool[Tensor, "d"]
+    cluttered: Float[Tensor, "k 3"]
     eyes: Float[Tensor, "p 3"]
     distances: Float[Tensor, "p"]
 
@@ -59,7 +63,8 @@ class CameraPositions:
         A good position is free, above the floor if there is one, and inside the room if the scene
         is one, else not enclosed. Near Gaussians must also be smaller than distant ones, as is
         usual where images were taken, unless the position faces, from outside, a side of small
-        Gaussians: the smooth back of an object.
+        Gaussians: the smooth back of an object. No position with clutter before the scene may be
+        nearer than one without.
 
         Args:
             eyes: Positions, scene units.
@@ -67,6 +72,10 @@ class CameraPositions:
         free = stand_free(self.layout, eyes)
         unsure = free & ~_sees_sharp_sides(self.layout, eyes, self.sharp_sides)
         free[unsure] = _growths(self.layout, eyes[unsure]) >= self.least_growth
+        if len(self.cluttered):
+            gaps = torch.cdist(eyes, self.eyes).amin(dim=1)
+            free &= gaps <= torch.cdist(eyes, self.cluttered).amin(dim=1)
+            free &= gaps <= self.layout.frame.radius
         return free
 
     def near(self, count: int, reach: tuple[float, float], seed: int) -> Float[Tensor, "c 3"]:
@@ -115,7 +124,8 @@ def find_view_positions(scene: SceneLike) -> CameraPositions:
         >>> len(positions.near(3, REACH, seed=0))
         3
     """
-    layout = find_layout(as_scene(scene))
+    scene = as_scene(scene)
+    layout = find_layout(scene)
     generator = torch.Generator().manual_seed(_SEED)
     directions = torch.nn.functional.normalize(
         torch.randn(_TRIED, 3, generator=generator, dtype=torch.float64, device="cpu"), dim=1
@@ -131,11 +141,13 @@ def find_view_positions(scene: SceneLike) -> CameraPositions:
     grows = growths >= least
     sharp_sides = _sharp_sides(layout, eyes[~grows])
     eyes = eyes[grows | _sees_sharp_sides(layout, eyes, sharp_sides)]
+    eyes, cluttered = split_by_clutter(scene, layout, eyes)
     distances = torch.linalg.vector_norm(eyes - center, dim=1) / radius
     return CameraPositions(
         layout=layout,
         least_growth=least,
         sharp_sides=sharp_sides,
+        cluttered=cluttered,
         eyes=eyes,
         distances=distances,
     )

@@ -11,6 +11,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.math import parameters
 from cvtgs.rendering import observe, render
+from cvtgs.scene import GaussianScene
 from cvtgs.views.layout import SceneLayout
 
 PIXELS = 64
@@ -108,36 +109,54 @@ class SplatSizes(NamedTuple):
     Attributes:
         in_image: ``(c,)`` projected standard deviations as a share of the image, float64.
         in_scene: ``(c,)`` standard deviations as a share of the robust radius, float64.
+        finest: ``(c,)`` their lower decile instead of the median.
     """
 
     in_image: Float[Tensor, "c"]
     in_scene: Float[Tensor, "c"]
+    finest: Float[Tensor, "c"]
 
 
 def splat_sizes(layout: SceneLayout, cameras: Cameras) -> SplatSizes:
     """Return the median size of the splats that each camera shows, for at least one camera."""
-    small, step = _small(cameras), _SPARSE if len(layout.sample) >= _FEW else 1
+    step = _SPARSE if len(layout.sample) >= _FEW else 1
     sample = layout.sample.select(torch.arange(0, len(layout.sample), step, device="cpu"))
-    means = sample.means.double()
-    widths = sample.log_scales.double().sort(dim=1).values[:, 1:].mean(dim=1).exp()
+    widths = splat_widths(sample)
     enlarged = sample.log_scales + 0.5 * math.log(step)
     sample = sample.with_tensors({"log_scales": enlarged}, {})
-    in_image, in_scene = [], []
-    for camera in small.singles():
-        painted = observe(sample, camera).contributions.double()
+    return measure_splats(sample, widths, layout.frame.radius, _small(cameras))
+
+
+def splat_widths(scene: GaussianScene) -> Float[Tensor, "n"]:
+    """Return the geometric mean of the larger two standard deviations, float64."""
+    return scene.log_scales.double().sort(dim=1).values[:, 1:].mean(dim=1).exp()
+
+
+def measure_splats(
+    scene: GaussianScene, widths: Float[Tensor, "n"], radius: float, cameras: Cameras
+) -> SplatSizes:
+    """Return the sizes of the splats that cameras show; ``widths`` need not be as drawn."""
+    means = scene.means.double()
+    in_image, in_scene, finest = [], [], []
+    for camera in cameras.singles():
+        painted = observe(scene, camera).contributions.double()
         ahead = means @ camera.viewmats[0, 2, :3] + camera.viewmats[0, 2, 3]
         seen = painted > 0
         seen |= ~seen.any()  # an empty image shows no size
         near = widths[seen] / ahead[seen].clamp_min(1e-9)
-        in_image.append(_weighted_median(near, painted[seen]) * camera.Ks[0, 0, 0] / PIXELS)
-        in_scene.append(_weighted_median(widths[seen], painted[seen]) / layout.frame.radius)
-    return SplatSizes(torch.stack(in_image), torch.stack(in_scene))
+        share_of_image = camera.Ks[0, 0, 0] / max(camera.width, camera.height)
+        in_image.append(_weighted_quantile(near, painted[seen], 0.5) * share_of_image)
+        in_scene.append(_weighted_quantile(widths[seen], painted[seen], 0.5) / radius)
+        finest.append(_weighted_quantile(widths[seen], painted[seen], 0.1) / radius)
+    return SplatSizes(torch.stack(in_image), torch.stack(in_scene), torch.stack(finest))
 
 
-def _weighted_median(values: Float[Tensor, "n"], weights: Float[Tensor, "n"]) -> Tensor:
+def _weighted_quantile(
+    values: Float[Tensor, "n"], weights: Float[Tensor, "n"], share: float
+) -> Tensor:
     values, order = values.sort()
     shares = weights[order].cumsum(dim=0)
-    return values[torch.searchsorted(shares, 0.5 * shares[-1])]
+    return values[torch.searchsorted(shares, share * shares[-1])]
 
 
 def _inside_gaussians(layout: SceneLayout, cameras: Cameras) -> Bool[Tensor, "c"]:
