@@ -43,6 +43,13 @@ def tests(session: nox.Session) -> None:
     session.run("pytest", *PARALLEL, "-m", "not long", *session.posargs)
 
 
+@nox.session(venv_backend="uv")
+def oldest(session: nox.Session) -> None:
+    """Tests with the oldest versions that pyproject.toml allows; needs uv, loads CUDA's torch."""
+    session.install("--resolution", "lowest-direct", "-e", ".[test]")
+    session.run("pytest", *PARALLEL, "-m", "not slow and not long", "-W", "default")
+
+
 @nox.session
 def coverage(session: nox.Session) -> None:
     """All tests with line and branch coverage, at least 95 %."""

@@ -5,7 +5,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import sph_harm_y
+
+try:
+    from scipy.special import sph_harm_y
+except ImportError:  # before scipy 1.15
+    from scipy.special import sph_harm
+
+    def sph_harm_y(n, m, theta, phi):
+        return sph_harm(m, n, phi, theta)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -98,6 +98,7 @@ def test_dropped_data_is_warned_about_in_full(tmp_path: Path) -> None:
     assert len(load(path)) == 3
 
 
+@pytest.mark.filterwarnings("error")
 def test_a_warning_that_is_an_error_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(DroppedDataWarning):
         save(storable_scene(4, degree=1), tmp_path / "a.splat")

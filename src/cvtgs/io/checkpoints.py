@@ -1,5 +1,6 @@
 """Read scenes from checkpoints of gsplat's trainer and of nerfstudio's Splatfacto."""
 
+import codecs
 import pickletools
 import re
 import warnings
@@ -168,8 +169,9 @@ def _numpy_numbers_ignored() -> Iterator[None]:
         _ignored_number("numpy.core.multiarray"),
         _ignored_number("numpy._core.multiarray"),
         type("dtype", (_IgnoredType,), {"__module__": "numpy"}),
+        codecs.encode,  # torch 2.6 and later allows it anyway
     ]
-    before = torch.serialization.get_safe_globals()
+    before = list(torch.serialization.get_safe_globals())
     torch.serialization.add_safe_globals(stand_ins)
     try:
         yield

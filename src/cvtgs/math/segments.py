@@ -8,6 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+_WEIGHTS_ONLY_FAIL = torch.torch_version.TorchVersion(torch.__version__) < "2.6"
+"""Whether ``embedding_bag`` fails if weights require gradients and the table does not."""
+
 
 def sort_by_label(
     labels: Int[Tensor, "n"], count: int
@@ -242,6 +245,8 @@ def segment_sum_of(
         [6.0, 1.0]
     """
     flat = table.detach().reshape(table.shape[0], math.prod(table.shape[1:]))
+    if weights.requires_grad and _WEIGHTS_ONLY_FAIL:
+        flat.requires_grad_()
     sums = torch.nn.functional.embedding_bag(
         rows, flat, offsets, mode="sum", per_sample_weights=weights, include_last_offset=True
     )

@@ -69,7 +69,9 @@ class Validation(NamedTuple):
         }
 
 
-_VALIDATIONS = pydantic.TypeAdapter(list[Validation])
+_VALIDATIONS = pydantic.TypeAdapter(
+    list[Validation], config=pydantic.ConfigDict(ser_json_inf_nan="strings")
+)
 
 
 class History:
