@@ -163,7 +163,7 @@ def check_levels(
                 ".ply and convert those files."
             )
     place = Path(folder)
-    if not place.exists():
+    if not os.path.exists(place):  # noqa: PTH110 (false for impossible names)
         check_output(place)  # its parent is there and writable
         for name in names:
             check_save(place.parent / f".{name}", overwrite=True)

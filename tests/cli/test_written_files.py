@@ -131,6 +131,18 @@ def test_no_lock_file_is_left(scene, name):
     assert not list((scene / "out").rglob(".*"))
 
 
+@pytest.mark.parametrize("name", [*COMMANDS, "demo", "cameras"])
+@pytest.mark.parametrize("length", [253, 300])  # a folder may have 255 bytes, its lock has 6 more
+def test_a_name_that_is_too_long_is_one_sentence(scene, capsys, name, length):
+    others = {"demo": "demo -o {}/out", "cameras": "render {}/in.ply -o {}/new --cameras {}/out"}
+    words = (COMMANDS | others)[name].replace("{}/out", "{}/" + "x" * length)
+    assert main(words.replace("{}", str(scene)).split()) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "name too long" in error or (name, length) == ("cameras", 253)  # merely none there
+    assert [path.name for path in scene.iterdir()] == ["in.ply"]
+
+
 def test_every_command_with_a_lock_has_an_output():
     for command in WRITE_SEVERAL:
         assert "-o" in build_parser()._subparsers._group_actions[0].choices[command].format_help()

@@ -21,6 +21,7 @@ from cvtgs.errors import (
     InvalidArgumentError,
     reason_of,
 )
+from cvtgs.io.files import is_folder
 
 Encoding = Literal["png", "webp"]
 
@@ -259,7 +260,7 @@ def _find_all(place: Path, cameras: Cameras) -> list[Path]:
         raise InvalidArgumentError(
             "photographs are matched by the names of the cameras, but these have none."
         )
-    if not place.is_dir():
+    if not is_folder(place):
         raise InputNotFoundError(f"{place}: the folder of photographs must exist, found none.")
     found = [_find(place, name) for name in cameras.names]  # names may repeat
     missing = [name for name, path in zip(cameras.names, found, strict=True) if path is None]

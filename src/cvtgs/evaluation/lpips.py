@@ -19,7 +19,7 @@ from cvtgs.errors import (
     InvalidArgumentError,
     MissingDependencyError,
 )
-from cvtgs.io.files import open_input
+from cvtgs.io.files import is_folder, open_input
 from cvtgs.losses import check_pair
 
 LPIPS_VARIABLE = "CVTGS_LPIPS_WEIGHTS"
@@ -260,7 +260,7 @@ def _weight_files(network: LpipsNetwork, path: str | os.PathLike[str] | None) ->
     given = os.fspath(path) if path is not None else os.environ.get(LPIPS_VARIABLE, "")
     if given:
         place = Path(given)
-        found = sorted(place.glob(f"lpips_{network}*.pth")) if place.is_dir() else [place]
+        found = sorted(place.glob(f"lpips_{network}*.pth")) if is_folder(place) else [place]
         if not found:
             raise InputNotFoundError(
                 f"{place}: the folder must hold a file lpips_{network}*.pth, found none."

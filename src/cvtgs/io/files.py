@@ -71,6 +71,11 @@ def is_file(path: Path) -> bool:
     return os.path.isfile(path)  # noqa: PTH113 (Path.is_file raises without permission)
 
 
+def is_folder(path: Path) -> bool:
+    """Return whether a folder exists; False if its parent is not readable or the name too long."""
+    return os.path.isdir(path)  # noqa: PTH112 (Path.is_dir raises for both)
+
+
 def scene_file(path: str | os.PathLike[str]) -> Path:
     """Find the file that holds the scene of a folder.
 
@@ -96,7 +101,7 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
         'scene.ply'
     """
     folder = Path(path)
-    if not os.path.isdir(folder):  # noqa: PTH112 (Path.is_dir raises without permission)
+    if not is_folder(folder):
         return folder
     try:
         found = next(_scenes(folder), None)

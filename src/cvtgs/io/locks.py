@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from cvtgs.errors import OutputBusyError, OutputError, reason_of
+from cvtgs.io.files import is_folder
 
 
 @contextmanager
@@ -65,7 +66,7 @@ def folder_lock(path: str | os.PathLike[str]) -> Iterator[None]:
 def lock_path(path: str | os.PathLike[str]) -> Path:
     """Return the lock file of an output: beside it, or in it if its parent is not writable."""
     target = Path(os.path.realpath(path))
-    if target.is_dir() and not os.access(target.parent, os.W_OK | os.X_OK):
+    if is_folder(target) and not os.access(target.parent, os.W_OK | os.X_OK):
         return target / ".lock"
     return target.with_name(f".{target.name}.lock")
 

@@ -160,7 +160,7 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
         names = " or ".join(INDEX_NAMES)
         raise InvalidArgumentError(f"kind of a stream must be {names}, found {kind!r}.")
     place = Path(folder)
-    if not place.exists():
+    if not os.path.exists(place):  # noqa: PTH110 (false for impossible names)
         check_output(place)  # checks that its parent exists and is writable
         return
     index = place / INDEX_NAMES[kind]

@@ -12,6 +12,7 @@ import torch
 from cvtgs import synthetic
 from cvtgs.errors import ConfigError
 from cvtgs.io import load
+from cvtgs.io.files import is_folder
 from cvtgs.math import parameters
 from cvtgs.mergenet import LearnedScene
 from cvtgs.scene import GaussianScene
@@ -81,7 +82,7 @@ def find_sources(config: DataConfig, *, seed: int) -> list[Source]:
 
 
 def _files_in(folder: Path) -> list[Path]:
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise ConfigError(f"data.folders: {folder} is not a folder.")
     files = sorted(folder.rglob("*.ply"))
     if not files:

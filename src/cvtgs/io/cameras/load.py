@@ -6,7 +6,7 @@ from pathlib import Path
 from cvtgs.cameras import Cameras
 from cvtgs.errors import FileFormatError, InputNotFoundError, InvalidArgumentError
 from cvtgs.io.cameras.views import SPLITS, Split, View, hold_out, to_cameras
-from cvtgs.io.files import is_file
+from cvtgs.io.files import is_file, is_folder
 
 _COLMAP_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 _KNOWN_FILES = (
@@ -65,7 +65,7 @@ def load_cameras(path: str | os.PathLike[str], *, split: Split | None = None) ->
     if split is not None and split not in SPLITS:
         raise InvalidArgumentError(f"split must be 'train', 'test' or None, found {split!r}.")
     source = Path(path)
-    views = _folder_views(source, split) if source.is_dir() else _file_views(source, split)
+    views = _folder_views(source, split) if is_folder(source) else _file_views(source, split)
     if not views:
         raise FileFormatError(
             f"{source}: must hold at least one {f'{split} ' if split else ''}camera, found none."
