@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import cvtgs
+from cvtgs.errors import how_to_install
 
 ROOT = Path(__file__).parent.parent
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -55,6 +56,19 @@ def test_the_docker_context_holds_the_copied_files():
     assert [name for name in copied if not (ROOT / name).exists()] == []
     extras = re.search(r'"\.\[(.*)\]"', read("Dockerfile"))[1].split(",")
     assert set(extras) <= set(PROJECT["optional-dependencies"])
+
+
+def test_messages_and_pages_say_in_the_same_words_how_to_install_an_extra():
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    told = [line for page in pages for line in re.findall(r"`(.*pip .*\[.*?)`", page.read_text())]
+    assert [text for text in told if not re.search(r'python -m pip install "cvtgs\[', text)] == []
+    sources = "".join(path.read_text() for path in Path(cvtgs.__file__).parent.rglob("*.py"))
+    extras = re.findall(r"how_to_install\('cvtgs\[(\w+)\]'", sources)
+    assert set(extras) == {"dask", "gsplat", "lpips", "plots", "view"}
+    assert set(extras) <= set(PROJECT["optional-dependencies"])
+    assert how_to_install("cvtgs[view]", "torch==2") == (
+        'install it with python -m pip install "cvtgs[view]" torch==2'
+    )
 
 
 def test_actions_are_pinned_by_their_commits():

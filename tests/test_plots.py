@@ -82,7 +82,7 @@ def test_a_missing_package_is_one_clear_error(monkeypatch):
         line_chart([Panel(series=[LOSS])])
     assert str(caught.value) == (
         "charts need matplotlib, which is not installed; "
-        "install it with: pip install 'cvtgs[plots]'."
+        'install it with python -m pip install "cvtgs[plots]".'
     )
 
 

@@ -197,6 +197,6 @@ def test_the_command_writes_a_page(
 
 def test_a_missing_viser_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'cvtgs\[view\]'"):
+    with pytest.raises(MissingDependencyError, match=r'pip install "cvtgs\[view\]"'):
         ViewerServer(SceneViewer(random_scene(3)))
     assert main(["view", str(tmp_path / "missing.ply")]) == 1

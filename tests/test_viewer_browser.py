@@ -27,7 +27,7 @@ MOST = 1.5
 """Largest mean difference from our image, of 255 levels; we measured 0.5, and 3 at another size."""
 
 pytestmark = [needs_browser, pytest.mark.long, pytest.mark.filterwarnings("ignore")]
-pytest.importorskip("viser", reason="needs viser: pip install 'cvtgs[view]'")
+pytest.importorskip("viser", reason="needs the extra cvtgs[view]")
 
 
 @pytest.fixture(scope="module")

@@ -111,6 +111,16 @@ def reason_of(error: Exception) -> str:
     return (getattr(error, "strerror", None) or str(error)).lower()
 
 
+def how_to_install(*packages: str) -> str:
+    """Return the end of a message about a missing package: the command that installs it.
+
+    An extra (``cvtgs[view]``) is added to the cvtgs that is installed. The quotes are those that
+    the shells of all systems know.
+    """
+    words = (f'"{package}"' if "[" in package else package for package in packages)
+    return f"install it with python -m pip install {' '.join(words)}"
+
+
 def is_out_of_memory(error: BaseException) -> bool:
     """Check whether an error of any library means that there is not enough memory."""
     if isinstance(error, MemoryError):

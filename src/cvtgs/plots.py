@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from cvtgs.errors import InvalidArgumentError, MissingDependencyError
+from cvtgs.errors import InvalidArgumentError, MissingDependencyError, how_to_install
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 """Palette of Okabe and Ito 2008, distinct with any colour vision."""
@@ -127,8 +127,7 @@ def _figure(width: float, height: float) -> Any:
         from matplotlib.figure import Figure  # noqa: PLC0415
     except ImportError as error:
         raise MissingDependencyError(
-            "charts need matplotlib, which is not installed; "
-            "install it with: pip install 'cvtgs[plots]'."
+            f"charts need matplotlib, which is not installed; {how_to_install('cvtgs[plots]')}."
         ) from error
     figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)

@@ -84,8 +84,8 @@ def test_the_summary_says_that_matplotlib_is_missing(again, tmp_path, capsys, mo
     assert main(again) == 0
     last = capsys.readouterr().out.splitlines()[-1]
     assert last == (
-        f"{tmp_path / 'net.safetensors'}, no image of its curves, which needs "
-        "pip install 'cvtgs[plots]'"
+        f"{tmp_path / 'net.safetensors'}, no image of its curves, which needs matplotlib; "
+        'install it with python -m pip install "cvtgs[plots]"'
     )
 
 

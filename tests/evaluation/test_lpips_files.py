@@ -103,7 +103,8 @@ def test_missing_weights_are_an_error_with_advice(monkeypatch) -> None:
         lpips(first, second)
     assert str(error.value) == (
         "the weights must be at the path CVTGS_LPIPS_WEIGHTS or in the package lpips, found "
-        "neither; pip install 'cvtgs[lpips]' torch==2.13.0 installs it and keeps this torch."
+        'neither; install it with python -m pip install "cvtgs[lpips]" torch==2.13.0, which keeps '
+        "this torch."
     )
 
 

@@ -73,7 +73,7 @@ def test_the_command_simplifies_on_a_cluster(cluster, source, tmp_path):
 @pytest.mark.slow
 def test_without_the_package_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'cvtgs\[dask\]'"):
+    with pytest.raises(MissingDependencyError, match=r'pip install "cvtgs\[dask\]"'):
         connect("tcp://127.0.0.1:1")
 
 

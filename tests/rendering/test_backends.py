@@ -74,7 +74,7 @@ def test_without_numba_auto_takes_torch_and_numba_is_refused():
         "torch",
         "backend 'numba' needs the package numba, which cannot be imported "
         "(import of numba halted; None in sys.modules); "
-        "install it with: pip install numba, or use backend='torch'.",
+        "install it with python -m pip install numba, or use backend='torch'.",
     ]
 
 

@@ -51,7 +51,7 @@ def reason():
         choose_backend("gsplat", CUDA)
     begin, end = (
         "backend 'gsplat' needs a working gsplat, but ",
-        "; install it with: pip install 'cvtgs[gsplat]', or use backend='torch'.",
+        "; install it with python -m pip install \"cvtgs[gsplat]\", or use backend='torch'.",
     )
     assert str(caught.value).startswith(begin)
     assert str(caught.value).endswith(end)

@@ -251,7 +251,7 @@ def test_without_matplotlib_only_the_plot_is_missing(measured, tmp_path, monkeyp
         monkeypatch.setitem(sys.modules, name, None)
     paths, note = write_tradeoff(measured, tmp_path)
     assert [path.name for path in paths] == ["tradeoff.csv", "tradeoff.json", "index.html"]
-    assert "pip install 'cvtgs[plots]'" in note
+    assert 'pip install "cvtgs[plots]"' in note
 
 
 def test_time_and_memory_of_a_process_are_measured():

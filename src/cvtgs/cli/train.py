@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import cvtgs
 from cvtgs.cli.display import progress_bars, say
 from cvtgs.cli.options import AddParser, add_options
-from cvtgs.errors import OutputError
+from cvtgs.errors import OutputError, how_to_install
 
 if TYPE_CHECKING:
     from cvtgs.train import History, TrainConfig
 
-WITHOUT_CURVES = "no image of its curves, which needs pip install 'cvtgs[plots]'"
+WITHOUT_CURVES = f"no image of its curves, which needs matplotlib; {how_to_install('cvtgs[plots]')}"
 
 
 def add_train(add_parser: AddParser) -> None:

@@ -18,6 +18,7 @@ from cvtgs.errors import (
     InputNotFoundError,
     InvalidArgumentError,
     MissingDependencyError,
+    how_to_install,
 )
 from cvtgs.io.files import is_folder, open_input
 from cvtgs.losses import check_pair
@@ -272,7 +273,7 @@ def _weight_files(network: LpipsNetwork, path: str | os.PathLike[str] | None) ->
         mine = torch.__version__.partition("+")[0]
         raise MissingDependencyError(
             f"the weights must be at the path {LPIPS_VARIABLE} or in the package lpips, found "
-            f"neither; pip install 'cvtgs[lpips]' torch=={mine} installs it and keeps this torch."
+            f"neither; {how_to_install('cvtgs[lpips]', f'torch=={mine}')}, which keeps this torch."
         )
     backbone = Path(torch.hub.get_dir()) / "checkpoints" / _BACKBONES[network]
     files = backbone, Path(spec.origin).parent / "weights" / "v0.1" / f"{network}.pth"

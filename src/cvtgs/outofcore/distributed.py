@@ -16,7 +16,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 
 import cvtgs
-from cvtgs.errors import CvtgsError, MissingDependencyError, RunError, is_out_of_memory
+from cvtgs.errors import (
+    CvtgsError,
+    MissingDependencyError,
+    RunError,
+    how_to_install,
+    is_out_of_memory,
+)
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.run import simplify_file
 from cvtgs.outofcore.workers import Item, Result
@@ -92,7 +98,7 @@ def connect(address: str) -> "Client":
     except ImportError as error:
         raise MissingDependencyError(
             "running on several machines needs the package distributed; "
-            "install it with: pip install 'cvtgs[dask]'."
+            f"{how_to_install('cvtgs[dask]')}."
         ) from error
     for name in ("distributed", "distributed.client"):  # their messages are raised as errors, too
         logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cvtgs.errors import MissingDependencyError, is_out_of_memory
+from cvtgs.errors import MissingDependencyError, how_to_install, is_out_of_memory
 
 try:
     import numba
@@ -22,7 +22,7 @@ except (ImportError, OSError) as error:
         raise MemoryError from error
     raise MissingDependencyError(
         f"backend 'numba' needs the package numba, which cannot be imported ({error}); "
-        f"install it with: pip install numba, or use backend='torch'."
+        f"{how_to_install('numba')}, or use backend='torch'."
     ) from error
 
 Array = NDArray[Any]

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
-from cvtgs.errors import DeviceError, MissingDependencyError
+from cvtgs.errors import DeviceError, MissingDependencyError, how_to_install
 from cvtgs.math.spherical_harmonics import REST_COUNTS, evaluate
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.rendering import torch_backend
@@ -49,7 +49,7 @@ def require(device: torch.device) -> None:
     if failure:
         raise MissingDependencyError(
             f"backend 'gsplat' needs a working gsplat, but {failure}; "
-            f"install it with: pip install 'cvtgs[gsplat]', or use backend='torch'."
+            f"{how_to_install('cvtgs[gsplat]')}, or use backend='torch'."
         )
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from cvtgs.errors import MissingDependencyError
+from cvtgs.errors import MissingDependencyError, how_to_install
 from cvtgs.math.frames import robust_frame
 from cvtgs.math.parameters import build_covariances, normalize_quats
 from cvtgs.math.spherical_harmonics import SH_C0
@@ -149,6 +149,6 @@ def _viser() -> Any:
         import viser  # noqa: PLC0415 (optional)
     except ImportError as error:
         raise MissingDependencyError(
-            "the viewer needs the package viser; install it with: pip install 'cvtgs[view]'."
+            f"the viewer needs the package viser; {how_to_install('cvtgs[view]')}."
         ) from error
     return viser
