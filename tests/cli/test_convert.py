@@ -111,6 +111,7 @@ def test_losses_depend_on_the_format() -> None:
     for name in ("a.spz", "a.sog", "a.compressed.ply"):
         assert any("view-dependent" in phrase for phrase in losses(scene, name).changed)
         assert not any("view-dependent" in phrase for phrase in losses(flat, name).changed)
+        assert not any("SH" in phrase for phrase in losses(flat, name).changed)
     assert losses(other, "a.spz").dropped == ()
 
 

@@ -117,12 +117,12 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
             changed=(
                 "rows in Morton order",
                 "positions in 65,536 steps of sign(x) log(1 + |x|) between minimum and maximum",
-                "scales, colours and SH coefficients limited to 256 different values each",
+                "scales and colours limited to 256 different values each",
                 "rotations in steps of 1/180 per component",
                 "opacities in steps of 1/255",
             ),
-            changed_bands="view-dependent colours from a palette of half as many entries or more, "
-            "at most 65,536",
+            changed_bands="view-dependent SH coefficients limited to 256 different values, in a "
+            "palette of at least half as many entries as Gaussians and at most 65,536",
         ),
     }
 )
