@@ -134,6 +134,20 @@ def test_flyaways_round_only_what_is_hardly_visible(
     assert (found.means > 0.9 * far).all(dim=1).sum() == len(rows)
 
 
+@pytest.mark.parametrize("end", [".compressed.ply", ".sog"])
+@pytest.mark.parametrize("size", [1e-6, 1.0, 3e38])
+def test_positions_up_to_the_largest_float32_are_written(
+    tmp_path: Path, end: str, size: float
+) -> None:
+    scene = storable_scene(300)
+    means, largest = size * scene.means.clamp(-1, 1), torch.finfo(torch.float32).max
+    means[:2] = torch.tensor([[largest, largest, largest], [-largest, -largest, -largest]])
+    save(scene.with_tensors({"means": means}), tmp_path / f"a{end}")
+    found = load(tmp_path / f"a{end}").means
+    assert found.amax().item() == pytest.approx(largest)
+    assert found.amin().item() == pytest.approx(-largest)
+
+
 def test_equal_gaussians_are_stored_exactly(tmp_path: Path) -> None:
     path = tmp_path / "a.compressed.ply"
     scene = storable_scene(1).select(torch.zeros(300, dtype=torch.int64))

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
+from cvtgs.errors import InvalidSceneError
 from cvtgs.math.frames import RobustFrame
 from cvtgs.views import automatic, layout, mixed, own, positions, scoring, up
 from cvtgs.views.layout import SceneLayout
@@ -47,6 +48,16 @@ def test_surfaces_beneath_do_not_enclose():
     assert layout.enclosure(eye, directions, UP) == 1.0
     one = torch.tensor([[0.5, 0.1, 0.9]]).double()
     assert layout.enclosure(eye, one, UP) == pytest.approx(1 / 60)
+
+
+def test_a_flyaway_at_the_largest_float32_does_not_matter_but_a_whole_scene_there_is_refused():
+    largest = torch.finfo(torch.float32).max
+    scene = random_scene(200)
+    means = scene.means / scene.means.abs().amax()
+    with pytest.raises(InvalidSceneError, match=r"within 1e\+14 units of .* one of \S+e\+38 units"):
+        layout.find_layout(scene.with_tensors({"means": largest * means}))
+    means[:2] = torch.tensor([[largest, -largest, 0], [-largest, largest, 0]])
+    assert layout.find_layout(scene.with_tensors({"means": means})).frame.radius < 2
 
 
 @pytest.mark.parametrize(("least_height", "is_free"), [(-1.0, False), (0.0, True), (0.5, True)])

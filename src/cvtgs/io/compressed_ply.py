@@ -275,11 +275,12 @@ def _fractions(
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "c 6"]]:
     """Return values as fractions of the range of their chunk, and the ranges."""
     starts = np.arange(0, len(values), _CHUNK_ROWS)
-    low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+    halves = values / 2  # exact, and no difference of two of them overflows
+    low, high = np.minimum.reduceat(halves, starts), np.maximum.reduceat(halves, starts)
     size = np.diff(np.append(starts, len(values)))
     below, width = np.repeat(low, size, axis=0), np.repeat(high - low, size, axis=0)
-    fractions = np.where(width > 0, (values - below) / np.where(width > 0, width, 1), 0)
-    return fractions, np.concatenate([low, high], axis=1)
+    fractions = np.where(width > 0, (halves - below) / np.where(width > 0, width, 1), 0)
+    return fractions, 2 * np.concatenate([low, high], axis=1)
 
 
 def _rest_bytes(rest: Float[np.ndarray, "n k"]) -> UInt8[np.ndarray, "n k"]:

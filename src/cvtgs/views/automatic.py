@@ -212,7 +212,7 @@ def automatic_views(
 
     Raises:
         InvalidArgumentError: Count or size is below 1.
-        InvalidSceneError: The scene has no valid row.
+        InvalidSceneError: The scene has no valid row, or is larger than 1e14 units.
 
     Example:
         >>> from cvtgs.synthetic import scene

@@ -163,6 +163,8 @@ _BOUNDED = 3.2
 _FAR = 4.0
 _FAR_SHARE = 0.02
 _HEIGHTS = (0.02, 0.98)
+_LARGEST = 1e14
+"""Units beyond which directions of length 1 vanish beside positions in float64."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -206,6 +208,13 @@ def find_layout(scene: GaussianScene) -> SceneLayout:
     sample, _ = covering_sample(valid, SAMPLE_SIZE)
     positions = _visible_positions(valid)
     frame = robust_frame(positions)
+    width = 2 * float(sample.scales.amax(dim=1).median())  # the extent if all centres coincide
+    largest = max(float(frame.center.abs().amax()), frame.radius, width)
+    if largest > _LARGEST:
+        raise InvalidSceneError(
+            f"automatic views need a scene within {_LARGEST:g} units of the origin, found one of "
+            f"{largest:.3g} units; scale it first (cvtgs.edit.move, convert --scale)."
+        )
     voxels, local = voxelize(sample, frame), frame.normalize(positions)
     distances = torch.linalg.vector_norm(local, dim=1)
     bounded = float(distances.quantile(0.97)) < _BOUNDED
@@ -218,7 +227,6 @@ def find_layout(scene: GaussianScene) -> SceneLayout:
     middle = 0.5 * (low + high) if bounded else torch.zeros_like(low)
     spread = torch.linalg.vector_norm(positions - middle, dim=1)
     radius = float(spread.amax()) if bounded else 1.0
-    width = 2 * float(sample.scales.amax(dim=1).median())  # the extent if all centres coincide
     center = frame.center + frame.radius * middle
     floor = find_floor(voxels, up)
     sized = sized_points(sample)

@@ -59,7 +59,7 @@ def random_views(
         with a field of view of 50 degrees; in a room at random surfaces, with 65 degrees.
 
     Raises:
-        InvalidSceneError: The scene has no valid row.
+        InvalidSceneError: The scene has no valid row, or is larger than 1e14 units.
 
     Example:
         >>> from cvtgs.synthetic import scene
@@ -126,7 +126,7 @@ def mixed_views(
 
     Raises:
         InvalidArgumentError: Count or size is below 1.
-        InvalidSceneError: The scene has no valid row.
+        InvalidSceneError: The scene has no valid row, or is larger than 1e14 units.
 
     Example:
         >>> from cvtgs.synthetic import scene

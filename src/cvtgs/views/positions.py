@@ -116,7 +116,7 @@ def find_view_positions(scene: SceneLike) -> CameraPositions:
         one that is above the floor.
 
     Raises:
-        InvalidSceneError: The scene has no valid row.
+        InvalidSceneError: The scene has no valid row, or is larger than 1e14 units.
 
     Example:
         >>> from cvtgs.synthetic import scene
