@@ -54,6 +54,9 @@ def test_background_shines_through(backend):
     cameras = straight()
     found = render(scene, cameras, backend=backend, background=torch.tensor([0.0, 1.0, 0.5]))
     assert found.rgb[0, 3, 4].tolist() == pytest.approx([0.25, 0.75, 0.375])
+    for color in ((0.0, 1, 0.5), [0, 1.0, 0.5]):
+        same = render(scene, cameras, backend=backend, background=color)
+        assert torch.equal(same.rgb, found.rgb)
     two = replace(cameras, viewmats=cameras.viewmats.repeat(2, 1, 1), Ks=cameras.Ks.repeat(2, 1, 1))
     each = torch.tensor([[0.0, 0, 0], [1.0, 1, 1]])
     found = render(scene, two, backend=backend, background=each).rgb[:, 3, 4]
@@ -180,11 +183,17 @@ def test_no_gaussians_and_none_in_view(backend):
     [
         (
             {"background": torch.zeros(4)},
-            "background must be a tensor of shape (3,) or (1, 3), found shape (4,).",
+            "background must be three numbers, or a tensor of shape (3,) or (1, 3), found shape "
+            "(4,).",
         ),
         (
-            {"background": (0, 0, 0)},
-            "background must be a tensor of shape (3,) or (1, 3), found tuple.",
+            {"background": (0.5, 0.5)},
+            "background must be three numbers, or a tensor of shape (3,) or (1, 3), found shape "
+            "(2,).",
+        ),
+        (
+            {"background": "white"},
+            "background must be three numbers, or a tensor of shape (3,) or (1, 3), found 'white'.",
         ),
         (
             {"sh_degree": 2},

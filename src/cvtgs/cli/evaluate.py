@@ -72,7 +72,6 @@ def render(options: argparse.Namespace) -> None:
     paths = [options.output / name for name in file_names(cameras.view_names)]
     for path in paths:
         cvtgs.io.check_output(path, options.overwrite)
-    background = torch.tensor(background_color(options))
     with progress_bars(quiet=options.quiet) as listener, torch.no_grad():
         for number, path in enumerate(paths):
             listener(ProgressEvent(stage="render", done=number, total=len(paths)))
@@ -80,7 +79,7 @@ def render(options: argparse.Namespace) -> None:
                 scene,
                 cameras.select(torch.tensor([number])),
                 backend=options.backend,
-                background=background,
+                background=background_color(options),
             ).rgb[0]
             with cvtgs.io.atomic_output(path, overwrite=options.overwrite) as file:
                 file.write(encode(as_bytes(image), "png"))

@@ -1,5 +1,6 @@
 """Differentiable rendering of scenes, and the contribution of each Gaussian to the images."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +14,7 @@ from cvtgs.math import parameters
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.rendering.backends import BackendName, BlendingWeights, choose_backend
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
+from cvtgs.text import shown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,7 +42,7 @@ def render(
     cameras: Cameras,
     *,
     backend: BackendName = "auto",
-    background: Float[Tensor, "3"] | Float[Tensor, "c 3"] | None = None,
+    background: Float[Tensor, "3"] | Float[Tensor, "c 3"] | Sequence[float] | None = None,
     sh_degree: int | None = None,
     depth: bool = False,
     listener: ProgressListener = silent,
@@ -64,7 +66,8 @@ def render(
         cameras: The cameras, any dtype and device.
         backend: ``torch``, ``numba`` (CPU), ``gsplat`` (CUDA) or ``auto``, the fastest of them
             that works on the scene's device.
-        background: Background colour, one for all cameras or one for each; black if None.
+        background: Background colour, as three numbers or a tensor, or a tensor with one for each
+            camera; black if None.
         sh_degree: Highest SH degree to evaluate; that of the scene if None.
         depth: Whether to return depths too.
         listener: Called before the first camera and after each.
@@ -259,17 +262,18 @@ def _degree(scene: GaussianScene, sh_degree: int | None) -> int:
 
 
 def _background(
-    scene: GaussianScene, cameras: Cameras, background: Tensor | None
+    scene: GaussianScene, cameras: Cameras, background: Tensor | Sequence[float] | None
 ) -> Float[Tensor, "c_or_1 3"] | None:
     if background is None:
         return None
-    if not isinstance(background, Tensor) or background.shape not in ((3,), (len(cameras), 3)):
-        found = (
-            f"shape {tuple(background.shape)}"
-            if isinstance(background, Tensor)
-            else type(background).__name__
-        )
+    try:
+        colors = torch.as_tensor(background, dtype=scene.dtype, device=scene.device)
+        found = f"shape {tuple(colors.shape)}"
+    except (TypeError, ValueError):
+        colors, found = None, shown(background)
+    if colors is None or colors.shape not in ((3,), (len(cameras), 3)):
         raise InvalidArgumentError(
-            f"background must be a tensor of shape (3,) or ({len(cameras)}, 3), found {found}."
+            f"background must be three numbers, or a tensor of shape (3,) or ({len(cameras)}, 3), "
+            f"found {found}."
         )
-    return background.to(device=scene.device, dtype=scene.dtype).reshape(-1, 3)
+    return colors.reshape(-1, 3)
