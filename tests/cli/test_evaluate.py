@@ -140,6 +140,15 @@ def test_invalid_arguments_are_refused_in_one_sentence(scenes, capsys, words, te
     assert errors.count("\n") == 1
 
 
+def test_a_size_of_two_numbers_is_refused_with_an_example(capsys):
+    with pytest.raises(SystemExit):
+        main(["render", "a.ply", "-o", "out", "--size", "400x300"])
+    assert capsys.readouterr().err.endswith(
+        "argument --size: must be the longer side of the images in pixels, for example 400, "
+        "found '400x300'\n"
+    )
+
+
 def test_missing_photographs_are_counted_and_named(folder, scenes, tmp_path, capsys):
     words = ["--cameras", str(folder), "--images", str(tmp_path)]
     assert main(["evaluate", *scenes[:2], *words]) == 1
