@@ -190,7 +190,10 @@ full_disk = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /de
 
 @pytest.mark.slow
 @full_disk
-@pytest.mark.parametrize("words", [["info", "a.ply"], ["--version"], ["info", "--help"]])
+@pytest.mark.parametrize(
+    "words",
+    [["info", "a.ply"], ["--version"], ["info", "--help"], ["convert", "a.ply", "-", "--quiet"]],
+)
 def test_a_full_disk_behind_stdout_is_reported_in_one_sentence(tmp_path, words):
     cvtgs.save(cvtgs.synthetic.scene("object", 20, sh_degree=0, seed=0), tmp_path / "a.ply")
     with Path("/dev/full").open("w") as full:
@@ -219,11 +222,13 @@ def test_an_unwritable_stderr_does_not_change_the_exit_status(tmp_path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="closes pipes as POSIX does")
-def test_a_closed_pipe_exits_with_141_and_no_message(tmp_path):
+@pytest.mark.parametrize("words", [["--version"], ["convert", "a.ply", "-", "--quiet"]])
+def test_a_closed_pipe_exits_with_141_and_no_message(tmp_path, words):
+    cvtgs.save(cvtgs.synthetic.scene("object", 20, sh_degree=0, seed=0), tmp_path / "a.ply")
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, "w") as closed:
-        done = run_into(closed, tmp_path, "--version")
+        done = run_into(closed, tmp_path, *words)
     assert (done.returncode, done.stderr) == (141, "")
 
 

@@ -1,5 +1,6 @@
 """Texts that several commands print: sizes, times, progress bars."""
 
+import shutil
 import sys
 import textwrap
 from collections.abc import Iterator
@@ -35,6 +36,13 @@ def flush_output() -> None:
         return
     with _console_errors(file):
         file.flush()
+
+
+def send_file(path: Path) -> None:
+    """Write the bytes of a file to stdout."""
+    with path.open("rb") as file, _console_errors(sys.stdout):
+        shutil.copyfileobj(file, sys.stdout.buffer)
+        sys.stdout.buffer.flush()
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 import argparse
 import glob
 import os
-import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -13,7 +12,15 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import cvtgs
-from cvtgs.cli.display import WIDTH, file_size, say, say_wrapped, size_text, without_middle
+from cvtgs.cli.display import (
+    WIDTH,
+    file_size,
+    say,
+    say_wrapped,
+    send_file,
+    size_text,
+    without_middle,
+)
 from cvtgs.cli.options import READABLE, WRITABLE, CommandParser
 from cvtgs.errors import (
     CvtgsError,
@@ -178,9 +185,7 @@ def _run_one(job: SceneJob, work: Callable[[SceneJob], Outcome]) -> None:
     sizes = f"{size_text(before)} -> {file_size(options.output)}"
     stream = sys.stderr if job.to_stream else sys.stdout
     if job.to_stream:
-        with options.output.open("rb") as file:
-            shutil.copyfileobj(file, sys.stdout.buffer)
-        sys.stdout.buffer.flush()
+        send_file(options.output)
     if options.quiet:
         return
     for note in outcome.notes:
