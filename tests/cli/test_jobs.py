@@ -66,6 +66,12 @@ def test_a_folder_is_expanded_to_the_scenes_in_it(
     assert "none: must be a file or the folder of a trained model" in capsys.readouterr().err
 
 
+def test_the_suffix_of_levels_needs_no_dot(scenes: Path) -> None:
+    words = ["--rho", "0.1", "--suffix", "spz", "--no-scores", "--quiet"]
+    assert main(["levels", "a.ply", "-o", "out", *words]) == 0
+    assert sorted(path.name for path in Path("out").iterdir()) == ["levels.json", "rho_0.1.spz"]
+
+
 def test_suffix_applies_to_all_scenes(scenes: Path) -> None:
     assert main(["convert", *NAMES, "-o", "deep/out", "--suffix", "splat", "--quiet"]) == 0
     names = {path.name for path in Path("deep/out").iterdir()}
@@ -211,7 +217,7 @@ def test_standard_input_and_output_hold_scenes(
         """Standard input with given bytes."""
 
     monkeypatch.setattr(sys, "stdin", Stream(io.BytesIO(Path(name).read_bytes())))
-    assert main(["simplify", "-", "-", "--count", "7", "--suffix", ".spz", *SMALL]) == 0
+    assert main(["simplify", "-", "-", "--count", "7", "--suffix", "spz", *SMALL]) == 0
     printed = capsysbinary.readouterr()
     assert len(cvtgs.load(io.BytesIO(printed.out))) == 7
     assert printed.err.splitlines()[-1].startswith(b"standard output: ")

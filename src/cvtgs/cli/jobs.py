@@ -21,7 +21,7 @@ from cvtgs.cli.display import (
     size_text,
     without_middle,
 )
-from cvtgs.cli.options import READABLE, WRITABLE, CommandParser
+from cvtgs.cli.options import READABLE, WRITABLE, CommandParser, dotted
 from cvtgs.errors import (
     CvtgsError,
     InputError,
@@ -91,6 +91,7 @@ def add_paths(parser: CommandParser, *, options: str) -> None:
     )
     parser.add_argument(
         "--suffix",
+        type=dotted,
         metavar="END",
         help="format of the scenes in DIR or on standard output, for example .spz (default: the "
         "format of IN if it can be written, else .ply)",
@@ -278,4 +279,4 @@ def _output_name(source: Path, suffix: str | None) -> str:
         (end for end in (*WRITABLE_SUFFIXES, *READABLE_SUFFIXES) if name.lower().endswith(end)), ""
     )
     end = suffix or (own if own in WRITABLE_SUFFIXES else ".ply")
-    return name[: len(name) - len(own)] + (end if end.startswith(".") else f".{end}")
+    return name[: len(name) - len(own)] + end

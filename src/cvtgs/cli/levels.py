@@ -9,6 +9,7 @@ from cvtgs.cli.display import progress_bars, say, size_text
 from cvtgs.cli.options import (
     AddParser,
     add_options,
+    dotted,
     read_axes,
     read_ratios,
     read_settings,
@@ -55,7 +56,9 @@ def add_levels(add_parser: AddParser) -> None:
         help="ratios of Gaussians to keep (default 0.1,0.01,0.001; with --stream "
         "1,0.25,0.06,0.015)",
     )
-    parser.add_argument("--suffix", metavar="END", help="format of the files (default .ply)")
+    parser.add_argument(
+        "--suffix", metavar="END", type=dotted, help="format of the files (default .ply)"
+    )
     add_stream_options(parser)
     add_options(parser, "--preset", "--ckpt", "--config", "--set", "--sh-degree", "--axes")
     parser.add_argument(

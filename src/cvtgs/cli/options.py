@@ -253,6 +253,11 @@ def _usage_errors() -> Iterator[None]:
         raise argparse.ArgumentTypeError(str(error).rstrip(".")) from error
 
 
+def dotted(text: str) -> str:
+    """Read ``--suffix``, for argparse: spz means .spz."""
+    return text if text.startswith(".") else f".{text}"
+
+
 class FileAxes(NamedTuple):
     """The axes of a file to read and of files to write; None if they were not given."""
 
