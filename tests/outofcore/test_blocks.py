@@ -18,9 +18,8 @@ from cvtgs.errors import ConfigError, FileFormatError, InvalidArgumentError, Inv
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.io.ply import open_rows
 from cvtgs.math.frames import robust_frame
-from cvtgs.outofcore import allocate, block_count, lloyd, read_bytes, simplify_file
+from cvtgs.outofcore import allocate, block_count, read_bytes, simplify_file
 from cvtgs.outofcore import scan as scan_module
-from cvtgs.outofcore.halo import Assignment
 from cvtgs.outofcore.memory import needed_memory
 from cvtgs.outofcore.scan import (
     RangeTotals,
@@ -31,7 +30,6 @@ from cvtgs.outofcore.scan import (
     scan_scene,
 )
 from cvtgs.views import automatic_views
-from hard_scenes import ball
 from scenes import random_scene, same_bits
 
 
@@ -130,20 +128,6 @@ def test_no_block_has_much_more_than_twice_the_average_of_rows_or_weight(tmp_pat
     for weights in (torch.ones(1000), scene.areas**config.cvt.area_power):
         sums = torch.bincount(blocks, weights.double(), minlength=4)
         assert float(sums.max()) < 2.1 * float(sums.mean())
-
-
-def test_an_empty_site_gets_a_point_that_its_cell_can_spare():
-    """Site 0 keeps its second point: it is farther, but costs less. The last is a remote one's."""
-    points = torch.tensor([[0.1], [0.2], [-9.0]])
-    found = Assignment(
-        torch.tensor([-1, -1, 3]), torch.tensor([0, 0, 7]), torch.tensor([0.01, 0.04, 0.1]).double()
-    )
-    weights, sites = torch.tensor([10.0, 1.0, 1.0]).double(), torch.tensor([[0.0], [5.0]]).double()
-    filled, refilled = vars(lloyd)["_fill_empty"](found, points, sites, weights)
-    assert refilled == 1
-    assert filled.blocks.tolist() == [-1, -1, 3]
-    assert filled.labels.tolist() == [1, 0, 7]
-    assert filled.squared.tolist() == pytest.approx([4.9**2, 0.04, 0.1])
 
 
 def test_coincident_points_lie_in_one_block():
@@ -268,20 +252,6 @@ def test_gaussians_of_blocks_without_cells_are_merged(tmp_path):
     assert report.filtered_count == 0
     assert report.largest_cell >= (500 - kept) / 2
     assert report.energy > 0
-
-
-@pytest.mark.parametrize("blocks", [2, 8])
-def test_a_site_without_points_of_its_block_gets_a_near_one(tmp_path, blocks):
-    """A far point would make a huge cell, together with points of other blocks."""
-    scene, path = ball(1500, torch.float32), tmp_path / "in.ply"
-    cvtgs.save(scene, path)
-    simplifier = Simplifier(None, preset="paper", device="cpu")
-    report = simplify_file(
-        path, tmp_path / "out.ply", count=100, blocks=blocks, simplifier=simplifier
-    )
-    assert report.refilled_cells >= 1
-    largest = cvtgs.load(tmp_path / "out.ply").log_scales.max()
-    assert largest < simplifier.simplify(scene, count=100).log_scales.max() + 0.2
 
 
 def test_a_filter_that_leaves_too_few_is_switched_off(tmp_path):

@@ -6,7 +6,7 @@ until the wanted number of groups is left, and gives each group to the block of 
 
 import json
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from jaxtyping import Int
@@ -31,13 +31,12 @@ KEY = 1 << 32
 
 
 def cell_parts(
-    job: Job, block: int, rows: BlockRows, owners: Int[Tensor, "n"], labels: Int[Tensor, "n"]
+    job: Job, rows: BlockRows, owners: Int[Tensor, "n"], labels: Int[Tensor, "n"], count: int
 ) -> dict[str, Tensor]:
     """Return the part of a cell that each Gaussian of a block belongs to, and all parts' moments.
 
-    Parts are numbered by :func:`number_remote`; ``owners`` and ``labels`` are as there.
+    Parts are numbered by :func:`number_remote`; ``owners``, ``labels`` and ``count`` are as there.
     """
-    count = job.cells[block]
     parts, remote = number_remote(owners, labels, count)
     moments = cells.group_moments(_members(job, rows), parts, count + len(remote))
     return {"parts": parts.int(), "remote": remote, **moments._asdict()}
@@ -63,19 +62,21 @@ def allocate(job: Job) -> None:
     ):
         return
     manifest = job.read_manifest()
-    regions = _regions(manifest.cells, manifest.cell_room)
+    cell_counts = _cell_counts(job)
+    regions = _regions(cell_counts, manifest.cell_room)
     if len(regions) > 1:
         warnings.warn(
-            f"{sum(manifest.cells)} cells do not fit into memory together, so merge costs are only "
+            f"{sum(cell_counts)} cells do not fit into memory together, so merge costs are only "
             f"compared within {len(regions)} parts of the scene; raise --memory if possible.",
             UserWarning,
             stacklevel=4,
         )
-    sizes = [sum(manifest.cells[block] for block in region) for region in regions]
+    sizes = [sum(cell_counts[block] for block in region) for region in regions]
     counts = shared_out(manifest.total, sizes, rooms=sizes)
     targets = [0] * job.blocks
     for region, count in zip(regions, counts, strict=True):
-        for block, target in zip(region, _allocate_region(job, region, count), strict=True):
+        found = _allocate_region(job, region, cell_counts, count)
+        for block, target in zip(region, found, strict=True):
             targets[block] = target
     with atomic_output(job.path("targets.json"), overwrite=True) as file:
         file.write(json.dumps(targets).encode())
@@ -95,11 +96,26 @@ def _regions(counts: Sequence[int], room: int) -> list[list[int]]:
     return regions
 
 
-def _allocate_region(job: Job, region: Sequence[int], count: int) -> list[int]:
+def _cell_counts(job: Job) -> list[int]:
+    """Return the number of cells in each block after Lloyd, which moves some to other blocks."""
+    counts = [0] * job.blocks
+    for block in job.blocks_with_sites():
+        counts[block] = _own_count(map_tensors(job.parts_path(block))[0])
+    return counts
+
+
+def _own_count(parts: Mapping[str, Tensor]) -> int:
+    """Return how many of the parts in a block belong to its own cells."""
+    return len(parts["weights"]) - len(parts["remote"])
+
+
+def _allocate_region(
+    job: Job, region: Sequence[int], cell_counts: Sequence[int], count: int
+) -> list[int]:
     """Merge the cells of a region, write its groups, and return the number of groups per block."""
     config = _costs(job)
-    sizes = torch.tensor(job.cells)[list(region)]
-    fine = _add_parts(job, region)
+    sizes = torch.tensor(cell_counts)[list(region)]
+    fine = _add_parts(job, region, cell_counts)
     labels = torch.arange(len(fine.weights))
     if len(labels) > count:
         near = cvt.nearest_neighbors(fine.means.T, config.neighbors)
@@ -133,16 +149,16 @@ def _costs(job: Job) -> AllocationConfig:
     return allocation_at(ratio, job.config, is_measured=is_measured(job))
 
 
-def _add_parts(job: Job, region: Sequence[int]) -> Moments:
+def _add_parts(job: Job, region: Sequence[int], cell_counts: Sequence[int]) -> Moments:
     """Return the moments of the cells of a region, including their parts in other blocks."""
-    starts, total, sizes = torch.full((job.blocks,), -1), 0, job.cells
+    starts, total = torch.full((job.blocks,), -1), 0
     for block in region:
         starts[block] = total
-        total += sizes[block]
+        total += cell_counts[block]
     found, labels = list[Moments](), list[Tensor]()
     for block in job.blocks_with_rows():
         tensors, _ = map_tensors(job.parts_path(block))
-        owners, numbers = _cells_of_parts(job, block, tensors["remote"])
+        owners, numbers = _cells_of_parts(block, tensors)
         rows = (starts[owners] >= 0).nonzero()[:, 0]
         found.append(Moments(*take_columns(rows, *(tensors[name] for name in Moments._fields))))
         labels.append(starts[owners[rows]] + numbers[rows])
@@ -150,9 +166,9 @@ def _add_parts(job: Job, region: Sequence[int]) -> Moments:
     return cells.group_moments(joined, torch.cat(labels), total)
 
 
-def _cells_of_parts(job: Job, block: int, remote: Int[Tensor, "r 2"]) -> tuple[Tensor, Tensor]:
+def _cells_of_parts(block: int, parts: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
     """Return block and number of the cell of every part in a block."""
-    count = job.cells[block]
+    count, remote = _own_count(parts), parts["remote"]
     owners = torch.cat([torch.full((count,), block), remote[:, 0]])
     return owners, torch.cat([torch.arange(count), remote[:, 1]])
 
@@ -166,7 +182,7 @@ def join(job: Job, block: int) -> None:
     if job.labels_path(block).exists():
         return
     tensors, _ = map_tensors(job.parts_path(block))
-    owners, numbers = _cells_of_parts(job, block, tensors["remote"])
+    owners, numbers = _cells_of_parts(block, tensors)
     (groups,) = _take(job, owners * KEY + numbers, "groups")
     found = groups[tensors["parts"].long()]
     if job.config.allocation.reassign:

@@ -177,7 +177,7 @@ class Job:
 
     @property
     def cells(self) -> tuple[int, ...]:
-        """Number of cells of the tessellation in each block."""
+        """Number of cells of the tessellation in each block, before Lloyd moves some to others."""
         return self.read_manifest().cells
 
     @property

@@ -1,5 +1,6 @@
 """One tessellation of all blocks: seeds per block, then Lloyd iterations across blocks."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -18,7 +19,7 @@ from cvtgs.cvt import (
 from cvtgs.devices import one_thread
 from cvtgs.grouping import curve_order, embed_rows
 from cvtgs.io.tensors import map_tensors, save_tensors
-from cvtgs.math.segments import label_argmin
+from cvtgs.math.segments import label_argmin, sort_by_label
 from cvtgs.outofcore.allocate import cell_parts
 from cvtgs.outofcore.halo import (
     Assignment,
@@ -43,6 +44,22 @@ class EmbeddedRows(NamedTuple):
     order: Tensor
     points: Tensor
     weights: Tensor
+
+
+class RemoteSums(NamedTuple):
+    """Sums over the points of other blocks that are nearest to a site of a block.
+
+    Attributes:
+        numbers: ``(r,)`` number of the site.
+        blocks: ``(r,)`` block of the points.
+        totals: ``(r,)`` their weight.
+        sums: ``(r, d)`` the sum of the weighted points.
+    """
+
+    numbers: Tensor
+    blocks: Tensor
+    totals: Tensor
+    sums: Tensor
 
 
 @one_thread()
@@ -79,31 +96,82 @@ def accumulate(job: Job, iteration: int, block: int) -> float:
     labels, remote = number_remote(found.blocks, found.labels, count)
     totals, sums = weighted_sums(points, weights, labels, count + len(remote))
     energy = (weights * found.squared).sum()
-    result = {"totals": totals, "sums": sums, "remote": remote, "energy": energy}
-    save_tensors(path, result, {})
+    own = {"totals": totals[:count], "sums": sums[:count]}
+    others = {"remote": remote, "remote_totals": totals[count:], "remote_sums": sums[count:]}
+    facts = {"energy": energy, "spare": torch.tensor(len(points) - count - 1)}
+    save_tensors(path, own | others | facts, {})
     return float(energy)
 
 
 def move_sites(job: Job, iteration: int) -> None:
-    """Move the sites of all blocks to their centroids; memory: one block and all remote sums."""
+    """Move the sites of all blocks to their centroids; memory: one block and all remote sums.
+
+    A site that only has points of other blocks becomes a site of one of these.
+    """
     blocks = job.blocks_with_sites()
     left = [block for block in blocks if not job.sites_path(iteration + 1, block).exists()]
     if not left:
         return
-    parts: dict[str, list[Tensor]] = {"remote": [], "totals": [], "sums": []}
+    remote = _remote_sums(job, iteration)
+    leaving, arriving = _change_blocks(job, iteration, remote)
+    for block in left:
+        sites = _centroids(job, iteration, block, remote[block])
+        stays = torch.ones(len(sites), dtype=torch.bool)
+        stays[leaving[block]] = False
+        _save_sites(job, iteration + 1, block, torch.cat([sites[stays], *arriving[block]]))
+
+
+def _remote_sums(job: Job, iteration: int) -> dict[int, RemoteSums]:
+    """Read the sums over the points of other blocks, for the sites of each block."""
+    blocks, parts = job.blocks_with_sites(), list[tuple[Tensor, ...]]()
     for block in blocks:
         tensors, _ = map_tensors(job.sums_path(iteration, block))
-        for name, values in parts.items():
-            values.append(tensors[name][len(tensors[name]) - len(tensors["remote"]) :])
-    remote, totals, sums = (torch.cat(values) for values in parts.values())
-    for block in left:
-        tensors, _ = map_tensors(job.sums_path(iteration, block))
-        sites = map_tensors(job.sites_path(iteration, block))[0]["sites"]
-        rows = (remote[:, 0] == block).nonzero()[:, 0]
-        numbers = remote[rows, 1]
-        total = tensors["totals"][: len(sites)].index_add(0, numbers, totals[rows])
-        summed = tensors["sums"][: len(sites)].index_add(0, numbers, sums[rows])
-        _save_sites(job, iteration + 1, block, centroids(total, summed, sites))
+        owners, numbers = tensors["remote"].unbind(1)
+        values = (tensors["remote_totals"], tensors["remote_sums"])
+        parts.append((owners, numbers, torch.full_like(owners, block), *values))
+    owners, *columns = (torch.cat(values) for values in zip(*parts, strict=True))
+    order, offsets = sort_by_label(owners, job.blocks)
+    rows = {block: order[offsets[block] : offsets[block + 1]] for block in blocks}
+    return {block: RemoteSums(*(values[rows[block]] for values in columns)) for block in blocks}
+
+
+def _centroids(job: Job, iteration: int, block: int, remote: RemoteSums) -> Tensor:
+    """Return the centroids of the sites of a block."""
+    tensors, _ = map_tensors(job.sums_path(iteration, block))
+    sites = map_tensors(job.sites_path(iteration, block))[0]["sites"]
+    totals = tensors["totals"].index_add(0, remote.numbers, remote.totals)
+    sums = tensors["sums"].index_add(0, remote.numbers, remote.sums)
+    return centroids(totals, sums, sites)
+
+
+def _change_blocks(
+    job: Job, iteration: int, remote: Mapping[int, RemoteSums]
+) -> tuple[dict[int, list[int]], dict[int, list[Tensor]]]:
+    """Choose the sites that change blocks: numbers that leave, and centroids that arrive.
+
+    A site without points of its block goes to the block with most of its weight; there,
+    :func:`assign` need not add a point to its cell, which may be far away. Each block keeps a
+    site, and gets fewer sites than it has points.
+    """
+    leaving: dict[int, list[int]] = {block: [] for block in remote}
+    arriving: dict[int, list[Tensor]] = {block: [] for block in remote}
+    spare = {
+        block: int(map_tensors(job.sums_path(iteration, block))[0]["spare"]) for block in remote
+    }
+    for block, sums in remote.items():
+        own = map_tensors(job.sums_path(iteration, block))[0]["totals"]
+        heaviest = label_argmin(-sums.totals, sums.numbers, len(own))
+        lonely = ((own == 0) & (heaviest < len(sums.totals))).nonzero()[: len(own) - 1, 0]
+        if len(lonely) == 0:
+            continue
+        sites = _centroids(job, iteration, block, sums)
+        others = sums.blocks[heaviest[lonely]]
+        for number, other in zip(lonely.tolist(), others.tolist(), strict=True):
+            if spare[other] > 0:
+                spare[other] -= 1
+                leaving[block].append(number)
+                arriving[other].append(sites[[number]])
+    return leaving, arriving
 
 
 @one_thread()
@@ -123,7 +191,7 @@ def assign(job: Job, iterations: int, block: int) -> None:
     owners, labels = torch.empty_like(rows), torch.empty_like(rows)
     owners[rows], labels[rows] = found.blocks, found.labels
     del order, points, weights, found, rows
-    parts = cell_parts(job, block, read_apparent_rows(job, block), owners, labels)
+    parts = cell_parts(job, read_apparent_rows(job, block), owners, labels, len(sites))
     facts = {"energy": energy, "refilled": torch.tensor(refilled)}
     save_tensors(job.parts_path(block), parts | facts, {})
 
