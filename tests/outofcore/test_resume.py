@@ -139,7 +139,8 @@ def test_blocks_of_another_job_are_not_used(source, tmp_path, change):
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "kind", ["parts", "groups", "targets", "labels", "sent", "merged", "inflated", "small"]
+    "kind",
+    ["parts", "sample", "groups", "targets", "labels", "sent", "merged", "inflated", "small"],
 )
 def test_damaged_files_of_steps_are_made_again(source, tmp_path, kind):
     output, folder, whole = tmp_path / "out.ply", tmp_path / ".out.ply.blocks", tmp_path / "w.ply"

@@ -68,7 +68,7 @@ def seed(job: Job, block: int) -> None:
 
     A block without cells gets neither; its Gaussians join cells of other blocks.
     """
-    if job.sites_path(0, block).exists():
+    if job.sites_path(0, block).exists() and job.sample_path(block).exists():
         return
     order, points, weights = _embedded_rows(job, block)
     config, count = job.config.cvt, job.cells[block]
