@@ -14,7 +14,7 @@ from cvtgs.config import AllocationConfig
 from cvtgs.devices import in_chunks
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.parameters import normalize_quats, quats_to_matrices
-from cvtgs.math.segments import label_argmin, label_sums, smallest_rows, take_columns
+from cvtgs.math.segments import ascending, label_argmin, label_sums, smallest_rows, take_columns
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
@@ -182,7 +182,7 @@ def _distinct_pairs(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     bits = max(int(ends.amax()).bit_length() if len(ends) else 1 for ends in (first, second))
     keys = torch.minimum(first, second).bitwise_left_shift_(bits)  # in place: there are many pairs
     keys |= torch.maximum(first, second)
-    keys = torch.unique(keys[first != second])
+    keys = torch.unique_consecutive(ascending(keys[first != second]))
     return keys >> bits, keys & ((1 << bits) - 1)
 
 
