@@ -93,8 +93,19 @@ def test_memory_errors_at_the_command_line(
     words = ["simplify", str(path), str(tmp_path / "b.ply"), "--rho", "0.5", "--quiet"]
     assert main([*words, "--preset", "fast"]) == 1
     assert capsys.readouterr().err == (
-        "cvtgs: error: cvtgs simplify needs more memory than is available; free some, or let "
-        "simplify process a binary .ply in blocks with --memory AMOUNT, for example 2GB, and use "
-        "--device cpu if a GPU ran out.\n"
+        "cvtgs: error: cvtgs simplify needs more memory than is available; free some, or process a "
+        "binary .ply in blocks with --memory AMOUNT, for example 2GB, and use --device cpu if a "
+        "GPU ran out.\n"
     )
     assert not (tmp_path / "b.ply").exists()
+
+
+def test_only_commands_that_have_blocks_advise_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("cvtgs.synthetic.demo_scene", without_memory)
+    assert main(["demo", "-o", str(tmp_path / "out"), "--quiet"]) == 1
+    assert capsys.readouterr().err == (
+        "cvtgs: error: cvtgs demo needs more memory than is available; free some, or ask for less, "
+        "and use --device cpu if a GPU ran out.\n"
+    )

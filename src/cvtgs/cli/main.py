@@ -36,10 +36,7 @@ WITHOUT_TORCH = ("completion",)
 """Commands that need no tensors, and start faster without them."""
 
 INTERRUPTED, TERMINATED, PIPE_CLOSED = 130, 143, 141
-MEMORY_ADVICE = (
-    "free some, or let simplify process a binary .ply in blocks with --memory AMOUNT, for example "
-    "2GB, and use --device cpu if a GPU ran out"
-)
+BLOCKS_ADVICE = "process a binary .ply in blocks with --memory AMOUNT, for example 2GB"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -79,7 +76,9 @@ def _run(words: Sequence[str]) -> None:
     options = parser.parse_args(words)
     if options.command not in WITHOUT_TORCH:
         load_torch()
-    advised = memory_errors(f"cvtgs {options.command}", MEMORY_ADVICE)
+    otherwise = BLOCKS_ADVICE if hasattr(options, "memory") else "ask for less"
+    advice = f"free some, or {otherwise}, and use --device cpu if a GPU ran out"
+    advised = memory_errors(f"cvtgs {options.command}", advice)
     with advised, _without_empty_folder(options), _lock(options):
         for name in ("input", "reference"):
             check_one_scene(getattr(options, name, ""))
