@@ -10,7 +10,9 @@ from cvtgs.views.layout import SceneLayout, covering_sample, valid_part
 from cvtgs.views.scoring import PIXELS, cameras_at, measure_splats, splat_sizes, splat_widths
 
 _ASKED = 32
-_MEASURED = 64
+_MEASURED = (16, 64)
+"""Numbers of positions to look closely from: first a few, then more where these see clutter."""
+
 _SAMPLE = 60_000
 _FEW = 20_000
 """Scenes of fewer Gaussians are coarse from everywhere."""
@@ -45,11 +47,12 @@ def split_by_clutter(
         return eyes, none  # the sample, which has larger splats, shows as much
     sample, enlargement = covering_sample(valid_part(scene), _SAMPLE)
     widths = splat_widths(sample) * torch.exp(-enlargement[:, 0].double())
-    few = eyes[:: -(-len(eyes) // _MEASURED)]
-    sizes = measure_splats(sample, widths, layout.frame.radius, _facing_middle(layout, few))
-    coarse = _are_coarse(sizes.finest, _LARGE)
-    if not _many(coarse, _CLUTTERED):
-        return eyes, none
+    for most in _MEASURED:
+        few = eyes[:: -(-len(eyes) // most)]
+        sizes = measure_splats(sample, widths, layout.frame.radius, _facing_middle(layout, few))
+        coarse = _are_coarse(sizes.finest, _LARGE)
+        if not _many(coarse, _CLUTTERED):
+            return eyes, none
     return few[~coarse], few[coarse]
 
 
