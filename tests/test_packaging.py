@@ -37,7 +37,7 @@ def test_the_workflow_checks_every_supported_python_as_ci_does():
     assert f">={classifiers[0]}" == PROJECT["requires-python"]
     assert "      - run: .ci/run\n" in workflow
     sessions = re.findall(r"nox -s (\w+)", workflow)
-    assert sessions == ["quick", "coverage", "docs", "wheel"]
+    assert sessions == ["quick", "oldest", "coverage", "docs", "wheel"]
     assert [name for name in sessions if f"\ndef {name}(" not in read("noxfile.py")] == []
 
 
