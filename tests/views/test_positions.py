@@ -128,18 +128,22 @@ def test_a_wall_captured_from_one_side_is_viewed_from_that_side():
     assert float((eyes[:, 2] < 0).double().mean()) > 0.9
 
 
+def from_two_away(*, focal: float, side: int) -> Cameras:
+    """Return a camera at z = -2 that looks at the origin."""
+    eye, half = torch.tensor([[0.0, 0, -2]]).double(), side / 2
+    return Cameras(
+        viewmats=look_at(eye, torch.zeros(1, 3).double(), DOWN.double()),
+        Ks=torch.tensor([[[focal, 0, half], [0, focal, half], [0, 0, 1]]]).double(),
+        width=side,
+        height=side,
+    )
+
+
 def test_splat_sizes_are_those_in_the_image():
     """Near ones are 0.1 wide at a distance of 2, and hide the far one."""
     means = torch.tensor([[0.0, 0, 0], [0.01, 0, 0], [0, 0, 2]])
     layout = find_layout(blobs(means, torch.tensor([0.1, 0.1, 0.1]).log()))
-    cameras = Cameras(
-        viewmats=look_at(
-            torch.tensor([[0.0, 0, -2]]).double(), torch.zeros(1, 3).double(), DOWN.double()
-        ),
-        Ks=torch.tensor([[[50.0, 0, 50], [0, 50, 50], [0, 0, 1]]]).double(),
-        width=100,
-        height=100,
-    )
+    cameras = from_two_away(focal=50.0, side=100)
     sizes = splat_sizes(layout, cameras)
     assert sizes.in_image.tolist() == pytest.approx([0.5 * 0.1 / 2], rel=1e-5)
     assert sizes.in_scene.tolist() == pytest.approx([0.1 / layout.frame.radius], rel=1e-5)
@@ -150,14 +154,7 @@ def test_the_finest_splats_are_the_lower_decile_of_what_is_seen(small, finest):
     """Each small splat paints some 6 % of what the large one does: one is less than a tenth."""
     means = torch.tensor([[0.0, 0, 0], [0.6, 0, 0], [0.9, 0, 0], [1.2, 0, 0]])[: 1 + small]
     widths = torch.tensor([0.1] + [0.04] * small).double()
-    camera = Cameras(
-        viewmats=look_at(
-            torch.tensor([[0.0, 0, -2]]).double(), torch.zeros(1, 3).double(), DOWN.double()
-        ),
-        Ks=torch.tensor([[[200.0, 0, 100], [0, 200, 100], [0, 0, 1]]]).double(),
-        width=200,
-        height=200,
-    )
+    camera = from_two_away(focal=200.0, side=200)
     scene = blobs(means, torch.tensor([0.1] + [0.025] * small).log())
     sizes = measure_splats(scene, widths, 2.0, camera)
     assert sizes.finest.tolist() == pytest.approx([finest / 2.0])
