@@ -168,6 +168,7 @@ STAGES = {
         "normalized_weights",
         "align_axes",
         "side_cover",
+        "view_components",
         "inflate_cells",
     },
     "evaluation": {

@@ -114,7 +114,6 @@ def group_rows(
         target,
         config,
         total=len(rows),
-        has_duplicates=analysis.plan.duplicates.active,
         on_iteration=on_iteration,
     )
     sums = label_sums([points.weights], labels, target)[0]
@@ -146,14 +145,20 @@ def _weighted(
     )
 
 
-def _moments(points: WeightedRows, analysis: SceneAnalysis) -> cells.Moments:
+def _moments(
+    points: WeightedRows, analysis: SceneAnalysis, config: AllocationConfig
+) -> cells.Moments:
     """Compute the moments of each Gaussian, in robust radii."""
+    components = None
+    if config.compares_view_colors:
+        components = cells.view_components(points.scene, points.rows, points.apparent_masses)
     return cells.gaussian_moments(
         points.scene,
         points.rows,
         analysis.frame,
         weights=points.masses,
         masses=points.apparent_masses,
+        components=components,
     )
 
 
@@ -164,7 +169,6 @@ def _tessellate(
     config: SimplifyConfig,
     *,
     total: int,
-    has_duplicates: bool,
     on_iteration: Callable[[int], None],
 ) -> tuple[cvt.Tessellation, Int[Tensor, "k"]]:
     """Tessellate Gaussians in Morton order, allocate cells, and return tessellation and labels.
@@ -183,13 +187,13 @@ def _tessellate(
         count,
         config=config.cvt,
         seed=config.seed,
-        has_duplicates=has_duplicates,
+        has_duplicates=analysis.plan.duplicates.active,
         on_iteration=on_iteration,
     )
     labels = tessellation.labels
     if count > target or (config.allocation.reassign and count < len(rows)):
         labels = allocate(
-            points.moments or _moments(points, analysis),
+            points.moments or _moments(points, analysis, config.allocation),
             labels,
             count,
             target,
@@ -300,7 +304,6 @@ def group_cells(
         target,
         config,
         total=len(grouping.partition.order),
-        has_duplicates=False,
         on_iteration=on_iteration,
     )
     coarse = torch.empty_like(labels)
@@ -371,11 +374,11 @@ def order_rows(
         config: Filter and weights.
 
     Returns:
-        The argument ``ordered`` of :func:`group_rows`; 160 bytes per Gaussian.
+        The argument ``ordered`` of :func:`group_rows`; at most 256 bytes per Gaussian.
     """
     rows = filter_rows(scene, analysis, 1, config.filter).rows
     points = _weighted(scene, rows, analysis, config)
-    return OrderedRows(rows, points._replace(moments=_moments(points, analysis)))
+    return OrderedRows(rows, points._replace(moments=_moments(points, analysis, config.allocation)))
 
 
 def add_neighbors(ordered: OrderedRows, target: int, config: AllocationConfig) -> OrderedRows:
@@ -390,9 +393,8 @@ def add_neighbors(ordered: OrderedRows, target: int, config: AllocationConfig) -
         The same with neighbours, 48 bytes per Gaussian; unchanged if it has them or needs none.
     """
     points, total = ordered.points, len(ordered.filtered)
-    if points.neighbors is not None or points.moments is None:
-        return ordered
-    if target >= total or finer_count(target, total, config) < total:
+    from_singles = target < total and finer_count(target, total, config) == total
+    if not from_singles or points.neighbors is not None or points.moments is None:
         return ordered
     near = cvt.nearest_neighbors(points.moments.means.T, config.neighbors)
     return ordered._replace(points=points._replace(neighbors=near))

@@ -38,8 +38,9 @@ Result = TypeVar("Result")
 class Prepared:
     """A scene to simplify repeatedly; results that do not depend on the count are cached.
 
-    From the second run or ``warm_up`` on, 160 more bytes per Gaussian are cached, and another 48
-    once such a run keeps more than an eighth of the Gaussians.
+    From the second run or ``warm_up`` on, 160 more bytes per Gaussian are cached (up to 256 with
+    view-dependent colour), and another 48 once such a run keeps more than an eighth of the
+    Gaussians.
 
     ``Simplifier.prepare`` creates instances. Every run gives the bits of ``Simplifier.run``; the
     report of the first run includes the shared stages.

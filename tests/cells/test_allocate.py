@@ -26,7 +26,8 @@ def points(places, *, colors=None, weights=None, size=0.01):
     covariances[[0, 3, 5]] = size**2
     weights = torch.tensor(weights or [1.0] * count).double()
     shades = torch.tensor(colors or [0.5] * count).double().expand(3, -1).contiguous()
-    return Moments(torch.ones_like(weights), weights, weights, means, covariances, shades)
+    ones, none = torch.ones_like(weights), means[:0]
+    return Moments(ones, weights, weights, means, covariances, shades, none)
 
 
 def all_others(count):

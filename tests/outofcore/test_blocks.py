@@ -119,7 +119,7 @@ def test_no_block_has_much_more_than_twice_the_average_of_rows_or_weight(tmp_pat
         scan_range(open_rows(tmp_path / "in.ply"), frame, (), RowRange(0, 0, 1000)),
         boxes=(),
         target=100,
-        cells=100,
+        cell_count=100,
         blocks=4,
         config=config,
         frame=frame,

@@ -204,6 +204,7 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
         job.read_scan().frame,
         weights=scene.masses,
         masses=torch.cat(areas) * scene.opacities,
+        components=job.read_scan().view_components,
     )
     config = allocation_at(TARGET / COUNT, job.config, is_measured=False)
     fine = sum(job.cells)

@@ -12,8 +12,9 @@ from pretended_device import CUDA, DeviceTensor, pretended_cuda
 from scenes import random_scene, same_bits
 
 PRESETS = ["draft", "fast", "standard", "paper"]
-WAITS, COPIES = 14, 7
-"""Largest numbers of host waits and of copies in one simplification.
+WAITS, COPIES, VIEW_COPIES = 14, 7, 2
+"""Largest numbers of host waits and of copies in one simplification, and of those that
+view-dependent colour adds.
 
 One copy is for the network, and 2 each, to the host and back, are for the tessellation, for the
 allocation and for the neighbours of merged Gaussians; a scene outside the device adds 6. Neither
@@ -38,7 +39,7 @@ def test_a_device_gives_the_bits_of_the_cpu_with_few_waits(preset, dtype):
         traffic.copies.clear()
         small, report = Simplifier(config=preset, device="cuda").run(there, 0.1)
         assert traffic.waits.total() <= WAITS, traffic.waits
-        assert traffic.copies.total() <= COPIES, traffic.copies
+        assert traffic.copies.total() <= COPIES + VIEW_COPIES, traffic.copies
         assert same_bits(on_device(small), wanted)
     assert report.backend == "scipy"
 

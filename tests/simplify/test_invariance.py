@@ -5,8 +5,10 @@ not expected of rotated scenes in general: the Morton curve that the seeds follo
 the frame is centred on, and the light that MergeNet sees depend on the axes, so a rotated scene has
 other seeds and other, equally good, cells. Rotations are therefore tested with every seed certain
 (few Gaussians hold nearly all of the mass), where the curve does not matter; by quarter turns where
-the median matters; and with a network only where all light is even. Other scenes are rotated with
-given cells and light in cells/test_moments.py and mergenet/test_correct.py.
+the median matters; and with a network only where all light is even. View-dependent colour is not
+compared, since neighbours along the curve tell which of it they have in common. Other scenes are
+rotated with given cells, light and neighbours in cells/test_moments.py, mergenet/test_correct.py
+and cells/test_view_colors.py.
 """
 
 import hashlib
@@ -107,10 +109,11 @@ def test_a_shift_does_not_matter(preset, shift):
     ids=["x to y to z", "quarter turn about z", "half turn about x"],
 )
 def test_turns_that_keep_the_axes(quat, degree, ckpt):
+    config = SimplifyConfig.from_mapping({"allocation": {"view_color": 0.0}})
     scene = dominated_scene(SEEDS, TOTAL, degree)
     assert_same_gaussians(
-        simplified(moved(scene, quat=quat), "standard", RATIO, ckpt=ckpt),
-        moved(simplified(scene, "standard", RATIO, ckpt=ckpt), quat=quat),
+        simplified(moved(scene, quat=quat), config, RATIO, ckpt=ckpt),
+        moved(simplified(scene, config, RATIO, ckpt=ckpt), quat=quat),
     )
 
 
@@ -119,7 +122,8 @@ def test_turns_that_keep_the_axes(quat, degree, ckpt):
 def test_any_turn_where_nothing_depends_on_the_axes(rho, quat, ckpt):
     """Colour, contraction and perspective use robust radii about the median, visibility a grid."""
     cvt = {"color": 0.0, "perspective": False, "hidden_share": 1.0}
-    config = SimplifyConfig.from_mapping({"cvt": cvt, "effects": {"unbounded": "off"}})
+    others = {"effects": {"unbounded": "off"}, "allocation": {"view_color": 0.0}}
+    config = SimplifyConfig.from_mapping({"cvt": cvt, **others})
     scene = dominated_scene(SEEDS, TOTAL, 3)
     motion = {"quat": quat, "shift": (1.0, 2.0, 3.0), "scale": 10.0}
     assert_same_gaussians(

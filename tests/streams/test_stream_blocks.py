@@ -176,10 +176,11 @@ def test_invalid_rows_are_counted(tmp_path: Path, scene: GaussianScene) -> None:
 @pytest.mark.slow
 def test_axes_and_sh_degree_are_applied(tmp_path: Path) -> None:
     save(make("courtyard", 1000, sh_degree=1, seed=3), tmp_path / "scene.ply")
-    stream(tmp_path / "scene.ply", tmp_path / "a")
-    stream(tmp_path / "scene.ply", tmp_path / "b", axes=("rdf", "rub"), sh_degree=0)
-    plain, turned = (load(tmp_path / name, lod=3) for name in "ab")
-    assert (plain.sh_degree, turned.sh_degree) == (1, 0)
+    stream(tmp_path / "scene.ply", tmp_path / "full")
+    stream(tmp_path / "scene.ply", tmp_path / "plain", sh_degree=0)
+    stream(tmp_path / "scene.ply", tmp_path / "turned", axes=("rdf", "rub"), sh_degree=0)
+    full, plain, turned = (load(tmp_path / name, lod=3) for name in ("full", "plain", "turned"))
+    assert [scene.sh_degree for scene in (full, plain, turned)] == [1, 0, 0]
     flipped = plain.means * torch.tensor([1.0, -1.0, -1.0])
     assert float(torch.cdist(flipped, turned.means).amin(dim=1).max()) < 0.05
 

@@ -20,6 +20,7 @@ from cvtgs.cells.merge import (
     normalized_weights,
 )
 from cvtgs.cells.partition import Partition
+from cvtgs.cells.view_colors import view_components
 
 __all__ = [
     "Descriptors",
@@ -40,4 +41,5 @@ __all__ = [
     "normalized_weights",
     "reassign",
     "side_cover",
+    "view_components",
 ]

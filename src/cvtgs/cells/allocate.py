@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from cvtgs.cells.view_colors import LARGEST_COLOR, view_colors
 from cvtgs.config import AllocationConfig
 from cvtgs.devices import in_chunks
 from cvtgs.math.frames import RobustFrame
@@ -45,6 +46,7 @@ class Moments(NamedTuple):
         means: ``(3, n)`` positions, robust radii from the centre of the scene.
         covariances: ``(6, n)`` upper triangles, squared robust radii.
         colors: ``(3, n)`` RGB of the constant band.
+        view_colors: ``(k, n)`` components of the view-dependent colour, in the units of RGB.
     """
 
     counts: Float[Tensor, "n"]
@@ -53,6 +55,7 @@ class Moments(NamedTuple):
     means: Float[Tensor, "3 n"]
     covariances: Float[Tensor, "6 n"]
     colors: Float[Tensor, "3 n"]
+    view_colors: Float[Tensor, "k n"]
 
 
 def gaussian_moments(
@@ -62,6 +65,7 @@ def gaussian_moments(
     *,
     weights: Float[Tensor, "n"],
     masses: Float[Tensor, "n"],
+    components: Float[Tensor, "c k"] | None = None,
     unit: float | None = None,
 ) -> Moments:
     """Return the moments of single Gaussians.
@@ -72,6 +76,7 @@ def gaussian_moments(
         frame: Centre and radius of the scene; the radius is the unit of length.
         weights: Mass of each.
         masses: Mass of each as seen in images.
+        components: Result of :func:`view_components`; None for no view-dependent colour.
         unit: Divisor of weights and masses; None divides each by its own mean.
 
     Returns:
@@ -80,6 +85,8 @@ def gaussian_moments(
     count, device, center = len(rows), rows.device, frame.center.to(rows.device)
     means = torch.empty(3, count, dtype=torch.float64, device=device)
     covariances, colors = means.new_empty(6, count), torch.empty_like(means)
+    varying = means.new_empty(0 if components is None else components.shape[1], count)
+    directions = components.to(device) if components is not None and len(varying) else None
 
     def moments_of(part: slice) -> None:
         some = rows[part]
@@ -91,7 +98,9 @@ def gaussian_moments(
         for number, (i, j) in enumerate(UPPER):
             covariances[number, part] = (columns[i] * columns[j]).sum(0)
         bands = scene.sh0.index_select(0, some)[:, 0]
-        colors[:, part] = (0.5 + SH_C0 * bands.double()).clamp(0.0, 1.5).T
+        colors[:, part] = (0.5 + SH_C0 * bands.double()).clamp(0.0, LARGEST_COLOR).T
+        if directions is not None:
+            varying[:, part] = view_colors(scene, some, directions).T
 
     in_chunks(moments_of, count, CHUNK, device)  # a few columns of a chunk fit into a cache
     tiny = torch.finfo(torch.float64).tiny
@@ -106,6 +115,7 @@ def gaussian_moments(
         means=means,
         covariances=covariances,
         colors=colors,
+        view_colors=varying,
     )
 
 
@@ -123,15 +133,16 @@ def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Mom
     columns = [members.counts, members.weights, members.masses]
     counts, weights, masses = label_sums(columns, labels, count)
     shares = members.weights / weights.index_select(0, labels)
-    columns = [*members.means, *members.colors]
-    means, colors = label_sums(columns, labels, count, shares).split(3)
+    columns = [*members.means, *members.colors, *members.view_colors]
+    sums = label_sums(columns, labels, count, shares)
+    means, colors, varying = sums[:3], sums[3:6], sums[6:]
     shifts = take_columns(labels, means)[0]
     torch.sub(members.means, shifts, out=shifts)
     products = torch.empty_like(members.covariances)
     for product, (i, j) in zip(products, UPPER, strict=True):
         torch.mul(shifts[i], shifts[j], out=product)
     covariances = label_sums(products.add_(members.covariances), labels, count, shares)
-    return Moments(counts, weights, masses, means, covariances, colors)
+    return Moments(counts, weights, masses, means, covariances, colors, varying)
 
 
 def merge_pairs(
@@ -205,7 +216,9 @@ def _pair_costs(
         ])  # fmt: skip
         own, others = volumes.index_select(0, i), volumes.index_select(0, j)
         cost = 0.5 * (_log_volume(merged) - share * own - other * others)
-        cost += config.color * product * (a.colors - b.colors).square().sum(0)
+        squares = (a.colors - b.colors).square().sum(0)
+        squares += config.view_color * (a.view_colors - b.view_colors).square().sum(0)
+        cost += config.color * product * squares
         cost *= (a.masses + b.masses) ** config.mass_power
         costs: Tensor = cost * (a.counts + b.counts)
         return costs

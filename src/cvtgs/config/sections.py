@@ -119,6 +119,8 @@ class AllocationConfig(Section):
             at one cell per Gaussian.
         color_power: This weight is proportional to the ratio of cells to Gaussians to this power;
             colours differ anyway within large cells.
+        view_color: Weight of view-dependent colours in this distance, as far as neighbours have
+            them in common (:func:`cvtgs.cells.view_components`); 0 leaves them out.
         mass_power: The cost of a pair is multiplied by its apparent mass to this power.
         reassign: Whether every Gaussian then moves to the cell that explains it best.
     """
@@ -127,8 +129,14 @@ class AllocationConfig(Section):
     neighbors: int = pydantic.Field(default=6, ge=1, le=64)
     color: float = pydantic.Field(default=75.0, ge=0.0)
     color_power: float = pydantic.Field(default=0.3, ge=0.0, le=1.0)
+    view_color: float = pydantic.Field(default=2.0, ge=0.0)
     mass_power: float = pydantic.Field(default=0.4, ge=0.0, le=2.0)
     reassign: bool = True
+
+    @property
+    def compares_view_colors(self) -> bool:
+        """Whether pairs of cells merge, and their costs depend on view-dependent colours."""
+        return self.oversampling > 1.0 and self.view_color > 0.0
 
 
 class VisibilityConfig(Section):

@@ -38,11 +38,13 @@ def cell_parts(
     Parts are numbered by :func:`number_remote`; ``owners``, ``labels`` and ``count`` are as there.
     """
     parts, remote = number_remote(owners, labels, count)
-    moments = cells.group_moments(_members(job, rows), parts, count + len(remote))
+    components = job.read_scan().view_components
+    members = _members(job, rows, components)
+    moments = cells.group_moments(members, parts, count + len(remote))
     return {"parts": parts.int(), "remote": remote, **moments._asdict()}
 
 
-def _members(job: Job, rows: BlockRows) -> Moments:
+def _members(job: Job, rows: BlockRows, components: Tensor | None = None) -> Moments:
     """Return the moments of Gaussians, in the same units for all blocks."""
     scan, scene = job.read_scan(), rows.scene
     return cells.gaussian_moments(
@@ -51,6 +53,7 @@ def _members(job: Job, rows: BlockRows) -> Moments:
         scan.frame,
         weights=scene.masses,
         masses=rows.apparent_areas * scene.opacities,
+        components=components,
         unit=scan.mass / (scan.row_count + scan.kept_count),
     )
 

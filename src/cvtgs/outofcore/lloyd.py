@@ -191,7 +191,9 @@ def assign(job: Job, iterations: int, block: int) -> None:
     owners, labels = torch.empty_like(rows), torch.empty_like(rows)
     owners[rows], labels[rows] = found.blocks, found.labels
     del order, points, weights, found, rows
-    parts = cell_parts(job, read_apparent_rows(job, block), owners, labels, len(sites))
+    is_slim = job.read_scan().view_components.shape[1] == 0
+    members = read_apparent_rows(job, block, is_slim=is_slim)
+    parts = cell_parts(job, members, owners, labels, len(sites))
     facts = {"energy": energy, "refilled": torch.tensor(refilled)}
     save_tensors(job.parts_path(block), parts | facts, {})
 

@@ -14,11 +14,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs import analysis, cvt, filters, validity
-from cvtgs.analysis import EffectPlan
+from cvtgs import analysis, cells, cvt, filters, validity
+from cvtgs.analysis import EffectPlan, SceneAnalysis
 from cvtgs.boxes import Box, inside
 from cvtgs.config import SimplifyConfig
 from cvtgs.devices import HOST, one_thread
+from cvtgs.grouping import curve_order
 from cvtgs.io.ply import PlyRows
 from cvtgs.io.tensors import map_tensors, save_tensors
 from cvtgs.math.frames import RobustFrame
@@ -183,6 +184,8 @@ class SceneScan:
         cell_weight: Weight of one cell; heavier Gaussians count as one cell. 0 if all count as one.
         area_power: Power of the area in the weight.
         partition: The blocks, in contracted space.
+        view_components: Components of the view-dependent colour
+            (:func:`cvtgs.cells.view_components`).
         mass: Opacity times mean projected area of all valid Gaussians, squared scene units.
         invalid_rows: Rows that are dropped, by the attribute that is NaN, infinite or zero.
         row_count: Number of valid Gaussians outside boxes.
@@ -199,6 +202,7 @@ class SceneScan:
     cell_weight: float
     area_power: float
     partition: KdPartition
+    view_components: Float[Tensor, "c k"]
     mass: float
     invalid_rows: dict[str, int]
     row_count: int
@@ -271,16 +275,16 @@ def scan_scene(
     *,
     boxes: tuple[Box, ...],
     target: int,
-    cells: int,
+    cell_count: int,
     blocks: int,
     config: SimplifyConfig,
     frame: RobustFrame,
 ) -> SceneScan:
     """Choose filter thresholds, scale of the weights and partition from the sample.
 
-    The filter keeps at least ``target`` Gaussians; ``cells`` is at least ``target``. The measure of
-    a block is the mean of its shares of the Gaussians and of their weight, so that no block has
-    more than about twice the average of either.
+    The filter keeps at least ``target`` Gaussians; ``cell_count`` is at least ``target``. The
+    measure of a block is the mean of its shares of the Gaussians and of their weight, so that no
+    block has more than about twice the average of either.
     """
     grid = analysis.visibility_grid(totals.depths)
     sample = analysis.select_columns(sample, config.effects)
@@ -303,7 +307,7 @@ def scan_scene(
     mean_weight = float(weights.mean()) or 1.0
     min_weight = mean_weight * config.cvt.weight_floor
     weights = weights.clamp_min(min_weight)
-    cell_weight = _cell_weight(weights, cells / rows_per_sample)
+    cell_weight = _cell_weight(weights, cell_count / rows_per_sample)
     shares = (weights / cell_weight).clamp_max(1.0) if cell_weight > 0 else torch.ones_like(weights)
     measure = 0.5 / len(shares) + 0.5 * shares / shares.sum()
     return SceneScan(
@@ -317,11 +321,23 @@ def scan_scene(
         cell_weight=cell_weight,
         area_power=power,
         partition=partition_space(frame.contract(sample.means[rows]), measure, blocks),
+        view_components=_view_components(sample, known, rows, config),
         mass=totals.mass,
         invalid_rows=totals.invalid_rows,
         row_count=row_count,
         kept_count=totals.kept_count,
     )
+
+
+def _view_components(
+    sample: GaussianScene, known: SceneAnalysis, rows: Int[Tensor, "k"], config: SimplifyConfig
+) -> Float[Tensor, "c k"]:
+    """Return the components of the view-dependent colour by which cells of all blocks compare."""
+    if not config.allocation.compares_view_colors:
+        return torch.zeros(0, 0, dtype=torch.float64)
+    masses = (known.apparent_areas * known.opacities)[rows]
+    order = curve_order(sample, rows, known.frame, masses=masses)
+    return cells.view_components(sample, rows[order], masses[order])
 
 
 def _max_flyaway_mass(totals: RangeTotals, max_share: float) -> float:

@@ -87,7 +87,7 @@ def _scan(
         totals,
         boxes=job.boxes,
         target=max(1, rest),
-        cells=finer_count(max(1, rest), valid - kept, job.config.allocation),
+        cell_count=finer_count(max(1, rest), valid - kept, job.config.allocation),
         blocks=job.blocks,
         config=job.config,
         frame=frame,

@@ -84,9 +84,9 @@ def is_measured(job: Job) -> bool:
     return _mass_per_pixel(job) is not None
 
 
-def read_apparent_rows(job: Job, block: int) -> BlockRows:
-    """Read slim rows, with the areas that images measured if there are images."""
-    rows, mass_per_pixel = read_rows(job, block, is_slim=True), _mass_per_pixel(job)
+def read_apparent_rows(job: Job, block: int, *, is_slim: bool = True) -> BlockRows:
+    """Read rows, with the areas that images measured if there are images."""
+    rows, mass_per_pixel = read_rows(job, block, is_slim=is_slim), _mass_per_pixel(job)
     if mass_per_pixel is None:
         return rows
     measured = measured_areas(
