@@ -29,6 +29,10 @@ SENT_BYTES = "sent_bytes"
 """Entry of the label file of a block: bytes of the file of its sent rows."""
 
 
+FILES_VERSION = 1
+"""Number of the layout of these files: raise it with every change, so that no run continues with
+files of another layout."""
+
 STEPS = (
     "contributions", "sample", "sites", "sums", "parts", "groups", "labels", "merged", "inflated"
 )  # fmt: skip
@@ -239,7 +243,7 @@ class Job:
             "boxes": [box.model_dump() for box in self.boxes],
             "config": self.config.model_dump(),
             "network": checkpoint and checkpoint.digest,
-            "versions": [cvtgs.__version__, torch.__version__],
+            "versions": [cvtgs.__version__, torch.__version__, FILES_VERSION],
         }
         return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
