@@ -149,8 +149,9 @@ def viewers(session: nox.Session) -> None:
     folder = session.create_tmp()
     session.run("npm", "install", "--prefix", folder, *VIEWERS, "--ignore-scripts", external=True)
     settings = {"CVTGS_NODE_MODULES": str(Path(folder).resolve() / "node_modules")}
-    files = ("tests/streams/test_stream_viewers.py", "tests/test_viewer_browser.py")
-    session.run("pytest", *files, *session.posargs, env=settings)
+    files = ("io/test_file_viewers.py", "streams/test_stream_viewers.py", "test_viewer_browser.py")
+    words = [f"tests/{file}" for file in files]
+    session.run("pytest", *words, *session.posargs, env=settings)
 
 
 @nox.session

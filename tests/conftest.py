@@ -2,6 +2,7 @@
 
 import os
 import signal
+from collections.abc import Iterator
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # before torch is imported
     os.environ["OMP_NUM_THREADS"] = "1"
@@ -10,11 +11,26 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in background jobs o
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 from importlib import import_module
+from pathlib import Path
 
 import pytest
+
+from viewer_pages import Pictured, Served, pictured_scene
 
 
 @pytest.fixture
 def coarse_light(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compute visibility on a grid of 16 voxels a side; 128 would take most of the test time."""
     monkeypatch.setattr(import_module("cvtgs.analysis.visibility"), "HALF_GRID", 8)
+
+
+@pytest.fixture(scope="session")
+def pictured() -> Pictured:
+    return pictured_scene()
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    server = Served(tmp_path)
+    yield server
+    server.close()
