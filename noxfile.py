@@ -22,7 +22,13 @@ WHEEL_TESTS = (
     "tests/evaluation/test_compare.py",
 )
 """What tells whether anything is missing in the wheel: data files, names, types, commands."""
-VIEWERS = ("playcanvas@2.23.3", "cesium@1.140.0")
+VIEWERS = (
+    "playcanvas@2.23.3",
+    "cesium@1.140.0",
+    "@sparkjsdev/spark@2.2.0",
+    "@mkkellogg/gaussian-splats-3d@0.4.7",
+    "three@0.187.0",
+)
 
 
 @nox.session
@@ -144,7 +150,7 @@ def speed(session: nox.Session) -> None:
 
 @nox.session
 def viewers(session: nox.Session) -> None:
-    """Show scenes in viser, PlayCanvas' engine and CesiumJS, in headless Chromium."""
+    """Show scenes in viser, PlayCanvas, CesiumJS, Spark and GaussianSplats3D, in Chromium."""
     session.install(*CONSTRAINTS, "-e", ".[test,view]")
     folder = session.create_tmp()
     session.run("npm", "install", "--prefix", folder, *VIEWERS, "--ignore-scripts", external=True)

@@ -29,7 +29,9 @@ MODULES = Path(os.environ.get("CVTGS_NODE_MODULES", "none"))
 PAGES = Path(__file__).parent / "data" / "viewers"
 PACKAGES = {
     "cesium": ("cesium",),
+    "gaussiansplats3d": ("@mkkellogg/gaussian-splats-3d", "three"),
     "playcanvas": ("playcanvas",),
+    "spark": ("@sparkjsdev/spark", "three"),
 }
 """What each page loads from npm."""
 
