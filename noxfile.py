@@ -150,7 +150,7 @@ def speed(session: nox.Session) -> None:
 
 @nox.session
 def viewers(session: nox.Session) -> None:
-    """Show scenes in viser, PlayCanvas, CesiumJS, Spark and GaussianSplats3D, in Chromium."""
+    """Show scenes in viser and in five viewers from npm, in headless Chromium."""
     session.install(*CONSTRAINTS, "-e", ".[test,view]")
     folder = session.create_tmp()
     session.run("npm", "install", "--prefix", folder, *VIEWERS, "--ignore-scripts", external=True)

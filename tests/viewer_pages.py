@@ -32,6 +32,7 @@ PACKAGES = {
     "gaussiansplats3d": ("@mkkellogg/gaussian-splats-3d", "three"),
     "playcanvas": ("playcanvas",),
     "spark": ("@sparkjsdev/spark", "three"),
+    "three": ("three",),
 }
 """What each page loads from npm."""
 

@@ -1,7 +1,7 @@
 """Single files in third-party viewers (``nox -s viewers``).
 
-PlayCanvas' engine, Spark and GaussianSplats3D show each format that they read. Spark 2.2 reads
-versions 1 to 3 of ``.spz``, GaussianSplats3D 0.4.7 versions 1 and 2.
+Each shows the formats that it reads. Spark 2.2 reads versions 1 to 3 of ``.spz``, GaussianSplats3D
+0.4.7 versions 1 and 2, three.js version 4, too.
 """
 
 from pathlib import Path
@@ -24,31 +24,36 @@ from viewer_pages import (
 
 pytestmark = pytest.mark.long
 
-CLOSE = 1.0
-"""Largest mean difference where a viewer's settings follow our rules. We measured 0.3 to 0.8; most
-of it is the viewers' rounding of colours and of each blended pixel to 8 bits."""
+PLAIN, ALL = ("ply", "splat"), ("ply", "compressed.ply", "sog", "splat")
+BOUNDS = {"gaussiansplats3d": 1.0, "spark": 1.0, "three": 2.5}
+"""Largest mean differences from our picture, in levels of 255.
+
+The first two have settings that follow our rules. We measured 0.4 to 0.8; with more bits for
+colours (Spark's accumExtSplats) 0.4 instead of 0.6. three.js cuts Gaussians off at two sigmas and
+lowers opacities as for scenes tagged mip, without settings. We measured 1.9 to 2.2."""
 
 
 @needs_browser
 @pytest.mark.parametrize(
     ("page", "name", "options"),
     [
-        *(case("spark", f"a.{end}", {}) for end in ("ply", "compressed.ply", "sog", "splat")),
+        *(case("spark", f"a.{end}", {}) for end in ALL),
         *(case("spark", f"v{version}.spz", {"spz_version": version}) for version in (2, 3)),
-        *(case("gaussiansplats3d", f"a.{end}", {}) for end in ("ply", "compressed.ply", "splat")),
+        *(case("gaussiansplats3d", f"a.{end}", {}) for end in (*PLAIN, "compressed.ply")),
         case("gaussiansplats3d", "v2.spz", {"spz_version": 2}),
+        *(case("three", f"a.{end}", {}) for end in (*PLAIN, "spz", "glb")),
     ],
 )
 @pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
-def test_files_look_the_same_in_viewers_with_our_rules(
+def test_files_look_the_same_in_other_viewers(
     tmp_path: Path, served: Served, pictured: Pictured, page: str, name: str, options: Any
 ) -> None:
     scene, wanted = pictured
     if name.endswith(".splat"):  # which holds no other SH bands
         wanted = picture_of(scene.with_sh_degree(0))
     cvtgs.save(scene, tmp_path / name, **options)
-    url = f"/files/{name}"
-    assert least_difference(served, wanted, page, most=CLOSE, url=url) < CLOSE
+    most, url = BOUNDS[page], f"/files/{name}"
+    assert least_difference(served, wanted, page, most=most, url=url) < most
 
 
 @needs_browser
@@ -83,4 +88,4 @@ def test_pictures_of_wrong_scenes_do_not_match(pictured: Pictured) -> None:
         {"logit_opacities": torch.logit(shares)},
         {"log_scales": scene.log_scales + 0.1},
     ):
-        assert difference(picture_of(scene.with_tensors(wrong)), wanted) > CLOSE, list(wrong)
+        assert difference(picture_of(scene.with_tensors(wrong)), wanted) > 1, list(wrong)
