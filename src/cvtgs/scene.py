@@ -219,7 +219,7 @@ class GaussianScene:
         format: str | None = None,
         overwrite: bool = False,
         axes: str | None = None,
-        spz_version: Literal[2, 3, 4] = 4,
+        spz_version: Literal[2, 3, 4] = 3,
     ) -> None:
         """Write the scene to a file, as :func:`cvtgs.save` does.
 
@@ -228,7 +228,7 @@ class GaussianScene:
             format: Suffix of the format, if the file name does not have it.
             overwrite: Whether an existing file may be replaced.
             axes: Directions of x, y and z in the file; None for the axes of the format.
-            spz_version: Version of the format in a ``.spz``: 2, 3 or 4.
+            spz_version: Version of the format in a ``.spz``: 2, 3 or 4, as for :func:`cvtgs.save`.
         """
         resolve_name("cvtgs.io.formats:save")(
             self, path, format=format, overwrite=overwrite, axes=axes, spz_version=spz_version

@@ -129,12 +129,19 @@ def test_files_are_in_the_axes_of_a_ply_unless_axes_are_given(tmp_path: Path) ->
     path, scene = tmp_path / "a.spz", storable_scene(30)
     save(scene, path)
     assert_within(scene, load(path), BOUNDS)
-    save(scene, path, axes="rub", overwrite=True)
+    save(scene, path, axes="rub", overwrite=True, spz_version=4)
     assert_within(scene, load(path), BOUNDS)  # the file states its axes
     assert_within(half_turn(scene), load(path, axes="rdf"), BOUNDS)
-    save(scene, path, axes="rub", overwrite=True, spz_version=3)
+    save(scene, path, axes="rub", overwrite=True)
     assert_within(half_turn(scene), load(path), BOUNDS)
     assert_within(scene, load(path, axes="RUB"), BOUNDS)
+
+
+def test_version_3_is_written_unless_another_is_given(tmp_path: Path) -> None:
+    """Many viewers cannot read version 4 yet, and the first ones only version 2."""
+    scene = storable_scene(3)
+    save(scene, tmp_path / "a.spz")
+    assert struct.unpack_from("<4sI", unpacked_spz((tmp_path / "a.spz").read_bytes())) == (b"NGSP", 3)
 
 
 def test_the_bytes_of_version_4_are_as_expected(tmp_path: Path) -> None:
@@ -149,7 +156,7 @@ def test_the_bytes_of_version_4_are_as_expected(tmp_path: Path) -> None:
     sizes = [struct.unpack_from("<QQ", content, 44 + 16 * block)[1] for block in range(6)]
     assert sizes == [27, 3, 9, 9, 12, 27]
     assert unpacked_spz(content)[16:] == third[16:]
-    save(scene.with_sh_degree(0), tmp_path / "0.spz")
+    save(scene.with_sh_degree(0), tmp_path / "0.spz", spz_version=4)
     assert (tmp_path / "0.spz").read_bytes()[15] == 5
 
 

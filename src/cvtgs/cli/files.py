@@ -157,8 +157,9 @@ def add_convert(add_parser: AddParser) -> None:
         metavar="V",
         type=int,
         choices=(2, 3, 4),
-        default=4,
-        help="version of a .spz to write: 4 (default), or 3 or 2 for older readers",
+        default=3,
+        help="version of a .spz to write: 3 (default), 4, which states its axes, or 2 for older "
+        "readers",
     )
     add_edit_options(parser)
 

@@ -194,7 +194,7 @@ def save(
     format: str | None = None,
     overwrite: bool = False,
     axes: str | None = None,
-    spz_version: Literal[2, 3, 4] = 4,
+    spz_version: Literal[2, 3, 4] = 3,
 ) -> None:
     """Write a scene to a file, completely or not at all.
 
@@ -216,7 +216,8 @@ def save(
             axes are ``"rdf"``, is converted to them. None uses those of the format: ``"luf"`` for
             glTF, ``"rub"`` for OpenUSD, ``"rdf"`` for the others. ``.spz`` files of version 4
             state their axes.
-        spz_version: Version of ``.spz`` files: 4, or 3 or 2 for older readers.
+        spz_version: Version of ``.spz`` files: 3, 4, which many viewers cannot read yet, or 2 for
+            older readers.
 
     Raises:
         FileFormatError: The format is unknown or cannot be written.

@@ -48,7 +48,7 @@ VERSIONS: tuple[Version, ...] = (2, 3, 4)
 
 
 def write_spz(
-    scene: GaussianScene, file: BinaryIO, *, version: Version = 4, axes: str = SCENE_AXES
+    scene: GaussianScene, file: BinaryIO, *, version: Version = 3, axes: str = SCENE_AXES
 ) -> None:
     """Write an ``.spz`` file, in the order and the axes of the scene.
 
@@ -57,8 +57,8 @@ def write_spz(
     Args:
         scene: The scene, on any device.
         file: The output, open for writing.
-        version: 4 (zstd), or 3 (gzip) or 2 (gzip, rotations in 24 instead of 32 bits) for older
-            readers.
+        version: 3 (gzip), 4 (zstd), which states its axes but which many viewers cannot read yet,
+            or 2 (gzip, rotations in 24 instead of 32 bits) for older readers.
         axes: The axes that a file of version 4 states; the scene is not converted.
 
     Raises:
