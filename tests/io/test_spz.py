@@ -141,7 +141,8 @@ def test_version_3_is_written_unless_another_is_given(tmp_path: Path) -> None:
     """Many viewers cannot read version 4 yet, and the first ones only version 2."""
     scene = storable_scene(3)
     save(scene, tmp_path / "a.spz")
-    assert struct.unpack_from("<4sI", unpacked_spz((tmp_path / "a.spz").read_bytes())) == (b"NGSP", 3)
+    content = unpacked_spz((tmp_path / "a.spz").read_bytes())
+    assert struct.unpack_from("<4sI", content) == (b"NGSP", 3)
 
 
 def test_the_bytes_of_version_4_are_as_expected(tmp_path: Path) -> None:
