@@ -59,7 +59,7 @@ def view_components(
     both = torch.cat([first, first + 1])
     bands = scene.shN.index_select(0, rows.index_select(0, both))
     bands, weights = move_together([bands, masses.index_select(0, both)], HOST)
-    colors, weights = _coefficients(bands), weights.double()
+    colors, weights = _project(bands.double(), torch.eye(width, device=HOST)), weights.double()
     weights = weights / weights.sum().clamp_min(torch.finfo(torch.float64).tiny)
     centered = colors - weights @ colors
     variances, axes = torch.linalg.eigh(centered.T @ (centered * weights[:, None]))
@@ -88,12 +88,14 @@ def view_colors(
     Returns:
         One row per Gaussian, float64.
     """
-    coefficients = _coefficients(scene.shN.index_select(0, rows))
-    return coefficients[:, : len(components)] @ components
+    return _project(scene.shN.index_select(0, rows), components)
 
 
-def _coefficients(bands: Float[Tensor, "n b 3"]) -> Float[Tensor, "n c"]:
-    """Return flattened coefficients; the mean of a squared colour is the sum of their squares."""
-    coefficients = SH_C0 * bands.double().flatten(1)
-    norms = coefficients.square().sum(dim=1, keepdim=True).sqrt()
-    return coefficients * (LARGEST_COLOR / norms.clamp_min(LARGEST_COLOR))
+def _project(bands: Float[Tensor, "n b 3"], components: Float[Tensor, "c k"]) -> Tensor:
+    """Return components, in units in which the mean of a squared colour is the sum of squares."""
+    coefficients = bands.flatten(1)[:, : len(components)]
+    norms = SH_C0 * torch.linalg.vector_norm(coefficients, dim=1, keepdim=True)
+    factors = SH_C0 * LARGEST_COLOR / norms.double().clamp_min(LARGEST_COLOR)
+    projected = coefficients @ components.to(coefficients.dtype)
+    colors: Tensor = (projected.double() * factors).nan_to_num(0.0, 0.0, 0.0)
+    return colors  # zeros where squares overflow
