@@ -67,11 +67,11 @@ def write_spz(
         OSError: The file cannot be written.
 
     Example:
-        >>> import io
+        >>> import gzip, io
         >>> from cvtgs.synthetic import scene
         >>> file = io.BytesIO()
         >>> write_spz(scene("object", 5, sh_degree=0, seed=0), file)
-        >>> file.getvalue()[:4]
+        >>> gzip.decompress(file.getvalue())[:4]
         b'NGSP'
     """
     if version not in VERSIONS:
