@@ -9,7 +9,7 @@ from block_jobs import unfinished_job
 from cvtgs import SimplifyConfig
 from cvtgs.analysis import analyze
 from cvtgs.cells import gaussian_moments, merge_pairs, view_components
-from cvtgs.cells.view_colors import MAX_COMPONENTS, view_colors
+from cvtgs.cells.view_colors import LARGEST_COLOR, MAX_COMPONENTS, view_colors
 from cvtgs.config import AllocationConfig
 from cvtgs.math.spherical_harmonics import rest_basis
 from scenes import moved, random_scene
@@ -101,7 +101,12 @@ def test_hard_values_give_finite_components():
     masses = torch.zeros(300)
     masses[5:9] = 1e30
     for weights in (torch.ones(300), masses, torch.zeros(300)):
-        assert bool(components_of(bands, weights)[1].isfinite().all())
+        scene, components = components_of(bands, weights)
+        assert bool(components.isfinite().all())
+        for directions in (components, torch.eye(45)):
+            colors = view_colors(scene, torch.arange(300), directions)
+            assert bool(colors.isfinite().all())
+            assert float(colors.norm(dim=1).amax()) < LARGEST_COLOR + 1e-6
     assert components_of(bands[:1])[1].shape == (45, 0)
 
 
