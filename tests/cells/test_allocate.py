@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -33,6 +34,13 @@ def points(places, *, colors=None, weights=None, size=0.01):
 def all_others(count):
     rows = torch.arange(count)
     return torch.stack([rows[rows != row] for row in rows])
+
+
+def all_pairs_near(near, labels, count):
+    """Neighbours of groups: those of their members, padded with the groups themselves."""
+    found = [sorted({int(labels[j]) for j in near[labels == i].flatten()}) for i in range(count)]
+    width = max(map(len, found))
+    return torch.tensor([others + [i] * (width - len(others)) for i, others in enumerate(found)])
 
 
 def scene_moments(scene):
@@ -84,25 +92,50 @@ def test_a_pair_that_images_hardly_show_merges_first():
     assert merge_pairs(moments, all_others(4), 3, equal).tolist() == [0, 0, 1, 2]
 
 
+def cost_of_a_pair(groups, config):
+    table = torch.cat([torch.atleast_2d(values).float() for values in groups])
+    (cost,) = merge_pairs.__globals__["_pair_costs"](
+        table, torch.tensor([0]), torch.tensor([1]), config
+    )
+    return float(cost)
+
+
 def test_the_cost_of_a_pair_by_hand():
     """Two round Gaussians of variance s^2, a apart: the variance between them grows by a^2 / 4.
 
     To each variance, a hundredth of the sum of variances and the floor are added.
     """
     groups, config = points([0.0, 0.3], size=0.1, colors=[0.2, 0.4]), AllocationConfig(mass_power=1)
-    costs = merge_pairs.__globals__["_pair_costs"](
-        groups, torch.tensor([0]), torch.tensor([1]), config
-    )
     own, added = 0.01 + 0.01 * 0.03 + 1e-8, 0.01 * (0.03 + 0.0225) + 1e-8
     across, along = 0.01 + added, 0.01 + 0.0225 + added
     wanted = 0.5 * (math.log(along) + 2 * math.log(across) - 3 * math.log(own))
     wanted += config.color * 0.25 * 3 * 0.2**2
-    assert float(costs[0]) == pytest.approx(2.0 * 2.0 * wanted)
+    assert cost_of_a_pair(groups, config) == pytest.approx(2.0 * 2.0 * wanted, rel=1e-5)
     groups = groups._replace(counts=torch.tensor([3.0, 4.0]).double())
-    costs = merge_pairs.__globals__["_pair_costs"](
-        groups, torch.tensor([0]), torch.tensor([1]), config
-    )
-    assert float(costs[0]) == pytest.approx(2.0 * 7.0 * wanted)
+    assert cost_of_a_pair(groups, config) == pytest.approx(2.0 * 7.0 * wanted, rel=1e-5)
+
+
+def test_equal_groups_cost_nothing_and_overflowing_ones_merge_last():
+    config = AllocationConfig()
+    assert cost_of_a_pair(points([0.5, 0.5], size=0.3), config) == pytest.approx(0.0, abs=1e-6)
+    assert cost_of_a_pair(points([0.0, 1e30]), config) == math.inf
+    labels = merge_pairs(points([-1e30, 0.0, 1.0, 1e30]), all_others(4), 3, DEFAULT)
+    assert labels.tolist() == [0, 1, 1, 2]
+
+
+def test_pairs_that_merged_cost_as_much_as_the_moments_of_their_members():
+    """Moments of groups are kept up to date from round to round, in float32."""
+    members = scene_moments(random_scene(300))
+    near = cvt.nearest_neighbors(members.means.T, 12)
+    labels = merge_pairs(members, near, 110, DEFAULT)
+    rounds, total = members, 300
+    seen = torch.arange(300)
+    while total > 110:  # the same, with moments computed from the members anew in each round
+        keep = max(110, total - int(0.35 * total))
+        own = merge_pairs(rounds, all_pairs_near(near, seen, total), keep, DEFAULT)
+        seen, total = own[seen], keep
+        rounds = group_moments(members, seen, total)
+    assert torch.equal(labels, seen)
 
 
 @pytest.mark.parametrize("count", [1, 2, 37, 99])
@@ -121,28 +154,40 @@ def test_groups_without_neighbours_merge_too():
     assert labels.tolist() == [0, 0, 0, 0]
 
 
-def test_disjoint_pairs_equal_those_of_a_loop_over_all_pairs():
-    g = torch.Generator().manual_seed(0)
-    first, second = torch.combinations(torch.arange(40)).T
-    costs = torch.rand(len(first), generator=g).double()
-    take = merge_pairs.__globals__["_cheapest_disjoint"]
-    used, wanted = set(), []
-    for pair in costs.argsort().tolist()[: 6 * 12]:
+def greedy(first, second, costs, wanted):
+    used, taken = set(), []
+    for pair in sorted(range(len(costs)), key=lambda pair: (float(costs[pair]), pair)):
         ends = {int(first[pair]), int(second[pair])}
-        if not used & ends and len(wanted) < 12:
+        if not used & ends and len(taken) < wanted:
             used |= ends
-            wanted.append(tuple(sorted(ends)))
-    found = list(zip(*(ends.tolist() for ends in take(first, second, costs, 12, 40)), strict=True))
-    assert found == wanted
+            taken.append(pair)
+    return [(int(first[pair]), int(second[pair])) for pair in sorted(taken)]
+
+
+@pytest.mark.parametrize("kind", ["random", "ties", "ascending"])
+@pytest.mark.parametrize("wanted", [1, 12, 19, 500])
+def test_disjoint_pairs_equal_those_of_a_loop_over_all_pairs(kind, wanted):
+    """Along a chain of ascending costs, a round finds one pair only, and a loop the rest."""
+    g = torch.Generator().manual_seed(0)
+    first, second = (rows.numpy() for rows in torch.combinations(torch.arange(40)).T)
+    costs = torch.rand(len(first), generator=g).numpy()
+    if kind == "ties":
+        costs = (4 * costs).round()
+    if kind == "ascending":
+        first, second = np.arange(199), np.arange(1, 200)
+        costs = np.arange(199, dtype=np.float32)
+    take = merge_pairs.__globals__["_cheapest_disjoint"]
+    found = take(first, second, costs, wanted, 200)
+    pairs = list(zip(*(ends.tolist() for ends in found), strict=True))
+    assert pairs == greedy(first, second, costs, wanted)
 
 
 def test_each_pair_appears_once_in_ascending_order():
     pairs_of = merge_pairs.__globals__["_distinct_pairs"]
-    first, second = torch.tensor([4, 2, 9, 2, 3, 0]), torch.tensor([2, 4, 0, 9, 3, 9])
-    found = pairs_of(first, second)
-    assert [ends.tolist() for ends in found] == [[0, 2, 2], [9, 4, 9]]
-    none = torch.empty(0, dtype=torch.int64)
-    assert [len(ends) for ends in pairs_of(none, none)] == [0, 0]
+    first, second = np.array([4, 2, 9, 2, 3, 0]), np.array([2, 4, 0, 9, 3, 9])
+    keys = pairs_of(first, second)
+    assert [(key >> 32, key % 2**32) for key in keys.tolist()] == [(0, 9), (2, 4), (2, 9)]
+    assert len(pairs_of(first[:0], first[:0])) == 0
 
 
 @pytest.mark.parametrize("count", [1, 30, 49, 60, 200])

@@ -6,20 +6,22 @@ tessellation makes more cells than are wanted, and the cheapest pairs merge.
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.cells.view_colors import LARGEST_COLOR, view_colors
 from cvtgs.config import AllocationConfig
-from cvtgs.devices import in_chunks
+from cvtgs.devices import HOST, in_chunks
 from cvtgs.math.frames import RobustFrame
 from cvtgs.math.parameters import normalize_quats, quats_to_matrices
-from cvtgs.math.segments import ascending, label_argmin, label_sums, smallest_rows, take_columns
+from cvtgs.math.segments import label_argmin, label_sums, take_columns
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 
-CHUNK = 1 << 15
+CHUNK = 1 << 14
 """Gaussians per chunk of the cost computation, to bound memory."""
 
 SHARE_PER_ROUND = 0.35
@@ -31,6 +33,15 @@ flat Gaussians, which images hardly show, counts less than their extent."""
 
 FLOOR = 1e-4
 """Standard deviation, in robust radii, added in quadrature so that flat shapes have a volume."""
+
+MOST_ROUNDS = 30
+"""Number of vectorised rounds that choose disjoint pairs; captures need 6 to 11."""
+
+ROW_BITS, LAST_ROW = 32, (1 << 32) - 1
+"""Keys to sort by have a row number in their lower bits."""
+
+Rows = NDArray[np.int64]
+"""Row numbers or keys."""
 
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Row and column of the six distinct entries of a symmetric matrix."""
@@ -163,67 +174,104 @@ def merge_pairs(
     Returns:
         The new group of every group, 0 to ``count - 1``.
     """
-    device, total = groups.weights.device, len(groups.weights)
-    labels = torch.arange(total, device=device)
-    pairs = _distinct_pairs(labels.repeat_interleave(neighbors.shape[1]), neighbors.flatten())
+    table = torch.cat([torch.atleast_2d(values).float() for values in groups])  # fast to gather
+    total, labels = len(groups.weights), np.arange(len(groups.weights))
+    pairs = _distinct_pairs(labels.repeat(neighbors.shape[1]), neighbors.numpy().ravel())
     while total > count:
+        if len(pairs) == 0:  # no neighbouring pairs are left: merge arbitrary ones
+            pairs = _distinct_pairs(np.arange(total - 1), np.arange(1, total))
+        first, second = pairs >> ROW_BITS, pairs & LAST_ROW
         wanted = min(total - count, max(1, int(SHARE_PER_ROUND * total)))
-        if len(pairs[0]) == 0:  # no neighbouring pairs are left: merge arbitrary ones
-            pairs = torch.arange(total - 1, device=device), torch.arange(1, total, device=device)
-        costs = _pair_costs(groups, *pairs, config)
-        first, second = _cheapest_disjoint(*pairs, costs, wanted, total)
-        target = torch.arange(total, device=device)
-        target[second] = first
-        keeps = torch.ones(total, dtype=torch.bool, device=device)
-        keeps[second] = False
-        target = (keeps.cumsum(0) - 1)[target]
-        total -= len(first)
-        labels = target[labels]
-        if total == count:
-            break
-        groups = group_moments(groups, target, total)
-        del costs  # frees memory, as does replacing the old pairs before duplicates are removed
-        pairs = target[pairs[0]], target[pairs[1]]
-        pairs = _distinct_pairs(*pairs)
-    return labels
+        costs = _pair_costs(table, torch.from_numpy(first), torch.from_numpy(second), config)
+        kept, merged = _cheapest_disjoint(first, second, costs.numpy(), wanted, total)
+        is_kept = np.ones(total, dtype=bool)
+        is_kept[merged] = False
+        target = np.cumsum(is_kept) - 1
+        target[merged] = target[kept]
+        labels, total = target[labels], total - len(merged)
+        if total > count:
+            _join_pairs(table, kept, merged)
+            table = table.index_select(1, torch.from_numpy(np.flatnonzero(is_kept)))
+            del pairs, costs  # frees memory
+            pairs = _distinct_pairs(target[first], target[second])
+    return torch.from_numpy(labels)
 
 
-def _distinct_pairs(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Return each unordered pair of different groups once, in ascending order."""
-    bits = max(int(ends.amax()).bit_length() if len(ends) else 1 for ends in (first, second))
-    keys = torch.minimum(first, second).bitwise_left_shift_(bits)  # in place: there are many pairs
-    keys |= torch.maximum(first, second)
-    keys = torch.unique_consecutive(ascending(keys[first != second]))
-    return keys >> bits, keys & ((1 << bits) - 1)
+def _distinct_pairs(first: Rows, second: Rows) -> Rows:
+    """Return a key of each unordered pair of different groups, ascending.
+
+    The upper bits of a key are the smaller of the two groups, the lower ones the other.
+    """
+    keys = np.minimum(first, second)
+    keys <<= ROW_BITS
+    keys |= np.maximum(first, second)
+    keys = keys[first != second]
+    keys.sort()
+    is_new = np.ones(len(keys), dtype=bool)
+    np.not_equal(keys[1:], keys[:-1], out=is_new[1:])
+    distinct: Rows = keys[is_new]
+    return distinct
+
+
+def _rows_of(table: Float[Tensor, "c n"]) -> Moments:
+    """Return the rows of a table as moments; those of one number per group have two dimensions."""
+    return Moments(*table.split([1, 1, 1, 3, 6, 3, len(table) - 15]))
 
 
 def _pair_costs(
-    groups: Moments, first: Tensor, second: Tensor, config: AllocationConfig
+    table: Float[Tensor, "c n"], first: Tensor, second: Tensor, config: AllocationConfig
 ) -> Float[Tensor, "p"]:
-    """Return the cost of merging each pair."""
-    volumes = _log_volume(groups.covariances)
+    """Return the cost of merging each pair, at least 0; infinite where float32 overflows."""
+    volumes = _log_volume(_rows_of(table).covariances)
 
     def costs_of(part: slice) -> Tensor:
         i, j = first[part], second[part]
-        a, b = Moments(*take_columns(i, *groups)), Moments(*take_columns(j, *groups))
-        total = a.weights + b.weights
-        share, other = a.weights / total, b.weights / total
-        product = share * other
-        shifts = a.means - b.means
-        merged = torch.stack([
-            share * a.covariances[k] + other * b.covariances[k] + product * shifts[r] * shifts[c]
-            for k, (r, c) in enumerate(UPPER)
-        ])  # fmt: skip
-        own, others = volumes.index_select(0, i), volumes.index_select(0, j)
-        cost = 0.5 * (_log_volume(merged) - share * own - other * others)
-        squares = (a.colors - b.colors).square().sum(0)
-        squares += config.view_color * (a.view_colors - b.view_colors).square().sum(0)
-        cost += config.color * product * squares
-        cost *= (a.masses + b.masses) ** config.mass_power
-        costs: Tensor = cost * (a.counts + b.counts)
-        return costs
+        one, two = (_rows_of(table.index_select(1, rows)) for rows in (i, j))
+        share = one.weights / (one.weights + two.weights)
+        own = share * volumes.index_select(0, i) + (1.0 - share) * volumes.index_select(0, j)
+        cost = 0.5 * (_log_volume(_joint_covariances(one, two, share)) - own)
+        squares = (one.colors - two.colors).square().sum(0)
+        squares += config.view_color * (one.view_colors - two.view_colors).square().sum(0)
+        cost += config.color * share * (1.0 - share) * squares
+        cost *= (one.masses + two.masses) ** config.mass_power
+        cost *= one.counts + two.counts
+        return cost[0].nan_to_num_(torch.inf, torch.inf).clamp_min_(0.0)
 
-    return torch.cat(in_chunks(costs_of, len(first), CHUNK, first.device))
+    return torch.cat(in_chunks(costs_of, len(first), CHUNK, HOST))
+
+
+def _joint_covariances(
+    one: Moments, two: Moments, share: Float[Tensor, "1 n"]
+) -> Float[Tensor, "6 n"]:
+    """Return the covariances of pairs, given the share of the first group in the weight."""
+    rest, shifts = 1.0 - share, one.means - two.means
+    spread = share * rest * shifts
+    return torch.cat([
+        share * one.covariances[k] + rest * two.covariances[k] + spread[r] * shifts[c]
+        for k, (r, c) in enumerate(UPPER)
+    ])  # fmt: skip
+
+
+def _join_pairs(table: Float[Tensor, "c n"], kept: Rows, merged: Rows) -> None:
+    """Replace the moments of kept groups by those of them and the merged ones, in place."""
+    first, second = torch.from_numpy(kept), torch.from_numpy(merged)
+
+    def join(part: slice) -> None:
+        one, two = (_rows_of(table.index_select(1, rows[part])) for rows in (first, second))
+        weights = one.weights + two.weights
+        share = one.weights / weights
+        both = Moments(
+            counts=one.counts + two.counts,
+            weights=weights,
+            masses=one.masses + two.masses,
+            means=torch.lerp(two.means, one.means, share),
+            covariances=_joint_covariances(one, two, share),
+            colors=torch.lerp(two.colors, one.colors, share),
+            view_colors=torch.lerp(two.view_colors, one.view_colors, share),
+        )
+        table.index_copy_(1, first[part], torch.cat(both))
+
+    in_chunks(join, len(kept), CHUNK, HOST)
 
 
 def _log_volume(covariances: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:
@@ -238,33 +286,40 @@ def _log_volume(covariances: Float[Tensor, "6 n"]) -> Float[Tensor, "n"]:
 
 
 def _cheapest_disjoint(
-    first: Tensor, second: Tensor, costs: Tensor, wanted: int, total: int
-) -> tuple[Tensor, Tensor]:
-    """Take disjoint pairs, cheapest first, at most ``wanted``.
+    first: Rows, second: Rows, costs: NDArray[np.float32], wanted: int, total: int
+) -> tuple[Rows, Rows]:
+    """Take disjoint pairs, cheapest first, at most ``wanted``; return them in the order of pairs.
 
-    Each round takes every pair that is the cheapest of both its groups. The result is that of
-    a greedy pass over all pairs in order (Preis 1999), in a few vectorised rounds.
+    Each round takes every pair that is the cheapest of both its groups. The result is that of a
+    greedy pass over all pairs by cost (Preis 1999), in a few vectorised rounds. Along chains of
+    ascending costs there would be as many rounds as pairs, so a loop finishes what is left.
     """
-    order = smallest_rows(costs, 6 * wanted)
-    ends = first.index_select(0, order), second.index_select(0, order)
-    ranks = torch.arange(len(order), device=order.device)  # ranks of the remaining pairs
-    left, taken = ends, []
-    while len(ranks):
-        best = torch.full((total,), len(order), device=order.device)
+    # Bits of positive floats are in the order of the floats, so these keys are in that of costs.
+    keys = costs.view(np.int32).astype(np.int64)
+    keys <<= ROW_BITS
+    keys |= np.arange(len(keys))
+    left, is_free = (first, second), np.ones(total, dtype=bool)
+    taken: list[Rows] = []
+    for _ in range(MOST_ROUNDS):
+        least = np.full(total, np.iinfo(np.int64).max)
         for groups in left:
-            best.scatter_reduce_(0, groups, ranks, "amin")
-        cheapest = [best.index_select(0, groups) == ranks for groups in left]
-        chosen = (cheapest[0] & cheapest[1]).nonzero()[:, 0]
-        taken.append(ranks.index_select(0, chosen))
-        free = torch.ones(total, dtype=torch.bool, device=order.device)
+            np.minimum.at(least, groups, keys)
+        is_chosen = (least[left[0]] == keys) & (least[left[1]] == keys)
+        taken.append(keys[is_chosen])
         for groups in left:
-            free[groups.index_select(0, chosen)] = False
-        stays = free.index_select(0, left[0]) & free.index_select(0, left[1])
-        rows = stays.nonzero()[:, 0]
-        left = left[0].index_select(0, rows), left[1].index_select(0, rows)
-        ranks = ranks.index_select(0, rows)
-    rows = torch.sort(torch.cat(taken)).values[:wanted]
-    return ends[0].index_select(0, rows), ends[1].index_select(0, rows)
+            is_free[groups[is_chosen]] = False
+        stays = np.flatnonzero(is_free[left[0]] & is_free[left[1]])
+        left, keys = (left[0][stays], left[1][stays]), keys[stays]
+        if len(keys) == 0:
+            break
+    order, free, late = np.argsort(keys), bytearray(is_free), list[int]()
+    for key, i, j in zip(*(values[order].tolist() for values in (keys, *left)), strict=True):
+        if free[i] and free[j]:
+            free[i] = free[j] = 0
+            late.append(key)
+    found = np.sort(np.concatenate([*taken, np.array(late, dtype=np.int64)]))
+    rows = np.sort(found[:wanted] & LAST_ROW)
+    return first[rows], second[rows]
 
 
 def reassign(

@@ -50,14 +50,6 @@ def smallest_rows(values: Float[Tensor, "n"], count: int) -> Int[Tensor, "k"]:
     return candidates[ascending_rows(values[candidates])[:count]]
 
 
-def ascending(values: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
-    """Return integers in ascending order; on a CPU in place, three times as fast as torch."""
-    if values.device.type != "cpu":
-        return torch.sort(values).values
-    values.numpy().sort()
-    return values
-
-
 def ascending_rows(values: Float[Tensor, "n"]) -> Int[Tensor, "n"]:
     """Return the rows in stable ascending order of values, with NaN at the end.
 
