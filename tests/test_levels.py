@@ -59,9 +59,9 @@ def test_costs_of_every_level_are_at_its_ratio_to_the_gaussians_of_the_scene(sce
     """Cells of a nested level are made from cells, but stand for all Gaussians in them."""
     ratios = []
 
-    def noted(ratio, config, *, is_measured):
+    def noted(ratio, config):
         ratios.append(ratio)
-        return allocation_at(ratio, config, is_measured=is_measured)
+        return allocation_at(ratio, config)
 
     monkeypatch.setattr("cvtgs.grouping.allocation_at", noted)
     config = cvtgs.SimplifyConfig.from_mapping({"filter": {"min_opacity": 0.0}})

@@ -197,7 +197,7 @@ def _tessellate(
             labels,
             count,
             target,
-            allocation_at(target / total, config, is_measured=analysis.is_measured),
+            allocation_at(target / total, config.allocation),
             neighbors=points.neighbors if count == len(rows) else None,
         )
     return tessellation, labels
@@ -214,16 +214,9 @@ def finer_count(target: int, available: int, config: AllocationConfig) -> int:
     return available if count * MEMBERS_PER_CELL > available else count
 
 
-def allocation_at(ratio: float, config: SimplifyConfig, *, is_measured: bool) -> AllocationConfig:
-    """Return the weights of the costs: colour at a ratio of cells to Gaussians, and masses.
-
-    Masses count more if images of the scene measured them.
-    """
-    costs = config.allocation
-    update = {"color": costs.color * ratio**costs.color_power}
-    if is_measured:
-        update["mass_power"] = config.visibility.mass_power
-    return costs.model_copy(update=update)
+def allocation_at(ratio: float, config: AllocationConfig) -> AllocationConfig:
+    """Return the weights of the costs at a ratio of cells to Gaussians."""
+    return config.model_copy(update={"color": config.color * ratio**config.color_power})
 
 
 def allocate(

@@ -271,17 +271,42 @@ def test_without_allocation_the_cells_of_the_tessellation_are_kept():
 
 
 def test_colours_count_more_where_cells_are_small():
-    config = SimplifyConfig(allocation=AllocationConfig(color=100.0, color_power=0.5))
-    assert allocation_at(0.25, config, is_measured=False).color == pytest.approx(50.0)
-    assert allocation_at(0.01, config, is_measured=False).color == pytest.approx(10.0)
+    config = AllocationConfig(color=100.0, color_power=0.5)
+    assert allocation_at(0.25, config).color == pytest.approx(50.0)
+    assert allocation_at(0.01, config).color == pytest.approx(10.0)
 
 
-def test_measured_masses_count_by_a_power_of_their_own():
-    config = SimplifyConfig.from_mapping({
-        "allocation": {"mass_power": 0.3}, "visibility": {"mass_power": 0.9}
-    })  # fmt: skip
-    assert allocation_at(0.1, config, is_measured=False).mass_power == 0.3
-    assert allocation_at(0.1, config, is_measured=True).mass_power == 0.9
+def test_contrast_is_that_of_neighbours_by_hand():
+    """Half of the mean squared difference: one of two neighbours differs by 0.3 in each channel."""
+    contrast = merge_pairs.__globals__["_relative_contrast"]
+    near = torch.tensor([[1], [0], [3], [2]])
+    groups = points([0.0, 1.0, 5.0, 5.5], colors=[0.1, 0.4, 0.7, 0.7])
+    assert contrast(groups.colors, near) == pytest.approx(math.sqrt(0.5 * 0.5 * 3 * 0.3**2) / 0.2)
+    alike = points([0.0, 1.0, 5.0, 5.5])
+    assert contrast(alike.colors, near) == 0.3
+    assert contrast(10 * groups.colors, near) == 1.4
+    assert contrast(alike.colors[:, :1], near[:1, :0]) == 0.3
+
+
+def test_masses_count_more_and_colours_less_where_neighbours_differ(monkeypatch):
+    """Weights are those of the configuration at the common contrast."""
+    seen = []
+    costs = merge_pairs.__globals__["_pair_costs"]
+
+    def noted(table, first, second, config):
+        seen.append((config.mass_power, config.color))
+        return costs(table, first, second, config)
+
+    monkeypatch.setitem(merge_pairs.__globals__, "_pair_costs", noted)
+    config = AllocationConfig(mass_power=0.6, color=30.0)
+    step = 0.2 * math.sqrt(2 / 3)  # of a contrast of 0.2
+    for factor in (0.0, 0.5, 1.0, 9.0):
+        shades = [0.0, factor * step, 0.0, factor * step]
+        moments = points([0.0, 1.0, 2.0, 3.0], colors=shades)
+        near = torch.tensor([[1], [0], [3], [2]])
+        merge_pairs(moments, near, 3, config)
+    wanted = [(0.6 * s, 30.0 / s) for s in (0.3, 0.5, 1.0, 1.4)]
+    assert seen == [pytest.approx(pair) for pair in wanted]
 
 
 def test_large_groups_merge_last():

@@ -124,7 +124,9 @@ def test_coincident_sites_are_searched_as_one(monkeypatch):
 def test_coincident_sites_are_separated_in_the_neighbour_tree(monkeypatch):
     home, seen = import_module("cvtgs.cvt.nearest"), []
     honest = home.build_tree
-    monkeypatch.setattr(home, "build_tree", lambda sites: seen.append(sites) or honest(sites))
+    monkeypatch.setattr(
+        home, "build_tree", lambda sites, **how: seen.append(sites) or honest(sites, **how)
+    )
     far = 3e38 * torch.tensor([[1.0, -1.0, 1.0]])  # their extent is beyond float32
     sites = torch.cat([torch.zeros(500, 3), far, -far])
     found = nearest_neighbors(sites, 8)

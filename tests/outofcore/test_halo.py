@@ -8,7 +8,7 @@ import torch
 import cvtgs
 from block_jobs import unfinished_job
 from cvtgs import SimplifyConfig, cells, cvt, validity
-from cvtgs.cells.allocate import Moments
+from cvtgs.cells import Moments
 from cvtgs.cvt import nearest_several
 from cvtgs.evaluation import EvaluationSettings
 from cvtgs.grouping import REASSIGN, allocate, allocation_at
@@ -206,7 +206,7 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
         masses=torch.cat(areas) * scene.opacities,
         components=job.read_scan().view_components,
     )
-    config = allocation_at(TARGET / COUNT, job.config, is_measured=False)
+    config = allocation_at(TARGET / COUNT, job.config.allocation)
     fine = sum(job.cells)
     assert fine > TARGET + 50
     whole = cells.group_moments(members, labels, fine)

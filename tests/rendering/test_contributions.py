@@ -81,7 +81,11 @@ def ball_and_core(count: int = 600) -> cvtgs.GaussianScene:
 
 def test_cells_go_to_visible_regions():
     scene = ball_and_core()
-    powers = {"allocation.mass_power": "1", "visibility.mass_power": "1"}
+    colors = torch.rand(len(scene), 1, 3, generator=torch.Generator().manual_seed(1))
+    scene = scene.with_tensors(
+        {"sh0": 4 * colors.double()}, {}
+    )  # their contrast lets masses count most
+    powers = {"allocation.color": "0", "allocation.mass_power": "0.72"}
     settings = {"merge.network": "false", "cvt.hidden_share": "1", **powers}
     blind = SimplifyConfig.compose(settings=settings)
     seeing = SimplifyConfig.compose(

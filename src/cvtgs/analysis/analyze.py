@@ -36,7 +36,6 @@ class SceneAnalysis:
         visibility: ``(n,)`` ambient visibility of every Gaussian, 0 (enclosed) to 1 (free);
             empty if neither weights nor the network use it.
         plan: The effects that the scene calls for.
-        is_measured: Whether images of the scene corrected the apparent areas.
         observed: Images of the scene and the contributions of these Gaussians to them; None if
             later stages do not use them.
     """
@@ -48,7 +47,6 @@ class SceneAnalysis:
     apparent_areas: Float[Tensor, "n"]
     visibility: Float[Tensor, "n_or_0"]
     plan: EffectPlan
-    is_measured: bool = False
     observed: ObservedViews | None = None
 
     def select(self, rows: Tensor) -> Self:
@@ -173,9 +171,7 @@ def measure_visibility(
         )
     haze = plan_haze(float(haze_share(opacities, apparent * opacities, config)), config)
     plan = analysis.plan.model_copy(update={"haze": haze})
-    return replace(
-        analysis, apparent_areas=apparent, is_measured=shows, plan=plan, observed=observed
-    )
+    return replace(analysis, apparent_areas=apparent, plan=plan, observed=observed)
 
 
 def visibility_cameras(

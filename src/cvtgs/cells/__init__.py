@@ -1,12 +1,6 @@
 """From cells to Gaussians: members, moments, axes, inflation and descriptors."""
 
-from cvtgs.cells.allocate import (
-    Moments,
-    gaussian_moments,
-    group_moments,
-    merge_pairs,
-    reassign,
-)
+from cvtgs.cells.allocate import merge_pairs, reassign
 from cvtgs.cells.descriptors import Descriptors
 from cvtgs.cells.features import describe_cells
 from cvtgs.cells.inflate import align_axes, inflate_cells, side_cover
@@ -19,8 +13,8 @@ from cvtgs.cells.merge import (
     merged_depth,
     normalized_weights,
 )
+from cvtgs.cells.moments import Moments, gaussian_moments, group_moments, view_components
 from cvtgs.cells.partition import Partition
-from cvtgs.cells.view_colors import view_components
 
 __all__ = [
     "Descriptors",

@@ -4,7 +4,7 @@ A Voronoi cell reflects where its Gaussians lie, not the error of replacing them
 tessellation makes more cells than are wanted, and the cheapest pairs merge.
 """
 
-from typing import NamedTuple
+import math
 
 import numpy as np
 import torch
@@ -12,14 +12,10 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvtgs.cells.view_colors import LARGEST_COLOR, view_colors
+from cvtgs.cells.moments import UPPER, Moments
 from cvtgs.config import AllocationConfig
 from cvtgs.devices import HOST, in_chunks
-from cvtgs.math.frames import RobustFrame
-from cvtgs.math.parameters import normalize_quats, quats_to_matrices
-from cvtgs.math.segments import label_argmin, label_sums, take_columns
-from cvtgs.math.spherical_harmonics import SH_C0
-from cvtgs.scene import GaussianScene
+from cvtgs.math.segments import label_argmin, take_columns
 
 CHUNK = 1 << 14
 """Gaussians per chunk of the cost computation, to bound memory."""
@@ -34,6 +30,12 @@ flat Gaussians, which images hardly show, counts less than their extent."""
 FLOOR = 1e-4
 """Standard deviation, in robust radii, added in quadrature so that flat shapes have a volume."""
 
+COMMON_CONTRAST = 0.2
+"""Contrast of neighbours, in units of RGB, for which weights of costs are given."""
+
+LEAST_CONTRAST, LARGEST_CONTRAST = 0.3, 1.4
+"""Limits of the contrast in weights, in units of the common one."""
+
 MOST_ROUNDS = 30
 """Number of vectorised rounds that choose disjoint pairs; captures need 6 to 11."""
 
@@ -42,118 +44,6 @@ ROW_BITS, LAST_ROW = 32, (1 << 32) - 1
 
 Rows = NDArray[np.int64]
 """Row numbers or keys."""
-
-UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Row and column of the six distinct entries of a symmetric matrix."""
-
-
-class Moments(NamedTuple):
-    """Mean, covariance and colour of Gaussians or of groups, one column per item, float64.
-
-    Attributes:
-        counts: ``(n,)`` number of Gaussians.
-        weights: ``(n,)`` weights in the moments of a group: the masses.
-        masses: ``(n,)`` masses as seen in images, mean 1 over all Gaussians.
-        means: ``(3, n)`` positions, robust radii from the centre of the scene.
-        covariances: ``(6, n)`` upper triangles, squared robust radii.
-        colors: ``(3, n)`` RGB of the constant band.
-        view_colors: ``(k, n)`` components of the view-dependent colour, in the units of RGB.
-    """
-
-    counts: Float[Tensor, "n"]
-    weights: Float[Tensor, "n"]
-    masses: Float[Tensor, "n"]
-    means: Float[Tensor, "3 n"]
-    covariances: Float[Tensor, "6 n"]
-    colors: Float[Tensor, "3 n"]
-    view_colors: Float[Tensor, "k n"]
-
-
-def gaussian_moments(
-    scene: GaussianScene,
-    rows: Int[Tensor, "n"],
-    frame: RobustFrame,
-    *,
-    weights: Float[Tensor, "n"],
-    masses: Float[Tensor, "n"],
-    components: Float[Tensor, "c k"] | None = None,
-    unit: float | None = None,
-) -> Moments:
-    """Return the moments of single Gaussians.
-
-    Args:
-        scene: The Gaussians.
-        rows: Row numbers of the Gaussians to use.
-        frame: Centre and radius of the scene; the radius is the unit of length.
-        weights: Mass of each.
-        masses: Mass of each as seen in images.
-        components: Result of :func:`view_components`; None for no view-dependent colour.
-        unit: Divisor of weights and masses; None divides each by its own mean.
-
-    Returns:
-        The moments, in the order of the rows.
-    """
-    count, device, center = len(rows), rows.device, frame.center.to(rows.device)
-    means = torch.empty(3, count, dtype=torch.float64, device=device)
-    covariances, colors = means.new_empty(6, count), torch.empty_like(means)
-    varying = means.new_empty(0 if components is None else components.shape[1], count)
-    directions = components.to(device) if components is not None and len(varying) else None
-
-    def moments_of(part: slice) -> None:
-        some = rows[part]
-        positions = scene.means.index_select(0, some).double() - center
-        means[:, part] = (positions / frame.radius).T
-        scales = torch.exp(scene.log_scales.index_select(0, some).double()) / frame.radius
-        quats = normalize_quats(scene.quats.index_select(0, some).double())
-        columns = (quats_to_matrices(quats) * scales[:, None, :]).permute(1, 2, 0).contiguous()
-        for number, (i, j) in enumerate(UPPER):
-            covariances[number, part] = (columns[i] * columns[j]).sum(0)
-        bands = scene.sh0.index_select(0, some)[:, 0]
-        colors[:, part] = (0.5 + SH_C0 * bands.double()).clamp(0.0, LARGEST_COLOR).T
-        if directions is not None:
-            varying[:, part] = view_colors(scene, some, directions).T
-
-    in_chunks(moments_of, count, CHUNK, device)  # a few columns of a chunk fit into a cache
-    tiny = torch.finfo(torch.float64).tiny
-    weights, masses = weights.double(), masses.double()
-    units = [
-        values.mean() if unit is None else values.new_tensor(unit) for values in (weights, masses)
-    ]
-    return Moments(
-        counts=torch.ones_like(weights),
-        weights=(weights / units[0].clamp_min(tiny)).clamp_min(1e-12),
-        masses=masses / units[1].clamp_min(tiny),
-        means=means,
-        covariances=covariances,
-        colors=colors,
-        view_colors=varying,
-    )
-
-
-def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Moments:
-    """Return the moments of groups; the spread of means is computed about the mean of the group.
-
-    Args:
-        members: Moments of the members.
-        labels: Group of each, 0 to ``count - 1``; none is empty.
-        count: Number of groups, m.
-
-    Returns:
-        Moments of the groups.
-    """
-    columns = [members.counts, members.weights, members.masses]
-    counts, weights, masses = label_sums(columns, labels, count)
-    shares = members.weights / weights.index_select(0, labels)
-    columns = [*members.means, *members.colors, *members.view_colors]
-    sums = label_sums(columns, labels, count, shares)
-    means, colors, varying = sums[:3], sums[3:6], sums[6:]
-    shifts = take_columns(labels, means)[0]
-    torch.sub(members.means, shifts, out=shifts)
-    products = torch.empty_like(members.covariances)
-    for product, (i, j) in zip(products, UPPER, strict=True):
-        torch.mul(shifts[i], shifts[j], out=product)
-    covariances = label_sums(products.add_(members.covariances), labels, count, shares)
-    return Moments(counts, weights, masses, means, covariances, colors, varying)
 
 
 def merge_pairs(
@@ -174,6 +64,9 @@ def merge_pairs(
     Returns:
         The new group of every group, 0 to ``count - 1``.
     """
+    contrast = _relative_contrast(groups.colors, neighbors)
+    update = {"color": config.color / contrast, "mass_power": config.mass_power * contrast}
+    config = config.model_copy(update=update)
     table = torch.cat([torch.atleast_2d(values).float() for values in groups])  # fast to gather
     total, labels = len(groups.weights), np.arange(len(groups.weights))
     pairs = _distinct_pairs(labels.repeat(neighbors.shape[1]), neighbors.numpy().ravel())
@@ -195,6 +88,19 @@ def merge_pairs(
             del pairs, costs  # frees memory
             pairs = _distinct_pairs(target[first], target[second])
     return torch.from_numpy(labels)
+
+
+def _relative_contrast(colors: Float[Tensor, "3 m"], neighbors: Int[Tensor, "m k"]) -> float:
+    """Return the contrast of neighbours in units of a common one, within limits.
+
+    The contrast is the root of half the mean squared difference of their colours.
+    """
+    squares = [
+        (take_columns(near, colors)[0] - colors).square_().sum() for near in neighbors.unbind(1)
+    ]
+    mean = float(sum(squares)) / max(1, neighbors.numel())
+    contrast = math.sqrt(0.5 * mean) / COMMON_CONTRAST
+    return min(max(contrast, LEAST_CONTRAST), LARGEST_CONTRAST)
 
 
 def _distinct_pairs(first: Rows, second: Rows) -> Rows:

@@ -116,21 +116,23 @@ class AllocationConfig(Section):
             of cells merge, cheapest first. 1 keeps the cells of the tessellation.
         neighbors: Number of nearest cells that a cell may merge with.
         color: Weight of the squared colour distance relative to the cost of shape and position,
-            at one cell per Gaussian.
+            at one cell per Gaussian and a contrast of 0.2 between neighbouring cells, the root of
+            half the mean squared distance of their colours. It is divided by the contrast.
         color_power: This weight is proportional to the ratio of cells to Gaussians to this power;
             colours differ anyway within large cells.
         view_color: Weight of view-dependent colours in this distance, as far as neighbours have
             them in common (:func:`cvtgs.cells.view_components`); 0 leaves them out.
-        mass_power: The cost of a pair is multiplied by its apparent mass to this power.
+        mass_power: The cost of a pair is multiplied by its apparent mass to this power, which is
+            that at a contrast of 0.2, too. It is multiplied by the contrast.
         reassign: Whether every Gaussian then moves to the cell that explains it best.
     """
 
     oversampling: float = pydantic.Field(default=8.0, ge=1.0, le=64.0)
     neighbors: int = pydantic.Field(default=6, ge=1, le=64)
-    color: float = pydantic.Field(default=75.0, ge=0.0)
+    color: float = pydantic.Field(default=50.0, ge=0.0)
     color_power: float = pydantic.Field(default=0.3, ge=0.0, le=1.0)
     view_color: float = pydantic.Field(default=2.0, ge=0.0)
-    mass_power: float = pydantic.Field(default=0.4, ge=0.0, le=2.0)
+    mass_power: float = pydantic.Field(default=0.5, ge=0.0, le=2.0)
     reassign: bool = True
 
     @property
@@ -150,14 +152,12 @@ class VisibilityConfig(Section):
             the whole image.
         mass_share: Share of the apparent mass that still comes from size, opacity and position,
             so that Gaussians that no image shows also count.
-        mass_power: Replaces ``allocation.mass_power`` where images measure the mass.
     """
 
     views: int = pydantic.Field(default=0, ge=0)
     size: int = pydantic.Field(default=128, ge=16)
     stride: Count = 1
     mass_share: Share = 0.3
-    mass_power: float = pydantic.Field(default=0.7, ge=0.0, le=2.0)
 
 
 class MatchConfig(Section):

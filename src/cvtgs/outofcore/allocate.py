@@ -24,7 +24,7 @@ from cvtgs.math.segments import segment_argmax, sort_by_label, take_columns
 from cvtgs.outofcore.halo import number_remote
 from cvtgs.outofcore.job import SENT_BYTES, Job
 from cvtgs.outofcore.rows import BlockRows, send_rows
-from cvtgs.outofcore.visibility import is_measured, read_apparent_rows
+from cvtgs.outofcore.visibility import read_apparent_rows
 
 KEY = 1 << 32
 """The global key of a cell or group is its block times this, plus its number in the block."""
@@ -149,7 +149,7 @@ def _allocate_region(
 def _costs(job: Job) -> AllocationConfig:
     """Return the costs of merging at the ratio of the whole scene."""
     ratio = job.read_manifest().total / job.read_scan().row_count
-    return allocation_at(ratio, job.config, is_measured=is_measured(job))
+    return allocation_at(ratio, job.config.allocation)
 
 
 def _add_parts(job: Job, region: Sequence[int], cell_counts: Sequence[int]) -> Moments:

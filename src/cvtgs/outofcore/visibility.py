@@ -79,11 +79,6 @@ def add_contributions(job: Job) -> None:
         file.write(json.dumps(sums).encode())
 
 
-def is_measured(job: Job) -> bool:
-    """Return whether images showed any of the Gaussians."""
-    return _mass_per_pixel(job) is not None
-
-
 def read_apparent_rows(job: Job, block: int, *, is_slim: bool = True) -> BlockRows:
     """Read rows, with the areas that images measured if there are images."""
     rows, mass_per_pixel = read_rows(job, block, is_slim=is_slim), _mass_per_pixel(job)

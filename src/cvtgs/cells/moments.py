@@ -1,0 +1,221 @@
+"""Moments of Gaussians and of groups of them: position, shape, colour, view-dependent colour."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from cvtgs.devices import HOST, in_chunks, move_together, one_thread
+from cvtgs.math.frames import RobustFrame
+from cvtgs.math.parameters import normalize_quats, quats_to_matrices
+from cvtgs.math.segments import label_sums, take_columns
+from cvtgs.math.spherical_harmonics import SH_C0
+from cvtgs.scene import GaussianScene
+
+CHUNK = 1 << 14
+"""Gaussians per chunk, of which a few columns fit into a cache."""
+
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Row and column of the six distinct entries of a symmetric matrix."""
+
+LARGEST_COLOR = 1.5
+"""Limit of a colour, and of the norm of coefficients, so that a few extreme ones do not decide."""
+
+MAX_COMPONENTS = 12
+"""Largest number of components."""
+
+LEAST_SPREAD = 0.01
+"""Smallest standard deviation of a component that counts, in units of RGB."""
+
+LEAST_SHARE = 0.1
+"""Smallest share of the variance of a component that neighbours have in common; less is chance."""
+
+SAMPLED_PAIRS = 1 << 14
+"""Approximate number of pairs of neighbours in which components are sought."""
+
+
+class Moments(NamedTuple):
+    """Mean, covariance and colour of Gaussians or of groups, one column per item, float64.
+
+    Attributes:
+        counts: ``(n,)`` number of Gaussians.
+        weights: ``(n,)`` weights in the moments of a group: the masses.
+        masses: ``(n,)`` masses as seen in images, mean 1 over all Gaussians.
+        means: ``(3, n)`` positions, robust radii from the centre of the scene.
+        covariances: ``(6, n)`` upper triangles, squared robust radii.
+        colors: ``(3, n)`` RGB of the constant band.
+        view_colors: ``(k, n)`` components of the view-dependent colour, in the units of RGB.
+    """
+
+    counts: Float[Tensor, "n"]
+    weights: Float[Tensor, "n"]
+    masses: Float[Tensor, "n"]
+    means: Float[Tensor, "3 n"]
+    covariances: Float[Tensor, "6 n"]
+    colors: Float[Tensor, "3 n"]
+    view_colors: Float[Tensor, "k n"]
+
+
+def gaussian_moments(
+    scene: GaussianScene,
+    rows: Int[Tensor, "n"],
+    frame: RobustFrame,
+    *,
+    weights: Float[Tensor, "n"],
+    masses: Float[Tensor, "n"],
+    components: Float[Tensor, "c k"] | None = None,
+    unit: float | None = None,
+) -> Moments:
+    """Return the moments of single Gaussians.
+
+    Args:
+        scene: The Gaussians.
+        rows: Row numbers of the Gaussians to use.
+        frame: Centre and radius of the scene; the radius is the unit of length.
+        weights: Mass of each.
+        masses: Mass of each as seen in images.
+        components: Result of :func:`view_components`; None for no view-dependent colour.
+        unit: Divisor of weights and masses; None divides each by its own mean.
+
+    Returns:
+        The moments, in the order of the rows.
+    """
+    count, device, center = len(rows), rows.device, frame.center.to(rows.device)
+    means = torch.empty(3, count, dtype=torch.float64, device=device)
+    covariances, colors = means.new_empty(6, count), torch.empty_like(means)
+    varying = means.new_empty(0 if components is None else components.shape[1], count)
+    directions = components.to(device) if components is not None and len(varying) else None
+
+    def moments_of(part: slice) -> None:
+        some = rows[part]
+        positions = scene.means.index_select(0, some).double() - center
+        means[:, part] = (positions / frame.radius).T
+        scales = torch.exp(scene.log_scales.index_select(0, some).double()) / frame.radius
+        quats = normalize_quats(scene.quats.index_select(0, some).double())
+        columns = (quats_to_matrices(quats) * scales[:, None, :]).permute(1, 2, 0).contiguous()
+        for number, (i, j) in enumerate(UPPER):
+            covariances[number, part] = (columns[i] * columns[j]).sum(0)
+        bands = scene.sh0.index_select(0, some)[:, 0]
+        colors[:, part] = (0.5 + SH_C0 * bands.double()).clamp(0.0, LARGEST_COLOR).T
+        if directions is not None:
+            varying[:, part] = view_colors(scene, some, directions).T
+
+    in_chunks(moments_of, count, CHUNK, device)  # a few columns of a chunk fit into a cache
+    tiny = torch.finfo(torch.float64).tiny
+    weights, masses = weights.double(), masses.double()
+    units = [
+        values.mean() if unit is None else values.new_tensor(unit) for values in (weights, masses)
+    ]
+    return Moments(
+        counts=torch.ones_like(weights),
+        weights=(weights / units[0].clamp_min(tiny)).clamp_min(1e-12),
+        masses=masses / units[1].clamp_min(tiny),
+        means=means,
+        covariances=covariances,
+        colors=colors,
+        view_colors=varying,
+    )
+
+
+def group_moments(members: Moments, labels: Int[Tensor, "n"], count: int) -> Moments:
+    """Return the moments of groups; the spread of means is computed about the mean of the group.
+
+    Args:
+        members: Moments of the members.
+        labels: Group of each, 0 to ``count - 1``; none is empty.
+        count: Number of groups, m.
+
+    Returns:
+        Moments of the groups.
+    """
+    columns = [members.counts, members.weights, members.masses]
+    counts, weights, masses = label_sums(columns, labels, count)
+    shares = members.weights / weights.index_select(0, labels)
+    columns = [*members.means, *members.colors, *members.view_colors]
+    sums = label_sums(columns, labels, count, shares)
+    means, colors, varying = sums[:3], sums[3:6], sums[6:]
+    shifts = take_columns(labels, means)[0]
+    torch.sub(members.means, shifts, out=shifts)
+    products = torch.empty_like(members.covariances)
+    for product, (i, j) in zip(products, UPPER, strict=True):
+        torch.mul(shifts[i], shifts[j], out=product)
+    covariances = label_sums(products.add_(members.covariances), labels, count, shares)
+    return Moments(counts, weights, masses, means, covariances, colors, varying)
+
+
+@one_thread()
+def view_components(
+    scene: GaussianScene, rows: Int[Tensor, "n"], masses: Float[Tensor, "n"]
+) -> Float[Tensor, "c k"]:
+    """Find the components of view-dependent colour that neighbouring Gaussians have in common.
+
+    In some scenes, the bands above the constant one show highlights and reflections that
+    neighbours share. In others they are mostly noise of the training, which makes neighbours look
+    different where images do not. So the components are principal ones, and each counts by the
+    share of its variance that is common to neighbours: the variance minus half of the mean squared
+    difference of neighbours (the nugget of a variogram, Matheron 1963), over the variance.
+
+    Args:
+        scene: The Gaussians.
+        rows: Row numbers, in the order of a space-filling curve.
+        masses: Mass of each as seen in images.
+
+    Returns:
+        The matrix that maps the coefficients of a Gaussian, flattened, to its components; float64,
+        on the CPU. It has no column if nothing is common to neighbours.
+
+    Example:
+        >>> from cvtgs.synthetic import scene as make
+        >>> scene = make("object", 100, sh_degree=1, seed=0)
+        >>> view_components(scene, torch.arange(100), scene.masses).shape[0]
+        9
+    """
+    width = scene.shN[:1].numel()
+    if width == 0 or len(rows) < 2:
+        return torch.zeros(width, 0, dtype=torch.float64, device=HOST)
+    step = max(1, len(rows) // SAMPLED_PAIRS)
+    first = torch.arange(0, len(rows) - 1, step, device=rows.device)
+    both = torch.cat([first, first + 1])
+    bands = scene.shN.index_select(0, rows.index_select(0, both))
+    bands, weights = move_together([bands, masses.index_select(0, both)], HOST)
+    colors, weights = _project(bands.double(), torch.eye(width, device=HOST)), weights.double()
+    weights = weights / weights.sum().clamp_min(torch.finfo(torch.float64).tiny)
+    centered = colors - weights @ colors
+    variances, axes = torch.linalg.eigh(centered.T @ (centered * weights[:, None]))
+    (ones, others), pairs = colors.chunk(2), weights.view(2, -1).sum(dim=0)
+    common = variances - 0.5 * pairs @ ((ones - others) @ axes).square()
+    chosen = torch.sort(common, descending=True, stable=True).indices[:MAX_COMPONENTS]
+    least = (LEAST_SHARE * variances).clamp_min(LEAST_SPREAD**2)
+    chosen = chosen[common[chosen] > least[chosen]]
+    components: Tensor = axes[:, chosen] * (common / variances)[chosen].sqrt()
+    return components
+
+
+def view_colors(
+    scene: GaussianScene, rows: Int[Tensor, "r"], components: Float[Tensor, "c k"]
+) -> Float[Tensor, "r k"]:
+    """Return the components of the view-dependent colour of some Gaussians, in units of RGB.
+
+    The sum of the squared differences of two Gaussians is at most the squared difference of their
+    view-dependent colours, averaged over all directions.
+
+    Args:
+        scene: The Gaussians; bands beyond those of the components are ignored.
+        rows: Row numbers.
+        components: Result of :func:`view_components`, on the device of the scene.
+
+    Returns:
+        One row per Gaussian, float64.
+    """
+    return _project(scene.shN.index_select(0, rows), components)
+
+
+def _project(bands: Float[Tensor, "n b 3"], components: Float[Tensor, "c k"]) -> Tensor:
+    """Return components, in units in which the mean of a squared colour is the sum of squares."""
+    coefficients = bands.flatten(1)[:, : len(components)]
+    norms = SH_C0 * torch.linalg.vector_norm(coefficients, dim=1, keepdim=True)
+    factors = SH_C0 * LARGEST_COLOR / norms.double().clamp_min(LARGEST_COLOR)
+    projected = coefficients @ components.to(coefficients.dtype)
+    colors: Tensor = (projected.double() * factors).nan_to_num(0.0, 0.0, 0.0)
+    return colors  # zeros where squares overflow
