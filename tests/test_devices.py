@@ -196,19 +196,20 @@ def test_ranges_of_rows_cover_all_rows_once_and_an_empty_table_is_one_range():
 
 @pytest.mark.slow
 def test_stages_give_the_same_bits_in_two_threads(two_threads, monkeypatch):
-    for name in ("cells.allocate.CHUNK", "cells.inflate.CHUNK", "cells.merge.CHUNK_MEMBERS"):
-        monkeypatch.setattr(f"cvtgs.{name}", 100)
+    for name in ("allocate.CHUNK", "moments.CHUNK", "inflate.CHUNK", "merge.CHUNK_MEMBERS"):
+        monkeypatch.setattr(f"cvtgs.cells.{name}", 100)
+    monkeypatch.setattr("cvtgs.mergenet.apply.CHUNK_MEMBERS", 100)
     handed_over = set()
 
     def recorded(function, items, device):
         handed_over.add(function.__name__)
         return in_threads(function, items, device)
 
-    for module in ("devices", "cells.inflate", "cells.merge"):
+    for module in ("devices", "cells.inflate", "cells.merge", "mergenet.apply"):
         monkeypatch.setattr(f"cvtgs.{module}.in_threads", recorded)
-    monkeypatch.setattr("cvtgs.mergenet.apply.CHUNK_MEMBERS", 100)
     scene = cvtgs.synthetic.scene("object", 2000, sh_degree=1, seed=0)
     two = cvtgs.Simplifier(device="cpu").simplify(scene, 0.1)
     with one_thread():
         assert same_bits(two, cvtgs.Simplifier(device="cpu").simplify(scene, 0.1))
-    assert handed_over == {"moments_of", "costs_of", "search", "merge_chunk", "inflate"}
+    in_allocation = {"moments_of", "costs_of", "join", "search"}
+    assert handed_over == in_allocation | {"merge_chunk", "inflate", "correct"}
