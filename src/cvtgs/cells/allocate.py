@@ -56,11 +56,12 @@ def merge_pairs(
 
     The cost of a pair is Runnalls' bound (2007) on the change of the mixture when both become one
     Gaussian, plus the squared colour distance, times a power of the mass as seen in images, times
-    the number of Gaussians, which keeps groups balanced.
+    the number of Gaussians, which keeps groups balanced. The contrast of neighbouring groups
+    scales the power and the weight of colour.
 
     Args:
-        groups: Moments of the groups.
-        neighbors: Groups that each group may merge with.
+        groups: Moments of the groups, on the CPU.
+        neighbors: Groups that each group may merge with, on the CPU.
         count: Number of groups to keep, 1 to m.
         config: Weights of the cost.
 

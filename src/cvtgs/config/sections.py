@@ -117,13 +117,14 @@ class AllocationConfig(Section):
         neighbors: Number of nearest cells that a cell may merge with.
         color: Weight of the squared colour distance relative to the cost of shape and position,
             at one cell per Gaussian and a contrast of 0.2 between neighbouring cells, the root of
-            half the mean squared distance of their colours. It is divided by the contrast.
+            half the mean squared distance of their colours. It is in inverse proportion to the
+            contrast, between 0.06 and 0.28.
         color_power: This weight is proportional to the ratio of cells to Gaussians to this power;
             colours differ anyway within large cells.
         view_color: Weight of view-dependent colours in this distance, as far as neighbours have
             them in common (:func:`cvtgs.cells.view_components`); 0 leaves them out.
-        mass_power: The cost of a pair is multiplied by its apparent mass to this power, which is
-            that at a contrast of 0.2, too. It is multiplied by the contrast.
+        mass_power: The cost of a pair is multiplied by its apparent mass to this power, also at
+            a contrast of 0.2. It is in proportion to the contrast, within the same limits.
         reassign: Whether every Gaussian then moves to the cell that explains it best.
     """
 
