@@ -109,6 +109,10 @@ def scoring_parser(description: str | None) -> argparse.ArgumentParser:
     parser.add_argument(
         "--cameras", type=Path, help="cameras of a single scene, as cvtgs reads them"
     )
+    parser.add_argument(
+        "--size", type=int, metavar="PIXELS",
+        help="longer side of the images, of our own renderer without --cameras only",
+    )  # fmt: skip
     parser.add_argument("--split", choices=("train", "test"), help="part of --cameras to use")
     parser.add_argument(
         "--images", type=Path, metavar="DIR", help="photographs of --cameras, to score against"
@@ -168,8 +172,8 @@ def make_scorer(options: argparse.Namespace, file: Path | None) -> Scorer:
     if options.images is not None:
         raise SystemExit("--images needs the cameras of the photographs: --cameras.")
     beside = file is not None and cameras_file(file).is_file()
-    cameras = cameras_beside(file) if file and beside else None
-    return own_scorer(weights, cameras, background=background)
+    cameras = cameras_beside(file, size=options.size) if file and beside else None
+    return own_scorer(weights, cameras, background=background, size=options.size or SIZE)
 
 
 def given_scorer(
@@ -227,13 +231,17 @@ def any_lpips(path: Path) -> LpipsWeights:
 
 
 def own_scorer(
-    weights: LpipsWeights | None, cameras: Cameras | None, *, background: scorers.Color
+    weights: LpipsWeights | None,
+    cameras: Cameras | None,
+    *,
+    background: scorers.Color,
+    size: int = SIZE,
 ) -> Scorer:
     """Return a scorer with cvtgs' own renderer, from cameras or else from automatic views."""
     metrics = scorers.Metrics(lpips=weights)
 
     def score(full: cvtgs.GaussianScene, small: Sequence[cvtgs.GaussianScene]) -> list[Quality]:
-        views = cameras or automatic_views(full, VIEWS, width=SIZE, height=SIZE)
+        views = cameras or automatic_views(full, VIEWS, width=size, height=size)
         scorer = scorers.Scorer(full, views.singles(), metrics=metrics, backgrounds=(background,))
         found = [scorers.scene_scores("", len(scene), scorer.score(scene)) for scene in small]
         return [Quality.of(scores) for scores in found]

@@ -23,7 +23,7 @@ from scenes import same_bits
 
 COUNT, BLOCKS, TARGET = 3000, 3, 150
 SETTINGS = {
-    "visibility": {"views": 6, "size": 48, "stride": 1},
+    "visibility": {"views": 6, "size": 96, "stride": 2},
     "filter": {"min_opacity": 0.0, "max_flyaway_share": 0.0},
 }
 BOX = Box(min=(-0.08, -0.08, -9), max=(0.08, 0.08, 9))

@@ -29,7 +29,7 @@ SENT_BYTES = "sent_bytes"
 """Entry of the label file of a block: bytes of the file of its sent rows."""
 
 
-FILES_VERSION = 1
+FILES_VERSION = 2
 """Number of the layout of these files: raise it with every change, so that no run continues with
 files of another layout."""
 
