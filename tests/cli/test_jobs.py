@@ -1,6 +1,7 @@
 """Many scenes in one command, standard streams, sizes and the last line of the output."""
 
 import io
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -119,7 +120,7 @@ def test_a_scene_that_fails_does_not_stop_the_others(
         ),
         (["nothing*", "-o", "out"], "nothing*: the pattern must match a file, found none."),
         (["a.ply", "-o", "a.ply"], "a.ply: must be a folder or a new path, found: "),
-        (["a.ply", "c.spz", "-o", "out", "--suffix", "xyz"], "the file name must end in "),
+        (["a.ply", "c.spz", "-o", "out", "--suffix", "xyz"], "--suffix must end in "),
     ],
 )
 def test_invalid_jobs_are_refused_before_the_work(
@@ -223,6 +224,20 @@ def test_standard_input_and_output_hold_scenes(
     assert printed.err.splitlines()[-1].startswith(b"standard output: ")
     assert main(["convert", name, "-", "--quiet"]) == 0
     assert capsysbinary.readouterr().out[:3] == b"ply"
+    monkeypatch.setattr(sys, "stdin", Stream(io.BytesIO(Path(name).read_bytes())))
+    assert main(["info", "-"]) == 0
+    first, second = capsysbinary.readouterr().out.decode().splitlines()[:2]
+    assert re.fullmatch(r"file +standard input, [\d.]+ k?B", first)
+    assert second.split() == ["Gaussians", str(len(cvtgs.load(name)))]
+
+
+def test_an_unknown_suffix_for_standard_output_is_refused(
+    scenes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["convert", "a.ply", "-", "--suffix", "foo"]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("cvtgs: error: --suffix must end in .compressed.ply, .ply, ")
+    assert said.endswith("or .usda, found '.foo'.\n")
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING
 import cvtgs
 from cvtgs.cli.display import file_size, say, say_wrapped
 from cvtgs.cli.edits import SceneEdits, add_edit_options
-from cvtgs.cli.jobs import Outcome, SceneJob, add_paths, check_paths, open_jobs, run_jobs
+from cvtgs.cli.jobs import (
+    STANDARD_INPUT,
+    Outcome,
+    SceneJob,
+    add_paths,
+    check_paths,
+    input_file,
+    open_jobs,
+    run_jobs,
+)
 from cvtgs.cli.options import AddParser, add_options, read_axes, read_scene, read_settings
 from cvtgs.errors import DroppedDataWarning
 from cvtgs.text import printable
@@ -25,8 +34,8 @@ def add_info(add_parser: AddParser) -> None:
         "info",
         help="show facts about a scene or a checkpoint",
         description="Show counts, sizes and statistics of a scene, and which effects simplify "
-        "would compute for it; or how a checkpoint (standard, paper or a .safetensors file) was "
-        "trained.",
+        "would compute for it (- is standard input); or how a checkpoint (standard, paper or a "
+        ".safetensors file) was trained.",
     )
     parser.set_defaults(run=show_info)
     add_options(parser, "input", "--json", "--effects", "--lod", "--trust-sizes")
@@ -39,12 +48,16 @@ def show_info(options: argparse.Namespace) -> None:
         return
     settings = read_settings(effects=options.effects)
     config = cvtgs.SimplifyConfig.compose(settings=settings)
-    facts = cvtgs.describe(read_scene(options, config), config)
+    with input_file(options.input) as path:
+        read = argparse.Namespace(**{**vars(options), "input": path})
+        facts = cvtgs.describe(read_scene(read, config), config)
+        is_file = path == options.input
+        file = f"{cvtgs.io.scene_file(path) if is_file else STANDARD_INPUT}, {file_size(path)}"
     if options.json:
         say(facts.model_dump_json(indent=2))
-    else:
-        for label, text in _rows(facts, options.input):
-            say(f"{label:<16} {text}")
+        return
+    for label, text in [("file", file), *_rows(facts)]:
+        say(f"{label:<16} {text}")
 
 
 def is_checkpoint(path: Path) -> bool:
@@ -83,12 +96,11 @@ def show_checkpoint(path: Path, *, as_json: bool) -> None:
         say(f"{label:<16} {text}")
 
 
-def _rows(facts: "SceneInfo", path: Path) -> list[tuple[str, str]]:
+def _rows(facts: "SceneInfo") -> list[tuple[str, str]]:
     from cvtgs.info import HEAVIEST, QUANTILES
 
     invalid = ", ".join(f"{name} {number:,}" for name, number in facts.invalid_rows.items())
     rows = [
-        ("file", f"{cvtgs.io.scene_file(path)}, {file_size(path)}"),
         ("Gaussians", f"{facts.count:,}"),
         ("SH degree", f"{facts.sh_degree}"),
         ("bounds", f"{_vector(facts.bounds[0])} to {_vector(facts.bounds[1])}"),

@@ -30,11 +30,12 @@ from cvtgs.errors import (
     OutputError,
     RunError,
 )
-from cvtgs.text import counted, printable, shortened
+from cvtgs.text import counted, printable, shortened, shown
 
 STREAM = "-"
 """The path that stands for standard input or output."""
 
+STANDARD_INPUT = "standard input"
 _OTHER_FORMATS = "save a scene in another format as a file, whose suffix gives the format"
 
 
@@ -118,8 +119,7 @@ def check_paths(parser: CommandParser, options: argparse.Namespace) -> None:
 @contextmanager
 def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
     """Find the scenes of a command; standard streams are temporary files within the context."""
-    from cvtgs.io.streams import file_of
-
+    _check_suffix(options.suffix)
     if options.folder is not None:
         yield _folder_jobs(options)
         return
@@ -132,13 +132,31 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
                 raise OutputError("standard output must be a pipe or a file, found a terminal.")
             folder = stack.enter_context(TemporaryDirectory(prefix="cvtgs-"))
             target = f"{folder}/standard-output{options.suffix or '.ply'}"
-        path = Path(source)
-        if source == STREAM:
-            copy = file_of(sys.stdin.buffer, name="standard input", advice=_OTHER_FORMATS)
-            path = stack.enter_context(copy)
-        own = {"input": path, "output": Path(target)}
+        own = {"input": stack.enter_context(input_file(source)), "output": Path(target)}
         job = argparse.Namespace(**{**vars(options), **own})
         yield [SceneJob(options=job, to_stream=to_stream)]
+
+
+@contextmanager
+def input_file(source: str | Path) -> Iterator[Path]:
+    """Return the path of a scene; standard input is a temporary file within the context."""
+    from cvtgs.io.streams import file_of
+
+    if str(source) != STREAM:
+        yield Path(source)
+        return
+    with file_of(sys.stdin.buffer, name=STANDARD_INPUT, advice=_OTHER_FORMATS) as path:
+        yield path
+
+
+def _check_suffix(suffix: str | None) -> None:
+    from cvtgs.io.formats import WRITABLE_SUFFIXES
+
+    if suffix is not None and not suffix.lower().endswith(WRITABLE_SUFFIXES):
+        *others, last = WRITABLE_SUFFIXES
+        raise InvalidArgumentError(
+            f"--suffix must end in {', '.join(others)} or {last}, found {shown(suffix)}."
+        )
 
 
 def run_jobs(jobs: Sequence[SceneJob], work: Callable[[SceneJob], Outcome]) -> None:

@@ -25,7 +25,6 @@ MEASURED = "measured.json"
 """File of the sums over all blocks."""
 
 SCENE = "scene/"
-SIZES = ("width", "height", "stride")
 
 
 @one_thread()
@@ -42,7 +41,7 @@ def write_views(job: Job, sample: GaussianScene, *, total: int) -> None:
             "ignores_tag": torch.tensor(cameras.ignores_tag, dtype=torch.bool),
             **add_prefix(SCENE, tensors),
         },
-        {name: str(getattr(cameras, name)) for name in SIZES},
+        {name: str(getattr(cameras, name)) for name in ("width", "height", "stride")},
     )
 
 
@@ -57,8 +56,10 @@ def measure(job: Job, block: int) -> None:
     cameras = Cameras(
         viewmats=tensors["viewmats"],
         Ks=tensors["Ks"],
+        width=int(facts["width"]),
+        height=int(facts["height"]),
+        stride=int(facts["stride"]),
         ignores_tag=tuple(tensors["ignores_tag"].tolist()),
-        **{name: int(facts[name]) for name in SIZES},
     )
     sample = rows.scene.with_tensors(under_prefix(SCENE, tensors), {})
     blocks = scan.partition.blocks_of(scan.frame.contract(sample.means))
