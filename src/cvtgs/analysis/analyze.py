@@ -185,17 +185,18 @@ def visibility_cameras(
         cameras: Cameras to choose from; None generates views.
 
     Returns:
-        The cameras of images of every ``config.visibility.stride``-th pixel; about every
-        third one ignores the tag mip.
+        The cameras of images of every second, third, ... pixel, as the configuration says; about
+        every third one ignores the tag mip.
     """
     choices = config.visibility
     if cameras is None:
-        side = max(choices.size, SSIM_WINDOW * choices.stride)
+        stride = choices.stride
+        side = max(choices.size, SSIM_WINDOW * stride)
         views = mixed_views(scene, choices.views, size=side, seed=config.seed)
     else:
-        longer, least = max(cameras.width, cameras.height), SSIM_WINDOW * choices.stride
-        views = cameras.spread(choices.views).fitted(min(choices.size, longer), least=least)
-    return views.interleaved(choices.stride).in_both_modes()
+        side, stride = choices.size_and_stride(max(cameras.width, cameras.height))
+        views = cameras.spread(choices.views).fitted(side, least=SSIM_WINDOW * stride)
+    return views.interleaved(stride).in_both_modes()
 
 
 def measured_areas(

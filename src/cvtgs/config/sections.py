@@ -142,22 +142,55 @@ class AllocationConfig(Section):
         return self.oversampling > 1.0 and self.view_color > 0.0
 
 
-class VisibilityConfig(Section):
+class ImageSection(Section):
+    """Base of the sections that render images of the scene.
+
+    Attributes:
+        size: Longer side of the images, pixels.
+        stride: Only every ``stride``-th pixel is used, along rows and columns.
+        given_size: Longer side of the images of given cameras, as far as they are as large, with a
+            stride in proportion; 0 for ``size``.
+    """
+
+    size: int = pydantic.Field(default=128, ge=16)
+    stride: Count = 1
+    given_size: int = pydantic.Field(default=0, ge=0)
+
+    def size_and_stride(self, longer: int) -> tuple[int, int]:
+        """Return the longer side and the stride of images of given cameras.
+
+        Args:
+            longer: Longer side of the images that the cameras were made for, pixels.
+
+        Returns:
+            The longer side, at most that of the cameras, and the stride, with which about as many
+            pixels are used as of generated views.
+
+        Example:
+            >>> sizes = RefineConfig(size=400, stride=2, given_size=800)
+            >>> [sizes.size_and_stride(longer) for longer in (300, 400, 640, 1600)]
+            [(300, 2), (400, 2), (640, 3), (800, 4)]
+        """
+        side = min(max(self.size, self.given_size), longer)
+        return side, round(self.stride * max(1.0, side / self.size))
+
+
+class VisibilityConfig(ImageSection):
     """The small images of the scene that measure how much each Gaussian contributes.
 
     Attributes:
         views: Number of images, from :func:`cvtgs.views.mixed_views`. With 0, contributions are
             estimated from size, opacity and position alone.
-        size: Side of the images, pixels.
+        size: Longer side of the images, pixels.
         stride: Only every ``stride``-th pixel is rendered, along rows and columns, as sharp as in
             the whole image.
+        given_size: Longer side of the images of given cameras, as far as they are as large, with a
+            stride in proportion; 0 for ``size``.
         mass_share: Share of the apparent mass that still comes from size, opacity and position,
             so that Gaussians that no image shows also count.
     """
 
     views: int = pydantic.Field(default=0, ge=0)
-    size: int = pydantic.Field(default=128, ge=16)
-    stride: Count = 1
     mass_share: Share = 0.3
 
 
@@ -238,7 +271,7 @@ class Rates(Section):
     shN: Rate = 0.002  # noqa: N815 (the name that scenes give it)
 
 
-class RefineConfig(Section):
+class RefineConfig(ImageSection):
     """The settings of a refinement; frozen, unknown keys are errors.
 
     Attributes:
@@ -256,6 +289,8 @@ class RefineConfig(Section):
         size: Longer side of the images, pixels; a side below 11 times ``stride`` becomes that.
         stride: Steps and checks use only every ``stride``-th pixel, along rows and columns, as
             sharp as in the whole image: at 2, four times as many steps take the same time.
+        given_size: Longer side of the images of given cameras, as far as they are as large, with a
+            stride in proportion; 0 for ``size``.
         batch: Views that are generated together: a quarter automatic, half random from around the
             scene, a quarter random from near it or within it.
         first_images: Steps at the start that each render a new image of the full scene.
@@ -278,7 +313,6 @@ class RefineConfig(Section):
     mse_weight: Rate = 0.5
     image_weight: Rate = 0.5
     size: int = pydantic.Field(default=256, ge=16)
-    stride: Count = 1
     batch: int = pydantic.Field(default=32, ge=4)
     first_images: Count = 1
     steps_per_image: Count = 1

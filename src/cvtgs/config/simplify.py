@@ -29,7 +29,7 @@ def unknown_preset(name: object) -> ConfigError:
 
 
 MATCHED: Mapping[str, Any] = {
-    "visibility": {"views": 32, "size": 400, "stride": 2},
+    "visibility": {"views": 32, "size": 400, "stride": 2, "given_size": 600},
     "match": {"opacity_rounds": 1},
     "refine": {
         "steps": 60,
@@ -37,6 +37,7 @@ MATCHED: Mapping[str, Any] = {
         "half_after": 48,
         "size": 400,
         "stride": 2,
+        "given_size": 600,
         "steps_per_image": 100,
         "check_every": 30,
     },
@@ -48,6 +49,7 @@ THINNED: Mapping[str, Any] = {
     "cooling": 0.3,
     "size": 400,
     "stride": 2,
+    "given_size": 600,
     "first_images": 32,
     "steps_per_image": 1000,
     "check_every": 50,
@@ -155,9 +157,9 @@ class SimplifyConfig(Section):
     @property
     def shares_images(self) -> bool:
         """Whether a refinement trains on the images that opacities are matched to."""
-        ours, theirs = self.visibility, self.refine
-        is_same = (ours.size, ours.stride) == (theirs.size, theirs.stride)
-        return self.uses_renders and self.match.enabled and theirs.enabled and is_same
+        sizes = [(own.size, own.stride, own.given_size) for own in (self.visibility, self.refine)]
+        is_same = sizes[0] == sizes[1]
+        return self.uses_renders and self.match.enabled and self.refine.enabled and is_same
 
     @classmethod
     def from_preset(cls, name: str) -> Self:

@@ -31,6 +31,7 @@ class RefineViews:
         heldout: Held-out cameras, single and of one size, which decide which scene is kept.
         training: Single training cameras.
         endless: Whether ``training`` never ends.
+        stride: A step sees every ``stride``-th pixel of a training image.
         heldout_images: Further held-out views, already rendered.
         images: Training images that are already rendered before the first step.
     """
@@ -38,6 +39,7 @@ class RefineViews:
     heldout: tuple[Cameras, ...]
     training: Iterator[Cameras]
     endless: bool
+    stride: int = 1
     heldout_images: tuple[ViewImage, ...] = ()
     images: tuple[ViewImage, ...] = ()
 
@@ -58,7 +60,7 @@ def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> 
             yield from views
 
     heldout = _thinned(batch(config.heldout, seed + HELDOUT_SEED), config.stride)
-    return RefineViews(heldout=heldout, training=training(), endless=True)
+    return RefineViews(heldout=heldout, training=training(), endless=True, stride=config.stride)
 
 
 def split_views(cameras: Cameras, *, config: RefineConfig, seed: int) -> RefineViews:
@@ -68,13 +70,13 @@ def split_views(cameras: Cameras, *, config: RefineConfig, seed: int) -> RefineV
             f"a refinement needs at least 2 cameras, one of them to be held out; found "
             f"{len(cameras)}."
         )
-    side = min(config.size, max(cameras.width, cameras.height))
-    views = cameras.fitted(side, least=SSIM_WINDOW * config.stride).singles()
+    side, stride = config.size_and_stride(max(cameras.width, cameras.height))
+    views = cameras.fitted(side, least=SSIM_WINDOW * stride).singles()
     held = _heldout_rows(len(views), config)
     others = [view for row, view in enumerate(views) if row not in held]
     random.Random(seed).shuffle(others)
-    heldout = _thinned([views[row] for row in held], config.stride)
-    return RefineViews(heldout=heldout, training=iter(others), endless=False)
+    heldout = _thinned([views[row] for row in held], stride)
+    return RefineViews(heldout=heldout, training=iter(others), endless=False, stride=stride)
 
 
 def shared_views(
@@ -97,6 +99,7 @@ def shared_views(
         heldout=(),
         training=_further(observed.cameras, full, cameras, config=config, seed=seed),
         endless=cameras is None,
+        stride=observed.cameras.stride,
         heldout_images=tuple(images[row] for row in held),
         images=tuple(image.half() for row, image in enumerate(images) if row not in held),
     )
@@ -138,7 +141,7 @@ class ImageBuffer:
     """Training images: the first are new, later ones are new at intervals and reused in between.
 
     A reused image is drawn at random from the least recently used half of the buffer. A step sees
-    every ``config.stride``-th pixel, with a random first one.
+    every ``views.stride``-th pixel, with a random first one.
 
     Memory: 8 bytes per pixel of at most ``config.images`` images, or of one image if every step
     renders a new one.
@@ -150,6 +153,7 @@ class ImageBuffer:
         always_new = views.endless and config.steps_per_image == 1
         self._full = full
         self._cameras = views.training
+        self._stride = views.stride
         self._config = config
         self._capacity = max(1 if always_new else config.images, len(views.images))
         self._first = max(config.first_images, len(views.images))
@@ -160,7 +164,7 @@ class ImageBuffer:
 
     def draw(self) -> ViewImage:
         """Return a training image, in half precision."""
-        image, stride = self._next(), self._config.stride
+        image, stride = self._next(), self._stride
         if image.camera.stride == stride:
             return image
         first = (self._rng.randrange(stride), self._rng.randrange(stride))
