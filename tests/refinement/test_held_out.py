@@ -1,11 +1,13 @@
-"""Held-out images: which they are, and how they decide; what a step compares."""
+"""Held-out images: which they are, their size, and how they decide; what a step compares."""
 
 import pytest
 import torch
 
+from cvtgs.analysis import visibility_cameras
+from cvtgs.config import SimplifyConfig
 from cvtgs.progress import silent
 from cvtgs.refinement import RefineConfig, optimize
-from cvtgs.refinement.images import ImageBuffer, RefineViews, split_views
+from cvtgs.refinement.images import ImageBuffer, RefineViews, generated_views, split_views
 from cvtgs.refinement.limits import Limits
 from refine_cases import discolored, full_scene, quick, ring
 
@@ -22,6 +24,25 @@ def test_thinned_views_start_at_every_first_pixel_in_turn():
     held = split_views(ring(40), config=RefineConfig(size=32, stride=2), seed=0).heldout
     shifts = [tuple((one.Ks - held[0].Ks)[0, :2, 2].tolist()) for one in held]
     assert shifts == [(0, 0), (-0.5, 0), (0, -0.5), (-0.5, -0.5), (0, 0)]
+
+
+@pytest.mark.parametrize(
+    ("width", "side", "stride"), [(24, 24, 2), (32, 32, 2), (50, 50, 3), (64, 64, 4), (200, 64, 4)]
+)
+def test_given_cameras_keep_their_size_up_to_a_limit(width, side, stride):
+    """Matching and refinement use the same images, of about as many pixels as generated ones."""
+    full, cameras = full_scene(50), ring(16, width=width, height=width)
+    sizes = {"size": 32, "stride": 2, "given_size": 64}
+    config = SimplifyConfig.from_mapping({"visibility": {"views": 8, **sizes}})
+    pixels = max(11, side // stride)
+    seen = visibility_cameras(full, config, cameras=cameras)
+    assert (seen.width, seen.stride) == (pixels, stride)
+    views = split_views(cameras, config=quick(**sizes), seed=0)
+    assert next(views.training).width == max(side, 11 * stride)
+    assert views.stride == stride
+    assert {camera.stride for camera in views.heldout} == {stride}
+    generated = generated_views(full, config=quick(**sizes), seed=0)
+    assert (next(generated.training).width, generated.stride) == (32, 2)
 
 
 def optimized(small, full, config, *, cameras, steps):

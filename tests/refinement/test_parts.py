@@ -7,9 +7,8 @@ from itertools import chain
 import pytest
 import torch
 
-from cvtgs.analysis import visibility_cameras
 from cvtgs.cameras import Cameras
-from cvtgs.config import Rates, SimplifyConfig
+from cvtgs.config import Rates
 from cvtgs.errors import ConfigError
 from cvtgs.evaluation import scorer as scorer_module
 from cvtgs.evaluation.scorer import BLACK, WHITE, Metrics, Scorer, ViewImage, render_view
@@ -246,25 +245,6 @@ def test_held_out_views_are_thinned_like_training_images():
     assert next(tiny.training).width == 33  # so that enough pixels for SSIM are left
     given = split_views(ring(8), config=quick(stride=2), seed=0)
     assert [(camera.width, camera.height) for camera in given.heldout] == [(16, 12)]
-
-
-@pytest.mark.parametrize(
-    ("width", "side", "stride"), [(24, 24, 2), (32, 32, 2), (50, 50, 3), (64, 64, 4), (200, 64, 4)]
-)
-def test_given_cameras_keep_their_size_up_to_a_limit(width, side, stride):
-    """Matching and refinement use the same images, of about as many pixels as generated ones."""
-    full, cameras = full_scene(50), ring(16, width=width, height=width)
-    sizes = {"size": 32, "stride": 2, "given_size": 64}
-    config = SimplifyConfig.from_mapping({"visibility": {"views": 8, **sizes}})
-    pixels = max(11, side // stride)
-    seen = visibility_cameras(full, config, cameras=cameras)
-    assert (seen.width, seen.stride) == (pixels, stride)
-    views = split_views(cameras, config=quick(**sizes), seed=0)
-    assert next(views.training).width == max(side, 11 * stride)
-    assert views.stride == stride
-    assert {camera.stride for camera in views.heldout} == {stride}
-    generated = generated_views(full, config=quick(**sizes), seed=0)
-    assert (next(generated.training).width, generated.stride) == (32, 2)
 
 
 def test_the_number_of_images_for_a_number_of_steps():
