@@ -111,7 +111,7 @@ def scoring_parser(description: str | None) -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--size", type=int, metavar="PIXELS",
-        help="longer side of the images, of our own renderer without --cameras only",
+        help="longer side of the images; not with --scorer or --cameras",
     )  # fmt: skip
     parser.add_argument("--split", choices=("train", "test"), help="part of --cameras to use")
     parser.add_argument(
@@ -163,6 +163,8 @@ def scenes(files: Sequence[Path], count: int) -> Iterator[tuple[str, cvtgs.Gauss
 
 def make_scorer(options: argparse.Namespace, file: Path | None) -> Scorer:
     """Make the scorer that the options ask for, for the scene of a file or a generated one."""
+    if options.size is not None and (options.scorer or options.cameras is not None):
+        raise SystemExit("--size cannot be used with --scorer or --cameras.")
     if options.scorer:
         return command_scorer(options.scorer)
     weights = None if options.lpips is None else any_lpips(options.lpips)

@@ -140,11 +140,11 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
 @contextmanager
 def input_file(source: str | Path) -> Iterator[Path]:
     """Return the path of a scene; standard input is a temporary file within the context."""
-    from cvtgs.io.streams import file_of
-
     if str(source) != STREAM:
         yield Path(source)
         return
+    from cvtgs.io.streams import file_of
+
     with file_of(sys.stdin.buffer, name=STANDARD_INPUT, advice=_OTHER_FORMATS) as path:
         yield path
 

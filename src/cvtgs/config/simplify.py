@@ -28,16 +28,17 @@ def unknown_preset(name: object) -> ConfigError:
     return ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {shown(name, 120)}{end}")
 
 
+IMAGES: Mapping[str, Any] = {"size": 400, "stride": 2, "given_size": 600}
+"""Sizes of images, equal for matching and refinement, which share them."""
+
 MATCHED: Mapping[str, Any] = {
-    "visibility": {"views": 32, "size": 400, "stride": 2, "given_size": 600},
+    "visibility": {**IMAGES, "views": 32},
     "match": {"opacity_rounds": 1},
     "refine": {
         "steps": 60,
         "rates": {"means": 0.03, "quats": 0.012, "log_scales": 0.015},
         "half_after": 48,
-        "size": 400,
-        "stride": 2,
-        "given_size": 600,
+        **IMAGES,
         "steps_per_image": 100,
         "check_every": 30,
     },
@@ -47,9 +48,7 @@ THINNED: Mapping[str, Any] = {
     "steps": 480,
     "half_after": 115,
     "cooling": 0.3,
-    "size": 400,
-    "stride": 2,
-    "given_size": 600,
+    **IMAGES,
     "first_images": 32,
     "steps_per_image": 1000,
     "check_every": 50,
@@ -157,8 +156,9 @@ class SimplifyConfig(Section):
     @property
     def shares_images(self) -> bool:
         """Whether a refinement trains on the images that opacities are matched to."""
-        sizes = [(own.size, own.stride, own.given_size) for own in (self.visibility, self.refine)]
-        is_same = sizes[0] == sizes[1]
+        is_same = all(
+            getattr(self.visibility, name) == getattr(self.refine, name) for name in IMAGES
+        )
         return self.uses_renders and self.match.enabled and self.refine.enabled and is_same
 
     @classmethod
