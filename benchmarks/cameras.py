@@ -164,7 +164,7 @@ class FullImages:
             key = hashlib.sha256(about_scene)
             key.update(_bytes_of(camera.viewmats))
             key.update(_bytes_of(camera.Ks))
-            key.update(f"{camera.width} {camera.height}".encode())
+            key.update(f"{camera.width} {camera.height} {any(camera.ignores_tag)}".encode())
             path = self.folder / f"{key.hexdigest()[:32]}.npy"
             if not path.is_file():
                 found = render_view(self.scene, camera)

@@ -1,13 +1,15 @@
 r"""Measure the gain of choices of ``simplify``, seen from hand-picked cameras.
 
 Every ``--set`` is one configuration: a list of settings that differ from the base; ``preset``
-is one of the settings:
+and ``ckpt`` (a checkpoint) are among the settings:
 
     python -m benchmarks.choices a.ply b.ply --rho 0.1 0.01 \
-        --set cvt.color=0.1 --set cvt.color=0.1 merge.network=false --set preset=high
+        --set cvt.color=0.1 --set cvt.color=0.1 merge.network=false --set preset=high \
+        --set ckpt=mine.safetensors
 
 Cameras are read from a file beside each scene (see ``benchmarks.cameras``), or are automatic views
-with ``--automatic``. Every line has PSNR, SSIM, the mean absolute error of alpha, its bias
+with ``--automatic``. ``--ignore-tag`` renders scenes tagged ``SplatRenderMode: mip`` as viewers do
+that do not know the tag. Every line has PSNR, SSIM, the mean absolute error of alpha, its bias
 (negative: more of the background shows through than in the full scene), each with its difference
 to the base, and CPU seconds of the simplification alone, in one process. Means over the scenes
 come last. ``--base merge.network=false`` changes the base. Images of full scenes are cached in
@@ -19,7 +21,7 @@ import argparse
 import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean
 
@@ -114,6 +116,7 @@ def parser() -> argparse.ArgumentParser:
     )
     found.add_argument("--automatic", action="store_true", help="use automatic views")
     found.add_argument("--size", type=int, help="longer side of the images, pixels")
+    found.add_argument("--ignore-tag", action="store_true", help="ignore the tag mip in images")
     found.add_argument(
         "--lpips", default="off", choices=("off", "auto", "vgg", "alex"), help="also measure LPIPS"
     )
@@ -143,8 +146,9 @@ def measure(
         kept: dict[str, cvtgs.GaussianScene] = {}
         for name, settings in configurations.items():
             values = dict(settings)
-            config = cvtgs.SimplifyConfig.compose(preset=values.pop("preset"), settings=values)
-            simplifier = cvtgs.Simplifier(config=config)
+            preset, checkpoint = values.pop("preset"), values.pop("ckpt", "auto")
+            config = cvtgs.SimplifyConfig.compose(preset=preset, settings=values)
+            simplifier = cvtgs.Simplifier(checkpoint, config=config)
             start = time.process_time()
             small = simplifier.simplify(scene, rho)
             seconds = time.process_time() - start
@@ -175,10 +179,12 @@ def measure(
 
 def views_of(file: Path, scene: cvtgs.GaussianScene, options: argparse.Namespace) -> Cameras:
     """Return the cameras beside a scene, or automatic ones."""
-    if not options.automatic:
-        return cameras_beside(file, size=options.size).to(scene.device)
-    size = options.size or AUTOMATIC_SIZE
-    return automatic_views(scene, AUTOMATIC_VIEWS, width=size, height=size)
+    if options.automatic:
+        size = options.size or AUTOMATIC_SIZE
+        cameras = automatic_views(scene, AUTOMATIC_VIEWS, width=size, height=size)
+    else:
+        cameras = cameras_beside(file, size=options.size).to(scene.device)
+    return replace(cameras, ignores_tag=(options.ignore_tag,) * len(cameras))
 
 
 def score(small: cvtgs.GaussianScene, full: FullImages, metrics: Metrics) -> Iterator[ImageScores]:

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from benchmarks import cameras as camera_files
 from benchmarks import choices, heights
 from cvtgs.edit import Motion, move
 from cvtgs.evaluation import EvaluationSettings
+from cvtgs.scene import ANTIALIASED_TAG
 from cvtgs.views import automatic_views
 
 SCENE = cvtgs.synthetic.scene("object", 600, sh_degree=0, seed=0)
@@ -50,6 +52,31 @@ def test_rows_have_the_scores_of_evaluate_and_differences_to_the_base(file, tmp_
     last = capsys.readouterr().out.splitlines()[-1].split()
     assert last[:2] == ["thing", "0.1"]
     assert float(last[3]) == pytest.approx(other["psnr"] - base["psnr"], abs=0.006)
+
+
+def test_a_checkpoint_is_a_choice(file, tmp_path):
+    place = tmp_path / "rows.json"
+    common = ["--rho", "0.1", "--cache", str(tmp_path / "kept"), "--json", str(place)]
+    networks = ["--set", "ckpt=none", "--set", "merge.network=false", "--set", "ckpt=standard"]
+    choices.main([str(file), *common, *networks])
+    base, none, without, shipped = (row["psnr"] for row in json.loads(place.read_text()))
+    assert none == without != base == shipped
+
+
+def test_images_may_ignore_the_tag(tmp_path, file):
+    """The images of the full scene, too, also if those with the tag are cached."""
+    tagged = replace(SCENE, comments=(ANTIALIASED_TAG,))
+    cvtgs.save(tagged, file, overwrite=True)
+    place = tmp_path / "rows.json"
+    common = ["--rho", "0.1", "--cache", str(tmp_path / "kept"), "--json", str(place)]
+    small = cvtgs.Simplifier().simplify(tagged, 0.1)
+    settings = EvaluationSettings(lpips="off")
+    for more, comments in ([], (ANTIALIASED_TAG,)), (["--ignore-tag"], ()):
+        choices.main([str(file), *common, *more])
+        full, shown = (replace(scene, comments=comments) for scene in (SCENE, small))
+        scores = cvtgs.evaluate(full, {"small": shown}, VIEWS, settings=settings).scenes[0]
+        (row,) = json.loads(place.read_text())
+        assert row["psnr"] == pytest.approx(scores.psnr.mean, abs=1e-3)
 
 
 def test_full_scenes_are_rendered_once_and_then_read(file, tmp_path, monkeypatch):
