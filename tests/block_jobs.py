@@ -18,7 +18,7 @@ def stop_before_assemble(event):
         raise StoppedError
 
 
-def unfinished_job(scene, folder, *, count, blocks, config=None, boxes=()):
+def unfinished_job(scene, folder, *, count, blocks, config=None, boxes=(), cameras=None):
     """Return a job that is complete except for the assembly of its blocks."""
     source, simplifier = folder / "in.ply", Simplifier(config=config, device="cpu")
     cvtgs.save(scene, source)
@@ -30,6 +30,7 @@ def unfinished_job(scene, folder, *, count, blocks, config=None, boxes=()):
             blocks=blocks,
             boxes=boxes,
             simplifier=simplifier,
+            cameras=cameras,
             listener=stop_before_assemble,
         )
     return Job(

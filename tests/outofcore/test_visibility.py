@@ -80,8 +80,8 @@ def test_invalid_rows_do_not_enlarge_the_sample(scene, tmp_path):
 
 
 def test_gaussians_of_a_sample_are_enlarged_to_the_mass_of_the_scene(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("cvtgs.outofcore.visibility.visibility_cameras", lambda *_: ring())
-    job = SimpleNamespace(config=SimplifyConfig(), views_path=tmp_path / "views")
+    monkeypatch.setattr("cvtgs.outofcore.visibility.visibility_cameras", lambda *_, **__: ring())
+    job = SimpleNamespace(config=SimplifyConfig(), cameras=None, views_path=tmp_path / "views")
     sample = scene.select(torch.arange(0, COUNT, 4))
     write_views(job, sample, total=COUNT)
     log_scales = map_tensors(job.views_path)[0]["scene/log_scales"]

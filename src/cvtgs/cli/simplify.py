@@ -169,8 +169,13 @@ def _simplify_one(
         if memory is not None:
             simplifier = cvtgs.Simplifier(checkpoint, config=config, device="cpu")
             report = _simplify_blocks(options, simplifier, memory, listener)
+            if options.cameras is None and report.views.endswith(" cameras"):
+                notes.append(f"Rendered from {report.views} found beside {options.input}.")
         else:
             report, notes = _simplify_in_memory(options, checkpoint, config, settings, listener)
+        used = report.config
+        if options.cameras is not None and not (_has_target(options) or used.uses_images):
+            notes.append(f"--cameras was not used: {used.preset} renders no images.")
     if options.report is not None:
         _write_report(options, report)
     searched = _has_target(options)
@@ -213,8 +218,6 @@ def _simplify_in_memory(
             cameras = own.cameras
             notes.append(f"Rendered from {len(cameras)} cameras found in {own.source.resolve()}.")
     search = _has_target(options)
-    if options.cameras is not None and not (search or config.uses_images):
-        notes.append(f"--cameras was not used: {config.preset} renders no images.")
     simplifier = cvtgs.Simplifier(
         checkpoint, config=config, device=options.device, listener=silent if search else listener
     )
@@ -289,7 +292,7 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
     from cvtgs.outofcore import check_config
 
     memory = memory_of(options)
-    names = ("target_psnr", "target_ssim", "time_budget", "cameras")
+    names = ("target_psnr", "target_ssim", "time_budget")
     excluded = [name for name in names if getattr(options, name) is not None]
     if options.scheduler is None and not _needs_blocks(options, memory):
         return None
@@ -352,6 +355,7 @@ def _simplify_blocks(
             source_axes=axes.source,
             output_axes=axes.target,
             simplifier=simplifier,
+            cameras=read_cameras(options),
             workers=blocks.workers,
             overwrite=options.overwrite,
             listener=listener,

@@ -5,6 +5,7 @@ their simplified ones, fixed and the same as in images of the small scene. Only 
 """
 
 from collections.abc import Sequence
+from functools import partial
 from statistics import mean
 from typing import Any, NamedTuple
 
@@ -12,7 +13,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.analysis import drop_unused_bands, restore_columns, select_columns
+from cvtgs.analysis import (
+    drop_unused_bands,
+    restore_columns,
+    select_columns,
+    visibility_cameras,
+)
+from cvtgs.cameras import Cameras
 from cvtgs.devices import one_thread
 from cvtgs.io import load
 from cvtgs.matching import cell_contributions, match_views
@@ -23,11 +30,19 @@ from cvtgs.refinement import refine
 from cvtgs.rendering import observe
 from cvtgs.report import MatchReport, RefineReport
 from cvtgs.scene import GaussianScene, concatenate
-from cvtgs.views import CameraPositions, find_view_positions, mixed_views
+from cvtgs.views import find_view_positions, mixed_views
 
 NEAR = 0.5
 """Camera positions depend on Gaussians around a block up to this share of its diagonal away."""
 
+SHOWS_BLOCK = 0.1
+"""A camera is used for a block if it shows this share of the pixels that the best one shows."""
+
+MOST_SHOWN = 0.01
+"""Largest share of an image that one Gaussian counts for in this."""
+
+LEAST_CAMERAS = 2
+"""A refinement trains with one camera at least, and holds out another."""
 
 LATER_SEED = 307
 """Added to the seed, so that views for refinement differ from those for matching."""
@@ -40,30 +55,39 @@ class Drawn(NamedTuple):
         small: The fixed Gaussians, then those of the simplified block.
         full: The fixed Gaussians, then the members of the cells of the block.
         fixed: Number of fixed Gaussians: protected ones, and the simplified ones of other blocks.
-        positions: Possible positions of cameras that look at the block.
     """
 
     small: GaussianScene
     full: GaussianScene
     fixed: int
-    positions: CameraPositions
+
+
+class BlockViews(NamedTuple):
+    """The cameras that look at a block.
+
+    Attributes:
+        matching: Those of the images that it is matched to; None if it is not.
+        refinement: Those of the images that it is refined with; None if it is not.
+    """
+
+    matching: Cameras | None
+    refinement: Cameras | None
 
 
 @one_thread()
 def improve(job: Job, block: int) -> None:
-    """Match a simplified block to images and refine it; other blocks are rendered unimproved."""
+    """Match a simplified block to images and refine it; other blocks are rendered unimproved.
+
+    A block that fewer than two of the given cameras show stays as it is.
+    """
     if job.improved_path(block).exists():
         return
     own, found, config = load(job.small_path(block)), read_cells(job, block), job.config
     drawn = _draw(job, block, own, found)
+    views = _choose_views(job, drawn)
     small, changes, observed = drawn.small, dict[str, Any](), None
-    if config.match.enabled and config.uses_renders:
-        choices = config.visibility
-        views = mixed_views(
-            drawn.positions, choices.views, size=choices.size, seed=config.seed, sharp=False
-        )
-        views = views.interleaved(choices.stride).in_both_modes()
-        observed = observe(drawn.full, views)
+    if views.matching is not None:
+        observed = observe(drawn.full, views.matching)
         targets = cell_contributions(observed.contributions[drawn.fixed :], found.partition)
         small, changes["matching"] = match_views(
             small,
@@ -72,14 +96,11 @@ def improve(job: Job, block: int) -> None:
             config=config.match,
             frozen=drawn.fixed,
         )
-    if config.refine.enabled:
-        number = min(config.refine.images, config.refine.steps) + config.refine.heldout
-        size, seed = config.refine.size, config.seed + LATER_SEED
-        cameras = mixed_views(drawn.positions, max(2, number), size=size, seed=seed, sharp=False)
+    if views.refinement is not None:
         small, changes["refinement"] = refine(
             small,
             drawn.full,
-            cameras=cameras,
+            cameras=views.refinement,
             config=config.refine,
             seed=config.seed,
             device="cpu",
@@ -92,6 +113,52 @@ def improve(job: Job, block: int) -> None:
     changes["mass_out"] = float(improved.masses.sum())
     report = read_report(job, block).model_copy(update=changes)
     write_block(job, block, improved, report, is_improved=True)
+
+
+def _choose_views(job: Job, drawn: Drawn) -> BlockViews:
+    """Choose from the given cameras, or generate some that look at a block."""
+    config, seed = job.config, job.config.seed
+    matches, refines = config.match.enabled and config.uses_renders, config.refine.enabled
+    members = drawn.full.select(torch.arange(drawn.fixed, len(drawn.full)))
+    if job.cameras is not None:
+        shown = cameras_of_block(job.cameras, members)
+        if len(shown) < LEAST_CAMERAS:
+            return BlockViews(None, None)
+        views = visibility_cameras(members, config, cameras=shown) if matches else None
+        return BlockViews(views, shown if refines else None)
+    fixed = drawn.small.select(torch.arange(drawn.fixed))
+    own = drawn.small.means[drawn.fixed :]
+    near = fixed.select(_near(fixed.means, own))
+    make = partial(mixed_views, find_view_positions(concatenate([members, near])), sharp=False)
+    views, later = None, None
+    if matches:
+        choices = config.visibility
+        views = make(choices.views, size=choices.size, seed=seed)
+        views = views.interleaved(choices.stride).in_both_modes()
+    if refines:
+        number = min(config.refine.images, config.refine.steps) + config.refine.heldout
+        later = make(max(2, number), size=config.refine.size, seed=seed + LATER_SEED)
+    return BlockViews(views, later)
+
+
+def cameras_of_block(cameras: Cameras, members: GaussianScene) -> Cameras:
+    """Return the cameras that show a block, whatever hides it, compared with the best of them."""
+    pixels = torch.stack([_pixels_of(members, camera) for camera in cameras.singles()])
+    rows = ((pixels > 0) & (pixels >= SHOWS_BLOCK * pixels.max())).nonzero()[:, 0]
+    return cameras.select(rows)
+
+
+def _pixels_of(members: GaussianScene, camera: Cameras) -> Float[Tensor, ""]:
+    """Return the opaque area of all Gaussians with centres in an image, pixels."""
+    view, intrinsics = camera.viewmats[0].double(), camera.Ks[0].double()
+    local = members.means.double() @ view[:3, :3].T + view[:3, 3]
+    x, y, depth = (local @ intrinsics.T).unbind(1)
+    is_inside = (depth > 0) & (x > 0) & (x < camera.width * depth)
+    is_inside &= (y > 0) & (y < camera.height * depth)
+    scales = intrinsics[0, 0] * intrinsics[1, 1] / depth[is_inside].square()
+    areas = members.areas[is_inside] * scales
+    most = MOST_SHOWN * camera.width * camera.height
+    return (members.opacities[is_inside] * areas.clamp_max(most)).sum()
 
 
 def _draw(job: Job, block: int, own: GaussianScene, found: BlockCells) -> Drawn:
@@ -108,12 +175,8 @@ def _draw(job: Job, block: int, own: GaussianScene, found: BlockCells) -> Drawn:
     ]
     own, members = bare(own), bare(found.scene)
     fixed = concatenate([*parts, own.select(torch.arange(0))])
-    near = _near(fixed.means, own.means)
     return Drawn(
-        small=concatenate([fixed, own]),
-        full=concatenate([fixed, members]),
-        fixed=len(fixed),
-        positions=find_view_positions(concatenate([members, fixed.select(near)])),
+        small=concatenate([fixed, own]), full=concatenate([fixed, members]), fixed=len(fixed)
     )
 
 

@@ -15,6 +15,7 @@ import torch
 
 import cvtgs
 from cvtgs.boxes import Box
+from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
 from cvtgs.errors import CvtgsError, OutputError, RunError, reason_of
 from cvtgs.io import atomic_output
@@ -76,6 +77,7 @@ class Job:
         range_rows: Rows of the file that one process reads in one call.
         sample_rows: Size of the sample of Gaussians from which the blocks are laid out.
         axes: Axes of the output: the directions of x, y and z.
+        cameras: Cameras for presets that render the scene; None generates views.
     """
 
     folder: str
@@ -88,6 +90,7 @@ class Job:
     range_rows: int
     sample_rows: int = SAMPLE_ROWS
     axes: str = SCENE_AXES
+    cameras: Cameras | None = None
 
     def path(self, name: str) -> Path:
         """Return the path of a file of the job."""
@@ -241,6 +244,7 @@ class Job:
             "axes": [self.source.axes, self.axes],
             "sh_degree": self.source.sh_degree,
             "boxes": [box.model_dump() for box in self.boxes],
+            "cameras": self.cameras and _listed(self.cameras),
             "config": self.config.model_dump(),
             "network": checkpoint and checkpoint.digest,
             "versions": [cvtgs.__version__, torch.__version__, FILES_VERSION],
@@ -363,6 +367,12 @@ def job_folder(output: str | os.PathLike[str], key: str) -> str:
     """
     target = Path(os.path.realpath(output))
     return str(target.with_name(f".{target.name}.blocks") / key[:16])
+
+
+def _listed(cameras: Cameras) -> list[object]:
+    """Return everything about cameras that a result depends on."""
+    matrices = [cameras.viewmats.tolist(), cameras.Ks.tolist()]
+    return [*matrices, cameras.width, cameras.height, cameras.stride, cameras.ignores_tag]
 
 
 def _not_seen(path: Path) -> RunError:

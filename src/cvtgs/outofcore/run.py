@@ -11,6 +11,7 @@ from pathlib import Path
 
 from cvtgs.analysis import restore_columns, select_columns
 from cvtgs.boxes import Box
+from cvtgs.cameras import Cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, shortfall, target_count
@@ -20,7 +21,7 @@ from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES, checked_axes
 from cvtgs.io.locks import output_lock
-from cvtgs.io.ply import join_plys, open_rows
+from cvtgs.io.ply import PlyRows, join_plys, open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.outofcore.allocate import allocate, join
 from cvtgs.outofcore.improve import improve, join_matchings, join_refinements
@@ -45,9 +46,13 @@ from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport
 from cvtgs.scene import GaussianScene, concatenate
 from cvtgs.simplifier import Simplifier
+from cvtgs.views import find_own_cameras
 
 RANGE_ROWS, MOST_RANGES = 1 << 18, 64
 """Minimum rows of the file that one process reads in one call; maximum number of such calls."""
+
+SAMPLED = 10_000
+"""Number of Gaussians that tell whether cameras look at the scene."""
 
 
 def simplify_file(  # noqa: PLR0913 (options by name)
@@ -64,6 +69,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     source_axes: str | None = None,
     output_axes: str | None = None,
     simplifier: Simplifier | None = None,
+    cameras: Cameras | None = None,
     workers: Workers | None = None,
     range_rows: int | None = None,
     overwrite: bool = False,
@@ -89,6 +95,9 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         source_axes: Directions of x, y and z in the source; None for those of PLY files.
         output_axes: Directions of x, y and z in the output; None for those of its format.
         simplifier: Configuration and network; None for the defaults.
+        cameras: Cameras for presets that render the scene; None takes those beside the source if
+            it has the axes of PLY files (:func:`cvtgs.views.find_own_cameras`), or else generates
+            views.
         workers: Call functions for ranges of the file and for blocks; None calls them one after
             the other in this process.
         range_rows: Rows of the file that one process reads in one call; None for 260,000, or a
@@ -133,6 +142,9 @@ def simplify_file(  # noqa: PLR0913 (options by name)
                 f"memory must be at least {(LEAST_BYTES + IMAGE_BYTES) / 1e6:g} MB with images of "
                 f"the scene, found {memory / 1e6:g} MB; use preset standard or more memory."
             )
+        if cameras is None and source_axes is None:
+            own = find_own_cameras(_sampled(rows), source)
+            cameras = None if own is None else own.cameras
     wanted = blocks or block_count(rows, room)
     job = Job(
         folder="",
@@ -145,6 +157,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         range_rows=range_rows or rows_per_range(rows.count),
         sample_rows=sample_rows(room),
         axes=checked_axes(output_axes or SCENE_AXES) if is_plain_ply(output) else SCENE_AXES,
+        cameras=cameras if simplifier.config.uses_images else None,
     )
     key = job.key(simplifier.checkpoint)
     job = replace(job, folder=job_folder(output, key))
@@ -162,6 +175,11 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         report = report_blocks(job, simplifier, clock, energies=energies, resumed=resumed)
         shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
     return report
+
+
+def _sampled(rows: PlyRows) -> GaussianScene:
+    """Read a few Gaussians of a file, evenly spaced."""
+    return rows.scene(rows.read(0, rows.count, max(1, rows.count // SAMPLED)))
 
 
 def rows_per_range(count: int) -> int:
@@ -360,7 +378,7 @@ def report_blocks(
         backend=reports[0].backend if reports else "none",
         checkpoint="none" if simplifier.checkpoint is None else simplifier.checkpoint.name,
         plan=scan.plan,
-        views="found" if simplifier.config.uses_renders or refinements else "none",
+        views=_views(job) if simplifier.config.uses_renders or refinements else "none",
         stages=tuple(clock.costs),
         matching=join_matchings(matchings) if matchings else None,
         refinement=join_refinements(refinements) if refinements else None,
@@ -368,3 +386,8 @@ def report_blocks(
         resumed_blocks=resumed,
         config=simplifier.config,
     )
+
+
+def _views(job: Job) -> str:
+    """Return the origin of the views, as the report gives it."""
+    return "found" if job.cameras is None else f"{len(job.cameras)} cameras"

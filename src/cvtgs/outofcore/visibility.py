@@ -29,8 +29,8 @@ SCENE = "scene/"
 
 @one_thread()
 def write_views(job: Job, sample: GaussianScene, *, total: int) -> None:
-    """Choose cameras by a sample of ``total`` Gaussians, and write both."""
-    cameras = visibility_cameras(sample, job.config)
+    """Choose cameras by a sample of ``total`` Gaussians, or from given ones; write both."""
+    cameras = visibility_cameras(sample, job.config, cameras=job.cameras)
     enlarged = sample.log_scales + 0.5 * math.log(total / len(sample))
     tensors = sample.with_sh_degree(0).tensors() | {"log_scales": enlarged}
     save_tensors(

@@ -1,0 +1,180 @@
+"""Given cameras in blocks: contributions, matching and refinement use them, as in one piece."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+import cvtgs
+from block_jobs import unfinished_job
+from camera_files import transforms, write_json
+from cvtgs import Simplifier, SimplifyConfig
+from cvtgs.analysis import visibility_cameras
+from cvtgs.cli.main import main
+from cvtgs.outofcore import improve, simplify_file
+from cvtgs.outofcore.improve import cameras_of_block
+from cvtgs.rendering import contributions, render
+from refine_cases import ring
+
+BLOCKS = 2
+MATCHED = {
+    "preset": "matched",
+    "visibility": {"views": 6, "size": 48, "given_size": 48, "stride": 1},
+    "match": {"color_iterations": 6},
+    "refine": {"steps": 0},
+}
+REFINED = MATCHED | {
+    "preset": "high",
+    "refine": {"steps": 12, "size": 48, "given_size": 48, "images": 6, "check_every": 6},
+}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return cvtgs.synthetic.scene("object", 3000, sh_degree=1, seed=4)
+
+
+@pytest.fixture(scope="module")
+def source(scene, tmp_path_factory):
+    path = tmp_path_factory.mktemp("given") / "in.ply"
+    cvtgs.save(scene, path)
+    return path
+
+
+def in_blocks(source, output, settings, **options):
+    simplifier = Simplifier(config=SimplifyConfig.from_mapping(settings), device="cpu")
+    return simplify_file(source, output, count=150, blocks=BLOCKS, simplifier=simplifier, **options)
+
+
+def squared_error(scene, small, cameras):
+    images = [render(one, cameras).rgb for one in (scene, small)]
+    return float((images[0] - images[1]).square().mean())
+
+
+@pytest.mark.parametrize("settings", [MATCHED, REFINED])
+def test_given_cameras_decide_what_blocks_look_like(scene, source, tmp_path, settings):
+    """The cameras stand on one side; from there, their result is nearer to the scene."""
+    cameras = ring(10, width=48, height=48)
+    reports = {
+        name: in_blocks(source, tmp_path / f"{name}.ply", settings, cameras=given)
+        for name, given in (("own", None), ("given", cameras))
+    }
+    assert [report.views for report in reports.values()] == ["found", "10 cameras"]
+    assert reports["given"].matching.views == BLOCKS * 6
+    errors = [
+        squared_error(scene, cvtgs.load(tmp_path / f"{name}.ply"), ring(5)) for name in reports
+    ]
+    assert errors[1] < 0.95 * errors[0]
+
+
+def test_contributions_are_measured_with_given_cameras(scene, tmp_path):
+    settings = {"visibility": MATCHED["visibility"]}
+    config, cameras = SimplifyConfig.from_mapping(settings), ring(10, width=48, height=48)
+    job = unfinished_job(scene, tmp_path, count=150, blocks=BLOCKS, config=config, cameras=cameras)
+    pixels = contributions(scene, visibility_cameras(scene, config, cameras=cameras)).sum()
+    found = json.loads(job.path("measured.json").read_bytes())
+    assert found["pixels"] == pytest.approx(float(pixels), rel=0.05)
+
+
+def test_a_block_takes_the_cameras_that_show_it(scene):
+    """Of ten cameras, five look at the block, one from far away, and four elsewhere."""
+    beside = scene.with_tensors({"means": scene.means + torch.tensor([100.0, 0, 0])})
+    at_it, far = ring(5), ring(1, distance=500.0)
+    away = replace(ring(4), viewmats=torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ ring(4).viewmats)
+    joined = replace(
+        at_it,
+        viewmats=torch.cat([away.viewmats, at_it.viewmats, far.viewmats]),
+        Ks=at_it.Ks[:1].repeat(10, 1, 1),
+    )
+    found = cameras_of_block(joined, scene)
+    assert torch.equal(found.viewmats, at_it.viewmats)
+    assert len(cameras_of_block(at_it, beside)) == 0
+
+
+@pytest.fixture
+def two_objects(scene, tmp_path):
+    """Write a scene of two objects, the second 60 units below the first."""
+    other = scene.with_tensors({"means": scene.means + torch.tensor([0.0, 60.0, 0.0])})
+    cvtgs.save(cvtgs.concatenate([scene, other]), tmp_path / "in.ply")
+    return tmp_path / "in.ply"
+
+
+def test_a_block_that_no_camera_shows_stays_as_it_is(two_objects, tmp_path):
+    """The cameras look at the first object only."""
+    unmatched = MATCHED | {"match": {"opacity_rounds": 0, "color_iterations": 0}}
+    results = {}
+    for name, settings in (("plain", unmatched), ("all", REFINED)):
+        path = tmp_path / f"{name}.ply"
+        report = in_blocks(two_objects, path, settings, cameras=ring(10))
+        results[name] = cvtgs.load(path)
+    assert report.matching.views == 6  # of one block only
+    same = (results["plain"].means == results["all"].means).all(dim=1)
+    is_second = results["plain"].means[:, 1] > 30
+    assert 20 < int(is_second.sum()) < 140
+    assert bool(same[is_second].all())
+    assert not bool(same[~is_second].all())
+
+
+def test_blocks_use_only_the_cameras_that_show_them(two_objects, tmp_path, monkeypatch):
+    """Half of the cameras look at the second object; more than enough for both blocks."""
+    below = ring(10).viewmats.clone()
+    below[:, 1, 3] -= 60.0
+    both = torch.cat([ring(10).viewmats, below])
+    cameras = replace(ring(20), viewmats=both)
+    seen = {"observe": [], "refine": []}
+    for name, true in (("observe", improve.observe), ("refine", improve.refine)):
+
+        def noting(*arguments, true=true, name=name, **options):
+            views = options.get("cameras") or arguments[1]
+            seen[name].append(views.centers[:, 1] > 30)
+            return true(*arguments, **options)
+
+        monkeypatch.setattr(improve, name, noting)
+    in_blocks(two_objects, tmp_path / "out.ply", REFINED, cameras=cameras)
+    for masks in seen.values():
+        assert sorted(float(mask.double().mean()) for mask in masks) == [0.0, 1.0]
+
+
+def test_cameras_are_part_of_the_key_of_a_job(scene, tmp_path):
+    config = SimplifyConfig.from_mapping(MATCHED)
+    job = unfinished_job(scene, tmp_path, count=150, blocks=BLOCKS, config=config, cameras=ring(6))
+    checkpoint, found = Simplifier(config=config).checkpoint, set()
+    for cameras in (ring(6), ring(6), ring(6, distance=6.0), ring(6, width=33), None):
+        found.add(replace(job, cameras=cameras).key(checkpoint))
+    assert len(found) == 4
+
+
+@pytest.fixture
+def two_blocks(monkeypatch):
+    for module in ("cvtgs.outofcore", "cvtgs.outofcore.run"):
+        monkeypatch.setattr(f"{module}.block_count", lambda rows, memory: BLOCKS)
+
+
+@pytest.mark.usefixtures("two_blocks")
+@pytest.mark.parametrize("is_given", [True, False])
+def test_cameras_of_a_capture_are_used_in_blocks(capsys, tmp_path, scene, is_given):
+    cvtgs.save(scene, tmp_path / "in.ply")
+    folder = tmp_path / "elsewhere" if is_given else tmp_path
+    write_json(folder / "transforms.json", transforms())
+    words = ["simplify", tmp_path / "in.ply", tmp_path / "out.ply", "--preset", "matched"]
+    words += ["--set", "visibility.views=4", "--set", "match.color_iterations=2"]
+    words += ["--memory", "900MB", "--workers", "1", "--rho", "0.05", "--report"]
+    words += [tmp_path / "report.json", *(["--cameras", folder] if is_given else [])]
+    assert main([str(word) for word in words]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert ("Rendered from 10 cameras found beside" in text) != is_given
+    report = cvtgs.SimplifyReport.model_validate_json((tmp_path / "report.json").read_text())
+    assert (report.views, report.blocks) == ("10 cameras", BLOCKS)
+
+
+@pytest.mark.usefixtures("two_blocks")
+def test_cameras_that_are_not_used_are_named(capsys, tmp_path, scene):
+    cvtgs.save(scene, tmp_path / "in.ply")
+    cameras = write_json(tmp_path / "cameras" / "transforms.json", transforms())
+    words = ["simplify", tmp_path / "in.ply", tmp_path / "out.ply", "--preset", "draft"]
+    words += ["--memory", "800MB", "--workers", "1", "--rho", "0.05", "--cameras", cameras]
+    assert main([str(word) for word in words]) == 0
+    assert "--cameras was not used: draft renders no images" in " ".join(
+        capsys.readouterr().out.split()
+    )
