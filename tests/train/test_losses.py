@@ -131,12 +131,19 @@ def test_chunks_of_the_network_change_neither_loss_nor_gradient(length, monkeypa
 
 
 def test_only_cells_that_are_seen_are_corrected(monkeypatch):
-    """The loss and its gradient are those of a correction of all cells."""
+    """The loss and its gradient are those of a correction of all cells.
+
+    The network is as moderate as a trained one, so that hardly any cell grows into an image.
+    """
     case, config, rows = some_case(4000, ratio=0.1), config_of(), []
     views = views_by(lambda viewmats, intrinsics: intrinsics[:, :2, :2].mul_(4.0))
 
     def loss_and_gradients() -> tuple[float, list[torch.Tensor]]:
         net = lively_net(torch.float32)
+        with torch.no_grad():
+            for layer in (net.decoder, net.member_gates.gates, net.pair_gates.gates):
+                for values in layer.parameters():
+                    values.mul_(0.25)
         net.register_forward_hook(lambda net, args, result: rows.append(len(args[0])))
         loss = scene_loss(net, case, views, config=config, rng=random.Random(0))
         loss.backward()
@@ -146,7 +153,7 @@ def test_only_cells_that_are_seen_are_corrected(monkeypatch):
     monkeypatch.setattr("cvtgs.train.losses.LEAST_PAINTED", -1.0)
     of_all, others = loss_and_gradients()
     assert rows[0] < 0.8 * rows[1] == 0.8 * len(case.cells)
-    assert loss == pytest.approx(of_all, abs=1e-3)
+    assert loss == pytest.approx(of_all, abs=5e-4)
     ours, theirs = (torch.cat([part.flatten() for part in parts]) for parts in (gradients, others))
     assert torch.cosine_similarity(ours, theirs, dim=0).item() > 0.999
 
