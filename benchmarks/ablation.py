@@ -253,6 +253,7 @@ def regroup(
         merged.partition,
         neighbors=merged.neighbors,
         visibility=reference.visibility,
+        pixel_size=reference.radius / config.merge.image_size,
     )
     return standardized(corrected)
 

@@ -18,6 +18,7 @@ import cvtgs
 from benchmarks.measuring import fastest, machine, renew_tables
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
 from cvtgs.cells import Partition, gather_members, mean_and_covariance, merge_cells
+from cvtgs.config import MergeConfig
 from cvtgs.cvt import embed, nearest_neighbors, tessellate
 from cvtgs.math import parameters
 from cvtgs.math.frames import morton_order, robust_frame
@@ -170,7 +171,10 @@ def corrected_scales(
 ) -> Tensor:
     net = Simplifier(device="cpu").checkpoint.net.to(scene.dtype)  # type: ignore[union-attr]
     light = torch.ones(len(scene), dtype=torch.float64)
-    small = correct_cells(net, scene, merged, part, neighbors=neighbors, visibility=light)
+    pixel_size = robust_frame(scene.means).radius / MergeConfig().image_size
+    small = correct_cells(
+        net, scene, merged, part, neighbors=neighbors, visibility=light, pixel_size=pixel_size
+    )
     return small.log_scales.double()
 
 

@@ -1,5 +1,6 @@
 """Cells, networks and comparisons that the tests of descriptors and MergeNet share."""
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -11,7 +12,9 @@ from cvtgs import GaussianScene
 from cvtgs.cells import Descriptors, Partition, align_axes, describe_cells, merge_cells
 from cvtgs.config import MergeConfig
 from cvtgs.cvt import nearest_neighbors
+from cvtgs.math.frames import robust_frame
 from cvtgs.mergenet import Architecture, MergeNet, Residuals, compose, correct_cells
+from cvtgs.scene import ANTIALIASED_TAG
 from scenes import random_scene
 
 
@@ -23,6 +26,7 @@ class Case(NamedTuple):
     part: Partition
     neighbors: Tensor
     visibility: Tensor
+    pixel_size: float
 
     @property
     def cells(self) -> Tensor:
@@ -37,6 +41,7 @@ class Case(NamedTuple):
             neighbors=self.neighbors,
             sizes=self.part.counts,
             visibility=self.visibility,
+            pixel_size=self.pixel_size,
         )
 
     def compose(self, residuals: Residuals) -> dict[str, Tensor]:
@@ -57,6 +62,7 @@ class Case(NamedTuple):
             self.part,
             neighbors=self.neighbors,
             visibility=self.visibility,
+            pixel_size=self.pixel_size,
         )
 
     def oracle_cells(self) -> list[oracle.Cell]:
@@ -70,6 +76,8 @@ class Case(NamedTuple):
                 visibilities=self.visibility[self.part.order[start:end]].tolist(),
                 others=[merged[other] for other in self.neighbors[cell].tolist()],
                 other_sizes=self.part.counts[self.neighbors[cell]].tolist(),
+                antialiased=self.scene.antialiased,
+                pixel_size=self.pixel_size,
             )
             for cell, (start, end) in enumerate(pairwise(ends))
         ]
@@ -102,7 +110,8 @@ def case_of(
         visibility = torch.rand(len(scene), generator=torch.Generator().manual_seed(5))
     neighbors = nearest_neighbors(merged.means, near)
     merged = align_axes(merged, part, neighbors)
-    return Case(scene, merged, part, neighbors, visibility.double())
+    pixel_size = robust_frame(scene.means).radius / 400
+    return Case(scene, merged, part, neighbors, visibility.double(), pixel_size)
 
 
 def some_labels(count: int, cells: int, *, seed: int = 0) -> Tensor:
@@ -120,8 +129,11 @@ def some_case(
     dtype: torch.dtype = torch.float64,
     seed: int = 0,
     near: int = 8,
+    tagged: bool = False,
 ) -> Case:
     scene = random_scene(count, degree=degree, dtype=dtype, seed=seed, size=0.4)
+    if tagged:
+        scene = replace(scene, comments=(ANTIALIASED_TAG,))
     return case_of(scene, some_labels(count, cells), near=near)
 
 

@@ -59,6 +59,8 @@ class Cell:
     visibilities: Sequence[float]
     others: Sequence[Gaussian]
     other_sizes: Sequence[int]
+    antialiased: bool
+    pixel_size: float
 
     @property
     def shares(self) -> list[float]:
@@ -201,6 +203,8 @@ def describe_cell(cell: Cell) -> list[float]:
         cell.visibility,
         min(float(np.linalg.norm(cell.visibility_gradient)), 3.0),
         min((squashed_length(position) for position in places), default=math.log1p(50.0)),
+        1.0 if cell.antialiased else 0.0,
+        0.3 * min(max(math.log(np.prod(own.scales) ** (1 / 3) / cell.pixel_size), -6.0), 12.0),
     ]
 
 

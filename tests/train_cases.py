@@ -113,7 +113,7 @@ def bits_of_case(case: Case) -> dict[str, Any]:
     """All contents of a case, for comparison bit for bit."""
     reference, seen = case.reference, case.descriptors
     return {
-        "names": (case.scene_name, case.ratio, reference.merged.antialiased),
+        "names": (case.scene_name, case.ratio, reference.merged.antialiased, reference.radius),
         "scene": bits_of(reference.scene.tensors()),
         "merged": bits_of(reference.merged.tensors()),
         "cells": bits(case.cells),
@@ -127,8 +127,9 @@ def bits_of_case(case: Case) -> dict[str, Any]:
 
 def bits_of_views(views: TargetViews) -> dict[str, Any]:
     cameras = views.cameras
+    modes = cameras.ignores_tag
     return {
-        "cameras": (bits(cameras.viewmats), bits(cameras.Ks), cameras.width, cameras.height),
+        "cameras": (bits(cameras.viewmats), bits(cameras.Ks), cameras.width, cameras.height, modes),
         "images": (bits(views.rgb), bits(views.alpha)),
     }
 

@@ -147,6 +147,7 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
                 merged.partition,
                 neighbors=merged.neighbors,
                 visibility=analysis.visibility,
+                pixel_size=analysis.frame.radius / config.merge.image_size,
                 on_cells=advance,
             )
     small = restore_columns(standardized(small), scene, analysis.plan)

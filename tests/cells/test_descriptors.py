@@ -44,7 +44,7 @@ def test_two_round_members_side_by_side():
         {},
     )
     case = case_of(scene, torch.tensor([0, 0]), visibility=torch.tensor([1.0, 0.0]))
-    seen = case.describe()
+    seen = case._replace(pixel_size=0.5).describe()
     far = math.log1p(2 / math.sqrt(5))
     inside = 0.3 * math.log(1 / math.sqrt(5))
     assert seen.positions.abs().tolist() == [pytest.approx([2 / math.sqrt(5), 0, 0])] * 2
@@ -58,15 +58,16 @@ def test_two_round_members_side_by_side():
     assert cell[:9] == pytest.approx([0] * 6 + [1 / 5, 1, 1])
     assert cell[9] == pytest.approx(0.2 * math.log(2))
     assert cell[13:15] == pytest.approx([0.5 * math.log(5) / 2, 0])
-    assert cell[15:] == pytest.approx([5 * 0.25, 0.5, 0.5 * 2 / math.sqrt(5), math.log(51)])
+    assert cell[15:20] == pytest.approx([5 * 0.25, 0.5, 0.5 * 2 / math.sqrt(5), math.log(51), 0])
+    assert cell[20] == pytest.approx(0.3 * math.log(2 * 5 ** (1 / 6)))
     assert seen.pairs.shape == (1, 0, PAIR_FEATURES)
     assert seen.weights.tolist() == [0.5, 0.5]
 
 
 @pytest.mark.parametrize("near", [0, 1, 8])
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_descriptors_equal_the_oracle(seed, near):
-    case = some_case(60, 12, seed=seed, near=near)
+@pytest.mark.parametrize(("seed", "tagged"), [(0, False), (1, True), (2, False)])
+def test_descriptors_equal_the_oracle(seed, tagged, near):
+    case = some_case(60, 12, seed=seed, near=near, tagged=tagged)
     seen = case.describe()
     cells = case.oracle_cells()
     members = [row for cell in cells for row in oracle.describe_members(cell)]
@@ -112,6 +113,7 @@ def test_a_subset_of_cells_gets_the_same_descriptors():
         neighbors=case.neighbors[keep],
         sizes=case.part.counts,
         visibility=case.visibility,
+        pixel_size=case.pixel_size,
     )
     members = torch.repeat_interleave(mask, case.part.counts)
     torch.testing.assert_close(some.cells, whole.cells[keep])
@@ -141,9 +143,29 @@ MOTIONS = {
 def test_descriptors_do_not_depend_on_place_size_or_orientation(motion, degree):
     case = some_case(degree=degree)
     there = case_of(moved(case.scene, **motion), some_labels(60, 12))
+    there = there._replace(pixel_size=case.pixel_size * motion.get("scale", 1.0))
     assert_same_features(case.describe(), there.describe())
-    carried = case._replace(scene=there.scene, merged=moved(case.merged, **motion))
+    carried = there._replace(
+        merged=moved(case.merged, **motion), part=case.part, neighbors=case.neighbors
+    )
     assert_same_features(case.describe(), carried.describe())
+
+
+def test_only_the_last_feature_of_a_cell_depends_on_the_size_of_images():
+    case = some_case()
+    large, small = (
+        case._replace(pixel_size=case.pixel_size * factor).describe() for factor in (0.5, 1.0)
+    )
+    torch.testing.assert_close(features_of(large), features_of(small.in_images(2.0)))
+    difference = large.cells - small.cells
+    torch.testing.assert_close(difference[:, -1], torch.full((12,), 0.3 * math.log(2)).double())
+    assert not difference[:, :-1].any()
+
+
+@pytest.mark.parametrize("extreme", [1e-30, 1e30])
+def test_sizes_in_pixels_are_bounded(extreme):
+    cells = some_case()._replace(pixel_size=extreme).describe().cells[:, -1]
+    assert cells.unique().tolist() == [pytest.approx(3.6 if extreme < 1 else -1.8)]
 
 
 @pytest.mark.parametrize("axis", HALF_TURNS)

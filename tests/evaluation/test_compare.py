@@ -155,8 +155,9 @@ def test_photographs_are_scored_for_every_scene(scene, small, cameras):
 
 
 def test_evaluate_refuses_invalid_arguments(scene, cameras):
-    with pytest.raises(ValueError, match="'full' is the name of the full scene"):
-        evaluate(scene, {"full": scene}, cameras, settings=OFF)
+    for wrong, message in (({"full": scene}, "the name of the full"), (scene, "must be a mapping")):
+        with pytest.raises(InvalidArgumentError, match=message):
+            evaluate(scene, wrong, cameras, settings=OFF)
     with pytest.raises(ValueError, match="at least one camera"):
         evaluate(scene, {"a": scene}, cameras.select(torch.tensor([], dtype=torch.long)))
     with pytest.raises(ValueError, match="lpips must be auto, vgg, alex or off, found 'x'"):
@@ -252,8 +253,7 @@ def test_each_photograph_must_have_the_shape_of_its_own_camera(tmp_path, cameras
         viewmats=cameras.viewmats, Ks=intrinsics, width=48, height=36, names=("a", "b", "c")
     )
     for name, size in (("a", (18, 24)), ("b", (18, 48)), ("c", (18, 24))):
-        pixels = np.zeros((*size, 3), np.uint8)
-        (tmp_path / f"{name}.png").write_bytes(encode(pixels, "png"))
+        (tmp_path / f"{name}.png").write_bytes(encode(np.zeros((*size, 3), np.uint8), "png"))
     fitted = fit_cameras(mixed, tmp_path)
     assert (fitted.width, fitted.height) == (24, 18)
     (tmp_path / "c.png").write_bytes(encode(np.zeros((24, 18, 3), np.uint8), "png"))  # upright

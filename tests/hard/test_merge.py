@@ -199,6 +199,7 @@ def test_corrected_cells_of_equal_eigenvalues_turn_with_the_scene():
     labels = torch.arange(COUNT) // 6
     turn = {"quat": (0.9, 0.1, -0.3, 0.2)}
     first, second = (
-        case_of(s, labels).correct(lively_net()) for s in (scene, moved(scene, **turn))
+        case_of(s, labels)._replace(pixel_size=0.01).correct(lively_net())
+        for s in (scene, moved(scene, **turn))
     )
     assert_same_gaussians(second, moved(first, **turn))

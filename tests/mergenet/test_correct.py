@@ -42,6 +42,7 @@ MOTIONS = {
 def test_the_correction_moves_with_the_scene(motion, degree):
     case, net = some_case(200, 30, degree=degree), lively_net()
     there = case_of(moved(case.scene, **motion), some_labels(200, 30))
+    there = there._replace(pixel_size=case.pixel_size * motion.get("scale", 1.0))
     assert_same_gaussians(there.correct(net), moved(case.correct(net), **motion), tolerance=1e-6)
     assert biggest_change(case.correct(net), case.merged) > 0.1
 
@@ -104,7 +105,12 @@ def test_a_scene_of_cells_of_one_is_unchanged():
     case = case_of(scene, torch.arange(5))
     net = lively_net(torch.float32)
     small = correct_cells(
-        net, *case[:3], neighbors=case.neighbors, visibility=case.visibility, on_cells=told.append
+        net,
+        *case[:3],
+        neighbors=case.neighbors,
+        visibility=case.visibility,
+        pixel_size=case.pixel_size,
+        on_cells=told.append,
     )
     assert same_bits(small, scene)
     assert told == []
@@ -116,7 +122,12 @@ def test_progress_counts_the_finished_cells(monkeypatch):
     case = case_of(scene, torch.tensor([0, 0, 1, 2, 2, 2, 3, 3, 4, 0]), near=0)
     net = lively_net(torch.float32)
     correct_cells(
-        net, *case[:3], neighbors=case.neighbors, visibility=case.visibility, on_cells=told.append
+        net,
+        *case[:3],
+        neighbors=case.neighbors,
+        visibility=case.visibility,
+        pixel_size=case.pixel_size,
+        on_cells=told.append,
     )
     assert told == [3, 4, 5]
 

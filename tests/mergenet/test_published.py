@@ -128,6 +128,7 @@ def corrected(case: Case, net: PublishedMergeNet) -> cvtgs.GaussianScene:
         case.part,
         neighbors=case.neighbors[:, :0],
         visibility=case.visibility[:0],
+        pixel_size=case.pixel_size,
     )
 
 

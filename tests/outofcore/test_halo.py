@@ -1,6 +1,7 @@
 """The halo: blocks together give the same result as one piece, also where they meet."""
 
 import time
+from dataclasses import replace
 
 import pytest
 import torch
@@ -20,7 +21,7 @@ from cvtgs.outofcore.halo import Balls, OtherBlock, assign_points, bounding_box,
 from cvtgs.outofcore.merge import read_cells
 from cvtgs.outofcore.rows import read_rows
 from cvtgs.pipeline import shape_merged
-from cvtgs.scene import concatenate
+from cvtgs.scene import ANTIALIASED_TAG, concatenate
 from cvtgs.views import automatic_views
 from scenes import same_bits
 
@@ -29,9 +30,18 @@ COUNT, BLOCKS, TARGET = 4000, 5, 120
 
 @pytest.fixture(scope="module")
 def job(tmp_path_factory):
+    return courtyard_job(tmp_path_factory.mktemp("borders"))
+
+
+@pytest.fixture(scope="module")
+def tagged_job(tmp_path_factory):
+    return courtyard_job(tmp_path_factory.mktemp("tagged"), comments=(ANTIALIASED_TAG,))
+
+
+def courtyard_job(folder, *, comments=()):
     scene = cvtgs.synthetic.scene("courtyard", COUNT, sh_degree=1, seed=8)
+    scene = replace(scene, comments=comments)
     config = SimplifyConfig.from_mapping({"cvt": {"weight_floor": 0.03}})  # some are below it
-    folder = tmp_path_factory.mktemp("borders")
     return unfinished_job(scene, folder, count=TARGET, blocks=BLOCKS, config=config)
 
 
@@ -280,10 +290,13 @@ def test_axes_and_inflation_are_the_same_as_in_one_piece(job):
     assert same_bits(inflated, wanted)
 
 
-def test_the_network_corrects_as_in_one_piece(job):
+@pytest.mark.parametrize("which", ["job", "tagged_job"])
+def test_the_network_corrects_as_in_one_piece(which, request):
+    job = request.getfixturevalue(which)
     members = [read_cells(job, block) for block in job.blocks_with_cells()]
     visibility = torch.cat([one.visibility for one in members])
     scene = concatenate([one.scene for one in members])
+    assert scene.antialiased == (which == "tagged_job")
     counts = torch.cat([one.partition.counts for one in members])
     firsts = torch.tensor([0, *[len(one.scene) for one in members]]).cumsum(0)
     pairs = list(zip(members, firsts[:-1], strict=True))
@@ -313,6 +326,7 @@ def test_the_network_corrects_as_in_one_piece(job):
             shown,
             neighbors=neighbors,
             visibility=visibility,
+            pixel_size=job.read_scan().frame.radius / 400,
         )
     )
     small = [cvtgs.load(job.small_path(block)) for block in job.blocks_with_cells()]

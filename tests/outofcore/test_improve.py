@@ -13,7 +13,8 @@ from cvtgs.outofcore import improve as module
 from cvtgs.report import MatchReport
 from cvtgs.views import automatic_views
 
-COUNT = 200
+COUNT, LARGER_COUNT = 200, 800
+SEEDS = (4, 5, 6, 7, 8)
 MATCHED = {
     "preset": "matched",
     "visibility": {"views": 12, "size": 64, "stride": 1},
@@ -43,10 +44,10 @@ def simplifier_of(settings):
     return Simplifier(config=SimplifyConfig.from_mapping(settings), device="cpu")
 
 
-def in_blocks(source, output, settings, *, blocks=3, **options):
+def in_blocks(source, output, settings, *, count=COUNT, blocks=3, **options):
     simplifier = simplifier_of(settings)
     return simplify_file(
-        source, output, count=COUNT, blocks=blocks, simplifier=simplifier, **options
+        source, output, count=count, blocks=blocks, simplifier=simplifier, **options
     )
 
 
@@ -60,26 +61,29 @@ def psnr_of(scene, small):
 
 @pytest.fixture(scope="module")
 def scores(tmp_path_factory):
-    """Mean PSNR of three scenes in one piece and in blocks, with and without matching.
+    """Mean PSNR of five scenes in one piece and in blocks, with and without matching.
 
-    Views are chosen like those of blocks, also blurred ones; PSNR of so few cells varies by 2 dB.
+    Views are chosen like those of blocks, also blurred ones. The loss of a single scene from blocks
+    varies by 0.4 dB with 800 Gaussians, and twice as much with 200.
     """
     found = {name: {"one": 0.0, "blocks": 0.0} for name in ("standard", "matched")}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("cvtgs.views.mixed.TRIED", 1)
-        for seed in (4, 5, 6):
+        for seed in SEEDS:
             scene = cvtgs.synthetic.scene("object", 4000, sh_degree=1, seed=seed)
             folder = tmp_path_factory.mktemp("scores")
             cvtgs.save(scene, folder / "in.ply")
             for name, settings in {"standard": {}, "matched": MATCHED}.items():
-                report = in_blocks(folder / "in.ply", folder / f"{name}.ply", settings)
+                report = in_blocks(
+                    folder / "in.ply", folder / f"{name}.ply", settings, count=LARGER_COUNT
+                )
                 small = {
-                    "one": simplifier_of(settings).simplify(scene, count=COUNT),
+                    "one": simplifier_of(settings).simplify(scene, count=LARGER_COUNT),
                     "blocks": cvtgs.load(folder / f"{name}.ply"),
                 }
-                assert len(small["blocks"]) == COUNT == report.output_count
+                assert len(small["blocks"]) == LARGER_COUNT == report.output_count
                 for way, value in zip(small, psnr_of(scene, small), strict=True):
-                    found[name][way] += value / 3
+                    found[name][way] += value / len(SEEDS)
             assert report.matching.views == 3 * 12
             assert report.matching.psnr_after > report.matching.psnr_before
     return found

@@ -133,9 +133,11 @@ def test_the_network_does_not_change_single_member_cells(lively):
     assert kept == report.single_member_cells > 0
 
 
-def test_the_reference_is_the_input_of_the_network(lively):
+@pytest.mark.parametrize("image_size", [400, 900])
+def test_the_reference_is_the_input_of_the_network(lively, image_size):
     """Correcting the reference by hand gives what the stages give."""
-    scene, config = random_scene(300), SimplifyConfig()
+    scene = random_scene(300)
+    config = SimplifyConfig.from_mapping({"merge": {"image_size": image_size}})
     net = load_checkpoint(lively).net
     reference = merge_scene(scene, 30, config)
     clock = StageClock(lambda event: None, torch.device("cpu"))
@@ -148,6 +150,7 @@ def test_the_reference_is_the_input_of_the_network(lively):
         reference.partition,
         neighbors=reference.neighbors,
         visibility=reference.visibility,
+        pixel_size=reference.radius / config.merge.image_size,
     )
     assert reference.neighbors.shape == (30, 8)
     assert reference.visibility.shape == (300,)

@@ -22,6 +22,7 @@ import pytest
 import torch
 
 from cvtgs import GaussianScene, Simplifier, SimplifyConfig
+from cvtgs.math.frames import RobustFrame
 from scenes import assert_same_gaussians, moved, random_scene, same_bits
 
 each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])
@@ -37,13 +38,24 @@ def simplified(
     return Simplifier(ckpt, config=config, device="cpu").simplify(scene, rho)
 
 
+def frame_about_mean(points: torch.Tensor) -> RobustFrame:
+    center = points.double().mean(dim=0)
+    distances = (points.double() - center).norm(dim=1)
+    return RobustFrame(center=center, radius=float(distances.quantile(0.7)))
+
+
 @pytest.fixture(params=[None, "auto"], ids=["moments", "network"])
 def ckpt(request, monkeypatch) -> str | None:
-    """Return None for no network, or the shipped one with full ambient visibility everywhere."""
+    """Return None for no network, or the shipped one in scenes that turn as a whole.
+
+    Ambient visibility is full everywhere, and the robust radius, by which the network knows the
+    size of a pixel, is one about the mean, which turns with the scene.
+    """
     if request.param is not None:
         even = lambda means, masses, frame: torch.ones(len(means), dtype=torch.float64)  # noqa: E731
         analysis = import_module("cvtgs.analysis.analyze")  # a function has the module's name
         monkeypatch.setattr(analysis, "ambient_visibility", even)
+        monkeypatch.setattr(analysis, "robust_frame", frame_about_mean)
     return request.param
 
 

@@ -82,6 +82,7 @@ def test_cached_results_equal_fresh_ones(source, made, tmp_path):
         for place, (size, views) in enumerate(zip((32, 40), prepared.views, strict=True)):
             fresh = render_views(made.scene, 4, size=size, seed=place)
             assert bits_of_views(views) == bits_of_views(fresh)
+            assert set(views.cameras.ignores_tag) == {True, False}
 
 
 @pytest.mark.slow

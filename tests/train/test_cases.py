@@ -73,6 +73,7 @@ def test_corrections_equal_those_of_the_simplifier():
         reference.partition,
         neighbors=reference.neighbors,
         visibility=reference.visibility,
+        pixel_size=reference.radius / 400,
     )
     for name, values in wanted.tensors().items():
         torch.testing.assert_close(getattr(corrected, name), values, rtol=1e-5, atol=1e-5)

@@ -21,7 +21,9 @@ SIDE = 4
 
 def as_case(cells: Cells) -> Case:
     light = cells.visibility.to(cells.scene.dtype)
-    reference = MergedScene(cells.scene, cells.merged, cells.part, cells.neighbors, light)
+    reference = MergedScene(
+        cells.scene, cells.merged, cells.part, cells.neighbors, light, radius=4.0
+    )
     several = cells.part.counts > 1
     rows = several.nonzero()[:, 0]
     return describe_case("made", 0.1, reference, rows, cells.part.select(several))

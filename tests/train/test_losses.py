@@ -113,6 +113,18 @@ def test_the_loss_depends_only_on_the_seed(kind, monkeypatch):
     assert len({loss(seed) for seed in range(4)}) == 4
 
 
+@pytest.mark.parametrize("size", [32, 40])
+def test_the_network_is_given_sizes_in_pixels_of_the_images(size):
+    case, seen, net = some_case(), [], small_net()
+    net.register_forward_hook(lambda net, args, result: seen.append(args[0].cells))
+    scene_loss(net, case, some_views(size=size), config=config_of(), rng=random.Random(0))
+    found = torch.cat(seen)[:, -1].sort().values
+    every = (case.descriptors.cells[:, -1] + 0.3 * math.log(size / 400)).sort().values
+    distances = (found[:, None] - every).abs().amin(dim=1)
+    assert len(found) > 5
+    assert float(distances.amax()) < 1e-6
+
+
 @pytest.mark.parametrize("length", [1, 40, 200])
 def test_chunks_of_the_network_change_neither_loss_nor_gradient(length, monkeypatch):
     case, views, config = some_case(), some_views(), config_of(residual_weight=1.0)
@@ -182,7 +194,8 @@ def test_residuals_are_penalized(kind):
     price = loss(2.0) - loss(0.0)
     assert 0 < price <= 2
     if kind == "scene":
-        assert price == pytest.approx(2 * net(case.descriptors).cost().item(), rel=1e-4)
+        cost = net(case.seen_by(views.cameras).descriptors).cost().item()
+        assert price == pytest.approx(2 * cost, rel=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["scene", "local"])
@@ -224,7 +237,7 @@ def test_validation_psnr_is_that_of_the_images_over_grey():
     grey = torch.full((3,), 0.5)
     wanted = render(small_scene(), views.cameras, background=grey).rgb
     with torch.no_grad():
-        corrected = case.correct_scene(net(case.descriptors))
+        corrected = case.correct_scene(net(case.seen_by(views.cameras).descriptors))
     for scene, found in ((case.reference.merged, before), (corrected, after)):
         rendered = render(scene, views.cameras, background=grey).rgb
         assert found == pytest.approx(psnr(rendered, wanted).mean().item(), abs=0.02)

@@ -1,12 +1,14 @@
 """Sources: scenes for training, scenes for validation, and variants made of them."""
 
 import random
+from dataclasses import replace
 
 import pytest
 import torch
 
 import cvtgs
 from cvtgs.errors import ConfigError, FileFormatError
+from cvtgs.scene import ANTIALIASED_TAG
 from cvtgs.train import DataConfig, find_sources
 from cvtgs.train.sources import VALIDATION_SEED, cut_block, perturb
 from cvtgs.validity import invalid_rows
@@ -211,6 +213,13 @@ def test_a_perturbed_scene_is_valid_and_different(seed):
     assert (other.dtype, other.sh_degree) == (scene.dtype, scene.sh_degree)
     assert not torch.isin(other.log_scales, scene.log_scales).all()
     assert not torch.isin(other.sh0, scene.sh0).any()
+
+
+@pytest.mark.parametrize("comments", [(), (ANTIALIASED_TAG,)])
+def test_half_of_the_perturbed_scenes_are_tagged(comments):
+    scene = replace(small_scene(20), comments=comments)
+    tagged = sum(perturb(scene, random.Random(seed)).antialiased for seed in range(40))
+    assert 10 <= tagged <= 30
 
 
 def test_the_seed_decides_what_is_perturbed():

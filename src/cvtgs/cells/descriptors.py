@@ -1,6 +1,7 @@
 """Descriptors: the input of MergeNet."""
 
-from dataclasses import dataclass, fields
+import math
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import torch
@@ -15,8 +16,11 @@ MEMBER_FEATURES = 19
 PAIR_FEATURES = 18
 """Number of features of a neighbour relative to a cell."""
 
-CELL_FEATURES = 19
+CELL_FEATURES = 21
 """Number of features of a cell itself."""
+
+PIXEL_SCALE = 0.3
+"""Factor of the logarithm of a size in pixels, the last feature of a cell."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -29,7 +33,7 @@ class Descriptors:
     Attributes:
         members: ``(n, 19)`` features of the members; those of one cell are contiguous.
         pairs: ``(m, k, 18)`` features of the neighbours of every cell.
-        cells: ``(m, 19)`` features of the cells.
+        cells: ``(m, 21)`` features of the cells; the last one is their size in pixels.
         weights: ``(n,)`` shares of the mass of the cell; those of one cell sum to 1.
         offsets: ``(m + 1,)`` start of each cell, and the end of the last one.
         positions: ``(n, 3)`` positions of the members relative to the centre of the cell, in its
@@ -90,6 +94,19 @@ class Descriptors:
             positions=self.positions[members],
             pair_positions=self.pair_positions[run],
         )
+
+    def in_images(self, factor: float) -> Self:
+        """Return the descriptors of the same cells in larger images.
+
+        Args:
+            factor: Ratio of the image sizes, above 0.
+
+        Returns:
+            Descriptors whose sizes in pixels are larger by the factor.
+        """
+        cells = self.cells.clone()
+        cells[:, -1] += PIXEL_SCALE * math.log(factor)
+        return replace(self, cells=cells)
 
     def to(self, target: torch.device | torch.dtype) -> Self:
         """Return the descriptors on a device or in another precision.

@@ -4,13 +4,14 @@ The values of one feature are contiguous in memory: sums of products over three 
 limited by memory bandwidth only, and many times as fast as products of small matrices.
 """
 
+import math
 from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cells.descriptors import Descriptors
+from cvtgs.cells.descriptors import PIXEL_SCALE, Descriptors
 from cvtgs.cells.inflate import project_on_axes, side_cover
 from cvtgs.cells.partition import Partition
 from cvtgs.math import parameters
@@ -90,6 +91,7 @@ def describe_cells(
     neighbors: Int[Tensor, "m k"],
     sizes: Int[Tensor, "m_all"],
     visibility: Float[Tensor, "n_all"],
+    pixel_size: float,
 ) -> Descriptors:
     """Compute the descriptors of some cells.
 
@@ -110,6 +112,7 @@ def describe_cells(
         sizes: Number of members of every cell, for all cells.
         visibility: Ambient visibility of every Gaussian of the scene, 0 to 1
             (:func:`cvtgs.analysis.ambient_visibility`).
+        pixel_size: Size of a pixel in the middle of the scene, scene units.
 
     Returns:
         The descriptors, in the dtype of the scene.
@@ -123,13 +126,15 @@ def describe_cells(
         >>> found = describe_cells(
         ...     scene, merge_cells(scene, part, config=MergeConfig()), part,
         ...     cells=torch.arange(2), neighbors=torch.tensor([[1], [0]]), sizes=part.counts,
-        ...     visibility=torch.ones(5),
+        ...     visibility=torch.ones(5), pixel_size=0.01,
         ... )
         >>> tuple(found.members.shape), tuple(found.pairs.shape), tuple(found.cells.shape)
-        ((5, 19), (2, 1, 18), (2, 19))
+        ((5, 19), (2, 1, 18), (2, 21))
     """
     context = neighbor_context(merged, cells=cells, neighbors=neighbors, sizes=sizes)
-    return describe_members(scene, part, context=context, visibility=visibility)
+    return describe_members(
+        scene, part, context=context, visibility=visibility, pixel_size=pixel_size
+    )
 
 
 def neighbor_context(
@@ -179,6 +184,7 @@ def describe_members(
     *,
     context: NeighborContext,
     visibility: Float[Tensor, "n_all"],
+    pixel_size: float,
 ) -> Descriptors:
     """Compute the descriptors of some cells like :func:`describe_cells`, from a known context."""
     offsets, rows = part.offsets, part.order
@@ -213,7 +219,7 @@ def describe_members(
     return Descriptors(
         members=features,
         pairs=context.pairs,
-        cells=_cell_features(context, totals),
+        cells=_cell_features(context, totals, antialiased=scene.antialiased, pixel_size=pixel_size),
         weights=weights,
         offsets=offsets,
         positions=positions.clamp(-LARGEST_DISTANCE, LARGEST_DISTANCE),
@@ -299,8 +305,15 @@ def _total(
     )
 
 
-def _cell_features(context: NeighborContext, totals: CellTotals) -> Float[Tensor, "m c"]:
-    """Return cover, inner extent, count, opacity, depth, shape, contrast, visibility of cells."""
+def _cell_features(
+    context: NeighborContext, totals: CellTotals, *, antialiased: bool, pixel_size: float
+) -> Float[Tensor, "m c"]:
+    """Return cover, inner extent, count, opacity, depth, shape, contrast, visibility of cells.
+
+    The last two are whether the scene is tagged ``SplatRenderMode: mip``, and the size in pixels:
+    images widen all splats by a fraction of a pixel, which closes gaps between small cells, but not
+    in tagged scenes.
+    """
     merged, log_scales = context.merged, context.merged.log_scales
     distances = context.positions.square().sum(dim=2).sqrt()
     nearest = torch.nn.functional.pad(distances, (0, 1), value=LARGEST_DISTANCE).amin(dim=1)
@@ -318,6 +331,8 @@ def _cell_features(context: NeighborContext, totals: CellTotals) -> Float[Tensor
         totals.visibility,
         torch.linalg.vector_norm(totals.visibility_gradients, dim=1).clamp_max(3.0),
         torch.log1p(nearest),
+        torch.full_like(nearest, float(antialiased)),
+        PIXEL_SCALE * (log_scales.mean(dim=1) - math.log(pixel_size)).clamp(-6, 12),
     )
 
 

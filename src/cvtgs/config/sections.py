@@ -239,6 +239,8 @@ class MergeConfig(Section):
         covered_inflation: Further growth, as such a share, along an axis with other cells at both
             ends.
         network: Whether MergeNet corrects the merged Gaussians.
+        image_size: Longer side of the images in which the scene will be seen, pixels, for the
+            network: small images widen small Gaussians. Trained on images of 256 and 600.
     """
 
     area_power: float = pydantic.Field(default=1.0, ge=0.0, le=2.0)
@@ -248,6 +250,7 @@ class MergeConfig(Section):
     inflation: float = pydantic.Field(default=0.1, ge=0.0, le=2.0)
     covered_inflation: float = pydantic.Field(default=0.4, ge=0.0, le=2.0)
     network: bool = True
+    image_size: int = pydantic.Field(default=400, ge=100, le=2000)
 
 
 class Rates(Section):

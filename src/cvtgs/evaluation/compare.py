@@ -209,6 +209,11 @@ def compare(  # noqa: PLR0913 (options by name)
 def _named_scenes(
     reference: SceneLike, small: Mapping[str, SceneLike], reference_name: str
 ) -> dict[str, GaussianScene]:
+    if not isinstance(small, Mapping):
+        raise InvalidArgumentError(
+            f"small must be a mapping of names and scenes, such as {{'small': scene}}; found "
+            f"{type(small).__name__}."
+        )
     if reference_name in small:
         raise InvalidArgumentError(
             f"the scenes must have different names; {reference_name!r} is the name of the full "

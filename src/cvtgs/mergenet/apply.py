@@ -23,7 +23,7 @@ CHUNK_MEMBERS = 1 << 15
 """Members and neighbours per chunk; each takes about ``2 kB``."""
 
 
-def correct_cells(
+def correct_cells(  # noqa: PLR0913 (options by name)
     net: MergeNet | PublishedMergeNet,
     scene: GaussianScene,
     merged: GaussianScene,
@@ -31,6 +31,7 @@ def correct_cells(
     *,
     neighbors: Int[Tensor, "m k"],
     visibility: Float[Tensor, "n"],
+    pixel_size: float,
     sizes: Int[Tensor, "m_all"] | None = None,
     on_cells: Callable[[int], None] = lambda done: None,
 ) -> GaussianScene:
@@ -44,6 +45,7 @@ def correct_cells(
         partition: Members of the cells; cells of one member stay as they are.
         neighbors: The nearest other cells of every cell of the partition.
         visibility: Ambient visibility of every Gaussian of the scene, 0 to 1.
+        pixel_size: Size of a pixel in the middle of the scene, scene units.
         sizes: Number of members of every cell in ``merged``; None if all are in the partition.
         on_cells: Called with the number of finished cells.
 
@@ -61,7 +63,7 @@ def correct_cells(
         >>> untrained = MergeNet(Architecture())
         >>> corrected = correct_cells(
         ...     untrained, scene, merged, cells,
-        ...     neighbors=torch.tensor([[1], [0]]), visibility=torch.ones(5),
+        ...     neighbors=torch.tensor([[1], [0]]), visibility=torch.ones(5), pixel_size=0.01,
         ... )
         >>> bool((corrected.means == merged.means).all())
         True
@@ -85,6 +87,7 @@ def correct_cells(
                 neighbors=neighbors,
                 visibility=visibility,
                 sizes=sizes,
+                pixel_size=pixel_size,
             )
         for rows, corrected in corrections:
             for name, values in tensors.items():
@@ -99,7 +102,7 @@ def correct_cells(
     return merged.with_tensors(tensors)
 
 
-def _correct_gated(
+def _correct_gated(  # noqa: PLR0913 (options by name)
     net: MergeNet,
     scene: GaussianScene,
     merged: GaussianScene,
@@ -109,6 +112,7 @@ def _correct_gated(
     neighbors: Int[Tensor, "m_all k"],
     visibility: Float[Tensor, "n"],
     sizes: Int[Tensor, "m_all"],
+    pixel_size: float,
 ) -> Iterator[tuple[Int[Tensor, "r"], dict[str, Tensor]]]:
     """Yield runs of cells and their corrected tensors."""
     chunk, near = chunk_length(CHUNK_MEMBERS, scene.device), neighbors.shape[1]
@@ -126,7 +130,11 @@ def _correct_gated(
             run, part = item
             rows = cells[block][run]
             descriptors = describe_members(
-                scene, part, context=context.cut(run), visibility=visibility
+                scene,
+                part,
+                context=context.cut(run),
+                visibility=visibility,
+                pixel_size=pixel_size,
             )
             residuals = net(descriptors)
             near = neighbors[rows]

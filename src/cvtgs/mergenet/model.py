@@ -28,7 +28,7 @@ LARGEST_TURN = 0.5
 LARGEST_MEMBER_GATE = 2.0
 LARGEST_PAIR_GATE = 0.5
 
-SUMMARY_FEATURES = CELL_FEATURES + MEMBER_FEATURES + PAIR_FEATURES
+SUMMARY_FEATURES = CELL_FEATURES - 1 + MEMBER_FEATURES + PAIR_FEATURES
 """Number of features that decide whether a cell is similar to the training cells."""
 
 TAIL = 0.01
@@ -145,7 +145,7 @@ class MergeNet(CellNetwork):
 
     Example:
         >>> sum(parameter.numel() for parameter in MergeNet(Architecture()).parameters())
-        25838
+        25966
     """
 
     def __init__(self, architecture: Architecture) -> None:
@@ -263,12 +263,13 @@ def summarize(descriptors: Descriptors) -> Float[Tensor, "m f"]:
     """Return the features of cells, and the means of those of members and neighbours.
 
     Members are weighted by their share of the mass, so that a huge faint member counts. Features
-    of missing neighbours are 0.
+    of missing neighbours are 0. The last feature of a cell, its size in pixels, is left out: every
+    cell is corrected whatever the size of the images.
     """
     pairs = descriptors.pairs
     near = pairs.mean(dim=1) if pairs.shape[1] else pairs.new_zeros(len(pairs), pairs.shape[2])
     members = segment_sum(descriptors.members, descriptors.offsets, descriptors.weights)
-    return torch.cat([descriptors.cells, members, near], dim=1)
+    return torch.cat([descriptors.cells[:, :-1], members, near], dim=1)
 
 
 class KnownRange(nn.Module):

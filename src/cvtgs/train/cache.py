@@ -22,7 +22,7 @@ from cvtgs.train.sources import Source
 
 Content = TypeVar("Content", TargetViews, Case)
 
-CACHE_VERSION = 6
+CACHE_VERSION = 8
 """Part of every cache key; increment it when the meaning of the content changes."""
 
 
@@ -97,6 +97,7 @@ def _packed_views(all_views: Iterable[TargetViews]) -> dict[str, Tensor]:
         tensors |= {
             f"{number}/viewmats": views.cameras.viewmats,
             f"{number}/Ks": views.cameras.Ks,
+            f"{number}/ignores_tag": torch.tensor(views.cameras.ignores_tag, dtype=torch.bool),
             f"{number}/rgb": views.rgb,
             f"{number}/alpha": views.alpha,
         }
@@ -116,6 +117,7 @@ def _packed_cases(cases: Iterable[Case | None]) -> dict[str, Tensor]:
         if number == 0:
             tensors |= add_prefix("scene/", reference.scene.tensors())
             tensors["visibility"] = reference.visibility.to(torch.float32)
+            tensors["radius"] = torch.tensor(reference.radius, dtype=torch.float64)
             if reference.scene.antialiased:
                 tensors["antialiased"] = torch.ones(1)
         tensors |= add_prefix(prefix + "merged/", reference.merged.tensors())
@@ -140,10 +142,9 @@ def _unpacked_cases(name: str, tensors: Mapping[str, Tensor]) -> tuple[Case, ...
     # Merged Gaussians must be rendered in the same way as their scene.
     comments = (ANTIALIASED_TAG,) if "antialiased" in tensors else ()
     scene = GaussianScene(**under_prefix("scene/", tensors), comments=comments)
-    visibility = tensors["visibility"]
+    shared = tensors["visibility"], float(tensors["radius"])
     return tuple(
-        _case(name, scene, visibility, under_prefix(f"{number}/", tensors))
-        for number in range(count)
+        _case(name, scene, *shared, under_prefix(f"{number}/", tensors)) for number in range(count)
     )
 
 
@@ -153,7 +154,11 @@ def _entry_count(tensors: Mapping[str, Tensor]) -> int:
 
 
 def _case(
-    name: str, scene: GaussianScene, visibility: Tensor, tensors: Mapping[str, Tensor]
+    name: str,
+    scene: GaussianScene,
+    visibility: Tensor,
+    radius: float,
+    tensors: Mapping[str, Tensor],
 ) -> Case:
     partition = Partition(order=tensors["order"].long(), offsets=tensors["offsets"])
     cells, several = partition.select_several()
@@ -166,6 +171,7 @@ def _case(
             partition=partition,
             neighbors=tensors["neighbors"].long(),
             visibility=visibility,
+            radius=radius,
         ),
         cells=cells,
         part=several,
@@ -176,6 +182,10 @@ def _case(
 def _views(tensors: Mapping[str, Tensor]) -> TargetViews:
     rgb = tensors["rgb"]
     cameras = Cameras(
-        viewmats=tensors["viewmats"], Ks=tensors["Ks"], width=rgb.shape[2], height=rgb.shape[1]
+        viewmats=tensors["viewmats"],
+        Ks=tensors["Ks"],
+        width=rgb.shape[2],
+        height=rgb.shape[1],
+        ignores_tag=tuple(tensors["ignores_tag"].tolist()),
     )
     return TargetViews(cameras=cameras, rgb=rgb, alpha=tensors["alpha"])

@@ -32,18 +32,25 @@ from cvtgs.scene import GaussianScene
 from cvtgs.validity import check_rows
 from cvtgs.views import mixed_views
 
+IMAGE_SIZE = 400
+"""Longer side of the images for which the cells of a case are described, pixels."""
+
 DEVICE_BYTES = 10**9
 """Memory for copies on devices that do not report their free memory, bytes."""
 
 
 class MergedScene(NamedTuple):
-    """The valid Gaussians of a scene, and one merged Gaussian per cell, before the network."""
+    """The valid Gaussians of a scene, and one merged Gaussian per cell, before the network.
+
+    The radius is that of the robust frame of the scene, scene units.
+    """
 
     scene: GaussianScene
     merged: GaussianScene
     partition: Partition
     neighbors: Int[Tensor, "m k"]
     visibility: Float[Tensor, "n"]
+    radius: float
 
 
 def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> MergedScene:
@@ -62,7 +69,14 @@ def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> Me
     merged = merge_and_inflate(
         valid, grouping.partition, config.merge, areas=analysis.areas, with_network=True
     )
-    return MergedScene(valid, merged.scene, merged.partition, merged.neighbors, analysis.visibility)
+    return MergedScene(
+        valid,
+        merged.scene,
+        merged.partition,
+        merged.neighbors,
+        analysis.visibility,
+        analysis.frame.radius,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -75,7 +89,7 @@ class Case:
         reference: Scene, merged Gaussians, cells, neighbours, visibility.
         cells: ``(r,)`` cells of several members, which the network corrects.
         part: Members of these cells.
-        descriptors: Input of the network for these cells.
+        descriptors: Input of the network for these cells, for images of ``IMAGE_SIZE``.
     """
 
     scene_name: str
@@ -99,6 +113,11 @@ class Case:
             descriptors=self.descriptors.select(rows),
         )
 
+    def seen_by(self, cameras: Cameras) -> "Case":
+        """Return the case with descriptors for the image size of some cameras."""
+        side = max(cameras.width, cameras.height)
+        return replace(self, descriptors=self.descriptors.in_images(side / IMAGE_SIZE))
+
     def correct_cells(self, residuals: Residuals) -> dict[str, Tensor]:
         """Return the tensors of the corrected cells, differentiably."""
         return compose(
@@ -114,7 +133,7 @@ class Case:
         """Return the whole simplified scene with its cells corrected by a network."""
         if isinstance(net, MergeNet):
             return self.correct_scene(net(self.descriptors))
-        scene, merged, _, _, _ = self.reference
+        scene, merged = self.reference[:2]
         descriptors = describe_published(scene, merged, self.part, cells=self.cells)
         changed = compose_published(merged, cells=self.cells, residuals=net(descriptors))
         return self._with_cells(changed)
@@ -146,6 +165,7 @@ class Case:
                 partition=reference.partition.to(device),
                 neighbors=reference.neighbors.to(device),
                 visibility=reference.visibility.to(device),
+                radius=reference.radius,
             ),
             cells=self.cells.to(device),
             part=self.part.to(device),
@@ -165,6 +185,7 @@ def describe_case(
         neighbors=reference.neighbors[cells],
         sizes=reference.partition.counts,
         visibility=reference.visibility,
+        pixel_size=reference.radius / IMAGE_SIZE,
     )
     return Case(
         scene_name=scene_name,
@@ -270,12 +291,14 @@ def render_views(
 ) -> TargetViews:
     """Render a full scene from evenly spread cameras of a file, or from mixed views.
 
-    Mixed views include blurred ones, as in the training of the shipped networks.
+    Mixed views include blurred ones, as in the training of the shipped networks. About every third
+    image ignores the tag ``SplatRenderMode: mip``, as many viewers do.
     """
     if file is None:
         cameras = mixed_views(scene, count, size=size, seed=seed, sharp=False)
     else:
         cameras = load_cameras(file).spread(count).fitted(size)
+    cameras = cameras.in_both_modes()
     with torch.no_grad():
         images = render(scene, cameras)
     return TargetViews(

@@ -27,7 +27,7 @@ class DataConfig(Section):
         blocks: Number of compact pieces cut from each file that is larger than a piece.
         block_count: Number of Gaussians in a piece.
         copies: Number of perturbed copies of each scene or piece: thinned, stretched, with
-            different contrast and opacity.
+            different contrast and opacity, half of them tagged ``SplatRenderMode: mip``.
         ratios: Ratios for training.
         validation_ratios: Ratios for validation.
         largest_scene: Files with more Gaussians are used only in pieces, to bound the time of a

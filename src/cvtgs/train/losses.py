@@ -60,6 +60,7 @@ def scene_loss(
     """
     shots = [_Shot.draw(views, config.views.crop, case, rng) for _ in range(config.views.per_step)]
     case = case.select(_seen_cells(case, [shot.crop_camera() for shot in shots]))
+    case = case.seen_by(views.cameras)
     residuals = _predict(net, case)
     corrected = case.correct_scene(residuals)
     losses = []
@@ -99,6 +100,7 @@ class _Shot(NamedTuple):
             Ks=camera.Ks - offset,
             width=min(self.columns.stop, camera.width) - self.columns.start,
             height=min(self.rows.stop, camera.height) - self.rows.start,
+            ignores_tag=camera.ignores_tag,
         )
 
 
@@ -146,7 +148,7 @@ def published_loss(
     The loss is ``0.8 L1 + 0.2 (1 - SSIM) + 0.2 gradient`` per crop, with all SH bands. Each cell is
     seen from a random direction, at a random zoom, over a random background.
     """
-    scene, merged, _, _, _ = case.reference
+    scene, merged = case.reference[:2]
     rows = _draw_cells(case.part.counts, config, rng)
     cells, part = case.cells[rows], case.part.select(rows)
     descriptors = describe_published(scene, merged, part, cells=cells)
@@ -202,7 +204,7 @@ def validation_psnr(
     target = views.over(grey)
     before, after = (
         float(psnr(render(scene, views.cameras, background=grey).rgb, target).mean())
-        for scene in (merged, case.correct_by(net))
+        for scene in (merged, case.seen_by(views.cameras).correct_by(net))
     )
     return before, after
 

@@ -3,7 +3,7 @@
 import hashlib
 import random
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -15,12 +15,15 @@ from cvtgs.io import load
 from cvtgs.io.files import is_folder
 from cvtgs.math import parameters
 from cvtgs.mergenet import LearnedScene
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
 from cvtgs.train.config import DataConfig
 from cvtgs.validity import valid_part
 
 VALIDATION_SEED = 1_000_000
 """First seed of generated validation scenes."""
+
+TAGGED = 0.5
+"""Share of the perturbed copies that are tagged ``SplatRenderMode: mip``; few files are."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,7 +181,7 @@ def cut_block(scene: GaussianScene, count: int, *, seed: int) -> GaussianScene:
 
 
 def perturb(scene: GaussianScene, rng: random.Random) -> GaussianScene:
-    """Thin, stretch and recolour a scene.
+    """Thin, stretch and recolour a scene, and draw whether it is tagged ``SplatRenderMode: mip``.
 
     Rotations, translations and uniform scales would add nothing: descriptors are invariant to them.
     """
@@ -192,7 +195,7 @@ def perturb(scene: GaussianScene, rng: random.Random) -> GaussianScene:
     scales, turned = parameters.decompose_covariances(shapes * stretch[:, None] * stretch)
     mix = torch.eye(3) * rng.uniform(0.5, 1.4) + 0.3 * torch.randn(3, 3, generator=generator)
     mix = mix.to(scene.dtype)
-    return kept.with_tensors(
+    changed = kept.with_tensors(
         {
             "means": kept.means * stretch,
             "log_scales": parameters.positive_log(scales).to(scene.dtype),
@@ -203,3 +206,4 @@ def perturb(scene: GaussianScene, rng: random.Random) -> GaussianScene:
         },
         {},
     )
+    return replace(changed, comments=(ANTIALIASED_TAG,) if rng.random() < TAGGED else ())
