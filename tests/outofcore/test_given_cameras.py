@@ -12,7 +12,7 @@ from camera_files import transforms, write_json
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.analysis import visibility_cameras
 from cvtgs.cli.main import main
-from cvtgs.outofcore import improve, simplify_file
+from cvtgs.outofcore import LocalWorkers, improve, simplify_file
 from cvtgs.outofcore.improve import cameras_of_block
 from cvtgs.rendering import contributions, render
 from refine_cases import ring
@@ -134,6 +134,14 @@ def test_blocks_use_only_the_cameras_that_show_them(two_objects, tmp_path, monke
     in_blocks(two_objects, tmp_path / "out.ply", REFINED, cameras=cameras)
     for masks in seen.values():
         assert sorted(float(mask.double().mean()) for mask in masks) == [0.0, 1.0]
+
+
+@pytest.mark.long
+def test_two_workers_and_cameras_give_the_same_bits(source, tmp_path):
+    in_blocks(source, tmp_path / "a.ply", REFINED, cameras=ring(10))
+    with LocalWorkers(2) as workers:
+        in_blocks(source, tmp_path / "b.ply", REFINED, cameras=ring(10), workers=workers)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
 def test_cameras_are_part_of_the_key_of_a_job(scene, tmp_path):
