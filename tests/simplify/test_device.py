@@ -5,6 +5,7 @@ import torch
 
 from cvtgs import Simplifier
 from cvtgs.cvt import nearest_neighbors, nearest_scipy, nearest_several
+from cvtgs.devices import one_thread
 from cvtgs.errors import OutOfMemoryError
 from cvtgs.math.frames import morton_order
 from cvtgs.math.segments import running_sums
@@ -105,13 +106,15 @@ def test_a_named_device_without_enough_memory_is_an_error():
 
 
 @pytest.mark.long
+@one_thread()  # two threads of a CPU round another way
 def test_short_chunks_are_used_where_long_ones_do_not_fit(monkeypatch):
     for name in ("mergenet.apply", "cells.merge"):
         monkeypatch.setattr(f"cvtgs.{name}.CHUNK_MEMBERS", 64)
     monkeypatch.setattr("cvtgs.analysis.visibility.HALF_GRID", 8)
     scene = random_scene(3000, degree=0, size=0.02)
     wanted = Simplifier(device="cpu").simplify(scene, 0.02)
-    with pretended_cuda(largest=300_000):
+    # The weights of the network, 299,172 bytes, are copied at once and just fit.
+    with pretended_cuda(largest=302_000):
         prepared = Simplifier(device="cuda").prepare(scene.to("cuda"))
         small, report = prepared.run(0.02)
         assert same_bits(on_device(small), wanted)
