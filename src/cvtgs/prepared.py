@@ -28,7 +28,7 @@ from cvtgs.grouping import OrderedRows, add_neighbors, order_rows
 from cvtgs.mergenet import Checkpoint, MergeNet, PublishedMergeNet
 from cvtgs.pipeline import Reduced, level_facts, nests_in, reduce_scene
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.report import Level, Simplified, SimplifyReport
+from cvtgs.report import Level, Simplified, SimplifyReport, origin_of_views
 from cvtgs.scene import GaussianScene, concatenate
 from cvtgs.validity import CheckedScene, check_rows, with_finite_opacities
 
@@ -305,7 +305,7 @@ class Prepared:
         views = "none"
         is_whole = target >= total - checked.invalid_count
         if not is_whole and (self._refines or analysis.plan.visibility.active):
-            views = "found" if self._cameras is None else f"{len(self._cameras)} cameras"
+            views = origin_of_views(self._cameras)
         report = SimplifyReport(
             input_count=total,
             output_count=len(reduced.scene),

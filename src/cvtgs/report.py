@@ -8,6 +8,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from cvtgs.analysis import EffectPlan
+from cvtgs.cameras import Cameras
 from cvtgs.clock import StageCost
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
@@ -182,6 +183,11 @@ class Simplified(NamedTuple):
         """Return HTML with an image and facts, for notebooks."""
         text: str = resolve_name("cvtgs.notebooks:result_html")(self)
         return text
+
+
+def origin_of_views(cameras: Cameras | None) -> str:
+    """Return the origin of rendered views: given cameras, or views that were generated."""
+    return "found" if cameras is None else f"{len(cameras)} cameras"
 
 
 class Level(NamedTuple):

@@ -43,7 +43,7 @@ from cvtgs.outofcore.sort import sort_into_blocks
 from cvtgs.outofcore.visibility import add_contributions, measure
 from cvtgs.outofcore.workers import Result, Workers, begin, sequentially, with_progress
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.report import SimplifyReport
+from cvtgs.report import SimplifyReport, origin_of_views
 from cvtgs.scene import GaussianScene, concatenate
 from cvtgs.simplifier import Simplifier
 from cvtgs.views import find_own_cameras
@@ -355,6 +355,7 @@ def report_blocks(
     tessellated = job.blocks_with_rows() if job.goes_by_steps else []
     parts = [map_tensors(job.parts_path(block))[0] for block in tessellated]
     kept_mass = sum(float(job.source.scene(rows).masses.sum()) for rows in kept_rows(job))
+    renders = simplifier.config.uses_renders or bool(refinements)
     return SimplifyReport(
         input_count=total,
         output_count=min(job.target, valid),
@@ -378,7 +379,7 @@ def report_blocks(
         backend=reports[0].backend if reports else "none",
         checkpoint="none" if simplifier.checkpoint is None else simplifier.checkpoint.name,
         plan=scan.plan,
-        views=_views(job) if simplifier.config.uses_renders or refinements else "none",
+        views=origin_of_views(job.cameras) if renders else "none",
         stages=tuple(clock.costs),
         matching=join_matchings(matchings) if matchings else None,
         refinement=join_refinements(refinements) if refinements else None,
@@ -386,8 +387,3 @@ def report_blocks(
         resumed_blocks=resumed,
         config=simplifier.config,
     )
-
-
-def _views(job: Job) -> str:
-    """Return the origin of the views, as the report gives it."""
-    return "found" if job.cameras is None else f"{len(job.cameras)} cameras"
