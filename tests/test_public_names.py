@@ -154,6 +154,8 @@ STAGES = {
         "Descriptors",
         "Members",
         "Partition",
+        "SampledMembers",
+        "sample_members",
         "describe_cells",
         "Moments",
         "gather_members",

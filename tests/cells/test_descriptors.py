@@ -9,8 +9,10 @@ import torch
 import mergenet_oracle as oracle
 import oracles
 from cvtgs import GaussianScene
-from cvtgs.cells import describe_cells
+from cvtgs.cells import describe_cells, sample_members
 from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES
+from cvtgs.cells.sample import MOST_SAMPLED
+from cvtgs.math.segments import segment_sum
 from mergenet_cases import (
     Case,
     assert_same_features,
@@ -84,6 +86,34 @@ def test_descriptors_equal_the_oracle(seed, tagged, near):
         np.testing.assert_allclose(seen.pairs, pairs, rtol=1e-9, atol=1e-9)
         places = [[cell.own.locate(other.mean) for other in cell.others] for cell in cells]
         np.testing.assert_allclose(seen.pair_positions, places, rtol=1e-9, atol=1e-9)
+
+
+def test_large_cells_are_described_by_a_sample():
+    """Totals of all 300 members of each cell are estimated; the number of members is exact."""
+    case = some_case(900, 3)
+    seen = case.describe()
+    sampled = sample_members(case.scene, case.part)
+    assert seen.rows.tolist() == sampled.part.order.tolist()
+    assert seen.offsets.tolist() == sampled.part.offsets.tolist()
+    assert float(seen.offsets.diff().amax()) <= MOST_SAMPLED
+    torch.testing.assert_close(segment_sum(seen.weights, seen.offsets), torch.ones(3).double())
+    wanted = torch.tensor([oracle.describe_cell(cell) for cell in case.oracle_cells()])
+    # The mean of all members is the centre of the cell, so that of the sample is moved there.
+    means = segment_sum(seen.positions, seen.offsets, seen.weights)
+    torch.testing.assert_close(means, torch.zeros(3, 3).double(), rtol=0.0, atol=1e-9)
+    rates = sampled.rates.reciprocal()
+    ids = torch.repeat_interleave(torch.arange(3), sampled.part.counts)
+    torch.testing.assert_close(
+        seen.shares, rates / segment_sum(rates, sampled.part.offsets)[ids], rtol=1e-12, atol=0.0
+    )
+    torch.testing.assert_close(seen.cells[:, 9], wanted[:, 9].double())
+    torch.testing.assert_close(seen.cells, wanted.double(), rtol=0.1, atol=0.1)
+    shares = torch.cat([torch.tensor(cell.shares) for cell in case.oracle_cells()]).double()
+    places = torch.empty_like(case.part.order)
+    places[case.part.order] = torch.arange(900)
+    counts = torch.repeat_interleave(sampled.counts, sampled.part.counts)
+    relative = 0.3 * (shares[places[seen.rows]] * counts).log()
+    torch.testing.assert_close(seen.members[:, 11], relative, rtol=0.0, atol=0.01)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

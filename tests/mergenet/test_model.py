@@ -134,6 +134,8 @@ def test_cells_do_not_affect_one_another():
         pairs=seen.pairs[mask],
         cells=seen.cells[mask],
         weights=seen.weights[members],
+        shares=seen.shares[members],
+        rows=seen.rows[members],
         offsets=part.offsets,
         positions=seen.positions[members],
         pair_positions=seen.pair_positions[mask],

@@ -68,6 +68,29 @@ def test_a_scene_is_made_once(source, made, tmp_path):
     assert [bits_of_views(v) for v in again.views] == [bits_of_views(v) for v in first.views]
 
 
+def mapped_file(tensor: torch.Tensor) -> str:
+    """The file whose pages hold a tensor."""
+    for line in Path("/proc/self/maps").read_text(encoding="utf-8").splitlines():
+        words = line.split()
+        start, end = (int(text, 16) for text in words[0].split("-"))
+        if start <= tensor.data_ptr() < end:
+            return words[5] if len(words) > 5 else ""
+    return ""
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="needs Linux")
+def test_cases_take_no_memory(source, tmp_path):
+    """All large tensors stay in the file, or hundreds of cases would fill the memory."""
+    for case in prepare_scene(source, config_of(), tmp_path).cases:
+        reference, seen = case.reference, case.descriptors
+        tensors = [reference.partition.order, reference.neighbors, reference.visibility]
+        tensors += [*reference.scene.tensors().values(), *reference.merged.tensors().values()]
+        tensors += [getattr(seen, name) for name in type(seen).__slots__]
+        files = {mapped_file(values) for values in tensors if values.numel()}
+        assert len(files) == 1
+        assert files.pop().startswith(str(tmp_path))
+
+
 @pytest.mark.slow
 def test_cached_results_equal_fresh_ones(source, made, tmp_path):
     config = config_of()

@@ -24,9 +24,7 @@ def as_case(cells: Cells) -> Case:
     reference = MergedScene(
         cells.scene, cells.merged, cells.part, cells.neighbors, light, radius=4.0
     )
-    several = cells.part.counts > 1
-    rows = several.nonzero()[:, 0]
-    return describe_case("made", 0.1, reference, rows, cells.part.select(several))
+    return describe_case("made", 0.1, reference, cells.part.several())
 
 
 def twins(cells: int = 16) -> Case:

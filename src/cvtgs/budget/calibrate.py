@@ -51,7 +51,7 @@ CANDIDATES = tuple(name for name in PRESETS if name != "paper")
 RENDERERS = ("gsplat", "numba")
 """Packages that render faster than torch; not imported to check, as that can outlast a run."""
 
-VERSION: Literal[5] = 5
+VERSION: Literal[6] = 6
 """Version of the cache file; raised when features change, so that older files are replaced."""
 
 SHIPPED_RATES = "rates.json"
@@ -127,7 +127,7 @@ Of fewer than eight images, matching would hold out all instead of every eighth.
 class CachedModel(Record, allow_inf_nan=False):
     """The content of the cache file."""
 
-    version: Literal[5]
+    version: Literal[6]
     key: dict[str, str]
     made: float
     model: CostModel

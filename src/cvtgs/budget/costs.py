@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 import pydantic
 
+from cvtgs.cells.sample import MOST_SAMPLED
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.cvt.tessellate import MIN_SAMPLES
@@ -25,7 +26,7 @@ FEATURES: Mapping[str, tuple[str, ...]] = {
     VISIBILITY: ("once", "view_pixels", "views_in"),
     MATCH: ("once", "view_pixels", "view_pairs", "view_values"),
     REFINE: ("once", "images_in", "looks", "look_pixels", "looks_out"),
-    NETWORK: ("once", "in", "in_values", "out", "out_values"),
+    NETWORK: ("once", "in", "sampled", "sampled_values", "out", "out_values"),
 }
 """Features of each stage; its seconds are linear in their amounts."""
 
@@ -88,6 +89,7 @@ class Work:
             Amounts by name.
         """
         cells = finer_count(self.target, self.count, config.allocation)
+        described = min(self.count, MOST_SAMPLED * self.target)
         sample = config.cvt.samples_per_site * cells
         sample = max(sample, MIN_SAMPLES) if sample else self.count
         sample = self.count if sample >= self.count // 2 else sample
@@ -106,6 +108,9 @@ class Work:
             "once": 1.0,
             "in": float(self.count),
             "in_values": float(self.count * self.colors),
+            # Members that the network sees: of large cells only some.
+            "sampled": float(described),
+            "sampled_values": float(described * self.colors),
             "out": float(self.target),
             "out_values": float(self.target * self.colors),
             "view_pixels": float(visibility.views * side**2),

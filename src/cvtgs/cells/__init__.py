@@ -15,12 +15,14 @@ from cvtgs.cells.merge import (
 )
 from cvtgs.cells.moments import Moments, gaussian_moments, group_moments, view_components
 from cvtgs.cells.partition import Partition
+from cvtgs.cells.sample import SampledMembers, sample_members
 
 __all__ = [
     "Descriptors",
     "Members",
     "Moments",
     "Partition",
+    "SampledMembers",
     "align_axes",
     "describe_cells",
     "gather_members",
@@ -34,6 +36,7 @@ __all__ = [
     "merged_depth",
     "normalized_weights",
     "reassign",
+    "sample_members",
     "side_cover",
     "view_components",
 ]

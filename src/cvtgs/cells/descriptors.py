@@ -31,10 +31,13 @@ class Descriptors:
     standard deviations, and independent of the sign of each axis.
 
     Attributes:
-        members: ``(n, 19)`` features of the members; those of one cell are contiguous.
+        members: ``(n, 19)`` features of the described members; those of one cell are contiguous.
         pairs: ``(m, k, 18)`` features of the neighbours of every cell.
         cells: ``(m, 21)`` features of the cells; the last one is their size in pixels.
-        weights: ``(n,)`` shares of the mass of the cell; those of one cell sum to 1.
+        weights: ``(n,)`` share of the mass of the cell that each stands for; those of one cell sum
+            to 1.
+        shares: ``(n,)`` the same for the number of members.
+        rows: ``(n,)`` row numbers of the members in the scene.
         offsets: ``(m + 1,)`` start of each cell, and the end of the last one.
         positions: ``(n, 3)`` positions of the members relative to the centre of the cell, in its
             frame and its standard deviations.
@@ -45,6 +48,8 @@ class Descriptors:
     pairs: Float[Tensor, "m k e"]
     cells: Float[Tensor, "m c"]
     weights: Float[Tensor, "n"]
+    shares: Float[Tensor, "n"]
+    rows: Int[Tensor, "n"]
     offsets: Int[Tensor, "m_plus_1"]
     positions: Float[Tensor, "n 3"]
     pair_positions: Float[Tensor, "m k 3"]
@@ -52,6 +57,11 @@ class Descriptors:
     def __len__(self) -> int:
         """Return the number of cells."""
         return len(self.cells)
+
+    @property
+    def part(self) -> Partition:
+        """The described members of every cell."""
+        return Partition(order=self.rows, offsets=self.offsets)
 
     def select(self, cells: Int[Tensor, "s"]) -> Self:
         """Return the descriptors of some cells.
@@ -69,6 +79,8 @@ class Descriptors:
             pairs=self.pairs.index_select(0, cells),
             cells=self.cells.index_select(0, cells),
             weights=self.weights[part.order],
+            shares=self.shares[part.order],
+            rows=self.rows[part.order],
             offsets=part.offsets,
             positions=self.positions.index_select(0, part.order),
             pair_positions=self.pair_positions.index_select(0, cells),
@@ -90,6 +102,8 @@ class Descriptors:
             pairs=self.pairs[run],
             cells=self.cells[run],
             weights=self.weights[members],
+            shares=self.shares[members],
+            rows=self.rows[members],
             offsets=ends - ends[0],
             positions=self.positions[members],
             pair_positions=self.pair_positions[run],
@@ -112,7 +126,7 @@ class Descriptors:
         """Return the descriptors on a device or in another precision.
 
         Args:
-            target: A device, or a dtype for all but ``offsets``.
+            target: A device, or a dtype for all but ``rows`` and ``offsets``.
 
         Returns:
             The moved or converted descriptors.

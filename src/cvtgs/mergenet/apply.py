@@ -139,7 +139,7 @@ def _correct_gated(  # noqa: PLR0913 (options by name)
             residuals = net(descriptors)
             near = neighbors[rows]
             corrected = compose(
-                scene, merged, part, cells=rows, neighbors=near, residuals=residuals
+                scene, merged, descriptors.part, cells=rows, neighbors=near, residuals=residuals
             )
             return rows, corrected
 

@@ -178,7 +178,7 @@ class MergeNet(CellNetwork):
         pairs = self.pair_layers(descriptors.pairs.flatten(0, 1))
         pooled = [
             descriptors.cells,
-            segment_sum(members, offsets) / offsets.diff()[:, None],
+            segment_sum(members, offsets, descriptors.shares),
             segment_sum(members, offsets, weights),
             segment_max(members, offsets),
             *_pool_pairs(pairs.unflatten(0, shape)),

@@ -22,7 +22,7 @@ from cvtgs.train.sources import Source
 
 Content = TypeVar("Content", TargetViews, Case)
 
-CACHE_VERSION = 8
+CACHE_VERSION = 9
 """Part of every cache key; increment it when the meaning of the content changes."""
 
 
@@ -128,9 +128,9 @@ def _packed_cases(cases: Iterable[Case | None]) -> dict[str, Tensor]:
         }
         tensors |= {
             prefix + "ratio": torch.tensor(case.ratio, dtype=torch.float64),
-            prefix + "order": reference.partition.order.to(torch.int32),
+            prefix + "order": reference.partition.order,
             prefix + "offsets": reference.partition.offsets,
-            prefix + "neighbors": reference.neighbors.to(torch.int32),
+            prefix + "neighbors": reference.neighbors,
         }
     return tensors
 
@@ -160,8 +160,7 @@ def _case(
     radius: float,
     tensors: Mapping[str, Tensor],
 ) -> Case:
-    partition = Partition(order=tensors["order"].long(), offsets=tensors["offsets"])
-    cells, several = partition.select_several()
+    partition = Partition(order=tensors["order"], offsets=tensors["offsets"])
     return Case(
         scene_name=name,
         ratio=float(tensors["ratio"]),
@@ -169,12 +168,11 @@ def _case(
             scene=scene,
             merged=GaussianScene(**under_prefix("merged/", tensors), comments=scene.comments),
             partition=partition,
-            neighbors=tensors["neighbors"].long(),
+            neighbors=tensors["neighbors"],
             visibility=visibility,
             radius=radius,
         ),
-        cells=cells,
-        part=several,
+        cells=partition.several(),
         descriptors=Descriptors(**under_prefix("seen/", tensors)),
     )
 

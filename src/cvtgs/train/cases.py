@@ -88,7 +88,6 @@ class Case:
         ratio: Share of Gaussians kept.
         reference: Scene, merged Gaussians, cells, neighbours, visibility.
         cells: ``(r,)`` cells of several members, which the network corrects.
-        part: Members of these cells.
         descriptors: Input of the network for these cells, for images of ``IMAGE_SIZE``.
     """
 
@@ -96,7 +95,6 @@ class Case:
     ratio: float
     reference: MergedScene
     cells: Int[Tensor, "r"]
-    part: Partition
     descriptors: Descriptors
 
     @property
@@ -104,12 +102,16 @@ class Case:
         """The scene name and ratio as text."""
         return f"{self.scene_name} at {self.ratio:g}"
 
+    @property
+    def part(self) -> Partition:
+        """All members of these cells; copied, as those of a prepared case are memory-mapped."""
+        return self.reference.partition.select(self.cells)
+
     def select(self, rows: Int[Tensor, "s"]) -> "Case":
         """Return the case restricted to some of its cells."""
         return replace(
             self,
             cells=self.cells[rows],
-            part=self.part.select(rows),
             descriptors=self.descriptors.select(rows),
         )
 
@@ -123,7 +125,7 @@ class Case:
         return compose(
             self.reference.scene,
             self.reference.merged,
-            self.part,
+            self.descriptors.part,
             cells=self.cells,
             neighbors=self.reference.neighbors[self.cells],
             residuals=residuals,
@@ -168,19 +170,18 @@ class Case:
                 radius=reference.radius,
             ),
             cells=self.cells.to(device),
-            part=self.part.to(device),
             descriptors=self.descriptors.to(device),
         )
 
 
 def describe_case(
-    scene_name: str, ratio: float, reference: MergedScene, cells: Tensor, part: Partition
+    scene_name: str, ratio: float, reference: MergedScene, cells: Int[Tensor, "r"]
 ) -> Case:
     """Return the case of some cells, with their descriptors."""
     descriptors = describe_cells(
         reference.scene,
         reference.merged,
-        part,
+        reference.partition.select(cells),
         cells=cells,
         neighbors=reference.neighbors[cells],
         sizes=reference.partition.counts,
@@ -192,7 +193,6 @@ def describe_case(
         ratio=ratio,
         reference=reference,
         cells=cells,
-        part=part,
         descriptors=descriptors,
     )
 
@@ -205,10 +205,8 @@ def make_case(
     if target >= len(scene):
         return None
     reference = merge_scene(scene, target, config)
-    cells, part = reference.partition.select_several()
-    if not len(cells):
-        return None
-    return describe_case(scene_name, ratio, reference, cells, part)
+    cells = reference.partition.several()
+    return describe_case(scene_name, ratio, reference, cells) if len(cells) else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

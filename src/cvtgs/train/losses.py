@@ -116,7 +116,8 @@ def _predict(net: MergeNet, case: Case) -> Residuals:
     """Predict all residuals in chunks, whose tensors fit the caches of a CPU."""
     near = case.descriptors.pairs.shape[1]
     length = chunk_length(CHUNK_MEMBERS, case.cells.device)
-    parts = [net(case.descriptors.cut(run)) for run, _ in case.part.chunks(length, cell_cost=near)]
+    chunks = case.descriptors.part.chunks(length, cell_cost=near)
+    parts = [net(case.descriptors.cut(run)) for run, _ in chunks]
     return Residuals(
         **{
             field.name: torch.cat([getattr(part, field.name) for part in parts])
@@ -148,9 +149,10 @@ def published_loss(
     The loss is ``0.8 L1 + 0.2 (1 - SSIM) + 0.2 gradient`` per crop, with all SH bands. Each cell is
     seen from a random direction, at a random zoom, over a random background.
     """
-    scene, merged = case.reference[:2]
-    rows = _draw_cells(case.part.counts, config, rng)
-    cells, part = case.cells[rows], case.part.select(rows)
+    scene, merged, partition = case.reference[:3]
+    rows = _draw_cells(partition.counts[case.cells], config, rng)
+    cells = case.cells[rows]
+    part = partition.select(cells)
     descriptors = describe_published(scene, merged, part, cells=cells)
     corrected = compose_published(merged, cells=cells, residuals=net(descriptors))
     background = _random_color(rng, case)
