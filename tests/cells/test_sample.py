@@ -34,7 +34,7 @@ def test_small_cells_keep_all_members():
     assert sampled.rates.tolist() == [1.0] * len(part.order)
 
 
-def test_large_cells_keep_the_same_number_in_the_same_order():
+def test_large_cells_keep_few_members_in_the_same_order():
     scene, part = random_scene(sum(SIZES), degree=0), cells_of(SIZES)
     sampled = sample_members(scene, part)
     assert sampled.counts.tolist() == SIZES
@@ -71,7 +71,7 @@ def test_a_heavy_member_is_always_taken():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_sums_are_estimated(seed):
-    """Masses exactly but for members of more than a step; other sums within a tenth."""
+    """Masses exactly but for members of more than a step; other sums within a hundredth."""
     g = torch.Generator().manual_seed(seed)
     masses = torch.rand(5000, generator=g).double() + 0.1
     values = masses * (2.0 + torch.arange(5000).double() / 5000)

@@ -199,7 +199,8 @@ def describe_members(
     log_masses = log_masses - torch.log(sampled.rates)
     masses = torch.exp(log_masses - segment_max(log_masses, offsets).index_select(0, ids))
     weights = masses / _sum(masses, offsets).index_select(0, ids)
-    relative = _center(relative, weights, sampled=sampled, ids=ids)
+    if len(rows) < len(part.order):
+        relative = _center(relative, weights, sampled=sampled, ids=ids)
     totals = _total(members, relative, weights, visible, sampled=sampled, ids=ids)
     sides = torch.cat([context.cover_difference.T, totals.visibility_gradients.T])
     sides = sides.index_select(1, ids)
@@ -297,8 +298,6 @@ def _center(
     with known totals are calibrated (Deville and Sarndal 1992).
     """
     offsets = sampled.part.offsets
-    if sampled.is_complete:
-        return relative
     means = _sum(weights[:, None] * relative.positions, offsets)
     means = torch.where((sampled.counts > offsets.diff())[:, None], means, 0.0)
     return relative._replace(positions=relative.positions - means.index_select(0, ids))

@@ -30,13 +30,11 @@ class SampledMembers(NamedTuple):
         part: The sampled members.
         counts: ``(m,)`` number of all members of every cell.
         rates: ``(n,)`` expected share of members of this mass that are sampled, above 0 to 1.
-        is_complete: Whether these are known to be all members.
     """
 
     part: Partition
     counts: Int[Tensor, "m"]
     rates: Float[Tensor, "n"]
-    is_complete: bool = False
 
 
 def sample_members(scene: GaussianScene, part: Partition) -> SampledMembers:
@@ -65,7 +63,7 @@ def sample_members(scene: GaussianScene, part: Partition) -> SampledMembers:
     counts, offsets, total = part.counts, part.offsets, len(part.order)
     on_host = part.order.device.type == "cpu"
     if total <= MOST_SAMPLED or (on_host and int(counts.amax()) <= MOST_SAMPLED):
-        return SampledMembers(part, counts, scene.logit_opacities.new_ones(total), True)
+        return SampledMembers(part, counts, scene.logit_opacities.new_ones(total))
     ids = segment_ids(offsets, total)
     masses = _relative_masses(scene, part, ids)
     sums = torch.nn.functional.pad(running_sums(masses), (1, 0))
