@@ -36,6 +36,9 @@ COMMON_CONTRAST = 0.2
 LEAST_CONTRAST, LARGEST_CONTRAST = 0.3, 1.4
 """Limits of the contrast in weights, in units of the common one."""
 
+VIEWERS = 3.0
+"""Distance from the middle of the scene, in robust radii, from which it is often seen."""
+
 SAMPLE = 1 << 16
 """Number of groups from which on only some of them are used to measure the contrast."""
 
@@ -57,7 +60,7 @@ def merge_pairs(
     The cost of a pair is Runnalls' bound (2007) on the change of the mixture when both become one
     Gaussian, plus the squared colour distance, times a power of the mass as seen in images, times
     the number of Gaussians, which keeps groups balanced. The contrast of neighbouring groups
-    scales the power and the weight of colour.
+    scales the power and the weight of colour. Pairs that would be seen at a wide angle cost more.
 
     Args:
         groups: Moments of the groups, on the CPU.
@@ -138,15 +141,32 @@ def _pair_costs(
         one, two = (_rows_of(table.index_select(1, rows)) for rows in (i, j))
         share = one.weights / (one.weights + two.weights)
         own = share * volumes.index_select(0, i) + (1.0 - share) * volumes.index_select(0, j)
-        cost = 0.5 * (_log_volume(_joint_covariances(one, two, share)) - own)
+        joint = _joint_covariances(one, two, share)
+        cost = 0.5 * (_log_volume(joint) - own)
         squares = (one.colors - two.colors).square().sum(0)
         squares += config.view_color * (one.view_colors - two.view_colors).square().sum(0)
         cost += config.color * share * (1.0 - share) * squares
+        if config.widest:
+            cost *= _fog_factor(joint, torch.lerp(two.means, one.means, share), config.widest)
         cost *= (one.masses + two.masses) ** config.mass_power
         cost *= one.counts + two.counts
         return cost[0].nan_to_num_(torch.inf, torch.inf).clamp_min_(0.0)
 
     return torch.cat(in_chunks(costs_of, len(first), CHUNK, HOST))
+
+
+def _fog_factor(
+    covariances: Float[Tensor, "6 n"], means: Float[Tensor, "3 n"], widest: float
+) -> Float[Tensor, "n"]:
+    """Return factors that grow where a Gaussian is wide for its distance from viewers.
+
+    A camera sees part of such a Gaussian even if its centre is far outside of the image. There its
+    projection is spread over the whole image, and drawn before what lies behind its centre.
+    """
+    xx, _, _, yy, _, zz = covariances
+    width = (xx + yy + zz) / (means.square().sum(0) + VIEWERS**2)
+    factors: Tensor = 1.0 + (width / widest**2).square().square()
+    return factors
 
 
 def _joint_covariances(

@@ -125,6 +125,9 @@ class AllocationConfig(Section):
             them in common (:func:`cvtgs.cells.view_components`); 0 leaves them out.
         mass_power: The cost of a pair is multiplied by its apparent mass to this power, also at
             a contrast of 0.2. It is in proportion to the contrast, within the same limits.
+        widest: Standard deviation of a cell in all directions together, divided by its distance
+            from viewers, above which merging costs much more, so that merged skies do not become
+            fog; 0 sets no limit.
         reassign: Whether every Gaussian then moves to the cell that explains it best.
     """
 
@@ -134,6 +137,7 @@ class AllocationConfig(Section):
     color_power: float = pydantic.Field(default=0.3, ge=0.0, le=1.0)
     view_color: float = pydantic.Field(default=2.0, ge=0.0)
     mass_power: float = pydantic.Field(default=0.5, ge=0.0, le=2.0)
+    widest: float = pydantic.Field(default=0.55, ge=0.0)
     reassign: bool = True
 
     @property
