@@ -90,16 +90,7 @@ def yard(count: int, *, seed: int, degree: int) -> GaussianScene:
     made = Part(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
     center = synthetic.scene("object", count - sum(counts.values()), sh_degree=degree, seed=seed)
     size = 0.6 / float(center.means.abs().quantile(0.95))
-    opacities = np.clip(made.opacities, 0.004, 0.995)
-    rest = (len(made.means), center.shN.shape[1], 3)
-    own = {
-        "means": made.means,
-        "quats": made.quats,
-        "log_scales": np.log(made.scales),
-        "logit_opacities": np.log(opacities / (1 - opacities)),
-        "sh0": ((np.clip(made.colors, 0, 1) - 0.5) / SH_C0)[:, None],
-        "shN": rng.normal(0, 0.03, rest),
-    }
+    own = stored(made) | {"shN": rng.normal(0, 0.03, (len(made.means), center.shN.shape[1], 3))}
     others = center.tensors() | {
         "means": center.means * size + torch.tensor([0.0, -0.02, 0.0]),
         "log_scales": center.log_scales + math.log(size),
@@ -109,6 +100,39 @@ def yard(count: int, *, seed: int, degree: int) -> GaussianScene:
         for name, values in own.items()
     }
     return GaussianScene(**joined)
+
+
+def far_surroundings(count: int, *, from_radius: float, seed: int) -> GaussianScene:
+    """Make trees, sky, floaters, and the ground of a yard beyond a radius, of SH degree 0."""
+    rng, fine = np.random.default_rng(seed), math.sqrt(300_000 / count)
+    shares = {name: SHARES[name] for name in ("trees", "sky", "floaters")}
+    trees, sky, floaters = (int(share * count) for share in shares.values())
+    ground = _ground(2 * (count - trees - sky - floaters), fine, rng)
+    is_far = np.hypot(ground.means[:, 0], ground.means[:, 2]) > from_radius
+    parts = [
+        Part(*(column[is_far] for column in ground)),
+        _trees(trees, rng),
+        _sky(sky, rng),
+        _floaters(floaters, rng),
+    ]
+    own = stored(Part(*(np.concatenate(columns) for columns in zip(*parts, strict=True))))
+    own["shN"] = np.zeros((len(own["means"]), 0, 3))
+    tensors: dict[str, Any] = {
+        name: torch.tensor(values, dtype=torch.float32) for name, values in own.items()
+    }
+    return GaussianScene(**tensors)
+
+
+def stored(part: Part) -> dict[str, Array]:
+    """Return the stored parameters of Gaussians, but for view-dependent colour."""
+    opacities = np.clip(part.opacities, 0.004, 0.995)
+    return {
+        "means": part.means,
+        "quats": part.quats,
+        "log_scales": np.log(part.scales),
+        "logit_opacities": np.log(opacities / (1 - opacities)),
+        "sh0": ((np.clip(part.colors, 0, 1) - 0.5) / SH_C0)[:, None],
+    }
 
 
 def cameras() -> Cameras:

@@ -28,6 +28,10 @@ COLOR_CELLS = 10_000
 """The number of cells at which ``cvt.color`` applies unchanged."""
 
 
+FULL_RELIEF = 0.1
+"""Ratio of cells to Gaussians from which on ``allocation.far_relief`` applies unchanged."""
+
+
 class Grouping(NamedTuple):
     """The cells, and the quality of the tessellation.
 
@@ -216,7 +220,9 @@ def finer_count(target: int, available: int, config: AllocationConfig) -> int:
 
 def allocation_at(ratio: float, config: AllocationConfig) -> AllocationConfig:
     """Return the weights of the costs at a ratio of cells to Gaussians."""
-    return config.model_copy(update={"color": config.color * ratio**config.color_power})
+    color = config.color * ratio**config.color_power
+    relief = config.far_relief * min(1.0, ratio / FULL_RELIEF)
+    return config.model_copy(update={"color": color, "far_relief": relief})
 
 
 def allocate(

@@ -309,6 +309,53 @@ def test_masses_count_more_and_colours_less_where_neighbours_differ(monkeypatch)
     assert seen == [pytest.approx(pair) for pair in wanted]
 
 
+@pytest.mark.parametrize("place", [0.0, 40.0])
+def test_pairs_that_viewers_see_at_a_wide_angle_cost_more(place):
+    """Both together have variances of s^2 + a^2 / 4 and twice s^2; viewers are 3 radii around."""
+    size, apart = 8.0, 12.0
+    pair = points([place - 6.0, place + 6.0], size=size)
+    width = (3 * size**2 + apart**2 / 4) / (place**2 + 9.0)
+    plain = cost_of_a_pair(pair, AllocationConfig(widest=0.0))
+    for widest in (0.3, 0.55, 5.0):
+        wanted = plain * (1.0 + (width / widest**2) ** 4)
+        assert cost_of_a_pair(pair, AllocationConfig(widest=widest)) == pytest.approx(wanted, 1e-4)
+
+
+def test_a_wide_sky_merges_after_near_groups():
+    """By divergence alone, the two wide ones on the right are the cheaper pair."""
+    moments = points([0.0, 0.2, 20.0, 26.0])
+    sizes = torch.tensor([0.1, 0.1, 12.0, 12.0]).double()
+    covariances = moments.covariances.clone()
+    covariances[[0, 3, 5]] = sizes.square()
+    moments = moments._replace(covariances=covariances)
+    unlimited = AllocationConfig(widest=0.0)
+    assert merge_pairs(moments, all_others(4), 3, unlimited).tolist() == [0, 1, 2, 2]
+    assert merge_pairs(moments, all_others(4), 3, DEFAULT).tolist() == [0, 0, 1, 2]
+
+
+def test_far_mass_lowers_the_power_of_masses(monkeypatch):
+    seen = []
+    costs = merge_pairs.__globals__["_pair_costs"]
+
+    def noted(table, first, second, config):
+        seen.append(config.mass_power)
+        return costs(table, first, second, config)
+
+    monkeypatch.setitem(merge_pairs.__globals__, "_pair_costs", noted)
+    config = AllocationConfig(mass_power=1.0, far_relief=0.5)
+    for place, mass in ((2.9, 1.0), (3.1, 1.0), (3.1, 7.0), (3.1, 0.0)):
+        moments = points([0.0, 0.1, place])
+        moments = moments._replace(masses=torch.tensor([0.5, 0.5, mass]).double())
+        merge_pairs(moments, all_others(3), 2, config)
+    assert seen == pytest.approx([0.3 * (1 - 0.5 * share) for share in (0.0, 0.5, 0.875, 0.0)])
+
+
+def test_far_mass_counts_less_below_a_tenth():
+    config = AllocationConfig(far_relief=0.5)
+    found = [allocation_at(ratio, config).far_relief for ratio in (0.3, 0.1, 0.05, 0.001)]
+    assert found == pytest.approx([0.5, 0.5, 0.25, 0.005])
+
+
 def test_large_groups_merge_last():
     """By divergence alone, the group of thirty and its neighbour are the cheapest pair."""
     moments = points([0.0, 0.1, 9.0, 9.5], size=0.1)

@@ -60,7 +60,8 @@ def merge_pairs(
     The cost of a pair is Runnalls' bound (2007) on the change of the mixture when both become one
     Gaussian, plus the squared colour distance, times a power of the mass as seen in images, times
     the number of Gaussians, which keeps groups balanced. The contrast of neighbouring groups
-    scales the power and the weight of colour. Pairs that would be seen at a wide angle cost more.
+    scales the power and the weight of colour; far mass lowers the power. Pairs that would be seen
+    at a wide angle cost more.
 
     Args:
         groups: Moments of the groups, on the CPU.
@@ -72,8 +73,8 @@ def merge_pairs(
         The new group of every group, 0 to ``count - 1``.
     """
     contrast = _relative_contrast(groups.colors, neighbors)
-    update = {"color": config.color / contrast, "mass_power": config.mass_power * contrast}
-    config = config.model_copy(update=update)
+    power = config.mass_power * contrast * (1.0 - config.far_relief * _far_share(groups))
+    config = config.model_copy(update={"color": config.color / contrast, "mass_power": power})
     table = torch.cat([torch.atleast_2d(values).float() for values in groups])  # fast to gather
     total, labels = len(groups.weights), np.arange(len(groups.weights))
     pairs = _distinct_pairs(labels.repeat(neighbors.shape[1]), neighbors.numpy().ravel())
@@ -107,6 +108,13 @@ def _relative_contrast(colors: Float[Tensor, "3 m"], neighbors: Int[Tensor, "m k
     squares = np.square(values[:, near] - values[:, rows, None]).sum()  # numpy uses one thread
     contrast = math.sqrt(0.5 * float(squares) / max(1, near.size)) / COMMON_CONTRAST
     return min(max(contrast, LEAST_CONTRAST), LARGEST_CONTRAST)
+
+
+def _far_share(groups: Moments) -> float:
+    """Return the share of the mass that lies beyond viewers."""
+    is_far = groups.means.square().sum(0) > VIEWERS**2
+    far, total = groups.masses[is_far].sum(), groups.masses.sum()
+    return float(far / total.clamp_min(torch.finfo(total.dtype).tiny))
 
 
 def _distinct_pairs(first: Rows, second: Rows) -> Rows:

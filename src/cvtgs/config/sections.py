@@ -125,6 +125,10 @@ class AllocationConfig(Section):
             them in common (:func:`cvtgs.cells.view_components`); 0 leaves them out.
         mass_power: The cost of a pair is multiplied by its apparent mass to this power, also at
             a contrast of 0.2. It is in proportion to the contrast, within the same limits.
+        far_relief: This power is reduced by this share where all mass lies beyond three robust
+            radii, and in proportion where some does: layers of far Gaussians hide one another, so
+            they show less than their mass. Below one cell per ten Gaussians, the share is in
+            proportion to their ratio.
         widest: Standard deviation of a cell in all directions together, divided by its distance
             from viewers, above which merging costs much more, so that merged skies do not become
             fog; 0 sets no limit.
@@ -137,6 +141,7 @@ class AllocationConfig(Section):
     color_power: float = pydantic.Field(default=0.3, ge=0.0, le=1.0)
     view_color: float = pydantic.Field(default=2.0, ge=0.0)
     mass_power: float = pydantic.Field(default=0.5, ge=0.0, le=2.0)
+    far_relief: Share = 0.55
     widest: float = pydantic.Field(default=0.55, ge=0.0)
     reassign: bool = True
 
