@@ -334,20 +334,22 @@ def test_a_wide_sky_merges_after_near_groups():
 
 
 def test_far_mass_lowers_the_power_of_masses(monkeypatch):
+    """Without any, nothing is wide enough to be a sky."""
     seen = []
     costs = merge_pairs.__globals__["_pair_costs"]
 
     def noted(table, first, second, config):
-        seen.append(config.mass_power)
+        seen.append((config.mass_power, config.widest))
         return costs(table, first, second, config)
 
     monkeypatch.setitem(merge_pairs.__globals__, "_pair_costs", noted)
-    config = AllocationConfig(mass_power=1.0, far_relief=0.5)
+    config = AllocationConfig(mass_power=1.0, far_relief=0.5, widest=0.6)
     for place, mass in ((2.9, 1.0), (3.1, 1.0), (3.1, 7.0), (3.1, 0.0)):
         moments = points([0.0, 0.1, place])
         moments = moments._replace(masses=torch.tensor([0.5, 0.5, mass]).double())
         merge_pairs(moments, all_others(3), 2, config)
-    assert seen == pytest.approx([0.3 * (1 - 0.5 * share) for share in (0.0, 0.5, 0.875, 0.0)])
+    wanted = [(0.3, 0.0), (0.3 * 0.75, 0.6), (0.3 * (1 - 0.5 * 0.875), 0.6), (0.3, 0.0)]
+    assert seen == [pytest.approx(pair) for pair in wanted]
 
 
 def test_far_mass_counts_less_below_a_tenth():

@@ -72,9 +72,13 @@ def merge_pairs(
     Returns:
         The new group of every group, 0 to ``count - 1``.
     """
-    contrast = _relative_contrast(groups.colors, neighbors)
-    power = config.mass_power * contrast * (1.0 - config.far_relief * _far_share(groups))
-    config = config.model_copy(update={"color": config.color / contrast, "mass_power": power})
+    contrast, far = _relative_contrast(groups.colors, neighbors), _far_share(groups)
+    update = {
+        "color": config.color / contrast,
+        "mass_power": config.mass_power * contrast * (1.0 - config.far_relief * far),
+        "widest": config.widest if far > 0.0 else 0.0,  # a bounded scene has no sky
+    }
+    config = config.model_copy(update=update)
     table = torch.cat([torch.atleast_2d(values).float() for values in groups])  # fast to gather
     total, labels = len(groups.weights), np.arange(len(groups.weights))
     pairs = _distinct_pairs(labels.repeat(neighbors.shape[1]), neighbors.numpy().ravel())

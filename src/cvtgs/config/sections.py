@@ -130,8 +130,8 @@ class AllocationConfig(Section):
             they show less than their mass. Below one cell per ten Gaussians, the share is in
             proportion to their ratio.
         widest: Standard deviation of a cell in all directions together, divided by its distance
-            from viewers, above which merging costs much more, so that merged skies do not become
-            fog; 0 sets no limit.
+            from viewers, above which merging costs much more in scenes with far mass, so that
+            merged skies do not become fog; 0 sets no limit.
         reassign: Whether every Gaussian then moves to the cell that explains it best.
     """
 
