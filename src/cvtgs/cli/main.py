@@ -73,7 +73,11 @@ def _run(words: Sequence[str]) -> None:
     parser = build_parser()
     if not words:
         parser.exit(2, parser.format_help())
-    options = parser.parse_args(words)
+    try:
+        options = parser.parse_args(words)
+    except SystemExit:  # after --help and --version, whose text may still be in a buffer
+        flush_output()
+        raise
     if options.command not in WITHOUT_TORCH:
         load_torch()
     otherwise = BLOCKS_ADVICE if hasattr(options, "memory") else "ask for less"
@@ -115,14 +119,19 @@ def run_process() -> NoReturn:
     for stream in (sys.stdout, sys.stderr):  # applies to output of libraries, too
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    code = main()
+    code: int | str | None
+    try:
+        code = main()
+    except SystemExit as stop:
+        code = stop.code
     for number in (signal.SIGINT, signal.SIGTERM):  # the exit status is final
         signal.signal(number, signal.SIG_IGN)
-    try:
-        if sys.stdout is not None:
-            sys.stdout.flush()
-    except OSError:  # already reported; Python would report it again at exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    for descriptor, file in ((1, sys.stdout), (2, sys.stderr)):
+        try:
+            if file is not None:
+                file.flush()
+        except OSError:  # already reported; Python would report it again at exit
+            os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
     gc.freeze()  # the process ends faster without a collection of everything it has loaded
     sys.exit(code)
 
