@@ -277,7 +277,7 @@ def test_the_package_is_marked_as_typed():
 
 
 def test_fractions_in_the_docs_have_braces():
-    r"""The converter of formulas to MathML reads ``\frac12`` as a fraction of 12 and what follows."""
+    r"""The converter to MathML reads ``\frac12`` as a fraction of 12 and what follows."""
     pages = sorted((ROOT / "docs").rglob("*.md"))
     assert any(r"\frac{" in page.read_text(encoding="utf-8") for page in pages)
     wrong = [page.name for page in pages if re.search(r"frac\d", page.read_text(encoding="utf-8"))]

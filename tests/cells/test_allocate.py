@@ -288,16 +288,22 @@ def test_contrast_is_that_of_neighbours_by_hand():
     assert contrast(alike.colors[:, :1], near[:1, :0]) == 0.3
 
 
-def test_masses_count_more_and_colours_less_where_neighbours_differ(monkeypatch):
-    """Weights are those of the configuration at the common contrast."""
+def watched_costs(monkeypatch, *names):
+    """Return a list that gets these weights whenever costs of pairs are computed."""
     seen = []
     costs = merge_pairs.__globals__["_pair_costs"]
 
     def noted(table, first, second, config):
-        seen.append((config.mass_power, config.color))
+        seen.append(tuple(getattr(config, name) for name in names))
         return costs(table, first, second, config)
 
     monkeypatch.setitem(merge_pairs.__globals__, "_pair_costs", noted)
+    return seen
+
+
+def test_masses_count_more_and_colours_less_where_neighbours_differ(monkeypatch):
+    """Weights are those of the configuration at the common contrast."""
+    seen = watched_costs(monkeypatch, "mass_power", "color")
     config = AllocationConfig(mass_power=0.6, color=30.0)
     step = 0.2 * math.sqrt(2 / 3)  # of a contrast of 0.2
     for factor in (0.0, 0.5, 1.0, 9.0):
@@ -335,14 +341,7 @@ def test_a_wide_sky_merges_after_near_groups():
 
 def test_far_mass_lowers_the_power_of_masses(monkeypatch):
     """Without any, nothing is wide enough to be a sky."""
-    seen = []
-    costs = merge_pairs.__globals__["_pair_costs"]
-
-    def noted(table, first, second, config):
-        seen.append((config.mass_power, config.widest))
-        return costs(table, first, second, config)
-
-    monkeypatch.setitem(merge_pairs.__globals__, "_pair_costs", noted)
+    seen = watched_costs(monkeypatch, "mass_power", "widest")
     config = AllocationConfig(mass_power=1.0, far_relief=0.5, widest=0.6)
     for place, mass in ((2.9, 1.0), (3.1, 1.0), (3.1, 7.0), (3.1, 0.0)):
         moments = points([0.0, 0.1, place])
