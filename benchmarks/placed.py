@@ -8,15 +8,12 @@ free to use are unbounded; these have captured surfaces before backgrounds that 
 
 import argparse
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor
+from scipy.spatial.transform import Rotation
 
 import cvtgs
 from benchmarks.cameras import beside_format, cameras_file
@@ -28,7 +25,7 @@ from cvtgs.validity import valid_part
 from cvtgs.views.layout import find_layout
 
 GROUND, SURROUNDINGS = 120_000, 50_000
-"""Number of Gaussians of the piece of ground, and of everything that is generated."""
+"""Number of Gaussians of the piece of ground, and roughly that of everything generated."""
 
 GROUND_RADIUS, OBJECT_RADIUS = 1.4, 0.5
 """Robust radii of both; the yards have the same units."""
@@ -69,28 +66,15 @@ def upright(scene: GaussianScene, *, radius: float, level: float) -> GaussianSce
     ``level`` is the share of Gaussians that end up above the plane.
     """
     layout = find_layout(scene)
-    quat = turn_between(layout.up.double(), torch.tensor(UP, dtype=torch.float64))
-    turned = edit.move(scene, edit.Motion(quat=quat, scale=radius / float(layout.frame.radius)))
+    turn, _ = Rotation.align_vectors([UP], layout.up.double()[None].numpy())  # the shortest
+    x, y, z, w = turn.as_quat().tolist()
+    motion = edit.Motion(quat=(w, x, y, z), scale=radius / float(layout.frame.radius))
+    turned = edit.move(scene, motion)
     middle = turned.means.double().median(dim=0).values
     heights = turned.means[:, 1].double()
     lowest = float(np.quantile(heights.numpy(), level))
     shift = (-float(middle[0]), -lowest, -float(middle[2]))
     return edit.move(turned, edit.Motion(shift=shift))
-
-
-def turn_between(
-    start: Float[Tensor, "3"], end: Float[Tensor, "3"]
-) -> tuple[float, float, float, float]:
-    """Return the quaternion of the shortest rotation between two unit vectors."""
-    cosine = float(start @ end)
-    if cosine < -0.999999:  # half a turn about any axis across
-        axis = torch.linalg.cross(start, torch.eye(3, dtype=start.dtype)[start.abs().argmin()])
-        x, y, z = (axis / torch.linalg.vector_norm(axis)).tolist()
-        return 0.0, x, y, z
-    x, y, z = torch.linalg.cross(start, end).tolist()
-    w = 1.0 + cosine
-    length = math.sqrt(w * w + x * x + y * y + z * z)
-    return w / length, x / length, y / length, z / length
 
 
 if __name__ == "__main__":

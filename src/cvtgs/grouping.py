@@ -27,7 +27,6 @@ REASSIGN = 7
 COLOR_CELLS = 10_000
 """The number of cells at which ``cvt.color`` applies unchanged."""
 
-
 FULL_RELIEF = 0.1
 """Ratio of cells to Gaussians from which on ``allocation.far_relief`` applies unchanged."""
 

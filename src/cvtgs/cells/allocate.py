@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cvtgs.analysis import far_share
 from cvtgs.cells.moments import UPPER, Moments
 from cvtgs.config import AllocationConfig
 from cvtgs.devices import HOST, in_chunks
@@ -72,7 +73,8 @@ def merge_pairs(
     Returns:
         The new group of every group, 0 to ``count - 1``.
     """
-    contrast, far = _relative_contrast(groups.colors, neighbors), _far_share(groups)
+    contrast = _relative_contrast(groups.colors, neighbors)
+    far = float(far_share(torch.linalg.vector_norm(groups.means, dim=0), groups.masses))
     update = {
         "color": config.color / contrast,
         "mass_power": config.mass_power * contrast * (1.0 - config.far_relief * far),
@@ -112,13 +114,6 @@ def _relative_contrast(colors: Float[Tensor, "3 m"], neighbors: Int[Tensor, "m k
     squares = np.square(values[:, near] - values[:, rows, None]).sum()  # numpy uses one thread
     contrast = math.sqrt(0.5 * float(squares) / max(1, near.size)) / COMMON_CONTRAST
     return min(max(contrast, LEAST_CONTRAST), LARGEST_CONTRAST)
-
-
-def _far_share(groups: Moments) -> float:
-    """Return the share of the mass that lies beyond viewers."""
-    is_far = groups.means.square().sum(0) > VIEWERS**2
-    far, total = groups.masses[is_far].sum(), groups.masses.sum()
-    return float(far / total.clamp_min(torch.finfo(total.dtype).tiny))
 
 
 def _distinct_pairs(first: Rows, second: Rows) -> Rows:
