@@ -50,7 +50,7 @@ class Grouping(NamedTuple):
 
 
 class WeightedRows(NamedTuple):
-    """Gaussians to group, in the order of the Morton curve.
+    """Gaussians to group, in the order of the Morton curve; at a coarser level, merged Gaussians.
 
     Attributes:
         scene: The Gaussians.
@@ -58,6 +58,7 @@ class WeightedRows(NamedTuple):
         weights: ``(k,)`` weights in the tessellation.
         masses: ``(k,)`` weights in the moments of a cell.
         apparent_masses: ``(k,)`` apparent masses, which scale the costs of merging.
+        members: Members of every merged Gaussian; None if these are Gaussians of the scene itself.
         moments: Moments of each Gaussian; None if not computed yet.
         neighbors: Gaussians that each may merge with; None if not computed yet.
     """
@@ -67,8 +68,14 @@ class WeightedRows(NamedTuple):
     weights: Float[Tensor, "k"]
     masses: Float[Tensor, "k"]
     apparent_masses: Float[Tensor, "k"]
+    members: cells.Partition | None = None
     moments: cells.Moments | None = None
     neighbors: Int[Tensor, "k j"] | None = None
+
+    @property
+    def total(self) -> int:
+        """The number of Gaussians of the full scene that these stand for."""
+        return len(self.rows if self.members is None else self.members.order)
 
 
 class OrderedRows(NamedTuple):
@@ -83,50 +90,28 @@ class OrderedRows(NamedTuple):
     points: WeightedRows
 
 
-def group_rows(
+def weigh_rows(
     scene: GaussianScene,
     rows: Int[Tensor, "k"],
     analysis: SceneAnalysis,
-    target: int,
     config: SimplifyConfig,
     *,
     ordered: OrderedRows | None = None,
-    on_iteration: Callable[[int], None] = lambda done: None,
-) -> Grouping:
-    """Group Gaussians into cells: tessellate, merge cheap pairs of cells, reassign members.
+) -> WeightedRows:
+    """Sort Gaussians along the Morton curve, and compute their weights.
 
     Args:
         scene: The Gaussians.
         rows: Rows that passed the filter.
-        analysis: Frame, apparent areas and effect plan.
-        target: Number of cells, at most k.
-        config: The configuration; ``cvt``, ``allocation`` and ``seed`` are used.
-        ordered: Cached result of :func:`order_rows`; ignored if its rows differ.
-        on_iteration: Called with the number of finished Lloyd iterations.
+        analysis: Frame and apparent areas.
+        config: The configuration; ``cvt`` is used.
+        ordered: Cached result of :func:`order_rows`, returned unless its rows differ.
 
     Returns:
-        The cells.
+        The Gaussians to group.
     """
     if ordered is not None and torch.equal(ordered.filtered, rows):
-        points = ordered.points
-    else:
-        points = _weighted(scene, rows, analysis, config)
-    tessellation, labels = _tessellate(
-        points,
-        analysis,
-        target,
-        config,
-        total=len(rows),
-        on_iteration=on_iteration,
-    )
-    sums = label_sums([points.weights], labels, target)[0]
-    return _grouping(tessellation, points.rows, labels, sums)
-
-
-def _weighted(
-    scene: GaussianScene, rows: Int[Tensor, "k"], analysis: SceneAnalysis, config: SimplifyConfig
-) -> WeightedRows:
-    """Sort Gaussians along the Morton curve, and compute their weights."""
+        return ordered.points
     # Advanced indexing (`values[rows]`) takes three to five times as long as `index_select`.
     opacities = analysis.opacities.index_select(0, rows)
     masses = analysis.apparent_areas.index_select(0, rows) * opacities
@@ -148,7 +133,142 @@ def _weighted(
     )
 
 
-def _moments(
+def weigh_cells(merged: GaussianScene, grouping: Grouping, analysis: SceneAnalysis) -> WeightedRows:
+    """Sort the merged Gaussians of a finer level, so that the cells of levels are nested.
+
+    Args:
+        merged: The merged Gaussians.
+        grouping: Their cells.
+        analysis: Frame of the scene.
+
+    Returns:
+        The merged Gaussians to group.
+    """
+    everything = torch.arange(len(merged), device=merged.device)
+    masses = grouping.weights * merged.opacities
+    rows = curve_order(merged, everything, analysis.frame, masses=masses)
+    weights = grouping.weights[rows]
+    return WeightedRows(
+        scene=merged,
+        rows=rows,
+        weights=weights,
+        masses=merged.masses[rows],
+        apparent_masses=weights,
+        members=grouping.partition,
+    )
+
+
+def tessellate_rows(
+    points: WeightedRows,
+    analysis: SceneAnalysis,
+    target: int,
+    config: SimplifyConfig,
+    *,
+    on_iteration: Callable[[int], None] = lambda done: None,
+) -> cvt.Tessellation:
+    """Tessellate Gaussians into cells, more of them than are wanted if pairs of cells will merge.
+
+    Args:
+        points: The Gaussians.
+        analysis: Frame and effect plan.
+        target: Number of cells in the end, at most k.
+        config: The configuration; ``cvt``, ``allocation`` and ``seed`` are used.
+        on_iteration: Called with the number of finished Lloyd iterations.
+
+    Returns:
+        The tessellation.
+    """
+    scene, rows = points.scene, points.rows
+    count = finer_count(target, len(rows), config.allocation)
+    if count == len(rows):  # every Gaussian is its own cell, so the space does not matter
+        space = scene.means.index_select(0, rows)
+    else:
+        space = embed_rows(scene, rows, analysis, target, config)
+    return cvt.tessellate(
+        space,
+        points.weights,
+        count,
+        config=config.cvt,
+        seed=config.seed,
+        has_duplicates=analysis.plan.duplicates.active,
+        on_iteration=on_iteration,
+    )
+
+
+def allocate(
+    points: WeightedRows,
+    tessellation: cvt.Tessellation,
+    analysis: SceneAnalysis,
+    target: int,
+    config: AllocationConfig,
+) -> Int[Tensor, "k"]:
+    """Merge cells in pairs down to the target count, and move members to the cell that fits best.
+
+    Args:
+        points: The Gaussians.
+        tessellation: Their cells, none empty; cell ``i`` is Gaussian ``i`` if there are as many.
+        analysis: Frame, in whose units costs are.
+        target: Number of cells to keep.
+        config: Weights of the costs.
+
+    Returns:
+        The new cell of each Gaussian; no cell is empty.
+    """
+    labels, count = tessellation.labels, len(tessellation.sites)
+    is_own = count == len(labels)
+    if count == target and (is_own or not config.reassign):
+        return labels
+    members = points.moments or row_moments(points, analysis, config)
+    config = allocation_at(target / points.total, config)
+    groups = members if is_own else cells.group_moments(members, labels, count)
+    merged = torch.arange(count, device=labels.device)
+    if count > target:
+        groups = cells.Moments(*move_together(groups, HOST))  # many small steps
+        neighbors = points.neighbors if is_own else None
+        if neighbors is None:
+            neighbors = cvt.nearest_neighbors(groups.means.T, config.neighbors)
+        merged = cells.merge_pairs(groups, neighbors, target, config)
+        groups = cells.group_moments(groups, merged, target)
+    if not config.reassign:
+        return merged.to(labels.device).index_select(0, labels)
+    near = cvt.nearest_neighbors(groups.means.T, REASSIGN)
+    merged, near, *moments = move_together([merged, near, *groups], labels.device)
+    labels = merged.index_select(0, labels)
+    return cells.reassign(members, labels, cells.Moments(*moments), near, config)
+
+
+def collect_cells(
+    points: WeightedRows, labels: Int[Tensor, "k"], target: int, tessellation: cvt.Tessellation
+) -> Grouping:
+    """Collect the Gaussians of the full scene that make up every cell.
+
+    Args:
+        points: The Gaussians that were grouped.
+        labels: Their cells, none empty.
+        target: Number of cells.
+        tessellation: The tessellation, for its statistics.
+
+    Returns:
+        The cells.
+    """
+    weights = label_sums([points.weights], labels, target)[0]
+    rows = points.rows
+    if points.members is not None:
+        of_merged = torch.empty_like(labels)
+        of_merged[rows] = labels
+        rows = points.members.order
+        labels = torch.repeat_interleave(of_merged, points.members.counts)
+    local = cells.Partition.from_labels(labels, target)
+    return Grouping(
+        partition=replace(local, order=rows.index_select(0, local.order)),
+        weights=weights,
+        refilled=tessellation.refilled,
+        energies=tessellation.energies,
+        energy=tessellation.energy,
+    )
+
+
+def row_moments(
     points: WeightedRows, analysis: SceneAnalysis, config: AllocationConfig
 ) -> cells.Moments:
     """Compute the moments of each Gaussian, in robust radii."""
@@ -163,47 +283,6 @@ def _moments(
         masses=points.apparent_masses,
         components=components,
     )
-
-
-def _tessellate(
-    points: WeightedRows,
-    analysis: SceneAnalysis,
-    target: int,
-    config: SimplifyConfig,
-    *,
-    total: int,
-    on_iteration: Callable[[int], None],
-) -> tuple[cvt.Tessellation, Int[Tensor, "k"]]:
-    """Tessellate Gaussians in Morton order, allocate cells, and return tessellation and labels.
-
-    ``total`` is the number of Gaussians of the scene in all cells.
-    """
-    scene, rows = points.scene, points.rows
-    count = finer_count(target, len(rows), config.allocation)
-    if count == len(rows):  # every Gaussian is its own cell, so the space does not matter
-        space = scene.means.index_select(0, rows)
-    else:
-        space = embed_rows(scene, rows, analysis, target, config)
-    tessellation = cvt.tessellate(
-        space,
-        points.weights,
-        count,
-        config=config.cvt,
-        seed=config.seed,
-        has_duplicates=analysis.plan.duplicates.active,
-        on_iteration=on_iteration,
-    )
-    labels = tessellation.labels
-    if count > target or (config.allocation.reassign and count < len(rows)):
-        labels = allocate(
-            points.moments or _moments(points, analysis, config.allocation),
-            labels,
-            count,
-            target,
-            allocation_at(target / total, config.allocation),
-            neighbors=points.neighbors if count == len(rows) else None,
-        )
-    return tessellation, labels
 
 
 def finer_count(target: int, available: int, config: AllocationConfig) -> int:
@@ -222,108 +301,6 @@ def allocation_at(ratio: float, config: AllocationConfig) -> AllocationConfig:
     color = config.color * ratio**config.color_power
     relief = config.far_relief * min(1.0, ratio / FULL_RELIEF)
     return config.model_copy(update={"color": color, "far_relief": relief})
-
-
-def allocate(
-    members: cells.Moments,
-    labels: Int[Tensor, "n"],
-    count: int,
-    target: int,
-    config: AllocationConfig,
-    *,
-    neighbors: Int[Tensor, "n k"] | None = None,
-) -> Int[Tensor, "n"]:
-    """Merge cells in pairs down to the target count, and move members to the cell that fits best.
-
-    Args:
-        members: Moments of the members.
-        labels: Cell of each member, none empty; ``i`` of member ``i`` if there is one for each.
-        count: Number of cells.
-        target: Target number of cells.
-        config: Weights of the costs.
-        neighbors: Neighbours of the cells; None computes them.
-
-    Returns:
-        The new cell of each member; no cell is empty.
-    """
-    groups = members if count == len(labels) else cells.group_moments(members, labels, count)
-    if count > target:
-        groups = cells.Moments(*move_together(groups, HOST))  # many small steps
-        if neighbors is None:
-            neighbors = cvt.nearest_neighbors(groups.means.T, config.neighbors)
-        merged = cells.merge_pairs(groups, neighbors, target, config)
-        groups = cells.group_moments(groups, merged, target)
-    else:
-        merged = torch.arange(count, device=labels.device)
-    if not config.reassign or target == len(labels):
-        return labels if count == target else merged.to(labels.device).index_select(0, labels)
-    near = cvt.nearest_neighbors(groups.means.T, REASSIGN)
-    merged, near, *moments = move_together([merged, near, *groups], labels.device)
-    labels = merged.index_select(0, labels)
-    return cells.reassign(members, labels, cells.Moments(*moments), near, config)
-
-
-def group_cells(
-    merged: GaussianScene,
-    grouping: Grouping,
-    analysis: SceneAnalysis,
-    target: int,
-    config: SimplifyConfig,
-    *,
-    on_iteration: Callable[[int], None] = lambda done: None,
-) -> Grouping:
-    """Group the cells of a finer level into coarser ones, so that levels are nested.
-
-    Args:
-        merged: The merged Gaussians of the finer level.
-        grouping: The cells of the finer level.
-        analysis: Frame and effect plan of the scene.
-        target: Number of cells, at most that of the finer level.
-        config: As for :func:`group_rows`.
-        on_iteration: Called with the number of finished Lloyd iterations.
-
-    Returns:
-        Cells that consist of whole finer cells; their members are Gaussians of the scene.
-    """
-    fine = torch.arange(len(merged), device=merged.device)
-    masses = grouping.weights * merged.opacities
-    rows = curve_order(merged, fine, analysis.frame, masses=masses)
-    weights = grouping.weights[rows]
-    points = WeightedRows(
-        scene=merged,
-        rows=rows,
-        weights=weights,
-        masses=merged.masses[rows],
-        apparent_masses=weights,
-    )
-    tessellation, labels = _tessellate(
-        points,
-        analysis,
-        target,
-        config,
-        total=len(grouping.partition.order),
-        on_iteration=on_iteration,
-    )
-    coarse = torch.empty_like(labels)
-    coarse[rows] = labels
-    partition = grouping.partition
-    of_rows = torch.repeat_interleave(coarse, partition.counts)
-    sums = label_sums([grouping.weights], coarse, target)[0]
-    return _grouping(tessellation, partition.order, of_rows, sums)
-
-
-def _grouping(
-    tessellation: cvt.Tessellation, rows: Tensor, labels: Tensor, weights: Tensor
-) -> Grouping:
-    """Return the grouping of labelled rows, given the weights of the cells."""
-    local = cells.Partition.from_labels(labels, len(weights))
-    return Grouping(
-        partition=replace(local, order=rows.index_select(0, local.order)),
-        weights=weights,
-        refilled=tessellation.refilled,
-        energies=tessellation.energies,
-        energy=tessellation.energy,
-    )
 
 
 def curve_order(
@@ -363,7 +340,7 @@ def order_rows(
 ) -> OrderedRows:
     """Compute the part of grouping that does not depend on the number of cells, for reuse.
 
-    :func:`group_rows` uses it only if the filter leaves enough rows for its target; otherwise the
+    :func:`weigh_rows` uses it only if the filter leaves enough rows for its target; otherwise the
     filter brings some rows back, and this part is computed again.
 
     Args:
@@ -372,11 +349,12 @@ def order_rows(
         config: Filter and weights.
 
     Returns:
-        The argument ``ordered`` of :func:`group_rows`; at most 256 bytes per Gaussian.
+        The argument ``ordered`` of :func:`weigh_rows`; at most 256 bytes per Gaussian.
     """
     rows = filter_rows(scene, analysis, 1, config.filter).rows
-    points = _weighted(scene, rows, analysis, config)
-    return OrderedRows(rows, points._replace(moments=_moments(points, analysis, config.allocation)))
+    points = weigh_rows(scene, rows, analysis, config)
+    moments = row_moments(points, analysis, config.allocation)
+    return OrderedRows(rows, points._replace(moments=moments))
 
 
 def add_neighbors(ordered: OrderedRows, target: int, config: AllocationConfig) -> OrderedRows:

@@ -1,4 +1,4 @@
-"""The stages of the method in order: filter, group, merge, correct.
+"""The stages of the method in order: filter, weigh, tessellate, allocate, merge, correct.
 
 Single runs, levels, protected regions and out-of-core runs all call these functions.
 """
@@ -21,7 +21,15 @@ from cvtgs.clock import StageClock
 from cvtgs.config import MergeConfig, SimplifyConfig
 from cvtgs.devices import chunk_length
 from cvtgs.filters import filter_rows
-from cvtgs.grouping import Grouping, OrderedRows, group_cells, group_rows
+from cvtgs.grouping import (
+    Grouping,
+    OrderedRows,
+    allocate,
+    collect_cells,
+    tessellate_rows,
+    weigh_cells,
+    weigh_rows,
+)
 from cvtgs.math.segments import segment_ids
 from cvtgs.mergenet import MergeNet, PublishedMergeNet, correct_cells
 from cvtgs.report import CellStatistics, MatchReport
@@ -91,7 +99,7 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
     finest: Reduced | None = None,
     ordered: OrderedRows | None = None,
 ) -> Reduced:
-    """Run the stages after the analysis: filter, tessellate, merge, correct.
+    """Run the stages after the analysis: filter, weigh, tessellate, allocate, merge, correct.
 
     Args:
         scene: The Gaussians, on the device to compute on; all rows must be valid.
@@ -111,23 +119,24 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
     if target >= len(scene.means):
         return Reduced(standardized(scene) if target < total else with_finite_opacities(scene))
     used = drop_unused_bands(scene, analysis.plan)
-    iterations = config.cvt.iterations + 1
     if finest is None or finest.merged is None or finest.grouping is None:
         with clock.stage("filter"):
             filtered = filter_rows(used, analysis, target, config.filter)
         left_out, left_out_mass_share = filtered.left_out, filtered.left_out_mass_share
-        with clock.stage("tessellate", iterations) as advance:
-            rows = filtered.rows
-            grouping = group_rows(
-                used, rows, analysis, target, config, ordered=ordered, on_iteration=advance
-            )
-        del filtered, rows
+        with clock.stage("weigh"):
+            points = weigh_rows(used, filtered.rows, analysis, config, ordered=ordered)
+        del filtered  # frees memory
     else:
         left_out = finest.statistics.filtered_count
         left_out_mass_share = finest.statistics.filtered_mass_share
-        with clock.stage("tessellate", iterations) as advance:
-            fine, cells_of = finest.merged.scene, finest.grouping
-            grouping = group_cells(fine, cells_of, analysis, target, config, on_iteration=advance)
+        with clock.stage("weigh"):
+            points = weigh_cells(finest.merged.scene, finest.grouping, analysis)
+    with clock.stage("tessellate", config.cvt.iterations + 1) as advance:
+        tessellation = tessellate_rows(points, analysis, target, config, on_iteration=advance)
+    with clock.stage("allocate"):
+        labels = allocate(points, tessellation, analysis, target, config.allocation)
+        grouping = collect_cells(points, labels, target, tessellation)
+    del points, labels, tessellation
     with clock.stage("merge", target) as advance:
         merged = merge_and_inflate(
             used,

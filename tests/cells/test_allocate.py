@@ -10,7 +10,13 @@ from cvtgs import SimplifyConfig, cvt
 from cvtgs.analysis import analyze
 from cvtgs.cells import Moments, gaussian_moments, group_moments, merge_pairs, reassign
 from cvtgs.config import AllocationConfig
-from cvtgs.grouping import allocate, allocation_at, finer_count, group_rows
+from cvtgs.grouping import (
+    allocate,
+    allocation_at,
+    finer_count,
+    tessellate_rows,
+    weigh_rows,
+)
 from cvtgs.math.segments import smallest_rows
 from cvtgs.synthetic import scene as make
 from scenes import random_scene
@@ -254,17 +260,21 @@ def test_merged_cells_lose_less_than_those_of_the_tessellation():
         allocation = {"oversampling": oversampling, "reassign": False}
         config = SimplifyConfig.from_mapping({"allocation": allocation})
         analysis = analyze(scene, config)
-        cells = group_rows(scene, torch.arange(len(scene)), analysis, target, config).partition
+        points = weigh_rows(scene, torch.arange(len(scene)), analysis, config)
+        tessellation = tessellate_rows(points, analysis, target, config)
         labels = torch.empty(len(scene), dtype=torch.int64)
-        labels[cells.order] = torch.repeat_interleave(cells.counts)
+        labels[points.rows] = allocate(points, tessellation, analysis, target, config.allocation)
         losses.append(float(divergence(members, labels, target).sum()))
     assert losses[0] < losses[1]
 
 
 def test_without_allocation_the_cells_of_the_tessellation_are_kept():
     off = AllocationConfig(oversampling=1.0, reassign=False)
-    members, labels = points([0.0, 1.0, 2.0]), torch.tensor([0, 1, 0])
-    assert allocate(members, labels, 2, 2, off) is labels
+    scene, config = make("object", 50, sh_degree=0, seed=0), SimplifyConfig()
+    analysis = analyze(scene, config)
+    points = weigh_rows(scene, torch.arange(50), analysis, config)
+    tessellation = cvt.tessellate(scene.means, points.weights, 5, config=config.cvt)
+    assert allocate(points, tessellation, analysis, 5, off) is tessellation.labels
     assert finer_count(10, 12, off) == 10
     assert finer_count(10, 320, DEFAULT) == 80
     assert finer_count(10, 319, DEFAULT) == 319

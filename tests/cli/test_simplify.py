@@ -53,7 +53,8 @@ def test_the_report_is_json_with_counts_costs_and_configuration(source, tmp_path
     assert (facts["input_count"], facts["output_count"]) == (500, 50)
     assert facts["config"]["preset"] == "paper"
     stages = [stage["stage"] for stage in facts["stages"]]
-    assert stages == ["check", "plan", "filter", "tessellate", "merge", "network"]
+    middle = ["filter", "weigh", "tessellate", "allocate"]
+    assert stages == ["check", "plan", *middle, "merge", "network"]
     assert facts["checkpoint"] == "paper"
     assert all(stage["seconds"] >= 0 for stage in facts["stages"])
 

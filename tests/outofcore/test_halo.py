@@ -12,7 +12,7 @@ from cvtgs import SimplifyConfig, cells, cvt, validity
 from cvtgs.cells import Moments
 from cvtgs.cvt import nearest_several
 from cvtgs.evaluation import EvaluationSettings
-from cvtgs.grouping import REASSIGN, allocate, allocation_at
+from cvtgs.grouping import REASSIGN, allocation_at
 from cvtgs.io.tensors import map_tensors
 from cvtgs.math.segments import take_columns
 from cvtgs.mergenet import correct_cells
@@ -244,7 +244,7 @@ def test_cells_merge_and_gaussians_move_as_in_one_piece(job):
     sizes = torch.cat([read_cells(job, block)[3].counts for block in job.blocks_with_cells()])
     wanted_sizes = torch.bincount(torch.cat(final), minlength=TARGET)
     assert torch.equal(sizes.sort().values, wanted_sizes.sort().values)
-    one_piece = allocate(members, labels, fine, TARGET, config)
+    one_piece = cells.reassign(members, merged[labels], wanted, near, config)
     moved = int((one_piece != merged[labels]).sum())
     assert moved > COUNT // 50
     assert int((torch.cat(final) != one_piece).sum()) < moved // 50

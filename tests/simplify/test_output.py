@@ -11,7 +11,7 @@ from cvtgs.validity import invalid_rows
 from scenes import assert_standard, random_scene, same_bits
 
 each_preset = pytest.mark.parametrize("preset", ["standard", "paper"])
-STAGES = ["check", "plan", "filter", "tessellate", "merge", "network"]
+STAGES = ["check", "plan", "filter", "weigh", "tessellate", "allocate", "merge", "network"]
 INF = float("inf")
 
 

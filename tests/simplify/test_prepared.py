@@ -91,7 +91,13 @@ def test_warming_up_does_the_work_that_runs_share(scene, monkeypatch):
     )
     small, report = prepared.run(0.5)
     assert same_bits(small, wanted)
-    assert {stage.stage for stage in report.stages} == {"filter", "tessellate", "merge"}
+    assert {stage.stage for stage in report.stages} == {
+        "filter",
+        "weigh",
+        "tessellate",
+        "allocate",
+        "merge",
+    }
     assert len(scene) not in searched
 
 

@@ -132,20 +132,20 @@ def _distinct_pairs(first: Rows, second: Rows) -> Rows:
     return distinct
 
 
-def _rows_of(table: Float[Tensor, "c n"]) -> Moments:
-    """Return the rows of a table as moments; those of one number per group have two dimensions."""
-    return Moments(*table.split([1, 1, 1, 3, 6, 3, len(table) - 15]))
+def _take(table: Float[Tensor, "c n"], groups: Int[Tensor, "k"]) -> Moments:
+    """Return the moments of some groups; those of one number per group have two dimensions."""
+    return Moments(*table.index_select(1, groups).split([1, 1, 1, 3, 6, 3, len(table) - 15]))
 
 
 def _pair_costs(
     table: Float[Tensor, "c n"], first: Tensor, second: Tensor, config: AllocationConfig
 ) -> Float[Tensor, "p"]:
     """Return the cost of merging each pair, at least 0; infinite where float32 overflows."""
-    volumes = _log_volume(_rows_of(table).covariances)
+    volumes = _log_volume(table[6:12])
 
     def costs_of(part: slice) -> Tensor:
         i, j = first[part], second[part]
-        one, two = (_rows_of(table.index_select(1, rows)) for rows in (i, j))
+        one, two = _take(table, i), _take(table, j)
         share = one.weights / (one.weights + two.weights)
         own = share * volumes.index_select(0, i) + (1.0 - share) * volumes.index_select(0, j)
         joint = _joint_covariances(one, two, share)
@@ -193,7 +193,7 @@ def _join_pairs(table: Float[Tensor, "c n"], kept: Rows, merged: Rows) -> None:
     first, second = torch.from_numpy(kept), torch.from_numpy(merged)
 
     def join(part: slice) -> None:
-        one, two = (_rows_of(table.index_select(1, rows[part])) for rows in (first, second))
+        one, two = _take(table, first[part]), _take(table, second[part])
         weights = one.weights + two.weights
         share = one.weights / weights
         both = Moments(

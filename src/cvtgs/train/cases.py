@@ -16,7 +16,7 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.counts import target_count
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.filters import filter_rows
-from cvtgs.grouping import group_rows
+from cvtgs.grouping import allocate, collect_cells, tessellate_rows, weigh_rows
 from cvtgs.io import load_cameras
 from cvtgs.mergenet import (
     MergeNet,
@@ -65,9 +65,12 @@ def merge_scene(scene: GaussianScene, target: int, config: SimplifyConfig) -> Me
         analysis = measure_visibility(valid, analysis, config)
     valid = drop_unused_bands(valid, analysis.plan)
     rows = filter_rows(valid, analysis, target, config.filter).rows
-    grouping = group_rows(valid, rows, analysis, target, config)
+    points = weigh_rows(valid, rows, analysis, config)
+    tessellation = tessellate_rows(points, analysis, target, config)
+    labels = allocate(points, tessellation, analysis, target, config.allocation)
+    partition = collect_cells(points, labels, target, tessellation).partition
     merged = merge_and_inflate(
-        valid, grouping.partition, config.merge, areas=analysis.areas, with_network=True
+        valid, partition, config.merge, areas=analysis.areas, with_network=True
     )
     return MergedScene(
         valid,
