@@ -59,6 +59,31 @@ def sphere(count: int, radius: float = 1.0) -> Tensor:
     return radius * torch.nn.functional.normalize(points, dim=1)
 
 
+@pytest.mark.parametrize("kind", ["courtyard", "landscape"])
+@pytest.mark.parametrize("floor", [True, False])
+def test_people_in_an_open_place_stand_on_its_ground(kind, floor, monkeypatch):
+    """They see the middle of the ground at most 35 degrees below them, from all around."""
+    if not floor:
+        monkeypatch.setattr("cvtgs.views.layout.find_floor", lambda voxels, up: None)
+    positions = find_view_positions(cvtgs.synthetic.scene(kind, 4000, sh_degree=0, seed=1))
+    layout = positions.layout
+    assert layout.is_open
+    assert (layout.floor is not None) == floor
+    ground = float(layout.frame.center @ layout.up) if layout.floor is None else layout.floor
+    offsets = (positions.eyes - layout.frame.center) / layout.frame.radius
+    level = torch.linalg.vector_norm(offsets - (offsets @ layout.up)[:, None] * layout.up, dim=1)
+    heights = (positions.eyes @ layout.up - ground) / layout.frame.radius
+    assert 0.2 <= float(level.amin()) < 0.5
+    assert 1.5 < float(level.amax()) <= 2.0
+    lifted = 0.2 if floor else 0.0  # those too low are mirrored at a tenth of a radius
+    assert bool((heights <= (math.tan(math.radians(35.0)) * level).clamp_min(lifted)).all())
+    assert bool((heights > 0).all())
+    directions = torch.nn.functional.normalize(offsets, dim=1).mean(dim=0)
+    assert float(torch.linalg.vector_norm(directions - (directions @ layout.up) * layout.up)) < 0.4
+    views = random_views(positions, 8, size=100, seed=0)
+    assert views.Ks[0, 0, 0].item() == pytest.approx(50.0 / math.tan(math.radians(30.0)))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["object", "courtyard"])
 @pytest.mark.parametrize("convention", CONVENTIONS)

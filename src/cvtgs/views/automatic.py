@@ -12,7 +12,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.devices import one_thread
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.scene import SceneLike
-from cvtgs.views.layout import SceneLayout
+from cvtgs.views.layout import SceneLayout, level_axes
 from cvtgs.views.positions import REACH, CameraPositions, as_positions
 from cvtgs.views.scoring import cameras_at, score_cameras
 
@@ -82,7 +82,7 @@ def outside_candidates(
     layout: SceneLayout, count: int, *, size: tuple[int, int], turn: float
 ) -> CandidateCameras:
     """Return cameras around the scene at several elevations, looking at its middle."""
-    right, ahead = _level_axes(layout.up)
+    right, ahead = level_axes(layout.up)
     shown = layout.radius * (_OBJECT_RADIUS if layout.bounded else _PLACE_RADIUS)
     distance = shown / math.sin(math.radians(0.5 * OUTSIDE_FIELD))
     elevations = [_ELEVATIONS[slot % len(_ELEVATIONS)] for slot in range(count)]
@@ -117,7 +117,7 @@ def inside_candidates(
     turn: float,
 ) -> CandidateCameras:
     """Return cameras in a room, moved back from its middle and looking across it."""
-    right, ahead = _level_axes(layout.up)
+    right, ahead = level_axes(layout.up)
     pitch = math.radians(_INSIDE_PITCH)
     rounds, distances = [], []
     for shift, back, lift in _INSIDE:
@@ -165,13 +165,6 @@ def _distances_to_walls(
         for row, there in zip(along, ahead, strict=True)
     ]
     return torch.stack(distances).clamp_max(_FARTHEST * layout.frame.radius)
-
-
-def _level_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Return two level directions, fixed by ``up`` alone."""
-    least = torch.eye(3, dtype=up.dtype, device="cpu")[up.abs().argmin()]
-    right = torch.nn.functional.normalize(torch.linalg.cross(up, least), dim=0)
-    return right, torch.linalg.cross(right, up)
 
 
 _GOLDEN = 0.6180339887498949

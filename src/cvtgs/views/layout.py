@@ -198,6 +198,11 @@ class SceneLayout:
     floor: float | None
     room: Float[Tensor, "3"] | None
 
+    @property
+    def is_open(self) -> bool:
+        """Whether people who see the scene stand in it, and look far: a garden, not an object."""
+        return not self.bounded and self.room is None
+
 
 def find_layout(scene: GaussianScene) -> SceneLayout:
     """Return the layout of a scene, from robust statistics of its visible Gaussians.
@@ -244,6 +249,13 @@ def find_layout(scene: GaussianScene) -> SceneLayout:
         floor=None if floor is None else float(frame.center @ up) + frame.radius * floor,
         room=None if room is None else frame.center + frame.radius * room,
     )
+
+
+def level_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Return two level directions, fixed by ``up`` alone."""
+    least = torch.eye(3, dtype=up.dtype, device="cpu")[up.abs().argmin()]
+    right = torch.nn.functional.normalize(torch.linalg.cross(up, least), dim=0)
+    return right, torch.linalg.cross(right, up)
 
 
 def valid_part(scene: GaussianScene) -> GaussianScene:

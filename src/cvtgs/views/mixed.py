@@ -28,6 +28,7 @@ NEAR = (0.2, 1.4)
 
 _AROUND = (1.1, 3.0)
 _FIELD = 50.0
+_OPEN_FIELD = 60.0
 _ROOM_FIELD = 65.0
 _AIM = 0.25
 _LEAST_AIM = 0.3
@@ -45,7 +46,7 @@ def random_views(
 
     A scene optimized on automatic views alone gets worse on all other sides. No camera is beneath
     a floor or inside matter (:class:`cvtgs.views.CameraPositions`); without a floor, some look
-    from below.
+    from below. In an open place, cameras are no higher than people hold them.
 
     Args:
         scene: The scene, or the result of :func:`find_view_positions`.
@@ -56,7 +57,8 @@ def random_views(
 
     Returns:
         Cameras, float64, upright. They look at points up to a quarter of a radius from the middle,
-        with a field of view of 50 degrees; in a room at random surfaces, with 65 degrees.
+        with a field of view of 50 degrees, in an open place of 60; in a room at random surfaces,
+        with 65 degrees.
 
     Raises:
         InvalidSceneError: The scene has no valid row, or is larger than 1e14 units.
@@ -69,7 +71,9 @@ def random_views(
     positions = as_positions(scene)
     layout = positions.layout
     eyes = positions.near(count, reach, seed)
-    targets, field = _targets(positions, eyes, seed), _FIELD if layout.room is None else _ROOM_FIELD
+    targets, field = _targets(positions, eyes, seed), _OPEN_FIELD if layout.is_open else _FIELD
+    if layout.room is not None:
+        field = _ROOM_FIELD
     focal = 0.5 * size / math.tan(math.radians(0.5 * field))
     intrinsics = torch.tensor(
         [[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]],

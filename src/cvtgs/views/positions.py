@@ -9,7 +9,15 @@ from torch import Tensor
 
 from cvtgs.scene import SceneLike, as_scene
 from cvtgs.views.clutter import split_by_clutter
-from cvtgs.views.layout import ENCLOSED, FREE, SceneLayout, enclosure, find_layout, size_growth
+from cvtgs.views.layout import (
+    ENCLOSED,
+    FREE,
+    SceneLayout,
+    enclosure,
+    find_layout,
+    level_axes,
+    size_growth,
+)
 from cvtgs.views.scoring import PIXELS, SMOOTH, cameras_at, splat_sizes
 
 REACH = (0.2, 3.0)
@@ -17,6 +25,12 @@ REACH = (0.2, 3.0)
 
 _TRIED = 384
 _SEED = 17
+_STANDING_REACH = (0.2, 2.0)
+"""Range of level distances of candidate positions in an open place, robust radii."""
+
+_ELEVATIONS = (5.0, 35.0)
+"""Range of angles at which these positions rise from the ground in the middle, degrees."""
+
 _ABOVE = 0.1
 """Least height above a floor, in robust radii."""
 
@@ -126,14 +140,8 @@ def find_view_positions(scene: SceneLike) -> CameraPositions:
     """
     scene = as_scene(scene)
     layout = find_layout(scene)
-    generator = torch.Generator().manual_seed(_SEED)
-    directions = torch.nn.functional.normalize(
-        torch.randn(_TRIED, 3, generator=generator, dtype=torch.float64, device="cpu"), dim=1
-    )
-    steps = torch.rand(_TRIED, 1, generator=generator, dtype=torch.float64, device="cpu")
-    low, high = REACH
     radius, center = layout.frame.radius, layout.frame.center
-    eyes = lifted(layout, center + radius * (low + (high - low) * steps) * directions)
+    eyes = lifted(layout, _standing_eyes(layout) if layout.is_open else _surrounding_eyes(layout))
     free = stand_free(layout, eyes)
     eyes = eyes[free] if bool(free.any()) else eyes[:1]
     growths = _growths(layout, eyes)
@@ -151,6 +159,31 @@ def find_view_positions(scene: SceneLike) -> CameraPositions:
         eyes=eyes,
         distances=distances,
     )
+
+
+def _surrounding_eyes(layout: SceneLayout) -> Float[Tensor, "c 3"]:
+    """Return random positions in all directions from the middle."""
+    generator = torch.Generator().manual_seed(_SEED)
+    directions = torch.nn.functional.normalize(
+        torch.randn(_TRIED, 3, generator=generator, dtype=torch.float64, device="cpu"), dim=1
+    )
+    steps = torch.rand(_TRIED, 1, generator=generator, dtype=torch.float64, device="cpu")
+    low, high = REACH
+    return layout.frame.center + layout.frame.radius * (low + (high - low) * steps) * directions
+
+
+def _standing_eyes(layout: SceneLayout) -> Float[Tensor, "c 3"]:
+    """Return random positions of people who stand on the ground and may raise the camera."""
+    generator = torch.Generator().manual_seed(_SEED)
+    draws = torch.rand(3, _TRIED, 1, generator=generator, dtype=torch.float64, device="cpu")
+    low, high = _STANDING_REACH
+    distances = layout.frame.radius * (low + (high - low) * draws[0])
+    angles, (least, most) = math.tau * draws[1], (math.tan(math.radians(x)) for x in _ELEVATIONS)
+    heights = distances * (least + (most - least) * draws[2])
+    center, (right, ahead) = layout.frame.center, level_axes(layout.up)
+    rise = 0.0 if layout.floor is None else layout.floor - float(center @ layout.up)
+    level = angles.cos() * right + angles.sin() * ahead
+    return center + distances * level + (rise + heights) * layout.up
 
 
 def as_positions(scene: SceneLike | CameraPositions) -> CameraPositions:
