@@ -141,7 +141,7 @@ def _pair_costs(
     table: Float[Tensor, "c n"], first: Tensor, second: Tensor, config: AllocationConfig
 ) -> Float[Tensor, "p"]:
     """Return the cost of merging each pair, at least 0; infinite where float32 overflows."""
-    volumes = _log_volume(table[6:12])
+    volumes = _log_volume(table[6:12])  # the covariances
 
     def costs_of(part: slice) -> Tensor:
         i, j = first[part], second[part]

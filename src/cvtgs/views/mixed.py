@@ -71,7 +71,8 @@ def random_views(
     positions = as_positions(scene)
     layout = positions.layout
     eyes = positions.near(count, reach, seed)
-    targets, field = _targets(positions, eyes, seed), _OPEN_FIELD if layout.is_open else _FIELD
+    targets = _targets(positions, eyes, seed)
+    field = _OPEN_FIELD if layout.is_open else _FIELD
     if layout.room is not None:
         field = _ROOM_FIELD
     focal = 0.5 * size / math.tan(math.radians(0.5 * field))

@@ -178,12 +178,14 @@ def _standing_eyes(layout: SceneLayout) -> Float[Tensor, "c 3"]:
     draws = torch.rand(3, _TRIED, 1, generator=generator, dtype=torch.float64, device="cpu")
     low, high = _STANDING_REACH
     distances = layout.frame.radius * (low + (high - low) * draws[0])
-    angles, (least, most) = math.tau * draws[1], (math.tan(math.radians(x)) for x in _ELEVATIONS)
+    angles = math.tau * draws[1]
+    least, most = (math.tan(math.radians(angle)) for angle in _ELEVATIONS)
     heights = distances * (least + (most - least) * draws[2])
-    center, (right, ahead) = layout.frame.center, level_axes(layout.up)
-    rise = 0.0 if layout.floor is None else layout.floor - float(center @ layout.up)
+    right, ahead = level_axes(layout.up)
     level = angles.cos() * right + angles.sin() * ahead
-    return center + distances * level + (rise + heights) * layout.up
+    center = layout.frame.center
+    ground = 0.0 if layout.floor is None else layout.floor - float(center @ layout.up)
+    return center + distances * level + (ground + heights) * layout.up
 
 
 def as_positions(scene: SceneLike | CameraPositions) -> CameraPositions:
