@@ -29,7 +29,8 @@ GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "h
         ),
         ({"width": 0}, "width must be a whole number above 0, found 0."),
         ({"height": 2.5}, "height must be a whole number above 0, found 2.5."),
-        ({"stride": 0}, "stride must be a whole number above 0, found 0."),
+        ({"strides": (0,)}, "every stride must be a whole number above 0, found 0."),
+        ({"strides": (2, 2)}, "strides must hold one stride per camera, 1; found 2."),
         (
             {"width": torch.tensor(2.5)},
             "width must be a whole number above 0, found tensor(2.5000).",
@@ -55,6 +56,7 @@ def test_invalid_cameras_are_refused(changes, text):
     ("work", "text"),
     [
         (lambda camera: camera.every(0), "stride must be a whole number above 0, found 0."),
+        (lambda camera: camera.in_two_sizes(0), "factor must be a whole number above 0, found 0."),
         (lambda camera: camera.interleaved(0), "stride must be a whole number above 0, found 0."),
         (lambda camera: camera.fitted(-5), "side must be a whole number above 0, found -5."),
         (lambda camera: camera.spread(-1), "count must be a whole number above 0, found -1."),
@@ -71,11 +73,11 @@ def test_every_second_pixel_by_hand():
     """Pixel 3 of a row, the second of those kept from 1 on, keeps its place: at 3.5, now at 1.5."""
     Ks = torch.tensor([[[10.0, 0, 4], [0, 12, 3], [0, 0, 1]]])  # noqa: N806
     found = Cameras(viewmats=torch.eye(4)[None], Ks=Ks, width=8, height=5).every(2, first=(1, 0))
-    assert (found.width, found.height, found.stride) == (4, 3, 2)
+    assert (found.width, found.height, found.strides) == (4, 3, (2,))
     assert found.Ks[0].tolist() == [[5, 0, 1.75], [0, 6, 1.75], [0, 0, 1]]
     slope = (3.5 - 4) / 10
     assert 5 * slope + 1.75 == 1.5
-    assert found.every(2).stride == 4
+    assert found.every(2).strides == (4,)
 
 
 def test_interleaved_cameras_start_at_their_own_first_pixels():
@@ -83,7 +85,7 @@ def test_interleaved_cameras_start_at_their_own_first_pixels():
     one = Cameras(viewmats=torch.eye(4)[None], Ks=Ks, width=8, height=5)
     five = one.select(torch.zeros(5, dtype=torch.int64))
     found = five.interleaved(2)
-    assert (found.width, found.height, found.stride) == (4, 2, 2)
+    assert (found.width, found.height, found.strides) == (4, 2, (2,) * 5)
     for camera, first in zip(found.Ks, [(0, 0), (1, 0), (0, 1), (1, 1), (0, 0)], strict=True):
         assert torch.equal(camera, one.every(2, first=first).Ks[0])
     assert five.interleaved(1) is five
@@ -139,6 +141,19 @@ def test_whether_a_point_is_in_an_image(point, is_seen):
     assert Cameras(**GOOD).shows_any(points) is is_seen
 
 
+def test_about_every_second_camera_sees_a_larger_image():
+    four = Cameras(**GOOD).select(torch.zeros(4, dtype=torch.int64))
+    found = four.in_two_sizes(3)
+    assert found.strides == (1, 3, 3, 1)
+    assert found.every(2).strides == (2, 6, 6, 2)
+    assert four.every(2).in_two_sizes(3).strides == (2, 6, 6, 2)
+    assert found.select(torch.tensor([3, 2])).strides == (1, 3)
+    assert [single.strides for single in found.singles()] == [(1,), (3,), (3,), (1,)]
+    assert torch.equal(found.Ks, four.Ks)
+    assert (found.width, found.height) == (four.width, four.height)
+    assert four.in_two_sizes(1) is four
+
+
 def test_about_every_third_camera_ignores_the_tag():
     four = Cameras(**GOOD).select(torch.zeros(4, dtype=torch.int64)).in_both_modes()
     assert four.ignores_tag == (False, False, True, False)
@@ -151,8 +166,11 @@ def test_about_every_third_camera_ignores_the_tag():
 
 @pytest.mark.parametrize("step", [1, 7, 8, 9, 10])
 def test_held_out_cameras_are_of_both_kinds(step):
-    many = Cameras(**GOOD).select(torch.zeros(300, dtype=torch.int64)).in_both_modes()
-    modes = many.ignores_tag[step // 2 :: step]
+    many = Cameras(**GOOD).select(torch.zeros(300, dtype=torch.int64))
+    many = many.in_two_sizes(2).in_both_modes()
+    modes, strides = many.ignores_tag[step // 2 :: step], many.strides[step // 2 :: step]
     assert sum(modes) / len(modes) == pytest.approx(1 / 3, abs=0.07)
+    assert strides.count(2) / len(strides) == pytest.approx(1 / 2, abs=0.07)
     for first in range(0, len(modes) - 8):
         assert len(set(modes[first : first + 8])) == 2
+        assert len(set(strides[first : first + 8])) == 2

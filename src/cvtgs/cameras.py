@@ -23,8 +23,9 @@ class Cameras:
         width: Image width, pixels.
         height: Image height, pixels.
         names: Name of each camera, such as its photograph's file name; empty if they have none.
-        stride: If above 1, the images hold every ``stride``-th pixel of finer ones, in both
-            directions; ``Ks``, width and height are those of the coarser grid (:meth:`every`).
+        strides: For each camera, a number s: its image holds every s-th pixel of a finer one, in
+            both directions, and is as sharp (:meth:`every`); ``Ks``, width and height are those of
+            the coarser grid. Empty if all are 1.
         ignores_tag: For each camera, whether images of scenes tagged ``SplatRenderMode: mip`` lack
             its opacity compensation, as in viewers that ignore the tag; empty if no camera does.
 
@@ -44,7 +45,7 @@ class Cameras:
     width: int
     height: int
     names: tuple[str, ...] = ()
-    stride: int = 1
+    strides: tuple[int, ...] = ()
     ignores_tag: tuple[bool, ...] = ()
 
     def __post_init__(self) -> None:
@@ -68,10 +69,13 @@ class Cameras:
                 f"viewmats and Ks must share device and dtype, found {self.viewmats.dtype} on "
                 f"{self.viewmats.device} and {self.Ks.dtype} on {self.Ks.device}."
             )
-        for name in ("width", "height", "stride"):
+        for name in ("width", "height"):
             _check_whole(getattr(self, name), name)
+        for stride in self.strides:
+            _check_whole(stride, "every stride")
         for name, values, entry in (
             ("names", self.names, "name"),
+            ("strides", self.strides, "stride"),
             ("ignores_tag", self.ignores_tag, "choice"),
         ):
             if values and len(values) != count:
@@ -108,15 +112,16 @@ class Cameras:
         """
         device = rows.device if isinstance(rows, Tensor) else torch.device("cpu")
         rows = row_numbers(rows, len(self), things="cameras", device=device)
-        names, ignores_tag = (
+        names, strides, ignores_tag = (
             tuple(values[row] for row in rows.tolist()) if values else ()
-            for values in (self.names, self.ignores_tag)
+            for values in (self.names, self.strides, self.ignores_tag)
         )
         return replace(
             self,
             viewmats=self.viewmats[rows],
             Ks=self.Ks[rows],
             names=names,
+            strides=strides,
             ignores_tag=ignores_tag,
         )
 
@@ -225,7 +230,33 @@ class Cameras:
         Ks = self.Ks.clone()  # noqa: N806 (the name that gsplat gives it)
         Ks[:, :2] /= stride
         Ks[:, :2, 2] += 0.5 - (firsts + 0.5) / stride
-        return replace(self, Ks=Ks, width=width, height=height, stride=self.stride * stride)
+        strides = tuple(before * stride for before in self.strides or (1,) * len(self))
+        return replace(self, Ks=Ks, width=width, height=height, strides=strides)
+
+    def in_two_sizes(self, factor: int) -> Self:
+        """Return cameras of which about every second one sees pixels of a larger image.
+
+        Its image is as sharp as one that is ``factor`` times as wide and high, and has as many
+        pixels as before. What fits images of both kinds fits screens of both sizes, while splats
+        are wider in small images. Multiples of an irrational number decide which cameras these are.
+
+        Args:
+            factor: Ratio of the two sizes; 1 changes nothing.
+
+        Returns:
+            The same cameras otherwise.
+
+        Raises:
+            InvalidArgumentError: The factor is no whole number above 0.
+        """
+        _check_whole(factor, "factor")
+        if factor == 1:
+            return self
+        strides = tuple(
+            stride * (factor if math.sqrt(3.0) * row % 1.0 < 0.5 else 1)
+            for row, stride in enumerate(self.strides or (1,) * len(self), start=1)
+        )
+        return replace(self, strides=strides)
 
     def in_both_modes(self) -> Self:
         """Return cameras of which about every third one ignores the tag ``SplatRenderMode: mip``.

@@ -20,13 +20,13 @@ from refine_cases import ring
 BLOCKS = 2
 MATCHED = {
     "preset": "matched",
-    "visibility": {"views": 6, "size": 48, "given_size": 48, "stride": 1},
+    "visibility": {"views": 6, "size": 48, "stride": 1},
     "match": {"color_iterations": 6},
     "refine": {"steps": 0},
 }
 REFINED = MATCHED | {
     "preset": "high",
-    "refine": {"steps": 12, "size": 48, "given_size": 48, "images": 6, "check_every": 6},
+    "refine": {"steps": 12, "size": 48, "images": 6, "check_every": 6},
 }
 
 

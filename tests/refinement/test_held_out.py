@@ -1,5 +1,7 @@
 """Held-out images: which they are, their size, and how they decide; what a step compares."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -26,23 +28,27 @@ def test_thinned_views_start_at_every_first_pixel_in_turn():
     assert shifts == [(0, 0), (-0.5, 0), (0, -0.5), (-0.5, -0.5), (0, 0)]
 
 
-@pytest.mark.parametrize(
-    ("width", "side", "stride"), [(24, 24, 2), (32, 32, 2), (50, 50, 3), (64, 64, 4), (200, 64, 4)]
-)
-def test_given_cameras_keep_their_size_up_to_a_limit(width, side, stride):
-    """Matching and refinement use the same images, of about as many pixels as generated ones."""
+@pytest.mark.parametrize(("width", "side"), [(16, 22), (24, 24), (32, 32), (200, 32)])
+def test_images_are_of_two_sizes(width, side):
+    """About half are as sharp as larger ones, which steps then see fewer pixels of."""
     full, cameras = full_scene(50), ring(16, width=width, height=width)
-    sizes = {"size": 32, "stride": 2, "given_size": 64}
+    sizes = {"size": 32, "stride": 2, "fine_factor": 3}
     config = SimplifyConfig.from_mapping({"visibility": {"views": 8, **sizes}})
-    pixels = max(11, side // stride)
-    seen = visibility_cameras(full, config, cameras=cameras)
-    assert (seen.width, seen.stride) == (pixels, stride)
-    views = split_views(cameras, config=quick(**sizes), seed=0)
-    assert next(views.training).width == max(side, 11 * stride)
-    assert views.stride == stride
-    assert {camera.stride for camera in views.heldout} == {stride}
-    generated = generated_views(full, config=quick(**sizes), seed=0)
-    assert (next(generated.training).width, generated.stride) == (32, 2)
+    for given, side_then in ((cameras, side), (None, 32)):
+        seen = visibility_cameras(full, config, cameras=given)
+        assert (seen.width, set(seen.strides)) == (side_then // 2, {2, 6})
+        if given is None:
+            views = generated_views(full, config=quick(**sizes), seed=0)
+        else:
+            views = split_views(given, config=quick(**sizes), seed=0)
+        training = [next(views.training) for _ in range(8)]
+        assert {camera.width for camera in training} == {side_then}
+        assert {camera.strides for camera in training} == {(1,), (3,)}
+        assert {camera.strides for camera in views.heldout} <= {(2,), (6,)}
+        images = ImageBuffer(full, replace(views, training=iter(training)), config=quick(), seed=0)
+        drawn = [images.draw().camera for _ in training]
+        assert [camera.strides[0] for camera in drawn] == [2 * one.strides[0] for one in training]
+        assert {camera.width for camera in drawn} == {side_then // 2}
 
 
 def optimized(small, full, config, *, cameras, steps):

@@ -238,7 +238,7 @@ def test_the_pixels_of_a_step_equal_those_of_the_whole_image():
 def test_held_out_views_are_thinned_like_training_images():
     full = full_scene(50)
     views = generated_views(full, config=quick(size=48, stride=2), seed=0)
-    assert all(camera.stride == 2 for camera in views.heldout)
+    assert all(camera.strides == (2,) for camera in views.heldout)
     assert {(camera.width, camera.height) for camera in views.heldout} == {(24, 24)}
     assert next(views.training).width == 48
     tiny = generated_views(full, config=quick(size=16, stride=3), seed=0)
@@ -274,7 +274,7 @@ def test_observed_images_come_first_and_every_eighth_is_held_out():
     given = {tuple(camera.viewmats.flatten().tolist()) for camera in observed.cameras.singles()}
     known = [tuple(image.camera.viewmats.flatten().tolist()) in given for image in drawn]
     assert known == [True] * 49 + [False]
-    assert {image.camera.stride for image in drawn} == {2}
+    assert {image.camera.strides for image in drawn} == {(2,)}
     held = {tuple(image.camera.viewmats.flatten().tolist()) for image in views.heldout_images}
     assert not held & {tuple(image.camera.viewmats.flatten().tolist()) for image in drawn}
     exact = render_view(full, drawn[0].camera)
@@ -289,7 +289,7 @@ def test_no_view_is_searched_before_it_is_needed(monkeypatch):
         observed, full, None, config=quick(steps_per_image=9), seed=0
     )
     images = ImageBuffer(full, views, config=quick(steps_per_image=9), seed=0)
-    assert [images.draw().camera.stride for _ in range(8)] == [1] * 8
+    assert [images.draw().camera.strides for _ in range(8)] == [()] * 8
     with pytest.raises(TypeError):
         images.draw()
 

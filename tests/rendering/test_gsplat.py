@@ -13,7 +13,7 @@ import gsplat_stand_in
 from cvtgs import GaussianScene
 from cvtgs.cameras import Cameras
 from cvtgs.errors import MissingDependencyError
-from cvtgs.rendering import choose_backend, contributions, gsplat_backend, render
+from cvtgs.rendering import choose_backend, contributions, gsplat_backend, projection, render
 from render_cases import MIP, around, oracle_images, scene_of, straight
 from scenes import random_scene
 
@@ -272,6 +272,20 @@ def test_cameras_that_treat_the_tag_differently_are_rendered_one_by_one(monkeypa
     single = (1, "antialiased")
     assert modes == [(3, "antialiased"), (3, "classic"), single, single, (1, "classic")]
     assert output.rgb.shape == (3, cameras.height, cameras.width, 3)
+
+
+def test_cameras_of_two_sizes_are_rendered_one_by_one(monkeypatch):
+    widened = []
+
+    def rasterization(**options):
+        widened.append((len(options["viewmats"]), options["eps2d"]))
+        return gsplat_stand_in.rasterization(**options)
+
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
+    gsplat_backend.rasterize(random_scene(5), around(2).every(2), sh_degree=0)
+    gsplat_backend.rasterize(random_scene(5), around(2).in_two_sizes(2), sh_degree=0)
+    dilation = projection.DILATION
+    assert widened == [(2, dilation / 4), (1, dilation), (1, dilation / 4)]
 
 
 def documented(scene, cameras, **options):

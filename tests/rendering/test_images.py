@@ -129,6 +129,18 @@ def test_a_camera_may_ignore_the_tag(backend):
     assert torch.equal(ours, theirs)
 
 
+@backends
+def test_cameras_may_be_of_two_sizes(backend):
+    """Every third pixel of a larger image, and an image of its own, are rendered together."""
+    scene, cameras = random_scene(20), around(2, 18, 12)
+    both = replace(cameras, strides=(1, 3))
+    found = render(scene, both, backend=backend).rgb
+    assert torch.equal(found[0], render(scene, cameras, backend=backend).rgb[0])
+    larger = cameras.resized(54, 36).every(3, first=(1, 1))
+    torch.testing.assert_close(found[1], render(scene, larger, backend=backend).rgb[1])
+    assert not torch.allclose(found[1], render(scene, cameras, backend=backend).rgb[1], atol=1e-3)
+
+
 # Shapes
 
 

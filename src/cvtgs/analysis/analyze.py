@@ -185,18 +185,19 @@ def visibility_cameras(
         cameras: Cameras to choose from; None generates views.
 
     Returns:
-        The cameras of images of every second, third, ... pixel, as the configuration says; about
-        every third one ignores the tag mip.
+        The cameras of images of every second, third, ... pixel, as the configuration says, in two
+        sizes; about every third one ignores the tag mip.
     """
     choices = config.visibility
+    least = SSIM_WINDOW * choices.stride
     if cameras is None:
-        stride = choices.stride
-        side = max(choices.size, SSIM_WINDOW * stride)
+        side = max(choices.size, least)
         views = mixed_views(scene, choices.views, size=side, seed=config.seed)
     else:
-        side, stride = choices.size_and_stride(max(cameras.width, cameras.height))
-        views = cameras.spread(choices.views).fitted(side, least=SSIM_WINDOW * stride)
-    return views.interleaved(stride).in_both_modes()
+        side = min(choices.size, max(cameras.width, cameras.height))
+        views = cameras.spread(choices.views).fitted(side, least=least)
+    views = views.interleaved(choices.stride).in_two_sizes(choices.fine_factor)
+    return views.in_both_modes()
 
 
 def measured_areas(

@@ -157,31 +157,13 @@ class ImageSection(Section):
     Attributes:
         size: Longer side of the images, pixels.
         stride: Only every ``stride``-th pixel is used, along rows and columns.
-        given_size: Longer side of the images of given cameras, as far as they are as large, with a
-            stride in proportion; 0 for ``size``.
+        fine_factor: About every second image is as sharp as one of ``fine_factor`` times the size;
+            1 for none.
     """
 
     size: int = pydantic.Field(default=128, ge=16)
     stride: Count = 1
-    given_size: int = pydantic.Field(default=0, ge=0)
-
-    def size_and_stride(self, longer: int) -> tuple[int, int]:
-        """Return the longer side and the stride of images of given cameras.
-
-        Args:
-            longer: Longer side of the images that the cameras were made for, pixels.
-
-        Returns:
-            The longer side, at most that of the cameras, and the stride, with which about as many
-            pixels are used as of generated views.
-
-        Example:
-            >>> sizes = RefineConfig(size=400, stride=2, given_size=800)
-            >>> [sizes.size_and_stride(longer) for longer in (300, 400, 640, 1600)]
-            [(300, 2), (400, 2), (640, 3), (800, 4)]
-        """
-        side = min(max(self.size, self.given_size), longer)
-        return side, round(self.stride * max(1.0, side / self.size))
+    fine_factor: Count = 1
 
 
 class VisibilityConfig(ImageSection):
@@ -193,8 +175,8 @@ class VisibilityConfig(ImageSection):
         size: Longer side of the images, pixels.
         stride: Only every ``stride``-th pixel is rendered, along rows and columns, as sharp as in
             the whole image.
-        given_size: Longer side of the images of given cameras, as far as they are as large, with a
-            stride in proportion; 0 for ``size``.
+        fine_factor: About every second image is as sharp as one of ``fine_factor`` times the size,
+            and has as many pixels, so that results fit screens of both sizes; 1 for none.
         mass_share: Share of the apparent mass that still comes from size, opacity and position,
             so that Gaussians that no image shows also count.
     """
@@ -301,8 +283,8 @@ class RefineConfig(ImageSection):
         size: Longer side of the images, pixels; a side below 11 times ``stride`` becomes that.
         stride: Steps and checks use only every ``stride``-th pixel, along rows and columns, as
             sharp as in the whole image: at 2, four times as many steps take the same time.
-        given_size: Longer side of the images of given cameras, as far as they are as large, with a
-            stride in proportion; 0 for ``size``.
+        fine_factor: About every second image is as sharp as one of ``fine_factor`` times the size,
+            and has as many pixels; 1 for none.
         batch: Views that are generated together: a quarter automatic, half random from around the
             scene, a quarter random from near it or within it.
         first_images: Steps at the start that each render a new image of the full scene.

@@ -28,7 +28,7 @@ def unknown_preset(name: object) -> ConfigError:
     return ConfigError(f"preset must be one of {', '.join(PRESETS)}; found {shown(name, 120)}{end}")
 
 
-IMAGES: Mapping[str, Any] = {"size": 400, "stride": 2, "given_size": 600}
+IMAGES: Mapping[str, Any] = {"size": 400, "stride": 2, "fine_factor": 2}
 """Sizes of images, equal for matching and refinement, which share them."""
 
 MATCHED: Mapping[str, Any] = {

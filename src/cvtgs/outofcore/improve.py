@@ -134,7 +134,8 @@ def _choose_views(job: Job, drawn: Drawn) -> BlockViews:
     if matches:
         choices = config.visibility
         views = make(choices.views, size=choices.size, seed=seed)
-        views = views.interleaved(choices.stride).in_both_modes()
+        views = views.interleaved(choices.stride).in_two_sizes(choices.fine_factor)
+        views = views.in_both_modes()
     if refines:
         number = min(config.refine.images, config.refine.steps) + config.refine.heldout
         later = make(max(2, number), size=config.refine.size, seed=seed + LATER_SEED)

@@ -372,7 +372,7 @@ def job_folder(output: str | os.PathLike[str], key: str) -> str:
 def _listed(cameras: Cameras) -> list[object]:
     """Return everything about cameras that a result depends on."""
     matrices = [cameras.viewmats.tolist(), cameras.Ks.tolist()]
-    return [*matrices, cameras.width, cameras.height, cameras.stride, cameras.ignores_tag]
+    return [*matrices, cameras.width, cameras.height, cameras.strides, cameras.ignores_tag]
 
 
 def _not_seen(path: Path) -> RunError:

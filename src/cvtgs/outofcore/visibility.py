@@ -38,10 +38,11 @@ def write_views(job: Job, sample: GaussianScene, *, total: int) -> None:
         {
             "viewmats": cameras.viewmats,
             "Ks": cameras.Ks,
+            "strides": torch.tensor(cameras.strides, dtype=torch.int64),
             "ignores_tag": torch.tensor(cameras.ignores_tag, dtype=torch.bool),
             **add_prefix(SCENE, tensors),
         },
-        {name: str(getattr(cameras, name)) for name in ("width", "height", "stride")},
+        {name: str(getattr(cameras, name)) for name in ("width", "height")},
     )
 
 
@@ -58,7 +59,7 @@ def measure(job: Job, block: int) -> None:
         Ks=tensors["Ks"],
         width=int(facts["width"]),
         height=int(facts["height"]),
-        stride=int(facts["stride"]),
+        strides=tuple(tensors["strides"].tolist()),
         ignores_tag=tuple(tensors["ignores_tag"].tolist()),
     )
     sample = rows.scene.with_tensors(under_prefix(SCENE, tensors), {})

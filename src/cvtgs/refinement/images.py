@@ -33,7 +33,8 @@ class RefineViews:
         endless: Whether ``training`` never ends.
         stride: A step sees every ``stride``-th pixel of a training image.
         heldout_images: Further held-out views, already rendered.
-        images: Training images that are already rendered before the first step.
+        images: Training images that are already rendered before the first step, of which steps see
+            all pixels.
     """
 
     heldout: tuple[Cameras, ...]
@@ -51,7 +52,7 @@ def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> 
 
     def batch(number: int, seed: int) -> list[Cameras]:
         views = mixed_views(positions, number, size=side, seed=seed)
-        return views.in_both_modes().singles()
+        return views.in_two_sizes(config.fine_factor).in_both_modes().singles()
 
     def training() -> Iterator[Cameras]:
         for number in count():
@@ -70,13 +71,14 @@ def split_views(cameras: Cameras, *, config: RefineConfig, seed: int) -> RefineV
             f"a refinement needs at least 2 cameras, one of them to be held out; found "
             f"{len(cameras)}."
         )
-    side, stride = config.size_and_stride(max(cameras.width, cameras.height))
-    views = cameras.fitted(side, least=SSIM_WINDOW * stride).singles()
+    side = min(config.size, max(cameras.width, cameras.height))
+    sized = cameras.fitted(side, least=SSIM_WINDOW * config.stride)
+    views = sized.in_two_sizes(config.fine_factor).singles()
     held = _heldout_rows(len(views), config)
     others = [view for row, view in enumerate(views) if row not in held]
     random.Random(seed).shuffle(others)
-    heldout = _thinned([views[row] for row in held], stride)
-    return RefineViews(heldout=heldout, training=iter(others), endless=False, stride=stride)
+    heldout = _thinned([views[row] for row in held], config.stride)
+    return RefineViews(heldout=heldout, training=iter(others), endless=False, stride=config.stride)
 
 
 def shared_views(
@@ -99,7 +101,7 @@ def shared_views(
         heldout=(),
         training=_further(observed.cameras, full, cameras, config=config, seed=seed),
         endless=cameras is None,
-        stride=observed.cameras.stride,
+        stride=config.stride,
         heldout_images=tuple(images[row] for row in held),
         images=tuple(image.half() for row, image in enumerate(images) if row not in held),
     )
@@ -158,19 +160,19 @@ class ImageBuffer:
         self._capacity = max(1 if always_new else config.images, len(views.images))
         self._first = max(config.first_images, len(views.images))
         self._rng = random.Random(seed)
-        self._kept: list[ViewImage] = list(views.images)
+        self._kept = [(image, 1) for image in views.images]  # with what is left of the stride
         self._drawn = len(self._kept)
         self.rendered = 0
 
     def draw(self) -> ViewImage:
         """Return a training image, in half precision."""
-        image, stride = self._next(), self._stride
-        if image.camera.stride == stride:
+        image, stride = self._next()
+        if stride == 1:
             return image
         first = (self._rng.randrange(stride), self._rng.randrange(stride))
         return image.every(stride, first=first)
 
-    def _next(self) -> ViewImage:
+    def _next(self) -> tuple[ViewImage, int]:
         self._drawn += 1
         later = self._drawn - self._first
         is_due = later <= 0 or later % self._config.steps_per_image == 0
@@ -181,7 +183,7 @@ class ImageBuffer:
             return used
         if len(self._kept) == self._capacity:
             self._kept.pop(self._rng.randrange(len(self._kept)))
-        self._kept.append(render_view(self._full, camera).half())
+        self._kept.append((render_view(self._full, camera).half(), self._stride))
         self.rendered += 1
         return self._kept[-1]
 

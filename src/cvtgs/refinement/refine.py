@@ -63,8 +63,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
     of numba code at its first use on a machine, some ten seconds.
 
     Memory: ten times the small scene, the memory for rendering the full scene, and the reused
-    images (those of given cameras), at most ``8 * size ** 2 * images`` bytes; with given cameras,
-    ``size`` may be ``given_size``.
+    images (those of given cameras), at most ``8 * size ** 2 * images`` bytes.
 
     Args:
         small: The simplified scene; it is not changed.

@@ -60,7 +60,7 @@ def rasterize(
     sh_degree: int,
     listener: ProgressListener = silent,
 ) -> RasterOutput:
-    """Render all cameras at once with gsplat, in float32, if all of them treat tags alike.
+    """Render all cameras at once with gsplat, in float32, if they treat tags and pixels alike.
 
     Memory: that of gsplat, linear in cameras times Gaussians and in intersections.
     """
@@ -68,6 +68,7 @@ def rasterize(
     listener(ProgressEvent(stage=STAGE, done=0, total=len(cameras)))
     if len(scene) and len(cameras):
         are_mixed = scene.antialiased and len(set(cameras.ignores_tag)) > 1
+        are_mixed = are_mixed or len(set(cameras.strides)) > 1
         parts = cameras.singles() if are_mixed else [cameras]
         found = [_rasterize_all(scene, part, sh_degree) for part in parts]
         layers, alpha = (torch.cat(images) for images in zip(*found, strict=True))
@@ -97,7 +98,7 @@ def blending_weights(scene: GaussianScene, camera: Cameras) -> BlendingWeights:
 
 
 def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tuple[Tensor, Tensor]:
-    """Return weighted sums of colours and depths, and alpha; all cameras treat tags alike."""
+    """Return sums of colours and depths, and alpha; all cameras treat tags and pixels alike."""
     rest = scene.shN[:, : REST_COUNTS[sh_degree]]
     if sh_degree:
         colors = torch.cat([scene.sh0, rest], dim=1)
@@ -116,7 +117,7 @@ def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tu
         width=cameras.width,
         height=cameras.height,
         near_plane=NEAR_PLANE,
-        eps2d=DILATION / cameras.stride**2,
+        eps2d=DILATION / max(cameras.strides, default=1) ** 2,
         sh_degree=sh_degree or None,
         packed=False,
         render_mode="RGB+D",

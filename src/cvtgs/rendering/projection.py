@@ -109,7 +109,8 @@ def to_pinholes(cameras: Cameras) -> list[Pinhole]:
     _check(viewmats, Ks)
     centers = -torch.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[:, :, 0]
     modes = cameras.ignores_tag or (False,) * len(cameras)
-    rows = zip(viewmats.tolist(), centers.tolist(), Ks.tolist(), modes, strict=True)
+    strides = cameras.strides or (1,) * len(cameras)
+    rows = zip(viewmats.tolist(), centers.tolist(), Ks.tolist(), strides, modes, strict=True)
     return [
         Pinhole(
             rotation=tuple((row[0], row[1], row[2]) for row in viewmat[:3]),
@@ -117,10 +118,10 @@ def to_pinholes(cameras: Cameras) -> list[Pinhole]:
             focal=(K[0][0], K[1][1]),
             principal=(K[0][2], K[1][2]),
             size=(cameras.width, cameras.height),
-            dilation=DILATION / cameras.stride**2,
+            dilation=DILATION / stride**2,
             ignores_tag=ignores_tag,
         )
-        for viewmat, center, K, ignores_tag in rows
+        for viewmat, center, K, stride, ignores_tag in rows
     ]
 
 
