@@ -10,6 +10,7 @@ from torch import Tensor
 import mergenet_oracle as oracle
 from cvtgs import GaussianScene
 from cvtgs.cells import Descriptors, Partition, align_axes, describe_cells, merge_cells
+from cvtgs.cells.descriptors import LEAST_PIXELS, PIXEL_SCALE
 from cvtgs.config import MergeConfig
 from cvtgs.cvt import nearest_neighbors
 from cvtgs.math.frames import robust_frame
@@ -156,6 +157,11 @@ def lively_net(
 
 def fields_of(residuals: Residuals) -> dict[str, Tensor]:
     return {name: getattr(residuals, name) for name in Residuals.__slots__}
+
+
+def are_corrected(case: "Case") -> Tensor:
+    """Return which cells are large enough in images for the network to correct them."""
+    return case.describe().cells[:, -1] > PIXEL_SCALE * (LEAST_PIXELS - 0.99)
 
 
 def features_of(seen: Descriptors) -> dict[str, Tensor]:

@@ -197,6 +197,18 @@ def test_two_clusters_seen_from_nearby_are_no_worse_than_pruned(preset):
         assert found[0] >= found[1], found
 
 
+def test_the_network_does_not_harm_clusters_that_are_far_apart():
+    """From their middle they would be invisible, so nobody knows their sizes in images."""
+    scene = valid_case(CASES["two_clusters"], 400, torch.float64)
+    ours, plain = (
+        simplifier("standard").simplify(scene, 0.2),
+        simplifier("fast").simplify(scene, 0.2),
+    )
+    cameras = ring(scene.select(torch.arange(0, 400, 2)))
+    found = scores(scene, {"ours": ours, "plain": plain}, cameras)
+    assert found[0] >= found[1] - 0.05, found
+
+
 @presets
 def test_georeferenced_scenes_are_better_than_pruned_in_float64(preset):
     scene = valid_case(CASES["georeferenced"], 200, torch.float64)

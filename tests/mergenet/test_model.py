@@ -10,7 +10,13 @@ import torch
 
 import mergenet_oracle as oracle
 from cvtgs import GaussianScene
-from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES
+from cvtgs.cells.descriptors import (
+    CELL_FEATURES,
+    LEAST_PIXELS,
+    MEMBER_FEATURES,
+    PAIR_FEATURES,
+    PIXEL_SCALE,
+)
 from cvtgs.mergenet import Architecture, KnownRange, MergeNet, Residuals, summarize
 from cvtgs.mergenet.model import MARGIN, MEMBERS, NARROWEST, SUMMARY_FEATURES
 from mergenet_cases import case_of, fields_of, lively_net, some_case, some_labels
@@ -313,6 +319,22 @@ def test_no_residual_for_a_cell_with_a_huge_far_faint_member():
         assert torch.equal(getattr(corrected, name)[cell], values[cell])
     others = torch.arange(12) != cell
     assert not torch.equal(corrected.means[others], odd.merged.means[others])
+
+
+def test_cells_that_are_far_too_small_for_images_stay_unchanged():
+    """Their residuals fade out over a factor of e in size."""
+    descriptors, net = some_case().describe(), lively_net()
+    found = []
+    for size in (0.0, -0.5, -0.9, -1.0, -9.0):
+        cells = descriptors.cells.clone()
+        cells[:, -1] = PIXEL_SCALE * (LEAST_PIXELS + size)
+        with torch.no_grad():
+            residuals = net(replace(descriptors, cells=cells))
+        found.append(float(sum(values.abs().sum() for values in fields_of(residuals).values())))
+    whole, half, tenth, *none = found
+    assert 0.4 < half / whole < 0.6
+    assert 0.05 < tenth / whole < 0.15
+    assert none == [0.0, 0.0]
 
 
 def test_training_cells_keep_their_residuals():

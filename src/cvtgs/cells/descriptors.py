@@ -22,6 +22,9 @@ CELL_FEATURES = 21
 PIXEL_SCALE = 0.3
 """Factor of the logarithm of a size in pixels, the last feature of a cell."""
 
+LEAST_PIXELS = -6.0
+"""Logarithm of the size in pixels of the smallest cells that training scenes have."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Descriptors:

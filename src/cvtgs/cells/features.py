@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cells.descriptors import PIXEL_SCALE, Descriptors
+from cvtgs.cells.descriptors import LEAST_PIXELS, PIXEL_SCALE, Descriptors
 from cvtgs.cells.inflate import project_on_axes, side_cover
 from cvtgs.cells.partition import Partition
 from cvtgs.cells.sample import SampledMembers, sample_members
@@ -361,7 +361,7 @@ def _cell_features(
         torch.linalg.vector_norm(totals.visibility_gradients, dim=1).clamp_max(3.0),
         torch.log1p(nearest),
         torch.full_like(nearest, float(antialiased)),
-        PIXEL_SCALE * (log_scales.mean(dim=1) - math.log(pixel_size)).clamp(-6, 12),
+        PIXEL_SCALE * (log_scales.mean(dim=1) - math.log(pixel_size)).clamp(LEAST_PIXELS - 1, 12),
     )
 
 

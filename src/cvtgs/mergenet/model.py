@@ -11,7 +11,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES, Descriptors
+from cvtgs.cells.descriptors import (
+    CELL_FEATURES,
+    LEAST_PIXELS,
+    MEMBER_FEATURES,
+    PAIR_FEATURES,
+    PIXEL_SCALE,
+    Descriptors,
+)
 from cvtgs.config.base import Record
 from cvtgs.devices import move_together
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
@@ -195,7 +202,7 @@ class MergeNet(CellNetwork):
         others = _pulls(of_pairs, pair_positions, near).unflatten(0, shape).sum(dim=1)
         # Doubled, so that neighbours can turn a cell as much as a gate of 1 does.
         twists = pulls[:, 3:] + 2 * others[:, 3:]
-        known = self.known(summarize(descriptors))
+        known = self.known(summarize(descriptors)) * _visible_share(descriptors.cells[:, -1])
         by_cell = known[:, None]
         return Residuals(
             d_means=(pulls[:, :3] + others[:, :3]) * by_cell,
@@ -263,13 +270,22 @@ def summarize(descriptors: Descriptors) -> Float[Tensor, "m f"]:
     """Return the features of cells, and the means of those of members and neighbours.
 
     Members are weighted by their share of the mass, so that a huge faint member counts. Features
-    of missing neighbours are 0. The last feature of a cell, its size in pixels, is left out: every
-    cell is corrected whatever the size of the images.
+    of missing neighbours are 0. The last feature of a cell, its size in pixels, is left out: cells
+    are corrected whatever the size of the images, unless they are far too small to be seen.
     """
     pairs = descriptors.pairs
     near = pairs.mean(dim=1) if pairs.shape[1] else pairs.new_zeros(len(pairs), pairs.shape[2])
     members = segment_sum(descriptors.members, descriptors.offsets, descriptors.weights)
     return torch.cat([descriptors.cells[:, :-1], members, near], dim=1)
+
+
+def _visible_share(sizes: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
+    """Return 1 for cells of sizes in pixels that training scenes have, and 0 for far smaller ones.
+
+    Such cells would not be seen from where the size of a pixel is measured, so people look at them
+    from nearby, and their size there is unknown.
+    """
+    return (sizes / PIXEL_SCALE - (LEAST_PIXELS - 1)).clamp(0, 1)
 
 
 class KnownRange(nn.Module):
