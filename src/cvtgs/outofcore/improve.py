@@ -132,10 +132,8 @@ def _choose_views(job: Job, drawn: Drawn) -> BlockViews:
     make = partial(mixed_views, find_view_positions(concatenate([members, near])), sharp=False)
     views, later = None, None
     if matches:
-        choices = config.visibility
-        views = make(choices.views, size=choices.size, seed=seed)
-        views = views.interleaved(choices.stride).in_two_sizes(choices.fine_factor)
-        views = views.in_both_modes()
+        views = make(config.visibility.views, size=config.visibility.size, seed=seed)
+        views = visibility_cameras(members, config, cameras=views)
     if refines:
         number = min(config.refine.images, config.refine.steps) + config.refine.heldout
         later = make(max(2, number), size=config.refine.size, seed=seed + LATER_SEED)
