@@ -17,6 +17,16 @@ import pytest
 
 from viewer_pages import Pictured, Served, pictured_scene
 
+SLOW_EXAMPLES = {"cvtgs.tradeoff.measure.measure_tradeoff", "cvtgs.train.loop.train"}
+"""Examples of docstrings that take more than a second."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the slow examples, which cannot carry a marker themselves."""
+    for item in items:
+        if item.name in SLOW_EXAMPLES:
+            item.add_marker("slow")
+
 
 @pytest.fixture
 def coarse_light(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,6 +22,7 @@ print(json.dumps([found, "torch" in sys.modules, gc.isenabled(), gc.get_freeze_c
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("given", "wanted"),
     [

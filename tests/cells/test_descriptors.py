@@ -88,6 +88,7 @@ def test_descriptors_equal_the_oracle(seed, tagged, near):
         np.testing.assert_allclose(seen.pair_positions, places, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_large_cells_are_described_by_a_sample():
     """Totals of all 300 members of each cell are estimated; the number of members is exact."""
     case = some_case(900, 3)

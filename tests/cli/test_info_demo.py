@@ -1,5 +1,7 @@
 """``cvtgs info`` and ``cvtgs demo``."""
 
+import pytest
+
 import cvtgs
 from cvtgs.cli import demo
 from cvtgs.cli.display import size_text
@@ -78,6 +80,7 @@ def test_info_of_a_shipped_checkpoint_and_of_a_damaged_one(tmp_path, capsys):
     assert "not a safetensors file, or it is damaged" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_demo_writes_three_scenes_and_a_page_and_prints_next_steps(tmp_path, capsys, monkeypatch):
     for name, value in (("VIEWS", 2), ("WIDTH", 64), ("HEIGHT", 48)):
         monkeypatch.setattr(demo, name, value)

@@ -38,6 +38,7 @@ def test_steps_are_in_the_report_and_the_summary(source, tmp_path, capsys):
     assert " refine " in " ".join(printed.split())
 
 
+@pytest.mark.slow
 def test_refine_stops_at_its_time_limit_or_earlier(source, tmp_path):
     report = tmp_path / "report.json"
     words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.1"]

@@ -52,6 +52,7 @@ def squared_error(scene, small, cameras):
     return float((images[0] - images[1]).square().mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [MATCHED, REFINED])
 def test_given_cameras_decide_what_blocks_look_like(scene, source, tmp_path, settings):
     """The cameras stand on one side; from there, their result is nearer to the scene."""
@@ -159,6 +160,7 @@ def two_blocks(monkeypatch):
         monkeypatch.setattr(f"{module}.block_count", lambda rows, memory: BLOCKS)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("two_blocks")
 @pytest.mark.parametrize("is_given", [True, False])
 def test_cameras_of_a_capture_are_used_in_blocks(capsys, tmp_path, scene, is_given):

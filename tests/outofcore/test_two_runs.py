@@ -68,6 +68,7 @@ def test_an_unreadable_lock_is_reported_as_another_process(tmp_path):
                 output_lock(path).__enter__()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kills as POSIX does")
 def test_the_lock_of_a_killed_process_is_free(tmp_path):
     path = tmp_path / "out.ply"

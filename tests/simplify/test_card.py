@@ -66,6 +66,7 @@ def test_levels_and_protected_regions():
     assert same_bits(small.select(torch.arange(25)), scene.select(keep))
 
 
+@pytest.mark.slow
 def test_images_and_gradients_match_those_of_the_cpu():
     scene = made(100)
     cameras = automatic_views(scene, 1, width=48, height=32)

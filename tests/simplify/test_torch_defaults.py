@@ -74,7 +74,10 @@ def through_a_file(scene, folder):
 
 
 @settings
-@pytest.mark.parametrize("work", [simplify, simplify_by_images, simplify_as_published])
+@pytest.mark.parametrize(
+    "work",
+    [simplify, pytest.param(simplify_by_images, marks=pytest.mark.slow), simplify_as_published],
+)
 def test_simplification(scene, setting, work):
     wanted = work(scene)
     with setting():

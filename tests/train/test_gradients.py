@@ -43,6 +43,7 @@ def results_of(config: TrainConfig, cache: Path, step: int = 3) -> list[gradient
         return compute(small_net(), step)
 
 
+@pytest.mark.slow
 def test_the_cases_of_a_step_differ_and_are_the_same_every_time(scenes, cache):
     config = config_of(scenes, cases_per_step=4)
     results = results_of(config, cache)
@@ -57,6 +58,7 @@ def test_the_first_case_of_a_step_does_not_depend_on_their_number(scenes, cache)
     assert (len(one), len(two)) == (1, 2)
 
 
+@pytest.mark.slow
 def test_processes_compute_what_one_does(scenes, cache, monkeypatch):
     config = config_of(scenes, cases_per_step=2)
     alone = results_of(config, cache)
@@ -90,6 +92,7 @@ def test_a_step_follows_the_mean_gradient(scenes, cache, tmp_path, monkeypatch):
         torch.testing.assert_close(gradient, (one + other) / 2)
 
 
+@pytest.mark.slow
 def test_a_resumed_training_of_several_cases_gives_the_same_bits(scenes, cache, tmp_path):
     config = config_of(scenes, cases_per_step=3, steps=4)
     run(config, tmp_path / "whole.safetensors", cache)

@@ -154,6 +154,7 @@ def test_a_second_training_names_the_first(trained, tmp_path):
     assert not torch.equal(first.net.known.low, second.net.known.low)
 
 
+@pytest.mark.slow
 def test_the_known_range_is_that_of_the_training_cases(trained):
     """Most training cells are within it; very different cells are not."""
     known = load_checkpoint(trained.files.checkpoint).net.known
@@ -171,6 +172,7 @@ def test_curves_are_an_image(trained):
     assert content[:8] == b"\x89PNG\r\n\x1a\n"
 
 
+@pytest.mark.slow
 def test_no_other_files_are_left_behind(trained):
     folder = Path(trained.files.checkpoint).parent
     names = {path.name for path in folder.iterdir()}

@@ -75,6 +75,7 @@ def test_validations_run_at_every_interval_and_at_the_end(scenes, cache, tmp_pat
     assert all(math.isfinite(entry.loss) for entry in later)
 
 
+@pytest.mark.slow
 def test_progress_is_reported_for_scenes_and_steps(scenes, cache, tmp_path):
     events: list[ProgressEvent] = []
     run(config_of(scenes, steps=3), tmp_path / "net.safetensors", cache, listener=events.append)

@@ -68,6 +68,7 @@ def test_scenes_of_few_gaussians_are_coarse_from_everywhere():
     assert torch.equal(clutter.split_by_clutter(scene, find_layout(scene), eyes)[0], eyes)
 
 
+@pytest.mark.slow
 def test_an_outdoor_place_without_clutter_keeps_its_positions():
     """Its sample alone would look coarse: grass and walls are thinned, haze is not."""
     scene = cvtgs.synthetic.scene("courtyard", 30_000, sh_degree=0, seed=0)
