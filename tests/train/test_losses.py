@@ -3,6 +3,7 @@
 import math
 import random
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,9 +11,10 @@ import torch
 import cvtgs
 from cvtgs.evaluation import psnr
 from cvtgs.losses import image_loss
-from cvtgs.rendering import render
+from cvtgs.rendering import Rendering, render
+from cvtgs.scene import ANTIALIASED_TAG
 from cvtgs.train import LossConfig
-from cvtgs.train.cases import TargetViews
+from cvtgs.train.cases import TargetViews, render_views
 from cvtgs.train.losses import local_loss, scene_loss, validation_psnr, view_loss
 from cvtgs.views import mixed_views
 from mergenet_cases import lively_net
@@ -123,6 +125,27 @@ def test_the_network_is_given_sizes_in_pixels_of_the_images(size):
     distances = (found[:, None] - every).abs().amin(dim=1)
     assert len(found) > 5
     assert float(distances.amax()) < 1e-6
+
+
+@pytest.mark.parametrize(("tagged", "share"), [(True, 0.5), (False, 0.25)])
+def test_half_of_the_images_of_a_tagged_scene_ignore_the_tag(tagged, share, monkeypatch):
+    """Of the four images of this scene, one ignores it."""
+    seen: list[bool] = []
+
+    def watched(scene, cameras, **options):
+        seen.extend(cameras.ignores_tag)
+        return Rendering(
+            rgb=torch.zeros(1, 32, 32, 3), alpha=torch.zeros(1, 32, 32), depth=None, backend=""
+        )
+
+    monkeypatch.setattr("cvtgs.train.losses.render", watched)
+    case, views = some_case(), render_views(small_scene(), 4, size=32, seed=0)
+    merged = replace(case.reference.merged, comments=(ANTIALIASED_TAG,) if tagged else ())
+    case = replace(case, reference=case.reference._replace(merged=merged))
+    assert sum(views.cameras.ignores_tag) == 1
+    for seed in range(80):
+        scene_loss(small_net(), case, views, config=config_of(), rng=random.Random(seed))
+    assert sum(seen) / len(seen) == pytest.approx(share, abs=0.1)
 
 
 @pytest.mark.parametrize("length", [1, 40, 200])

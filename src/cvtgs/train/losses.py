@@ -82,7 +82,7 @@ class _Shot(NamedTuple):
     @classmethod
     def draw(cls, views: TargetViews, side: int, case: Case, rng: random.Random) -> "_Shot":
         background = _background(rng, case)
-        view = views.select(rng.randrange(len(views.cameras)))
+        view = views.select(_draw_view(views, case, rng))
         last = max(0, view.cameras.width - side)
         top, left = rng.randint(0, last), rng.randint(0, last)
         return cls(view, background, slice(top, top + side), slice(left, left + side))
@@ -102,6 +102,19 @@ class _Shot(NamedTuple):
             height=min(self.rows.stop, camera.height) - self.rows.start,
             ignores_tag=camera.ignores_tag,
         )
+
+
+def _draw_view(views: TargetViews, case: Case, rng: random.Random) -> int:
+    """Draw an image; of a scene tagged ``SplatRenderMode: mip``, one that ignores it half the time.
+
+    Otherwise the network would serve viewers that honour the tag at the cost of the others.
+    """
+    numbers: Sequence[int] = range(len(views.cameras))
+    modes = views.cameras.ignores_tag
+    if case.reference.merged.antialiased and len(set(modes)) > 1:
+        mode = rng.random() < 0.5
+        numbers = [number for number in numbers if modes[number] == mode]
+    return rng.choice(numbers)
 
 
 def _seen_cells(case: Case, cameras: Sequence[Cameras]) -> Int[Tensor, "s"]:
