@@ -233,7 +233,13 @@ def test_an_unwritable_stderr_does_not_change_the_exit_status(tmp_path, words, s
 
 @pytest.mark.skipif(os.name != "posix", reason="closes pipes as POSIX does")
 @pytest.mark.usefixtures("buffering")
-@pytest.mark.parametrize("words", [["--version"], ["convert", "a.ply", "-", "--quiet"]])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--version"],
+        pytest.param(["convert", "a.ply", "-", "--quiet"], marks=pytest.mark.slow),
+    ],
+)
 def test_a_closed_pipe_exits_with_141_and_no_message(tmp_path, words):
     cvtgs.save(cvtgs.synthetic.scene("object", 20, sh_degree=0, seed=0), tmp_path / "a.ply")
     reading, writing = os.pipe()

@@ -73,6 +73,7 @@ def test_invalid_limits_are_refused_before_the_work(tmp_path, capsys, words, tex
     assert capsys.readouterr().err == f"cvtgs: error: {text}\n"
 
 
+@pytest.mark.slow
 def test_an_interrupt_leaves_no_output(source, tmp_path, capsys, monkeypatch):
     module = import_module("cvtgs.refinement.optimize")
     honest, calls = module.relative_loss, []

@@ -122,7 +122,7 @@ def test_an_empty_site_gets_a_point_that_its_cell_can_spare():
     assert filled.squared.tolist() == pytest.approx([4.9**2, 0.04, 0.1])
 
 
-@pytest.mark.parametrize("blocks", [2, 8])
+@pytest.mark.parametrize("blocks", [2, pytest.param(8, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("make", [ball, duplicates])
 def test_a_site_without_points_gets_a_near_one(tmp_path, make, blocks):
     """A far point would make a huge cell; seeds that coincide leave sites without points."""

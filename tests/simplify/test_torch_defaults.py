@@ -93,6 +93,7 @@ def test_files_and_rows(scene, setting, tmp_path):
     assert all(same_bits(one, other) for one, other in zip(found, wanted, strict=True))
 
 
+@pytest.mark.slow
 @settings
 @pytest.mark.parametrize("find", [automatic_views, mixed_views])
 def test_views(scene, setting, find):

@@ -143,7 +143,7 @@ def test_half_of_the_images_of_a_tagged_scene_ignore_the_tag(tagged, share, monk
     merged = replace(case.reference.merged, comments=(ANTIALIASED_TAG,) if tagged else ())
     case = replace(case, reference=case.reference._replace(merged=merged))
     assert sum(views.cameras.ignores_tag) == 1
-    for seed in range(80):
+    for seed in range(50):
         scene_loss(small_net(), case, views, config=config_of(), rng=random.Random(seed))
     assert sum(seen) / len(seen) == pytest.approx(share, abs=0.1)
 
