@@ -4,6 +4,7 @@ import json
 import math
 import os
 import time
+from functools import partial
 
 import pytest
 
@@ -80,10 +81,24 @@ def test_seconds_that_follow_the_features_are_predicted_exactly(model, name):
     wanted = 0.11 + 1e-6 * (4_200_000 + 40_000 + pairs) + 2e-7 * search
     wanted += 0.1 * (name == "standard")
     assert model.seconds(work, config) == pytest.approx(wanted, rel=1e-3)
-    stages = {"check", "plan", "filter", "weigh", "tessellate", "allocate", "merge"}
-    stages |= {"something new"}
-    wanted_stages = stages | {"network"} if name == "standard" else stages
+    parts = {"check", "plan", "filter", "weigh", "tessellate", "allocate", "merge", "something new"}
+    wanted_stages = parts | {"network"} if name == "standard" else parts
     assert set(model.stage_seconds(work, config)) == wanted_stages
+
+
+def test_trials_that_the_prior_does_not_fit_tell_the_speed_of_the_machine_only(model):
+    """Views of these trials take half as long again as the prior predicts, on any machine."""
+
+    def times(speed: float, config, scene, count) -> dict[str, float]:
+        seconds = {name: speed * one for name, one in made_up(config, scene, count).items()}
+        return {name: one * (1 + (name == "visibility") / 2) for name, one in seconds.items()}
+
+    odd = calibrate(partial(times, 1.0), trials=SMALL_TRIALS, prior=NO_PRIOR)
+    prior = model.model_copy(update={"trials": odd.trials})
+    found = calibrate(partial(times, 2.0), trials=SMALL_TRIALS, prior=prior)
+    work, high = Work(count=100_000, target=1000), preset("high")
+    seen, wanted = (one.stage_seconds(work, high)["visibility"] for one in (found, model))
+    assert seen == pytest.approx(2 * wanted, rel=0.1)
 
 
 def test_the_cost_of_many_images_is_extrapolated_from_few(model):

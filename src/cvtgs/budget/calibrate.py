@@ -7,7 +7,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -51,7 +51,7 @@ CANDIDATES = tuple(name for name in PRESETS if name != "paper")
 RENDERERS = ("gsplat", "numba")
 """Packages that render faster than torch; not imported to check, as that can outlast a run."""
 
-VERSION: Literal[6] = 6
+VERSION: Literal[7] = 7
 """Version of the cache file; raised when features change, so that older files are replaced."""
 
 SHIPPED_RATES = "rates.json"
@@ -127,7 +127,7 @@ Of fewer than eight images, matching would hold out all instead of every eighth.
 class CachedModel(Record, allow_inf_nan=False):
     """The content of the cache file."""
 
-    version: Literal[6]
+    version: Literal[7]
     key: dict[str, str]
     made: float
     model: CostModel
@@ -317,6 +317,7 @@ def calibrate(
                 best[row][stage] = min(seconds, best[row].get(stage, seconds))
             spent[row] += clock() - begin
         listener(ProgressEvent(stage=STAGE, done=number + 1, total=total))
+    prior = prior or shipped_model()
     measured = [
         Measurement(
             work=Work.of(scene, target_count(len(scene), trial.rho)),
@@ -324,15 +325,38 @@ def calibrate(
             seconds=stages,
         )
         for trial, scene, stages in zip(trials, scenes, best, strict=True)
-        if stages
     ]
+    if len(prior.trials) == len(trials):
+        measured = [
+            replace(one, seconds=_without_misfit(one, prior, there))
+            for one, there in zip(measured, prior.trials, strict=True)
+        ]
     starts = {
         with_images: min(max(loading[row] - sum(best[row].values()), 0.0), MOST_START_SECONDS)
         for with_images, row in first.items()
     }
-    return CostModel.fit(
+    model = CostModel.fit(
         measured,
-        prior=prior or shipped_model(),
+        prior=prior,
         start=starts.get(False, 0.0),
         image_start=starts.get(True, 0.0),
     )
+    return model.model_copy(update={"trials": tuple(best)})
+
+
+def _without_misfit(
+    one: Measurement, prior: CostModel, there: Mapping[str, float]
+) -> dict[str, float]:
+    """Return what the prior would predict for a trial on a machine as fast as this one.
+
+    The prior does not fit each trial exactly, so a trial that takes longer than it predicts may
+    take as long as on the machine of the prior: only the ratio of both measurements tells the
+    speed. ``there`` has the seconds on that machine, by stage.
+    """
+    predicted = prior.stage_seconds(one.work, one.config)
+    return {
+        stage: predicted[stage] * seconds / there[stage]
+        if stage in predicted and there.get(stage)
+        else seconds
+        for stage, seconds in one.seconds.items()
+    }

@@ -153,11 +153,13 @@ class CostModel(Record, allow_inf_nan=False):
             follow from the configuration.
         start: Additional seconds of the first simplification of a process, for loading libraries.
         image_start: The same for libraries that only configurations with images need.
+        trials: Seconds of each trial of a calibration, by stage.
     """
 
     rates: dict[str, dict[str, pydantic.NonNegativeFloat]]
     start: pydantic.NonNegativeFloat = 0.0
     image_start: pydantic.NonNegativeFloat = 0.0
+    trials: tuple[dict[str, pydantic.NonNegativeFloat], ...] = ()
 
     @classmethod
     def fit(
