@@ -103,7 +103,6 @@ def shipped_rates() -> CostModel:
         for rho in ratios
         if count <= MOST_WITH_IMAGES or not images(preset)
     ]
-    first = len(trials)
     trials += TRIALS
     kind, count, degree = SCENES[1]
     trials.append(
@@ -112,7 +111,8 @@ def shipped_rates() -> CostModel:
     model = calibrate(
         measured_seconds("cpu"), prior=CostModel(rates={}), trials=trials, cpu=lambda: 0.0
     )
-    return model.model_copy(update={"trials": model.trials[first : first + len(TRIALS)]})
+    of_calibrations = {trial.name: model.trials[trial.name] for trial in TRIALS}
+    return model.model_copy(update={"trials": of_calibrations})
 
 
 def images(preset: str) -> dict[str, int]:

@@ -5,7 +5,8 @@ import math
 import pytest
 
 from cvtgs import SimplifyConfig
-from cvtgs.budget import CostModel, Work
+from cvtgs.budget import CostModel, Work, shipped_model
+from cvtgs.budget.calibrate import TRIALS
 from cvtgs.budget.costs import Measurement, fit_rates
 
 
@@ -83,3 +84,12 @@ def test_a_refinement_with_images_of_its_own_renders_held_out_ones_too(name):
     views = shared.visibility.views
     assert counts[0] == refine.new_images(refine.steps, given=views - refine.heldout_of(views))
     assert counts[1] == refine.new_images(refine.steps) + refine.heldout
+
+
+def test_the_shipped_rates_were_measured_on_the_trials_of_calibrations():
+    """After a change of the trials: ``python -m benchmarks.cost_model --ship``."""
+    found = shipped_model().trials
+    assert list(found) == [trial.name for trial in TRIALS]
+    for trial in TRIALS:
+        assert {"check", "merge", "network"} <= set(found[trial.name])
+        assert ("refine" in found[trial.name]) == trial.config.uses_images

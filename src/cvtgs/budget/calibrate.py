@@ -91,6 +91,13 @@ class Trial:
     steps: int = 0
 
     @property
+    def name(self) -> str:
+        """A name of everything that is measured."""
+        scene = f"{self.kind} of {self.count:,}, SH degree {self.sh_degree}"
+        images = f"{self.views} images of {self.size}, {self.steps} steps"
+        return f"{self.preset} at {self.rho}: {scene}; {images}"
+
+    @property
     def config(self) -> SimplifyConfig:
         """The preset, with fewer and smaller images."""
         config = SimplifyConfig.from_preset(self.preset)
@@ -289,7 +296,8 @@ def calibrate(
     libraries. Then every trial is measured up to three times, or once if that takes long; the
     fastest time of each stage counts, since other programs can only slow it down. After 15 CPU
     seconds nothing is repeated, and the last trials are skipped. Where the measurements leave rates
-    open, those of ``prior`` hold; None is the shipped model.
+    open, those of ``prior`` hold; None is the shipped model. A trial that the prior has measured,
+    too, tells only how much faster or slower this machine is.
     """
     kinds = {trial: (trial.kind, trial.count, trial.sh_degree) for trial in trials}
     made = {key: make(key[0], key[1], sh_degree=key[2]) for key in dict.fromkeys(kinds.values())}
@@ -318,19 +326,18 @@ def calibrate(
             spent[row] += clock() - begin
         listener(ProgressEvent(stage=STAGE, done=number + 1, total=total))
     prior = prior or shipped_model()
+    taken = {trial.name: stages for trial, stages in zip(trials, best, strict=True) if stages}
     measured = [
         Measurement(
             work=Work.of(scene, target_count(len(scene), trial.rho)),
             config=trial.config,
-            seconds=stages,
+            seconds=taken[trial.name],
         )
-        for trial, scene, stages in zip(trials, scenes, best, strict=True)
+        for trial, scene in zip(trials, scenes, strict=True)
+        if trial.name in taken
     ]
-    if len(prior.trials) == len(trials):
-        measured = [
-            replace(one, seconds=_without_misfit(one, prior, there))
-            for one, there in zip(measured, prior.trials, strict=True)
-        ]
+    there = [prior.trials.get(name, {}) for name in taken]
+    measured = [_without_misfit(*pair, prior) for pair in zip(measured, there, strict=True)]
     starts = {
         with_images: min(max(loading[row] - sum(best[row].values()), 0.0), MOST_START_SECONDS)
         for with_images, row in first.items()
@@ -341,22 +348,20 @@ def calibrate(
         start=starts.get(False, 0.0),
         image_start=starts.get(True, 0.0),
     )
-    return model.model_copy(update={"trials": tuple(best)})
+    return model.model_copy(update={"trials": taken})
 
 
-def _without_misfit(
-    one: Measurement, prior: CostModel, there: Mapping[str, float]
-) -> dict[str, float]:
-    """Return what the prior would predict for a trial on a machine as fast as this one.
+def _without_misfit(here: Measurement, there: Mapping[str, float], prior: CostModel) -> Measurement:
+    """Replace the seconds of a trial by those that the prior would predict at this speed.
 
     The prior does not fit each trial exactly, so a trial that takes longer than it predicts may
-    take as long as on the machine of the prior: only the ratio of both measurements tells the
-    speed. ``there`` has the seconds on that machine, by stage.
+    take as long as on the machine of the prior, ``there``: only the ratio of both tells the speed.
     """
-    predicted = prior.stage_seconds(one.work, one.config)
-    return {
-        stage: predicted[stage] * seconds / there[stage]
+    predicted = prior.stage_seconds(here.work, here.config)
+    seconds = {
+        stage: predicted[stage] * one / there[stage]
         if stage in predicted and there.get(stage)
-        else seconds
-        for stage, seconds in one.seconds.items()
+        else one
+        for stage, one in here.seconds.items()
     }
+    return replace(here, seconds=seconds)

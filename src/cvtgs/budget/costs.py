@@ -153,13 +153,13 @@ class CostModel(Record, allow_inf_nan=False):
             follow from the configuration.
         start: Additional seconds of the first simplification of a process, for loading libraries.
         image_start: The same for libraries that only configurations with images need.
-        trials: Seconds of each trial of a calibration, by stage.
+        trials: Seconds of the trials of a calibration, by name of the trial and by stage.
     """
 
     rates: dict[str, dict[str, pydantic.NonNegativeFloat]]
     start: pydantic.NonNegativeFloat = 0.0
     image_start: pydantic.NonNegativeFloat = 0.0
-    trials: tuple[dict[str, pydantic.NonNegativeFloat], ...] = ()
+    trials: dict[str, dict[str, pydantic.NonNegativeFloat]] = pydantic.Field(default_factory=dict)
 
     @classmethod
     def fit(
