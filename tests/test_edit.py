@@ -11,7 +11,9 @@ from cvtgs import GaussianScene
 from cvtgs.boxes import Box
 from cvtgs.edit import Motion, Sphere, crop, drop_faint, drop_large, merge, move
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
+from cvtgs.io import change_axes
 from cvtgs.math.spherical_harmonics import rotated_rest
+from cvtgs.scene import FLAT_LOG_SCALE, NORMALS
 from format_cases import angles
 from scenes import moved, random_scene, same_bits
 
@@ -146,8 +148,9 @@ def test_merge_keeps_all_rows() -> None:
 def test_merge_widens_unlike_scenes_and_warns() -> None:
     first = replace(labelled(4, degree=0), comments=("SplatRenderMode: mip",))
     second = random_scene(3, degree=3, dtype=torch.float64)
-    with pytest.warns(DroppedDataWarning) as said:
+    with pytest.warns(UserWarning, match="of the scenes to merge") as said:
         both = merge([first, second])
+    assert [one.category for one in said] == [DroppedDataWarning, UserWarning]
     assert [str(one.message) for one in said] == [
         "left out column 'label', which not all of the scenes to merge have.",
         "some of the scenes to merge were trained with anti-aliasing and others were not; viewers "
@@ -182,3 +185,44 @@ def test_merge_widens_unlike_scenes_and_warns() -> None:
 def test_invalid_arguments_are_refused(make, text: str) -> None:
     with pytest.raises(InvalidArgumentError, match=text):
         make()
+
+
+def with_normals(scene: GaussianScene, normals: torch.Tensor) -> GaussianScene:
+    return scene.with_tensors({}, dict(zip(NORMALS, normals.unbind(1), strict=True)))
+
+
+def test_normals_turn_with_the_scene() -> None:
+    normals = torch.tensor([[1.0, 0, 0], [0, 2, 0]])
+    scene = with_normals(random_scene(2), normals)
+    turned = move(scene, Motion.of_angles((0.0, 0.0, 90.0), scale=3.0, shift=(1.0, 0.0, 0.0)))
+    found = torch.stack([turned.extras[name] for name in NORMALS], dim=1)
+    assert torch.allclose(found, torch.tensor([[0.0, 1, 0], [-2, 0, 0]]), atol=1e-15)
+    there = change_axes(scene, "rdf", "rub")
+    assert torch.equal(there.extras["ny"], -normals[:, 1])
+    assert same_bits(change_axes(there, "rub", "rdf"), scene)
+    quarter = change_axes(scene, "rdf", "rfu")
+    assert quarter.extras["nz"].tolist() == [0.0, -2.0]
+
+
+def test_missing_normals_are_zeros_when_scenes_merge() -> None:
+    first = with_normals(random_scene(2), torch.ones(2, 3))
+    both = merge([first, random_scene(3)])
+    assert [both.extras[name].tolist() for name in NORMALS] == [[1.0, 1, 0, 0, 0]] * 3
+    assert not merge([random_scene(2), random_scene(3)]).extras
+
+
+def test_the_third_of_two_scales_marks_flat_gaussians_at_every_size() -> None:
+    scene = random_scene(3).with_tensors({"log_scales": torch.full((3, 3), FLAT_LOG_SCALE)}, {})
+    flat = replace(scene, layout=(("x", "float"),))
+    assert move(flat, Motion(scale=2.0)).log_scales[:, 2].tolist() == [FLAT_LOG_SCALE] * 3
+    assert (move(scene, Motion(scale=2.0)).log_scales > FLAT_LOG_SCALE).all()
+
+
+def test_coordinates_stay_within_their_type() -> None:
+    scene = random_scene(3)
+    with pytest.raises(
+        InvalidArgumentError, match=r"within 3\.4e\+38, the range of float32, found"
+    ):
+        move(scene, Motion(scale=1e39))
+    infinite = scene.with_tensors({"means": torch.full((3, 3), torch.inf)}, {})
+    assert move(infinite, Motion(scale=2.0)).means.isinf().all()

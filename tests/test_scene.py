@@ -5,6 +5,7 @@ import dataclasses
 import math
 import pickle
 
+import numpy as np
 import pytest
 import torch
 
@@ -79,6 +80,9 @@ def test_scenes_are_indexed_like_tensors():
         (scene[[7, -1]], [7, 8]),
         (scene[[]], []),
         (scene[mask.numpy()], [0, 2, 4, 6, 8]),
+        (scene[np.arange(9)[::-2]], [8, 6, 4, 2, 0]),
+        (scene[mask.numpy()[::-1]], [0, 2, 4, 6, 8]),
+        (scene[np.array([3, 1], dtype=">i8")], [3, 1]),
     ]
     for small, rows in taken:
         assert small.extras["label"].tolist() == rows

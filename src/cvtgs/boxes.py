@@ -98,7 +98,7 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
         (Box(min=(0.0, 0.0, 0.0), max=(1.0, 2.0, 3.0)),)
     """
     try:
-        values = json.loads(Path(path).read_text(encoding="utf-8"))
+        values = json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
     except OSError as error:

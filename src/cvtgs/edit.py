@@ -12,7 +12,7 @@ from cvtgs.boxes import Box, Corner, inside
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
 from cvtgs.math.parameters import multiply_quats, rotation_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS, rotated_rest
-from cvtgs.scene import GaussianScene, concatenate
+from cvtgs.scene import NORMALS, GaussianScene, concatenate, turned_normals
 from cvtgs.text import shown
 
 __all__ = [
@@ -217,7 +217,7 @@ def _kept(scene: GaussianScene, keep: Tensor) -> GaussianScene:
 
 
 def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
-    """Rotate, scale and translate a scene; view-dependent colours rotate with it.
+    """Rotate, scale and translate a scene; view-dependent colours and normals rotate with it.
 
     Args:
         scene: The scene; it is not changed.
@@ -227,13 +227,16 @@ def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
         The moved scene. Only tensors that change are computed: a translation changes the centres
         alone, a scale factor the centres and scales alone.
 
+    Raises:
+        InvalidArgumentError: Coordinates would leave the range of the dtype.
+
     Example:
         >>> from cvtgs.synthetic import scene as make
         >>> one = make("object", 1, sh_degree=0, seed=0)
         >>> (move(one, Motion(shift=(1.0, 0.0, 0.0))).means - one.means).tolist()
         [[1.0, 0.0, 0.0]]
     """
-    means, changes = scene.means.double(), {}
+    means, changes, extras = scene.means.double(), {}, scene.extras
     quat = torch.tensor([motion.quat], dtype=torch.float64, device=scene.device)
     if bool((quat[0, 1:] != 0).any()):
         turn = quat / torch.linalg.vector_norm(quat)
@@ -242,21 +245,30 @@ def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
         quats = multiply_quats(turn.expand(len(scene), 4), scene.quats.double())
         changes["quats"] = quats.to(scene.dtype)
         changes["shN"] = rotated_rest(scene.shN, matrix)
+        extras = turned_normals(scene.extras, matrix)
     if motion.scale != 1.0:
         means = motion.scale * means
         log_scales = scene.log_scales.double() + math.log(motion.scale)
+        if scene.has_two_scales:  # the third one only says that Gaussians are flat
+            log_scales[:, 2] = scene.log_scales[:, 2]
         changes["log_scales"] = log_scales.to(scene.dtype)
     if motion.shift != _NO_SHIFT:
         means = means + means.new_tensor(motion.shift)
-    return scene.with_tensors({"means": means.to(scene.dtype), **changes})
+    moved = means.to(scene.dtype)
+    if bool((moved.isinf() & scene.means.isfinite()).any()):
+        raise InvalidArgumentError(
+            f"a motion must keep coordinates within {torch.finfo(scene.dtype).max:.3g}, the range "
+            f"of {str(scene.dtype).removeprefix('torch.')}, found larger ones."
+        )
+    return scene.with_tensors({"means": moved, **changes}, extras)
 
 
 def merge(scenes: Sequence[GaussianScene]) -> GaussianScene:
     """Return the Gaussians of several scenes as one scene; degrees and dtypes may differ.
 
-    Missing SH bands are filled with zeros, and the result is float64 if any scene is. Extra columns
-    that a scene lacks are dropped with a warning. If only some scenes were trained with
-    anti-aliasing, viewers cannot show all of them correctly, so a warning says so.
+    Missing SH bands and normals are filled with zeros, and the result is float64 if any scene is.
+    Other extra columns that a scene lacks are dropped with a warning. If only some scenes were
+    trained with anti-aliasing, viewers cannot show all of them correctly, so a warning says so.
 
     Args:
         scenes: At least one, all on one device.
@@ -276,7 +288,8 @@ def merge(scenes: Sequence[GaussianScene]) -> GaussianScene:
         raise InvalidSceneError("merging needs at least one scene, found none.")
     if len({scene.device for scene in scenes}) > 1:
         raise InvalidSceneError("scenes to merge must be on one device, found several.")
-    common = set.intersection(*(set(scene.extras) for scene in scenes))
+    common = set.intersection(*({*scene.extras, *NORMALS} for scene in scenes))
+    common &= {name for scene in scenes for name in scene.extras}
     missing = sorted({name for scene in scenes for name in scene.extras} - common)
     if missing:
         warnings.warn(
@@ -289,7 +302,7 @@ def merge(scenes: Sequence[GaussianScene]) -> GaussianScene:
         warnings.warn(
             "some of the scenes to merge were trained with anti-aliasing and others were not; "
             "viewers will show the latter too soft.",
-            DroppedDataWarning,
+            UserWarning,
             stacklevel=2,
         )
     dtype = torch.float64 if any(s.dtype == torch.float64 for s in scenes) else torch.float32
@@ -307,5 +320,6 @@ def _widened(
     tensors = {name: tensor.to(dtype) for name, tensor in scene.tensors().items()}
     missing = REST_COUNTS[degree] - scene.shN.shape[1]
     tensors["shN"] = torch.nn.functional.pad(tensors["shN"], (0, 0, 0, missing))
+    zeros = dict.fromkeys(extras & set(NORMALS), torch.zeros_like(tensors["means"][:, 0]))
     kept = {name: column for name, column in scene.extras.items() if name in extras}
-    return scene.with_tensors(tensors, kept)
+    return scene.with_tensors(tensors, zeros | kept)

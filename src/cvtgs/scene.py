@@ -22,6 +22,9 @@ ANTIALIASED_TAG = "SplatRenderMode: mip"
 FLAT_LOG_SCALE = -20.0
 """Third log-scale of Gaussians with two scales (2DGS): two billionths of a scene unit."""
 
+NORMALS = ("nx", "ny", "nz")
+"""Extra columns that are a direction. 3DGS writes zeros, which are not read."""
+
 _CHUNK = 1 << 16
 _NOT_INDEXABLE = (torch.uint16, torch.uint32, torch.uint64)  # torch cannot select their rows
 
@@ -370,3 +373,13 @@ def concatenate(scenes: Sequence[GaussianScene]) -> GaussianScene:
         {name: torch.cat([each[name] for each in tensors]) for name in tensors[0]},
         {name: torch.cat([scene.extras[name] for scene in scenes]) for name in first.extras},
     )
+
+
+def turned_normals(extras: Mapping[str, Tensor], matrix: Tensor) -> dict[str, Tensor]:
+    """Return extra columns with their normals multiplied by a 3 x 3 matrix, if there are any."""
+    if not all(name in extras and extras[name].is_floating_point() for name in NORMALS):
+        return dict(extras)
+    normals = torch.stack([extras[name].double() for name in NORMALS], dim=1)
+    turned = normals @ matrix.to(normals).T
+    columns = {name: turned[:, k].to(extras[name].dtype) for k, name in enumerate(NORMALS)}
+    return {**extras, **columns}

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Int
 from torch import Tensor
@@ -36,6 +37,8 @@ def row_numbers(
     if isinstance(rows, int | str) or getattr(rows, "ndim", 1) != 1:
         single = f"; write [{rows}] for a single one" if isinstance(rows, int) else ""
         raise _error(rows, things, single)
+    if isinstance(rows, np.ndarray):  # torch takes no reversed arrays and no foreign byte order
+        rows = np.ascontiguousarray(rows, rows.dtype.newbyteorder("="))
     try:
         picked = torch.as_tensor(rows, device=device)
     except (TypeError, ValueError, RuntimeError):

@@ -207,20 +207,25 @@ def standardized(scene: GaussianScene) -> GaussianScene:
     return scene.with_tensors(tensors)
 
 
+def lost_step(scene: GaussianScene) -> float:
+    """Return the step between float32 coordinates far from the origin; 0 where it is harmless."""
+    if len(scene) == 0 or scene.means.element_size() > 4:
+        return 0.0
+    far = float(scene.means.nanmedian(dim=0).values.abs().amax())
+    return 2.0 ** (math.floor(math.log2(far)) - 23) if _FAR <= far < math.inf else 0.0
+
+
 def warn_of_lost_digits(scene: GaussianScene) -> None:
     """Warn if a scene is so far from its origin that float32 loses small differences."""
-    if len(scene) == 0 or scene.means.element_size() > 4:
-        return
-    middle = scene.means.nanmedian(dim=0).values.double()
-    far = float(middle.abs().amax())
-    if _FAR <= far < math.inf:
-        step = 2.0 ** (math.floor(math.log2(far)) - 23)
+    step = lost_step(scene)
+    if step:
+        middle = scene.means.nanmedian(dim=0).values.double()
         shift = ",".join(f"{-round(value)}" for value in middle.tolist())
         warnings.warn(
-            f"positions lie {far:.3g} from the origin, where float32 only resolves steps of "
-            f"{step:.3g}: precision is already lost. Write the scene again from its source, with "
-            f"positions shifted by {shift} before they become float32, and keep a record of the "
-            f"shift.",
+            f"positions lie {float(middle.abs().amax()):.3g} from the origin, where float32 only "
+            f"resolves steps of {step:.3g}: precision is already lost. Write the scene again from "
+            f"its source, with positions shifted by {shift} before they become float32, and keep a "
+            f"record of the shift.",
             UserWarning,
             stacklevel=3,
         )

@@ -1,5 +1,6 @@
 """Edits of ``cvtgs convert``."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from cvtgs import GaussianScene, load, save
 from cvtgs.boxes import Box
 from cvtgs.cli.main import main
 from cvtgs.edit import Motion, Sphere, crop, drop_faint, drop_large, merge, move
+from format_cases import storable_scene
 from scenes import random_scene, same_bits
 
 
@@ -110,3 +112,41 @@ def test_older_spz_versions_are_written_on_request(tmp_path: Path, scene: Gaussi
         starts[version] = target.read_bytes()[:2]
         assert torch.allclose(load(target).means, scene.means, atol=1e-3)
     assert starts == {"2": b"\x1f\x8b", "3": b"\x1f\x8b", "4": b"NG"}
+
+
+def test_merged_files_of_other_formats_keep_their_axes(tmp_path: Path) -> None:
+    scene = storable_scene(200, degree=1)
+    save(scene, tmp_path / "a.spz", axes="rub")
+    save(scene, tmp_path / "b.spz", axes="rub")
+    save(scene, tmp_path / "c.glb")
+    words = ["convert", str(tmp_path / "a.spz"), str(tmp_path / "o.ply"), "--axes", "rub"]
+    words += ["--merge", str(tmp_path / "b.spz"), "--merge", str(tmp_path / "c.glb")]
+    assert main(words) == 0
+    found = load(tmp_path / "o.ply")
+    for start in (0, 200, 400):
+        torch.testing.assert_close(found.means[start : start + 200], scene.means, atol=1e-3, rtol=0)
+
+
+def test_merging_says_what_is_lost_and_mixed(
+    tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save(replace(scene, comments=("SplatRenderMode: mip",)), tmp_path / "mip.ply")
+    save(scene.with_tensors({}, {"label": torch.arange(200)}), tmp_path / "labelled.ply")
+    both = ["--merge", str(tmp_path / "mip.ply"), "--merge", str(tmp_path / "labelled.ply")]
+    converted(tmp_path, *both)
+    printed = capsys.readouterr()
+    assert "columns that not all scenes have (label)" in printed.out
+    assert "trained with anti-aliasing" in printed.err
+    assert "label" not in printed.err
+    converted(tmp_path, *both, "--quiet")
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "left out column 'label'" in printed.err
+
+
+def test_lost_digits_of_moved_positions_are_printed(
+    tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    converted(tmp_path, "--translate", "500000,4000000,0")
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Lost: digits of positions (steps of 0.25 so far from the origin)." in printed

@@ -149,7 +149,7 @@ def test_missing_image_sizes_are_one_sentence(tmp_path) -> None:
     path = write_json(tmp_path / "transforms.json", document)
     assert camera_refusal(path) == (
         f"{path}: frame 0: 'w' and 'h' must be given in the frame or at the top level of the "
-        f"file, or the image must exist; found neither them nor {tmp_path / 'r_0'}."
+        f"file, or the image must exist; found neither them nor an image 'r_0'."
     )
     for content in (b"\xff\xd8\xff" + bytes(100), b"\x89PNG"):
         (tmp_path / "r_0.png").write_bytes(content)

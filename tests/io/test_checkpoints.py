@@ -71,6 +71,14 @@ def test_gsplat_checkpoints_are_read_as_copies(tmp_path: Path, suffix: str) -> N
     assert same_bits(again, scene)
 
 
+def test_a_checkpoint_of_one_of_several_gpus_is_warned_about(tmp_path: Path) -> None:
+    for rank in range(2):
+        splats = OrderedDict(to_dict(random_scene(7, seed=rank)))
+        torch.save({"step": 1, "splats": splats}, tmp_path / f"ckpt_1_rank{rank}.pt")
+    with pytest.warns(UserWarning, match=r"holds the Gaussians of one GPU; ckpt_1_rank1\.pt and"):
+        assert len(load(tmp_path / "ckpt_1_rank0.pt")) == 7
+
+
 def test_reading_leaves_torch_safe_globals_unchanged(tmp_path: Path) -> None:
     before = set(torch.serialization.get_safe_globals())
     torch.save(splatfacto(random_scene(2)), tmp_path / "a.ckpt")

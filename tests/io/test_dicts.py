@@ -44,6 +44,12 @@ def test_gsplat_values_are_read_as_stored_values() -> None:
     assert scene.sh_degree == 1
 
 
+def test_an_empty_dictionary_is_an_empty_scene() -> None:
+    assert (
+        len(from_dict({name: value[:0] for name, value in gsplat().items()}, activated=True)) == 0
+    )
+
+
 def test_activated_values_are_converted() -> None:
     values = {
         **gsplat(),

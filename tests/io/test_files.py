@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 import tempfile
+import warnings
 import zipfile
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -282,6 +283,44 @@ def test_an_unknown_format_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"^format must be .*, found 'xyz'\.$"):
         cvtgs.load(tmp_path / "a.ply", format="xyz")
     assert losses(scene, "spz") == losses(scene, ".spz") == losses(scene, "a.spz")
+
+
+@pytest.mark.parametrize("name", ["spz.gz", "tar.gz", "."])
+def test_unknown_formats_of_streams_are_named(name: str) -> None:
+    stream = io.BytesIO()
+    cvtgs.save(storable_scene(5), stream)
+    with pytest.raises(FileFormatError, match=f"^format must be .*, found '{name}'"):
+        cvtgs.load(io.BytesIO(stream.getvalue()), format=name)
+
+
+def test_messages_about_streams_name_the_stream(tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    cvtgs.save(storable_scene(5), stream)
+    face = b"element face 1\nproperty uchar corner\n"
+    ply = stream.getvalue().replace(b"end_header\n", face + b"end_header\n", 1) + b"\0"
+    with pytest.warns(DroppedDataWarning, match="^the BytesIO: left out element 'face'"):
+        cvtgs.load(io.BytesIO(ply))
+    before = warnings.showwarning
+    gltf = {"asset": {"version": "2.0"}, "buffers": [{"byteLength": 9, "uri": "no.bin"}]}
+    cvtgs.save(storable_scene(5, degree=0), tmp_path / "a.gltf")
+    document = json.loads((tmp_path / "a.gltf").read_text())
+    document["buffers"] = gltf["buffers"]
+    with pytest.raises(InputNotFoundError, match=r"^no\.bin: the file to read must exist"):
+        cvtgs.load(io.BytesIO(json.dumps(document).encode()), format=".gltf")
+    assert warnings.showwarning is before
+
+
+@pytest.mark.parametrize("end", [".glb", ".gltf", ".splat", ".usda"])
+def test_scales_beyond_float32_are_clamped(tmp_path: Path, end: str) -> None:
+    scene = replace(storable_scene(4, degree=0), comments=())
+    log_scales = torch.tensor([[95.0, 0, 0], [-95, 0, 0], [1, 2, 3], [0, 0, 0]])
+    path = tmp_path / f"a{end}"
+    with pytest.warns(UserWarning, match="clamped") as said:
+        cvtgs.save(scene.with_tensors({"log_scales": log_scales}), path)
+    assert [one.category for one in said] == [DroppedDataWarning]  # none of numpy
+    if end != ".usda":  # which is not read
+        found = cvtgs.load(path).log_scales
+        assert torch.allclose(found, log_scales.clamp(-87.3, 88.7), atol=1e-4)
 
 
 def test_the_size_of_a_missing_file_is_an_error(tmp_path: Path) -> None:

@@ -124,6 +124,10 @@ DAMAGE: dict[str, tuple[Change, str]] = {
         lambda d: d["bufferViews"][0].update(byteStride=4),
         "bufferViews[0] must have a stride of 12 to 252 bytes, found 4.",
     ),
+    "bracket": (
+        lambda d: d["buffers"][0].update(uri="//[x"),
+        "buffers[0] must be in the folder of the file, found '//[x'.",
+    ),
 }
 
 

@@ -64,11 +64,13 @@ HEADER_CASES: Mapping[str, tuple[bytes, str]] = {
     ),
     "gzip": (
         b"\x1f\x8b\x08\x00",
-        "a PLY file must start with the line 'ply', found a gzip file; unpack it first.",
+        "a PLY file must start with the line 'ply', found a gzip file; unpack it first, or "
+        "rename it if it is an .spz.",
     ),
     "zip": (
         b"PK\x03\x04\x14",
-        "a PLY file must start with the line 'ply', found a zip archive; unpack it first.",
+        "a PLY file must start with the line 'ply', found a zip archive; unpack it first, or "
+        "rename it if it is a .sog.",
     ),
     "web page": (
         b"<!DOCTYPE html>",

@@ -243,6 +243,16 @@ def test_parameters_with_gradients_can_be_saved(tmp_path: Path) -> None:
             "a comment must be one line to be written to a PLY, found 'end\\nend_header'.",
         ),
         (
+            {"comments": ("\ud800",)},
+            "comments and names of columns must be Unicode text to be written to a PLY, found "
+            "'\\ud800'.",
+        ),
+        (
+            {"comments": ("x" * (1 << 20),)},
+            "comments and names of columns must take at most 1,048,576 bytes to be written to a "
+            "PLY, found 1,048,996.",
+        ),
+        (
             {"layout": (("x", "half"),)},
             "the layout must give property 'x' one of the types char, uchar, short, ushort, int, "
             "uint, float, double, found 'half'.",

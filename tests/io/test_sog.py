@@ -64,6 +64,13 @@ def test_an_unbundled_sog_is_read_by_file_and_by_folder(tmp_path: Path) -> None:
             assert torch.equal(tensor, scene.tensors()[name])
 
 
+@pytest.mark.parametrize("name", ["scene-meta.json", "META.JSON"])
+def test_the_index_of_an_unbundled_sog_may_have_another_name(tmp_path: Path, name: str) -> None:
+    path = unpacked(tmp_path)
+    other = path.rename(tmp_path / name)
+    assert torch.equal(load(other).means, load(THEIRS).means)
+
+
 def image(rows: list[list[int]]) -> bytes:
     return encode_webp(np.array(rows, np.uint8).reshape(1, -1, 4))
 

@@ -117,6 +117,13 @@ def test_a_file_with_a_partial_gaussian_is_refused(tmp_path: Path, size: int) ->
     )
 
 
+def test_a_ply_with_the_wrong_suffix_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.splat"
+    path.write_bytes(b"ply\n".ljust(64))
+    with pytest.raises(FileFormatError, match="has no header, found a PLY; rename it"):
+        load(path)
+
+
 def test_rows_of_zeros_are_read_as_small_faint_gaussians(tmp_path: Path) -> None:
     path = tmp_path / "a.splat"
     path.write_bytes(bytes(32))

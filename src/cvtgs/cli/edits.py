@@ -91,7 +91,9 @@ class SceneEdits:
         self.motion = _motion(options)
 
     def apply(self, scene: "GaussianScene") -> "tuple[GaussianScene, list[str]]":
-        """Return the edited scene, and one phrase for each kind of dropped Gaussians."""
+        """Return the edited scene, and one phrase for each kind of lost data."""
+        from cvtgs.validity import lost_step
+
         phrases = []
         for phrase, smaller in self._filtered(scene):
             if len(smaller) < len(scene):
@@ -102,7 +104,11 @@ class SceneEdits:
                 f"at least one Gaussian must be left to write, found none: {'; '.join(phrases)}."
             )
         if self.motion is not None:
-            scene = cvtgs.edit.move(scene, self.motion)
+            moved = cvtgs.edit.move(scene, self.motion)
+            step = lost_step(moved)
+            if step > lost_step(scene):
+                phrases.append(f"digits of positions (steps of {step:.3g} so far from the origin)")
+            scene = moved
         return scene, phrases
 
     def _filtered(self, scene: "GaussianScene") -> "Iterator[tuple[str, GaussianScene]]":

@@ -191,11 +191,17 @@ def _convert_one(job: SceneJob, edits: SceneEdits) -> Outcome:
     options = job.options
     axes = read_axes(options.axes)
     scenes = [
-        cvtgs.io.load(path, axes=axes.source, trust_sizes=options.trust_sizes, lod=lod)
-        for path, lod in [(options.input, options.lod), *((path, None) for path in options.merge)]
+        cvtgs.io.load(
+            options.input, axes=axes.source, trust_sizes=options.trust_sizes, lod=options.lod
+        )
     ]
+    for path in options.merge:
+        alike = path.suffix.lower() == options.input.suffix.lower()
+        source = axes.source if alike else None  # other formats have axes of their own
+        scenes.append(cvtgs.io.load(path, axes=source, trust_sizes=options.trust_sizes))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DroppedDataWarning)  # printed below instead
+        if not options.quiet:  # printed below instead
+            warnings.simplefilter("ignore", DroppedDataWarning)
         scene = scenes[0] if len(scenes) == 1 else cvtgs.edit.merge(scenes)
     left = sorted({name for one in scenes for name in one.extras} - set(scene.extras))
     scene, phrases = edits.apply(scene)

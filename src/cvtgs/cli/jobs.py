@@ -290,7 +290,7 @@ def _output_name(source: Path, suffix: str | None) -> str:
     """Return the file name for the output of a scene, with the suffix that sets its format."""
     from cvtgs.io.formats import READABLE_SUFFIXES, WRITABLE_SUFFIXES
 
-    if source.name == "meta.json":
+    if source.name in ("meta.json", "lod-meta.json"):
         source = source.parent
     name = source.resolve().name if source.is_dir() else source.name
     own = next(

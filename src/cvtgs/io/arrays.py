@@ -100,6 +100,16 @@ def log_scales_of(scales: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         return logs
 
 
+SCALE_RANGE = (-87.3, 88.7)
+"""Logarithms of the scales that float32 holds with full precision."""
+
+
+def scales_of(log_scales: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Return the scales of clamped logarithms, as formats with scales store them."""
+    scales: Floats = np.exp(np.clip(log_scales, *SCALE_RANGE))
+    return scales
+
+
 def opacities_of(logits: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Return the opacities of logits."""
     return parameters.opacity_from_logit(torch.from_numpy(logits)).numpy()

@@ -9,7 +9,7 @@ from torch import Tensor
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math.parameters import multiply_quats
 from cvtgs.math.spherical_harmonics import rest_basis, rotated_rest
-from cvtgs.scene import GaussianScene
+from cvtgs.scene import GaussianScene, turned_normals
 
 AXES = (
     *("ldb", "rdb", "lub", "rub", "ldf", "rdf", "luf", "ruf"),
@@ -42,6 +42,7 @@ def checked_axes(name: str) -> str:
 def change_axes(scene: GaussianScene, source: str, target: str) -> GaussianScene:
     """Convert a scene from one set of axes to another.
 
+    Centres, rotations, view-dependent colours and normals (``nx``, ``ny``, ``nz``) are converted.
     Names have one letter for each of x, y and z, the direction in which it points: left or right,
     up or down, back or forward. Examples are ``"rdf"`` (PLY files of 3DGS) and ``"rub"`` (OpenGL,
     Niantic's apps). If only signs differ, only signs of centres, quaternions and SH coefficients
@@ -85,7 +86,7 @@ def _with_signs(scene: GaussianScene, x: int, y: int, z: int) -> GaussianScene:
             "quats": scene.quats * scene.quats.new_tensor([1, y * z, x * z, x * y]),
             "shN": scene.shN * _sh_signs(x, y, z).to(scene.shN)[: scene.shN.shape[1], None],
         },
-        scene.extras,
+        turned_normals(scene.extras, torch.diag(scene.means.new_tensor([x, y, z]))),
     )
 
 
@@ -97,7 +98,7 @@ def _with_quarter_turn(scene: GaussianScene) -> GaussianScene:
             "quats": multiply_quats(turn, scene.quats),
             "shN": rotated_rest(scene.shN, _QUARTER_TURN),
         },
-        scene.extras,
+        turned_normals(scene.extras, _QUARTER_TURN),
     )
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from cvtgs.errors import CvtgsError, FileFormatError, InvalidSceneError, is_out_of_memory
 from cvtgs.io.dicts import check_tensors, from_dict
-from cvtgs.io.files import check_stored, open_input
+from cvtgs.io.files import check_stored, is_file, open_input
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
@@ -42,8 +42,17 @@ def read_checkpoint(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
     ``ckpt_29999_rank0.pt`` of gsplat's examples, which holds it under ``splats``. Nothing in the
     file is executed, and only the scene is loaded, not the state of the optimiser. At SH degree 0,
     Splatfacto trains colours through a sigmoid; these are converted to the usual ``sh0``. A tensor
-    that repeats numbers instead of storing them is refused, unless sizes are trusted.
+    that repeats numbers instead of storing them is refused, unless sizes are trusted. gsplat's
+    trainer writes a part of the scene for each of several GPUs; a warning names the other files.
     """
+    second = path.with_name(path.name.replace("_rank0.pt", "_rank1.pt"))
+    if second != path and is_file(second):
+        warnings.warn(
+            f"{path}: holds the Gaussians of one GPU; {second.name} and further files beside it "
+            f"hold the others: add them with cvtgs convert IN OUT --merge FILE.",
+            UserWarning,
+            stacklevel=3,
+        )
     with _damage_named(path):
         tensors, splatfacto = _scene_tensors(_unpickled(path), path)
         check_tensors(tensors)

@@ -214,7 +214,7 @@ def _as_tensor(key: str, value: Tensor | NDArray[Any]) -> Tensor:
 
 
 def _check_values(name: str, wrong: Tensor, *, required: str) -> None:
-    rows = wrong.reshape(len(wrong), -1).any(dim=1)
+    rows = wrong.any(dim=1) if wrong.ndim > 1 else wrong
     count = int(rows.sum())
     if count:
         raise InvalidSceneError(

@@ -145,7 +145,10 @@ def load(
         raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {sh_degree!r}.")
     axes = None if axes is None else checked_axes(axes)
     if not isinstance(path, str | os.PathLike):
-        with file_of(path, _dotted(format)) as copy:
+        format = (
+            None if format is None else _suffix_of(_dotted(format) or "", _READERS, format=format)
+        )
+        with file_of(path, format) as copy:
             return load(
                 copy,
                 format=format,

@@ -6,6 +6,7 @@ from types import MappingProxyType
 
 import torch
 
+from cvtgs.io.arrays import SCALE_RANGE
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
 from cvtgs.text import counted
@@ -76,7 +77,7 @@ _GLTF = FormatLimits(
     sh_degree=3,
     antialiased=True,
     comments=True,
-    ranges={"log_scales": (-87.3, 88.7)},  # scales are stored as float32
+    ranges={"log_scales": SCALE_RANGE},  # scales are stored as float32
     changed=("scales and opacities as float32 instead of their logarithms and logits",),
 )
 
@@ -105,7 +106,7 @@ FORMAT_LIMITS: Mapping[str, FormatLimits] = MappingProxyType(
             sh_degree=0,
             antialiased=False,
             # colours in [0, 1] plus half a step; scales are stored as float32
-            ranges={"sh0": (-1.7794, 1.7794), "log_scales": (-87.3, 88.7)},
+            ranges={"sh0": (-1.7794, 1.7794), "log_scales": SCALE_RANGE},
             changed=(
                 "colours and opacities in steps of 1/255",
                 "rotations in steps of 1/128 per component",

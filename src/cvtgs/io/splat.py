@@ -14,6 +14,7 @@ from cvtgs.io.arrays import (
     log_scales_of,
     logits_of_bytes,
     opacity_bytes,
+    scales_of,
     scene_of,
     sh0_of_colors,
     to_bytes,
@@ -47,6 +48,9 @@ def read_splat(path: Path) -> GaussianScene:
                 f"{path}: a .splat file must hold one or more Gaussians of {_ROW.itemsize} bytes "
                 f"each, found {size:,} bytes."
             )
+        if file.read(4) in (b"ply\n", b"ply\r"):
+            raise FileFormatError(f"{path}: a .splat file has no header, found a PLY; rename it.")
+        file.seek(0)
         rows = np.fromfile(file, _ROW)
     return scene_of(
         Arrays(
@@ -67,8 +71,7 @@ def write_splat(scene: GaussianScene, file: BinaryIO) -> None:
         part = slice(start, start + _CHUNK_ROWS)
         rows = np.empty(len(arrays.means[part]), _ROW)
         rows["mean"] = arrays.means[part]
-        with np.errstate(over="ignore"):
-            rows["scale"] = np.exp(arrays.log_scales[part])
+        rows["scale"] = scales_of(arrays.log_scales[part])
         rows["rgb"] = to_bytes(255 * colors_of_sh0(arrays.sh0[part]))
         rows["opacity"] = opacity_bytes(arrays.logit_opacities[part])
         rows["quat"] = to_bytes(128 + 128 * arrays.quats[part])

@@ -1,13 +1,15 @@
 """Open binary files as input and output: pipes, sockets, zip members, bytes in memory."""
 
+import os
 import re
 import shutil
+import warnings
 import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import SpooledTemporaryFile, TemporaryDirectory
-from typing import BinaryIO, Protocol, cast
+from typing import Any, BinaryIO, Protocol, cast
 
 from cvtgs.errors import CvtgsError, FileFormatError, InputError, OutputError, reason_of
 
@@ -47,7 +49,8 @@ def file_of(
 ) -> Iterator[Path]:
     """Copy the rest of a stream to a temporary file, which exists while the context is open.
 
-    Errors in the context that name the file name the stream instead, by ``name`` or its own name.
+    Errors and warnings in the context that name the file name the stream instead, by ``name`` or
+    its own name.
     ``advice`` ends the error message if the first bytes match no format.
     """
     name = name or name_of(stream)
@@ -73,14 +76,35 @@ def file_of(
                 f"{name}: the first bytes must be those of a .ply, .spz, .sog, .glb or .pt, found "
                 f"{first!r}; {advice}."
             )
-        path = path.rename(path.with_suffix(suffix))
+        path = path.rename(path.with_name(f"stream{suffix}"))
+        stack.enter_context(_named_in_warnings(path, name))
         try:
             yield path
         except CvtgsError as error:
             text = str(error)
-            if str(path) not in text:
+            if folder not in text:
                 raise
-            raise type(error)(text.replace(str(path), name)) from error
+            raise type(error)(_renamed(text, path, name)) from error
+
+
+@contextmanager
+def _named_in_warnings(path: Path, name: str) -> Iterator[None]:
+    """Show warnings with the name of the stream."""
+    before = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *others: Any, **named: Any) -> None:
+        before(category(_renamed(str(message), path, name)), category, *others, **named)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = before
+
+
+def _renamed(text: str, path: Path, name: str) -> str:
+    """Replace the temporary file and its folder in a message."""
+    return text.replace(str(path), name).replace(f"{path.parent}{os.sep}", "")
 
 
 def _chunks(stream: ByteSource, name: str) -> Iterator[bytes]:

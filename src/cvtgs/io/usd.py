@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from cvtgs.io.arrays import Arrays, Floats, arrays_of, opacities_of
+from cvtgs.io.arrays import Arrays, Floats, arrays_of, opacities_of, scales_of
 from cvtgs.math.parameters import build_covariances
 from cvtgs.math.spherical_harmonics import degree_of
 from cvtgs.scene import GaussianScene
@@ -36,7 +36,7 @@ def _document(scene: GaussianScene, arrays: Arrays) -> Iterator[str]:
     yield from _array("float3[] extent", _extent(arrays))
     yield from _array("point3f[] positions", arrays.means)
     yield from _array("quatf[] orientations", arrays.quats)
-    yield from _array("float3[] scales", np.exp(arrays.log_scales))
+    yield from _array("float3[] scales", scales_of(arrays.log_scales))
     yield from _array("float[] opacities", opacities_of(arrays.logit_opacities))
     degree = degree_of(arrays.shN.shape[1])
     yield f"    uniform int radiance:sphericalHarmonicsDegree = {degree}\n"
@@ -71,5 +71,5 @@ def _extent(arrays: Arrays) -> Float[np.ndarray, "2 3"]:
 
 
 def _quoted(text: str) -> str:
-    plain = printable(text).replace("\\", "\\\\").replace('"', '\\"')
+    plain = printable(text).replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
     return f'"{plain}"'

@@ -16,7 +16,7 @@ from cvtgs.errors import FileFormatError
 from cvtgs.io.cameras.views import Lens, View, checked_lens
 from cvtgs.io.files import is_file, open_input
 from cvtgs.math import parameters
-from cvtgs.text import shown
+from cvtgs.text import MOST_LETTERS, printable, shortened, shown
 
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<iiQQ")
@@ -127,7 +127,8 @@ def _find_model(name: str, where: str) -> _Model:
     """Return a camera model by its name."""
     if name not in _MODELS:
         raise FileFormatError(
-            f"{where}: the camera model must be one of {', '.join(_MODELS)}, found {name}; "
+            f"{where}: the camera model must be one of {', '.join(_MODELS)}, found "
+            f"{shortened(printable(name), MOST_LETTERS)}; "
             f"undistort the images first (colmap image_undistorter)."
         )
     return _MODELS[name]

@@ -216,12 +216,12 @@ def _size(frame: _Frame, document: _Transforms, *, path: Path, where: str) -> tu
     if width is not None and height is not None:
         return width, height
     image = path.parent / frame.file_path
-    for candidate in (image, image.with_name(f"{image.name}.png")):
+    for candidate in (image, Path(f"{image}.png")):
         if is_file(candidate):
             return _png_size(candidate)
     raise FileFormatError(
         f"{where}: 'w' and 'h' must be given in the frame or at the top level of the file, or the "
-        f"image must exist; found neither them nor {image}."
+        f"image must exist; found neither them nor an image {shown(frame.file_path)}."
     )
 
 

@@ -234,7 +234,10 @@ class GltfFile:
             raise self.error(f"buffers[{index}] must be valid base64, found: {error}") from error
 
     def _beside(self, uri: str, index: int, length: int) -> bytes:
-        parts = urlsplit(uri)
+        try:
+            parts = urlsplit(uri)
+        except ValueError:  # brackets that enclose no address
+            parts = urlsplit("//outside")
         name = unquote(parts.path)
         outside = not is_within(name) or len(uri) > LONGEST_NAME  # such as a damaged data URI
         if parts.scheme or parts.netloc or parts.query or outside:

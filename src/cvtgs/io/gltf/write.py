@@ -18,6 +18,7 @@ from cvtgs.io.arrays import (
     colors_of_sh0,
     opacities_of,
     opacity_bytes,
+    scales_of,
     to_bytes,
 )
 from cvtgs.io.gltf.document import (
@@ -134,7 +135,7 @@ def _attributes(arrays: Arrays) -> list[_Attribute]:
         floats(POSITION, "VEC3", lambda part: arrays.means[part]),
         _Attribute(name=COLOR, kind="VEC4", component=UNSIGNED_BYTE, values=colors),
         floats(ROTATION, "VEC4", lambda part: np.roll(arrays.quats[part], -1, axis=1)),
-        floats(SCALE, "VEC3", lambda part: np.exp(arrays.log_scales[part])),
+        floats(SCALE, "VEC3", lambda part: scales_of(arrays.log_scales[part])),
         floats(OPACITY, "SCALAR", lambda part: opacities_of(arrays.logit_opacities[part])),
         floats(coefficient(0, 0), "VEC3", lambda part: arrays.sh0[part]),
     ]

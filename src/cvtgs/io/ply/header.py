@@ -24,8 +24,8 @@ MAX_HEADER_BYTES = 1 << 20
 
 _OTHER_FILES = MappingProxyType(
     {
-        b"\x1f\x8b": "a gzip file; unpack it first",
-        b"PK\x03\x04": "a zip archive; unpack it first",
+        b"\x1f\x8b": "a gzip file; unpack it first, or rename it if it is an .spz",
+        b"PK\x03\x04": "a zip archive; unpack it first, or rename it if it is a .sog",
         b"<": "a web page; failed downloads often leave one",
     }
 )
@@ -266,7 +266,19 @@ def header_bytes(comments: Iterable[str], elements: Iterable[tuple[str, int, Lay
     for name, count, columns in elements:
         lines.append(f"element {name} {count}")
         lines += [f"property {kind} {column}" for column, kind in columns]
-    return "\n".join([*lines, "end_header", ""]).encode()
+    try:
+        header = "\n".join([*lines, "end_header", ""]).encode()
+    except UnicodeEncodeError as error:
+        raise InvalidSceneError(
+            f"comments and names of columns must be Unicode text to be written to a PLY, found "
+            f"{shown(error.object[error.start])}."
+        ) from None
+    if len(header) > MAX_HEADER_BYTES:
+        raise InvalidSceneError(
+            f"comments and names of columns must take at most {MAX_HEADER_BYTES:,} bytes to be "
+            f"written to a PLY, found {len(header):,}."
+        )
+    return header
 
 
 def row_dtype(columns: Layout) -> np.dtype[Any]:

@@ -11,9 +11,6 @@ from cvtgs.io.ply.header import FLOAT_TYPES, Element, Header, Layout
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.text import shown
 
-NORMALS = ("nx", "ny", "nz")
-"""Columns that 3DGS files carry for viewers of point clouds, almost always zero."""
-
 _OPTIONAL = ("scale_2",)
 """Standard properties that a file may lack: 2DGS has two scales."""
 

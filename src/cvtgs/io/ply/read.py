@@ -16,7 +16,6 @@ from cvtgs.errors import DroppedDataWarning, FileFormatError
 from cvtgs.io.files import open_input
 from cvtgs.io.ply.header import SCALARS, Element, Header, Layout, read_header, row_dtype
 from cvtgs.io.ply.properties import (
-    NORMALS,
     check_size,
     dtype_of,
     find_vertices,
@@ -26,7 +25,7 @@ from cvtgs.io.ply.properties import (
     standard_slots,
 )
 from cvtgs.math.spherical_harmonics import REST_COUNTS
-from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
+from cvtgs.scene import FLAT_LOG_SCALE, NORMALS, GaussianScene
 from cvtgs.text import shown
 
 CHUNK_BYTES = 1 << 20

@@ -11,13 +11,12 @@ from torch import Tensor
 from cvtgs.errors import DroppedDataWarning, InvalidSceneError
 from cvtgs.io.ply.header import FLOAT_TYPES, SCALARS, Layout, header_bytes, row_dtype
 from cvtgs.io.ply.properties import (
-    NORMALS,
     dtype_of,
     is_standard,
     rest_index,
     standard_slots,
 )
-from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
+from cvtgs.scene import FLAT_LOG_SCALE, NORMALS, GaussianScene
 
 CHUNK_BYTES = 1 << 20
 """Bytes that are gathered before they are written."""

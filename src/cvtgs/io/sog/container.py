@@ -34,17 +34,23 @@ StoredBytes = Callable[[Sequence[str]], int]
 
 def open_container(path: Path) -> AbstractContextManager[tuple[Reader, StoredBytes]]:
     """Open a bundled or an unbundled SOG."""
-    return _beside(path) if path.name == META else _inside(path)
+    return _beside(path) if is_index(path) else _inside(path)
+
+
+def is_index(path: Path) -> bool:
+    """Return whether a path is the ``meta.json`` of an unbundled SOG, whatever its exact name."""
+    return path.suffix.lower() == ".json"
 
 
 @contextmanager
 def _beside(path: Path) -> Iterator[tuple[Reader, StoredBytes]]:
     def read(name: str, most: int) -> bytes:
         _check_name(name, path)
-        with open_input(path.with_name(name)) as file:
+        part = path if name == META else path.with_name(name)
+        with open_input(part) as file:
             size = os.fstat(file.fileno()).st_size
             if size > most:
-                raise _too_long(f"{path.with_name(name)}", most, size)
+                raise _too_long(f"{part}", most, size)
             return file.read()
 
     def stored(names: Sequence[str]) -> int:

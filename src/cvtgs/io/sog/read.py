@@ -28,6 +28,7 @@ from cvtgs.io.sog.container import (
     Reader,
     StoredBytes,
     decode_webp,
+    is_index,
     open_container,
 )
 from cvtgs.math.spherical_harmonics import REST_COUNTS
@@ -154,7 +155,7 @@ def read_sog(path: Path, *, trust_sizes: bool = False) -> GaussianScene:
     """
     # A damaged file may hold numbers beyond float32.
     with open_container(path) as (read, stored), np.errstate(all="ignore"):
-        where = str(path) if path.name == META else f"{path}: {META}"
+        where = str(path) if is_index(path) else f"{path}: {META}"
         meta = _read_meta(parse_json(read(META, MOST_META_BYTES), where), where)
         document = meta.document
         if not trust_sizes:
