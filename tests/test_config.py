@@ -269,6 +269,18 @@ def test_a_file_that_is_missing_or_not_toml_is_an_error(tmp_path):
         assert compose_error(file=path).startswith(f"{path}: is not a TOML file: ")
 
 
+def test_a_section_of_a_file_that_is_none_is_named(tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_text("cvt = 3\n")
+    with pytest.raises(ConfigError, match=r"a\.toml: cvt: input should be a valid dictionary"):
+        SimplifyConfig.compose(file=path, settings={"cvt.iterations": "4"})
+
+
+@pytest.mark.parametrize("value", [True, False])
+def test_a_truth_value_is_no_sh_degree(value):
+    assert error_of({"effects": {"sh": value}}).startswith("effects.sh: input should be 'auto', ")
+
+
 def test_settings_reach_nested_sections():
     config = SimplifyConfig.compose(settings={"refine.rates.sh0": "0.5", "refine.steps": "3"})
     assert (config.refine.rates.sh0, config.refine.steps) == (0.5, 3)

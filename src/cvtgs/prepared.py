@@ -35,6 +35,17 @@ from cvtgs.validity import CheckedScene, check_rows, with_finite_opacities
 Result = TypeVar("Result")
 
 
+def check_cameras(cameras: Cameras | None, config: SimplifyConfig) -> None:
+    """Raise if cameras were given, but too few for a configuration that renders images."""
+    least = 2 if config.refine.enabled else 1
+    if cameras is not None and config.uses_images and len(cameras) < least:
+        raise InvalidArgumentError(
+            f"preset {config.preset} needs at least {least} "
+            f"{'cameras, one of them to be held out' if least > 1 else 'camera'}; "
+            f"found {len(cameras)}."
+        )
+
+
 class Prepared:
     """A scene to simplify repeatedly; results that do not depend on the count are cached.
 
@@ -67,13 +78,7 @@ class Prepared:
         cameras: Cameras | None = None,
         listener: ProgressListener = silent,
     ) -> None:
-        least = 2 if config.refine.enabled else 1
-        if cameras is not None and config.uses_images and len(cameras) < least:
-            raise InvalidArgumentError(
-                f"preset {config.preset} needs at least {least} "
-                f"{'cameras, one of them to be held out' if least > 1 else 'camera'}; "
-                f"found {len(cameras)}."
-            )
+        check_cameras(cameras, config)
         self._scene, self._config, self._checkpoint = scene, config, checkpoint
         self._total = len(scene)
         self._refines = config.refine.enabled
@@ -329,7 +334,7 @@ class Prepared:
         )
         small = restore_columns(reduced.scene, scene, analysis.plan).to(scene.means.device)
         result = Simplified(small, report)
-        if not self._refines or report.output_count == total:
+        if not self._refines or is_whole:
             return result
         return self._refine(result, analysis)
 

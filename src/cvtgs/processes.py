@@ -13,7 +13,7 @@ from multiprocessing import get_context
 from types import TracebackType
 from typing import Self, TypeVar
 
-from cvtgs.errors import RunError
+from cvtgs.errors import InvalidArgumentError, RunError
 from cvtgs.startup import load_torch
 
 if sys.platform == "win32":
@@ -34,9 +34,16 @@ class LocalWorkers:
     Args:
         count: Number of processes.
         remedy: What to do when a process ends unexpectedly, for the error message.
+
+    Raises:
+        InvalidArgumentError: The number is below 1.
     """
 
     def __init__(self, count: int, remedy: str = "with less --memory or fewer --workers") -> None:
+        if count < 1:
+            raise InvalidArgumentError(
+                f"the number of processes must be at least 1, found {count}."
+            )
         self._count, self._remedy = count, remedy
 
     def __enter__(self) -> Self:

@@ -5,9 +5,10 @@ import math
 import pytest
 
 from cvtgs import SimplifyConfig
-from cvtgs.budget import CostModel, Work, shipped_model
+from cvtgs.budget import CostModel, Work, choose_preset, shipped_model
 from cvtgs.budget.calibrate import TRIALS
 from cvtgs.budget.costs import Measurement, fit_rates
+from cvtgs.errors import InvalidArgumentError
 
 
 def preset(name: str) -> SimplifyConfig:
@@ -93,3 +94,15 @@ def test_the_shipped_rates_were_measured_on_the_trials_of_calibrations():
     for trial in TRIALS:
         assert {"check", "merge", "network"} <= set(found[trial.name])
         assert ("refine" in found[trial.name]) == trial.config.uses_images
+
+
+def test_a_scene_that_stays_whole_is_only_checked_and_analysed():
+    whole = Work(count=2_000_000, target=2_000_000, colors=48)
+    assert set(shipped_model().stage_seconds(whole, preset("high"))) == {"check", "plan"}
+    assert choose_preset(whole, 20.0, model=shipped_model()).preset == "high"
+
+
+def test_no_setting_may_name_the_preset_that_a_budget_chooses():
+    work = Work(count=10_000, target=100)
+    with pytest.raises(InvalidArgumentError, match=r"chooses the preset.*found preset = draft"):
+        choose_preset(work, 9.0, settings={"preset": "draft"}, model=shipped_model())

@@ -2,6 +2,7 @@
 
 import argparse
 import re
+import shutil
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -236,3 +237,23 @@ def test_shipped_rates_need_no_measurement(scene, measured, capsys):
 def test_keep_needs_a_size():
     with pytest.raises(InvalidArgumentError, match=r"--keep needs --rho, --count or --max-count\."):
         check_goals(options("--target-psnr", "30", "--keep", "box.json"))
+
+
+@pytest.mark.slow
+def test_several_scenes_measure_the_machine_once(source, tmp_path, measured):
+    shutil.copy(source, tmp_path / "other.ply")
+    words = ["--rho", "0.1", "--time-budget", "50s", "--recalibrate", "--quiet"]
+    assert (
+        main(
+            [
+                "simplify",
+                str(source),
+                str(tmp_path / "other.ply"),
+                "-o",
+                str(tmp_path / "out"),
+                *words,
+            ]
+        )
+        == 0
+    )
+    assert measured == [True, False]

@@ -350,7 +350,7 @@ def test_the_command_cuts_the_scene_if_memory_is_low(source, tmp_path, capsys, m
     monkeypatch.setattr("cvtgs.outofcore.memory.BASE_BYTES", 10)
     monkeypatch.setattr("cvtgs.outofcore.memory.LEAST_BYTES", 20)
     monkeypatch.setattr(
-        "cvtgs.outofcore.memory.needed_memory", lambda source, rows: 10 + 1000 * rows
+        "cvtgs.outofcore.memory.needed_memory", lambda source, rows, merging=0: 10 + 1000 * rows
     )
     words = ["simplify", str(source), str(tmp_path / "out.ply"), "--rho", "0.01"]
     words += ["--report", str(tmp_path / "report.json"), "--overwrite"]

@@ -12,6 +12,7 @@ from camera_files import transforms, write_json
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.analysis import visibility_cameras
 from cvtgs.cli.main import main
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.outofcore import LocalWorkers, improve, simplify_file
 from cvtgs.outofcore.improve import cameras_of_block
 from cvtgs.rendering import contributions, render
@@ -157,7 +158,7 @@ def test_cameras_are_part_of_the_key_of_a_job(scene, tmp_path):
 @pytest.fixture
 def two_blocks(monkeypatch):
     for module in ("cvtgs.outofcore", "cvtgs.outofcore.run"):
-        monkeypatch.setattr(f"{module}.block_count", lambda rows, memory: BLOCKS)
+        monkeypatch.setattr(f"{module}.block_count", lambda rows, memory, merging: BLOCKS)
 
 
 @pytest.mark.slow
@@ -188,3 +189,9 @@ def test_cameras_that_are_not_used_are_named(capsys, tmp_path, scene):
     assert "--cameras was not used: draft renders no images" in " ".join(
         capsys.readouterr().out.split()
     )
+
+
+def test_too_few_cameras_are_refused_as_in_one_piece(source, tmp_path):
+    for number in (0, 1):
+        with pytest.raises(InvalidArgumentError, match="at least 2 cameras, one of them to be"):
+            in_blocks(source, tmp_path / "o.ply", REFINED, cameras=ring(2).select(slice(number)))

@@ -6,18 +6,26 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import psutil
 import pytest
 
 import cvtgs
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.ply import open_rows
-from cvtgs.outofcore import available_memory, block_count, needed_memory, read_bytes
+from cvtgs.outofcore import (
+    available_memory,
+    block_count,
+    needed_memory,
+    read_bytes,
+    simplify_file,
+)
 from cvtgs.outofcore.memory import (
     BASE_BYTES,
     LEAST_BYTES,
     ROOMY_BYTES,
     SMALL_BASE_BYTES,
+    cell_room,
     control_group_rooms,
     sample_rows,
 )
@@ -176,3 +184,26 @@ def test_a_job_under_a_ulimit_uses_blocks_without_an_option(tmp_path: Path) -> N
     assert (done.returncode, done.stderr) == (0, "")
     assert "blocks" in done.stdout
     assert len(cvtgs.load(small)) == 260
+
+
+def test_pairs_that_merge_need_memory() -> None:
+    rows = SimpleNamespace(count=2_000_000, dtype=np.dtype([("x", "u1", 68)]))
+    few, all_rows = (needed_memory(rows, rows.count, merging=n) for n in (160_000, rows.count))
+    assert 1_134e6 < few < 1.35 * 1_134e6  # what was measured at 0.01
+    assert 1_676e6 < all_rows < 1.2 * 1_676e6  # and at 0.1
+    assert block_count(rows, 1_500_000_000, merging=160_000) == 1
+    assert block_count(rows, 1_500_000_000, merging=rows.count) > 1
+
+
+def test_cells_that_merge_together_do_not_depend_on_every_byte() -> None:
+    rooms = {cell_room(2_100_000_000 + k * 1_000_000) for k in range(100)}
+    assert rooms == {cell_room(None)} == {1 << 20}
+    assert cell_room(8_000_000_000) == 4 << 20
+    assert cell_room(2_000_000_000) == 7 << 17
+    assert cell_room(LEAST_BYTES) == cell_room(LEAST_BYTES + 10) > 0
+
+
+def test_blocks_need_the_least_memory(tmp_path: Path) -> None:
+    cvtgs.save(cvtgs.synthetic.scene("object", 200, sh_degree=0), tmp_path / "a.ply")
+    with pytest.raises(InvalidArgumentError, match="at least 400 MB, found 100 MB"):
+        simplify_file(tmp_path / "a.ply", tmp_path / "b.ply", 0.1, memory=100_000_000, blocks=2)

@@ -7,10 +7,14 @@ import sys
 import time
 
 import pytest
+import torch
 
 import cvtgs
+from cvtgs.errors import InvalidSceneError, OutputError
 from cvtgs.io.tensors import save_tensors
 from cvtgs.outofcore import simplify_file
+from cvtgs.outofcore.attempts import Attempt
+from cvtgs.streams import stream_file
 
 CODE = """
 import sys
@@ -153,3 +157,19 @@ def test_damaged_files_of_steps_are_made_again(source, tmp_path, kind):
     report = simplify_file(source, output, 0.05, blocks=8)
     assert report.resumed_blocks == {"small": 2, "targets": 0}.get(kind, 3)
     assert output.read_bytes() == whole.read_bytes()
+
+
+def test_a_job_that_fails_before_it_can_resume_leaves_no_folder(source, tmp_path):
+    scene = cvtgs.load(source)
+    bad = scene.with_tensors({"means": torch.full_like(scene.means, torch.nan)}, {})
+    cvtgs.save(bad, source, overwrite=True)
+    with pytest.raises(InvalidSceneError):
+        simplify_file(source, tmp_path / "out.ply", 0.05, blocks=3)
+    with pytest.raises(InvalidSceneError):
+        stream_file(source, tmp_path / "stream", [0.5, 0.1], kind="sog", blocks=3)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.ply"]
+
+
+def test_rows_that_cannot_be_written_are_one_sentence(tmp_path):
+    with pytest.raises(OutputError, match=r"attempt_rows_\S*: the output must be writable, found"):
+        Attempt(str(tmp_path / "gone")).append("rows", b"1")

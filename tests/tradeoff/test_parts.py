@@ -286,8 +286,8 @@ def test_a_missing_program_is_an_error():
 
 
 def test_presets_and_ratios_are_checked():
-    names = [task.name for task in tasks_of(None, [0.1])]
-    assert names == [f"{preset} 0.1" for preset in cvtgs.PRESETS]
+    names = [task.name for task in tasks_of(None, torch.tensor([0.1234567]))]
+    assert names == [f"{preset} 0.1234567" for preset in cvtgs.PRESETS]
     with pytest.raises(ConfigError, match="found 'best'"):
         tasks_of(["best"], [0.1])
     with pytest.raises(InvalidArgumentError, match=r"rho must be above 0 and at most 1; found 2\."):

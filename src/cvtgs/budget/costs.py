@@ -15,6 +15,7 @@ from cvtgs.cvt.tessellate import MIN_SAMPLES
 from cvtgs.grouping import finer_count
 from cvtgs.scene import GaussianScene
 
+CHECK, PLAN = "check", "plan"
 VISIBILITY, NETWORK, MATCH, REFINE = "visibility", "network", "match", "refine"
 
 FEATURES: Mapping[str, tuple[str, ...]] = {
@@ -200,8 +201,9 @@ class CostModel(Record, allow_inf_nan=False):
             config: Configuration of the simplification.
 
         Returns:
-            Wall-clock seconds by stage.
+            Wall-clock seconds by stage; a scene that stays whole is only checked and analysed.
         """
+        is_whole = work.target >= work.count
         optional = {
             VISIBILITY: config.uses_renders,
             NETWORK: config.merge.network,
@@ -210,7 +212,7 @@ class CostModel(Record, allow_inf_nan=False):
         }
         seconds = {}
         for stage, rates in self.rates.items():
-            if optional.get(stage, True):
+            if stage in (CHECK, PLAN) or (not is_whole and optional.get(stage, True)):
                 amounts = work.features(stage, config)
                 seconds[stage] = sum(rate * amounts[name] for name, rate in rates.items())
         limit = config.refine.seconds

@@ -328,6 +328,11 @@ def choose_preset(
     """
     if not 0 < seconds < math.inf:
         raise InvalidArgumentError(f"the time must be above 0 and finite, found {seconds!r} s.")
+    if settings and "preset" in settings:
+        raise InvalidArgumentError(
+            f"a time budget chooses the preset, so no setting may name it; found preset = "
+            f"{settings['preset']}."
+        )
     if isinstance(work, GaussianScene):
         work = Work.of(work, target_count(len(work), rho, count=count))
     elif rho is not None or count is not None:

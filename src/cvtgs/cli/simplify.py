@@ -155,6 +155,8 @@ def simplify(options: argparse.Namespace) -> None:
             cvtgs.io.check_save(job.options.output, overwrite=options.overwrite)
         if options.report is not None:
             cvtgs.io.check_output(options.report, overwrite=options.overwrite)
+        for job in jobs[1:]:
+            job.options.recalibrate = False  # once is enough
         run_jobs(jobs, lambda job: _simplify_one(job, checkpoint, config, settings))
 
 
@@ -294,7 +296,7 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
     memory = memory_of(options)
     names = ("target_psnr", "target_ssim", "time_budget")
     excluded = [name for name in names if getattr(options, name) is not None]
-    if options.scheduler is None and not _needs_blocks(options, memory):
+    if options.scheduler is None and not _needs_blocks(options, memory, config):
         return None
     if options.memory is None and options.scheduler is None:
         try:
@@ -311,17 +313,22 @@ def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int |
     return memory
 
 
-def _needs_blocks(options: argparse.Namespace, memory: int) -> bool:
+def _needs_blocks(options: argparse.Namespace, memory: int, config: "SimplifyConfig") -> bool:
     """Return whether a file does not fit; only binary PLYs can be read in parts, and simplified."""
+    from cvtgs.grouping import finer_count
     from cvtgs.outofcore import block_count
 
     rows = _rows_of(options.input)
-    if rows is None or block_count(rows, memory) == 1:
+    if rows is None:
         return False
     sizes = {"count": options.count, "max_count": options.max_count}
-    if options.rho is None and set(sizes.values()) == {None}:  # a quality is wanted
-        return True
-    return cvtgs.target_count(rows.count, options.rho, **sizes) < rows.count
+    target = rows.count
+    if options.rho is not None or set(sizes.values()) != {None}:  # else a quality is wanted
+        target = cvtgs.target_count(rows.count, options.rho, **sizes)
+        if target == rows.count:
+            return False
+    merging = finer_count(target, rows.count, config.allocation)
+    return block_count(rows, memory, merging=merging) > 1
 
 
 def _rows_of(path: Path) -> "PlyRows | None":

@@ -128,6 +128,7 @@ def stream_blocks(
     axes: "FileAxes",
 ) -> bool:
     """Write a stream in blocks if the scene does not fit into memory; return whether it did."""
+    from cvtgs.grouping import finer_count
     from cvtgs.io.axes import SCENE_AXES
     from cvtgs.io.ply import open_rows
     from cvtgs.outofcore import block_count, check_config
@@ -136,8 +137,12 @@ def stream_blocks(
 
     memory, asked = memory_of(options), options.memory is not None
     try:
-        if options.scheduler is None and block_count(open_rows(options.input), memory) == 1:
-            return False
+        if options.scheduler is None:
+            rows = open_rows(options.input)
+            target = max(cvtgs.target_count(rows.count, rho) for rho in rhos)
+            merging = finer_count(target, rows.count, config.allocation)
+            if block_count(rows, memory, merging=merging) == 1:
+                return False
         check_config(config, with_images=False)
     except (InputError, FileFormatError, ConfigError):
         if options.scheduler is not None or (asked and options.input.suffix == ".ply"):

@@ -14,7 +14,9 @@ Less = Literal["auto", "off"]
 
 
 def _number_of_text(value: object) -> object:
-    """Parse a degree given as text."""
+    """Parse a degree given as text; a truth value, which equals 0 or 1 in Python, is none."""
+    if isinstance(value, bool):
+        return str(value)
     numbers = {str(degree): degree for degree in range(4)}
     return numbers.get(value, value) if isinstance(value, str) else value
 

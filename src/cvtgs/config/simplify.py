@@ -231,15 +231,16 @@ class SimplifyConfig(Section):
         values = {} if file is None else read_toml(Path(file))
         if preset is not None:
             values["preset"] = preset
-        for key, text in (settings or {}).items():
-            *sections, name = key.split(".")
-            target = values
-            for section in sections:
-                target = target.setdefault(section, {})
-                if not isinstance(target, dict):
-                    raise ConfigError(f"{named(key)}: is not a known setting.")
-            target[name] = text
         try:
+            for key, text in (settings or {}).items():
+                *sections, name = key.split(".")
+                target = values
+                for section in sections:
+                    target = target.setdefault(section, {})
+                    if not isinstance(target, dict):
+                        cls.from_mapping(values)  # the file may be wrong
+                        raise ConfigError(f"{named(key)}: is not a known setting.")
+                target[name] = text
             return cls.from_mapping(values)
         except ConfigError as error:
             raise ConfigError(str(error) if file is None else f"{file}: {error}") from None

@@ -87,7 +87,7 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
     except OSError as error:
         if isinstance(error, CvtgsError):
             raise
-        raise _failed(path, error) from error
+        raise write_error(path, error) from error
 
 
 @contextmanager
@@ -140,7 +140,7 @@ def atomic_output(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
             raise
         if isinstance(error, FileExistsError):
             raise _exists(path) from error
-        raise _failed(path, error) from error
+        raise write_error(path, error) from error
     finally:
         if fcntl is None and temporary is not None:
             temporary.unlink(missing_ok=True)
@@ -303,7 +303,8 @@ def _exists(path: str | os.PathLike[str]) -> OutputExistsError:
     )
 
 
-def _failed(path: str | os.PathLike[str], error: OSError) -> OutputError:
+def write_error(path: str | os.PathLike[str], error: OSError) -> OutputError:
+    """Return the error for an output that the system refused to write."""
     if error.errno in _DISK_FULL:
         return OutputError(
             f"{os.fspath(path)}: the output needs more space than the disk has left; "

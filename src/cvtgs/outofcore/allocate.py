@@ -66,7 +66,7 @@ def allocate(job: Job) -> None:
         return
     manifest = job.read_manifest()
     cell_counts = _cell_counts(job)
-    regions = _regions(cell_counts, manifest.cell_room)
+    regions = _regions(cell_counts, job.cell_room)
     if len(regions) > 1:
         warnings.warn(
             f"{sum(cell_counts)} cells do not fit into memory together, so merge costs are only "

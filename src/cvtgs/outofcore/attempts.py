@@ -5,6 +5,8 @@ import zlib
 from pathlib import Path
 from typing import NamedTuple
 
+from cvtgs.io.atomic import write_error
+
 
 class SortedFile(NamedTuple):
     """A file that one attempt to sort a range wrote, before the job adopts it.
@@ -35,8 +37,12 @@ class Attempt:
 
     def append(self, name: str, content: bytes) -> None:
         """Append to the file with this final name."""
-        with (self._folder / self._name(name)).open("ab") as file:
-            file.write(content)
+        path = self._folder / self._name(name)
+        try:
+            with path.open("ab") as file:
+                file.write(content)
+        except OSError as error:
+            raise write_error(path, error) from error
         size, checksum = self._found.get(name, (0, 0))
         self._found[name] = (size + len(content), zlib.crc32(content, checksum))
 

@@ -24,6 +24,7 @@ from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import Checkpoint, load_checkpoint, save_checkpoint
 from cvtgs.outofcore.attempts import SortedFile
+from cvtgs.outofcore.memory import CELL_ROOM
 from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, write_scan
 
 SENT_BYTES = "sent_bytes"
@@ -48,7 +49,6 @@ class Manifest(pydantic.BaseModel):
         source: Path of the source.
         total: Number of Gaussians that all blocks keep together.
         cells: Number of cells of the tessellation in each block; their sum is at least ``total``.
-        cell_room: Number of cells that may merge together in one process.
         left_out_mass: Mass of the Gaussians that the filter leaves out.
     """
 
@@ -58,7 +58,6 @@ class Manifest(pydantic.BaseModel):
     source: str
     total: int
     cells: tuple[int, ...]
-    cell_room: int
     left_out_mass: float
 
 
@@ -76,6 +75,7 @@ class Job:
         has_network: Whether the folder holds a checkpoint.
         range_rows: Rows of the file that one process reads in one call.
         sample_rows: Size of the sample of Gaussians from which the blocks are laid out.
+        cell_room: Number of cells that may merge together in one process.
         axes: Axes of the output: the directions of x, y and z.
         cameras: Cameras for presets that render the scene; None generates views.
     """
@@ -89,6 +89,7 @@ class Job:
     has_network: bool
     range_rows: int
     sample_rows: int = SAMPLE_ROWS
+    cell_room: int = CELL_ROOM
     axes: str = SCENE_AXES
     cameras: Cameras | None = None
 
@@ -241,10 +242,11 @@ class Job:
             "blocks": self.blocks,
             "ranges": self.range_rows,
             "sample": self.sample_rows,
+            "cell_room": self.cell_room,
             "axes": [self.source.axes, self.axes],
             "sh_degree": self.source.sh_degree,
             "boxes": [box.model_dump() for box in self.boxes],
-            "cameras": self.cameras and _listed(self.cameras),
+            "cameras": None if self.cameras is None else _listed(self.cameras),
             "config": self.config.model_dump(),
             "network": checkpoint and checkpoint.digest,
             "versions": [cvtgs.__version__, torch.__version__, FILES_VERSION],

@@ -29,7 +29,10 @@ CELL_BYTES = 1500
 """Bytes per cell while pairs of cells merge; some 1,030 were measured, and 220 more with twelve
 components of view-dependent colour."""
 
-CELL_ROOM = 1_000_000
+MERGING_BYTES = 230
+"""The same in one piece, beyond what rows take in other stages."""
+
+CELL_ROOM = 1 << 20
 """Number of cells that may merge together if no memory is given."""
 
 SHARED_BY = 4
@@ -92,6 +95,16 @@ def available_memory() -> int:
         if limit != resource.RLIM_INFINITY:
             rooms.append(limit - psutil.Process().memory_info().vms)
     return max(0, min(rooms))
+
+
+def check_memory(memory: int | None, *, with_images: bool) -> None:
+    """Raise if the memory that was given is too small for any run in blocks."""
+    least = LEAST_BYTES + (IMAGE_BYTES if with_images else 0)
+    if memory is not None and memory < least:
+        raise InvalidArgumentError(
+            f"memory must be at least {least / 1e6:g} MB"
+            f"{' with images of the scene' * with_images}, found {memory / 1e6:g} MB."
+        )
 
 
 def memory_to_plan(free: int) -> int:
@@ -164,28 +177,37 @@ def sample_rows(memory: int) -> int:
     return SAMPLE_ROWS if memory >= ROOMY_BYTES else SAMPLE_ROWS // 4
 
 
-def needed_memory(source: PlyRows, rows: int) -> int:
+def needed_memory(source: PlyRows, rows: int, *, merging: int = 0) -> int:
     """Estimate the memory needed to simplify some rows at once.
 
-    Measured at rho 0.01: 290 bytes per Gaussian without view-dependent colour, 630 with degree 3.
+    Measured without view-dependent colour (``python -m benchmarks.memory``): 410 bytes per Gaussian
+    at rho 0.01, 630 where pairs merge from single Gaussians; with degree 3, 450 and 860.
 
     Args:
         source: The file.
         rows: Number of its rows.
+        merging: Number of cells, or single Gaussians, that merge in pairs at once
+            (:func:`cvtgs.grouping.finer_count`).
 
     Returns:
         Bytes.
     """
-    return BASE_BYTES + rows * (250 + 2 * source.dtype.itemsize)
+    return BASE_BYTES + rows * (290 + 2 * source.dtype.itemsize) + merging * MERGING_BYTES
 
 
 def cell_room(memory: int | None) -> int:
-    """Return how many cells of the tessellation may merge together in this memory."""
-    room = CELL_ROOM * CELL_BYTES if memory is None else memory - base_bytes(memory)
-    return max(0, room) // CELL_BYTES
+    """Return how many cells of the tessellation may merge together in this memory.
+
+    It is rounded down to three binary digits, so that the result does not depend on every byte.
+    """
+    if memory is None:
+        return CELL_ROOM
+    room = max(0, memory - base_bytes(memory)) // CELL_BYTES
+    dropped = max(0, room.bit_length() - 3)
+    return room >> dropped << dropped
 
 
-def block_count(source: PlyRows, memory: int) -> int:
+def block_count(source: PlyRows, memory: int, *, merging: int = 0) -> int:
     """Choose the number of blocks, so that any one of them fits into memory.
 
     A block holds at most twice the mean number of rows (:func:`cvtgs.outofcore.scan.scan_scene`).
@@ -193,13 +215,15 @@ def block_count(source: PlyRows, memory: int) -> int:
     Args:
         source: The file.
         memory: Bytes.
+        merging: Number of cells, or single Gaussians, that merge in pairs at once if the file is
+            simplified in one piece.
 
     Returns:
         1 if the whole file fits, else a multiple of ``SHARED_BY``.
     """
     base = min(BASE_BYTES, base_bytes(memory))
-    wanted = needed_memory(source, source.count) - BASE_BYTES
-    if base + wanted <= memory:
+    if base + needed_memory(source, source.count, merging=merging) - BASE_BYTES <= memory:
         return 1
+    wanted = needed_memory(source, source.count) - BASE_BYTES
     room = (memory if memory > base else LEAST_BYTES) - base
     return SHARED_BY * math.ceil(2 * wanted / room / SHARED_BY)

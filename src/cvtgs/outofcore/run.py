@@ -16,7 +16,7 @@ from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, shortfall, target_count
 from cvtgs.devices import HOST, one_thread
-from cvtgs.errors import ConfigError, DroppedDataWarning, InvalidArgumentError
+from cvtgs.errors import ConfigError, DroppedDataWarning
 from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES, checked_axes
@@ -29,10 +29,10 @@ from cvtgs.outofcore.job import Job, Manifest, job_folder
 from cvtgs.outofcore.lloyd import accumulate, assign, move_sites, seed
 from cvtgs.outofcore.memory import (
     IMAGE_BYTES,
-    LEAST_BYTES,
     available_memory,
     block_count,
     cell_room,
+    check_memory,
     memory_to_plan,
     sample_rows,
 )
@@ -41,7 +41,15 @@ from cvtgs.outofcore.rows import kept_rows
 from cvtgs.outofcore.scan import CHUNK
 from cvtgs.outofcore.sort import sort_into_blocks
 from cvtgs.outofcore.visibility import add_contributions, measure
-from cvtgs.outofcore.workers import Result, Workers, begin, sequentially, with_progress
+from cvtgs.outofcore.workers import (
+    Result,
+    Workers,
+    begin,
+    nothing_left,
+    sequentially,
+    with_progress,
+)
+from cvtgs.prepared import check_cameras
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import SimplifyReport, origin_of_views
 from cvtgs.scene import GaussianScene, concatenate
@@ -130,22 +138,20 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     simplifier = simplifier or Simplifier(device="cpu")
     workers = workers or sequentially
     check_config(simplifier.config)
+    check_cameras(cameras, simplifier.config)
     check_save(output, overwrite=overwrite)
     rows = open_rows(source, sh_degree=sh_degree, axes=source_axes)
     rows = replace(rows, path=str(Path(rows.path).absolute()))  # for workers in other folders
     target = target_count(rows.count, rho, count=count, max_count=max_count)
+    check_memory(memory, with_images=simplifier.config.uses_images)
     room = memory or memory_to_plan(available_memory())
     if simplifier.config.uses_images:
         room -= IMAGE_BYTES
-        if memory is not None and room < LEAST_BYTES:
-            raise InvalidArgumentError(
-                f"memory must be at least {(LEAST_BYTES + IMAGE_BYTES) / 1e6:g} MB with images of "
-                f"the scene, found {memory / 1e6:g} MB; use preset standard or more memory."
-            )
         if cameras is None and source_axes is None:
             own = find_own_cameras(_sampled(rows), source)
             cameras = None if own is None else own.cameras
-    wanted = blocks or block_count(rows, room)
+    merging = finer_count(target, rows.count, simplifier.config.allocation)
+    wanted = blocks or block_count(rows, room, merging=merging)
     job = Job(
         folder="",
         source=rows,
@@ -156,6 +162,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
         has_network=simplifier.checkpoint is not None,
         range_rows=range_rows or rows_per_range(rows.count),
         sample_rows=sample_rows(room),
+        cell_room=cell_room(memory),
         axes=checked_axes(output_axes or SCENE_AXES) if is_plain_ply(output) else SCENE_AXES,
         cameras=cameras if simplifier.config.uses_images else None,
     )
@@ -164,10 +171,11 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     clock = StageClock(listener, HOST)
     with output_lock(output):
         resumes = job.can_resume(key)
-        begin(job, workers, clock, simplifier.checkpoint, resumes=resumes)
-        if not resumes:
-            with one_thread():
-                job.write_manifest(_scan_and_sort(job, key, workers, clock, room=cell_room(memory)))
+        with nothing_left(job, resumes=resumes):
+            begin(job, workers, clock, simplifier.checkpoint, resumes=resumes)
+            if not resumes:
+                with one_thread():
+                    job.write_manifest(_scan_and_sort(job, key, workers, clock))
         energies = _tessellate_and_merge(job, workers, clock) if job.goes_by_steps else ()
         resumed = _run_blocks(job, workers, clock)
         with clock.stage("assemble"):
@@ -211,15 +219,13 @@ def check_config(config: SimplifyConfig, *, with_images: bool = True) -> None:
         )
 
 
-def _scan_and_sort(
-    job: Job, key: str, workers: Workers, clock: StageClock, *, room: int
-) -> Manifest:
+def _scan_and_sort(job: Job, key: str, workers: Workers, clock: StageClock) -> Manifest:
     """Scan the file and sort its rows into blocks; return the manifest."""
     found = sort_into_blocks(job, workers, clock)
     total = sum(found.rows)
     finer = finer_count(found.rest, total, job.config.allocation)
-    if total > room:  # one process merges all cells
-        finer = min(finer, max(room, 2 * found.rest), max(found.rest, total // 2))
+    if total > job.cell_room:  # one process merges all cells
+        finer = min(finer, max(job.cell_room, 2 * found.rest), max(found.rest, total // 2))
     if finer < sum(1 for count in found.rows if count):  # the heaviest get one each
         order = sorted(range(job.blocks), key=lambda block: -found.cells[block])
         cells = [int(block in order[:finer]) for block in range(job.blocks)]
@@ -230,7 +236,6 @@ def _scan_and_sort(
         source=job.source.path,
         total=found.rest,
         cells=tuple(cells),
-        cell_room=room,
         left_out_mass=found.left_out_mass,
     )
 

@@ -1,10 +1,14 @@
 """Workers, which call functions for ranges of a file and for blocks, here or elsewhere."""
 
+import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Protocol, TypeVar
 
 from cvtgs.clock import StageClock
 from cvtgs.devices import core_count
+from cvtgs.errors import CvtgsError
 from cvtgs.mergenet import Checkpoint
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.memory import ROOMY_BYTES
@@ -43,6 +47,17 @@ def begin(
             check(job)
     if not resumes and checkpoint is not None:
         job.write_network(checkpoint)
+
+
+@contextmanager
+def nothing_left(job: Job, *, resumes: bool) -> Iterator[None]:
+    """Remove the folder of a job that fails before there is anything to resume."""
+    try:
+        yield
+    except CvtgsError:
+        if not resumes:
+            shutil.rmtree(Path(job.folder).parent, ignore_errors=True)
+        raise
 
 
 def sequentially(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:

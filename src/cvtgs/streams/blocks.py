@@ -20,6 +20,7 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, target_count
 from cvtgs.devices import HOST, one_thread
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
+from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output, change_axes
 from cvtgs.io.atomic import make_folder
 from cvtgs.io.axes import SCENE_AXES
@@ -32,7 +33,7 @@ from cvtgs.outofcore.memory import memory_to_plan, sample_rows
 from cvtgs.outofcore.rows import analysis_of, read_rows
 from cvtgs.outofcore.run import rows_per_range
 from cvtgs.outofcore.sort import sort_into_blocks
-from cvtgs.outofcore.workers import begin, sequentially, with_progress
+from cvtgs.outofcore.workers import begin, nothing_left, sequentially, with_progress
 from cvtgs.pipeline import Reduced, level_facts, nests_in, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.scene import GaussianScene
@@ -208,7 +209,8 @@ def stream_file(  # noqa: PLR0913 (options by name)
         )
     merged = [target for target in targets if target < rows.count] or targets
     room = memory or memory_to_plan(available_memory())
-    wanted = blocks or block_count(rows, room)
+    merging = finer_count(merged[0], rows.count, simplifier.config.allocation)
+    wanted = blocks or block_count(rows, room, merging=merging)
     job = Job(
         folder="",
         source=rows,
@@ -253,11 +255,12 @@ def _run(
     """Sort the file and write the missing parts; return all parts and the number resumed."""
     job = spec.job
     resumes = job.has_sorted_rows() and job.path("targets.json").exists()
-    begin(job, workers, clock, simplifier.checkpoint, resumes=resumes)
-    if not resumes:
-        with one_thread():
-            found = sort_into_blocks(job, workers, clock, keep_all=True)
-        _write_targets(spec, targets, found.rows, found.cells)
+    with nothing_left(job, resumes=resumes):
+        begin(job, workers, clock, simplifier.checkpoint, resumes=resumes)
+        if not resumes:
+            with one_thread():
+                found = sort_into_blocks(job, workers, clock, keep_all=True)
+            _write_targets(spec, targets, found.rows, found.cells)
     make_folder(spec.folder, parents=False)
     blocks = [block for block, counts in enumerate(spec.targets()) if counts[0]]
     unfinished = [block for block in blocks if spec.finished(block) is None]

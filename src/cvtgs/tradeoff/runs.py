@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cvtgs.config import PRESETS, SimplifyConfig
 from cvtgs.config.simplify import unknown_preset
-from cvtgs.counts import target_count
+from cvtgs.counts import target_count, written
 from cvtgs.errors import InvalidArgumentError, RunError
 from cvtgs.progress import ProgressEvent, ProgressListener
 from cvtgs.report import SimplifyReport
@@ -81,12 +81,12 @@ class Task:
     @property
     def name(self) -> str:
         """Preset and ratio."""
-        return f"{self.preset} {self.rho:g}"
+        return f"{self.preset} {self.rho:.15g}"
 
     @property
     def file_name(self) -> str:
         """Name of the output file."""
-        return f"{self.preset}_{self.rho:g}.ply"
+        return f"{self.preset}_{self.rho:.15g}.ply"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,7 +114,8 @@ def tasks_of(presets: Sequence[str] | None, ratios: Sequence[float]) -> tuple[Ta
             raise unknown_preset(name)
     for rho in ratios:
         target_count(1, rho)
-    tasks = tuple(Task(preset=name, rho=rho) for rho in ratios for name in names)
+    numbers = [float(written(rho)) for rho in ratios]
+    tasks = tuple(Task(preset=name, rho=rho) for rho in numbers for name in names)
     if not tasks:
         raise InvalidArgumentError("give at least one preset and one ratio.")
     twice = [task.name for number, task in enumerate(tasks) if task in tasks[:number]]
