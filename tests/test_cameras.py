@@ -7,6 +7,9 @@ import torch
 
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.errors import InvalidArgumentError
+from cvtgs.rendering import render
+from refine_cases import ring
+from scenes import random_scene
 
 GOOD = {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "height": 3}
 
@@ -174,3 +177,16 @@ def test_held_out_cameras_are_of_both_kinds(step):
     for first in range(0, len(modes) - 8):
         assert len(set(modes[first : first + 8])) == 2
         assert len(set(strides[first : first + 8])) == 2
+
+
+def test_a_uniform_scale_of_a_view_changes_neither_centre_nor_depth():
+    plain = ring(1, width=64, height=64)
+    scaled = plain.viewmats.clone()
+    scaled[:, :3] *= 2
+    views = torch.cat([plain.viewmats, scaled])
+    both = Cameras(viewmats=views, Ks=plain.Ks.repeat(2, 1, 1), width=64, height=64)
+    torch.testing.assert_close(both.centers, both.centers[:1].expand(2, 3))
+    scene = random_scene(50)
+    images = render(scene, both, depth=True)
+    torch.testing.assert_close(images.rgb[1], images.rgb[0])
+    torch.testing.assert_close(images.depth[1], images.depth[0])

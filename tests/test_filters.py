@@ -5,8 +5,9 @@ import torch
 
 import cvtgs
 from cvtgs.analysis import analyze
+from cvtgs.edit import Motion, move
 from cvtgs.evaluation import psnr
-from cvtgs.filters import filter_rows, flyaway_rows, visible_rows
+from cvtgs.filters import FLYAWAY_RADII, filter_rows, flyaway_rows, visible_rows
 from cvtgs.validity import invalid_rows, standardized, with_finite_opacities
 from cvtgs.views import automatic_views
 from scenes import random_scene, same_bits
@@ -69,7 +70,9 @@ def test_the_mass_of_dropped_gaussians_is_bounded(share):
     keep = visible_rows(
         scene.opacities, scene.masses, min_opacity=0.5, max_mass_share=share, at_least=1
     )
-    assert float(scene.masses[~keep].sum()) <= share * float(scene.masses.sum()) * (1 + 1e-12)
+    masses = scene.masses * (scene.opacities >= 1 / 255)  # others are never drawn
+    assert float(masses[~keep].sum()) <= share * float(masses.sum()) * (1 + 1e-12)
+    assert not bool(keep[scene.opacities < 1 / 255].any())
     assert bool(keep[scene.opacities >= 0.5].all())
 
 
@@ -177,3 +180,33 @@ def test_flyaways_stay_if_the_target_needs_them(target, kept):
 def test_flyaways_are_dropped_only_up_to_their_share_of_mass():
     distances, masses = torch.full((10,), 1e3), torch.ones(10)
     assert int(flyaway_rows(distances, masses, max_share=0.35).sum()) == 3
+
+
+def test_what_stands_around_a_detailed_object_is_no_flyaway():
+    """A room of 3,000 Gaussians around an object of 8,000 of a thousandth of its size."""
+    room = cvtgs.synthetic.scene("room", 3000, sh_degree=0, seed=0)
+    tiny = move(cvtgs.synthetic.scene("object", 8000, sh_degree=0, seed=0), Motion(scale=1e-3))
+    both = cvtgs.concatenate([room, tiny])
+    analysis = analyze(both, cvtgs.SimplifyConfig())
+    assert int((analysis.frame.distances(both.means) > FLYAWAY_RADII).sum()) > 1000
+    assert filter_rows(both, analysis, 100, cvtgs.SimplifyConfig().filter).left_out == 0
+
+
+@pytest.mark.parametrize("opacity", [0.0005, 0.0038])
+def test_gaussians_that_are_never_drawn_are_no_haze_and_no_frame(opacity):
+    scene = cvtgs.synthetic.scene("object", 3000, sh_degree=0, seed=0)
+    unseen = scene.with_tensors(
+        {
+            "means": 1e-6 * scene.means,
+            "logit_opacities": torch.full((3000,), opacity).logit(),
+            "log_scales": torch.zeros(3000, 3),
+        },
+        {},
+    )
+    both = cvtgs.concatenate([scene, unseen, unseen, unseen])
+    report = cvtgs.Simplifier(device="cpu").run(both, count=300).report
+    assert (report.filtered_count, report.plan.haze.active) == (9000, False)
+    frames = [analyze(one, cvtgs.SimplifyConfig()).frame for one in (scene, both)]
+    assert frames[0].radius == frames[1].radius
+    assert torch.equal(frames[0].center, frames[1].center)
+    assert analyze(unseen, cvtgs.SimplifyConfig()).frame.radius > 0  # of all, if none is drawn

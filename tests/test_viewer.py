@@ -133,6 +133,7 @@ def test_a_standalone_page_starts_in_view_of_the_scene(scene: GaussianScene) -> 
     assert scene_page({"a": scene, "b": random_scene(7)}) == "<html>[[500], [7]] True</html>"
     stand = viser_stand_in.ViserServer.latest
     assert not stand.is_open
+    assert stand.scene.up == "-y"
     assert list(stand.scene.labels.values()) == ["a: 500 Gaussians", "b: 7 Gaussians"]
     eye, target = stand.initial_camera.position, stand.initial_camera.look_at
     toward = [b - a for a, b in zip(eye, target, strict=True)]
@@ -174,7 +175,8 @@ def test_the_camera_of_a_view_equals_that_by_hand() -> None:
     assert (cameras.width, cameras.height) == (480, 240)
     point = cameras.viewmats[0].double() @ torch.tensor([1, 2, -1, 1], dtype=torch.float64)
     torch.testing.assert_close(point, torch.tensor([0, 0, 4, 1], dtype=torch.float64))
-    assert cameras.Ks[0].tolist() == [[120, 0, 240], [0, 120, 120], [0, 0, 1]]
+    wanted = [[120.0, 0, 240], [0, 120, 120], [0, 0, 1]]
+    torch.testing.assert_close(cameras.Ks[0], torch.tensor(wanted, dtype=torch.float64))
 
 
 def test_names_reserved_by_the_viewer_are_refused(scene: GaussianScene) -> None:

@@ -96,7 +96,8 @@ class Cameras:
     def centers(self) -> Float[Tensor, "c 3"]:
         """Positions of the cameras in the world."""
         rotations, shifts = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3:]
-        return -(rotations.transpose(1, 2) @ shifts)[:, :, 0]
+        centers = -(rotations.transpose(1, 2) @ shifts)[:, :, 0]
+        return centers / view_scales(self.viewmats)[:, None].square()
 
     def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "c"]) -> Self:
         """Return some of the cameras.
@@ -304,6 +305,12 @@ class Cameras:
         return self.select(
             torch.tensor(spread_rows(len(self), count), dtype=torch.int64, device="cpu")
         )
+
+
+def view_scales(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "c"]:
+    """Return the uniform scale of each view matrix; exactly 1 for rotations up to rounding."""
+    scales = viewmats[:, :3, :3].square().sum(dim=(1, 2)).div(3).sqrt()
+    return torch.where((scales - 1).abs() > 1e-3, scales, 1.0)
 
 
 def _check_whole(value: object, name: str) -> None:

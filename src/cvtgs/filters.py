@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.analysis import SceneAnalysis, perspective_falloff
+from cvtgs.analysis import SceneAnalysis, drawn_rows, perspective_falloff
 from cvtgs.config import FilterConfig
 from cvtgs.math.parameters import divide
 from cvtgs.math.segments import running_sums, true_rows
@@ -85,7 +85,7 @@ def visible_rows(
     max_mass_share: float,
     at_least: int,
 ) -> Bool[Tensor, "n"]:
-    """Drop the faintest Gaussians up to a share of the mass.
+    """Drop the faintest Gaussians up to a share of the mass; those that are never drawn have none.
 
     With ``max_mass_share = 1`` this is the filter of CVT-GS: everything below ``min_opacity`` is
     dropped. A smaller share keeps haze, which is many faint Gaussians with real mass.
@@ -114,8 +114,8 @@ def visible_rows(
     faint = faint[torch.sort(opacities[faint], stable=True).indices]
     dropped = faint
     if max_mass_share < 1:
-        lost = running_sums(masses[faint].double())
-        dropped = faint[lost <= max_mass_share * masses.double().sum()]
+        drawn = masses.double() * drawn_rows(opacities)
+        dropped = faint[running_sums(drawn[faint]) <= max_mass_share * drawn.sum()]
     missing = at_least - (len(opacities) - len(dropped))
     if missing > 0:
         heaviest_first = torch.sort(masses[dropped], stable=True, descending=True).indices
@@ -125,12 +125,18 @@ def visible_rows(
     return keep
 
 
+def most_flyaways(total: int) -> int:
+    """Return the largest number of flyaways of a scene; a scene of few may have ten."""
+    return max(10, total // 100)
+
+
 def flyaway_rows(
     distances: Float[Tensor, "n"], masses: Float[Tensor, "n"], *, max_share: float
 ) -> Bool[Tensor, "n"]:
     """Find Gaussians that lie absurdly far away and contribute next to nothing.
 
-    Merging them with others would give one huge blob. A sky has real mass, and stays.
+    Merging them with others would give one huge blob. A sky has real mass, and stays. If more than
+    a hundredth of all Gaussians lie there, they are what stands around a small detailed object.
 
     Args:
         distances: Distances from the middle of the scene, in robust radii.
@@ -147,8 +153,10 @@ def flyaway_rows(
         [False, True]
     """
     far = (distances > FLYAWAY_RADII).nonzero()[:, 0]
+    found = torch.zeros(len(distances), dtype=torch.bool, device=distances.device)
+    if len(far) > most_flyaways(len(distances)):
+        return found
     far = far[torch.sort(masses[far], stable=True).indices]
     lost = running_sums(masses[far].double())
-    found = torch.zeros(len(distances), dtype=torch.bool, device=distances.device)
     found[far[lost <= max_share * masses.double().sum()]] = True
     return found

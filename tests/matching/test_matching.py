@@ -1,5 +1,6 @@
 """Matching to images without gradients: opacities by contributions, colours by least squares."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -9,7 +10,7 @@ import cvtgs
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.config import MatchConfig
 from cvtgs.matching import cell_contributions, colors, fit_colors, match_opacities, match_views
-from cvtgs.matching.match import with_deeper_opacities
+from cvtgs.matching.match import mean_squared_error, with_deeper_opacities
 from cvtgs.math import parameters
 from cvtgs.rendering import contributions, observe, render
 from cvtgs.views import automatic_views, mixed_views, random_views
@@ -337,3 +338,10 @@ def test_omitted_bands_stay_zero():
     small = Simplifier(config=preset(), device="cpu").simplify(plain, 0.1)
     assert small.sh_degree == 2
     assert not bool(small.shN.any())
+
+
+def test_errors_count_what_a_screen_can_show(scene, views):
+    bright = replace(views, rgb=views.rgb + 5.0)
+    small = scene.with_tensors({"sh0": scene.sh0 + 40.0})
+    shown = mean_squared_error(small, bright)
+    assert shown < 1.0  # unclipped, colours differ by more than 5

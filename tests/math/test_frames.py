@@ -31,10 +31,14 @@ def test_one_point_and_coincident_points():
         assert frame.radius == 1.0
 
 
-def test_mostly_coincident_points_take_the_largest_distance():
+def test_mostly_coincident_points_take_a_quantile_of_the_others():
     points = torch.zeros(10, 3)
     points[9, 0] = 4.0
     assert robust_frame(points).radius == 4.0
+    points = torch.zeros(100, 3)
+    points[90:, 0] = torch.arange(1, 11)
+    points[99, 0] = 1e9
+    assert robust_frame(points).radius == 7.0
 
 
 @pytest.mark.parametrize("far", [1e6, 1e30])

@@ -12,6 +12,7 @@ from cvtgs.math.parameters import LOGIT_LIMIT
 from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.refinement import refine
 from cvtgs.refinement.images import ImageBuffer
+from cvtgs.refinement.optimize import SceneOptimizer
 from cvtgs.scene import concatenate
 from refine_cases import as_dtype, discolored, full_scene, quick, ring, small_scene
 from scenes import random_scene, same_bits
@@ -207,3 +208,16 @@ def test_random_backgrounds_take_black_paint_from_an_empty_background(monkeypatc
     (_, before, after, black), empty = alphas_of(full, small, refined, over_black)
     assert after[empty].mean() < 0.95 * black[empty].mean()
     assert after[empty].mean() < before[empty].mean()
+
+
+@pytest.mark.parametrize("log_scale", [44.5, 88.0])
+def test_huge_gaussians_have_finite_units(log_scale):
+    scene = small_scene(full_scene())
+    log_scales = scene.log_scales.clone()
+    log_scales[0] = torch.tensor([log_scale, 0.0, log_scale])
+    optimizer = SceneOptimizer(
+        scene.with_tensors({"log_scales": log_scales}),
+        quick().rates,
+        learning_rate_scale=torch.ones(len(scene)),
+    )
+    assert all(tensor.isfinite().all() for tensor in optimizer.scene().tensors().values())

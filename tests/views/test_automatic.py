@@ -253,3 +253,12 @@ def test_large_scenes_are_thinned_and_look_the_same(monkeypatch):
     )
     assert float(thinned.up @ whole.up) > 0.99
     assert abs(thinned.radius / whole.radius - 1) < 0.05
+
+
+@pytest.mark.parametrize("count", [500, 800, 1200])
+def test_small_objects_are_no_rooms(count):
+    for seed in range(3):
+        scene = cvtgs.synthetic.scene("object", count, sh_degree=0, seed=seed)
+        assert find_layout(scene).room is None
+    room = cvtgs.synthetic.scene("room", 4000, sh_degree=0, seed=0)
+    assert find_layout(room).room is not None

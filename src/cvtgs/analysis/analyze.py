@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.analysis.effects import EffectPlan, haze_share, plan_effects, plan_haze
+from cvtgs.analysis.effects import EffectPlan, drawn_rows, haze_share, plan_effects, plan_haze
 from cvtgs.analysis.visibility import ambient_visibility, perspective_falloff
 from cvtgs.cameras import Cameras
 from cvtgs.config import EffectsConfig, SimplifyConfig, TessellationConfig
@@ -90,7 +90,8 @@ def analyze(
         >>> analysis.plan.unbounded.active, len(analysis.areas)
         (False, 100)
     """
-    frame, areas, opacities = robust_frame(scene.means), scene.areas, scene.opacities
+    areas, opacities = scene.areas, scene.opacities
+    frame = frame_of(scene.means, opacities)
     distances, masses = frame.distances(scene.means), areas * opacities
     visibility = masses[:0]
     if with_visibility or config.cvt.hidden_share < 1.0:
@@ -106,6 +107,19 @@ def analyze(
         visibility=visibility,
         plan=plan,
     )
+
+
+def frame_of(means: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"]) -> RobustFrame:
+    """Return the robust frame of the Gaussians that are drawn at all; of all if none is.
+
+    Args:
+        means: Finite centres.
+        opacities: Their opacities.
+
+    Returns:
+        Centre and radius.
+    """
+    return robust_frame(means[drawn_rows(opacities)])
 
 
 def apparent_areas(

@@ -4,13 +4,13 @@ import math
 from itertools import pairwise
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.devices import chunk_length
-from cvtgs.math.parameters import divide, opacity_from_logit
+from cvtgs.math.parameters import MIN_ALPHA, divide, opacity_from_logit
 from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
 from cvtgs.scene import GaussianScene
 
@@ -184,11 +184,28 @@ def plan_effects(
     )
 
 
+def drawn_rows(opacities: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    """Return which Gaussians images can show at all; all of them if none can be seen.
+
+    Args:
+        opacities: Opacities; renderers skip what is below 1/255.
+
+    Returns:
+        Mask of the rows.
+
+    Example:
+        >>> drawn_rows(torch.tensor([0.001, 0.5])).tolist()
+        [False, True]
+    """
+    drawn = opacities >= MIN_ALPHA
+    return drawn | ~drawn.any()
+
+
 def haze_share(
     opacities: Float[Tensor, "n"], apparent_masses: Float[Tensor, "n"], config: SimplifyConfig
 ) -> Float[Tensor, ""]:
-    """Return the share of the apparent mass that faint Gaussians hold."""
-    masses = apparent_masses.double()
+    """Return the share of the apparent mass that faint Gaussians hold, if they are drawn at all."""
+    masses = apparent_masses.double() * drawn_rows(opacities)
     return divide((masses * (opacities < config.filter.min_opacity)).sum(), masses.sum())
 
 

@@ -173,12 +173,12 @@ def heldout_views(views: ObservedViews) -> ObservedViews:
 
 
 def mean_squared_error(small: GaussianScene, views: ObservedViews) -> float:
-    """Return the mean squared error of the images of a scene, over black."""
+    """Return the mean squared error of the images of a scene, over black, as PSNR counts it."""
     total = 0.0
     for camera, wanted in zip(views.cameras.singles(), views.rgb, strict=True):
         with torch.no_grad():
             image = render(small, camera).rgb[0]
-        total += float((image - wanted).double().square().mean())
+        total += float((image.clamp(0, 1) - wanted.clamp(0, 1)).double().square().mean())
     return total / len(views.cameras)
 
 

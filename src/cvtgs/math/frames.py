@@ -91,8 +91,8 @@ def robust_frame(points: Float[Tensor, "n 3"]) -> RobustFrame:
         points: Finite positions, at least one.
 
     Returns:
-        The frame. If more than 70 % of the points coincide, the radius is the largest distance;
-        if all do, it is 1.
+        The frame. If more than 70 % of the points coincide, the radius is the 70 % quantile of the
+        distances of the others; if all do, it is 1.
 
     Example:
         >>> frame = robust_frame(torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
@@ -101,9 +101,13 @@ def robust_frame(points: Float[Tensor, "n 3"]) -> RobustFrame:
     """
     center = torch.stack(list(map(torch.median, points.unbind(1)))).double()
     distances = RobustFrame(center=center, radius=1.0).distances(points)
-    rank = max(1, math.ceil(RADIUS_QUANTILE * len(points)))
-    radius = float(distances.kthvalue(rank).values) or float(distances.amax()) or 1.0
+    radius = _radius(distances) or _radius(distances[distances > 0.0]) or 1.0
     return RobustFrame(center=center, radius=radius)
+
+
+def _radius(distances: Float[Tensor, "n"]) -> float:
+    rank = math.ceil(RADIUS_QUANTILE * len(distances))
+    return float(distances.kthvalue(rank).values) if rank else 0.0
 
 
 def morton_order(

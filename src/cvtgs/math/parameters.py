@@ -15,6 +15,9 @@ OPACITY_MARGIN = 1e-6
 LOGIT_LIMIT = math.log((1.0 - OPACITY_MARGIN) / OPACITY_MARGIN)
 """The logit of the largest opacity, about 13.8."""
 
+MIN_ALPHA = 1 / 255
+"""Gaussians of lower alpha in a pixel are not drawn there."""
+
 EIGENVALUE_FLOOR = 1e-12
 """Floor of eigenvalues as a share of the largest one (for scales: 1e-6)."""
 

@@ -293,10 +293,9 @@ def scan_scene(
     distances = frame.distances(sample.means)
     apparent = analysis.apparent_areas(known.areas, distances, visibility, config=config.cvt)
     known = replace(known, apparent_areas=apparent, visibility=visibility)
-    if boxes:
-        free = (~inside(boxes, sample.means)).nonzero()[:, 0]
-        if len(free):
-            sample, known = sample.select(free), known.select(free)
+    free = (~inside(boxes, sample.means)).nonzero()[:, 0]
+    if boxes and len(free):
+        sample, known = sample.select(free), known.select(free)
     row_count = totals.valid_count - totals.kept_count
     rows_per_sample = row_count / max(1, len(sample))
     least = min(len(sample), -int(-target // rows_per_sample))
@@ -343,6 +342,7 @@ def _view_components(
 def _max_flyaway_mass(totals: RangeTotals, max_share: float) -> float:
     """Return the largest mass of a flyaway that is left out; -1 if none is left out."""
     ascending = torch.sort(totals.far_masses).values
+    max_share *= len(ascending) <= filters.most_flyaways(totals.valid_count)
     left_out = ascending[ascending.cumsum(0) <= max_share * totals.falloff_mass]
     return float(left_out[-1]) if max_share > 0 and len(left_out) else -1.0
 

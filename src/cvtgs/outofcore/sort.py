@@ -6,11 +6,11 @@ from functools import partial
 from typing import NamedTuple
 
 from cvtgs import validity
+from cvtgs.analysis import frame_of
 from cvtgs.boxes import check_room
 from cvtgs.clock import StageClock
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.grouping import finer_count
-from cvtgs.math.frames import robust_frame
 from cvtgs.outofcore.attempts import SortedFile
 from cvtgs.outofcore.job import Job
 from cvtgs.outofcore.rows import sort_range
@@ -70,7 +70,7 @@ def _scan(
     if len(sample) == 0:
         raise InvalidSceneError(f"{job.source.path}: found no valid Gaussian.")
     validity.warn_of_lost_digits(sample)
-    frame = robust_frame(sample.means)
+    frame = frame_of(sample.means, sample.opacities)
     scan_rows = partial(scan_range, job.source, frame, job.boxes)
     totals = add_totals(with_progress(workers(scan_rows, ranges), advance))
     valid, kept = totals.valid_count, totals.kept_count

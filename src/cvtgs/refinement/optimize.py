@@ -24,6 +24,8 @@ from cvtgs.validity import standardized, valid_rows, with_finite_opacities
 
 STAGE = "refine"
 
+_LARGEST = 1e18
+
 THINNEST = 0.1
 """Axes thinner than this share of the mean axis count as this thick, as they do in images."""
 
@@ -212,7 +214,8 @@ def _units(scene: GaussianScene, scale: Float[Tensor, "n"]) -> dict[str, Tensor]
     """
     axes = torch.where((scale > 0)[:, None], torch.exp(scene.log_scales), 0.0)
     axes = torch.maximum(axes, THINNEST * axes.mean(dim=1, keepdim=True))
-    first, second = axes[:, [1, 2, 0]], axes[:, [2, 0, 1]]
+    finite = axes.clamp_max(_LARGEST)  # their products must not overflow
+    first, second = finite[:, [1, 2, 0]], finite[:, [2, 0, 1]]
     squares = (first.square() - second.square()).abs()
     turns = (first * second / squares.clamp_min(1e-30)).clamp_max(1.0)
     units = {name: _like(scale, tensor) for name, tensor in scene.tensors().items()}

@@ -9,9 +9,10 @@ import math
 
 import numpy as np
 
+from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.rendering.compiled import Array, Ints, PixelBox, TileArrays, parallel, prange, serial
 from cvtgs.rendering.kernels_tiles import LOG_MIN_ALPHA, box_of, span, tile_at
-from cvtgs.rendering.projection import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from cvtgs.rendering.projection import MAX_ALPHA, MIN_TRANSMITTANCE
 
 WIDEST = 1e9
 """Half widths of splats beyond this, in pixels, count as this."""

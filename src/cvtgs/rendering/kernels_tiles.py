@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 
+from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.rendering.compiled import Array, Ints, PixelBox, parallel, prange, serial
-from cvtgs.rendering.projection import MIN_ALPHA
 
 SLACK = 1e-3
 LOG_MIN_ALPHA = math.log(MIN_ALPHA)

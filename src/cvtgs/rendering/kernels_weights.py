@@ -9,6 +9,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.rendering.compiled import (
     Array,
     Ints,
@@ -20,7 +21,7 @@ from cvtgs.rendering.compiled import (
     serial,
 )
 from cvtgs.rendering.kernels_tiles import LOG_MIN_ALPHA, box_of, span, tile_at
-from cvtgs.rendering.projection import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from cvtgs.rendering.projection import MAX_ALPHA, MIN_TRANSMITTANCE
 
 
 class WeightArrays(NamedTuple):

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from cvtgs.cameras import Cameras
+from cvtgs.cameras import Cameras, view_scales
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.scene import GaussianScene
@@ -27,8 +27,6 @@ FRUSTUM_MARGIN = 0.3
 MAX_ALPHA = 0.99
 """Largest alpha of one Gaussian in a pixel."""
 
-MIN_ALPHA = 1 / 255
-"""Gaussians of lower alpha in a pixel are skipped there."""
 
 MIN_TRANSMITTANCE = 1e-4
 """A pixel is finished before the Gaussian that would lower its transmittance below this."""
@@ -107,6 +105,8 @@ def to_pinholes(cameras: Cameras) -> list[Pinhole]:
     table = torch.cat(both, dim=1).detach().cpu()
     viewmats, Ks = table[:, :16].view(-1, 4, 4), table[:, 16:].view(-1, 3, 3)  # noqa: N806 (as gsplat)
     _check(viewmats, Ks)
+    viewmats = viewmats.clone()
+    viewmats[:, :3] /= view_scales(viewmats)[:, None, None]  # depths are in scene units
     centers = -torch.linalg.solve(viewmats[:, :3, :3], viewmats[:, :3, 3:])[:, :, 0]
     modes = cameras.ignores_tag or (False,) * len(cameras)
     strides = cameras.strides or (1,) * len(cameras)
@@ -218,7 +218,7 @@ def pack(splats: Splats) -> Float[Tensor, "m 10"]:
 @torch.no_grad()
 def reach_of(opacities: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
     """Return the squared Mahalanobis distance at which alpha falls to 1/255."""
-    return (2 * parameters.positive_log(opacities / MIN_ALPHA)).clamp_min(0)
+    return (2 * parameters.positive_log(opacities / parameters.MIN_ALPHA)).clamp_min(0)
 
 
 @torch.no_grad()
@@ -259,7 +259,7 @@ def _candidates(scene: GaussianScene, camera: Pinhole, beside: CameraTensors) ->
     ):
         place = way / z * focal + principal
         keep &= (place + radius > 0) & (place - radius < size)
-    keep &= parameters.opacity_from_logit(scene.logit_opacities) >= MIN_ALPHA
+    keep &= parameters.opacity_from_logit(scene.logit_opacities) >= parameters.MIN_ALPHA
     return keep.nonzero()[:, 0]
 
 
@@ -290,7 +290,7 @@ def _ellipses(axes: Float[Tensor, "m 2 3"], dilation: float) -> tuple[Tensor, Te
     minors = torch.linalg.cross(across, down / d.sqrt()[:, None])
     bare = (minors * minors).sum(dim=1)
     schur = bare + dilation * (bare_a + d) / d
-    survival = (bare / schur).clamp_min(MIN_ALPHA**2 / 4).sqrt()
+    survival = (bare / schur).clamp_min(parameters.MIN_ALPHA**2 / 4).sqrt()
     return torch.stack([1 / schur, -b / d, 1 / d], dim=1), survival
 
 
@@ -299,7 +299,7 @@ def _front_to_back(
     centers: Tensor, ellipses: Tensor, opacities: Tensor, depths: Tensor, camera: Pinhole
 ) -> Tensor:
     """Return the indices of the splats that touch the image, sorted by depth."""
-    keep = (opacities >= MIN_ALPHA) & torch.isfinite(ellipses).all(dim=1)
+    keep = (opacities >= parameters.MIN_ALPHA) & torch.isfinite(ellipses).all(dim=1)
     halves = half_sizes(ellipses, reach_of(opacities))
     for place, half, size in zip(centers.unbind(1), halves, camera.size, strict=True):
         keep &= (place + half >= 0) & (place - half <= size)

@@ -12,12 +12,12 @@ from torch.autograd.function import once_differentiable
 
 from cvtgs.cameras import Cameras
 from cvtgs.math import segments
+from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.rendering.backends import RasterOutput, contributions_by_gradient, render_each
 from cvtgs.rendering.pixel_weights import PixelWeights
 from cvtgs.rendering.projection import (
     MAX_ALPHA,
-    MIN_ALPHA,
     MIN_TRANSMITTANCE,
     Pinhole,
     Splats,

@@ -18,6 +18,7 @@ from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import valid_part
 from cvtgs.views import automatic_views
+from cvtgs.views.layout import find_layout
 
 if TYPE_CHECKING:
     import viser
@@ -103,8 +104,12 @@ def record_page(server: "viser.ViserServer", nodes: Sequence[SceneNode]) -> str:
 
 
 def look_at(server: "viser.ViserServer", scene: GaussianScene) -> Point:
-    """Set the initial camera to a good view of the scene; return the place of labels in it."""
-    camera = automatic_views(scene.to("cpu"), 1)
+    """Set up and the initial camera to a good view; return the place of labels in it."""
+    scene = scene.to("cpu")
+    up = find_layout(scene).up
+    axis = int(up.abs().argmax())
+    server.scene.set_up_direction(f"{'+' if up[axis] > 0 else '-'}{'xyz'[axis]}")
+    camera = automatic_views(scene, 1)
     rotation, center = camera.viewmats[0, :3, :3], camera.centers[0]
     depth = float(rotation[2] @ (robust_frame(scene.means).center.cpu().double() - center))
     depth = max(depth, 1e-3)
@@ -126,7 +131,6 @@ def start_server(host: str, port: int) -> "viser.ViserServer":
         server: viser.ViserServer = module.ViserServer(
             host=host, port=port, label="cvtgs", verbose=False
         )
-    server.scene.set_up_direction("-y")
     return server
 
 

@@ -173,8 +173,8 @@ def camera_of(
     focal = height / 2 / math.tan(fov / 2)
     intrinsics = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
     return Cameras(
-        viewmats=view.float()[None],
-        Ks=torch.tensor([intrinsics], dtype=torch.float32, device="cpu"),
+        viewmats=view[None],
+        Ks=torch.tensor([intrinsics], dtype=torch.float64, device="cpu"),
         width=width,
         height=height,
     )

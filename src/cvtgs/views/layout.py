@@ -39,6 +39,10 @@ _FARTHEST = 6.0
 _MOST_POINTS = 10_000
 _CELLS = 10
 _LEAST_IN_CELL = 8
+_LEAST_CELLS = 16
+"""A room has Gaussians in at least so many cells of directions; small objects seem to grow in a
+few by chance."""
+
 _BANDS = 5
 _SECTORS = 12
 
@@ -82,7 +86,8 @@ def find_room(
         return None
     if hidden_share(best, points) > _HIDDEN:
         return None
-    if size_growth(sized, frame.center + frame.radius * best, frame.radius) < _GROWS:
+    middle = frame.center + frame.radius * best
+    if size_growth(sized, middle, frame.radius, least_cells=_LEAST_CELLS) < _GROWS:
         return None
     eye: Tensor = center + (0.58 * (high - low) + low) * up
     return eye
@@ -117,8 +122,13 @@ def hidden_share(eye: Float[Tensor, "3"], points: Float[Tensor, "v 3"]) -> float
     return float((distances > _BEHIND * nearest[cells] + VOXEL_SIZE).double().mean())
 
 
-def size_growth(sized: SizedPoints, eye: Float[Tensor, "3"], radius: float) -> float:
-    """Return the correlation of sizes with distances from a point, as a mean over directions."""
+def size_growth(
+    sized: SizedPoints, eye: Float[Tensor, "3"], radius: float, *, least_cells: int = 1
+) -> float:
+    """Return the correlation of sizes with distances from a point, as a mean over directions.
+
+    It is 0 if fewer cells of directions than ``least_cells`` have enough Gaussians.
+    """
     offsets = sized.means - eye
     distances = torch.linalg.vector_norm(offsets, dim=1)
     near = (distances < _FARTHEST * radius) & (distances > 0)
@@ -135,7 +145,7 @@ def size_growth(sized: SizedPoints, eye: Float[Tensor, "3"], radius: float) -> f
     products = (sums(distances.square()) * sums(sizes.square())).sqrt()
     correlations = divide(sums(distances * sizes), products)
     enough = (numbers >= _LEAST_IN_CELL) & (products > 0)
-    return float(correlations[enough].mean()) if bool(enough.any()) else 0.0
+    return float(correlations[enough].mean()) if int(enough.sum()) >= least_cells else 0.0
 
 
 def _cells_of_cube(offsets: Float[Tensor, "n 3"]) -> Tensor:
