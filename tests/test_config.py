@@ -272,7 +272,7 @@ def test_a_file_that_is_missing_or_not_toml_is_an_error(tmp_path):
 def test_a_section_of_a_file_that_is_none_is_named(tmp_path):
     path = tmp_path / "a.toml"
     path.write_text("cvt = 3\n")
-    with pytest.raises(ConfigError, match=r"a\.toml: cvt: input should be a valid dictionary"):
+    with pytest.raises(ConfigError, match=r"a\.toml: cvt: holds settings, found 3"):
         SimplifyConfig.compose(file=path, settings={"cvt.iterations": "4"})
 
 

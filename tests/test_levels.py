@@ -123,8 +123,9 @@ def test_invalid_rows_are_counted_once_in_every_report(simplifier):
 
 
 def test_no_ratio_and_bad_ratios_are_refused(scene, simplifier):
-    with pytest.raises(InvalidArgumentError, match="at least one ratio"):
-        simplifier.levels(scene, [])
+    for wrong in ([], 0.1):
+        with pytest.raises(InvalidArgumentError, match="levels need a list of ratios, found"):
+            simplifier.levels(scene, wrong)
     with pytest.raises(InvalidArgumentError, match="rho must be above 0"):
         simplifier.levels(scene, [0.1, 2.0])
 

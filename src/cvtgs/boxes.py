@@ -115,7 +115,8 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
         where = shortened(where if where.isprintable() else repr(where), MOST_LETTERS)
         raise InvalidArgumentError(
             f'{path}: must hold boxes like {{"min": [x, y, z], "max": [x, y, z]}}; '
-            f"{where + ': ' if where else ''}{problem['msg'].lower()}."
+            f"{where + ': ' if where else ''}"
+            f"{problem['msg'].lower().removeprefix('value error, ')}."
         ) from None
     if not boxes:
         raise InvalidArgumentError(f"{path}: must hold at least one box, found none.")

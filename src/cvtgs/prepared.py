@@ -30,6 +30,7 @@ from cvtgs.pipeline import Reduced, level_facts, nests_in, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified, SimplifyReport, origin_of_views
 from cvtgs.scene import GaussianScene, concatenate
+from cvtgs.text import shown
 from cvtgs.validity import CheckedScene, check_rows, with_finite_opacities
 
 Result = TypeVar("Result")
@@ -199,9 +200,9 @@ class Prepared:
         Returns:
             One level per ratio, in the order of the ratios.
         """
+        if isinstance(rhos, int | float) or not len(rhos):
+            raise InvalidArgumentError(f"levels need a list of ratios, found {shown(rhos)}.")
         targets = [target_count(self._total, rho) for rho in rhos]
-        if not targets:
-            raise InvalidArgumentError("levels need at least one ratio, found none.")
         found = self._attempt(partial(self._run_levels, targets))
         return tuple(found[target] for target in targets)
 

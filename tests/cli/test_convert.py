@@ -184,3 +184,10 @@ def test_simplify_and_levels_write_no_columns_of_dropped_bands(
     for path in (small, tmp_path / "levels" / "rho_0.1.ply"):
         assert path.read_bytes().count(b"property float f_rest_") == columns
         assert load(path).sh_degree == degree
+
+
+def test_a_version_of_spz_needs_an_spz(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["convert", str(DATA / "source.ply"), str(tmp_path / "a.glb"), "--spz-version", "4"]
+    assert main(words) == 1
+    assert "--spz-version needs a .spz to write, found a.glb." in capsys.readouterr().err
+    assert not (tmp_path / "a.glb").exists()

@@ -83,9 +83,9 @@ def test_edits_use_the_axes_of_a_ply(tmp_path: Path, scene: GaussianScene) -> No
         (["--crop-sphere", "0,0,0,0"], "at least one Gaussian must be left to write, found n"),
         (["--min-opacity", "2"], "--min-opacity must be from 0 to 1, found 2.0."),
         (["--max-size", "0"], "--max-size must be above 0, found 0.0."),
-        (["--scale", "-1"], "--scale must be above 0, found -1.0."),
+        (["--scale", "-1"], "--scale must be above 0 and finite, found -1.0."),
         (["--rotate", "90"], "--rotate must be three numbers x,y,z, degrees about each axis, fou"),
-        (["--translate", "nan,0,0"], "a motion must consist of finite numbers"),
+        (["--translate", "nan,0,0"], "--translate must be three numbers x,y,z, found 'nan,0,0'"),
         (["--merge", "missing.ply"], "missing.ply: the file to read must exist, found none."),
     ],
 )

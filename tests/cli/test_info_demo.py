@@ -116,3 +116,15 @@ def test_size_text():
         "68.0 MB",
         "2.0 GB",
     ]
+
+
+def test_demo_replaces_only_files_of_an_earlier_demo(tmp_path, capsys):
+    (tmp_path / "index.html").write_text("mine")
+    assert main(["demo", "-o", str(tmp_path), "--count", "50"]) == 1
+    assert "a new folder or that of an earlier demo, found index.html" in capsys.readouterr().err
+    assert (tmp_path / "index.html").read_text() == "mine"
+
+
+def test_effects_are_no_matter_of_checkpoints(capsys):
+    assert main(["info", "standard", "--effects", "sh=1"]) == 1
+    assert "--effects applies to scenes" in capsys.readouterr().err

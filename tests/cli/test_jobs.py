@@ -292,3 +292,14 @@ def test_a_plain_run_makes_no_temporary_folder(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "none"))
     assert main(["convert", str(tmp_path / "in.ply"), str(tmp_path / "out.ply"), "--quiet"]) == 0
     assert (tmp_path / "out.ply").exists()
+
+
+def test_an_output_may_not_replace_another_input(
+    scenes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cvtgs.save(cvtgs.load("c.spz"), "a.small.ply")
+    before = Path("a.small.ply").read_bytes()
+    words = ["a.ply", "a.small.ply", "-o", str(scenes), "--suffix", ".small.ply", "--overwrite"]
+    assert main(["convert", *words]) == 1
+    assert "the output of a.ply must not replace another input, found" in capsys.readouterr().err
+    assert Path("a.small.ply").read_bytes() == before

@@ -115,3 +115,17 @@ def test_the_first_image_needs_a_twentieth_of_the_bytes(tmp_path: Path, kind: st
     assert main([*words, "--stream", kind, "--chunk", "2000"]) == 0
     total = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
     assert 0 < first_bytes(out) <= 0.05 * total
+
+
+@pytest.mark.parametrize("given", [["--no-scores"], ["--stream", "sog"]])
+@pytest.mark.parametrize("words", [["--views", "3"], ["--background", "white"]])
+def test_options_of_scores_need_scores(tmp_path, capsys, given, words):
+    line = ["levels", str(tmp_path / "a.ply"), "-o", str(tmp_path / "out"), *given, *words]
+    assert main(line) == 1
+    assert f"{words[0]} cannot be used with {given[0]}" in capsys.readouterr().err
+
+
+def test_an_unknown_suffix_of_levels_is_named(tmp_path, capsys):
+    line = ["levels", str(tmp_path / "a.ply"), "-o", str(tmp_path / "out"), "--suffix", "xyz"]
+    assert main(line) == 1
+    assert "--suffix must end in .compressed.ply, " in capsys.readouterr().err

@@ -249,6 +249,42 @@ def test_a_closed_pipe_exits_with_141_and_no_message(tmp_path, words):
     assert (done.returncode, done.stderr) == (141, "")
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="closes streams as POSIX shells do")
+def test_streams_that_the_parent_closed(tmp_path):
+    cvtgs.save(cvtgs.synthetic.scene("object", 200, sh_degree=0, seed=0), tmp_path / "a.ply")
+
+    def run(words: str) -> subprocess.CompletedProcess[str]:
+        line = f"{sys.executable} -m cvtgs {words}"
+        return subprocess.run(
+            ["sh", "-c", line], capture_output=True, text=True, check=False, cwd=tmp_path
+        )
+
+    assert run("convert a.ply - 2>&- >b.ply").returncode == 0
+    assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
+    assert run("simplify a.ply c.ply --rho 0.1 --preset draft 2>&-").returncode == 0
+    for words, stream in (("info - <&-", "input"), ("convert a.ply - >&-", "output")):
+        done = run(words)
+        assert done.returncode == 1
+        assert done.stderr == (
+            f"cvtgs: error: standard {stream} must be a pipe or a file, found none.\n"
+        )
+
+
+def test_only_some_commands_read_standard_input(capsys):
+    assert main(["evaluate", "-", "a.ply"]) == 1
+    assert "simplify, convert and info read standard input (-)." in capsys.readouterr().err
+
+
+def test_all_folders_that_a_failed_command_made_are_removed(tmp_path, capsys):
+    cvtgs.save(cvtgs.synthetic.scene("object", 20, sh_degree=0), tmp_path / "a.ply")
+    (tmp_path / "bad.ply").write_text("bad")
+    words = ["convert", str(tmp_path / "bad.ply"), "-o", str(tmp_path / "n" / "m" / "o")]
+    assert main(words) == 1
+    assert not (tmp_path / "n").exists()
+    capsys.readouterr()
+
+
 def test_a_signal_ignored_in_a_destructor_is_sent_again(tmp_path, monkeypatch, capsys):
     class Deaf:
         def __del__(self):
@@ -325,6 +361,8 @@ def test_bash_completes_commands_options_values_and_files(bash, tmp_path, monkey
     assert completed(bash, "cvtgs", "simplify", "sc") == ["scan.ply"]
     assert completed(bash, "cvtgs", "simplify", "--report", "sc") == ["scan.ply"]
     assert completed(bash, "cvtgs", "info", "my") == ["my scan.ply"]
+    assert completed(bash, "cvtgs", "simplify", "--ckpt", "s") == ["standard", "scan.ply"]
+    assert completed(bash, "cvtgs", "tradeoff", "--presets", "dr") == ["draft"]
 
 
 def test_every_option_of_every_command_is_in_every_script(capsys):

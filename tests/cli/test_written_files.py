@@ -8,7 +8,7 @@ import pytest
 
 import cvtgs
 from cvtgs.cli.main import WRITE_SEVERAL, build_parser, main
-from cvtgs.errors import OutputBusyError
+from cvtgs.errors import OutputBusyError, OutputError
 from cvtgs.io.locks import folder_lock, lock_path
 
 
@@ -166,3 +166,12 @@ def test_a_missing_parent_is_left_to_the_command_to_report(tmp_path):
     with folder_lock(tmp_path / "missing" / "out"):
         assert list(tmp_path.iterdir()) == []
     assert lock_path(tmp_path / "out") == tmp_path / ".out.lock"
+
+
+@pytest.mark.skipif(not Path("/dev/fd").exists(), reason="needs /dev/fd")
+def test_a_link_to_a_pipe_is_no_output():
+    reading, writing = os.pipe()
+    with pytest.raises(OutputError, match="a regular file, found a device or a pipe"):
+        cvtgs.io.check_output(f"/dev/fd/{writing}", overwrite=True)
+    os.close(reading)
+    os.close(writing)

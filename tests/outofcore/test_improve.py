@@ -129,7 +129,7 @@ def test_reports_of_matched_blocks_are_joined():
 
 
 def test_images_raise_the_least_memory(source, tmp_path):
-    with pytest.raises(InvalidArgumentError, match="at least 800 MB with images"):
+    with pytest.raises(InvalidArgumentError, match="at least 800,000,000 with images"):
         in_blocks(source, tmp_path / "no.ply", MATCHED, blocks=None, memory=600_000_000)
 
 

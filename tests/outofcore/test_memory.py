@@ -205,5 +205,6 @@ def test_cells_that_merge_together_do_not_depend_on_every_byte() -> None:
 
 def test_blocks_need_the_least_memory(tmp_path: Path) -> None:
     cvtgs.save(cvtgs.synthetic.scene("object", 200, sh_degree=0), tmp_path / "a.ply")
-    with pytest.raises(InvalidArgumentError, match="at least 400 MB, found 100 MB"):
-        simplify_file(tmp_path / "a.ply", tmp_path / "b.ply", 0.1, memory=100_000_000, blocks=2)
+    for wrong in (100_000_000, 5e8, "1GB"):
+        with pytest.raises(InvalidArgumentError, match="number of bytes, at least 400,000,000; f"):
+            simplify_file(tmp_path / "a.ply", tmp_path / "b.ply", 0.1, memory=wrong, blocks=2)

@@ -148,3 +148,14 @@ def test_stages_by_hand_give_the_bits_of_the_simplifier(simplify_by_hand, scene,
     whole = cvtgs.Simplifier(preset, device="cpu").simplify(scene, count=90)
     assert same_bits(simplify_by_hand(scene, 90, preset), whole)
     assert not same_bits(whole, cvtgs.Simplifier(preset, device="cpu").simplify(scene, count=89))
+
+
+def test_arguments_of_another_kind_are_one_sentence(tmp_path):
+    scene = random_scene(5)
+    with pytest.raises(InvalidArgumentError, match="cameras must be Cameras, for example of"):
+        cvtgs.render(scene, "cameras.json")
+    for wrong in (None, b"bytes"):
+        with pytest.raises(InvalidArgumentError, match="from a path or an open binary file"):
+            cvtgs.load(wrong)
+    with pytest.raises(InvalidArgumentError, match=r"found 'a\.ply' as scene"):
+        cvtgs.save("a.ply", tmp_path / "z.ply")

@@ -32,9 +32,10 @@ _cvtgs() {{
     fi
     if [ -n "$words" ]; then
         COMPREPLY=($(compgen -W "$words" -- "$current"))
-    else
+    fi
+    if [ -z "$words" ] || [ "$before" = --ckpt ]; then
         local IFS=$'\n'  # names may hold spaces
-        COMPREPLY=($(compgen -f -- "$current"))
+        COMPREPLY+=($(compgen -f -- "$current"))
     fi
 }}
 complete -o filenames -F _cvtgs cvtgs
@@ -70,6 +71,7 @@ def values_of(action: argparse.Action) -> list[str]:
         return [str(choice) for choice in action.choices]
     return {
         "preset": list(cvtgs.PRESETS),
+        "presets": list(cvtgs.PRESETS),
         "ckpt": ["auto", *cvtgs.mergenet.SHIPPED, "none"],
         "device": ["auto", "cpu", "cuda"],
         "background": ["black", "gray", "white"],
@@ -106,6 +108,7 @@ def fish_lines(commands: Mapping[str, argparse.ArgumentParser]) -> Iterator[str]
                     yield f"complete -c cvtgs {where} -x -a {_quoted(words)}"
                 continue
             takes = f" -x -a {_quoted(words)}" if words else " -r" * (action.nargs != 0)
+            takes = takes.replace(" -x", " -r") if action.dest == "ckpt" else takes  # also files
             about = (action.help or "").replace("%%", "%").split(";")[0]
             yield (
                 f"complete -c cvtgs -n '__fish_seen_subcommand_from {command}' -l {names[0][2:]}"

@@ -1,6 +1,7 @@
 """The editing options of ``cvtgs convert``, and the edits."""
 
 import argparse
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -127,8 +128,8 @@ def _motion(options: argparse.Namespace) -> "Motion | None":
 
     if options.scale is None and options.rotate is None and options.translate is None:
         return None
-    if options.scale is not None and not options.scale > 0:
-        raise InvalidArgumentError(f"--scale must be above 0, found {options.scale}.")
+    if options.scale is not None and not 0 < options.scale < math.inf:
+        raise InvalidArgumentError(f"--scale must be above 0 and finite, found {options.scale}.")
     a, b, c = _numbers("--rotate", options.rotate or "0,0,0", 3)
     x, y, z = _numbers("--translate", options.translate or "0,0,0", 3)
     return Motion.of_angles((a, b, c), scale=options.scale or 1.0, shift=(x, y, z))
@@ -139,6 +140,6 @@ def _numbers(name: str, text: str, count: int) -> list[float]:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) != count:
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
         raise InvalidArgumentError(f"{name} must be {_NUMBERS[name]}, found {text!r}.")
     return numbers

@@ -20,7 +20,7 @@ from cvtgs.cli.jobs import (
     run_jobs,
 )
 from cvtgs.cli.options import AddParser, add_options, read_axes, read_scene, read_settings
-from cvtgs.errors import DroppedDataWarning
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
 from cvtgs.text import printable
 
 if TYPE_CHECKING:
@@ -44,6 +44,8 @@ def add_info(add_parser: AddParser) -> None:
 def show_info(options: argparse.Namespace) -> None:
     """Run ``cvtgs info``."""
     if is_checkpoint(options.input):
+        if options.effects is not None:
+            raise InvalidArgumentError("--effects applies to scenes, and cannot be used here.")
         show_checkpoint(options.input, as_json=options.json)
         return
     settings = read_settings(effects=options.effects)
@@ -169,7 +171,6 @@ def add_convert(add_parser: AddParser) -> None:
         metavar="V",
         type=int,
         choices=(2, 3, 4),
-        default=3,
         help="version of a .spz to write: 3 (default), 4, which states its axes, or 2 for older "
         "readers",
     )
@@ -183,6 +184,10 @@ def convert(options: argparse.Namespace) -> None:
     with open_jobs(options) as jobs:
         for job in jobs:
             cvtgs.io.check_save(job.options.output, overwrite=options.overwrite)
+            if options.spz_version and not job.options.output.name.lower().endswith(".spz"):
+                raise InvalidArgumentError(
+                    f"--spz-version needs a .spz to write, found {job.options.output.name}."
+                )
         run_jobs(jobs, lambda job: _convert_one(job, edits))
 
 
@@ -227,7 +232,7 @@ def _convert_one(job: SceneJob, edits: SceneEdits) -> Outcome:
             options.output,
             overwrite=options.overwrite,
             axes=axes.target,
-            spz_version=options.spz_version,
+            spz_version=options.spz_version or 3,
         )
     lines = [*phrases, *lost.dropped]
     notes = [f"Lost: {'; '.join(lines)}."] if job.is_one_of_many and lines else []

@@ -21,7 +21,7 @@ from cvtgs.cli.display import (
     size_text,
     without_middle,
 )
-from cvtgs.cli.options import READABLE, WRITABLE, CommandParser, dotted
+from cvtgs.cli.options import READABLE, WRITABLE, CommandParser, dotted, is_same_file
 from cvtgs.errors import (
     CvtgsError,
     InputError,
@@ -119,7 +119,7 @@ def check_paths(parser: CommandParser, options: argparse.Namespace) -> None:
 @contextmanager
 def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
     """Find the scenes of a command; standard streams are temporary files within the context."""
-    _check_suffix(options.suffix)
+    check_suffix(options.suffix)
     if options.folder is not None:
         yield _folder_jobs(options)
         return
@@ -128,6 +128,8 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
     to_stream = target == STREAM
     with ExitStack() as stack:
         if to_stream:
+            if sys.stdout is None:
+                raise OutputError("standard output must be a pipe or a file, found none.")
             if sys.stdout.isatty():
                 raise OutputError("standard output must be a pipe or a file, found a terminal.")
             folder = stack.enter_context(TemporaryDirectory(prefix="cvtgs-"))
@@ -145,11 +147,14 @@ def input_file(source: str | Path) -> Iterator[Path]:
         return
     from cvtgs.io.streams import file_of
 
+    if sys.stdin is None:
+        raise InputError("standard input must be a pipe or a file, found none.")
     with file_of(sys.stdin.buffer, name=STANDARD_INPUT, advice=_OTHER_FORMATS) as path:
         yield path
 
 
-def _check_suffix(suffix: str | None) -> None:
+def check_suffix(suffix: str | None) -> None:
+    """Raise if ``--suffix`` names no format that can be written."""
     from cvtgs.io.formats import WRITABLE_SUFFIXES
 
     if suffix is not None and not suffix.lower().endswith(WRITABLE_SUFFIXES):
@@ -240,6 +245,12 @@ def _folder_jobs(options: argparse.Namespace) -> list[SceneJob]:
                 f"{targets[target]} and {source}."
             )
         targets[target] = source
+    for target, source in targets.items():
+        for other in sources:
+            if other != source and is_same_file(target, other):
+                raise InvalidArgumentError(
+                    f"the output of {source} must not replace another input, found {target}."
+                )
     make_folder(options.folder)
     return [
         SceneJob(

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.display import progress_bars, say, size_text
+from cvtgs.cli.jobs import check_suffix
 from cvtgs.cli.options import (
     AddParser,
     add_options,
@@ -76,6 +77,7 @@ def levels(options: argparse.Namespace) -> None:
     rhos = sorted(read_ratios(options.rho or default), reverse=True)
     for rho in rhos:
         cvtgs.target_count(1, rho)
+    check_suffix(options.suffix)
     suffix = options.suffix or ".ply"
     names = cvtgs.levels.level_names(rhos, suffix)
     check_stream_options(options)

@@ -20,13 +20,13 @@ from cvtgs.cli.display import flush_output, say
 from cvtgs.cli.doctor import ShowVersions, add_doctor
 from cvtgs.cli.evaluate import add_compare, add_evaluate, add_render, add_tradeoff
 from cvtgs.cli.files import add_convert, add_info
-from cvtgs.cli.jobs import check_one_scene
+from cvtgs.cli.jobs import STREAM, check_one_scene
 from cvtgs.cli.levels import add_levels
 from cvtgs.cli.options import CommandParser
 from cvtgs.cli.simplify import add_simplify
 from cvtgs.cli.train import add_train
 from cvtgs.cli.view import add_view
-from cvtgs.errors import CvtgsError, memory_errors
+from cvtgs.errors import CvtgsError, InvalidArgumentError, memory_errors
 from cvtgs.startup import load_torch
 
 WRITE_SEVERAL = ("levels", "render", "compare", "tradeoff", "demo", "train")
@@ -86,6 +86,11 @@ def _run(words: Sequence[str]) -> None:
     with advised, _without_empty_folder(options), _lock(options):
         for name in ("input", "reference"):
             check_one_scene(getattr(options, name, ""))
+            if str(getattr(options, name, "")) == STREAM and options.command != "info":
+                raise InvalidArgumentError(
+                    f"{options.command} needs a file; simplify, convert and info read standard "
+                    f"input (-)."
+                )
         options.run(options)
     flush_output()
 
@@ -101,21 +106,26 @@ def _lock(options: argparse.Namespace) -> AbstractContextManager[None]:
 
 @contextmanager
 def _without_empty_folder(options: argparse.Namespace) -> Iterator[None]:
-    """After an error, remove the output folder if the command made it and left it empty."""
+    """After an error, remove the output folders that the command made and left empty."""
     named = (getattr(options, name, None) for name in ("folder", "output"))
     folder = next((path for path in named if path is not None), Path())
-    is_new = not os.path.exists(folder)  # noqa: PTH110 (false for impossible names)
+    new = [
+        path
+        for path in (folder, *folder.parents)
+        if not os.path.exists(path)  # noqa: PTH110 (false for impossible names)
+    ]
     try:
         yield
     except BaseException:
-        if is_new:
-            with suppress(OSError):
-                folder.rmdir()
+        with suppress(OSError):
+            for path in new:
+                path.rmdir()
         raise
 
 
 def run_process() -> NoReturn:
     """Run the command line and end the process with its exit status."""
+    _fill_closed_streams()
     for stream in (sys.stdout, sys.stderr):  # applies to output of libraries, too
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -134,6 +144,17 @@ def run_process() -> NoReturn:
             os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
     gc.freeze()  # the process ends faster without a collection of everything it has loaded
     sys.exit(code)
+
+
+def _fill_closed_streams() -> None:
+    """Open standard streams that the parent process closed, so that no other file gets theirs."""
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest free number
+    if sys.stderr is None:
+        sys.stderr = Path(os.devnull).open("w")  # noqa: SIM115 (open until the process ends)
 
 
 class _Stop:

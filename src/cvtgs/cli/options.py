@@ -278,7 +278,10 @@ def read_axes(text: str | None) -> FileAxes:
 def read_settings(words: Sequence[str] = (), effects: str | None = None) -> dict[str, str]:
     """Read ``--set`` and ``--effects`` as settings by dotted key; ``--set`` takes precedence."""
     example = "--effects needs NAME=VALUE, for example sh=1,mip=off"
-    forced = _assignments([] if effects is None else effects.split(","), example)
+    words_of_effects = [] if effects is None else effects.split(",")
+    if effects and "" in map(str.strip, words_of_effects):
+        raise ConfigError(f"{example}; found {effects!r}.")
+    forced = _assignments(words_of_effects, example)
     settings = {f"effects.{name}": value for name, value in forced.items()}
     settings |= _assignments(words, "--set needs KEY=VALUE, for example cvt.iterations=10")
     known = list(_setting_names(cvtgs.SimplifyConfig))
@@ -341,13 +344,14 @@ def check_written_files(options: argparse.Namespace) -> None:
         others = {key: other for key, other in read.items() if (name, key) != ("OUT", "IN")}
         others |= {"OUT": options.output} if name == "--report" else {}
         for other, taken in others.items():
-            if path is not None and _is_same_file(path, taken):
+            if path is not None and is_same_file(path, taken):
                 raise InvalidArgumentError(
                     f"{name} and {other} must be different files, found {path} for both."
                 )
 
 
-def _is_same_file(path: Path, other: Path) -> bool:
+def is_same_file(path: Path, other: Path) -> bool:
+    """Return whether two paths lead to one file."""
     if os.path.realpath(path) == os.path.realpath(other):
         return True
     try:

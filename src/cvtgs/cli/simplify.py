@@ -1,6 +1,7 @@
 """``cvtgs simplify``: simplify scenes to a size, quality or time, in memory or in blocks."""
 
 import argparse
+import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -271,6 +272,10 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
     if options.refine is None and options.refine_steps is None:
         return {}
     steps, seconds = options.refine_steps or 0, options.refine or 0.0
+    if steps < 0 or not 0 <= seconds < math.inf:
+        raise InvalidArgumentError(
+            f"--refine and --refine-steps must be at least 0, found {steps if steps < 0 else seconds:g}."
+        )
     return {"refine.steps": str(steps), "refine.seconds": str(seconds)}
 
 

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 STREAMS = ("sog", "3dtiles")
 OF_STREAMS = ("chunk", "environment", "memory", "workers", "scheduler", "place", "transform")
-OF_SCORES = ("views", "size")
+OF_SCORES = {"views": None, "size": None, "background": "black", "backend": "auto"}
+"""Options of scores, and their defaults."""
 
 
 def add_stream_options(parser: argparse.ArgumentParser) -> None:
@@ -63,6 +64,8 @@ def check_stream_options(options: argparse.Namespace) -> None:
     """Check the options of streams before the long work starts."""
     from cvtgs.streams import check_stream
 
+    if options.no_scores and (scoring := _of_scores(options)):
+        raise InvalidArgumentError(f"--{scoring[0]} cannot be used with --no-scores.")
     if options.stream is None:
         for name in OF_STREAMS:
             if getattr(options, name) is not None:
@@ -74,8 +77,7 @@ def check_stream_options(options: argparse.Namespace) -> None:
         )
     if options.suffix is not None:
         raise InvalidArgumentError("--suffix cannot be used with --stream, which sets the format.")
-    scoring = [name for name in OF_SCORES if getattr(options, name) is not None]
-    if scoring:
+    if scoring := _of_scores(options):
         raise InvalidArgumentError(
             f"--{scoring[0]} cannot be used with --stream, since streams are not scored."
         )
@@ -88,6 +90,11 @@ def check_stream_options(options: argparse.Namespace) -> None:
         )
     read_transform(options)
     check_stream(options.output, options.stream, overwrite=options.overwrite)
+
+
+def _of_scores(options: argparse.Namespace) -> list[str]:
+    """Return the options that were given and only apply to scores."""
+    return [name for name, default in OF_SCORES.items() if getattr(options, name) != default]
 
 
 def read_transform(options: argparse.Namespace) -> tuple[float, ...] | None:

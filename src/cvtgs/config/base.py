@@ -75,6 +75,8 @@ def explain(error: pydantic.ValidationError) -> str:
         key = named(".".join(str(part) for part in problem["loc"]))
         if problem["type"] == "extra_forbidden":
             problems.append(f"{key}: is not a known setting")
+        elif problem["type"] == "model_type":
+            problems.append(f"{key}: holds settings, found {shown(problem['input'], 120)}")
         elif problem["type"] == "value_error":  # raised by cvtgs, as a whole sentence
             problems.append(str(problem["ctx"]["error"]).removesuffix("."))
         else:

@@ -67,7 +67,7 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
             )
         if target.is_dir():
             raise OutputError(f"{os.fspath(path)}: the output must be a file, found a directory.")
-        if target.exists() and not target.is_file():
+        if (target.exists() and not target.is_file()) or _is_device(path):
             raise OutputError(
                 f"{os.fspath(path)}: the output must be a regular file, found a device or a pipe."
             )
@@ -301,6 +301,15 @@ def _exists(path: str | os.PathLike[str]) -> OutputExistsError:
         f"{os.fspath(path)}: the output must not exist yet, found a file; pass overwrite=True "
         f"(--overwrite) to replace it."
     )
+
+
+def _is_device(path: str | os.PathLike[str]) -> bool:
+    """Return whether a path leads to a pipe or a terminal, as /dev/stdout does."""
+    try:
+        mode = Path(path).stat().st_mode
+    except OSError:
+        return False
+    return stat.S_ISFIFO(mode) or stat.S_ISCHR(mode) or stat.S_ISSOCK(mode)
 
 
 def write_error(path: str | os.PathLike[str], error: OSError) -> OutputError:

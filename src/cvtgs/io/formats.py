@@ -145,6 +145,10 @@ def load(
         raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {sh_degree!r}.")
     axes = None if axes is None else checked_axes(axes)
     if not isinstance(path, str | os.PathLike):
+        if not hasattr(path, "read"):
+            raise InvalidArgumentError(
+                f"a scene is read from a path or an open binary file, found {shown(path)}."
+            )
         format = (
             None if format is None else _suffix_of(_dotted(format) or "", _READERS, format=format)
         )
@@ -241,6 +245,8 @@ def save(
         ...     save(scene, Path(folder) / "two.ply", overwrite=True)
     """
     output: AbstractContextManager[BinaryIO]
+    if not isinstance(scene, GaussianScene):
+        raise InvalidArgumentError(f"a scene is saved to a path, found {shown(scene)} as scene.")
     if isinstance(path, str | os.PathLike):
         name, named = os.fspath(path), _dotted(format) or path
         output = atomic_output(path, overwrite=overwrite)

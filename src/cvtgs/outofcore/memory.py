@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
+from cvtgs.counts import whole_number
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.ply import PlyRows
 from cvtgs.outofcore.scan import SAMPLE_ROWS
@@ -100,10 +101,10 @@ def available_memory() -> int:
 def check_memory(memory: int | None, *, with_images: bool) -> None:
     """Raise if the memory that was given is too small for any run in blocks."""
     least = LEAST_BYTES + (IMAGE_BYTES if with_images else 0)
-    if memory is not None and memory < least:
+    if memory is not None and whole_number(memory) < least:
         raise InvalidArgumentError(
-            f"memory must be at least {least / 1e6:g} MB"
-            f"{' with images of the scene' * with_images}, found {memory / 1e6:g} MB."
+            f"memory must be a whole number of bytes, at least {least:,}"
+            f"{' with images of the scene' * with_images}; found {memory!r}."
         )
 
 

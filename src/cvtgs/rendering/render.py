@@ -93,6 +93,11 @@ def render(
         torch.Size([1, 48, 64, 3])
     """
     scene = as_scene(scene)
+    if not isinstance(cameras, Cameras):
+        raise InvalidArgumentError(
+            f"cameras must be Cameras, for example of cvtgs.load_cameras or "
+            f"cvtgs.views.automatic_views; found {shown(cameras)}."
+        )
     degree = _degree(scene, sh_degree)
     behind = _background(scene, cameras, background)
     name, chosen = choose_backend(backend, scene.device)
