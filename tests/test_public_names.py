@@ -119,6 +119,7 @@ STAGES = {
         "merge_and_inflate",
         "reduce_scene",
     },
+    "startup": {"load_torch"},
     "validity": {
         "MAX_LOG_SCALE",
         "UNIT_TOLERANCE",

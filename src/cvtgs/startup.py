@@ -7,6 +7,8 @@ import gc
 import os
 import sys
 
+__all__ = ["load_torch"]
+
 
 def load_torch() -> None:
     """Load torch, if it is not loaded, with settings for a process that ends with its work.

@@ -14,7 +14,7 @@ from pretended_device import CUDA, DeviceTensor, pretended_cuda
 from scenes import random_scene, same_bits
 
 PRESETS = ["draft", "fast", "standard", "paper"]
-WAITS, COPIES, VIEW_COPIES = 14, 7, 2
+WAITS, COPIES, VIEW_COPIES = 15, 7, 2
 """Largest numbers of host waits and of copies in one simplification, and of those that
 view-dependent colour adds.
 
