@@ -162,7 +162,7 @@ def test_compare_and_levels_write_a_page(
     assert main(["compare", str(full), str(small), "-o", f"{folder}2", *views[:-1]]) == 0
     assert "viewer.html" not in (tmp_path / "compared2" / "index.html").read_text()
     folder = tmp_path / "levels"
-    words = ["levels", str(full), "-o", str(folder), "--rho", "0.1,0.02", "--no-scores", *views]
+    words = ["levels", str(full), "-o", str(folder), "--rho", "0.1,0.02", "--no-scores", *views[4:]]
     assert main([*words, "--preset", "draft"]) == 0
     assert (folder / "viewer.html").read_text() == "<html>[[500], [50], [10]] True</html>"
     assert main([*words, "--stream", "sog"]) == 1
