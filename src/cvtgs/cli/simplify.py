@@ -273,8 +273,9 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
         return {}
     steps, seconds = options.refine_steps or 0, options.refine or 0.0
     if steps < 0 or not 0 <= seconds < math.inf:
+        found = steps if steps < 0 else seconds
         raise InvalidArgumentError(
-            f"--refine and --refine-steps must be at least 0, found {steps if steps < 0 else seconds:g}."
+            f"--refine and --refine-steps must be at least 0, found {found:g}."
         )
     return {"refine.steps": str(steps), "refine.seconds": str(seconds)}
 
