@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cvtgs.errors import InvalidSceneError
+from cvtgs.io.limits import SCALE_RANGE
 from cvtgs.math import parameters
 from cvtgs.math.frames import morton_order
 from cvtgs.math.spherical_harmonics import REST_COUNTS, SH_C0
@@ -98,10 +99,6 @@ def log_scales_of(scales: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     with np.errstate(invalid="ignore"):  # of NaN; rows are checked later
         logs: Floats = np.log(np.maximum(scales, np.finfo(np.float32).tiny))
         return logs
-
-
-SCALE_RANGE = (-87.3, 88.7)
-"""Logarithms of the scales that float32 holds with full precision."""
 
 
 def scales_of(log_scales: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -6,11 +6,13 @@ from types import MappingProxyType
 
 import torch
 
-from cvtgs.io.arrays import SCALE_RANGE
 from cvtgs.math.spherical_harmonics import REST_COUNTS
 from cvtgs.scene import ANTIALIASED_TAG, GaussianScene
 from cvtgs.text import counted
 from cvtgs.validity import writable_rows
+
+SCALE_RANGE = (-87.3, 88.7)
+"""Logarithms of the scales that float32 holds with full precision."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
