@@ -107,8 +107,8 @@ def fish_lines(commands: Mapping[str, argparse.ArgumentParser]) -> Iterator[str]
                     where = f"-n '__fish_seen_subcommand_from {command}'"
                     yield f"complete -c cvtgs {where} -x -a {_quoted(words)}"
                 continue
-            takes = f" -x -a {_quoted(words)}" if words else " -r" * (action.nargs != 0)
-            takes = takes.replace(" -x", " -r") if action.dest == "ckpt" else takes  # also files
+            alone = "-r" if action.dest == "ckpt" else "-x"  # -r also completes files
+            takes = f" {alone} -a {_quoted(words)}" if words else " -r" * (action.nargs != 0)
             about = (action.help or "").replace("%%", "%").split(";")[0]
             yield (
                 f"complete -c cvtgs -n '__fish_seen_subcommand_from {command}' -l {names[0][2:]}"

@@ -146,8 +146,9 @@ def stream_blocks(
     try:
         if options.scheduler is None:
             rows = open_rows(options.input)
-            target = max(cvtgs.target_count(rows.count, rho) for rho in rhos)
-            merging = finer_count(target, rows.count, config.allocation)
+            targets = {cvtgs.target_count(rows.count, rho) for rho in rhos}
+            finest = max(targets - {rows.count}, default=rows.count)  # a whole level merges nothing
+            merging = finer_count(finest, rows.count, config.allocation)
             if block_count(rows, memory, merging=merging) == 1:
                 return False
         check_config(config, with_images=False)

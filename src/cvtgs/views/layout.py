@@ -86,8 +86,8 @@ def find_room(
         return None
     if hidden_share(best, points) > _HIDDEN:
         return None
-    middle = frame.center + frame.radius * best
-    if size_growth(sized, middle, frame.radius, least_cells=_LEAST_CELLS) < _GROWS:
+    place = frame.center + frame.radius * best
+    if size_growth(sized, place, frame.radius, least_cells=_LEAST_CELLS) < _GROWS:
         return None
     eye: Tensor = center + (0.58 * (high - low) + low) * up
     return eye
