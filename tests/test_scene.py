@@ -11,7 +11,7 @@ import torch
 
 import cvtgs
 from cvtgs import GaussianScene
-from cvtgs.errors import InvalidArgumentError, InvalidSceneError, OutputExistsError
+from cvtgs.errors import DeviceError, InvalidArgumentError, InvalidSceneError, OutputExistsError
 from scenes import random_scene, same_bits
 
 INF = float("inf")
@@ -159,6 +159,11 @@ def test_with_tensors_keeps_comments_and_layout():
 def test_to_the_same_device_is_the_same_scene():
     scene = random_scene(3)
     assert scene.to("cpu") is scene
+
+
+def test_to_a_device_that_does_not_exist():
+    with pytest.raises(DeviceError, match="device 'bogus' cannot be used here: torch has no such"):
+        random_scene(3).to("bogus")
 
 
 @pytest.mark.cuda

@@ -44,6 +44,8 @@ def usable_device(device: str | torch.device) -> torch.device:
         torch.empty(0, device=resolved)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).split("\n")[0].rstrip(".")
+        if reason.startswith("Expected one of"):  # all types that torch knows
+            reason = "torch has no such device; 'cpu' and 'cuda' are common ones"
         raise DeviceError(f"device {str(device)!r} cannot be used here: {reason}.") from None
     return resolved
 

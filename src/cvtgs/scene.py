@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from cvtgs.devices import usable_device
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.selection import row_numbers
@@ -294,8 +295,11 @@ class GaussianScene:
 
         Returns:
             The same object if it is already there, else a copy.
+
+        Raises:
+            DeviceError: The device cannot be used.
         """
-        target = torch.device(device)
+        target = usable_device(device)
         if target == self.device:
             return self
         return self.with_tensors(

@@ -255,6 +255,21 @@ def test_arguments_of_gsplat(monkeypatch, degree, comments):
     assert all(t.dtype == torch.float32 for t in arguments.values() if isinstance(t, torch.Tensor))
 
 
+def test_a_uniform_scale_of_a_view_does_not_reach_gsplat(monkeypatch):
+    found = []
+
+    def rasterization(**options):
+        found.append(options["viewmats"])
+        return torch.zeros(1, 6, 8, 4), torch.zeros(1, 6, 8, 1), {}
+
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
+    scaled = SMALL.viewmats.clone()
+    scaled[:, :3] *= 3
+    for cameras in (SMALL, replace(SMALL, viewmats=scaled)):
+        gsplat_backend.rasterize(random_scene(5), cameras, sh_degree=0)
+    torch.testing.assert_close(*found)
+
+
 def test_cameras_that_treat_the_tag_differently_are_rendered_one_by_one(monkeypatch):
     modes = []
 

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cvtgs.cameras import Cameras
+from cvtgs.cameras import Cameras, view_scales
 from cvtgs.errors import DeviceError, MissingDependencyError, how_to_install
 from cvtgs.math.spherical_harmonics import REST_COUNTS, evaluate
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
@@ -129,9 +129,11 @@ def _rasterize_all(scene: GaussianScene, cameras: Cameras, sh_degree: int) -> tu
 def _about_cameras(scene: GaussianScene, cameras: Cameras) -> tuple[Tensor, Tensor]:
     """Return means and view matrices relative to the mean camera position, in float64.
 
-    gsplat works in float32, which is too coarse for either far from the origin.
+    gsplat works in float32, which is too coarse for either far from the origin. View matrices are
+    without their uniform scales, so that depths are in scene units.
     """
     viewmats = cameras.viewmats.double().clone()
+    viewmats[:, :3] /= view_scales(viewmats)[:, None, None]
     middle = cameras.centers.double().mean(dim=0)
     viewmats[:, :3, 3] += viewmats[:, :3, :3] @ middle
     return scene.means.double() - middle, viewmats
