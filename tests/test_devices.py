@@ -40,6 +40,7 @@ def test_tensors_of_any_dtype_and_shape_move_in_one_copy():
         torch.tensor(7),
         torch.empty(0, 3),
         torch.linspace(0, 1, 33, dtype=torch.float32),
+        torch.arange(6).view(3, 2)[:, 1:],
     ]
     with pretended_cuda() as traffic:
         there = move_together(tensors, torch.device("cuda"))
@@ -152,15 +153,6 @@ def test_the_number_of_threads_is_restored_after_an_error():
     with pytest.raises(ZeroDivisionError), one_thread():
         divmod(torch.get_num_threads(), 0)
     assert torch.get_num_threads() == before
-
-
-@pytest.fixture
-def two_threads(monkeypatch):
-    monkeypatch.setattr("cvtgs.devices.thread_count", lambda: 2)
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
 
 
 def test_chunks_are_computed_by_one_thread_each_and_stay_in_order(two_threads):

@@ -7,6 +7,7 @@ import torch
 
 from cvtgs import GaussianScene, describe
 from cvtgs.errors import InvalidSceneError
+from pretended_device import pretended_cuda
 from scenes import random_scene
 
 NAN = float("nan")
@@ -113,3 +114,10 @@ def test_figures_that_overflow_can_be_read_back():
     found = describe(bright.with_tensors(shN=torch.full_like(bright.shN, 1e30)))
     assert found.plan.sh.figure == float("inf")
     assert type(found).model_validate_json(found.model_dump_json()) == found
+
+
+def test_a_device_gives_the_figures_of_the_cpu():
+    scene = random_scene(50)
+    with pretended_cuda():
+        found = describe(scene.to("cuda"))
+    assert found.mass_shares == pytest.approx(describe(scene).mass_shares, rel=1e-12)

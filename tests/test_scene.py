@@ -309,3 +309,9 @@ def test_with_tensors_takes_keywords_and_keeps_extras():
         scene.with_tensors(scales=torch.ones(4, 3))
     with pytest.raises(InvalidSceneError, match=r"extra column 'label' must have shape \(2,\)"):
         scene.with_tensors(scene[:2].tensors())
+
+
+def test_scenes_on_two_devices_are_not_joined():
+    scene = random_scene(3)
+    with pytest.raises(InvalidSceneError, match="the first is on cpu, scene 1 on meta"):
+        cvtgs.concatenate([scene, scene.to("meta")])

@@ -76,7 +76,7 @@ def move_together(tensors: Sequence[Tensor], device: torch.device) -> list[Tenso
     """Return tensors of one device and any dtypes on another device, moved in a single copy."""
     if tensors[0].device == device:
         return list(tensors)
-    parts = [tensor.reshape(-1).view(torch.uint8) for tensor in tensors]
+    parts = [tensor.contiguous().view(-1).view(torch.uint8) for tensor in tensors]
     padded = [pad(part, (0, -len(part) % ALIGNMENT)) for part in parts]
     moved = torch.cat(padded).to(device).split([len(part) for part in padded])
     return [
@@ -206,6 +206,15 @@ def without_autocast() -> Iterator[None]:
         for kind in ("cpu", "cuda"):
             if torch.is_autocast_enabled(kind):
                 stack.enter_context(torch.autocast(kind, enabled=False))
+        yield
+
+
+@contextmanager
+def on_host() -> Iterator[None]:
+    """Create tensors on the CPU, whatever the default device of the caller."""
+    with ExitStack() as stack:
+        if torch.get_default_device() != HOST:
+            stack.enter_context(HOST)
         yield
 
 

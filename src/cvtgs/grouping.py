@@ -366,11 +366,12 @@ def add_neighbors(ordered: OrderedRows, target: int, config: AllocationConfig) -
         config: Number of neighbours.
 
     Returns:
-        The same with neighbours, 48 bytes per Gaussian; unchanged if it has them or needs none.
+        The same with neighbours, 48 bytes per Gaussian on the host, where pairs merge; unchanged if
+        it has them or needs none.
     """
     points, total = ordered.points, len(ordered.filtered)
     from_singles = target < total and finer_count(target, total, config) == total
     if not from_singles or points.neighbors is not None or points.moments is None:
         return ordered
-    near = cvt.nearest_neighbors(points.moments.means.T, config.neighbors)
+    near = cvt.nearest_neighbors(points.moments.means.T.to(HOST), config.neighbors)
     return ordered._replace(points=points._replace(neighbors=near))

@@ -9,6 +9,7 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.errors import InvalidSceneError
 from cvtgs.math import parameters
+from cvtgs.math.segments import running_sums
 from cvtgs.scene import SceneLike, as_scene
 from cvtgs.validity import invalid_rows
 
@@ -122,6 +123,6 @@ def _quantiles(values: Float[Tensor, "n"]) -> tuple[float, ...]:
 
 
 def _heaviest_shares(masses: Float[Tensor, "n"]) -> tuple[float, ...]:
-    running = torch.sort(masses, descending=True).values.cumsum(0)
+    running = running_sums(torch.sort(masses, descending=True).values)
     counts = (max(1, round(share * len(masses))) for share in HEAVIEST)
     return tuple(float(parameters.divide(running[count - 1], running[-1])) for count in counts)

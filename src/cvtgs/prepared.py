@@ -173,7 +173,13 @@ class Prepared:
         protected = with_finite_opacities(valid.select(first))
         part, room = analysis.select(rest), target - len(protected)
         others = reduce_scene(
-            valid.select(rest), part, room, self._config, net=self._net, clock=clock
+            valid.select(rest),
+            part,
+            room,
+            self._config,
+            net=self._net,
+            clock=clock,
+            total=self._total - len(protected),
         )
         reduced = others._replace(scene=concatenate([protected, others.scene]))
         reduced = self._match(reduced, part, clock)

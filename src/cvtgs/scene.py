@@ -372,6 +372,11 @@ def concatenate(scenes: Sequence[GaussianScene]) -> GaussianScene:
                 f"{first.sh_degree} and {first.dtype}, scene {number} {other.sh_degree} and "
                 f"{other.dtype}."
             )
+        if other.device != first.device:
+            raise InvalidSceneError(
+                f"scenes to join must be on one device; the first is on {first.device}, scene "
+                f"{number} on {other.device}."
+            )
     tensors = [scene.tensors() for scene in scenes]
     return first.with_tensors(
         {name: torch.cat([each[name] for each in tensors]) for name in tensors[0]},

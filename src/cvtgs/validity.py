@@ -27,8 +27,11 @@ __all__ = [
 UNIT_TOLERANCE = 1e-5
 """Quaternions whose squared length differs from 1 by at most this count as unit quaternions."""
 
-MAX_LOG_SCALE = math.log(torch.finfo(torch.float32).max)
-"""The logarithm of the largest float32 scale, since files and renderers hold float32."""
+MAX_MEAN = torch.finfo(torch.float32).max
+"""Files and renderers hold float32."""
+
+MAX_LOG_SCALE = math.log(MAX_MEAN)
+"""The logarithm of the largest float32 scale."""
 
 _FAR = 1e6
 """Distance from the origin at which float32 has a resolution of a sixteenth of a unit."""
@@ -88,8 +91,9 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
     """Find the rows that no renderer can draw.
 
     NaN or infinite means, scales and SH coefficients, NaN opacities, and quaternions that are
-    zero, NaN or infinite are invalid. Scales beyond float32 count as infinite. Log-scales of minus
-    infinity, which are scales of 0, are invalid too. Infinite opacity logits are valid.
+    zero, NaN or infinite are invalid. Means and scales beyond float32 count as infinite.
+    Log-scales of minus infinity, which are scales of 0, are invalid too. Infinite opacity logits
+    are valid.
 
     Args:
         scene: Any scene.
@@ -112,6 +116,8 @@ def invalid_rows(scene: GaussianScene) -> dict[str, Bool[Tensor, "n"]]:
         parts = values.flatten(start_dim=1).split(1 << 16)
         masks[name] = torch.cat([(part * 0).sum(dim=1) != 0 for part in parts])
     masks["quats"] |= (scene.quats == 0).all(dim=1)
+    if scene.dtype == torch.float64:
+        masks["means"] |= (scene.means.abs() > MAX_MEAN).any(dim=1)
     masks["log_scales"] |= (scene.log_scales > MAX_LOG_SCALE).any(dim=1)
     # All masks at once, so that the host synchronises with the device only once.
     any_bad = torch.stack([mask.any() for mask in masks.values()]).tolist()

@@ -130,3 +130,11 @@ def test_a_coincident_site_is_never_its_own_neighbour():
     found = nearest_neighbors(sites, 4)
     assert found.shape == (50, 4)
     assert not bool((found == torch.arange(50)[:, None]).any())
+
+
+@pytest.mark.parametrize("far", [1.0, 1e6, 1e12, 1e30])
+def test_coincident_sites_are_neighbours_whatever_lies_far_away(far):
+    half = torch.randn(100, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    sites = torch.cat([half, half, torch.tensor([[far, 0, 0]], dtype=torch.float64)])
+    found = nearest_neighbors(sites, 1)[:100, 0]
+    assert torch.equal(found, torch.arange(100) + 100)

@@ -11,6 +11,7 @@ import torch
 import cvtgs
 from cvtgs.cells import Partition
 from cvtgs.config import SimplifyConfig
+from cvtgs.devices import one_thread
 from cvtgs.errors import CheckpointError
 from cvtgs.mergenet import (
     Architecture,
@@ -24,6 +25,7 @@ from cvtgs.mergenet import (
     save_checkpoint,
 )
 from mergenet_cases import Case, lively_net, some_case
+from scenes import random_scene, same_bits
 
 SMALL = PublishedArchitecture(width=5, cell_width=7)
 INFO = CheckpointInfo(architecture=SMALL, preset="paper")
@@ -278,3 +280,22 @@ def test_the_order_of_members_does_not_matter():
     cells = torch.arange(len(case.part))
     found = net(describe_published(flipped, case.merged, turned, cells=cells))
     torch.testing.assert_close(found.d_sh, net(described(case)).d_sh)
+
+
+@pytest.mark.parametrize("factor", [1e12, 1e22, 1e37])
+def test_huge_colours_give_finite_gaussians(factor):
+    """Unlimited residuals grow with them, beyond the root of the largest float32."""
+    scene = random_scene(100)
+    scene = scene.with_tensors({"sh0": scene.sh0 * factor}, {})
+    small = cvtgs.Simplifier("paper", device="cpu").simplify(scene, 0.1)
+    for name, values in small.tensors().items():
+        assert bool(values.isfinite().all()), name
+    assert small.quats.norm(dim=1).tolist() == pytest.approx([1.0] * 10)
+
+
+def test_one_cell_has_the_same_bits_in_two_threads(two_threads):
+    scene = cvtgs.synthetic.scene("object", 8, sh_degree=2, seed=1)
+    simplifier = cvtgs.Simplifier("paper", device="cpu")
+    two = simplifier.simplify(scene, count=1)
+    with one_thread():
+        assert same_bits(two, simplifier.simplify(scene, count=1))

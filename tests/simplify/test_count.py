@@ -128,6 +128,17 @@ def test_invalid_rows_are_dropped_counted_and_warned_about(preset):
     assert result.report.shortfall == ""
 
 
+@each_preset
+def test_means_beyond_float32_are_dropped(preset):
+    scene = random_scene(100, dtype=torch.float64)
+    means = scene.means.clone()
+    means[:40, 0], means[50, 1] = 1e160, 3e38
+    with pytest.warns(DroppedDataWarning, match="dropped 40 of 100 Gaussians"):
+        small = simplifier(preset).simplify(scene.with_tensors({"means": means}, {}), 0.1)
+    assert len(small) == 10
+    assert all(bool(values.isfinite().all()) for values in small.tensors().values())
+
+
 def test_ratio_of_one_drops_invalid_rows():
     scene = random_scene(20)
     with pytest.warns(DroppedDataWarning):

@@ -229,3 +229,24 @@ def test_the_pretended_device_refuses_and_counts():
         assert torch.equal(there[:1].cpu(), host[:1] + 1)
     with pytest.raises(RuntimeError, match="no device outside"):
         there + 1
+
+
+@pytest.mark.slow
+def test_a_prepared_scene_runs_again_on_a_device():
+    scene = random_scene(300)
+    wanted = Simplifier(device="cpu").prepare(scene)
+    with pretended_cuda():
+        prepared = Simplifier(device="cuda").prepare(scene)
+        for count in (40, 50, 2):
+            small = prepared.run(count=count).scene
+            assert same_bits(small.to("cpu"), wanted.run(count=count).scene)
+
+
+@pytest.mark.parametrize("preset", ["draft", "standard"])
+@one_thread()
+def test_two_gaussians_on_a_device(preset):
+    scene = random_scene(100)
+    wanted = Simplifier(config=preset, device="cpu").simplify(scene, count=2)
+    with pretended_cuda():
+        small = Simplifier(config=preset, device="cuda").simplify(scene, count=2)
+        assert same_bits(small.to("cpu"), wanted)

@@ -70,6 +70,18 @@ def test_invalid_rows_are_never_kept(scene):
     assert same_bits(small.select(torch.arange(4)), scene.select(torch.arange(1, 5)))
 
 
+def test_invalid_rows_leave_the_others_in_standard_form(scene):
+    means = scene.means.clone()
+    means[0] = torch.nan
+    scene = scene.with_tensors({"means": means, "quats": 5 * scene.quats}, {})
+    keep = torch.arange(400) == 3
+    with pytest.warns(UserWarning, match="dropped 1 of 400"):
+        small = Simplifier(device="cpu").simplify(scene, count=399, keep=keep)
+    assert same_bits(small.select(torch.arange(1)), scene.select(torch.tensor([3])))
+    norms = torch.linalg.vector_norm(small.quats[1:], dim=1)
+    torch.testing.assert_close(norms, torch.ones(398))
+
+
 @pytest.mark.slow
 def test_refinement_leaves_kept_rows_alone(scene):
     keep = torch.arange(400) < 30

@@ -8,7 +8,9 @@ import torch
 import cvtgs
 from cvtgs import Simplifier, SimplifyConfig
 from cvtgs.io import axes as axes_module
+from cvtgs.outofcore import simplify_file
 from cvtgs.rendering import contributions
+from cvtgs.streams import plan_stream, stream_file, write_sog_stream, write_tiles
 from cvtgs.synthetic import scene as make
 from cvtgs.views import automatic_views, mixed_views
 from scenes import same_bits
@@ -90,6 +92,38 @@ def test_files_and_rows(scene, setting, tmp_path):
     wanted = through_a_file(scene, tmp_path)
     with setting():
         found = through_a_file(scene, tmp_path)
+    assert all(same_bits(one, other) for one, other in zip(found, wanted, strict=True))
+
+
+def in_blocks(scene, folder):
+    cvtgs.save(scene, folder / "scene.ply", overwrite=True)
+    for preset in ("standard", SimplifyConfig.from_mapping(IMAGES)):
+        simplifier = Simplifier(config=preset, device="cpu")
+        options = {"simplifier": simplifier, "blocks": 3, "overwrite": True}
+        simplify_file(folder / "scene.ply", folder / "small.ply", 0.2, **options)
+        yield cvtgs.load(folder / "small.ply")
+
+
+def streamed(scene, folder):
+    cvtgs.save(scene, folder / "scene.ply", overwrite=True)
+    rhos = [0.5, 0.1]
+    options = {"kind": "3dtiles", "blocks": 3, "overwrite": True}
+    stream_file(folder / "scene.ply", folder / "blocks", rhos, **options)
+    plan = plan_stream(Simplifier(device="cpu").levels(scene, rhos), chunk_gaussians=64)
+    write_sog_stream(plan, folder / "sog", overwrite=True)
+    write_tiles(plan, folder / "tiles", overwrite=True)
+    for file in sorted(folder.glob("*/*.glb")):
+        yield cvtgs.load(file)
+    yield cvtgs.load(folder / "sog" / "lod-meta.json")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("work", [in_blocks, streamed])
+def test_files_in_parts(scene, tmp_path, work):
+    wanted = list(work(scene, tmp_path))
+    with another_device():
+        found = list(work(scene, tmp_path))
+    assert len(found) > 1
     assert all(same_bits(one, other) for one, other in zip(found, wanted, strict=True))
 
 

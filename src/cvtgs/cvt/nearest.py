@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.devices import thread_count
+from cvtgs.math.frames import robust_frame
 from cvtgs.math.segments import ascending_rows
 
 SEARCH = "scipy"
@@ -23,7 +24,7 @@ CHUNK = 1 << 15
 """Points per chunk of a search thread, to bound memory."""
 
 TINY_SHIFT = 1e-9
-"""Coincident sites are separated by at most this share of the extent of all sites."""
+"""Coincident sites are separated by at most this share of the robust radius of all sites."""
 
 
 def nearest_scipy(
@@ -133,9 +134,8 @@ def _apart(sites: Float[Tensor, "m d"]) -> Float[Tensor, "m e"]:
     if runs is None:
         return sites.double()
     (order, ranks), places = runs, sites.double()
-    extent = float((places.amax(dim=0) - places.amin(dim=0)).amax()) or 1.0
     shifts = torch.empty_like(places[:, 0])
-    shifts[order] = ranks.double() * (TINY_SHIFT * extent / len(sites))
+    shifts[order] = ranks.double() * (TINY_SHIFT * robust_frame(places).radius / len(sites))
     return torch.cat([places, shifts[:, None]], dim=1)
 
 

@@ -22,6 +22,8 @@ from cvtgs.scene import GaussianScene
 CHUNK_MEMBERS = 1 << 15
 """Members and neighbours per chunk; each takes about ``2 kB``."""
 
+_LARGEST = 1e15
+
 
 def correct_cells(  # noqa: PLR0913 (options by name)
     net: MergeNet | PublishedMergeNet,
@@ -95,8 +97,10 @@ def correct_cells(  # noqa: PLR0913 (options by name)
             done += len(rows)
             on_cells(done)
     # Near the limits of the dtype (a flyaway at 3e38) a correction may overflow.
+    flat = [values.reshape(len(values), -1) for values in tensors.values()]
+    finite = torch.stack([values.isfinite().all(dim=1) for values in flat]).all(dim=0)
     tensors = {
-        name: torch.where(values.isfinite(), values, originals[name])
+        name: torch.where(finite.view(-1, *[1] * (values.dim() - 1)), values, originals[name])
         for name, values in tensors.items()
     }
     return merged.with_tensors(tensors)
@@ -156,10 +160,15 @@ def _correct_as_published(
     cells: Int[Tensor, "m"],
 ) -> Iterator[tuple[Int[Tensor, "r"], dict[str, Tensor]]]:
     """Yield runs of cells and their corrected tensors."""
-    for run, part in several.chunks(chunk_length(CHUNK_MEMBERS, scene.device)):
+
+    def correct(item: tuple[slice, Partition]) -> tuple[Tensor, dict[str, Tensor]]:
+        run, part = item
         rows = cells[run]
         descriptors = describe_published(scene, merged, part, cells=rows)
-        yield rows, compose_published(merged, cells=rows, residuals=net(descriptors))
+        return rows, compose_published(merged, cells=rows, residuals=net(descriptors))
+
+    chunks = several.chunks(chunk_length(CHUNK_MEMBERS, scene.device))
+    yield from in_threads(correct, chunks, scene.device)
 
 
 def compose(
@@ -281,7 +290,7 @@ def _reshape(
 
 def _rotate(quats: Float[Tensor, "m 4"], rotvecs: Float[Tensor, "m 3"]) -> Float[Tensor, "m 4"]:
     """Rotate about the local axes: multiply by ``(1, v / 2)`` and keep the length."""
-    half = rotvecs / 2
+    half = (rotvecs / 2).clamp(-_LARGEST, _LARGEST)  # squares must not overflow
     factor = torch.cat([torch.ones_like(half[:, :1]), half], dim=1)
     length = torch.sqrt(1 + half.square().sum(dim=1, keepdim=True))
     return parameters.multiply_quats(quats, factor) / length

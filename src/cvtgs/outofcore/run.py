@@ -15,7 +15,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, shortfall, target_count
-from cvtgs.devices import HOST, one_thread
+from cvtgs.devices import HOST, on_host, one_thread
 from cvtgs.errors import ConfigError, DroppedDataWarning
 from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output, check_save, load, save
@@ -63,6 +63,7 @@ SAMPLED = 10_000
 """Number of Gaussians that tell whether cameras look at the scene."""
 
 
+@on_host()
 def simplify_file(  # noqa: PLR0913 (options by name)
     source: str | os.PathLike[str],
     output: str | os.PathLike[str],

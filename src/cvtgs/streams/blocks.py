@@ -18,7 +18,7 @@ from cvtgs.analysis import SceneAnalysis, select_columns
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, target_count
-from cvtgs.devices import HOST, one_thread
+from cvtgs.devices import HOST, on_host, one_thread
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
 from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output, change_axes
@@ -132,6 +132,7 @@ def _bytes_of(path: Path, kind: str) -> int:
     return path.stat().st_size
 
 
+@on_host()
 def stream_file(  # noqa: PLR0913 (options by name)
     source: str | os.PathLike[str],
     folder: str | os.PathLike[str],

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from cvtgs.boxes import Corner
+from cvtgs.devices import on_host
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.arrays import morton_rows
 from cvtgs.math.frames import RobustFrame, robust_frame
@@ -117,6 +118,7 @@ class _Cut(NamedTuple):
     sides: tuple["_Cut", ...] = ()
 
 
+@on_host()
 def plan_stream(
     levels: Sequence[StreamedLevel],
     *,

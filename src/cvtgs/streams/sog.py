@@ -11,6 +11,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from cvtgs.boxes import Corner
+from cvtgs.devices import on_host
 from cvtgs.io import atomic_output, load, save
 from cvtgs.io.atomic import make_folder
 from cvtgs.io.sog import encode_sog
@@ -108,6 +109,7 @@ class SogFormat:
         }
 
 
+@on_host()
 def write_sog_stream(
     plan: StreamPlan,
     folder: str | os.PathLike[str],

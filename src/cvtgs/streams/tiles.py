@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from cvtgs.boxes import Corner
+from cvtgs.devices import on_host
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io import atomic_output
 from cvtgs.io.axes import SCENE_AXES, change_axes
@@ -100,6 +101,7 @@ class TilesFormat:
         }
 
 
+@on_host()
 def write_tiles(
     plan: StreamPlan,
     folder: str | os.PathLike[str],
