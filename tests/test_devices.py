@@ -205,3 +205,29 @@ def test_stages_give_the_same_bits_in_two_threads(two_threads, monkeypatch):
         assert same_bits(two, cvtgs.Simplifier(device="cpu").simplify(scene, 0.1))
     in_allocation = {"moments_of", "costs_of", "join", "search"}
     assert handed_over == in_allocation | {"merge_chunk", "inflate", "correct"}
+
+
+def test_calls_at_the_same_time_restore_the_number_of_threads(two_threads):
+    inside, found = threading.Barrier(2, timeout=30), []
+
+    def limited():
+        with one_thread():
+            inside.wait()  # the second thread of the program starts with a limited torch
+            inside.wait()
+
+    def later():
+        inside.wait()
+        inside.wait()
+        with one_thread():
+            pass
+        found.append(torch.get_num_threads())
+
+    threads = [threading.Thread(target=work) for work in (limited, later)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    fresh = threading.Thread(target=lambda: found.append(torch.get_num_threads()))
+    fresh.start()
+    fresh.join()
+    assert found == [2, 2]

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -161,8 +162,10 @@ def test_merge_widens_unlike_scenes_and_warns() -> None:
     assert torch.equal(both.means[:4].float(), first.means)
     assert not both.shN[:4].any()
     assert torch.equal(both.shN[4:], second.shN)
-    with pytest.raises(InvalidSceneError, match="merging needs at least one scene, found none"):
+    with pytest.raises(InvalidSceneError, match=r"merging needs at least one scene, found \[\]"):
         merge([])
+    with pytest.raises(InvalidSceneError, match=r"at least one scene, found \['a.ply'\]"):
+        merge(["a.ply"])
 
 
 @pytest.mark.parametrize(
@@ -176,7 +179,10 @@ def test_merge_widens_unlike_scenes_and_warns() -> None:
         (lambda: Motion(quat=(1e-200,) * 4), "a quaternion of length 1e-100 to 1e100"),
         (lambda: Motion(quat=(1e200,) * 4), "a quaternion of length 1e-100 to 1e100"),
         (lambda: Motion(shift=(math.nan, 0, 0)), "must consist of finite numbers"),
-        (lambda: Motion.of_angles((math.inf, 0, 0)), "must consist of finite numbers"),
+        (lambda: Motion.of_angles((math.inf, 0, 0)), "angles must be 3 finite numbers in degrees"),
+        (lambda: Motion.of_angles((90, 0)), "angles must be 3 finite numbers in degrees"),
+        (lambda: Motion(quat=(1, 0, 0), shift=(0,) * 4), "must consist of finite numbers"),
+        (lambda: Sphere(center=None, radius=1.0), "a centre of 3 finite numbers"),
         (lambda: Sphere(center=(0.0, 0.0, 0.0), radius=-1), "a radius of at least 0"),
         (lambda: drop_faint(random_scene(2), 1.5), "from 0 to 1, found 1.5"),
         (lambda: drop_large(random_scene(2), 0.0), "above 0, found 0.0"),
@@ -226,3 +232,17 @@ def test_coordinates_stay_within_their_type() -> None:
         move(scene, Motion(scale=1e39))
     infinite = scene.with_tensors({"means": torch.full((3, 3), torch.inf)}, {})
     assert move(infinite, Motion(scale=2.0)).means.isinf().all()
+
+
+def test_numbers_of_any_type_make_a_motion():
+    scene, wanted = random_scene(5, degree=1), Motion(quat=(1, 2, 3, 4), shift=(1, 2, 3))
+    motion = Motion(quat=torch.tensor([1.0, 2, 3, 4]), shift=np.array([1.0, 2, 3]))
+    assert motion == wanted
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert same_bits(move(scene, motion), move(scene, wanted))
+    assert len(crop(scene, Sphere(center=torch.zeros(3), radius=1e6))) == 5
+
+
+def test_scenes_to_merge_may_come_from_an_iterator():
+    scenes = [random_scene(2), random_scene(3)]
+    assert same_bits(merge(iter(scenes)), merge(scenes))

@@ -313,5 +313,7 @@ def test_with_tensors_takes_keywords_and_keeps_extras():
 
 def test_scenes_on_two_devices_are_not_joined():
     scene = random_scene(3)
-    with pytest.raises(InvalidSceneError, match="the first is on cpu, scene 1 on meta"):
+    with pytest.raises(
+        InvalidSceneError, match="joining needs scenes on one device, found cpu, meta"
+    ):
         cvtgs.concatenate([scene, scene.to("meta")])

@@ -8,9 +8,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from cvtgs.counts import whole_number
+from cvtgs.counts import check_whole
+from cvtgs.devices import usable_device
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.selection import row_numbers
+from cvtgs.text import shown
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -70,9 +72,9 @@ class Cameras:
                 f"{self.viewmats.device} and {self.Ks.dtype} on {self.Ks.device}."
             )
         for name in ("width", "height"):
-            _check_whole(getattr(self, name), name)
+            check_whole(getattr(self, name), name)
         for stride in self.strides:
-            _check_whole(stride, "every stride")
+            check_whole(stride, "every stride")
         for name, values, entry in (
             ("names", self.names, "name"),
             ("strides", self.strides, "stride"),
@@ -144,8 +146,12 @@ class Cameras:
 
         Returns:
             The cameras on that device.
+
+        Raises:
+            DeviceError: The device cannot be used.
         """
-        return replace(self, viewmats=self.viewmats.to(device), Ks=self.Ks.to(device))
+        target = usable_device(device)
+        return replace(self, viewmats=self.viewmats.to(target), Ks=self.Ks.to(target))
 
     def resized(self, width: int, height: int) -> Self:
         """Return cameras with the same field of view and another image size.
@@ -173,8 +179,8 @@ class Cameras:
         Raises:
             InvalidArgumentError: A length is no whole number above 0.
         """
-        _check_whole(side, "side")
-        _check_whole(least, "least")
+        check_whole(side, "side")
+        check_whole(least, "least")
         factor = side / max(self.width, self.height)
         return self.resized(
             max(least, round(factor * self.width)), max(least, round(factor * self.height))
@@ -196,7 +202,7 @@ class Cameras:
         Raises:
             InvalidArgumentError: The stride is no whole number above 0.
         """
-        _check_whole(stride, "stride")
+        check_whole(stride, "stride")
         return self._strided(
             stride,
             self.Ks.new_tensor([first]),
@@ -216,7 +222,7 @@ class Cameras:
         Raises:
             InvalidArgumentError: The stride is no whole number above 0.
         """
-        _check_whole(stride, "stride")
+        check_whole(stride, "stride")
         if stride == 1:
             return self
         rows = torch.arange(len(self), device=self.Ks.device)
@@ -250,7 +256,7 @@ class Cameras:
         Raises:
             InvalidArgumentError: The factor is no whole number above 0.
         """
-        _check_whole(factor, "factor")
+        check_whole(factor, "factor")
         if factor == 1:
             return self
         strides = tuple(
@@ -301,21 +307,26 @@ class Cameras:
         Raises:
             InvalidArgumentError: The count is no whole number above 0.
         """
-        _check_whole(count, "count")
+        check_whole(count, "count")
         return self.select(
             torch.tensor(spread_rows(len(self), count), dtype=torch.int64, device="cpu")
         )
+
+
+def checked_cameras(cameras: object) -> Cameras:
+    """Return cameras unchanged; raise for anything else."""
+    if not isinstance(cameras, Cameras):
+        raise InvalidArgumentError(
+            f"cameras must be Cameras, for example of cvtgs.load_cameras or "
+            f"cvtgs.views.automatic_views; found {shown(cameras)}."
+        )
+    return cameras
 
 
 def view_scales(viewmats: Float[Tensor, "c 4 4"]) -> Float[Tensor, "c"]:
     """Return the uniform scale of each view matrix; exactly 1 for rotations up to rounding."""
     scales = viewmats[:, :3, :3].square().sum(dim=(1, 2)).div(3).sqrt()
     return torch.where((scales - 1).abs() > 1e-3, scales, 1.0)
-
-
-def _check_whole(value: object, name: str) -> None:
-    if whole_number(value) < 1:
-        raise InvalidArgumentError(f"{name} must be a whole number above 0, found {value!r}.")
 
 
 def spread_rows(length: int, count: int) -> tuple[int, ...]:

@@ -44,7 +44,7 @@ def target_count(
     """Return the number of Gaussians to keep.
 
     ``rho`` is taken as the decimal number that was written: 0.07 of 100 Gaussians are 7, although
-    the nearest double times 100 is slightly more.
+    the nearest double times 100 is slightly more. The quotient of a count and N gives that count.
 
     Args:
         total: Number of Gaussians, N.
@@ -92,6 +92,9 @@ def target_count(
     if rho is None or not _is_ratio(rho):
         kind = "" if isinstance(rho, int | float) else "a number "
         raise InvalidArgumentError(f"rho must be {kind}above 0 and at most 1; found {rho!r}.")
+    near = round(float(rho) * total)
+    if near and near / total == float(rho):  # for example that of a report
+        return near
     return math.ceil(Fraction(written(rho)) * total)
 
 
@@ -120,6 +123,12 @@ def whole_number(number: object) -> int:
         return operator.index(number)
     except TypeError:  # a tensor of several or fractional numbers
         return -1
+
+
+def check_whole(value: object, name: str) -> None:
+    """Raise unless a value is a whole number above 0."""
+    if whole_number(value) < 1:
+        raise InvalidArgumentError(f"{name} must be a whole number above 0, found {value!r}.")
 
 
 def shortfall(valid: int, total: int, target: int) -> str:

@@ -3,6 +3,7 @@
 import gc
 import os
 import platform
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -33,11 +34,28 @@ Result = TypeVar("Result")
 _SHORT_CHUNKS = ContextVar("short_chunks", default=False)
 
 
+class _Own(threading.local):
+    """Whether the calling thread computes with one thread of torch."""
+
+    is_limited = False
+
+
+class _Limits:
+    """Running calls that limit torch, in the whole process, and the number before the first."""
+
+    lock = threading.Lock()
+    running = 0
+    threads = 1
+
+
+_OWN = _Own()
+
+
 def usable_device(device: str | torch.device) -> torch.device:
     """Return the named device; raise DeviceError if it cannot be used."""
-    if not isinstance(device, str | torch.device | int):
+    if not isinstance(device, str | torch.device | int) or isinstance(device, bool):
         raise DeviceError(
-            f"device must be 'auto', a name such as 'cpu', or a torch.device, found {device!r}."
+            f"device must be a name such as 'cpu' or a torch.device, found {device!r}."
         )
     try:
         resolved = torch.device(device)
@@ -156,7 +174,7 @@ def in_threads(
     the same bits, whatever the number of threads. On other devices than CPUs, chunks run
     sequentially. Results come in the order of the items, computed when requested or earlier.
     """
-    threads = torch.get_num_threads()
+    threads = _threads_of_torch()
     if device.type != "cpu" or threads == 1 or thread_count() == 1:
         return map(function, items)
     return _in_pool(function, items, min(threads, thread_count()))
@@ -178,14 +196,15 @@ def in_chunks(
 def _in_pool(
     function: Callable[[Item], Result], items: Iterable[Item], threads: int
 ) -> Iterator[Result]:
-    before, has_gradients = torch.get_num_threads(), torch.is_grad_enabled()
+    has_gradients = torch.is_grad_enabled()
 
     def start() -> None:
+        _OWN.is_limited = True
         torch.set_num_threads(1)
         torch.set_grad_enabled(has_gradients)
 
     waiting: deque[Future[Result]] = deque()
-    with ThreadPoolExecutor(threads, initializer=start) as pool:
+    with _restored_threads(), ThreadPoolExecutor(threads, initializer=start) as pool:
         try:
             for item in items:
                 waiting.append(pool.submit(function, item))
@@ -196,7 +215,32 @@ def _in_pool(
         finally:
             for future in waiting:
                 future.cancel()
-            torch.set_num_threads(before)  # threads started later would also be limited to one
+
+
+def _threads_of_torch() -> int:
+    """Return torch's number of threads, even where another call limits it at the moment."""
+    with _Limits.lock:
+        is_free = _Limits.running == 0 or _OWN.is_limited
+        return torch.get_num_threads() if is_free else _Limits.threads
+
+
+@contextmanager
+def _restored_threads() -> Iterator[None]:
+    """Restore torch's number of threads at the end.
+
+    The number holds for the whole process, and threads of the program that start later take it, so
+    of calls at the same time, only the first may read it.
+    """
+    with _Limits.lock:
+        if _Limits.running == 0:
+            _Limits.threads = torch.get_num_threads()
+        _Limits.running += 1
+    try:
+        yield
+    finally:
+        with _Limits.lock:
+            _Limits.running -= 1
+            torch.set_num_threads(_Limits.threads)
 
 
 @contextmanager
@@ -225,9 +269,13 @@ def one_thread() -> Iterator[None]:
     Sums then do not depend on the number of cores, and operations that are too small to parallelise
     do not wait for threads.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    if _OWN.is_limited:
         yield
-    finally:
-        torch.set_num_threads(threads)
+        return
+    with _restored_threads():
+        _OWN.is_limited = True
+        torch.set_num_threads(1)
+        try:
+            yield
+        finally:
+            _OWN.is_limited = False

@@ -2,17 +2,24 @@
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from cvtgs.boxes import Box, Corner, inside
-from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, InvalidSceneError
+from cvtgs.devices import without_autocast
+from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
 from cvtgs.math.parameters import multiply_quats, rotation_matrices
 from cvtgs.math.spherical_harmonics import REST_COUNTS, rotated_rest
-from cvtgs.scene import NORMALS, GaussianScene, concatenate, turned_normals
+from cvtgs.scene import (
+    NORMALS,
+    GaussianScene,
+    checked_scenes,
+    concatenate,
+    turned_normals,
+)
 from cvtgs.text import shown
 
 __all__ = [
@@ -49,12 +56,14 @@ class Sphere:
     radius: float
 
     def __post_init__(self) -> None:
-        numbers = (*self.center, self.radius)
-        if len(numbers) != 4 or not all(map(math.isfinite, numbers)) or self.radius < 0:
+        center, radius = _numbers(self.center, 3), _numbers([self.radius], 1)
+        if center is None or radius is None or radius[0] < 0:
             raise InvalidArgumentError(
                 f"a sphere needs a centre of 3 finite numbers and a radius of at least 0, "
-                f"found {self.center} and {self.radius}."
+                f"found {shown(self.center)} and {shown(self.radius)}."
             )
+        object.__setattr__(self, "center", center)
+        object.__setattr__(self, "radius", radius[0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,19 +89,22 @@ class Motion:
     shift: Corner = _NO_SHIFT
 
     def __post_init__(self) -> None:
-        numbers = (*self.quat, self.scale, *self.shift)
-        if len(numbers) != 8 or not all(map(math.isfinite, numbers)):
-            found = ", ".join(f"{number:g}" for number in numbers)
+        quat, scale = _numbers(self.quat, 4), _numbers([self.scale], 1)
+        shift = _numbers(self.shift, 3)
+        if quat is None or scale is None or shift is None:
+            found = ", ".join(map(shown, (self.quat, self.scale, self.shift)))
             raise InvalidArgumentError(
                 f"a motion must consist of finite numbers (4 of a quaternion, a scale, 3 of a "
                 f"shift), found {found}."
             )
         # the square of the length must be a float64
-        if self.scale <= 0 or not 1e-100 <= math.hypot(*self.quat) <= 1e100:
+        if scale[0] <= 0 or not 1e-100 <= math.hypot(*quat) <= 1e100:
             raise InvalidArgumentError(
                 f"a motion needs a scale above 0 and a quaternion of length 1e-100 to 1e100, "
-                f"found {self.scale} and {self.quat}."
+                f"found {scale[0]} and {quat}."
             )
+        for name, value in (("quat", quat), ("scale", scale[0]), ("shift", shift)):
+            object.__setattr__(self, name, value)
 
     @classmethod
     def of_angles(
@@ -111,8 +123,13 @@ class Motion:
         Raises:
             InvalidArgumentError: A number is not finite, or the factor is not above 0.
         """
+        degrees = _numbers(angles, 3)
+        if degrees is None:
+            raise InvalidArgumentError(
+                f"angles must be 3 finite numbers in degrees, found {shown(angles)}."
+            )
         quat = torch.tensor([_NO_TURN], dtype=torch.float64, device="cpu")
-        for axis, angle in enumerate(angles):
+        for axis, angle in enumerate(degrees):
             turn = torch.zeros(1, 4, dtype=torch.float64, device="cpu")
             # exact for quarter turns, unlike the sine of rounded radians
             turn[0, 0], turn[0, 1 + axis] = _cos_sin(angle / 2)
@@ -121,10 +138,19 @@ class Motion:
         return cls(quat=(w, x, y, z), scale=scale, shift=shift)
 
 
+def _numbers(values: Iterable[float], count: int) -> tuple[float, ...] | None:
+    """Return finite numbers of any type as floats; None if they are others."""
+    try:
+        numbers = tuple(map(float, values))
+    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor of several numbers
+        return None
+    return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else None
+
+
 def _cos_sin(degrees: float) -> tuple[float, float]:
-    if math.isfinite(degrees) and degrees % 90 == 0:
+    if degrees % 90 == 0:
         return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(degrees // 90) % 4]
-    radians = math.radians(degrees) if math.isfinite(degrees) else math.nan
+    radians = math.radians(degrees)
     return math.cos(radians), math.sin(radians)
 
 
@@ -216,6 +242,7 @@ def _kept(scene: GaussianScene, keep: Tensor) -> GaussianScene:
     return scene if bool(keep.all()) else scene.select(keep)
 
 
+@without_autocast()
 def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
     """Rotate, scale and translate a scene; view-dependent colours and normals rotate with it.
 
@@ -263,7 +290,7 @@ def move(scene: GaussianScene, motion: Motion) -> GaussianScene:
     return scene.with_tensors({"means": moved, **changes}, extras)
 
 
-def merge(scenes: Sequence[GaussianScene]) -> GaussianScene:
+def merge(scenes: Iterable[GaussianScene]) -> GaussianScene:
     """Return the Gaussians of several scenes as one scene; degrees and dtypes may differ.
 
     Missing SH bands and normals are filled with zeros, and the result is float64 if any scene is.
@@ -284,10 +311,7 @@ def merge(scenes: Sequence[GaussianScene]) -> GaussianScene:
         >>> merge([make("object", 10, sh_degree=0), make("object", 5, sh_degree=2)])
         GaussianScene(15 Gaussians, SH degree 2, float32, cpu)
     """
-    if not scenes:
-        raise InvalidSceneError("merging needs at least one scene, found none.")
-    if len({scene.device for scene in scenes}) > 1:
-        raise InvalidSceneError("scenes to merge must be on one device, found several.")
+    scenes = checked_scenes(scenes, "merging")
     common = set.intersection(*({*scene.extras, *NORMALS} for scene in scenes))
     common &= {name for scene in scenes for name in scene.extras}
     missing = sorted({name for scene in scenes for name in scene.extras} - common)

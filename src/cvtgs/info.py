@@ -7,10 +7,11 @@ from torch import Tensor
 from cvtgs.analysis import EffectPlan, analyze, select_columns
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
-from cvtgs.errors import InvalidSceneError
+from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.math import parameters
 from cvtgs.math.segments import running_sums
 from cvtgs.scene import SceneLike, as_scene
+from cvtgs.text import shown
 from cvtgs.validity import invalid_rows
 
 FAINT = 0.1
@@ -76,6 +77,7 @@ def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInf
 
     Raises:
         InvalidSceneError: The scene has no valid row.
+        InvalidArgumentError: The configuration is none.
 
     Example:
         >>> from cvtgs.synthetic import scene
@@ -90,7 +92,9 @@ def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInf
     if len(scene) == int(bad.sum()):
         raise InvalidSceneError(f"none of the {len(scene)} Gaussians is valid.")
     valid = scene.select(~bad) if invalid else scene
-    config = config or SimplifyConfig()
+    config = SimplifyConfig() if config is None else config
+    if not isinstance(config, SimplifyConfig):
+        raise InvalidArgumentError(f"config must be a SimplifyConfig, found {shown(config)}.")
     analysis = analyze(select_columns(valid, config.effects), config)
     frame, opacities = analysis.frame, analysis.opacities
     masses = analysis.areas * opacities

@@ -1,6 +1,6 @@
 """Prepared: a scene to simplify repeatedly, with a fallback if the device lacks memory."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import TypeVar
 
@@ -18,7 +18,7 @@ from cvtgs.analysis import (
     select_columns,
 )
 from cvtgs.boxes import check_mask, check_room
-from cvtgs.cameras import Cameras
+from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shortfall, target_count
@@ -39,7 +39,7 @@ Result = TypeVar("Result")
 def check_cameras(cameras: Cameras | None, config: SimplifyConfig) -> None:
     """Raise if cameras were given, but too few for a configuration that renders images."""
     least = 2 if config.refine.enabled else 1
-    if cameras is not None and config.uses_images and len(cameras) < least:
+    if cameras is not None and len(checked_cameras(cameras)) < least and config.uses_images:
         raise InvalidArgumentError(
             f"preset {config.preset} needs at least {least} "
             f"{'cameras, one of them to be held out' if least > 1 else 'camera'}; "
@@ -206,9 +206,10 @@ class Prepared:
         Returns:
             One level per ratio, in the order of the ratios.
         """
-        if isinstance(rhos, int | float) or not len(rhos):
+        ratios = list(rhos) if isinstance(rhos, Iterable) else []
+        if not ratios:
             raise InvalidArgumentError(f"levels need a list of ratios, found {shown(rhos)}.")
-        targets = [target_count(self._total, rho) for rho in rhos]
+        targets = [target_count(self._total, rho) for rho in ratios]
         found = self._attempt(partial(self._run_levels, targets))
         return tuple(found[target] for target in targets)
 
@@ -245,6 +246,9 @@ class Prepared:
         if self._checked is None:
             with clock.stage("check"):
                 used = select_columns(self._scene, self._config.effects).to(self._device)
+                # sums over rows would round another way
+                tensors = {name: tensor.contiguous() for name, tensor in used.tensors().items()}
+                used = used.with_tensors(tensors)
                 if self._checkpoint is not None:
                     self._net = self._checkpoint.net.copy_to(self._device, used.means.dtype)
                 self._checked = check_rows(used)

@@ -1,7 +1,7 @@
 """GaussianScene: the Gaussians of a scene in stored (not activated) parameters."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pkgutil import resolve_name
@@ -12,10 +12,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from cvtgs.counts import whole_number
 from cvtgs.devices import usable_device
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.selection import row_numbers
+from cvtgs.text import shown
 
 ANTIALIASED_TAG = "SplatRenderMode: mip"
 """The comment of scenes that were trained with anti-aliasing (Mip-Splatting)."""
@@ -28,7 +30,6 @@ NORMALS = ("nx", "ny", "nz")
 
 _CHUNK = 1 << 16
 _NOT_INDEXABLE = (torch.uint16, torch.uint32, torch.uint64)  # torch cannot select their rows
-
 _TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
 
 
@@ -250,7 +251,7 @@ class GaussianScene:
         Raises:
             InvalidArgumentError: The degree is not from 0 to 3.
         """
-        if degree not in range(len(spherical_harmonics.REST_COUNTS)):
+        if whole_number(degree) not in range(len(spherical_harmonics.REST_COUNTS)):
             raise InvalidArgumentError(f"the SH degree must be from 0 to 3, found {degree!r}.")
         if degree >= self.sh_degree:
             return self
@@ -342,7 +343,18 @@ def as_scene(scene: SceneLike, name: str = "scene") -> GaussianScene:
     )
 
 
-def concatenate(scenes: Sequence[GaussianScene]) -> GaussianScene:
+def checked_scenes(scenes: Any, work: str) -> list[GaussianScene]:
+    """Return several scenes as a list; raise if there is none, or not all are on one device."""
+    found = [scenes] if isinstance(scenes, GaussianScene) else list(scenes)
+    if not found or not all(isinstance(scene, GaussianScene) for scene in found):
+        raise InvalidSceneError(f"{work} needs at least one scene, found {shown(found)}.")
+    places = sorted({str(scene.device) for scene in found})
+    if len(places) > 1:
+        raise InvalidSceneError(f"{work} needs scenes on one device, found {', '.join(places)}.")
+    return found
+
+
+def concatenate(scenes: Iterable[GaussianScene]) -> GaussianScene:
     """Return the Gaussians of several scenes as one scene.
 
     Args:
@@ -355,8 +367,7 @@ def concatenate(scenes: Sequence[GaussianScene]) -> GaussianScene:
     Raises:
         InvalidSceneError: The scenes do not fit together.
     """
-    if not scenes:
-        raise InvalidSceneError("joining needs at least one scene, found none.")
+    scenes = checked_scenes(scenes, "joining")
     first, *others = scenes
     if not others:
         return first
@@ -371,11 +382,6 @@ def concatenate(scenes: Sequence[GaussianScene]) -> GaussianScene:
                 f"scenes to join must have the same SH degree and dtype; the first has "
                 f"{first.sh_degree} and {first.dtype}, scene {number} {other.sh_degree} and "
                 f"{other.dtype}."
-            )
-        if other.device != first.device:
-            raise InvalidSceneError(
-                f"scenes to join must be on one device; the first is on {first.device}, scene "
-                f"{number} on {other.device}."
             )
     tensors = [scene.tensors() for scene in scenes]
     return first.with_tensors(

@@ -8,8 +8,10 @@ import torch
 from scipy.ndimage import correlate1d
 
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.evaluation import alpha_bias, alpha_error, psnr, ssim
+from cvtgs.evaluation import EvaluationSettings, alpha_bias, alpha_error, evaluate, psnr, ssim
 from cvtgs.losses import ssim_loss
+from cvtgs.views import automatic_views
+from scenes import random_scene
 
 
 def noisy_pair(size: tuple[int, int], noise: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -138,3 +140,17 @@ def test_alpha_that_does_not_fit_is_refused() -> None:
             alpha_error(alpha, other)
     with pytest.raises(InvalidArgumentError, match=r"floats of shape \(c, h, w\)"):
         alpha_bias(alpha[0], alpha[0])
+
+
+def test_autocast_does_not_change_scores():
+    scene = random_scene(30)
+    cameras, settings = automatic_views(scene, 1, width=32, height=32), EvaluationSettings()
+    wanted = evaluate(scene, {"some": scene[:9]}, cameras, settings=settings)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert evaluate(scene, {"some": scene[:9]}, cameras, settings=settings) == wanted
+
+
+def test_names_of_scenes_are_texts():
+    scene = random_scene(3)
+    with pytest.raises(InvalidArgumentError, match="names of scenes must be texts, found 1"):
+        evaluate(scene, {1: scene}, automatic_views(scene, 1, width=32, height=32))

@@ -4,6 +4,7 @@ import io
 import json
 import sys
 import tempfile
+import threading
 import warnings
 import zipfile
 from collections import OrderedDict
@@ -180,6 +181,63 @@ def test_text_files_and_closed_files_are_refused(tmp_path: Path) -> None:
     cvtgs.save(scene, path, overwrite=True)
     with path.open("rb") as file, pytest.raises(OutputError, match="must be open for writing"):
         cvtgs.save(scene, file)
+
+
+class Cut(io.RawIOBase):
+    """A connection that breaks, with an error of its own kind."""
+
+    name = ""
+
+    def read(self, size: int = -1) -> bytes:
+        raise EOFError("the stream ended too early")
+
+
+def test_streams_that_break_and_closed_ones_are_refused() -> None:
+    with pytest.raises(InputError, match="the Cut: must be readable to its end, found: the stream"):
+        cvtgs.load(Cut())
+    closed = io.BytesIO(GOOD)
+    closed.close()
+    with pytest.raises(InputError, match="must be readable to its end, found: I/O operation on"):
+        cvtgs.load(closed)
+    with pytest.raises(OutputError, match="must be open for writing in binary mode, found: I/O"):
+        cvtgs.save(storable_scene(5), closed)
+
+
+def test_warnings_are_shown_as_before_after_streams_were_read_in_threads() -> None:
+    before = warnings.showwarning
+    together = threading.Barrier(3, timeout=30)
+
+    def read() -> None:
+        together.wait()
+        for _ in range(10):
+            cvtgs.load(io.BytesIO(GOOD))
+
+    threads = [threading.Thread(target=read) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert warnings.showwarning is before
+
+
+@pytest.mark.parametrize(
+    ("work", "error", "text"),
+    [
+        (
+            lambda: cvtgs.load("a.ply", sh_degree=1.5),
+            InvalidArgumentError,
+            "from 0 to 3",
+        ),
+        (lambda: cvtgs.load("a.ply", axes=5), InvalidArgumentError, "axes must be .* found 5"),
+        (lambda: cvtgs.load("a.ply", format=5), FileFormatError, "format must be a suffix .* 5"),
+        (lambda: cvtgs.load("a\0b.ply"), InputNotFoundError, "the file to read must exist"),
+        (lambda: cvtgs.save(storable_scene(1), None), InvalidArgumentError, "found None"),
+        (lambda: cvtgs.save(storable_scene(1), "a\0b.ply"), OutputError, "found a null byte"),
+    ],
+)
+def test_arguments_of_other_types_are_errors(work, error: type[Exception], text: str) -> None:
+    with pytest.raises(error, match=text):
+        work()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the file size as Linux does")

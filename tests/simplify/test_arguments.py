@@ -16,6 +16,7 @@ from cvtgs.errors import (
     InvalidArgumentError,
 )
 from cvtgs.refinement import RefineConfig
+from cvtgs.rendering import contributions
 from scenes import random_scene, same_bits
 
 
@@ -57,7 +58,7 @@ def test_a_preset_given_as_the_checkpoint_is_an_error():
         ({"ckpt": 3}, r"ckpt must be the name of a checkpoint, a file or None, found int\."),
         ({"ckpt": SimplifyConfig()}, "found SimplifyConfig; for a configuration, give config."),
         ({"listener": None}, "listener must be a function of a progress event, found None"),
-        ({"device": None}, "device must be 'auto', a name such as 'cpu', .*, found None"),
+        ({"device": None}, "device must be a name such as 'cpu' or a torch.device, found None"),
     ],
 )
 def test_arguments_of_other_types_are_errors(arguments, message):
@@ -159,3 +160,32 @@ def test_arguments_of_another_kind_are_one_sentence(tmp_path):
             cvtgs.load(wrong)
     with pytest.raises(InvalidArgumentError, match=r"found 'a\.ply' as scene"):
         cvtgs.save("a.ply", tmp_path / "z.ply")
+
+
+@pytest.mark.parametrize("preset", ["standard", "paper"])
+def test_the_random_numbers_of_the_program_are_left_alone(preset):
+    torch.manual_seed(0)
+    wanted = torch.rand(2)
+    torch.manual_seed(0)
+    Simplifier(config=preset, device="cpu").simplify(random_scene(50), 0.1)
+    assert torch.equal(torch.rand(2), wanted)
+
+
+def test_cameras_of_other_types_are_errors():
+    scene, wrong = random_scene(20), [object()]
+    for work in (
+        lambda: Simplifier(config="matched", device="cpu").simplify(scene, 0.1, cameras=wrong),
+        lambda: cvtgs.refine(scene, scene, steps=1, cameras=wrong),
+        lambda: cvtgs.evaluate(scene, {"a": scene}, wrong),
+        lambda: contributions(scene, wrong),
+    ):
+        with pytest.raises(InvalidArgumentError, match="cameras must be Cameras, for example of"):
+            work()
+
+
+def test_configurations_of_other_types_are_errors():
+    scene = random_scene(20)
+    with pytest.raises(InvalidArgumentError, match="config must be a RefineConfig, found 'high'"):
+        cvtgs.refine(scene, scene, config="high")
+    with pytest.raises(InvalidArgumentError, match="config must be a SimplifyConfig, found 'fast'"):
+        cvtgs.describe(scene, "fast")

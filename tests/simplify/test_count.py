@@ -55,6 +55,12 @@ def test_count_of_known_ratios(total, rho, wanted):
     assert target_count(total, rho) == wanted
 
 
+@pytest.mark.parametrize("total", [1, 3, 777, 3000, 99_999, 1_234_567])
+def test_the_ratio_of_a_report_gives_its_count(total):
+    for count in range(1, min(total, 2000) + 1):
+        assert target_count(total, count / total) == count
+
+
 @pytest.mark.parametrize("total", [1, 2, 3, 10, 99, 100, 1000, 123_457, 10**8])
 def test_the_count_is_the_ceiling_of_the_decimal_as_written(total):
     for hundredths in range(1, 101):

@@ -132,3 +132,24 @@ def test_invalid_rows_are_warned_about_once_and_counted_in_every_run():
 def test_a_size_out_of_range_is_refused(scene):
     with pytest.raises(InvalidArgumentError):
         Simplifier(device="cpu").prepare(scene).run(count=0)
+
+
+def test_levels_take_any_iterable_of_ratios(scene):
+    simplifier = Simplifier("standard", device="cpu")
+    found = simplifier.levels(scene, (rho for rho in (0.2, 0.1)))
+    wanted = simplifier.levels(scene, [0.2, 0.1])
+    assert [len(level.scene) for level in found] == [len(level.scene) for level in wanted]
+    for wrong in (None, 0.1, []):
+        with pytest.raises(InvalidArgumentError, match="levels need a list of ratios"):
+            simplifier.levels(scene, wrong)
+
+
+def test_tensors_of_other_strides_give_the_same_bits(scene):
+    tensors = {
+        name: torch.stack([values, values], dim=-1)[..., 0]
+        for name, values in scene.tensors().items()
+    }
+    assert not tensors["sh0"].is_contiguous()
+    simplifier = Simplifier("standard", device="cpu")
+    wanted = simplifier.simplify(scene, 0.1)
+    assert same_bits(simplifier.simplify(scene.with_tensors(tensors), 0.1), wanted)

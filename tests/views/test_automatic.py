@@ -229,8 +229,10 @@ def test_views_of_a_georeferenced_scene_are_those_of_the_scene_at_the_origin(dty
 def test_bad_arguments_are_refused():
     scene = random_scene(10)
     for words, text in (
-        ({"count": 0}, "count must be at least 1, found 0."),
-        ({"width": 0}, "width must be at least 1, found 0."),
+        ({"count": 0}, "count must be a whole number above 0, found 0."),
+        ({"count": 1.5}, "count must be a whole number above 0, found 1.5."),
+        ({"seed": 0.5}, "seed must be a whole number, found 0.5."),
+        ({"width": 0}, "width must be a whole number above 0, found 0."),
     ):
         with pytest.raises(ValueError, match=text):
             automatic_views(scene, **words)
@@ -262,3 +264,14 @@ def test_small_objects_are_no_rooms(count):
         assert find_layout(scene).room is None
     room = cvtgs.synthetic.scene("room", 4000, sh_degree=0, seed=0)
     assert find_layout(room).room is not None
+
+
+@pytest.mark.filterwarnings("error")
+def test_scenes_that_require_gradients_and_any_seeds():
+    scene = random_scene(50)
+    leaves = {name: values.clone().requires_grad_() for name, values in scene.tensors().items()}
+    for seed in (0, 2**70, -1):
+        found = automatic_views(scene.with_tensors(leaves), 2, width=32, height=32, seed=seed)
+        wanted = automatic_views(scene, 2, width=32, height=32, seed=seed)
+        assert torch.equal(found.viewmats, wanted.viewmats)
+        assert not found.viewmats.requires_grad

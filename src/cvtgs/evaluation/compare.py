@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from cvtgs.cameras import Cameras, spread_rows
+from cvtgs.cameras import Cameras, checked_cameras, spread_rows
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation.images import as_bytes
 from cvtgs.evaluation.report import Evaluation, SceneScores
@@ -22,6 +22,7 @@ from cvtgs.evaluation.scorer import (
 )
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
+from cvtgs.text import shown
 
 STAGE = "evaluate"
 """Stage name in progress events; one step per image."""
@@ -179,13 +180,13 @@ def compare(  # noqa: PLR0913 (options by name)
     if most_images is not None and most_images < 1:
         raise InvalidArgumentError(f"most_images must be at least 1, found {most_images}.")
     scenes = _named_scenes(reference, small, reference_name)
-    shown = spread_rows(len(cameras), most_images or len(cameras))
-    shape = (len(shown), cameras.height, cameras.width)
+    views = spread_rows(len(checked_cameras(cameras)), most_images or len(cameras))
+    shape = (len(views), cameras.height, cameras.width)
     images = {
         name: SceneImages(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.uint8))
         for name in scenes
     }
-    places = {view: place for place, view in enumerate(shown)}
+    places = {view: place for place, view in enumerate(views)}
 
     def keep(name: str, view: int, color: Tensor, alpha: Tensor) -> None:
         if view in places:
@@ -202,7 +203,7 @@ def compare(  # noqa: PLR0913 (options by name)
     )
     full = images.pop(reference_name)
     return Comparison(
-        evaluation=evaluation, shown=shown, full=full, small=images, sizes=dict(sizes or {})
+        evaluation=evaluation, shown=views, full=full, small=images, sizes=dict(sizes or {})
     )
 
 
@@ -214,6 +215,9 @@ def _named_scenes(
             f"small must be a mapping of names and scenes, such as {{'small': scene}}; found "
             f"{type(small).__name__}."
         )
+    for name in small:
+        if not isinstance(name, str):
+            raise InvalidArgumentError(f"names of scenes must be texts, found {shown(name)}.")
     if reference_name in small:
         raise InvalidArgumentError(
             f"the scenes must have different names; {reference_name!r} is the name of the full "
@@ -252,7 +256,7 @@ def _score_images(
     listener: ProgressListener,
 ) -> Evaluation:
     """Score all scenes against the first, view by view; pass every image to ``keep``."""
-    if len(cameras) == 0:
+    if len(checked_cameras(cameras)) == 0:
         raise InvalidArgumentError("an evaluation needs at least one camera, found none.")
     if photographs is not None:
         _check_photographs(photographs, cameras)
@@ -267,8 +271,7 @@ def _score_images(
             f"views; give cameras of this scene, in its axes and units."
         )
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
-    for view in range(len(cameras)):
-        camera = cameras.select(torch.tensor([view], device="cpu"))
+    for view, camera in enumerate(cameras.singles()):
         truth: tuple[Tensor, Tensor] | None = None
         for name, scene in scenes.items():
             rendered = render_view(scene, camera, backend=settings.backend)

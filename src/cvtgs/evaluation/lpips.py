@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.devices import without_autocast
 from cvtgs.errors import (
     FileFormatError,
     InputNotFoundError,
@@ -106,6 +107,7 @@ class LpipsWeights:
 
 
 @torch.no_grad()
+@without_autocast()
 def lpips(
     a: Float[Tensor, "c h w 3"],
     b: Float[Tensor, "c h w 3"],

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from cvtgs.devices import without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.losses import SSIM_WINDOW, check_pair, mean_ssim
 
@@ -33,6 +34,7 @@ def psnr(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tens
 
 
 @torch.no_grad()
+@without_autocast()
 def ssim(a: Float[Tensor, "c h w 3"], b: Float[Tensor, "c h w 3"]) -> Float[Tensor, "c"]:
     """Return the structural similarity of each pair of images.
 

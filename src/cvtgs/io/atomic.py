@@ -13,6 +13,7 @@ from pathlib import Path, PureWindowsPath
 from typing import BinaryIO
 
 from cvtgs.errors import CvtgsError, OutputError, OutputExistsError, reason_of
+from cvtgs.text import shown
 
 try:
     import fcntl
@@ -56,6 +57,8 @@ def check_output(path: str | os.PathLike[str], overwrite: bool = False) -> None:
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     check_output(Path(folder) / "new.ply")
     """
+    if "\0" in os.fspath(path):
+        raise OutputError(f"{shown(path)}: the output must have a valid name, found a null byte.")
     target = _target(path)
     fault = windows_fault(PureWindowsPath(path)) if _WINDOWS else None
     if fault is not None:

@@ -31,7 +31,7 @@ _QUARTER_TURN = torch.tensor(
 
 def checked_axes(name: str) -> str:
     """Check the name of axes, and return it in lower case."""
-    if name.lower() not in AXES:
+    if not isinstance(name, str) or name.lower() not in AXES:
         raise InvalidArgumentError(
             f"axes must be the directions of x, y and z, such as rdf (right, down, forward: PLY) "
             f"or rub (right, up, back: Niantic), one of {', '.join(AXES)}; found {name!r}."

@@ -101,6 +101,8 @@ def scene_file(path: str | os.PathLike[str]) -> Path:
         'scene.ply'
     """
     folder = Path(path)
+    if "\0" in str(folder):  # no system allows it
+        raise InputNotFoundError(f"{shown(str(folder))}: the file to read must exist, found none.")
     if not is_folder(folder):
         return folder
     try:

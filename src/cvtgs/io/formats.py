@@ -11,6 +11,7 @@ from typing import Any, BinaryIO, Literal
 
 import torch
 
+from cvtgs.counts import whole_number
 from cvtgs.devices import usable_device
 from cvtgs.errors import (
     DroppedDataWarning,
@@ -141,7 +142,7 @@ def load(
         GaussianScene(2 Gaussians, SH degree 0, float32, cpu)
     """
     usable_device(device)
-    if sh_degree is not None and not 0 <= sh_degree < len(REST_COUNTS):
+    if sh_degree is not None and whole_number(sh_degree) not in range(len(REST_COUNTS)):
         raise InvalidArgumentError(f"sh_degree must be from 0 to 3, found {sh_degree!r}.")
     axes = None if axes is None else checked_axes(axes)
     if not isinstance(path, str | os.PathLike):
@@ -251,6 +252,10 @@ def save(
         name, named = os.fspath(path), _dotted(format) or path
         output = atomic_output(path, overwrite=overwrite)
     else:
+        if not hasattr(path, "write"):
+            raise InvalidArgumentError(
+                f"a scene is saved to a path or an open binary file, found {shown(path)}."
+            )
         name, named = name_of(path), _dotted(format) or ".ply"
         output = written_to(path)
     suffix = _suffix_of(named, _WRITERS, format=format)
@@ -321,6 +326,8 @@ def check_save(path: str | os.PathLike[str], overwrite: bool = False) -> None:
 
 def _dotted(suffix: str | None) -> str | None:
     """Return the suffix of a format with a leading dot: ``ply`` means ``.ply``."""
+    if not isinstance(suffix, str | None):
+        raise FileFormatError(f"format must be a suffix such as '.ply', found {shown(suffix)}.")
     if suffix and ("." not in suffix or f".{suffix.lower()}" in (*_READERS, *_WRITERS)):
         return f".{suffix}"
     return suffix

@@ -3,13 +3,14 @@
 import os
 import re
 import shutil
+import threading
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import SpooledTemporaryFile, TemporaryDirectory
-from typing import Any, BinaryIO, Protocol, cast
+from typing import Any, BinaryIO, ClassVar, Protocol, cast
 
 from cvtgs.errors import CvtgsError, FileFormatError, InputError, OutputError, reason_of
 
@@ -89,17 +90,37 @@ def file_of(
 
 @contextmanager
 def _named_in_warnings(path: Path, name: str) -> Iterator[None]:
-    """Show warnings with the name of the stream."""
-    before = warnings.showwarning
+    """Show warnings with the name of the stream.
 
-    def show(message: Warning | str, category: type[Warning], *others: Any, **named: Any) -> None:
-        before(category(_renamed(str(message), path, name)), category, *others, **named)
-
-    warnings.showwarning = show
+    Python has one function that shows warnings, so it is replaced once for all streams that are
+    read at the same time.
+    """
+    with _Shown.lock:
+        if not _Shown.names:
+            _Shown.before, warnings.showwarning = warnings.showwarning, _show
+        _Shown.names[path] = name
     try:
         yield
     finally:
-        warnings.showwarning = before
+        with _Shown.lock:
+            del _Shown.names[path]
+            if not _Shown.names:
+                warnings.showwarning = _Shown.before
+
+
+class _Shown:
+    """The streams that are being read, by temporary file, and what shows warnings without them."""
+
+    lock = threading.Lock()
+    names: ClassVar[dict[Path, str]] = {}
+    before: ClassVar[Callable[..., None]] = staticmethod(warnings.showwarning)
+
+
+def _show(message: Warning | str, category: type[Warning], *others: Any, **named: Any) -> None:
+    text = renamed = str(message)
+    for path, name in tuple(_Shown.names.items()):
+        renamed = _renamed(renamed, path, name)
+    _Shown.before(message if renamed == text else category(renamed), category, *others, **named)
 
 
 def _renamed(text: str, path: Path, name: str) -> str:
@@ -112,8 +133,12 @@ def _chunks(stream: ByteSource, name: str) -> Iterator[bytes]:
     while True:
         try:
             chunk = stream.read(CHUNK_BYTES)
-        except OSError as error:
-            raise InputError(f"{name}: must be readable to its end, found: {error}.") from error
+        except MemoryError:
+            raise
+        except Exception as error:  # archives and connections raise their own kinds
+            raise InputError(
+                f"{name}: must be readable to its end, found: {error or type(error).__name__}."
+            ) from error
         if not isinstance(chunk, bytes):
             raise InputError(f"{name}: must be open in binary mode, found text; open it with 'rb'.")
         if not chunk:
@@ -130,7 +155,7 @@ def written_to(stream: ByteSink) -> Iterator[BinaryIO]:
         try:
             shutil.copyfileobj(file, stream)
             getattr(stream, "flush", lambda: None)()
-        except (OSError, TypeError) as error:
+        except (OSError, TypeError, ValueError) as error:  # ValueError: it is closed
             raise OutputError(
                 f"{name_of(stream)}: must be open for writing in binary mode, found: {error}."
             ) from error
@@ -156,4 +181,4 @@ def format_of(path: Path) -> str | None:
 def name_of(stream: ByteSource | ByteSink) -> str:
     """Return the name of a stream for messages."""
     name = getattr(stream, "name", None)
-    return name if isinstance(name, str) else f"the {type(stream).__name__}"
+    return name if isinstance(name, str) and name else f"the {type(stream).__name__}"

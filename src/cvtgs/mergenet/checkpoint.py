@@ -262,7 +262,8 @@ def build_network(
 def _build_net(
     info: CheckpointInfo, tensors: dict[str, Tensor], name: str
 ) -> MergeNet | PublishedMergeNet:
-    net = build_network(info.architecture)
+    with torch.random.fork_rng(devices=[]):  # layers start with random weights
+        net = build_network(info.architecture)
     if isinstance(net, MergeNet) and not any(key.startswith(KNOWN) for key in tensors):
         own = net.state_dict()
         tensors = tensors | {key: own[key] for key in own if key.startswith(KNOWN)}

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import torch
 
-from cvtgs.cameras import Cameras
+from cvtgs.cameras import Cameras, checked_cameras
 from cvtgs.clock import StageClock
 from cvtgs.config import RefineConfig
 from cvtgs.devices import chosen_device, without_autocast
@@ -18,6 +18,7 @@ from cvtgs.rendering import ObservedViews
 from cvtgs.rendering.backends import choose_backend
 from cvtgs.report import RefineReport, SimplifyReport
 from cvtgs.scene import GaussianScene, SceneLike, as_scene
+from cvtgs.text import shown
 from cvtgs.validity import valid_rows
 
 DEFAULT_STEPS = 500
@@ -98,7 +99,9 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         ('perfect', 0.0)
     """
     small, full = as_scene(small, "small"), as_scene(full, "full")
-    config = config or RefineConfig()
+    config = RefineConfig() if config is None else config
+    if not isinstance(config, RefineConfig):
+        raise InvalidArgumentError(f"config must be a RefineConfig, found {shown(config)}.")
     if seconds is None and steps is None:
         seconds = config.seconds or None
         steps = config.steps or (DEFAULT_STEPS if seconds is None else None)
@@ -109,7 +112,7 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         )
     place = chosen_device(device, small.device)
     ours, theirs = _on_device(small, full, place)
-    cameras = None if cameras is None else cameras.in_both_modes()
+    cameras = None if cameras is None else checked_cameras(cameras).in_both_modes()
     limits, clock = Limits(seconds, steps=steps), StageClock(listener, place)
     # The program may have disabled gradients, or be in inference mode or autocast.
     with (

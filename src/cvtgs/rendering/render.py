@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from cvtgs.cameras import Cameras
+from cvtgs.cameras import Cameras, checked_cameras
+from cvtgs.counts import whole_number
 from cvtgs.devices import without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.math import parameters
@@ -93,11 +94,7 @@ def render(
         torch.Size([1, 48, 64, 3])
     """
     scene = as_scene(scene)
-    if not isinstance(cameras, Cameras):
-        raise InvalidArgumentError(
-            f"cameras must be Cameras, for example of cvtgs.load_cameras or "
-            f"cvtgs.views.automatic_views; found {shown(cameras)}."
-        )
+    checked_cameras(cameras)
     degree = _degree(scene, sh_degree)
     behind = _background(scene, cameras, background)
     name, chosen = choose_backend(backend, scene.device)
@@ -147,7 +144,7 @@ def contributions(
     """
     chosen = choose_backend(backend, scene.device)[1]
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
-    for camera in cameras.to(scene.device).singles():
+    for camera in checked_cameras(cameras).to(scene.device).singles():
         total += chosen.contributions(scene, camera)
     return total
 
@@ -201,7 +198,7 @@ def observe(
         >>> views.rgb.shape, bool((views.alpha.sum() - views.contributions.sum()).abs() < 1e-2)
         (torch.Size([2, 32, 32, 3]), True)
     """
-    if len(cameras) == 0:
+    if len(checked_cameras(cameras)) == 0:
         raise InvalidArgumentError("cameras must hold at least one camera, found none.")
     name, chosen = choose_backend(backend, scene.device)
     total = torch.zeros(len(scene), dtype=torch.float64, device=scene.device)
@@ -258,10 +255,10 @@ def blending_weights(
 def _degree(scene: GaussianScene, sh_degree: int | None) -> int:
     if sh_degree is None:
         return scene.sh_degree
-    if not 0 <= sh_degree <= scene.sh_degree:
+    if not 0 <= whole_number(sh_degree) <= scene.sh_degree:
         raise InvalidArgumentError(
             f"sh_degree must be from 0 to {scene.sh_degree}, the degree of the scene, "
-            f"found {sh_degree}."
+            f"found {sh_degree!r}."
         )
     return sh_degree
 

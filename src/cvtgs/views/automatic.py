@@ -10,10 +10,9 @@ from torch import Tensor
 
 from cvtgs.cameras import Cameras
 from cvtgs.devices import one_thread
-from cvtgs.errors import InvalidArgumentError
 from cvtgs.scene import SceneLike
 from cvtgs.views.layout import SceneLayout, level_axes
-from cvtgs.views.positions import REACH, CameraPositions, as_positions
+from cvtgs.views.positions import REACH, CameraPositions, as_positions, checked_seed
 from cvtgs.views.scoring import cameras_at, score_cameras
 
 _ELEVATIONS = (20.0, 35.0, 12.0, 28.0)
@@ -170,6 +169,7 @@ def _distances_to_walls(
 _GOLDEN = 0.6180339887498949
 
 
+@torch.no_grad()
 def automatic_views(
     scene: SceneLike | CameraPositions,
     count: int = 8,
@@ -204,7 +204,8 @@ def automatic_views(
         The cameras, float64 on the CPU, named ``view 1`` and so on.
 
     Raises:
-        InvalidArgumentError: Count or size is below 1.
+        InvalidArgumentError: Count or size is no whole number above 0, or the seed is no whole
+            number.
         InvalidSceneError: The scene has no valid row, or is larger than 1e14 units.
 
     Example:
@@ -212,9 +213,7 @@ def automatic_views(
         >>> automatic_views(scene("object", 1000), 3, width=64, height=48).names
         ('view 1', 'view 2', 'view 3')
     """
-    for name, value in (("count", count), ("width", width), ("height", height)):
-        if value < 1:
-            raise InvalidArgumentError(f"{name} must be at least 1, found {value}.")
+    seed = checked_seed(seed, count=count, width=width, height=height)
     size, turn = (width, height), 0.5 + seed * _GOLDEN
     with one_thread():
         positions = as_positions(scene)

@@ -10,7 +10,7 @@ from torch import Tensor
 from cvtgs.cameras import Cameras, look_at
 from cvtgs.scene import SceneLike
 from cvtgs.views.automatic import automatic_views
-from cvtgs.views.positions import CameraPositions, as_positions
+from cvtgs.views.positions import CameraPositions, as_positions, checked_seed
 from cvtgs.views.scoring import SMOOTH, splat_sizes
 
 TRIED = 3
@@ -34,6 +34,7 @@ _AIM = 0.25
 _LEAST_AIM = 0.3
 
 
+@torch.no_grad()
 def random_views(
     scene: SceneLike | CameraPositions,
     count: int,
@@ -61,6 +62,7 @@ def random_views(
         with 65 degrees.
 
     Raises:
+        InvalidArgumentError: The size is no whole number above 0, or the seed is no whole number.
         InvalidSceneError: The scene has no valid row, or is larger than 1e14 units.
 
     Example:
@@ -68,6 +70,7 @@ def random_views(
         >>> len(random_views(scene("object", 1000), 3, size=64, seed=0))
         3
     """
+    seed = checked_seed(seed, size=size)
     positions = as_positions(scene)
     layout = positions.layout
     eyes = positions.near(count, reach, seed)
@@ -106,6 +109,7 @@ def _targets(
     return points[order.argmax(dim=1)]
 
 
+@torch.no_grad()
 def mixed_views(
     scene: SceneLike | CameraPositions, count: int, *, size: int, seed: int = 0, sharp: bool = True
 ) -> Cameras:
@@ -130,7 +134,8 @@ def mixed_views(
         The cameras: automatic, near, then other random views.
 
     Raises:
-        InvalidArgumentError: Count or size is below 1.
+        InvalidArgumentError: Count or size is no whole number above 0, or the seed is no whole
+            number.
         InvalidSceneError: The scene has no valid row, or is larger than 1e14 units.
 
     Example:
@@ -138,6 +143,7 @@ def mixed_views(
         >>> len(mixed_views(scene("object", 1000), 5, size=64))
         5
     """
+    seed = checked_seed(seed, count=count, size=size)
     positions = as_positions(scene)
     usual, near = max(1, count // 4), count // 4
     times = TRIED if sharp else 1

@@ -2,12 +2,16 @@
 
 import math
 from dataclasses import dataclass
+from operator import index
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from cvtgs.counts import check_whole
+from cvtgs.errors import InvalidArgumentError
 from cvtgs.scene import SceneLike, as_scene
+from cvtgs.text import shown
 from cvtgs.views.clutter import split_by_clutter
 from cvtgs.views.layout import (
     ENCLOSED,
@@ -23,6 +27,7 @@ from cvtgs.views.scoring import PIXELS, SMOOTH, cameras_at, splat_sizes
 REACH = (0.2, 3.0)
 """Range of distances of candidate positions, in robust radii from the centre of the frame."""
 
+_SEEDS = 1 << 62
 _TRIED = 384
 _SEED = 17
 _STANDING_REACH = (0.2, 2.0)
@@ -119,6 +124,7 @@ class CameraPositions:
         return torch.where(self.admit(moved)[:, None], moved, eyes)
 
 
+@torch.no_grad()
 def find_view_positions(scene: SceneLike) -> CameraPositions:
     """Find valid camera positions, once for many sets of views.
 
@@ -186,6 +192,16 @@ def _standing_eyes(layout: SceneLayout) -> Float[Tensor, "c 3"]:
     center = layout.frame.center
     ground = 0.0 if layout.floor is None else layout.floor - float(center @ layout.up)
     return center + distances * level + (ground + heights) * layout.up
+
+
+def checked_seed(seed: int, **sizes: int) -> int:
+    """Return a seed in the range of random generators; raise unless it and the sizes are valid."""
+    for name, value in sizes.items():
+        check_whole(value, name)
+    try:
+        return index(seed) % _SEEDS
+    except TypeError:
+        raise InvalidArgumentError(f"seed must be a whole number, found {shown(seed)}.") from None
 
 
 def as_positions(scene: SceneLike | CameraPositions) -> CameraPositions:
