@@ -31,12 +31,12 @@ from benchmarks.measuring import warm_up, write_file
 from benchmarks.quality import mean_or_none
 from cvtgs.cameras import Cameras
 from cvtgs.evaluation import EvaluationSettings, compare, write_comparison
-from cvtgs.evaluation.report import mean_of
 from cvtgs.evaluation.scorer import (
     BLACK,
     ImageScores,
     Metrics,
     chosen_metrics,
+    mean_of,
     render_view,
     scene_scores,
 )

@@ -40,7 +40,7 @@ from cvtgs.evaluation import (
     load_photographs,
 )
 from cvtgs.evaluation import scorer as scorers
-from cvtgs.evaluation.report import mean_of
+from cvtgs.evaluation.scorer import mean_of
 from cvtgs.views import automatic_views
 
 VIEWS = 8

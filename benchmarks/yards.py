@@ -1,7 +1,7 @@
 """Generate yards that resemble trained unbounded captures, to train and evaluate networks.
 
 ``python -m benchmarks.yards FOLDER`` writes the yards that the shipped ``standard`` was trained on
-(``yard11`` to ``yard16``) and those with which its gate was found (``yard1`` to ``yard3``), each
+(``yard11`` to ``yard20``) and those with which its gate was found (``yard1`` to ``yard3``), each
 with its cameras. Gaussians are dense in the middle and grow with the distance. About 4 % of them
 form a shell of huge, faint Gaussians 40 to 250 units away, and some are floaters.
 """
@@ -36,6 +36,10 @@ YARDS = {
     "yard14": (100_000, 14, 1),
     "yard15": (200_000, 15, 0),
     "yard16": (250_000, 16, 1),
+    "yard17": (150_000, 17, 0),
+    "yard18": (100_000, 18, 1),
+    "yard19": (200_000, 19, 0),
+    "yard20": (80_000, 20, 2),
 }
 """Number of Gaussians, seed and SH degree of every yard."""
 

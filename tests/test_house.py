@@ -57,7 +57,7 @@ OWNERS = {
     "distributed": "outofcore/distributed.py",
     "filelock": "io/locks.py",
     "psutil": "outofcore/memory.py",
-    "viser": "viewer/nodes.py",
+    "viser": "viewer/server.py",
 }
 HEAVY = ("scipy", "kornia", "plyfile", "rich", "PIL", "jinja2", "matplotlib", "zstandard")
 HEAVY += ("distributed",)

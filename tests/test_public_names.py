@@ -206,6 +206,7 @@ STAGES = {
         "KnownRange",
         "LearnedScene",
         "MergeNet",
+        "Net",
         "PublishedArchitecture",
         "PublishedDescriptors",
         "PublishedMergeNet",

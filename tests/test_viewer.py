@@ -14,8 +14,8 @@ import torch
 import viser_stand_in
 from cvtgs import GaussianScene, Simplifier, load, save
 from cvtgs.cli.main import main
-from cvtgs.errors import InvalidArgumentError, MissingDependencyError
-from cvtgs.viewer import SceneViewer, ViewerServer, camera_of, scene_page
+from cvtgs.errors import ConfigError, DeviceError, InvalidArgumentError, MissingDependencyError
+from cvtgs.viewer import SceneViewer, ShownScene, ViewerServer, camera_of, scene_page
 from scenes import random_scene, same_bits
 
 FACTS, NOTES = "markdown 0", "markdown 7"
@@ -74,6 +74,25 @@ def test_moving_the_slider_shows_the_simplified_scene(page: Any, scene: Gaussian
     until(lambda: control(page, FACTS).content.startswith("5 of 500 Gaussians"))
     wanted = Simplifier(preset="draft", device="cpu").simplify(scene, 0.01)
     assert same_bits(page.viewer.scenes["simplified"].scene, wanted)
+
+
+def test_the_ratio_to_start_with_is_exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until the slider, whose steps are larger, is moved."""
+    seen: list[float] = []
+
+    def simplify(viewer: SceneViewer, _: str, rho: float) -> ShownScene:
+        seen.append(rho)
+        return viewer.scenes["full scene"]
+
+    monkeypatch.setattr(SceneViewer, "simplify", simplify)
+    server = ViewerServer(SceneViewer(random_scene(3)), rho=0.00011)
+    server.finish()
+    slider = viser_stand_in.ViserServer.latest.gui.controls["log10 of rho"]
+    assert slider.value == pytest.approx(-3.95)
+    slider.value = -2.0
+    until(lambda: len(seen) == 2)
+    server.close()
+    assert seen == [0.00011, 0.01]
 
 
 @pytest.mark.slow
@@ -189,12 +208,45 @@ def test_the_command_writes_a_page(
     tmp_path: Path, scene: GaussianScene, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save(scene, tmp_path / "a.ply")
-    words = ["view", str(tmp_path / "a.ply"), "--page", str(tmp_path / "a.html"), "--rho", "2%"]
+    save(random_scene(7), tmp_path / "b.ply")
+    names = [str(tmp_path / name) for name in ("a.ply", "b.ply", "b.ply")]
+    words = ["view", *names, "--page", str(tmp_path / "a.html"), "--rho", "3%"]
     assert main([*words, "--preset", "draft", "--device", "cpu"]) == 0
-    assert capsys.readouterr().out == f"{tmp_path / 'a.html'}: 2 scenes; open it in a browser.\n"
-    assert (tmp_path / "a.html").read_text() == "<html>[[500], [10]] True</html>"
+    assert capsys.readouterr().out == f"{tmp_path / 'a.html'}: 3 scenes; open it in a browser.\n"
+    assert (tmp_path / "a.html").read_text() == "<html>[[500], [15], [7]] True</html>"
     assert main(words) == 1
     assert "a.html: the output must not exist yet" in capsys.readouterr().err
+
+
+def test_a_page_without_the_simplified_scene_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise DeviceError("there is no such device.")
+
+    monkeypatch.setattr(SceneViewer, "simplify", fail)
+    save(random_scene(3), tmp_path / "a.ply")
+    assert main(["view", str(tmp_path / "a.ply"), "--page", str(tmp_path / "a.html")]) == 1
+    assert capsys.readouterr().err == "cvtgs: error: there is no such device.\n"
+    assert not (tmp_path / "a.html").exists()
+    assert not viser_stand_in.ViserServer.latest.is_open
+
+
+def test_wrong_values_are_refused_before_a_server_starts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(viser_stand_in, "ViserServer", None)
+    viewer = SceneViewer(random_scene(3))
+    with pytest.raises(ConfigError, match="preset must be one of draft, "):
+        ViewerServer(viewer, preset="nope")
+    with pytest.raises(InvalidArgumentError, match="rho must be"):
+        ViewerServer(viewer, rho=0.0)
+    with pytest.raises(
+        InvalidArgumentError, match=r"of this machine, found '192\.0\.2\.1': cannot"
+    ):
+        ViewerServer(viewer, host="192.0.2.1")
+    assert main(["view", str(tmp_path / "missing.ply"), "--preset", "nope"]) == 1
+    assert "found 'nope'" in capsys.readouterr().err
 
 
 def test_a_missing_viser_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -87,33 +87,6 @@ _HOME = {
     "simplify": "cvtgs.simplifier",
     "target_count": "cvtgs.counts",
 }
-_MODULES = (
-    "pipeline",
-    "validity",
-    "rendering",
-    "refinement",
-    "evaluation",
-    "outofcore",
-    "boxes",
-    "cells",
-    "cvt",
-    "edit",
-    "analysis",
-    "errors",
-    "filters",
-    "budget",
-    "io",
-    "levels",
-    "losses",
-    "matching",
-    "math",
-    "mergenet",
-    "streams",
-    "synthetic",
-    "tradeoff",
-    "train",
-    "views",
-)
 __all__ = [
     "PRESETS",
     "Cameras",
@@ -168,6 +141,7 @@ __all__ = [
     "validity",
     "views",
 ]
+_MODULES = tuple(name for name in __all__ if name not in _HOME)
 
 
 if not TYPE_CHECKING:  # or type checkers would accept any name

@@ -12,7 +12,7 @@ from cvtgs.math import parameters
 from cvtgs.math.segments import running_sums
 from cvtgs.scene import SceneLike, as_scene
 from cvtgs.text import shown
-from cvtgs.validity import invalid_rows
+from cvtgs.validity import any_row, invalid_rows
 
 FAINT = 0.1
 """Opacities below this are counted as faint: the filter of CVT-GS would drop them."""
@@ -86,9 +86,7 @@ def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInf
     """
     scene = as_scene(scene)
     invalid = invalid_rows(scene)
-    bad = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
-    for mask in invalid.values():
-        bad |= mask
+    bad = any_row(scene, invalid)
     if len(scene) == int(bad.sum()):
         raise InvalidSceneError(f"none of the {len(scene)} Gaussians is valid.")
     valid = scene.select(~bad) if invalid else scene

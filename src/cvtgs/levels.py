@@ -13,7 +13,7 @@ from cvtgs.config.base import Record, explain
 from cvtgs.counts import written
 from cvtgs.errors import FileFormatError, InvalidArgumentError
 from cvtgs.evaluation import Evaluation, SceneScores
-from cvtgs.evaluation.report import mean_of
+from cvtgs.evaluation.scorer import mean_of
 from cvtgs.io import atomic_output, check_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.files import open_input

@@ -31,7 +31,7 @@ from cvtgs.grouping import (
     weigh_rows,
 )
 from cvtgs.math.segments import segment_ids
-from cvtgs.mergenet import MergeNet, PublishedMergeNet, correct_cells
+from cvtgs.mergenet import Net, correct_cells
 from cvtgs.report import CellStatistics, MatchReport
 from cvtgs.scene import GaussianScene
 from cvtgs.validity import standardized, with_finite_opacities
@@ -93,7 +93,7 @@ def reduce_scene(  # noqa: PLR0913 (options by name)
     target: int,
     config: SimplifyConfig,
     *,
-    net: MergeNet | PublishedMergeNet | None,
+    net: Net | None,
     clock: StageClock,
     total: int = 0,
     finest: Reduced | None = None,

@@ -25,7 +25,7 @@ from cvtgs.counts import shortfall, target_count
 from cvtgs.devices import chosen_device, within_memory, without_autocast
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.grouping import OrderedRows, add_neighbors, order_rows
-from cvtgs.mergenet import Checkpoint, MergeNet, PublishedMergeNet
+from cvtgs.mergenet import Checkpoint, Net
 from cvtgs.pipeline import Reduced, level_facts, nests_in, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.report import Level, Simplified, SimplifyReport, origin_of_views
@@ -100,7 +100,7 @@ class Prepared:
 
     def _forget(self) -> None:
         """Release everything that is cached on the device."""
-        self._net: MergeNet | PublishedMergeNet | None = None
+        self._net: Net | None = None
         self._checked: CheckedScene | None = None
         self._analysis: SceneAnalysis | None = None
         self._ordered: OrderedRows | None = None

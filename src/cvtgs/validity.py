@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -70,7 +71,7 @@ def check_rows(scene: GaussianScene) -> CheckedScene:
     invalid = invalid_rows(scene)
     if not invalid:
         return CheckedScene(scene, {}, 0)
-    dropped = torch.stack(list(invalid.values())).any(dim=0)
+    dropped = any_row(scene, invalid)
     count = int(dropped.sum())
     reasons = {name: int(mask.sum()) for name, mask in invalid.items()}
     text = ", ".join(f"{name} {number}" for name, number in reasons.items())
@@ -138,10 +139,13 @@ def valid_rows(scene: GaussianScene) -> Bool[Tensor, "n"]:
         >>> bool(valid_rows(scene("object", 10, sh_degree=0, seed=0)).all())
         True
     """
-    valid = torch.ones(len(scene), dtype=torch.bool, device=scene.device)
-    for mask in invalid_rows(scene).values():
-        valid &= ~mask
-    return valid
+    return ~any_row(scene, invalid_rows(scene))
+
+
+def any_row(scene: GaussianScene, masks: Mapping[str, Bool[Tensor, "n"]]) -> Bool[Tensor, "n"]:
+    """Return a mask of the rows of a scene that any mask names."""
+    nothing = torch.zeros(len(scene), dtype=torch.bool, device=scene.device)
+    return torch.stack([nothing, *masks.values()]).any(dim=0)
 
 
 def valid_part(scene: GaussianScene) -> GaussianScene:

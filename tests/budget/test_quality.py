@@ -119,6 +119,21 @@ def test_the_goal_is_reached_and_smaller_tries_miss_it(full, views, simplifier, 
     assert (mine.psnr, mine.ssim) == (found.psnr, found.ssim)
 
 
+def test_the_goal_is_reached_by_what_is_written(full, views, simplifier):
+    """The result is not rounded: saving it does that."""
+
+    def written(scene: cvtgs.GaussianScene) -> cvtgs.GaussianScene:
+        return scene.with_tensors({"sh0": scene.sh0.round(decimals=0)})
+
+    found = find_count(full, psnr=20.0, simplifier=simplifier, heldout=views, written=written)
+    scorer = heldout_scorer(full, views, listener=silent)
+    quality = heldout_quality(scorer, written(found.scene), count=len(found.scene))
+    assert quality.psnr == found.psnr >= 20.0
+    unrounded = find_count(full, psnr=20.0, simplifier=simplifier, heldout=views)
+    assert len(unrounded.scene) < len(found.scene)
+    assert same_bits(found.scene, simplifier.simplify(full, count=len(found.scene)))
+
+
 def test_the_scores_match_an_evaluation(full, views, simplifier):
     small = simplifier.simplify(full, 0.2)
     scorer = heldout_scorer(full, views, listener=silent)

@@ -11,7 +11,7 @@ import oracles
 from cvtgs import GaussianScene
 from cvtgs.cells import describe_cells, sample_members
 from cvtgs.cells.descriptors import CELL_FEATURES, MEMBER_FEATURES, PAIR_FEATURES
-from cvtgs.cells.sample import MOST_SAMPLED
+from cvtgs.cells.partition import MOST_SAMPLED
 from cvtgs.math.segments import segment_sum
 from mergenet_cases import (
     Case,
@@ -284,12 +284,11 @@ def test_inverted_visibility_matters_and_mirroring_does_not():
 
 
 def test_descriptors_of_some_cells():
-    """Selected or cut out, they are the same bits as in the whole."""
+    """They are the same bits as in the whole."""
     case = some_case()
     seen, counts = case.describe(), case.part.counts
     for chosen, found in (
         (torch.tensor([1, 3, 4]), seen.select(torch.tensor([1, 3, 4]))),
-        (torch.arange(2, 5), seen.cut(slice(2, 5))),
         (torch.arange(0), seen.select(torch.arange(0))),
     ):
         is_chosen = torch.zeros(len(counts), dtype=torch.bool)

@@ -7,7 +7,7 @@ import torch
 
 from cvtgs import GaussianScene
 from cvtgs.cells import Partition
-from cvtgs.cells.sample import MOST_SAMPLED, START, sample_members
+from cvtgs.cells.partition import MOST_SAMPLED, START, sample_members
 from scenes import random_scene
 
 SIZES = [1, MOST_SAMPLED, MOST_SAMPLED + 1, 500, 3000]

@@ -55,6 +55,10 @@ def test_a_small_stream_is_one_chunk(words: list[str], capsys: pytest.CaptureFix
         ),
         (["--stream", "3dtiles", "--place", "8,97"], "a latitude from -90 to 90"),
         (["--stream", "3dtiles", "--transform", "1,2"], "--transform must be 16 numbers"),
+        (
+            ["--stream", "3dtiles", "--axes", "rub:rub"],
+            "--axes IN:OUT cannot be used with --stream",
+        ),
         (["--stream", "3dtiles", "--workers", "0"], "--workers must be at least 1"),
         (["--stream", "sog", "--chunk", "0"], "--chunk must be at least 1, found 0."),
     ],

@@ -8,6 +8,8 @@ import torch
 
 import cvtgs
 from cvtgs.cli.main import main
+from cvtgs.cli.notes import report_notes
+from cvtgs.report import MatchReport, SimplifyReport
 from scenes import random_scene
 
 
@@ -72,16 +74,59 @@ def test_the_number_of_kept_gaussians_is_printed(capsys, source):
     assert f"{kept} Gaussians in the boxes of --keep." in simplified(capsys, source, *words)
 
 
-def test_a_target_is_measured_over_the_given_cameras(capsys, source):
-    cameras = write_cameras(source.with_name("views.json"))
-    text = simplified(capsys, source, "--target-psnr", "12", "--cameras", cameras)
+@pytest.mark.parametrize(
+    ("suffix", "axes"),
+    [(".ply", ()), (".compressed.ply", ()), (".spz", ()), (".spz", ("--axes", "rdf:rub"))],
+)
+def test_a_target_is_measured_in_the_file_over_the_given_cameras(capsys, source, suffix, axes):
+    """All but plain PLY files round."""
+    cameras, output = write_cameras(source.with_name("views.json")), source.with_name(f"o{suffix}")
+    words = ["--preset", "draft", "--target-psnr", "12", "--cameras", cameras, *axes]
+    text = printed(capsys, "simplify", source, output, *words)
     assert "over the given cameras; found in" in text
     assert "Seconds of the chosen try: " in text
-    small = cvtgs.load(source.with_name("out.ply"))
+    small = cvtgs.load(output, axes="rub" if axes else None)
     settings = cvtgs.evaluation.EvaluationSettings(lpips="off")
     views = cvtgs.load_cameras(cameras)
     found = cvtgs.evaluate(source, {"small": small}, views, settings=settings).scenes[0]
     assert f"PSNR {found.psnr.mean:.2f} dB" in text
+    assert found.psnr.mean >= 12
+
+
+def test_a_target_out_of_reach_of_the_format_says_so(capsys, source):
+    cameras = write_cameras(source.with_name("views.json"))
+    words = ["--target-psnr", "60", "--cameras", cameras, "--preset", "draft"]
+    text = printed(capsys, "simplify", source, source.with_name("o.splat"), *words, status=1)
+    assert "These are scores of files like o.splat, which round; a plain .ply does not." in text
+    text = printed(capsys, "simplify", source, source.with_name("o.ply"), *words, status=1)
+    assert "no simplified scene reaches 60.00 dB" in text
+    assert "These are scores" not in text
+
+
+@pytest.mark.parametrize(
+    ("views", "blocks", "where"),
+    [
+        (4, 1, "the same images"),
+        (8, 1, "every eighth of them"),
+        (12, 3, "the same images"),
+        (24, 3, "every eighth of them"),
+    ],
+)
+def test_the_images_that_a_matching_is_scored_on_are_named(views, blocks, where):
+    matched = MatchReport(
+        views=views, opacities_kept=True, psnr_before=20.0, psnr_after=20.5, backend="numba"
+    )
+    report = SimplifyReport(
+        input_count=10,
+        output_count=1,
+        target_count=1,
+        rho=0.1,
+        blocks=blocks,
+        matching=matched,
+        config=cvtgs.SimplifyConfig(),
+    )
+    text = f"Matched to {views} images of the scene: +0.50 dB on {where}."
+    assert text in report_notes(report)
 
 
 def test_cameras_that_are_not_used_are_mentioned(capsys, source):

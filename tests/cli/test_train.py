@@ -137,6 +137,15 @@ def test_an_existing_checkpoint_is_replaced_only_when_asked(again, made, tmp_pat
     assert output.read_bytes() == (made / "net.safetensors").read_bytes()
 
 
+@pytest.mark.parametrize("name", ["net.state", "net.png"])
+def test_files_beside_the_checkpoint_are_replaced_only_when_asked(again, tmp_path, capsys, name):
+    (tmp_path / name).write_text("precious")
+    assert main(again) == 1
+    assert f"{name}: the output must not exist yet" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "precious"
+
+
 @pytest.mark.slow
 def test_resume_continues_an_interrupted_training(again, made, tmp_path, capsys, monkeypatch):
     true_step = train_loop._step

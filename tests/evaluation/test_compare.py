@@ -27,7 +27,6 @@ from cvtgs.evaluation import (
     write_comparison,
 )
 from cvtgs.evaluation.comparison_files import (
-    bytes_text,
     comparison_page,
     contact_sheet,
     error_sheet,
@@ -391,10 +390,3 @@ def test_photographs_need_named_cameras(tmp_path):
 def test_an_unreadable_photograph_is_an_error(tmp_path):
     with pytest.raises(InputError, match="the file must be readable, found: is a directory"):
         read_image(tmp_path, (4, 3), (0.0, 0.0, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("count", "text"), [(999, "999 B"), (250_000_000, "250 MB"), (5 * 10**12, "5000 GB")]
-)
-def test_byte_counts_as_text(count, text):
-    assert bytes_text(count) == text

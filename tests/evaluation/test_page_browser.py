@@ -4,6 +4,7 @@ import re
 import subprocess
 
 import pytest
+import torch
 
 import cvtgs
 from browser_cases import (
@@ -134,6 +135,18 @@ def test_the_page_loads_nothing_from_the_network(page):
     console = [line for line in done.stderr.decode().splitlines() if "CONSOLE" in line]
     assert console == []
     assert 'data-ready="yes"' in done.stdout.decode()
+
+
+@pytest.mark.slow
+def test_a_larger_scene_has_more_gaussians(tmp_path):
+    scene = cvtgs.synthetic.scene("object", 300, sh_degree=0, seed=0)
+    cameras, settings = (
+        automatic_views(scene, 1, width=32, height=24),
+        EvaluationSettings(lpips="off"),
+    )
+    small = scene.select(torch.arange(50))
+    write_comparison(compare(small, {"larger": scene}, cameras, settings=settings), tmp_path)
+    assert "<b>6\u00d7 more</b>" in dom(tmp_path / "index.html")
 
 
 @pytest.mark.slow

@@ -201,7 +201,7 @@ def test_the_size_of_a_missing_file_is_an_error(tmp_path: Path) -> None:
 
 
 def kinds_of_documents() -> list[type[Document]]:
-    for name in ("gltf.read", "sog.read", "sog.stream", "cameras.transforms"):
+    for name in ("gltf.read", "sog.read", "sog.stream", "transforms"):
         importlib.import_module(f"cvtgs.io.{name}")
     found = [Document]
     for kind in found:

@@ -88,6 +88,19 @@ def test_a_chunk_without_the_level_gives_its_next_level(stream: Path) -> None:
     assert load(path, lod=1).means.tolist() == means(first, coarse[:2])
 
 
+def test_a_chunk_without_the_level_gives_nothing_if_others_have_all_of_it(stream: Path) -> None:
+    def drop(document: dict[str, Any]) -> None:
+        del document["tree"]["children"][0]["lods"]["0"]
+        document.update(counts=[4, 5])
+
+    path = changed(stream, drop)
+    second, coarse, far = (
+        load(stream / name / "meta.json").means for name in ("0_1", "1_0", "env")
+    )
+    assert load(path).means.tolist() == means(second, far)
+    assert load(path, lod=1).means.tolist() == means(coarse, far)
+
+
 def test_commands_accept_lod(stream: Path, tmp_path: Path) -> None:
     words = ["convert", str(stream), str(tmp_path / "a.ply"), "--quiet", "--lod", "1"]
     assert main(words) == 0

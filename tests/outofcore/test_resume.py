@@ -13,7 +13,7 @@ import cvtgs
 from cvtgs.errors import InvalidSceneError, OutputError
 from cvtgs.io.tensors import save_tensors
 from cvtgs.outofcore import simplify_file
-from cvtgs.outofcore.attempts import Attempt
+from cvtgs.outofcore.sort import Attempt
 from cvtgs.streams import stream_file
 
 CODE = """

@@ -15,7 +15,7 @@ from cvtgs.errors import OutputBusyError, OutputError, RunError
 from cvtgs.io.locks import lock_path, output_lock
 from cvtgs.io.ply import open_rows
 from cvtgs.outofcore import simplify_file
-from cvtgs.outofcore.rows import sort_range
+from cvtgs.outofcore.sort import sort_range
 
 HOLD = """
 import sys, time

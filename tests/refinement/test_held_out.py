@@ -10,7 +10,7 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.progress import silent
 from cvtgs.refinement import RefineConfig, optimize
 from cvtgs.refinement.images import ImageBuffer, RefineViews, generated_views, split_views
-from cvtgs.refinement.limits import Limits
+from cvtgs.refinement.optimize import Limits
 from refine_cases import discolored, full_scene, quick, ring
 
 
@@ -45,7 +45,8 @@ def test_images_are_of_two_sizes(width, side):
         assert {camera.width for camera in training} == {side_then}
         assert {camera.strides for camera in training} == {(1,), (3,)}
         assert {camera.strides for camera in views.heldout} <= {(2,), (6,)}
-        images = ImageBuffer(full, replace(views, training=iter(training)), config=quick(), seed=0)
+        shown = replace(views, training=iter(training))
+        images = ImageBuffer(full, shown, config=quick(**sizes), seed=0)
         drawn = [images.draw().camera for _ in training]
         assert [camera.strides[0] for camera in drawn] == [2 * one.strides[0] for one in training]
         assert {camera.width for camera in drawn} == {side_then // 2}

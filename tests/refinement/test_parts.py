@@ -15,10 +15,9 @@ from cvtgs.evaluation.scorer import BLACK, WHITE, Metrics, Scorer, ViewImage, re
 from cvtgs.math import parameters
 from cvtgs.refinement import RefineConfig
 from cvtgs.refinement import images as images_module
-from cvtgs.refinement import limits as limits_module
+from cvtgs.refinement import optimize as limits_module
 from cvtgs.refinement.images import ImageBuffer, RefineViews, generated_views, split_views
-from cvtgs.refinement.limits import Limits
-from cvtgs.refinement.optimize import SceneOptimizer, heldout_psnr, psnr_cap, step_factor
+from cvtgs.refinement.optimize import Limits, SceneOptimizer, heldout_psnr, psnr_cap, step_factor
 from cvtgs.refinement.refine import changed_count
 from cvtgs.rendering import observe
 from refine_cases import full_scene, quick, ring
@@ -218,8 +217,8 @@ def test_first_steps_get_new_images_and_all_images_recur():
 def test_the_pixels_of_a_step_equal_those_of_the_whole_image():
     full = full_scene(200)
     cameras = ring(1, width=47, height=33)
-    views = RefineViews(heldout=(), training=iter([cameras]), endless=False, stride=3)
-    images = ImageBuffer(full, views, config=quick(), seed=0)
+    views = RefineViews(heldout=(), training=iter([cameras]), endless=False)
+    images = ImageBuffer(full, views, config=quick(stride=3), seed=0)
     whole = render_view(full, cameras).rgb
     seen = set()
     for _ in range(40):

@@ -3,11 +3,13 @@
 import json
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 
-from cvtgs.streams import StreamPlan, blocks, sog, write_tiles
+from cvtgs.errors import DroppedDataWarning
+from cvtgs.streams import StreamPlan, blocks, sog, write_sog_stream, write_tiles
 from cvtgs.streams.plan import plan_part
 from scenes import random_scene
 
@@ -72,6 +74,51 @@ def test_tiles_state_the_largest_error_of_their_level_and_all_finer_ones(tmp_pat
     root = json.loads((tmp_path / "tileset.json").read_text())["root"]
     assert root["geometricError"] == 16 * 5.0
     assert {child["geometricError"] for child in root["children"]} == {0.0}
+
+
+CLAMPED = (
+    "; view-dependent SH coefficients outside [-1.0625, 1.0625], which are clamped (6 Gaussians)"
+)
+
+
+@pytest.mark.parametrize(
+    ("write", "most", "more"),
+    [(write_sog_stream, "file_gaussians", ""), (write_tiles, "tile_gaussians", CLAMPED)],
+)
+def test_all_files_of_a_stream_give_one_warning(
+    tmp_path: Path, write: Any, most: str, more: str
+) -> None:
+    """Two files have the four fine Gaussians, and one has the two coarse ones."""
+    fine, coarse = level([0.0, 1, 2, 3], None), level([0.0, 2], [0, 0, 1, 1])
+    for one in (fine, coarse):
+        count = len(one.scene)
+        large = {"sh0": torch.zeros(count, 1, 3), "shN": torch.full((count, 3, 3), 2.0)}
+        one.scene = one.scene.with_tensors(large, {"own": torch.zeros(count)})
+    with pytest.warns(DroppedDataWarning) as caught:
+        write(planned(fine, coarse, most=2), tmp_path / "out", **{most: 2})
+    (warning,) = caught
+    assert str(warning.message) == (
+        f"{tmp_path / 'out'}: the files of this stream, all levels together, do not hold extra "
+        f"column 'own'{more}."
+    )
+    assert warning.filename == __file__
+
+
+@pytest.mark.parametrize(
+    ("limit", "files"), [(110, ["a0", "b0"]), (109, ["a1"]), (20, ["a1"]), (3, ["a2", "b2"])]
+)
+def test_all_parts_have_their_environment_at_one_level(
+    limit: int, files: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The finest with few enough Gaussians in total, or the coarsest."""
+    monkeypatch.setattr("cvtgs.streams.plan.ENVIRONMENT_GAUSSIANS", limit)
+    parts = [
+        SimpleNamespace(far=(60, 20, 3), environments=("a0", "a1", "a2")),
+        SimpleNamespace(far=(), environments=()),
+        SimpleNamespace(far=(50, 0, 1), environments=("b0", "b1", "b2")),
+    ]
+    assert vars(sog)["_far_files"](parts) == files
+    assert vars(sog)["_far_files"](parts[1:2]) == []
 
 
 @pytest.mark.parametrize(

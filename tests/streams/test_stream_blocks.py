@@ -191,20 +191,51 @@ def test_an_unknown_kind_is_refused_before_the_work(tmp_path: Path, source: Path
     assert names_in(tmp_path) == ["scene.ply"]
 
 
+def test_other_axes_of_3d_tiles_are_refused(tmp_path: Path, source: Path) -> None:
+    with pytest.raises(InvalidArgumentError, match=r"own \(z up\), .* must be rdf, found 'rub'"):
+        stream(source, tmp_path / "out", kind="3dtiles", axes=("rub", "rub"))
+    assert names_in(tmp_path) == ["scene.ply"]
+
+
+def test_all_blocks_give_one_warning(tmp_path: Path) -> None:
+    """Each block has a tile of its finest level, and one of its coarsest: 300 and 4 in total."""
+    scene = make("object", 300, sh_degree=1, seed=3)
+    save(scene.with_tensors({"shN": scene.shN + 2.0}, {}), tmp_path / "scene.ply")
+    with pytest.warns(DroppedDataWarning, match=r"which are clamped \(304 Gaussians\)") as caught:
+        report = stream(tmp_path / "scene.ply", tmp_path / "out", kind="3dtiles")
+    assert report.blocks == 3
+    assert [warning.filename for warning in caught] == [__file__]
+
+
 def test_levels_of_equal_size_are_refused(tmp_path: Path, source: Path) -> None:
     with pytest.raises(InvalidArgumentError, match="needs levels of different sizes"):
         stream_file(source, tmp_path / "out", [0.1, 0.1], kind="sog", simplifier=FAST)
     assert names_in(tmp_path) == ["scene.ply"]
 
 
-@pytest.mark.slow
-def test_blocks_share_one_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Even if a run ends after all blocks and another one resumes it."""
+def save_open_scene(path: Path) -> None:
+    """Write an object under a sky of 200 Gaussians."""
     near, far = make("object", 3000, sh_degree=0, seed=1), make("object", 200, sh_degree=0, seed=2)
     directions = torch.nn.functional.normalize(far.means - far.means.mean(dim=0))
     radius = float(near.means.norm(dim=1).quantile(0.7))
     sky = far.with_tensors({"means": 40 * radius * directions}, {})
-    save(concatenate([near, sky]), tmp_path / "scene.ply")
+    save(concatenate([near, sky]), path)
+
+
+@pytest.mark.slow
+def test_the_environment_of_all_blocks_fits_its_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_open_scene(tmp_path / "scene.ply")
+    monkeypatch.setattr("cvtgs.streams.plan.ENVIRONMENT_GAUSSIANS", 150)
+    stream(tmp_path / "scene.ply", tmp_path / "out", environment_radii=10)
+    assert 3 <= len(load(tmp_path / "out" / "environment" / "meta.json")) <= 150
+
+
+@pytest.mark.slow
+def test_blocks_share_one_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even if a run ends after all blocks and another one resumes it."""
+    save_open_scene(tmp_path / "scene.ply")
 
     def stop(*_: Any, **__: Any) -> None:
         raise StoppedError

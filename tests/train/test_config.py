@@ -95,6 +95,14 @@ def test_a_configuration_is_frozen():
         ("[data]\nratios = [0.1, 1.0]", "data.ratios.1: input should be less than 1, found 1.0."),
         ("[views]\nsizes = [10]", "views.sizes.0: input should be greater than or equal to 11"),
         ("[views]\ncrop = 10", "views.crop: input should be greater than or equal to 11"),
+        ("[data]\ngenerated_counts = []", "data.generated_counts: tuple should have at least 1"),
+        ("[data]\nratios = []", "data.ratios: tuple should have at least 1 item"),
+        ("[data]\nvalidation_ratios = []", "data.validation_ratios: tuple should have at least 1"),
+        ("[views]\nsizes = []", "views.sizes: tuple should have at least 1 item"),
+        (
+            "[loss]\nmse_weight = 0\nimage_weight = 0",
+            "loss: one of mse_weight, image_weight and ssim_weight must be above 0, found 0 for",
+        ),
         (
             "[loss]\nimage_weight = -1",
             "loss.image_weight: input should be greater than or equal to 0, found -1.",
@@ -105,6 +113,11 @@ def test_a_bad_setting_is_named_with_its_file(tmp_path, text, problem):
     with pytest.raises(ConfigError) as caught:
         from_text(tmp_path, text)
     assert str(caught.value).startswith(f"{tmp_path / 'training.toml'}: {problem}")
+
+
+def test_a_published_training_needs_no_weights(tmp_path):
+    text = 'kind = "published"\n[loss]\nmse_weight = 0\nimage_weight = 0'
+    assert from_text(tmp_path, text).loss.image_weight == 0
 
 
 def test_every_problem_is_named(tmp_path):

@@ -6,9 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 
+import cvtgs
 from cvtgs.errors import (
     CheckpointError,
     ConfigError,
+    InvalidSceneError,
     MissingDependencyError,
     OutputError,
     TrainingError,
@@ -17,7 +19,7 @@ from cvtgs.mergenet import load_checkpoint
 from cvtgs.progress import ProgressEvent
 from cvtgs.train import Gain, History, TrainConfig, TrainFiles, gradients
 from cvtgs.train import loop as train_loop
-from train_cases import bits_of, run, tiny_config, tiny_data, write_scenes
+from train_cases import bits_of, run, small_scene, tiny_config, tiny_data, write_scenes
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +130,34 @@ def test_the_last_network_is_kept_if_the_configuration_says_so(
     assert bits_of(kept.net.state_dict()) == marks.nets[-1]
 
 
+@pytest.mark.parametrize("keep", ["best", "last"])
+def test_a_missing_checkpoint_is_written_again(scenes, cache, tmp_path, monkeypatch, keep):
+    gains = (0.0, 0.5) if keep == "best" else (0.0, -0.5)
+    monkeypatch.setattr(train_loop, "validation_psnr", Marks(*gains))
+    path, config = tmp_path / "net.safetensors", config_of(scenes, steps=2, keep=keep)
+    run(config, path, cache)
+    content = path.read_bytes()
+    path.unlink()
+    run(config, path, cache, resume=True)
+    assert path.read_bytes() == content
+
+
+def test_a_missing_checkpoint_that_the_state_does_not_hold_is_an_error(
+    scenes, cache, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(train_loop, "validation_psnr", Marks(0.0, -0.5))
+    path, config = tmp_path / "net.safetensors", config_of(scenes, steps=2)
+    run(config, path, cache)
+    path.unlink()
+    with pytest.raises(CheckpointError) as caught:
+        run(config, path, cache, resume=True)
+    assert str(caught.value) == (
+        f"{path}: the network of the best validation is missing, and {path.with_suffix('.state')} "
+        f"holds only a later one; restore the file, or train to another output."
+    )
+    assert not path.exists()
+
+
 def test_training_stops_when_patience_runs_out(scenes, cache, tmp_path, monkeypatch):
     monkeypatch.setattr(train_loop, "validation_psnr", Marks(0.0, 0.5, 0.2, 0.4, 0.1, 0.9))
     config = config_of(scenes, steps=100, patience=2)
@@ -221,6 +251,15 @@ def test_scenes_too_small_for_their_ratios_are_an_error(scenes, cache, tmp_path,
     config = tiny_config(tiny_data(scenes, **changes))
     with pytest.raises(ConfigError, match=f"the {text} scenes are too small for their ratios"):
         run(config, tmp_path / "net.safetensors", cache)
+
+
+def test_a_scene_that_cannot_be_used_is_named(tmp_path):
+    scenes = write_scenes(tmp_path / "scenes", ["exam", "lesson"])
+    broken = small_scene(20)
+    broken = broken.with_tensors({"means": broken.means * math.nan}, {})
+    cvtgs.save(broken, scenes / "broken.ply")
+    with pytest.raises(InvalidSceneError, match="scene broken: automatic views need a scene"):
+        run(config_of(scenes), tmp_path / "net.safetensors")
 
 
 def test_a_cache_that_is_a_file_is_an_error(scenes, tmp_path):

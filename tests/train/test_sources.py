@@ -215,6 +215,11 @@ def test_a_perturbed_scene_is_valid_and_different(seed):
     assert not torch.isin(other.sh0, scene.sh0).any()
 
 
+def test_a_perturbed_scene_is_never_empty():
+    one = small_scene(20).select(torch.tensor([0]))
+    assert {len(perturb(one, random.Random(seed))) for seed in range(20)} == {1}
+
+
 @pytest.mark.parametrize("comments", [(), (ANTIALIASED_TAG,)])
 def test_half_of_the_perturbed_scenes_are_tagged(comments):
     scene = replace(small_scene(20), comments=comments)

@@ -9,10 +9,17 @@ import pytest
 import torch
 
 import cvtgs
+from cvtgs.config import Section
 from cvtgs.errors import CheckpointError
 from cvtgs.io.tensors import map_tensors, save_tensors
-from cvtgs.mergenet import Architecture, LearnedScene, MergeNet
-from cvtgs.train import Gain, History, LossConfig, TrainConfig, Validation
+from cvtgs.mergenet import (
+    Architecture,
+    CheckpointInfo,
+    LearnedScene,
+    MergeNet,
+    save_checkpoint,
+)
+from cvtgs.train import DataConfig, Gain, History, LossConfig, TrainConfig, Validation
 from cvtgs.train.state import TrainState
 from mergenet_cases import some_case
 from train_cases import bits_of, needs_matplotlib, small_net
@@ -124,11 +131,16 @@ def test_the_running_mean_is_a_separate_network():
         {"learning_rate": 0.1},
         {"kind": "local"},
         {"width": 7},
+        {"keep": "last"},
+        {"data": DataConfig(copies=1)},
         {"loss": LossConfig(residual_weight=1.0)},
     ],
     ids=lambda changes: next(iter(changes)),
 )
 def test_another_configuration_is_one_clear_error(tmp_path, changes):
+    (name, value), *_ = changes.items()
+    if isinstance(value, Section):
+        name += "." + next(key for key, one in value if one != getattr(getattr(CONFIG, name), key))
     path = saved(tmp_path / "a.state")
     config = CONFIG.model_copy(update=changes)
     state = TrainState(
@@ -137,8 +149,8 @@ def test_another_configuration_is_one_clear_error(tmp_path, changes):
     with pytest.raises(CheckpointError) as caught:
         state.load(path, config)
     assert str(caught.value) == (
-        f"{path}: the state belongs to a training run with another configuration; "
-        f"remove it, or train to another output."
+        f"{path}: the state belongs to a training run with another configuration "
+        f"({name} differs); restore the setting, or train to another output."
     )
     assert state.step == 0
 
@@ -146,6 +158,39 @@ def test_another_configuration_is_one_clear_error(tmp_path, changes):
 def test_note_and_patience_may_change(tmp_path):
     path = saved(tmp_path / "a.state")
     assert loaded(path, CONFIG.model_copy(update={"note": "more", "patience": 3})).step == 3
+
+
+def test_the_folders_of_scenes_may_move(tmp_path):
+    path, data = saved(tmp_path / "a.state"), DataConfig(folders=(tmp_path,))
+    assert loaded(path, CONFIG.model_copy(update={"data": data})).step == 3
+
+
+def test_the_start_may_move_but_not_change(tmp_path):
+    path, starts = tmp_path / "a.state", [tmp_path / f"{name}.safetensors" for name in "abc"]
+    for seed, start in zip((0, 0, 1), starts, strict=True):
+        info = CheckpointInfo(architecture=small_net().architecture, preset="standard", seed=seed)
+        start.write_bytes(save_checkpoint(small_net(), info))
+    first, moved, other = (CONFIG.model_copy(update={"start": start}) for start in starts)
+    TrainState(small_net(), first).save(path, first)
+    TrainState(small_net(), moved).load(path, moved)
+    for config in (other, CONFIG):
+        with pytest.raises(CheckpointError, match=r"another configuration \(start differs\)"):
+            TrainState(small_net(), config).load(path, config)
+
+
+def test_a_state_of_other_settings_is_of_another_version(tmp_path):
+    path = saved(tmp_path / "a.state")
+    tensors, metadata = map_tensors(path)
+    facts = json.loads(metadata["state"])
+    facts["config"].pop("keep")
+    old = tmp_path / "old.state"
+    save_tensors(old, tensors, {"state": json.dumps(facts)})
+    with pytest.raises(CheckpointError) as caught:
+        loaded(old)
+    assert str(caught.value) == (
+        f"{old}: the state was written by another version of cvtgs, which has other settings; "
+        f"remove it, or train to another output."
+    )
 
 
 SCENES = (LearnedScene(name="room", count=5, sha256="ab"), LearnedScene(name="exam", count=7))

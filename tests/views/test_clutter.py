@@ -8,8 +8,9 @@ import torch
 
 import cvtgs
 from cvtgs.scene import GaussianScene
-from cvtgs.views import automatic_views, clutter, find_view_positions, mixed_views
+from cvtgs.views import automatic_views, find_view_positions, mixed_views
 from cvtgs.views.layout import covering_sample, find_layout
+from cvtgs.views.positions import split_by_clutter
 
 DETAIL = 0.005
 FLOATER = 0.25
@@ -47,7 +48,7 @@ def ring(*heights: float) -> torch.Tensor:
 
 def test_positions_behind_floaters_are_cluttered():
     scene = wall(60)
-    clear, cluttered = clutter.split_by_clutter(scene, find_layout(scene), ring(-2.5, 2.5))
+    clear, cluttered = split_by_clutter(scene, find_layout(scene), ring(-2.5, 2.5))
     assert len(clear) == len(cluttered) == 8
     assert float(clear[:, 2].amax()) < 0 < float(cluttered[:, 2].amin())
 
@@ -57,7 +58,7 @@ def test_without_much_clutter_all_positions_stay(heights, floaters):
     """Without floaters, or where a quarter of all positions is behind them."""
     scene = wall(floaters)
     eyes = ring(*heights)
-    clear, cluttered = clutter.split_by_clutter(scene, find_layout(scene), eyes)
+    clear, cluttered = split_by_clutter(scene, find_layout(scene), eyes)
     assert torch.equal(clear, eyes)
     assert len(cluttered) == 0
 
@@ -65,7 +66,7 @@ def test_without_much_clutter_all_positions_stay(heights, floaters):
 def test_scenes_of_few_gaussians_are_coarse_from_everywhere():
     scene = wall(60).select(torch.arange(30_000 - 10_500, 30_060))
     eyes = ring(-2.5, 2.5)
-    assert torch.equal(clutter.split_by_clutter(scene, find_layout(scene), eyes)[0], eyes)
+    assert torch.equal(split_by_clutter(scene, find_layout(scene), eyes)[0], eyes)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 import pydantic
 
-from cvtgs.cells.sample import MOST_SAMPLED
+from cvtgs.cells.partition import MOST_SAMPLED
 from cvtgs.config import SimplifyConfig
 from cvtgs.config.base import Record
 from cvtgs.cvt.tessellate import MIN_SAMPLES

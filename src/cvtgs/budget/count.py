@@ -125,6 +125,7 @@ def find_count(
     simplifier: Simplifier | None = None,
     cameras: Cameras | None = None,
     heldout: Cameras | None = None,
+    written: Callable[[GaussianScene], GaussianScene] = lambda scene: scene,
     listener: ProgressListener = silent,
 ) -> Found:
     """Find the smallest number of Gaussians that reaches a quality, to within 3 %.
@@ -143,6 +144,8 @@ def find_count(
         simplifier: Simplifier of the scene; None for the standard one.
         cameras: Views for presets that use images of the scene; None finds or generates views.
         heldout: Held-out views to measure over; None for the automatic ones.
+        written: Called with each simplified scene; returns the scene to score, for example as it
+            is read back from a file whose format rounds. The result is not rounded.
         listener: Called with progress events.
 
     Returns:
@@ -178,7 +181,7 @@ def find_count(
     def reach(count: int) -> float:
         nonlocal best
         made = prepared.run(count=count)
-        tried.append(heldout_quality(scorer, made.scene, count=count))
+        tried.append(heldout_quality(scorer, written(made.scene), count=count))
         value = target.of(tried[-1])
         if value >= target.value and (best is None or len(made.scene) < len(best[0].scene)):
             best = made, tried[-1]

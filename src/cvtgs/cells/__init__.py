@@ -14,8 +14,7 @@ from cvtgs.cells.merge import (
     normalized_weights,
 )
 from cvtgs.cells.moments import Moments, gaussian_moments, group_moments, view_components
-from cvtgs.cells.partition import Partition
-from cvtgs.cells.sample import SampledMembers, sample_members
+from cvtgs.cells.partition import Partition, SampledMembers, sample_members
 
 __all__ = [
     "Descriptors",

@@ -89,29 +89,6 @@ class Descriptors:
             pair_positions=self.pair_positions.index_select(0, cells),
         )
 
-    def cut(self, run: slice) -> Self:
-        """Return the descriptors of some consecutive cells; all but ``offsets`` are views.
-
-        Args:
-            run: The cells to keep, with a start and a stop.
-
-        Returns:
-            Their descriptors.
-        """
-        ends = self.offsets[run.start : run.stop + 1]
-        members = slice(int(ends[0]), int(ends[-1]))
-        return type(self)(
-            members=self.members[members],
-            pairs=self.pairs[run],
-            cells=self.cells[run],
-            weights=self.weights[members],
-            shares=self.shares[members],
-            rows=self.rows[members],
-            offsets=ends - ends[0],
-            positions=self.positions[members],
-            pair_positions=self.pair_positions[run],
-        )
-
     def in_images(self, factor: float) -> Self:
         """Return the descriptors of the same cells in larger images.
 

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from cvtgs.cells.descriptors import LEAST_PIXELS, PIXEL_SCALE, Descriptors
 from cvtgs.cells.inflate import project_on_axes, side_cover
-from cvtgs.cells.partition import Partition
-from cvtgs.cells.sample import SampledMembers, sample_members
+from cvtgs.cells.partition import Partition, SampledMembers, sample_members
 from cvtgs.math import parameters
 from cvtgs.math.segments import gather_columns, segment_ids, segment_max, segment_sum
 from cvtgs.math.spherical_harmonics import SH_C0

@@ -36,10 +36,14 @@ def report_notes(report: "SimplifyReport") -> list[str]:
     if report.shortfall:
         notes.append(f"Fewer than the requested {report.target_count:,}: {report.shortfall}.")
     if report.matching is not None:
+        from cvtgs.matching import heldout_rows
+
         matched = report.matching
+        each = matched.views // report.blocks  # every block has held-out images of its own
+        where = "every eighth of them" if heldout_rows(each) else "the same images"
         notes.append(
             f"Matched to {matched.views} images of the scene: "
-            f"{matched.psnr_after - matched.psnr_before:+.2f} dB on every eighth of them."
+            f"{matched.psnr_after - matched.psnr_before:+.2f} dB on {where}."
         )
     if report.refinement is not None:
         refined = report.refinement

@@ -23,6 +23,7 @@ from cvtgs.cli.options import (
     read_scene,
     read_settings,
 )
+from cvtgs.cli.target import check_target, has_target, search_target
 from cvtgs.cli.time_budget import STARTED, check_time_budget, choose_preset
 from cvtgs.cli.view_options import check_split, read_cameras
 from cvtgs.errors import (
@@ -76,8 +77,9 @@ def add_simplify(add_parser: AddParser) -> None:
         "--target-psnr",
         type=float,
         metavar="DB",
-        help="PSNR to reach with as few Gaussians as possible, over --cameras or the automatic "
-        "views of cvtgs evaluate; for presets that use images, over other automatic views",
+        help="PSNR that OUT is to reach with as few Gaussians as possible, over --cameras or the "
+        "automatic views of cvtgs evaluate; for presets that use images, over other automatic "
+        "views",
     )
     size.add_argument(
         "--target-ssim",
@@ -177,11 +179,11 @@ def _simplify_one(
         else:
             report, notes = _simplify_in_memory(options, checkpoint, config, settings, listener)
         used = report.config
-        if options.cameras is not None and not (_has_target(options) or used.uses_images):
+        if options.cameras is not None and not (has_target(options) or used.uses_images):
             notes.append(f"--cameras was not used: {used.preset} renders no images.")
     if options.report is not None:
         _write_report(options, report)
-    searched = _has_target(options)
+    searched = has_target(options)
     if not job.is_one_of_many and report.stages:
         seconds = (f"{stage.stage}{TIE}{stage.seconds:.2f}" for stage in report.stages)
         of_what = " of the chosen try" if searched else ""
@@ -220,19 +222,13 @@ def _simplify_in_memory(
         if own is not None and axes.source is None:
             cameras = own.cameras
             notes.append(f"Rendered from {len(cameras)} cameras found in {own.source.resolve()}.")
-    search = _has_target(options)
+    search = has_target(options)
     simplifier = cvtgs.Simplifier(
         checkpoint, config=config, device=options.device, listener=silent if search else listener
     )
     if search:
-        found = cvtgs.budget.find_count(
-            scene,
-            psnr=options.target_psnr,
-            ssim=options.target_ssim,
-            simplifier=simplifier,
-            cameras=cameras,
-            heldout=None if config.uses_images else cameras,
-            listener=listener,
+        found = search_target(
+            options, scene, simplifier, cameras=cameras, axes=axes.target, listener=listener
         )
         small, report = found.scene, found.report
         notes.append(target_note(found, config, is_given=options.cameras is not None))
@@ -280,19 +276,10 @@ def _refine_settings(options: argparse.Namespace) -> dict[str, str]:
     return {"refine.steps": str(steps), "refine.seconds": str(seconds)}
 
 
-def _has_target(options: argparse.Namespace) -> bool:
-    return options.target_psnr is not None or options.target_ssim is not None
-
-
 def check_goals(options: argparse.Namespace) -> None:
     """Check the targets and the time budget, and raise for options that exclude them."""
-    if _has_target(options):
-        from cvtgs.budget.count import checked_target
-
-        if options.keep is not None:
-            raise InvalidArgumentError("--keep needs --rho, --count or --max-count.")
-        checked_target(options.target_psnr, ssim=options.target_ssim)
-    check_time_budget(options, has_target=_has_target(options))
+    check_target(options)
+    check_time_budget(options, has_target=has_target(options))
 
 
 def block_memory(options: argparse.Namespace, config: "SimplifyConfig") -> int | None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import cvtgs
 from cvtgs.cli.blocks import add_block_options, block_workers, memory_of
 from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
+from cvtgs.cli.options import read_axes
 from cvtgs.errors import ConfigError, FileFormatError, InputError, InvalidArgumentError
 
 if TYPE_CHECKING:
@@ -80,6 +81,11 @@ def check_stream_options(options: argparse.Namespace) -> None:
     if scoring := _of_scores(options):
         raise InvalidArgumentError(
             f"--{scoring[0]} cannot be used with --stream, since streams are not scored."
+        )
+    if options.stream == "3dtiles" and read_axes(options.axes).target is not None:
+        raise InvalidArgumentError(
+            "--axes IN:OUT cannot be used with --stream 3dtiles, whose axes are fixed (z up); give "
+            "only those of IN."
         )
     if options.chunk is not None and options.chunk < 1:
         raise InvalidArgumentError(f"--chunk must be at least 1, found {options.chunk}.")

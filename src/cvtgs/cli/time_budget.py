@@ -27,15 +27,19 @@ class ChosenPreset(NamedTuple):
     name: str
     reason: str
     left: float
+    is_measured: bool
+    """Whether the choice is by timings of this machine."""
 
     def late_note(self, seconds: float) -> list[str]:
         """Return a sentence if a run took longer than the time that was left."""
         if seconds <= self.left:
             return []
-        return [
-            f"The run took {seconds:.1f} s, where {self.left:.1f} s were left; --recalibrate "
-            "measures this machine again."
-        ]
+        advice = (
+            "--recalibrate measures this machine again"
+            if self.is_measured
+            else "without --shipped-rates, cvtgs measures this machine"
+        )
+        return [f"The run took {seconds:.1f} s, where {self.left:.1f} s were left; {advice}."]
 
 
 def check_time_budget(options: argparse.Namespace, *, has_target: bool) -> None:
@@ -118,4 +122,4 @@ def choose_preset(
         f"Preset {choice.preset}, the best that fits into {budget:g} s: expected to take "
         f"{choice.seconds:.1f} s after {spent:.1f} s of starting and reading."
     )
-    return ChosenPreset(choice.preset, reason, budget - spent)
+    return ChosenPreset(choice.preset, reason, budget - spent, not options.shipped_rates)

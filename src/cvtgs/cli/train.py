@@ -72,7 +72,8 @@ def train(options: argparse.Namespace) -> None:
         raise OutputError(f"{options.output}: the name must end in .safetensors.")
     files = cvtgs.train.TrainFiles.beside(options.output, options.cache)
     resumes = options.resume and files.state.is_file()
-    cvtgs.io.check_output(options.output, overwrite=options.overwrite or resumes)
+    for path in (files.checkpoint, files.state, files.curves):
+        cvtgs.io.check_output(path, overwrite=options.overwrite or resumes)
     device = chosen_device(options.device)
     with progress_bars(quiet=options.quiet) as listener:
         history = cvtgs.train.train(

@@ -87,6 +87,8 @@ def view(options: argparse.Namespace) -> None:
 
     check_viewer()
     cvtgs.target_count(1, options.rho)
+    preset = options.preset or "draft"
+    cvtgs.SimplifyConfig.compose(preset=preset)
     if not 0 < options.port < 1 << 16:
         raise InvalidArgumentError(f"--port must be from 1 to 65535, found {options.port}.")
     if options.page is not None:
@@ -94,12 +96,9 @@ def view(options: argparse.Namespace) -> None:
     names = [options.input, *options.small]
     scene, *others = (cvtgs.load(path, trust_sizes=options.trust_sizes) for path in names)
     named = {str(path): other for path, other in zip(options.small, others, strict=True)}
+    viewer = SceneViewer(scene, named, device=options.device)
     server = ViewerServer(
-        SceneViewer(scene, named, device=options.device),
-        host=options.host,
-        port=options.port,
-        preset=options.preset or "draft",
-        rho=options.rho,
+        viewer, host=options.host, port=options.port, preset=preset, rho=options.rho
     )
     try:
         if options.page is not None:
@@ -107,7 +106,7 @@ def view(options: argparse.Namespace) -> None:
             with cvtgs.io.atomic_output(options.page, overwrite=options.overwrite) as file:
                 file.write(server.page().encode())
             if not options.quiet:
-                say(f"{options.page}: {len(names) + 1} scenes; open it in a browser.")
+                say(f"{options.page}: {len(viewer.scenes)} scenes; open it in a browser.")
             return
         if not options.quiet:
             say(f"{server.address} (end with Ctrl+C)", flush=True)

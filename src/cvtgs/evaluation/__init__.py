@@ -5,8 +5,7 @@ from cvtgs.evaluation.comparison_files import write_comparison
 from cvtgs.evaluation.images import fit_cameras, load_photographs
 from cvtgs.evaluation.lpips import LPIPS_VARIABLE, LpipsWeights, load_lpips, lpips
 from cvtgs.evaluation.metrics import alpha_bias, alpha_error, psnr, ssim
-from cvtgs.evaluation.report import Evaluation, SceneScores, Score
-from cvtgs.evaluation.scorer import EvaluationSettings
+from cvtgs.evaluation.scorer import Evaluation, EvaluationSettings, SceneScores, Score
 
 __all__ = [
     "LPIPS_VARIABLE",

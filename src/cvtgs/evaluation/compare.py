@@ -12,10 +12,11 @@ from torch import Tensor
 from cvtgs.cameras import Cameras, checked_cameras, spread_rows
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.evaluation.images import as_bytes
-from cvtgs.evaluation.report import Evaluation, SceneScores
 from cvtgs.evaluation.scorer import (
+    Evaluation,
     EvaluationSettings,
     ImageScores,
+    SceneScores,
     chosen_metrics,
     render_view,
     scene_scores,

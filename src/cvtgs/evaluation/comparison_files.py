@@ -25,7 +25,7 @@ from cvtgs.evaluation.images import (
     error_map,
     resized,
 )
-from cvtgs.evaluation.report import SceneScores
+from cvtgs.evaluation.scorer import SceneScores
 from cvtgs.io import atomic_output, check_output
 from cvtgs.io.atomic import make_folder
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
@@ -259,7 +259,8 @@ def bytes_text(count: int | None) -> str:
 def _ratio_text(ratio: float) -> str:
     if abs(ratio - 1) < 0.005:
         return "as many"
-    return f"{ratio:,.0f} times fewer" if ratio >= 10 else f"{ratio:.3g} times fewer"
+    factor, word = (ratio, "fewer") if ratio > 1 else (1 / ratio, "more")
+    return f"{factor:,.0f} times {word}" if factor >= 10 else f"{factor:.3g} times {word}"
 
 
 def comparison_page(

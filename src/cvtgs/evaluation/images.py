@@ -193,7 +193,7 @@ def load_photographs(
         ``(c, h, w, 3)`` images in [0, 1], float32.
 
     Raises:
-        InvalidArgumentError: The cameras have no names.
+        InvalidArgumentError: The cameras have no names, or two names match one photograph.
         InputNotFoundError: There is no such folder, or a camera has no photograph in it.
         InputError: A photograph cannot be read.
         FileFormatError: A photograph is no image.
@@ -224,7 +224,8 @@ def fit_cameras(cameras: Cameras, folder: str | os.PathLike[str]) -> Cameras:
         Cameras with scaled intrinsics, or the same cameras; the most frequent size is used.
 
     Raises:
-        InvalidArgumentError: The cameras have no names, or an aspect ratio differs.
+        InvalidArgumentError: The cameras have no names, two names match one photograph, or an
+            aspect ratio differs.
         InputNotFoundError: There is no such folder, or a camera has no photograph in it.
         FileFormatError: A photograph is no image.
 
@@ -269,7 +270,16 @@ def _find_all(place: Path, cameras: Cameras) -> list[Path]:
             f"{place}: must hold a photograph of every camera; {len(missing)} of "
             f"{len(found)} cameras have none, the first is {missing[0]!r}."
         )
-    return [path for path in found if path]
+    paths = [path for path in found if path]
+    owners: dict[Path, str] = {}
+    for name, path in zip(cameras.names, paths, strict=True):
+        owner = owners.setdefault(path, name)
+        if owner != name:
+            raise InvalidArgumentError(
+                f"{place}: every camera must have its own photograph, but {owner!r} and {name!r} "
+                f"both match {path.name}; give the folder that holds the folders in these names."
+            )
+    return paths
 
 
 def _find(folder: Path, name: str) -> Path | None:

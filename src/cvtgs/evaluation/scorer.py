@@ -1,4 +1,4 @@
-"""Score images by metrics, for evaluation, refinement and the search for a count."""
+"""Score images of scenes, and average the scores."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -10,22 +10,129 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cvtgs.cameras import Cameras
+from cvtgs.config.base import Record
 from cvtgs.errors import CvtgsError, InvalidArgumentError
 from cvtgs.evaluation.lpips import LEAST_PIXELS, LpipsNetwork, LpipsWeights, load_lpips, lpips
 from cvtgs.evaluation.metrics import alpha_bias, alpha_error, pair_psnr, ssim
-from cvtgs.evaluation.report import NOT_ASKED_FOR, SceneScores, Score
 from cvtgs.rendering import BackendName, render
 from cvtgs.scene import GaussianScene
 from cvtgs.text import shown
+
+NOT_ASKED_FOR = "not asked for"
+"""Note for LPIPS that was not requested, which needs no explanation."""
 
 LpipsChoice = Literal["auto", "vgg", "alex", "off"]
 """``auto``: VGG if its weights are available, else Alex, else none."""
 
 Color = tuple[float, float, float]
+
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 MOST_PSNR = 60.0
 """Upper limit of PSNR where scores are compared, dB: closer images count as equal."""
+
+
+class Score(Record):
+    """One metric.
+
+    Attributes:
+        mean: Mean over the views.
+        views: The value of each view.
+    """
+
+    mean: float
+    views: tuple[float, ...]
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Self:
+        """Make a score from the values of the views.
+
+        Args:
+            values: One per view, at least one.
+
+        Returns:
+            The score.
+
+        Example:
+            >>> Score.of([20.0, 30.0]).mean
+            25.0
+        """
+        return cls(mean=math.fsum(values) / len(values), views=tuple(values))
+
+
+def mean_of(score: Score | None) -> float | None:
+    """Return the mean of a score, or None if there is no score."""
+    return None if score is None else score.mean
+
+
+class SceneScores(Record):
+    """Mean and per-view scores of the images of one scene.
+
+    Attributes:
+        name: Name of the scene.
+        count: Number of its Gaussians.
+        psnr: Peak signal-to-noise ratio, dB; infinite where images are equal.
+        ssim: Structural similarity, at most 1.
+        lpips: LPIPS distance, at least 0; None if it was not measured.
+        alpha_error: Mean absolute difference of accumulated alpha, 0 to 1; None against
+            photographs, which have none.
+        alpha_bias: Mean of the accumulated alpha minus that of the full scene, -1 to 1; negative
+            if more of the background shows through. None against photographs.
+    """
+
+    name: str
+    count: int
+    psnr: Score
+    ssim: Score
+    lpips: Score | None = None
+    alpha_error: Score | None = None
+    alpha_bias: Score | None = None
+
+
+class Evaluation(Record):
+    """Scores of simplified scenes, and the settings of the measurement.
+
+    Attributes:
+        reference: Name of the full scene.
+        reference_count: Number of its Gaussians.
+        views: Names of the views.
+        width: Width of the images, pixels.
+        height: Height of the images, pixels.
+        backend: Name of the backend that rendered.
+        lpips_network: The network of LPIPS; None if it was not measured.
+        lpips_note: Why LPIPS was not measured, else empty.
+        scenes: Scores of each simplified scene against images of the full one.
+        photographs: Scores of the full and of each simplified scene against photographs; empty
+            without photographs.
+    """
+
+    reference: str
+    reference_count: int
+    views: tuple[str, ...]
+    width: int
+    height: int
+    backend: str
+    lpips_network: LpipsNetwork | None = None
+    lpips_note: str = ""
+    scenes: tuple[SceneScores, ...]
+    photographs: tuple[SceneScores, ...] = ()
+
+    @property
+    def lpips_sentence(self) -> str:
+        """A sentence that names the LPIPS network or why LPIPS is missing; empty if turned off."""
+        if self.lpips_network:
+            return f"LPIPS with the network {self.lpips_network}."
+        if self.lpips_note and self.lpips_note != NOT_ASKED_FOR:
+            return f"LPIPS was not measured: {self.lpips_note}."
+        return ""
+
+    def to_json(self) -> str:
+        """Return the evaluation as indented JSON; infinity becomes the string ``Infinity``.
+
+        Returns:
+            JSON text that ends with a line break.
+        """
+        return self.model_dump_json(indent=2) + "\n"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -33,7 +33,7 @@ _READERS: Mapping[str, str] = MappingProxyType(
         ".compressed.ply": "cvtgs.io.compressed_ply:read_compressed_ply",
         ".ply": "cvtgs.io.ply:read_ply",
         ".spz": "cvtgs.io.spz:read_spz",
-        ".ksplat": "cvtgs.io.ksplat:read_ksplat",
+        ".ksplat": "cvtgs.io.splat:read_ksplat",
         ".splat": "cvtgs.io.splat:read_splat",
         ".sog": "cvtgs.io.sog:read_sog",
         "lod-meta.json": "cvtgs.io.sog:read_lod_sog",

@@ -148,28 +148,42 @@ def losses_within(scene: GaussianScene, limits: FormatLimits) -> Losses:
     if others and not limits.comments:
         changed.append(f"without {counted(len(others), 'comment')}")
     return Losses(
-        dropped=tuple(_dropped(scene, limits)),
+        dropped=phrases(dropped_within(scene, limits)),
         changed=tuple(changed),
         count=int(writable_rows(scene).sum()),
         sh_degree=min(scene.sh_degree, limits.sh_degree),
     )
 
 
-def _dropped(scene: GaussianScene, limits: FormatLimits) -> Iterator[str]:
+def phrases(dropped: Mapping[str, int]) -> tuple[str, ...]:
+    """Return the phrases of :func:`dropped_within` with their numbers of Gaussians."""
+    return tuple(
+        f"{what} ({counted(count, 'Gaussian')})" if count else what
+        for what, count in dropped.items()
+    )
+
+
+def dropped_within(scene: GaussianScene, limits: FormatLimits) -> dict[str, int]:
+    """Return the lost data, and of clamped data the number of Gaussians, otherwise 0."""
+    return dict(_dropped(scene, limits))
+
+
+def _dropped(scene: GaussianScene, limits: FormatLimits) -> Iterator[tuple[str, int]]:
     if scene.extras:
         names = ", ".join(map(repr, scene.extras))
-        yield f"extra {'columns' if len(scene.extras) > 1 else 'column'} {names}"
+        yield f"extra {'columns' if len(scene.extras) > 1 else 'column'} {names}", 0
     if scene.sh_degree > limits.sh_degree:
-        yield f"SH bands above degree {limits.sh_degree} (the scene has degree {scene.sh_degree})"
+        own = f"the scene has degree {scene.sh_degree}"
+        yield f"SH bands above degree {limits.sh_degree} ({own})", 0
     if scene.antialiased and not limits.antialiased:
-        yield f"the tag '{ANTIALIASED_TAG}', without which viewers show the scene too sharp"
+        yield f"the tag '{ANTIALIASED_TAG}', without which viewers show the scene too sharp", 0
     if scene.dtype == torch.float64:
-        yield "double precision"
+        yield "double precision", 0
     rows = writable_rows(scene)
     if not bool(rows.all()):
         count = int((~rows).sum())
         verbs = "is not finite or has" if count == 1 else "are not finite or have"
-        yield f"{counted(count, 'Gaussian')} that {verbs} no rotation"
+        yield f"{counted(count, 'Gaussian')} that {verbs} no rotation", 0
     ranges = dict(limits.ranges)
     if limits.largest_coordinate is not None:
         largest = limits.largest_coordinate(scene)
@@ -180,7 +194,4 @@ def _dropped(scene: GaussianScene, limits: FormatLimits) -> Iterator[str]:
         beyond = (values < low) | (values > high)
         count = int(beyond.reshape(len(values), -1).any(dim=1).sum()) if values.numel() else 0
         if count:
-            yield (
-                f"{_VALUES[name]} outside [{low:.5g}, {high:.5g}], which are clamped "
-                f"({counted(count, 'Gaussian')})"
-            )
+            yield f"{_VALUES[name]} outside [{low:.5g}, {high:.5g}], which are clamped", count

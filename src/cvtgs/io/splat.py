@@ -1,10 +1,13 @@
-"""The ``.splat`` files of antimatter15's viewer: 32 bytes per Gaussian, nothing else."""
+"""The ``.splat`` files of antimatter15's viewer and the ``.ksplat`` files of mkkellogg's."""
 
+import dataclasses
 import os
+import struct
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from cvtgs.errors import FileFormatError
 from cvtgs.io.arrays import (
@@ -33,6 +36,23 @@ _ROW = np.dtype(
     ]
 )
 _CHUNK_ROWS = 1 << 16
+
+HEADER_BYTES, SECTION_BYTES = 4096, 1024
+
+_HEADER = struct.Struct("<BBxxIIIIHxx3fff")
+
+_SECTION = struct.Struct("<IIIIfHxxIIIIH")
+
+_NUMBERS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
+"""Types of positions, of scales and rotations, and of SH, by compression level."""
+
+_RANGE = 32767
+"""Quantised positions are centred on this number, unless the section states another."""
+
+_SH_RANGE = (-1.5, 1.5)
+
+_COMPONENTS = (0, 9, 24)
+"""View-dependent SH components of a Gaussian, by degree."""
 
 
 def read_splat(path: Path) -> GaussianScene:
@@ -76,3 +96,163 @@ def write_splat(scene: GaussianScene, file: BinaryIO) -> None:
         rows["opacity"] = opacity_bytes(arrays.logit_opacities[part])
         rows["quat"] = to_bytes(128 + 128 * arrays.quats[part])
         file.write(rows.tobytes())
+
+
+class _Section(NamedTuple):
+    """The header of a section."""
+
+    used: int
+    room: int
+    """Number of Gaussians that the section has bytes for."""
+    bucket_size: int
+    buckets: int
+    block_size: float
+    bucket_bytes: int
+    scale_range: int
+    stored_bytes: int
+    full_buckets: int
+    partial_buckets: int
+    sh_degree: int
+
+
+def read_ksplat(path: Path) -> GaussianScene:
+    """Read a ``.ksplat`` file.
+
+    The file has sections of Gaussians in buckets. Positions, scales and rotations are f32; or
+    positions are 16 bits about the centre of the bucket, and scales and rotations are halves.
+    Opacities and colours are bytes; SH up to degree 2 are f32, halves or bytes.
+    """
+    with open_input(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        head = file.read(HEADER_BYTES)
+        if len(head) < HEADER_BYTES:
+            raise FileFormatError(
+                f"{path}: a .ksplat file must start with a header of {HEADER_BYTES} bytes, "
+                f"found {len(head)}."
+            )
+        major, minor, most, _, _, count, level, *_, low, high = _HEADER.unpack_from(head)
+        if (major, minor) != (0, 1) or level >= len(_NUMBERS):
+            raise FileFormatError(
+                f"{path}: must be a .ksplat of version 0.1 with compression 0, 1 or 2, found "
+                f"version {major}.{minor} and compression {level}."
+            )
+        ends = HEADER_BYTES + most * SECTION_BYTES
+        if ends > size:
+            raise FileFormatError(
+                f"{path}: must hold the headers of {most:,} sections, found {size:,} bytes."
+            )
+        headers = file.read(most * SECTION_BYTES)
+        sections = [
+            _Section(*_SECTION.unpack_from(headers, number * SECTION_BYTES))
+            for number in range(most)
+        ]
+        sh_range = (low, high) if low or high else _SH_RANGE
+        degree = max((one.sh_degree for one in sections if one.used), default=0)
+        parts = []
+        for section in sections:
+            if section.used:
+                parts.append(_read_section(file, section, level, degree, sh_range, path))
+            else:
+                file.seek(_section_bytes(section, level, path), os.SEEK_CUR)
+    found = sum(len(part.means) for part in parts)
+    if found != count or not count:
+        raise FileFormatError(
+            f"{path}: the sections must hold the {count:,} Gaussians that the header promises, "
+            f"and at least one, found {found:,}."
+        )
+    names = [field.name for field in dataclasses.fields(Arrays)]
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return scene_of(Arrays(**joined))
+
+
+def _row_type(level: int, degree: int, path: Path) -> np.dtype[Any]:
+    """Return the layout of a Gaussian."""
+    if degree >= len(_COMPONENTS):
+        raise FileFormatError(
+            f"{path}: a .ksplat must have an SH degree of at most {len(_COMPONENTS) - 1}, "
+            f"found {degree}."
+        )
+    mean, half, sh = _NUMBERS[level]
+    fields = [("mean", mean, 3), ("scale", half, 3), ("quat", half, 4)]
+    return np.dtype([*fields, ("rgba", "u1", 4), ("sh", sh, _COMPONENTS[degree])])
+
+
+def _section_bytes(section: _Section, level: int, path: Path) -> int:
+    row = _row_type(level, section.sh_degree, path).itemsize
+    extra = 4 * section.partial_buckets + section.bucket_bytes * section.buckets
+    return extra + row * section.room
+
+
+def _read_section(
+    file: BinaryIO,
+    section: _Section,
+    level: int,
+    degree: int,
+    sh_range: tuple[float, float],
+    path: Path,
+) -> Arrays:
+    row = _row_type(level, section.sh_degree, path)
+    wanted = _section_bytes(section, level, path)
+    here = file.tell()
+    left = os.fstat(file.fileno()).st_size - here
+    needed = wanted - row.itemsize * (section.room - section.used)
+    if section.used > section.room or needed > left:
+        raise FileFormatError(
+            f"{path}: a section of {section.used:,} Gaussians must take {needed:,} bytes, "
+            f"found {left:,}."
+        )
+    lengths = np.fromfile(file, "<u4", section.partial_buckets).astype(np.int64)
+    extra = np.fromfile(file, np.uint8, section.bucket_bytes * section.buckets)
+    rows = np.fromfile(file, row, section.used)
+    file.seek(here + wanted)
+    means = rows["mean"].astype(np.float32)
+    if level:
+        bucket = _buckets(section, lengths)
+        bucket = bucket[: section.used]
+        most = int(bucket.max(initial=0))
+        if section.bucket_bytes < 12 or len(bucket) < section.used or most >= section.buckets:
+            raise FileFormatError(
+                f"{path}: the buckets of a section must hold its {section.used:,} Gaussians, "
+                f"found {section.buckets:,} buckets of {len(bucket):,}."
+            )
+        centers = extra.reshape(section.buckets, -1)[:, :12].copy().view("<f4")
+        middle = section.scale_range or _RANGE
+        step = np.float32(section.block_size / 2 / middle)
+        means = (means - np.float32(middle)) * step + centers[bucket]
+    stored = rows["sh"].astype(np.float32)
+    if level == 2:  # bytes
+        stored = sh_range[0] + stored / np.float32(255) * np.float32(sh_range[1] - sh_range[0])
+    return Arrays(
+        means=means,
+        quats=unit_quats(rows["quat"].astype(np.float32)),
+        log_scales=log_scales_of(rows["scale"].astype(np.float32)),
+        logit_opacities=logits_of_bytes(rows["rgba"][:, 3]),
+        sh0=sh0_of_colors(rows["rgba"][:, :3].astype(np.float32) / np.float32(255)),
+        shN=_rest(stored, degree),
+    )
+
+
+def _buckets(section: _Section, lengths: Int[np.ndarray, "p"]) -> Int[np.ndarray, "n"]:
+    """Return the bucket of every Gaussian: full buckets first, then those of given lengths."""
+    room = section.used
+    size = min(section.bucket_size, room)  # a damaged header may state four billion
+    full = min(section.full_buckets, room // max(1, size) + 1)
+    first = np.repeat(np.arange(full), size)[:room]
+    clipped = np.minimum(lengths, room)
+    if int(clipped.sum()) > 2 * room:  # a damaged file
+        return first[:0]
+    rest = np.repeat(section.full_buckets + np.arange(len(lengths)), clipped)
+    return np.concatenate([first, rest])
+
+
+def _rest(stored: Float[np.ndarray, "n c"], degree: int) -> Float[np.ndarray, "n k 3"]:
+    """Reorder SH components, stored by band and then by channel; missing bands are 0."""
+    rest = np.zeros((len(stored), _COMPONENTS[degree] // 3, 3), np.float32)
+    start = 0
+    for band in (1, 2):
+        width = 2 * band + 1
+        if stored.shape[1] >= start + 3 * width:
+            part = stored[:, start : start + 3 * width].reshape(len(stored), 3, width)
+            rest[:, start // 3 : start // 3 + width] = part.transpose(0, 2, 1)
+        start += 3 * width
+    return rest

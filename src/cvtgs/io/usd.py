@@ -13,9 +13,6 @@ from cvtgs.math.spherical_harmonics import degree_of
 from cvtgs.scene import GaussianScene
 from cvtgs.text import printable
 
-AXES = "rub"
-"""Right, up, back: the axes of a stage whose up axis is Y."""
-
 _CHUNK_ROWS = 1 << 15
 _SIGMAS = 3.0
 """Extent of a Gaussian in the bounds, in standard deviations."""

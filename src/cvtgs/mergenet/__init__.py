@@ -19,6 +19,7 @@ from cvtgs.mergenet.model import (
     summarize,
 )
 from cvtgs.mergenet.published import (
+    Net,
     PublishedArchitecture,
     PublishedDescriptors,
     PublishedMergeNet,
@@ -35,6 +36,7 @@ __all__ = [
     "KnownRange",
     "LearnedScene",
     "MergeNet",
+    "Net",
     "PublishedArchitecture",
     "PublishedDescriptors",
     "PublishedMergeNet",

@@ -13,6 +13,7 @@ from cvtgs.math import parameters
 from cvtgs.math.segments import segment_sum, segment_sum_of
 from cvtgs.mergenet.model import MergeNet, Residuals
 from cvtgs.mergenet.published import (
+    Net,
     PublishedMergeNet,
     PublishedResiduals,
     describe_published,
@@ -26,7 +27,7 @@ _LARGEST = 1e15
 
 
 def correct_cells(  # noqa: PLR0913 (options by name)
-    net: MergeNet | PublishedMergeNet,
+    net: Net,
     scene: GaussianScene,
     merged: GaussianScene,
     partition: Partition,

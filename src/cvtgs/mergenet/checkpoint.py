@@ -22,7 +22,7 @@ from cvtgs.errors import (
 )
 from cvtgs.io.tensors import pack_tensors, unpack_tensors
 from cvtgs.mergenet.model import Architecture, MergeNet
-from cvtgs.mergenet.published import PublishedArchitecture, PublishedMergeNet
+from cvtgs.mergenet.published import Net, PublishedArchitecture, PublishedMergeNet
 from cvtgs.text import printable, shown
 
 SHIPPED = ("standard", "paper")
@@ -105,7 +105,7 @@ class Checkpoint:
         digest: SHA-256 of the weights and the description, hexadecimal.
     """
 
-    net: MergeNet | PublishedMergeNet
+    net: Net
     info: CheckpointInfo
     name: str
     digest: str
@@ -146,7 +146,7 @@ def load_checkpoint(source: str | os.PathLike[str]) -> Checkpoint:
     )
 
 
-def save_checkpoint(net: MergeNet | PublishedMergeNet, info: CheckpointInfo) -> bytes:
+def save_checkpoint(net: Net, info: CheckpointInfo) -> bytes:
     """Return the bytes of a checkpoint file.
 
     The same network and description give the same bytes.
@@ -246,7 +246,7 @@ def _parse_info(metadata: Mapping[str, str], name: str) -> CheckpointInfo:
 
 def build_network(
     architecture: Architecture | PublishedArchitecture,
-) -> MergeNet | PublishedMergeNet:
+) -> Net:
     """Build an untrained network in float32 on the CPU, which changes nothing.
 
     Example:
@@ -259,9 +259,7 @@ def build_network(
         return MergeNet(architecture).float()
 
 
-def _build_net(
-    info: CheckpointInfo, tensors: dict[str, Tensor], name: str
-) -> MergeNet | PublishedMergeNet:
+def _build_net(info: CheckpointInfo, tensors: dict[str, Tensor], name: str) -> Net:
     with torch.random.fork_rng(devices=[]):  # layers start with random weights
         net = build_network(info.architecture)
     if isinstance(net, MergeNet) and not any(key.startswith(KNOWN) for key in tensors):

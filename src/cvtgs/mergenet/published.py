@@ -12,7 +12,7 @@ from cvtgs.cells import Partition
 from cvtgs.config.base import Record
 from cvtgs.math import parameters
 from cvtgs.math.segments import segment_ids, segment_max, segment_sum
-from cvtgs.mergenet.model import CellNetwork, two_layers
+from cvtgs.mergenet.model import CellNetwork, MergeNet, two_layers
 from cvtgs.scene import GaussianScene
 
 SH_COEFFICIENTS = 16
@@ -195,3 +195,7 @@ class PublishedMergeNet(CellNetwork):
             d_logit_opacities=changes[:, 9],
             d_sh=changes[:, 10:].unflatten(1, (SH_COEFFICIENTS, 3)),
         )
+
+
+Net = MergeNet | PublishedMergeNet
+"""A network of either kind, of this library or as published."""

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import zlib
-from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -17,13 +16,12 @@ import cvtgs
 from cvtgs.boxes import Box
 from cvtgs.cameras import Cameras
 from cvtgs.config import SimplifyConfig
-from cvtgs.errors import CvtgsError, OutputError, RunError, reason_of
+from cvtgs.errors import CvtgsError, OutputError, reason_of
 from cvtgs.io import atomic_output
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import Checkpoint, load_checkpoint, save_checkpoint
-from cvtgs.outofcore.attempts import SortedFile
 from cvtgs.outofcore.memory import CELL_ROOM
 from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, write_scan
 
@@ -290,28 +288,6 @@ class Job:
                 f"found: {reason}."
             ) from error
 
-    def adopt(self, files: Iterable[SortedFile]) -> None:
-        """Give the files of finished attempts their final names, and remove other attempts."""
-        adopted = list(files)
-        for path in self.path("").glob("rows_*"):
-            path.unlink()  # from an earlier sort with another filter
-        for file in adopted:
-            try:
-                found = self.path(file.attempt).stat().st_size
-            except OSError as error:
-                raise _not_seen(self.path(file.attempt)) from error
-            if found != file.size:
-                raise RunError(
-                    f"{self.path(file.attempt)}: must have the {file.size} bytes that were "
-                    f"written, found {found}; check the disk, and run the same command again."
-                )
-            self.path(file.attempt).replace(self.path(file.name))
-        for path in self.path("").glob("attempt_*"):
-            path.unlink(missing_ok=True)
-        facts = {file.name: (file.size, file.checksum) for file in adopted}
-        with atomic_output(self.path("sorted.json"), overwrite=True) as output:
-            output.write(json.dumps(facts).encode())
-
     def read_manifest(self) -> Manifest:
         """Read the manifest."""
         return Manifest.model_validate_json(self.path("manifest.json").read_bytes())
@@ -375,10 +351,3 @@ def _listed(cameras: Cameras) -> list[object]:
     """Return everything about cameras that a result depends on."""
     matrices = [cameras.viewmats.tolist(), cameras.Ks.tolist()]
     return [*matrices, cameras.width, cameras.height, cameras.strides, cameras.ignores_tag]
-
-
-def _not_seen(path: Path) -> RunError:
-    return RunError(
-        f"{path}: a worker reported that it wrote this file, but it is not here; every worker "
-        "must see the output folder under the same path."
-    )

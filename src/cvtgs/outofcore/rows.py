@@ -1,4 +1,4 @@
-"""Sort rows of the source into files of blocks, and read them back by block or by cell."""
+"""Read the rows that were sorted into blocks, by block or by cell, and send some to others."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,15 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cvtgs import analysis, cvt, filters, validity
-from cvtgs.boxes import inside
-from cvtgs.config import TessellationConfig
-from cvtgs.devices import one_thread
+from cvtgs import analysis
 from cvtgs.io import atomic_output
 from cvtgs.io.tensors import map_tensors
-from cvtgs.outofcore.attempts import Attempt, SortedFile
 from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.scan import CHUNK, RowRange, SceneScan
+from cvtgs.outofcore.scan import CHUNK, SceneScan
 from cvtgs.scene import GaussianScene
 
 AREA, VISIBILITY, CELL = "cvtgs_apparent_area", "cvtgs_visibility", "cvtgs_cell"
@@ -39,88 +35,6 @@ class BlockRows(NamedTuple):
     scene: GaussianScene
     apparent_areas: Tensor
     visibility: Tensor
-
-
-class SortedCounts(NamedTuple):
-    """The contribution of a range of the source to every block.
-
-    Attributes:
-        rows: Number of Gaussians per block.
-        cells: Weight per chunk of rows and block, in cells; a Gaussian counts at most 1.
-        left_out: Mass that the filter leaves out, one entry per chunk that loses any.
-        files: Files of the rows.
-    """
-
-    rows: list[int]
-    cells: list[list[float]]
-    left_out: list[float]
-    files: tuple[SortedFile, ...]
-
-
-@one_thread()
-def sort_range(job: Job, rows: RowRange) -> SortedCounts:
-    """Write the rows of a range into one file per block, to which no other call writes."""
-    scan, attempt = job.read_scan(), Attempt(job.folder)
-    row_counts = torch.zeros(job.blocks, dtype=torch.int64)
-    cell_counts, left_out = [], []
-    for start in range(rows.start, rows.stop, CHUNK):
-        records = job.source.read(start, min(start + CHUNK, rows.stop))
-        scene = job.source.scene(records)
-        valid = validity.valid_rows(scene)
-        protected = valid & inside(job.boxes, scene.means) if job.boxes else ~valid & valid
-        if bool(protected.any()):
-            kept = _kept_rows(records, scene, protected)
-            attempt.append(job.kept_path(rows.number).name, kept)
-        free = (valid & ~protected).nonzero()[:, 0]
-        chosen, areas, visibility = _filtered(scan, job.config.cvt, scene, free)
-        if len(chosen) < len(free):
-            masses = scene.masses
-            left_out.append(float(masses[free].sum() - masses[chosen].sum()))
-        weights = cvt.gaussian_weights(scene.opacities[chosen], areas, scan.area_power)
-        weights = weights.clamp_min(scan.min_weight)
-        per_cell = scan.cell_weight
-        cells = (weights / per_cell).clamp_max(1.0) if per_cell > 0 else torch.ones_like(weights)
-        blocks = scan.partition.blocks_of(scan.frame.contract(scene.means[chosen]))
-        added = torch.bincount(blocks, minlength=job.blocks)
-        row_counts += added
-        cell_counts.append(torch.bincount(blocks, cells, minlength=job.blocks).tolist())
-        order = torch.sort(blocks, stable=True).indices
-        table = np.empty(len(order), record_type(job))
-        numbers = chosen[order].numpy()
-        for name in records.dtype.names or ():
-            table[name] = records[name][numbers]
-        table[AREA], table[VISIBILITY] = areas[order].numpy(), visibility[order].numpy()
-        ends = added.cumsum(0).tolist()
-        for block, (end, count) in enumerate(zip(ends, added.tolist(), strict=True)):
-            if count:
-                name = job.rows_path(block, rows.number).name
-                attempt.append(name, table[end - count : end].tobytes())
-    return SortedCounts(row_counts.tolist(), cell_counts, left_out, attempt.files())
-
-
-def _filtered(
-    scan: SceneScan, config: TessellationConfig, scene: GaussianScene, rows: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the rows that pass the filter, their apparent areas and their visibility."""
-    means, opacities = scene.means[rows], scene.opacities[rows]
-    areas = scene.select(rows).areas
-    visibility = analysis.visibility_at(scan.visibility, means, scan.frame)
-    distances = scan.frame.distances(means)
-    apparent = analysis.apparent_areas(areas, distances, visibility, config=config)
-    stays = opacities >= scan.min_opacity
-    if scan.max_flyaway_mass >= 0.0:
-        far = distances > filters.FLYAWAY_RADII
-        masses = areas * opacities * analysis.perspective_falloff(distances)
-        stays &= ~(far & (masses <= scan.max_flyaway_mass))
-    return rows[stays], apparent[stays], visibility[stays]
-
-
-def _kept_rows(records: NDArray[Any], scene: GaussianScene, protected: Tensor) -> bytes:
-    """Return the protected rows, with finite opacities."""
-    kept = records[protected.numpy()]
-    logits = validity.with_finite_opacities(scene.select(protected)).logit_opacities
-    kept["opacity"] = logits.numpy()
-    return bytes(kept.tobytes())
 
 
 def record_type(job: Job, *, with_cell: bool = False) -> np.dtype[Any]:

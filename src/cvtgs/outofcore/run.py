@@ -44,9 +44,8 @@ from cvtgs.outofcore.visibility import add_contributions, measure
 from cvtgs.outofcore.workers import (
     Result,
     Workers,
-    begin,
-    nothing_left,
     sequentially,
+    started,
     with_progress,
 )
 from cvtgs.prepared import check_cameras
@@ -172,8 +171,7 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     clock = StageClock(listener, HOST)
     with output_lock(output):
         resumes = job.can_resume(key)
-        with nothing_left(job, resumes=resumes):
-            begin(job, workers, clock, simplifier.checkpoint, resumes=resumes)
+        with started(job, workers, clock, simplifier.checkpoint, resumes=resumes):
             if not resumes:
                 with one_thread():
                     job.write_manifest(_scan_and_sort(job, key, workers, clock))

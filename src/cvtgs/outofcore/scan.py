@@ -231,7 +231,7 @@ def scan_range(
         invalid = validity.invalid_rows(scene)
         if invalid:
             found.update({name: int(mask.sum()) for name, mask in invalid.items()})
-            scene = scene.select(~torch.stack(list(invalid.values())).any(dim=0))
+            scene = scene.select(~validity.any_row(scene, invalid))
         masses = scene.masses
         analysis.add_depths(depths, scene.means, masses, frame)
         distances = frame.distances(scene.means)

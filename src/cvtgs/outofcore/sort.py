@@ -1,20 +1,33 @@
 """Sort a file into blocks: the first pass scans it, the second writes the rows of every block."""
 
-from collections.abc import Callable, Sequence
+import json
+import secrets
+import zlib
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
-from cvtgs import validity
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from cvtgs import analysis, cvt, filters, validity
 from cvtgs.analysis import frame_of
-from cvtgs.boxes import check_room
+from cvtgs.boxes import check_room, inside
 from cvtgs.clock import StageClock
-from cvtgs.errors import InvalidArgumentError, InvalidSceneError
+from cvtgs.config import TessellationConfig
+from cvtgs.devices import one_thread
+from cvtgs.errors import InvalidArgumentError, InvalidSceneError, RunError
 from cvtgs.grouping import finer_count
-from cvtgs.outofcore.attempts import SortedFile
+from cvtgs.io import atomic_output
+from cvtgs.io.atomic import write_error
 from cvtgs.outofcore.job import Job
-from cvtgs.outofcore.rows import sort_range
+from cvtgs.outofcore.rows import AREA, VISIBILITY, record_type
 from cvtgs.outofcore.scan import (
+    CHUNK,
     RowRange,
     SceneScan,
     add_totals,
@@ -24,6 +37,56 @@ from cvtgs.outofcore.scan import (
 )
 from cvtgs.outofcore.visibility import write_views
 from cvtgs.outofcore.workers import Workers, with_progress
+from cvtgs.scene import GaussianScene
+
+
+class SortedFile(NamedTuple):
+    """A file that one attempt to sort a range wrote, before the job adopts it.
+
+    Attributes:
+        name: Final name in the folder of the job.
+        attempt: Current name.
+        size: Size in bytes.
+        checksum: CRC-32 of its content.
+    """
+
+    name: str
+    attempt: str
+    size: int
+    checksum: int
+
+
+class Attempt:
+    """The files that one call writes for a range; every other call for it writes other files.
+
+    Therefore a worker that was presumed dead but still writes cannot damage the files in use.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self._folder = Path(folder)
+        self._token = secrets.token_hex(8)
+        self._found: dict[str, tuple[int, int]] = {}
+
+    def append(self, name: str, content: bytes) -> None:
+        """Append to the file with this final name."""
+        path = self._folder / self._name(name)
+        try:
+            with path.open("ab") as file:
+                file.write(content)
+        except OSError as error:
+            raise write_error(path, error) from error
+        size, checksum = self._found.get(name, (0, 0))
+        self._found[name] = (size + len(content), zlib.crc32(content, checksum))
+
+    def files(self) -> tuple[SortedFile, ...]:
+        """Return the written files."""
+        return tuple(
+            SortedFile(name, self._name(name), size, checksum)
+            for name, (size, checksum) in self._found.items()
+        )
+
+    def _name(self, name: str) -> str:
+        return f"attempt_{name}_{self._token}"
 
 
 class SortedBlocks(NamedTuple):
@@ -112,5 +175,113 @@ def _sort(
         for mass in part.left_out:
             left_out_mass += mass
         files += part.files
-    job.adopt(files)
+    _adopt(job, files)
     return SortedBlocks(rest, rows, cells, left_out_mass)
+
+
+class SortedCounts(NamedTuple):
+    """The contribution of a range of the source to every block.
+
+    Attributes:
+        rows: Number of Gaussians per block.
+        cells: Weight per chunk of rows and block, in cells; a Gaussian counts at most 1.
+        left_out: Mass that the filter leaves out, one entry per chunk that loses any.
+        files: Files of the rows.
+    """
+
+    rows: list[int]
+    cells: list[list[float]]
+    left_out: list[float]
+    files: tuple[SortedFile, ...]
+
+
+@one_thread()
+def sort_range(job: Job, rows: RowRange) -> SortedCounts:
+    """Write the rows of a range into one file per block, to which no other call writes."""
+    scan, attempt = job.read_scan(), Attempt(job.folder)
+    row_counts = torch.zeros(job.blocks, dtype=torch.int64)
+    cell_counts, left_out = [], []
+    for start in range(rows.start, rows.stop, CHUNK):
+        records = job.source.read(start, min(start + CHUNK, rows.stop))
+        scene = job.source.scene(records)
+        valid = validity.valid_rows(scene)
+        protected = valid & inside(job.boxes, scene.means) if job.boxes else ~valid & valid
+        if bool(protected.any()):
+            kept = _kept_rows(records, scene, protected)
+            attempt.append(job.kept_path(rows.number).name, kept)
+        free = (valid & ~protected).nonzero()[:, 0]
+        chosen, areas, visibility = _filtered(scan, job.config.cvt, scene, free)
+        if len(chosen) < len(free):
+            masses = scene.masses
+            left_out.append(float(masses[free].sum() - masses[chosen].sum()))
+        weights = cvt.gaussian_weights(scene.opacities[chosen], areas, scan.area_power)
+        weights = weights.clamp_min(scan.min_weight)
+        per_cell = scan.cell_weight
+        cells = (weights / per_cell).clamp_max(1.0) if per_cell > 0 else torch.ones_like(weights)
+        blocks = scan.partition.blocks_of(scan.frame.contract(scene.means[chosen]))
+        added = torch.bincount(blocks, minlength=job.blocks)
+        row_counts += added
+        cell_counts.append(torch.bincount(blocks, cells, minlength=job.blocks).tolist())
+        order = torch.sort(blocks, stable=True).indices
+        table = np.empty(len(order), record_type(job))
+        numbers = chosen[order].numpy()
+        for name in records.dtype.names or ():
+            table[name] = records[name][numbers]
+        table[AREA], table[VISIBILITY] = areas[order].numpy(), visibility[order].numpy()
+        ends = added.cumsum(0).tolist()
+        for block, (end, count) in enumerate(zip(ends, added.tolist(), strict=True)):
+            if count:
+                name = job.rows_path(block, rows.number).name
+                attempt.append(name, table[end - count : end].tobytes())
+    return SortedCounts(row_counts.tolist(), cell_counts, left_out, attempt.files())
+
+
+def _filtered(
+    scan: SceneScan, config: TessellationConfig, scene: GaussianScene, rows: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the rows that pass the filter, their apparent areas and their visibility."""
+    means, opacities = scene.means[rows], scene.opacities[rows]
+    areas = scene.select(rows).areas
+    visibility = analysis.visibility_at(scan.visibility, means, scan.frame)
+    distances = scan.frame.distances(means)
+    apparent = analysis.apparent_areas(areas, distances, visibility, config=config)
+    stays = opacities >= scan.min_opacity
+    if scan.max_flyaway_mass >= 0.0:
+        far = distances > filters.FLYAWAY_RADII
+        masses = areas * opacities * analysis.perspective_falloff(distances)
+        stays &= ~(far & (masses <= scan.max_flyaway_mass))
+    return rows[stays], apparent[stays], visibility[stays]
+
+
+def _kept_rows(records: NDArray[Any], scene: GaussianScene, protected: Tensor) -> bytes:
+    """Return the protected rows, with finite opacities."""
+    kept = records[protected.numpy()]
+    logits = validity.with_finite_opacities(scene.select(protected)).logit_opacities
+    kept["opacity"] = logits.numpy()
+    return bytes(kept.tobytes())
+
+
+def _adopt(job: Job, files: Iterable[SortedFile]) -> None:
+    """Give the files of finished attempts their final names, and remove other attempts."""
+    adopted = list(files)
+    for path in job.path("").glob("rows_*"):
+        path.unlink()  # from an earlier sort with another filter
+    for file in adopted:
+        try:
+            found = job.path(file.attempt).stat().st_size
+        except OSError as error:
+            raise RunError(
+                f"{job.path(file.attempt)}: a worker reported that it wrote this file, but it is "
+                f"not here; every worker must see the output folder under the same path."
+            ) from error
+        if found != file.size:
+            raise RunError(
+                f"{job.path(file.attempt)}: must have the {file.size} bytes that were "
+                f"written, found {found}; check the disk, and run the same command again."
+            )
+        job.path(file.attempt).replace(job.path(file.name))
+    for path in job.path("").glob("attempt_*"):
+        path.unlink(missing_ok=True)
+    facts = {file.name: (file.size, file.checksum) for file in adopted}
+    with atomic_output(job.path("sorted.json"), overwrite=True) as output:
+        output.write(json.dumps(facts).encode())

@@ -35,24 +35,23 @@ class Workers(Protocol):
         ...
 
 
-def begin(
-    job: Job, workers: Workers, clock: StageClock, checkpoint: Checkpoint | None, *, resumes: bool
-) -> None:
-    """Make the folder of a job and write its network, unless it resumes; check the workers."""
-    if not resumes:
-        job.start_over()
-    check: Callable[[Job], object] | None = getattr(workers, "check", None)
-    if check is not None:  # workers on other machines
-        with clock.stage("workers"):
-            check(job)
-    if not resumes and checkpoint is not None:
-        job.write_network(checkpoint)
-
-
 @contextmanager
-def nothing_left(job: Job, *, resumes: bool) -> Iterator[None]:
-    """Remove the folder of a job that fails before there is anything to resume."""
+def started(
+    job: Job, workers: Workers, clock: StageClock, checkpoint: Checkpoint | None, *, resumes: bool
+) -> Iterator[None]:
+    """Make the folder of a job and write its network, unless it resumes; check the workers.
+
+    The folder is removed if the job fails before there is anything to resume.
+    """
     try:
+        if not resumes:
+            job.start_over()
+        check: Callable[[Job], object] | None = getattr(workers, "check", None)
+        if check is not None:  # workers on other machines
+            with clock.stage("workers"):
+                check(job)
+        if not resumes and checkpoint is not None:
+            job.write_network(checkpoint)
         yield
     except CvtgsError:
         if not resumes:

@@ -31,7 +31,6 @@ class RefineViews:
         heldout: Held-out cameras, single and of one size, which decide which scene is kept.
         training: Single training cameras.
         endless: Whether ``training`` never ends.
-        stride: A step sees every ``stride``-th pixel of a training image.
         heldout_images: Further held-out views, already rendered.
         images: Training images that are already rendered before the first step, of which steps see
             all pixels.
@@ -40,7 +39,6 @@ class RefineViews:
     heldout: tuple[Cameras, ...]
     training: Iterator[Cameras]
     endless: bool
-    stride: int = 1
     heldout_images: tuple[ViewImage, ...] = ()
     images: tuple[ViewImage, ...] = ()
 
@@ -61,7 +59,7 @@ def generated_views(full: GaussianScene, *, config: RefineConfig, seed: int) -> 
             yield from views
 
     heldout = _thinned(batch(config.heldout, seed + HELDOUT_SEED), config.stride)
-    return RefineViews(heldout=heldout, training=training(), endless=True, stride=config.stride)
+    return RefineViews(heldout=heldout, training=training(), endless=True)
 
 
 def split_views(cameras: Cameras, *, config: RefineConfig, seed: int) -> RefineViews:
@@ -78,7 +76,7 @@ def split_views(cameras: Cameras, *, config: RefineConfig, seed: int) -> RefineV
     others = [view for row, view in enumerate(views) if row not in held]
     random.Random(seed).shuffle(others)
     heldout = _thinned([views[row] for row in held], config.stride)
-    return RefineViews(heldout=heldout, training=iter(others), endless=False, stride=config.stride)
+    return RefineViews(heldout=heldout, training=iter(others), endless=False)
 
 
 def shared_views(
@@ -101,7 +99,6 @@ def shared_views(
         heldout=(),
         training=_further(observed.cameras, full, cameras, config=config, seed=seed),
         endless=cameras is None,
-        stride=config.stride,
         heldout_images=tuple(images[row] for row in held),
         images=tuple(image.half() for row, image in enumerate(images) if row not in held),
     )
@@ -143,7 +140,7 @@ class ImageBuffer:
     """Training images: the first are new, later ones are new at intervals and reused in between.
 
     A reused image is drawn at random from the least recently used half of the buffer. A step sees
-    every ``views.stride``-th pixel, with a random first one.
+    every ``config.stride``-th pixel, with a random first one.
 
     Memory: 8 bytes per pixel of at most ``config.images`` images, or of one image if every step
     renders a new one.
@@ -155,7 +152,6 @@ class ImageBuffer:
         always_new = views.endless and config.steps_per_image == 1
         self._full = full
         self._cameras = views.training
-        self._stride = views.stride
         self._config = config
         self._capacity = max(1 if always_new else config.images, len(views.images))
         self._first = max(config.first_images, len(views.images))
@@ -183,7 +179,7 @@ class ImageBuffer:
             return used
         if len(self._kept) == self._capacity:
             self._kept.pop(self._rng.randrange(len(self._kept)))
-        self._kept.append((render_view(self._full, camera).half(), self._stride))
+        self._kept.append((render_view(self._full, camera).half(), self._config.stride))
         self.rendered += 1
         return self._kept[-1]
 

@@ -12,8 +12,7 @@ from cvtgs.errors import InvalidArgumentError, InvalidSceneError
 from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.refinement.images import ImageBuffer, generated_views, shared_views, split_views
-from cvtgs.refinement.limits import Limits, check_limits
-from cvtgs.refinement.optimize import STAGE, learning_rate_scales, optimize
+from cvtgs.refinement.optimize import STAGE, Limits, check_limits, learning_rate_scales, optimize
 from cvtgs.rendering import ObservedViews
 from cvtgs.rendering.backends import choose_backend
 from cvtgs.report import RefineReport, SimplifyReport

@@ -14,8 +14,8 @@ from cvtgs.cameras import Cameras
 from cvtgs.math import segments
 from cvtgs.math.parameters import MIN_ALPHA
 from cvtgs.progress import ProgressListener, silent
-from cvtgs.rendering.backends import RasterOutput, contributions_by_gradient, render_each
-from cvtgs.rendering.pixel_weights import PixelWeights
+from cvtgs.rendering import backends
+from cvtgs.rendering.backends import PixelWeights, RasterOutput
 from cvtgs.rendering.projection import (
     MAX_ALPHA,
     MIN_TRANSMITTANCE,
@@ -87,12 +87,12 @@ def rasterize(
     """
     empty = scene.means.new_zeros(0, cameras.height, cameras.width, 5)
     images = [partial(_render_one, scene, camera, sh_degree) for camera in to_pinholes(cameras)]
-    return render_each(images, empty, listener)
+    return backends.render_each(images, empty, listener)
 
 
 def contributions(scene: GaussianScene, camera: Cameras) -> Tensor:
     """Return the sum of each Gaussian's weights ``alpha * T`` over one image."""
-    return contributions_by_gradient(rasterize, scene, camera)
+    return backends.contributions_by_gradient(rasterize, scene, camera)
 
 
 def observe(

@@ -26,14 +26,14 @@ from cvtgs.io.atomic import make_folder
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.locks import output_lock
 from cvtgs.io.ply import open_rows
-from cvtgs.mergenet import MergeNet, PublishedMergeNet
+from cvtgs.mergenet import Net
 from cvtgs.outofcore import Workers, available_memory, block_count, check_config
 from cvtgs.outofcore.job import Job, job_folder
 from cvtgs.outofcore.memory import memory_to_plan, sample_rows
 from cvtgs.outofcore.rows import analysis_of, read_rows
 from cvtgs.outofcore.run import rows_per_range
 from cvtgs.outofcore.sort import sort_into_blocks
-from cvtgs.outofcore.workers import begin, nothing_left, sequentially, with_progress
+from cvtgs.outofcore.workers import sequentially, started, with_progress
 from cvtgs.pipeline import Reduced, level_facts, nests_in, reduce_scene
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.scene import GaussianScene
@@ -45,6 +45,7 @@ from cvtgs.streams.files import (
     check_stream,
     join_levels,
     publish,
+    warn_of_losses,
     write_index,
 )
 from cvtgs.streams.plan import CHUNK_GAUSSIANS, near_rows, plan_part
@@ -113,7 +114,7 @@ class StreamJob:
         try:
             part = StreamPart.model_validate_json(self.part_path(block).read_bytes())
             sizes = [_bytes_of(self.folder / name, self.form.kind) for name in part.names]
-            if part.environment is not None and not (self.folder / part.environment).exists():
+            if not all((self.folder / name).exists() for name in part.environments):
                 return None
         except (OSError, ValueError):
             return None
@@ -169,7 +170,8 @@ def stream_file(  # noqa: PLR0913 (options by name)
         environment_radii: Gaussians farther from the centre than this, in robust radii, are the
             environment of a streamed SOG, which all levels share; None for no environment.
         transform: Root transform of 3D Tiles (:func:`cvtgs.streams.geo_transform`).
-        axes: Axes of the input file and of the output.
+        axes: Axes of the input file and of the output; those of 3D Tiles are fixed, so their
+            output must be ``rdf``.
         sh_degree: Highest SH degree to keep; None keeps all.
         simplifier: Configuration and network; None for the defaults.
         workers: Call functions for ranges of the file and for blocks; None calls them one after
@@ -182,7 +184,8 @@ def stream_file(  # noqa: PLR0913 (options by name)
 
     Raises:
         ConfigError: The configuration renders images, which needs the whole scene in memory.
-        InvalidArgumentError: A ratio is out of range, or two ratios give the same size.
+        InvalidArgumentError: A ratio is out of range, two ratios give the same size, or other axes
+            are asked of 3D Tiles.
         InvalidSceneError: No row is valid.
         FileFormatError: The file cannot be read in parts.
         OutputExistsError: The folder holds files that may not be replaced.
@@ -198,6 +201,11 @@ def stream_file(  # noqa: PLR0913 (options by name)
         ...     [len(load(out, lod=lod)) for lod in (0, 1)], report.blocks
         ([2000, 200], 3)
     """
+    if kind == "3dtiles" and axes[1] != SCENE_AXES:
+        raise InvalidArgumentError(
+            f"3D Tiles have axes of their own (z up), so the axes of the output must be "
+            f"{SCENE_AXES}, found {axes[1]!r}."
+        )
     simplifier, workers = simplifier or Simplifier(device="cpu"), workers or sequentially
     check_config(simplifier.config, with_images=False)
     rows = open_rows(source)
@@ -240,6 +248,7 @@ def stream_file(  # noqa: PLR0913 (options by name)
     with output_lock(Path(spec.job.folder).parent):  # commands lock the output folder
         parts, resumed = _run(spec, targets, simplifier, workers, StageClock(listener, HOST))
         write_index(form, parts, spec.folder)
+        warn_of_losses(parts, Path(folder), stacklevel=4)
         publish(spec.folder, Path(folder), kind, overwrite=overwrite)
         shutil.rmtree(Path(spec.job.folder).parent, ignore_errors=True)
     chunks = sum(part.chunks for part in parts)
@@ -256,8 +265,7 @@ def _run(
     """Sort the file and write the missing parts; return all parts and the number resumed."""
     job = spec.job
     resumes = job.has_sorted_rows() and job.path("targets.json").exists()
-    with nothing_left(job, resumes=resumes):
-        begin(job, workers, clock, simplifier.checkpoint, resumes=resumes)
+    with started(job, workers, clock, simplifier.checkpoint, resumes=resumes):
         if not resumes:
             with one_thread():
                 found = sort_into_blocks(job, workers, clock, keep_all=True)
@@ -321,7 +329,7 @@ def reduce_levels(
     targets: Sequence[int],
     config: SimplifyConfig,
     *,
-    net: MergeNet | PublishedMergeNet | None,
+    net: Net | None,
 ) -> list[BlockLevel]:
     """Simplify valid Gaussians to descending sizes; coarse levels merge cells of the finest."""
     found: list[BlockLevel] = []

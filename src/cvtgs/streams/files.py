@@ -4,6 +4,8 @@ import json
 import os
 import re
 import shutil
+import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,9 +13,16 @@ from typing import Any, NamedTuple, Protocol
 
 from cvtgs.boxes import Corner
 from cvtgs.config.base import Record
-from cvtgs.errors import InvalidArgumentError, OutputError, OutputExistsError, reason_of
+from cvtgs.errors import (
+    DroppedDataWarning,
+    InvalidArgumentError,
+    OutputError,
+    OutputExistsError,
+    reason_of,
+)
 from cvtgs.io import atomic_output, check_output
 from cvtgs.io.atomic import make_folder
+from cvtgs.io.limits import phrases
 from cvtgs.progress import ProgressListener
 from cvtgs.streams.plan import StreamPlan, join_boxes
 
@@ -51,7 +60,12 @@ class StreamPart(Record):
         tree: The node of the index that holds the part.
         box_min: Minimum coordinates of its chunks.
         box_max: Maximum coordinates.
-        environment: File with the part's share of the environment; None if it has none.
+        dropped: Data that its files do not hold, as :func:`cvtgs.io.limits.dropped_within`
+            returns them.
+        far: Number of Gaussians of each level that are in no chunk, the finest level first; empty
+            if there are none.
+        environments: Files with them, for each level from the finest that can be the environment
+            to the coarsest.
     """
 
     levels: tuple[StreamLevel, ...]
@@ -60,7 +74,9 @@ class StreamPart(Record):
     tree: dict[str, Any]
     box_min: Corner
     box_max: Corner
-    environment: str | None = None
+    dropped: dict[str, int]
+    far: tuple[int, ...] = ()
+    environments: tuple[str, ...] = ()
 
 
 class StreamFormat(Protocol):
@@ -99,6 +115,7 @@ def write_stream(
     with _hidden_folder(place) as hidden:
         part = form.write_part(plan, hidden, part=0, listener=listener)
         write_index(form, [part], hidden)
+        warn_of_losses([part], place, stacklevel=5)
         publish(hidden, place, form.kind, overwrite=overwrite)
     return part.levels
 
@@ -108,6 +125,20 @@ def write_index(form: StreamFormat, parts: Sequence[StreamPart], folder: Path) -
     content = json.dumps(form.index(parts, folder), separators=(",", ":"))
     with atomic_output(folder / INDEX_NAMES[form.kind], overwrite=True) as file:
         file.write(content.encode())
+
+
+def warn_of_losses(parts: Sequence[StreamPart], place: Path, *, stacklevel: int) -> None:
+    """Warn once of data that the files of the parts do not hold, with the sums of their counts."""
+    dropped = Counter[str]()
+    for part in parts:
+        dropped.update(part.dropped)
+    if dropped:
+        warnings.warn(
+            f"{place}: the files of this stream, all levels together, do not hold "
+            f"{'; '.join(phrases(dropped))}.",
+            DroppedDataWarning,
+            stacklevel=stacklevel,
+        )
 
 
 def join_levels(parts: Sequence[StreamPart]) -> tuple[StreamLevel, ...]:

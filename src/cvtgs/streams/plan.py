@@ -95,14 +95,24 @@ class StreamPlan(NamedTuple):
         levels: The levels, the finest first.
         chunks: The chunks.
         root: Root of the tree.
-        environment: Gaussians that are so far away that they are in no chunk and all levels share
-            them; None if there are none.
+        far: Row numbers in every level of the Gaussians that are so far away that they are in no
+            chunk, the finest level first; empty if there are none.
     """
 
     levels: tuple[StreamedLevel, ...]
     chunks: tuple[StreamChunk, ...]
     root: StreamNode
-    environment: GaussianScene | None = None
+    far: tuple[Int[Tensor, "k"], ...] = ()
+
+    @property
+    def environment(self) -> GaussianScene | None:
+        """The far Gaussians that all levels share; None if there are none."""
+        return self.far_scene(environment_level([*map(len, self.far)])) if self.far else None
+
+    def far_scene(self, level: int) -> GaussianScene:
+        """Return the far Gaussians of a level."""
+        scene = self.levels[level].scene
+        return scene.select(self.far[level].to(scene.device))
 
     @property
     def counts(self) -> tuple[int, ...]:
@@ -187,19 +197,14 @@ def plan_part(
         _rows(own, level.scene, count) for level, own in zip(ordered, of_levels, strict=True)
     ]
     chunks = tuple(_chunk(ordered, rows) for rows in zip(*members, strict=True))
-    environment = None if bool(near.all()) else _environment(ordered, of_levels)
-    return StreamPlan(tuple(ordered), chunks, _node(tree, chunks), environment)
+    far = () if bool(near.all()) else tuple((own < 0).nonzero()[:, 0] for own in of_levels)
+    return StreamPlan(tuple(ordered), chunks, _node(tree, chunks), far)
 
 
-def _environment(
-    levels: Sequence[StreamedLevel], labels: Sequence[Int[Tensor, "m"]]
-) -> GaussianScene:
-    """Return the Gaussians in no chunk, from the finest level with few enough of them."""
-    far = [(own < 0).nonzero()[:, 0] for own in labels]
-    fitting = (level for level, rows in enumerate(far) if len(rows) <= ENVIRONMENT_GAUSSIANS)
-    level = next(fitting, len(levels) - 1)
-    scene = levels[level].scene
-    return scene.select(far[level].to(scene.device))
+def environment_level(far: Sequence[int]) -> int:
+    """Return the finest level with few enough far Gaussians, by their numbers at each level."""
+    fitting = (level for level, count in enumerate(far) if 0 < count <= ENVIRONMENT_GAUSSIANS)
+    return next(fitting, max(0, len(far) - 1))
 
 
 def _parents(level: StreamedLevel, coarsest: StreamedLevel) -> Int[Tensor, "m"]:

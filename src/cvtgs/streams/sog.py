@@ -1,6 +1,7 @@
 """Write a streamed SOG: ``lod-meta.json`` of version 1 and the SOGs that it names."""
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from cvtgs.boxes import Corner
 from cvtgs.devices import on_host
 from cvtgs.io import atomic_output, load, save
 from cvtgs.io.atomic import make_folder
+from cvtgs.io.limits import FORMAT_LIMITS, dropped_within
 from cvtgs.io.sog import encode_sog
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.scene import GaussianScene, concatenate
@@ -24,7 +26,7 @@ from cvtgs.streams.files import (
     join_trees,
     write_stream,
 )
-from cvtgs.streams.plan import StreamNode, StreamPlan
+from cvtgs.streams.plan import StreamNode, StreamPlan, environment_level
 
 __all__ = ["write_sog_stream"]
 
@@ -61,20 +63,24 @@ class SogFormat:
     ) -> StreamPart:
         """Write the chunks of a level consecutively, so that nearby chunks share a file."""
         units = list(_units(plan, part, self.file_gaussians))
-        sizes = [0] * len(plan.levels)
+        sizes, dropped = [0] * len(plan.levels), Counter[str]()
         for number, unit in enumerate(units):
             scene = plan.levels[unit.level].scene
             part_of = scene.select(unit.rows.to(scene.device))
             sizes[unit.level] += _write_sog(part_of, folder / unit.name)
+            dropped.update(dropped_within(part_of, FORMAT_LIMITS[".sog"]))
             listener(ProgressEvent(stage="write", done=number + 1, total=len(units)))
         levels = tuple(
             StreamLevel(count, sum(unit.level == number for unit in units), size)
             for number, (count, size) in enumerate(zip(plan.counts, sizes, strict=True))
         )
-        environment = None
-        if plan.environment is not None:
-            environment = f".environment_{part}.ply"
-            save(plan.environment, folder / environment, overwrite=True)
+        far = tuple(map(len, plan.far))
+        environments = {
+            f".environment_{part}_{level}.ply": plan.far_scene(level)
+            for level in range(environment_level(far), len(far))
+        }
+        for name, scene in environments.items():
+            save(scene, folder / name, overwrite=True)
         return StreamPart(
             levels=levels,
             chunks=len(plan.chunks),
@@ -82,7 +88,9 @@ class SogFormat:
             tree=_tree(plan, units),
             box_min=plan.root.box_min,
             box_max=plan.root.box_max,
-            environment=environment,
+            dropped=dropped,
+            far=far,
+            environments=tuple(environments),
         )
 
     def index(self, parts: Sequence[StreamPart], folder: Path) -> dict[str, Any]:
@@ -91,10 +99,10 @@ class SogFormat:
         before = [0]
         for part in parts:
             before.append(before[-1] + len(part.names))
-        far = [folder / part.environment for part in parts if part.environment is not None]
+        scenes = [load(folder / name, trust_sizes=True) for name in _far_files(parts)]
         more = {}
-        if far:
-            _write_sog(concatenate([load(path, trust_sizes=True) for path in far]), folder / _FAR)
+        if scenes:
+            _write_sog(concatenate(scenes), folder / _FAR)
             more = {"environment": f"{_FAR}/meta.json"}
         return {
             "version": 1,
@@ -151,6 +159,14 @@ def write_sog_stream(
     """
     form = SogFormat(file_gaussians=file_gaussians)
     return write_stream(form, plan, folder, overwrite=overwrite, listener=listener)
+
+
+def _far_files(parts: Sequence[StreamPart]) -> list[str]:
+    """Return the files with the environment, at the finest level that fits for all parts."""
+    with_far = [part for part in parts if part.far]
+    counts = [sum(level) for level in zip(*(part.far for part in with_far), strict=True)]
+    level = environment_level(counts)
+    return [part.environments[level - len(counts)] for part in with_far if part.far[level]]
 
 
 def _write_sog(scene: GaussianScene, folder: Path) -> int:

@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ from cvtgs.io import atomic_output
 from cvtgs.io.axes import SCENE_AXES, change_axes
 from cvtgs.io.gltf import write_spz_glb
 from cvtgs.io.gltf.document import AXES, SPLATS, SPZ
+from cvtgs.io.limits import FORMAT_LIMITS, dropped_within
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.streams.files import StreamLevel, StreamPart, join_trees, write_stream
 from cvtgs.streams.plan import StreamNode, StreamPlan, join_boxes
@@ -66,6 +68,7 @@ class TilesFormat:
         tiles = list(_listed(root))
         names = {id(tile): f"{part}_{number}.glb" for number, tile in enumerate(tiles)}
         counts, files, sizes = ([0] * len(plan.levels) for _ in range(3))
+        dropped = Counter[str]()
         for number, tile in enumerate(tiles):
             scene = plan.levels[tile.level].scene
             rows = torch.cat([plan.chunks[chunk].rows[tile.level] for chunk in tile.chunks])
@@ -73,6 +76,7 @@ class TilesFormat:
             path = folder / names[id(tile)]
             with atomic_output(path, overwrite=True) as file:
                 write_spz_glb(turned, file)
+            dropped.update(dropped_within(turned, FORMAT_LIMITS[".spz.glb"]))
             counts[tile.level] += len(rows)
             files[tile.level] += 1
             sizes[tile.level] += path.stat().st_size
@@ -84,6 +88,7 @@ class TilesFormat:
             tree=_entry(plan, root, names),
             box_min=plan.root.box_min,
             box_max=plan.root.box_max,
+            dropped=dropped,
         )
 
     def index(self, parts: Sequence[StreamPart], folder: Path) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.devices import chosen_device, device_name
 from cvtgs.errors import RunError
 from cvtgs.evaluation import Comparison, EvaluationSettings, compare
-from cvtgs.evaluation.report import mean_of
+from cvtgs.evaluation.scorer import mean_of
 from cvtgs.io import load, scene_size
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.scene import GaussianScene

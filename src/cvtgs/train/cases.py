@@ -20,7 +20,7 @@ from cvtgs.grouping import allocate, collect_cells, tessellate_rows, weigh_rows
 from cvtgs.io import load_cameras
 from cvtgs.mergenet import (
     MergeNet,
-    PublishedMergeNet,
+    Net,
     Residuals,
     compose,
     compose_published,
@@ -134,7 +134,7 @@ class Case:
             residuals=residuals,
         )
 
-    def correct_by(self, net: MergeNet | PublishedMergeNet) -> GaussianScene:
+    def correct_by(self, net: Net) -> GaussianScene:
         """Return the whole simplified scene with its cells corrected by a network."""
         if isinstance(net, MergeNet):
             return self.correct_scene(net(self.descriptors))

@@ -11,6 +11,7 @@ from cvtgs.errors import ConfigError
 Ratio = Annotated[float, pydantic.Field(gt=0.0, lt=1.0)]
 Count = Annotated[int, pydantic.Field(ge=1)]
 Side = Annotated[int, pydantic.Field(ge=11)]  # at least an SSIM window, pixels
+Some = pydantic.Field(min_length=1)
 
 
 class DataConfig(Section):
@@ -38,12 +39,12 @@ class DataConfig(Section):
     validation: tuple[str, ...] = ()
     generated: int = pydantic.Field(default=4, ge=0)
     generated_validation: int = pydantic.Field(default=1, ge=0)
-    generated_counts: tuple[Count, ...] = (20_000, 40_000, 60_000, 80_000)
+    generated_counts: Annotated[tuple[Count, ...], Some] = (20_000, 40_000, 60_000, 80_000)
     blocks: int = pydantic.Field(default=4, ge=0)
     block_count: Count = 60_000
     copies: int = pydantic.Field(default=0, ge=0)
-    ratios: tuple[Ratio, ...] = (0.15, 0.06, 0.02, 0.008, 0.003, 0.001)
-    validation_ratios: tuple[Ratio, ...] = (0.1, 0.01, 0.001)
+    ratios: Annotated[tuple[Ratio, ...], Some] = (0.15, 0.06, 0.02, 0.008, 0.003, 0.001)
+    validation_ratios: Annotated[tuple[Ratio, ...], Some] = (0.1, 0.01, 0.001)
     largest_scene: Count = 130_000
 
 
@@ -60,7 +61,7 @@ class ViewsConfig(Section):
     """
 
     count: Count = 16
-    sizes: tuple[Side, ...] = (256, 448)
+    sizes: Annotated[tuple[Side, ...], Some] = (256, 448)
     per_step: Count = 2
     crop: Side = 256
     validation_count: Count = 8
@@ -72,7 +73,8 @@ class LossConfig(Section):
 
     ``mse_weight log(mse) + image_weight log(loss of CVT-GS) + ssim_weight log(1 - SSIM)
     + residual_weight * size of the residuals``.
-    With logarithms, every scene, ratio and view has the same weight, as in a mean of PSNR.
+    With logarithms, every scene, ratio and view has the same weight, as in a mean of PSNR. One of
+    the first three weights must be above 0, but for a ``published`` training, which ignores them.
 
     Attributes:
         mse_weight: Weight of the logarithm of the mean squared error.
@@ -143,6 +145,17 @@ class TrainConfig(Section):
     data: DataConfig = DataConfig()
     views: ViewsConfig = ViewsConfig()
     loss: LossConfig = LossConfig()
+
+    @pydantic.model_validator(mode="after")
+    def _check_loss(self) -> Self:
+        loss = self.loss
+        weights = (loss.mse_weight, loss.image_weight, loss.ssim_weight)
+        if self.kind != "published" and not any(weights):
+            raise ConfigError(
+                "loss: one of mse_weight, image_weight and ssim_weight must be above 0, found 0 "
+                "for all."
+            )
+        return self
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:

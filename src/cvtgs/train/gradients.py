@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from cvtgs.devices import thread_count
-from cvtgs.mergenet import MergeNet, PublishedMergeNet
+from cvtgs.mergenet import Net, PublishedMergeNet
 from cvtgs.processes import LocalWorkers
 from cvtgs.train.cache import prepare_scene
 from cvtgs.train.cases import Case, DeviceCopies, TargetViews
@@ -20,7 +20,6 @@ from cvtgs.train.config import TrainConfig
 from cvtgs.train.losses import local_loss, published_loss, scene_loss
 from cvtgs.train.sources import find_sources
 
-Net = MergeNet | PublishedMergeNet
 CaseWithViews = tuple[Case, tuple[TargetViews, ...]]
 
 

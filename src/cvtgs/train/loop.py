@@ -9,15 +9,20 @@ from pathlib import Path
 import torch
 
 import cvtgs
-from cvtgs.errors import ConfigError, MissingDependencyError, TrainingError
+from cvtgs.errors import (
+    CheckpointError,
+    ConfigError,
+    InvalidSceneError,
+    MissingDependencyError,
+    TrainingError,
+)
 from cvtgs.io import atomic_output
 from cvtgs.io.atomic import make_folder
 from cvtgs.mergenet import (
     Architecture,
     CheckpointInfo,
-    MergeNet,
+    Net,
     PublishedArchitecture,
-    PublishedMergeNet,
     build_network,
     load_checkpoint,
     save_checkpoint,
@@ -97,7 +102,8 @@ def train(
     Args:
         config: The settings.
         files: Output files; checkpoint, state and curves are replaced during training.
-        resume: Whether to resume from ``files.state`` if it exists.
+        resume: Whether to resume from ``files.state`` if it exists. All settings but ``note`` and
+            ``patience``, the scenes and the start must be the same; their paths may differ.
         device: Device to train on.
         listener: Called for each prepared scene and each step.
         on_validation: Called after each validation.
@@ -107,7 +113,9 @@ def train(
 
     Raises:
         ConfigError: There are no scenes to train on or to validate with.
-        CheckpointError: The start checkpoint or the state to resume from cannot be used.
+        CheckpointError: The start checkpoint or the state to resume from cannot be used, or the
+            checkpoint to continue is missing and the state does not hold its network.
+        InvalidSceneError: A scene cannot be used; the message names it.
         TrainingError: The loss is not finite; the message names the scene and the last good file.
         OutputError: A file cannot be written.
 
@@ -137,6 +145,7 @@ def train(
     state = TrainState(_first_net(config).to(device), config, origins)
     if resume and files.state.is_file():
         state.load(files.state, config)
+        _restore_checkpoint(state, config, files)
     make_folder(files.cache)
     cases, validation_scenes = _prepare_scenes(sources, config, files.cache, listener)
     if config.kind != "published":
@@ -158,7 +167,7 @@ def train(
     return state.history
 
 
-def _first_net(config: TrainConfig) -> MergeNet | PublishedMergeNet:
+def _first_net(config: TrainConfig) -> Net:
     shape = _shape(config)
     if config.start is not None:
         net = copy.deepcopy(load_checkpoint(config.start).net).requires_grad_(True).train()
@@ -189,7 +198,10 @@ def _prepare_scenes(
     cases, validation_scenes = [], []
     for number, source in enumerate(sources):
         listener(ProgressEvent(stage="prepare", done=number, total=len(sources)))
-        scene = prepare_scene(source, config, cache)
+        try:
+            scene = prepare_scene(source, config, cache)
+        except InvalidSceneError as error:
+            raise InvalidSceneError(f"scene {source.name}: {error}") from error
         if source.is_validation:
             validation_scenes.append(scene)
         else:
@@ -207,7 +219,7 @@ def _prepare_scenes(
 
 def _step(
     state: TrainState,
-    compute: Callable[[MergeNet | PublishedMergeNet, int], list[CaseGradient]],
+    compute: Callable[[Net, int], list[CaseGradient]],
     config: TrainConfig,
     files: TrainFiles,
 ) -> float:
@@ -254,8 +266,7 @@ def _validate(
     history = state.history
     history.validations.append(Validation(step=state.step, loss=loss, gains=tuple(gains)))
     if config.keep == "last" or history.since_best() == 0:
-        with atomic_output(files.checkpoint, overwrite=True) as file:
-            file.write(save_checkpoint(state.mean_net, _description(state, config)))
+        _write_checkpoint(state, config, files)
     state.save(files.state, config)
     try:
         curves = history.curves()
@@ -263,6 +274,23 @@ def _validate(
         return  # do not lose hours of training for a plot
     with atomic_output(files.curves, overwrite=True) as file:
         file.write(curves)
+
+
+def _restore_checkpoint(state: TrainState, config: TrainConfig, files: TrainFiles) -> None:
+    """Write a missing checkpoint again; raise if its network is not that of the state."""
+    if files.checkpoint.is_file():
+        return
+    if config.keep == "best" and state.history.since_best() > 0:
+        raise CheckpointError(
+            f"{files.checkpoint}: the network of the best validation is missing, and {files.state} "
+            f"holds only a later one; restore the file, or train to another output."
+        )
+    _write_checkpoint(state, config, files)
+
+
+def _write_checkpoint(state: TrainState, config: TrainConfig, files: TrainFiles) -> None:
+    with atomic_output(files.checkpoint, overwrite=True) as file:
+        file.write(save_checkpoint(state.mean_net, _description(state, config)))
 
 
 def _description(state: TrainState, config: TrainConfig) -> CheckpointInfo:
@@ -276,6 +304,6 @@ def _description(state: TrainState, config: TrainConfig) -> CheckpointInfo:
         steps=state.step,
         version=cvtgs.__version__,
         config=settings,
-        start="" if config.start is None else load_checkpoint(config.start).digest,
+        start=state.start,
         scenes=state.scenes,
     )

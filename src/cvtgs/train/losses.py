@@ -20,6 +20,7 @@ from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.math.segments import segment_ids, true_rows
 from cvtgs.mergenet import (
     MergeNet,
+    Net,
     PublishedMergeNet,
     Residuals,
     compose_published,
@@ -130,7 +131,8 @@ def _predict(net: MergeNet, case: Case) -> Residuals:
     near = case.descriptors.pairs.shape[1]
     length = chunk_length(CHUNK_MEMBERS, case.cells.device)
     chunks = case.descriptors.part.chunks(length, cell_cost=near)
-    parts = [net(case.descriptors.cut(run)) for run, _ in chunks]
+    numbers = torch.arange(len(case.cells), device=case.cells.device)
+    parts = [net(case.descriptors.select(numbers[run])) for run, _ in chunks]
     return Residuals(
         **{
             field.name: torch.cat([getattr(part, field.name) for part in parts])
@@ -210,9 +212,7 @@ def view_loss(
 
 
 @torch.no_grad()
-def validation_psnr(
-    net: MergeNet | PublishedMergeNet, case: Case, views: TargetViews
-) -> tuple[float, float]:
+def validation_psnr(net: Net, case: Case, views: TargetViews) -> tuple[float, float]:
     """Return the mean PSNR over grey without and with the network, in decibels."""
     merged = case.reference.merged
     grey = merged.means.new_full((3,), 0.5)

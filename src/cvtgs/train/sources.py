@@ -188,6 +188,7 @@ def perturb(scene: GaussianScene, rng: random.Random) -> GaussianScene:
     generator = torch.Generator().manual_seed(rng.getrandbits(62))
     share = rng.uniform(0.4, 1.0)
     kept = scene.select(torch.rand(len(scene), generator=generator) < share)
+    kept = kept if len(kept) else scene
     stretch = torch.tensor([rng.uniform(0.6, 1.5) for _ in range(3)], dtype=scene.dtype)
     wider = share ** (-1 / 3)
     quats = parameters.normalize_quats(kept.quats.double())

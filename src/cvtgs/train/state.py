@@ -14,7 +14,7 @@ from torch import Tensor
 import cvtgs
 from cvtgs.errors import CheckpointError
 from cvtgs.io.tensors import add_prefix, map_tensors, save_tensors, under_prefix
-from cvtgs.mergenet import LearnedScene, MergeNet, PublishedMergeNet
+from cvtgs.mergenet import LearnedScene, MergeNet, Net, load_checkpoint
 from cvtgs.plots import Panel, Series, line_chart
 from cvtgs.train.config import TrainConfig
 
@@ -165,7 +165,7 @@ class TrainState:
 
     def __init__(
         self,
-        net: MergeNet | PublishedMergeNet,
+        net: Net,
         config: TrainConfig,
         scenes: Iterable[LearnedScene] = (),
     ) -> None:
@@ -176,6 +176,7 @@ class TrainState:
         )
         self.history = History()
         self.scenes = tuple(scenes)
+        self.start = "" if config.start is None else load_checkpoint(config.start).digest
         self.step = 0
         self.averaged_steps = config.averaged_steps
 
@@ -201,7 +202,7 @@ class TrainState:
         record = {
             "step": self.step,
             "history": self.history.to_json(),
-            "config": _fingerprint(config),
+            "config": _fingerprint(config, self.start),
             "version": cvtgs.__version__,
             "scenes": [scene.model_dump() for scene in self.scenes],
         }
@@ -212,12 +213,9 @@ class TrainState:
         try:
             tensors, metadata = map_tensors(path)
             record = json.loads(metadata["state"])
-            if record["config"] != _fingerprint(config):
-                raise CheckpointError(
-                    f"{path}: the state belongs to a training run with another configuration; "
-                    f"remove it, or train to another output."
-                )
-            self._check_origin(path, record["version"], record["scenes"])
+            _check_version(path, record["version"])
+            self._check_settings(path, record["config"], config)
+            self._check_scenes(path, record["scenes"])
             # Mapped tensors must not be written to, and the optimiser does not copy them: clone.
             self._load_tensors({name: values.clone() for name, values in tensors.items()})
             self.step = int(record["step"])
@@ -229,13 +227,23 @@ class TrainState:
                 f"{path}: the training state is damaged; remove it, or train to another output."
             ) from error
 
-    def _check_origin(self, path: Path, version: str, scenes: list[dict[str, Any]]) -> None:
-        """Raise an error for another version or other scenes: a checkpoint names one of each."""
-        if version != cvtgs.__version__:
+    def _check_settings(self, path: Path, theirs: dict[str, Any], config: TrainConfig) -> None:
+        """Raise an error for other settings, which names the first one that differs."""
+        ours = _fingerprint(config, self.start)
+        if set(theirs) != set(ours):
             raise CheckpointError(
-                f"{path}: the state was written by cvtgs {version}, but this is "
-                f"{cvtgs.__version__}; remove it, or train to another output."
+                f"{path}: the state was written by another version of cvtgs, which has other "
+                f"settings; remove it, or train to another output."
             )
+        odd = [key for key in ours if theirs[key] != ours[key]]
+        if odd:
+            raise CheckpointError(
+                f"{path}: the state belongs to a training run with another configuration "
+                f"({odd[0]} differs); restore the setting, or train to another output."
+            )
+
+    def _check_scenes(self, path: Path, scenes: list[dict[str, Any]]) -> None:
+        """Raise an error for other scenes, which the checkpoint would not name."""
         theirs = {LearnedScene.model_validate(scene) for scene in scenes}
         odd = sorted(scene.name for scene in theirs ^ set(self.scenes))
         if self.scenes and odd:
@@ -254,6 +262,25 @@ class TrainState:
         self.optimizer.load_state_dict(state)
 
 
-def _fingerprint(config: TrainConfig) -> dict[str, Any]:
-    """Return the settings that must not change between start and resume."""
-    return config.model_dump(mode="json", exclude={"note", "patience", "keep"})
+def _check_version(path: Path, version: str) -> None:
+    """Raise an error for another version: a checkpoint names one."""
+    if version != cvtgs.__version__:
+        raise CheckpointError(
+            f"{path}: the state was written by cvtgs {version}, but this is {cvtgs.__version__}; "
+            f"remove it, or train to another output."
+        )
+
+
+def _fingerprint(config: TrainConfig, start: str) -> dict[str, Any]:
+    """Return the settings that must not change between start and resume, by dotted key."""
+    # Paths may change: the scenes and the digest of the start are compared instead.
+    values = config.model_dump(
+        mode="json", exclude={"note": True, "patience": True, "data": {"folders"}}
+    )
+    settings: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            settings |= {f"{key}.{name}": inner for name, inner in value.items()}
+        else:
+            settings[key] = value
+    return settings | {"start": start}

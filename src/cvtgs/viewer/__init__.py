@@ -1,7 +1,6 @@
 """A browser page that shows a scene while the user chooses its size."""
 
-from cvtgs.viewer.nodes import check_viewer, scene_page
 from cvtgs.viewer.scenes import SceneViewer, ShownScene, camera_of
-from cvtgs.viewer.server import ViewerServer
+from cvtgs.viewer.server import ViewerServer, check_viewer, scene_page
 
 __all__ = ["SceneViewer", "ShownScene", "ViewerServer", "camera_of", "check_viewer", "scene_page"]

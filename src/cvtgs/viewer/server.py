@@ -1,28 +1,196 @@
-"""The server of the page, with a slider of rho, presets, scores and saving."""
+"""Serve a page with viser: the nodes of its scenes, the controls, and the simplification."""
 
+import io
 import math
+import socket
 import threading
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout, suppress
 from typing import TYPE_CHECKING, Any
 
-from cvtgs.config import PRESETS
-from cvtgs.errors import CvtgsError
+import torch
+
+from cvtgs.config import PRESETS, SimplifyConfig
+from cvtgs.counts import target_count
+from cvtgs.errors import (
+    CvtgsError,
+    InvalidArgumentError,
+    MissingDependencyError,
+    how_to_install,
+    reason_of,
+)
+from cvtgs.math.frames import robust_frame
+from cvtgs.math.parameters import build_covariances, normalize_quats
+from cvtgs.math.spherical_harmonics import SH_C0
 from cvtgs.scene import GaussianScene
 from cvtgs.text import printable
-from cvtgs.viewer.nodes import SceneNode, look_at, record_page, start_server, stop_server
+from cvtgs.validity import valid_part
 from cvtgs.viewer.scenes import FULL, SIMPLIFIED, SceneViewer, camera_of
+from cvtgs.views import automatic_views
+from cvtgs.views.layout import find_layout
 
 if TYPE_CHECKING:
     import viser
 
+__all__ = ["check_viewer", "scene_page"]
+
+Point = tuple[float, float, float]
+
+_FLIP_SECONDS = 2.0
+"""Seconds for which a standalone page shows each scene."""
+
+_ANY_PORT = 8999
+"""First port tried for the temporary server that records a standalone page."""
+
+_ABOVE = 0.85
+"""Height of labels in the initial view, as a share of half the image; all scenes share it."""
+
 __all__ = ["ViewerServer"]
 
 SLIDER = (-3.5, 0.0, 0.05)
-"""Range of the slider in log10 of rho: minimum, maximum, step."""
+"""Range of the slider in log10 of rho: minimum, maximum, step. It starts lower if need be."""
 
 _GIVE_UP = 0.5
 """Seconds between checks whether the server was closed."""
+
+
+def scene_page(scenes: Mapping[str, GaussianScene]) -> str:
+    """Return a standalone page with a 3D viewer, whose time line flips between scenes.
+
+    Colours are those of the constant SH band.
+
+    Args:
+        scenes: The scenes by name; the camera starts at a good view of the first.
+
+    Returns:
+        HTML that needs no server and fetches nothing.
+
+    Raises:
+        MissingDependencyError: viser is not installed.
+    """
+    server = start_server("127.0.0.1", _ANY_PORT)
+    try:
+        place = look_at(server, next(iter(scenes.values())))
+        nodes = {
+            name: SceneNode(server, name, f"/scene {k}", label=place)
+            for k, name in enumerate(scenes)
+        }
+        for name, scene in scenes.items():
+            nodes[name].draw(scene, visible=False)
+        return record_page(server, list(nodes.values()))
+    finally:
+        stop_server(server)
+
+
+class SceneNode:
+    """A scene on a server, and a label with its name that is shown and hidden with it."""
+
+    def __init__(self, server: "viser.ViserServer", name: str, path: str, *, label: Point) -> None:
+        self._server, self._name, self._path, self._label = server, name, path, label
+        self._splats: Any = None
+
+    def draw(self, scene: GaussianScene, *, visible: bool) -> None:
+        """Draw a scene in place of the current one."""
+        part = valid_part(scene).to("cpu")
+        covariances = build_covariances(part.scales, normalize_quats(part.quats))
+        self._splats = self._server.scene.add_gaussian_splats(
+            self._path,
+            centers=part.means.float().numpy(),
+            covariances=covariances.float().numpy(),
+            rgbs=(0.5 + SH_C0 * part.sh0[:, 0]).clamp(0, 1).float().numpy(),
+            opacities=part.opacities[:, None].float().numpy(),
+            visible=visible,
+        )
+        self._server.scene.add_label(
+            f"{self._path}/name", f"{self._name}: {len(part):,} Gaussians", position=self._label
+        )
+
+    def show(self, visible: bool) -> None:
+        """Show or hide the scene and its label."""
+        self._splats.visible = visible
+
+
+def record_page(server: "viser.ViserServer", nodes: Sequence[SceneNode]) -> str:
+    """Record the scenes one after the other, and return the page."""
+    recorder = server.get_scene_serializer()
+    for shown in nodes:
+        for node in nodes:
+            node.show(node is shown)
+        recorder.insert_sleep(_FLIP_SECONDS)
+    return str(recorder.as_html(dark_mode=True))
+
+
+def look_at(server: "viser.ViserServer", scene: GaussianScene) -> Point:
+    """Set up and the initial camera to a good view; return the place of labels in it."""
+    scene = scene.to("cpu")
+    up = find_layout(scene).up
+    axis = int(up.abs().argmax())
+    server.scene.set_up_direction(f"{'+' if up[axis] > 0 else '-'}{'xyz'[axis]}")
+    camera = automatic_views(scene, 1)
+    rotation, center = camera.viewmats[0, :3, :3], camera.centers[0]
+    depth = float(rotation[2] @ (robust_frame(scene.means).center.cpu().double() - center))
+    depth = max(depth, 1e-3)
+    target, half = center + rotation[2] * depth, camera.height / 2 / float(camera.Ks[0, 1, 1])
+    server.initial_camera.position = _three(center)
+    server.initial_camera.look_at = _three(target)
+    server.initial_camera.fov = 2 * math.atan(half)
+    return _three(target - rotation[1] * (_ABOVE * half * depth))
+
+
+def _three(point: torch.Tensor) -> Point:
+    x, y, z = point.tolist()
+    return x, y, z
+
+
+def start_server(host: str, port: int) -> "viser.ViserServer":
+    module = _viser()
+    _check_host(host)  # viser would wait for ever
+    with redirect_stdout(io.StringIO()):  # viser prints even if verbose is False
+        server: viser.ViserServer = module.ViserServer(
+            host=host, port=port, label="cvtgs", verbose=False
+        )
+    return server
+
+
+def _check_host(host: str) -> None:
+    """Raise unless this machine can listen on an address."""
+    try:
+        family, kind, *_, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.bind(address)
+    except (OSError, UnicodeError) as error:
+        raise InvalidArgumentError(
+            f"host must be an address or a name of this machine, found {host!r}: "
+            f"{reason_of(error)}."
+        ) from error
+
+
+def stop_server(server: "viser.ViserServer") -> None:
+    with redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def check_viewer() -> None:
+    """Check that pages can be served, before scenes are read.
+
+    Raises:
+        MissingDependencyError: viser is not installed.
+    """
+    _viser()
+
+
+def _viser() -> Any:
+    try:
+        import viser  # noqa: PLC0415 (optional)
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"the viewer needs the package viser; {how_to_install('cvtgs[view]')}."
+        ) from error
+    return viser
+
+
+if TYPE_CHECKING:
+    import viser
 
 
 class ViewerServer:
@@ -35,11 +203,12 @@ class ViewerServer:
         host: Address to listen on.
         port: Port to listen on; if it is taken, the next free one.
         preset: Preset to start with.
-        rho: Ratio to start with, in (0, 1].
+        rho: Ratio to start with, in (0, 1]; it is exact until the slider is moved.
 
     Raises:
         MissingDependencyError: viser is not installed.
         ConfigError: The preset does not exist.
+        InvalidArgumentError: The ratio is out of range, or the host is not this machine.
     """
 
     def __init__(
@@ -51,15 +220,19 @@ class ViewerServer:
         preset: str = "draft",
         rho: float = 0.1,
     ) -> None:
+        SimplifyConfig.compose(preset=preset)
+        target_count(1, rho)
         self._viewer, self._wanted = viewer, threading.Event()
+        self._start: float | None = rho
+        self._error: CvtgsError | None = None
         self._closed, self._first = False, threading.Event()
         self._server = start_server(host, port)
         self._label = look_at(self._server, viewer.scenes[FULL].scene)
         gui, low, high, step = self._server.gui, *SLIDER
         self._facts = gui.add_markdown("")
-        start = min(max(math.log10(rho), low), high)
+        start = round(math.log10(rho) / step) * step
         self._slider = gui.add_slider(
-            "log10 of rho", min=low, max=high, step=step, initial_value=round(start / step) * step
+            "log10 of rho", min=min(low, start), max=high, step=step, initial_value=start
         )
         presets = tuple(PRESETS)
         self._preset = gui.add_dropdown("preset", presets, initial_value=preset)
@@ -70,7 +243,7 @@ class ViewerServer:
         self._path = gui.add_text("file", "small.ply")
         keep = gui.add_button("save this scene")
         self._notes = gui.add_markdown("")
-        self._slider.on_update(lambda _: self._wanted.set())
+        self._slider.on_update(lambda _: self._move())
         self._preset.on_update(lambda _: self._wanted.set())
         self._shown.on_update(lambda _: self._show())
         score.on_click(self._score)
@@ -104,8 +277,14 @@ class ViewerServer:
             self._worker.join(timeout=_GIVE_UP)
 
     def finish(self) -> None:
-        """Wait until the first simplified scene is shown, or is known to fail."""
+        """Wait until the first simplified scene is shown.
+
+        Raises:
+            CvtgsError: It cannot be computed.
+        """
         self._first.wait()
+        if self._error is not None:
+            raise self._error
 
     def close(self) -> None:
         """Stop the server."""
@@ -120,15 +299,20 @@ class ViewerServer:
             self._wanted.wait()
             self._wanted.clear()
             if not self._closed:
-                self._try(self._simplify)
+                self._error = self._try(self._simplify)
                 is_first = not self._first.is_set()
                 self._first.set()
                 if is_first and not (self._wanted.is_set() or self._closed):
                     with suppress(CvtgsError):  # the next run reports it
                         self._viewer.warm_up(self._preset.value)
 
+    def _move(self) -> None:
+        """Take the ratio from the slider."""
+        self._start = None
+        self._wanted.set()
+
     def _simplify(self) -> str:
-        rho = min(1.0, 10.0**self._slider.value)
+        rho = self._start or min(1.0, 10.0**self._slider.value)
         self._facts.content = f"simplifying to {rho:.4g} ..."
         small = self._viewer.simplify(self._preset.value, rho)
         self._draw(SIMPLIFIED, small.scene)
@@ -159,9 +343,11 @@ class ViewerServer:
     def _save(self) -> str:
         return self._viewer.save(self._shown.value, self._path.value.strip())
 
-    def _try(self, action: Callable[[], str]) -> None:
-        """Run an action, and show its result or its error on the page."""
+    def _try(self, action: Callable[[], str]) -> CvtgsError | None:
+        """Run an action, and show its result or its error, which is returned, on the page."""
         try:
             self._notes.content = printable(action())
         except CvtgsError as error:
             self._notes.content = f"**{printable(str(error))}**"
+            return error
+        return None

@@ -12,7 +12,7 @@ from cvtgs.errors import InvalidSceneError
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import divide
 from cvtgs.scene import GaussianScene
-from cvtgs.validity import valid_rows, with_finite_opacities
+from cvtgs.validity import valid_part, with_finite_opacities
 from cvtgs.views.up import VOXEL_SIZE, Voxels, among_others, find_floor, find_up, voxelize
 
 ENCLOSED = 0.7
@@ -219,7 +219,7 @@ def find_layout(scene: GaussianScene) -> SceneLayout:
 
     Memory: a mask per attribute, and a sample of at most 30,000 Gaussians.
     """
-    valid = valid_part(scene)
+    valid = viewable_part(scene)
     sample, _ = covering_sample(valid, SAMPLE_SIZE)
     positions = _visible_positions(valid)
     frame = robust_frame(positions)
@@ -268,14 +268,14 @@ def level_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor
     return right, torch.linalg.cross(right, up)
 
 
-def valid_part(scene: GaussianScene) -> GaussianScene:
+def viewable_part(scene: GaussianScene) -> GaussianScene:
     """Return the valid rows of a scene that has some."""
-    valid = valid_rows(scene)
-    if not bool(valid.any()):
+    part = valid_part(scene)
+    if len(part) == 0:
         raise InvalidSceneError(
             f"automatic views need a scene with valid Gaussians; none of {len(scene)} is valid."
         )
-    return scene if bool(valid.all()) else scene.select(valid)
+    return part
 
 
 def _visible_positions(scene: GaussianScene) -> Float[Tensor, "k 3"]:

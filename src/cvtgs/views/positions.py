@@ -1,4 +1,4 @@
-"""Plausible camera positions in a scene: above its floor, and not inside matter."""
+"""Plausible camera positions in a scene: above its floor, not inside matter, not behind clutter."""
 
 import math
 from dataclasses import dataclass
@@ -8,21 +8,30 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from cvtgs.cameras import Cameras
 from cvtgs.counts import check_whole
 from cvtgs.errors import InvalidArgumentError
-from cvtgs.scene import SceneLike, as_scene
+from cvtgs.scene import GaussianScene, SceneLike, as_scene
 from cvtgs.text import shown
-from cvtgs.views.clutter import split_by_clutter
 from cvtgs.views.layout import (
     ENCLOSED,
     FREE,
     SceneLayout,
+    covering_sample,
     enclosure,
     find_layout,
     level_axes,
     size_growth,
+    viewable_part,
 )
-from cvtgs.views.scoring import PIXELS, SMOOTH, cameras_at, splat_sizes
+from cvtgs.views.scoring import (
+    PIXELS,
+    SMOOTH,
+    cameras_at,
+    measure_splats,
+    splat_sizes,
+    splat_widths,
+)
 
 REACH = (0.2, 3.0)
 """Range of distances of candidate positions, in robust radii from the centre of the frame."""
@@ -53,6 +62,26 @@ _OUTSIDE = 1.1
 
 _SIDE_DISTANCE, _SIDE_FIELD = 2.2, 50.0
 """Distance of the cameras that check sides, robust radii, and their field of view, degrees."""
+
+_ASKED = 32
+
+_MEASURED = (16, 64)
+"""Numbers of positions to look closely from: first a few, then more where these see clutter."""
+
+_SAMPLE = 60_000
+
+_FEW = 20_000
+"""Scenes of fewer Gaussians are coarse from everywhere."""
+
+_COARSE = 2.0
+"""The finest tenth of an image of clutter is over this many times that of clear images."""
+
+_SUSPECT, _SUSPECTED = 0.03, 0.25
+
+_LARGE, _CLUTTERED = 0.015, 0.4
+"""Least size of the finest splats of clutter, robust radii, and least share of such positions."""
+
+_FIELD = 50.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -290,3 +319,45 @@ def _side_directions() -> Float[Tensor, "d 3"]:
 def _growths(layout: SceneLayout, eyes: Float[Tensor, "c 3"]) -> Float[Tensor, "c"]:
     growths = [size_growth(layout.sized, eye, layout.frame.radius) for eye in eyes]
     return torch.tensor(growths, dtype=torch.float64, device="cpu")
+
+
+def split_by_clutter(
+    scene: GaussianScene, layout: SceneLayout, eyes: Float[Tensor, "p 3"]
+) -> tuple[Float[Tensor, "c 3"], Float[Tensor, "k 3"]]:
+    """Return positions with a clear view of the middle, and others that look through clutter.
+
+    A wall or a street is photographed from one side. From all others, large floaters hide it: even
+    the finest splats of an image are large. A few of them before an object are no clutter.
+
+    Returns:
+        All positions and none; or, in a capture from one side, at most 64 together.
+    """
+    none = eyes[:0]
+    if len(scene) < _FEW:
+        return eyes, none
+    few = eyes[:: -(-len(eyes) // _ASKED)]
+    finest = splat_sizes(layout, _facing_middle(layout, few)).finest
+    if not _many(_are_coarse(finest, _SUSPECT), _SUSPECTED):
+        return eyes, none  # the sample, which has larger splats, shows as much
+    sample, enlargement = covering_sample(viewable_part(scene), _SAMPLE)
+    widths = splat_widths(sample) * torch.exp(-enlargement[:, 0].double())
+    for most in _MEASURED:
+        few = eyes[:: -(-len(eyes) // most)]
+        sizes = measure_splats(sample, widths, layout.frame.radius, _facing_middle(layout, few))
+        coarse = _are_coarse(sizes.finest, _LARGE)
+        if not _many(coarse, _CLUTTERED):
+            return eyes, none
+    return few[~coarse], few[coarse]
+
+
+def _facing_middle(layout: SceneLayout, eyes: Float[Tensor, "p 3"]) -> Cameras:
+    middle = layout.center if layout.room is None else layout.room
+    return cameras_at(eyes, middle - eyes, layout.up, size=(PIXELS, PIXELS), field=_FIELD)
+
+
+def _are_coarse(finest: Float[Tensor, "p"], least: float) -> Bool[Tensor, "p"]:
+    return finest > (_COARSE * finest.quantile(0.1)).clamp_min(least)
+
+
+def _many(mask: Bool[Tensor, "p"], share: float) -> bool:
+    return float(mask.double().mean()) >= share

@@ -80,7 +80,7 @@ def score_cameras(
     A camera is bad if it is inside a Gaussian, if something near fills too much of the image or
     hides its middle, or if too little of the image is filled.
     """
-    small = _small(cameras)
+    small = cameras.fitted(PIXELS, least=8)
     images = render(layout.sample, small, depth=True)
     depth = images.alpha.new_zeros(()) if images.depth is None else images.depth
     near = (images.alpha > _VISIBLE) & (depth < _NEAR * distances.to(depth)[:, None, None])
@@ -94,13 +94,6 @@ def score_cameras(
     good = (near_share <= _MOST_NEAR) & (blocked <= _MOST_BLOCKED) & (lacking == 0) & ~enclosed
     penalties = 2 * near_share + blocked + 2 * lacking + enclosed.double()
     return CameraScores(good=good, penalties=penalties)
-
-
-def _small(cameras: Cameras) -> Cameras:
-    factor = PIXELS / max(cameras.width, cameras.height)
-    return cameras.resized(
-        max(8, round(factor * cameras.width)), max(8, round(factor * cameras.height))
-    )
 
 
 class SplatSizes(NamedTuple):
@@ -124,7 +117,7 @@ def splat_sizes(layout: SceneLayout, cameras: Cameras) -> SplatSizes:
     widths = splat_widths(sample)
     enlarged = sample.log_scales + 0.5 * math.log(step)
     sample = sample.with_tensors({"log_scales": enlarged}, {})
-    return measure_splats(sample, widths, layout.frame.radius, _small(cameras))
+    return measure_splats(sample, widths, layout.frame.radius, cameras.fitted(PIXELS, least=8))
 
 
 def splat_widths(scene: GaussianScene) -> Float[Tensor, "n"]:

@@ -19,10 +19,11 @@
     }
     return number(value, unit === "B" || value >= 100 ? 0 : 1) + " " + unit;
   };
-  const fewer = (scene) => {
+  const difference = (scene) => {
     const ratio = data.reference.count / Math.max(1, scene.count);
     if (Math.abs(ratio - 1) < 0.005) return "As many";
-    return number(ratio, ratio >= 10 || Number.isInteger(ratio) ? 0 : 1) + "× fewer";
+    const [factor, word] = ratio > 1 ? [ratio, "fewer"] : [1 / ratio, "more"];
+    return `${number(factor, factor >= 10 || Number.isInteger(factor) ? 0 : 1)}× ${word}`;
   };
   const join = (...parts) => parts.filter(Boolean).join(" · ");
   const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
@@ -80,7 +81,7 @@
       `, next to ${small.length === 1 ? "a simplified version" : small.length + " simplified versions"}` +
       ` from ${views.length === 1 ? "one view" : views.length + " views"}. Drag the divider: full on the left, simplified on the right.`;
     at("scenes").append(...small.map((scene, index) => choice("small", index + 1, [
-      make("b", data.named ? scene.name : fewer(scene)),
+      make("b", data.named ? scene.name : difference(scene)),
       make("span", decibels(scene.psnr.mean), { class: "psnr" }),
       make("small", join(count(scene.count) + " Gaussians", bytes(scene.bytes), data.named ? "" : scene.name)),
     ])));

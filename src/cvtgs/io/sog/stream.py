@@ -43,7 +43,7 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
     Args:
         path: The ``lod-meta.json``; its SOGs are in its folder.
         lod: The level, 0 for the finest. Chunks without this level give their next coarser level,
-            or their coarsest.
+            or their coarsest, unless the others hold as many Gaussians as the file states.
         trust_sizes: Whether images may unpack to any size.
 
     Returns:
@@ -60,19 +60,12 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
         raise InvalidArgumentError(
             f"lod must be from 0 to {meta.lodLevels - 1}, the levels of {path}, found {lod}."
         )
+    places = list(_places(meta, lod, path))
+    own = [rows for level, rows in places if level == lod]
+    stated = None if meta.counts is None else meta.counts[lod : lod + 1]
+    complete = len(own) == len(places) or stated == [sum(rows.count for rows in own)]
     ranges: dict[int, list[_Range]] = {}
-    complete = True
-    for chunk, levels in enumerate(_chunks(meta.tree, path)):
-        level = _level_of(levels, lod, f"{path}: chunk {chunk}")
-        if level is None:
-            continue
-        complete &= level == lod
-        rows = validated(_Rows, levels[str(level)], f"{path}: chunk {chunk}, level {level}")
-        if rows.file >= len(meta.filenames):
-            raise FileFormatError(
-                f"{path}: filenames has {len(meta.filenames):,} entries, found a reference to "
-                f"{rows.file}."
-            )
+    for rows in own if complete else [rows for _, rows in places]:
         if rows.count:
             part = _Range(rows.offset, rows.offset + rows.count)
             ranges.setdefault(rows.file, []).append(part)
@@ -87,6 +80,21 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
     for source, parts in sources:
         scenes.append(_read_rows(source, parts, trust_sizes=trust_sizes))
     return scenes[0] if len(scenes) == 1 else merge(scenes)
+
+
+def _places(meta: _LodMeta, lod: int, path: Path) -> Iterator[tuple[int, _Rows]]:
+    """Yield the rows of every chunk at ``lod`` or the level that stands for it, and that level."""
+    for chunk, levels in enumerate(_chunks(meta.tree, path)):
+        level = _level_of(levels, lod, f"{path}: chunk {chunk}")
+        if level is None:
+            continue
+        rows = validated(_Rows, levels[str(level)], f"{path}: chunk {chunk}, level {level}")
+        if rows.file >= len(meta.filenames):
+            raise FileFormatError(
+                f"{path}: filenames has {len(meta.filenames):,} entries, found a reference to "
+                f"{rows.file}."
+            )
+        yield level, rows
 
 
 def _chunks(tree: dict[str, Any], path: Path) -> Iterator[dict[str, Any]]:

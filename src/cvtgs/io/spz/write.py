@@ -21,7 +21,7 @@ from cvtgs.io.arrays import (
     to_bytes,
 )
 from cvtgs.io.axes import AXES, SCENE_AXES, checked_axes
-from cvtgs.io.spz.layout import (
+from cvtgs.io.spz.read import (
     ANTIALIASED_FLAG,
     AXES_EXTENSION,
     COLOR_SCALE,

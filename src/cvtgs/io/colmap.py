@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from cvtgs.errors import FileFormatError
-from cvtgs.io.cameras.views import Lens, View, checked_lens
+from cvtgs.io.cameras import Lens, View, checked_lens
 from cvtgs.io.files import is_file, open_input
 from cvtgs.math import parameters
 from cvtgs.text import MOST_LETTERS, printable, shortened, shown

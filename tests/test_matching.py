@@ -7,10 +7,16 @@ import pytest
 import torch
 
 import cvtgs
-from cvtgs import Simplifier, SimplifyConfig
+from cvtgs import Simplifier, SimplifyConfig, matching
 from cvtgs.config import MatchConfig
-from cvtgs.matching import cell_contributions, colors, fit_colors, match_opacities, match_views
-from cvtgs.matching.match import mean_squared_error, with_deeper_opacities
+from cvtgs.matching import (
+    cell_contributions,
+    fit_colors,
+    match_opacities,
+    match_views,
+    mean_squared_error,
+    with_deeper_opacities,
+)
 from cvtgs.math import parameters
 from cvtgs.rendering import contributions, observe, render
 from cvtgs.views import automatic_views, mixed_views, random_views
@@ -86,7 +92,7 @@ def test_the_ridge_of_view_dependent_bands_is_stronger_by_its_factor(band_ridge)
     dull = scene.with_tensors({"sh0": 0.5 * scene.sh0}, {})
     config = MatchConfig(color_iterations=20, band_ridge=band_ridge)
     found = fit_colors(dull, views, config=config)
-    basis = colors.linear_view(dull, views.cameras, views.rgb[0]).basis[0, :, None]
+    basis = matching.linear_view(dull, views.cameras, views.rgb[0]).basis[0, :, None]
     unit = (found.sh0 - dull.sh0)[0] / basis[0]
     assert bool((unit > 0.1).all())
     wanted = basis[1:] * unit / band_ridge
@@ -96,12 +102,12 @@ def test_the_ridge_of_view_dependent_bands_is_stronger_by_its_factor(band_ridge)
 
 @backends
 def test_backends_find_the_same_colours(scene, views, backend, monkeypatch):
-    plain = colors.blending_weights
+    plain = matching.blending_weights
     dull = scene.with_tensors({"sh0": 0.5 * scene.sh0}, {})
     config = MatchConfig(color_iterations=4)
     wanted = fit_colors(dull, views, config=config)
     monkeypatch.setattr(
-        colors, "blending_weights", lambda one, camera: plain(one, camera, backend=backend)
+        matching, "blending_weights", lambda one, camera: plain(one, camera, backend=backend)
     )
     found = fit_colors(dull, views, config=config)
     assert torch.allclose(found.sh0, wanted.sh0, atol=2e-3)
@@ -125,7 +131,7 @@ def test_matched_opacities_restore_contributions(scene, views):
 def test_a_round_changes_depths_by_a_power_of_the_ratio_of_contributions(monkeypatch):
     """One pixel is added to both, and no ratio is above 3 or below a third."""
     own = torch.tensor([1.0, 3.0, 4.0, 99.0, 0.0]).double()
-    monkeypatch.setattr("cvtgs.matching.match.contributions", lambda *_: own)
+    monkeypatch.setattr("cvtgs.matching.contributions", lambda *_: own)
     depths = torch.full((5,), 0.1).double()
     logits = parameters.logit_from_optical_depth(depths)
     scene = random_scene(5, dtype=torch.float64).with_tensors({"logit_opacities": logits}, {})
@@ -142,9 +148,9 @@ def test_steps_towards_held_out_images_are_from_none_to_the_whole(residual, step
     view = SimpleNamespace(
         paint=lambda _: torch.ones(4, 5, 3), residual=torch.full((4, 5, 3), residual)
     )
-    assert colors.best_step([view, view], torch.zeros(1, 1, 3)) == pytest.approx(step)
+    assert matching.best_step([view, view], torch.zeros(1, 1, 3)) == pytest.approx(step)
     blank = SimpleNamespace(paint=lambda _: torch.zeros(4, 5, 3), residual=view.residual)
-    assert colors.best_step([blank], torch.zeros(1, 1, 3)) == 0.0
+    assert matching.best_step([blank], torch.zeros(1, 1, 3)) == 0.0
 
 
 def test_the_ridge_has_a_floor_of_a_fiftieth_of_the_median_weight():
@@ -157,20 +163,20 @@ def test_the_ridge_has_a_floor_of_a_fiftieth_of_the_median_weight():
         gradient=lambda: torch.full((1, 1, 3), 3.0).double(),
     )
     config = MatchConfig(color_ridge=0.5)
-    found = colors.LeastSquares([view], config=config, frozen=0).solve(3)
+    found = matching.LeastSquares([view], config=config, frozen=0).solve(3)
     assert found.flatten().tolist() == pytest.approx([3 / 2.52] * 3)
 
 
 @pytest.mark.parametrize(("step", "solved"), [(0.6, [14, 16]), (0.4, [14])])
 def test_held_out_images_help_only_once_the_others_have_proved_right(monkeypatch, step, solved):
-    counts, plain = [], colors.LeastSquares
+    counts, plain = [], matching.LeastSquares
 
     def noted(linear, **words):
         counts.append(len(linear))
         return plain(linear, **words)
 
-    monkeypatch.setattr(colors, "LeastSquares", noted)
-    monkeypatch.setattr(colors, "best_step", lambda heldout, _: step * (len(heldout) == 2))
+    monkeypatch.setattr(matching, "LeastSquares", noted)
+    monkeypatch.setattr(matching, "best_step", lambda heldout, _: step * (len(heldout) == 2))
     scene = random_scene(5, degree=0)
     fit_colors(scene, observe(scene, ring(16)), config=MatchConfig(color_iterations=1))
     assert counts == solved
@@ -184,7 +190,7 @@ def test_only_held_out_images_decide_on_opacities(monkeypatch):
         judged.append(views.cameras.centers)
         return 0.1
 
-    monkeypatch.setattr("cvtgs.matching.match.mean_squared_error", noted)
+    monkeypatch.setattr("cvtgs.matching.mean_squared_error", noted)
     config = MatchConfig(opacity_rounds=1, color_iterations=1)
     match_views(scene, views, views.contributions, config=config)
     assert len(judged) == 3
@@ -196,10 +202,10 @@ def test_the_solution_is_found_from_any_start():
     cameras = ring(8)
     dull = scene.with_tensors({"sh0": scene.sh0 + 0.2}, {})
     linear = [
-        colors.linear_view(dull, camera, image)
+        matching.linear_view(dull, camera, image)
         for camera, image in zip(cameras.singles(), render(scene, cameras).rgb, strict=True)
     ]
-    problem = colors.LeastSquares(linear, config=MatchConfig(), frozen=0)
+    problem = matching.LeastSquares(linear, config=MatchConfig(), frozen=0)
     found = problem.solve(20)
     assert float(found.abs().amax()) > 0.05
     for start in (found, torch.ones_like(found)):

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from cvtgs.errors import FileFormatError, InvalidArgumentError
-from cvtgs.io.cameras.views import (
+from cvtgs.io.cameras import (
     SPLITS,
     Lens,
     Split,

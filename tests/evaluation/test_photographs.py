@@ -1,0 +1,35 @@
+"""Photographs that are matched to cameras by name."""
+
+import numpy as np
+import pytest
+import torch
+
+import cvtgs
+from cvtgs.errors import InvalidArgumentError
+from cvtgs.evaluation import fit_cameras, load_photographs
+from cvtgs.evaluation.images import encode
+
+
+def test_a_photograph_of_two_cameras_is_an_error(tmp_path):
+    """The folder is that of the left camera; its images have the same names as the right ones."""
+    rig = cvtgs.Cameras(
+        viewmats=torch.eye(4).expand(2, 4, 4),
+        Ks=torch.eye(3).expand(2, 3, 3),
+        width=48,
+        height=36,
+        names=("left/1.png", "right/1.png"),
+    )
+    content = encode(np.full((36, 48, 3), 50, np.uint8), "png")
+    (tmp_path / "1.png").write_bytes(content)
+    for use in (lambda: load_photographs(tmp_path, rig), lambda: fit_cameras(rig, tmp_path)):
+        with pytest.raises(InvalidArgumentError) as caught:
+            use()
+        assert str(caught.value) == (
+            f"{tmp_path}: every camera must have its own photograph, but 'left/1.png' and "
+            f"'right/1.png' both match 1.png; give the folder that holds the folders in these "
+            f"names."
+        )
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        (tmp_path / side / "1.png").write_bytes(content)
+    assert load_photographs(tmp_path, rig).shape == (2, 36, 48, 3)
