@@ -105,6 +105,7 @@ def in_blocks(scene, folder):
 
 
 def streamed(scene, folder):
+    scene = scene.with_tensors({"shN": 0.1 * scene.shN})  # in the range of tiles
     cvtgs.save(scene, folder / "scene.ply", overwrite=True)
     rhos = [0.5, 0.1]
     options = {"kind": "3dtiles", "blocks": 3, "overwrite": True}
