@@ -12,8 +12,8 @@ import cvtgs
 from cvtgs.budget import CostModel, Found
 from cvtgs.budget.calibrate import CANDIDATES
 from cvtgs.budget.costs import FEATURES
+from cvtgs.cli.display import target_note
 from cvtgs.cli.main import build_parser, main
-from cvtgs.cli.notes import target_note
 from cvtgs.cli.simplify import check_goals
 from cvtgs.cli.time_budget import STARTED, choose_preset, read_seconds
 from cvtgs.errors import GoalError, InvalidArgumentError

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import cvtgs
+from cvtgs.cli.display import report_notes
 from cvtgs.cli.main import main
-from cvtgs.cli.notes import report_notes
 from cvtgs.report import MatchReport, SimplifyReport
 from scenes import random_scene
 

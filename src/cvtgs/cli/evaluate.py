@@ -8,6 +8,14 @@ from pathlib import PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING, NamedTuple
 
 import cvtgs
+from cvtgs.cli.cameras import (
+    add_view_options,
+    background_color,
+    check_view_options,
+    choose_cameras,
+    evaluation_settings,
+    read_photographs,
+)
 from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
 from cvtgs.cli.options import (
     AddParser,
@@ -16,14 +24,6 @@ from cvtgs.cli.options import (
     read_words,
 )
 from cvtgs.cli.view import PAGE, check_page, write_page
-from cvtgs.cli.view_options import (
-    add_view_options,
-    background_color,
-    check_view_options,
-    choose_cameras,
-    evaluation_settings,
-    read_photographs,
-)
 from cvtgs.errors import InvalidArgumentError
 from cvtgs.io.atomic import windows_fault
 from cvtgs.progress import ProgressEvent

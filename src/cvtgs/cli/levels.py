@@ -5,6 +5,12 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import cvtgs
+from cvtgs.cli.cameras import (
+    add_view_options,
+    check_view_options,
+    choose_cameras,
+    evaluation_settings,
+)
 from cvtgs.cli.display import progress_bars, say, size_text
 from cvtgs.cli.jobs import check_suffix
 from cvtgs.cli.options import (
@@ -22,12 +28,6 @@ from cvtgs.cli.streams import (
     stream_levels,
 )
 from cvtgs.cli.view import check_page, write_page
-from cvtgs.cli.view_options import (
-    add_view_options,
-    check_view_options,
-    choose_cameras,
-    evaluation_settings,
-)
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import cvtgs
 from cvtgs.cli.blocks import add_block_options, block_workers, memory_of
-from cvtgs.cli.display import TIE, progress_bars
+from cvtgs.cli.cameras import check_split, read_cameras
+from cvtgs.cli.display import TIE, progress_bars, report_notes, target_note
 from cvtgs.cli.jobs import Outcome, SceneJob, add_paths, check_paths, open_jobs, run_jobs
-from cvtgs.cli.notes import report_notes, target_note
 from cvtgs.cli.options import (
     CAMERA_FILES,
     AddParser,
@@ -25,7 +25,6 @@ from cvtgs.cli.options import (
 )
 from cvtgs.cli.target import check_target, has_target, search_target
 from cvtgs.cli.time_budget import STARTED, check_time_budget, choose_preset
-from cvtgs.cli.view_options import check_split, read_cameras
 from cvtgs.errors import (
     ConfigError,
     FileFormatError,
