@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from cvtgs.errors import InputError, InputNotFoundError, InvalidArgumentError, reason_of
+from cvtgs.errors import InvalidArgumentError, input_errors
 from cvtgs.text import MOST_LETTERS, shortened, shown
 
 __all__ = [
@@ -98,12 +98,8 @@ def read_boxes(path: str | os.PathLike[str]) -> tuple[Box, ...]:
         (Box(min=(0.0, 0.0, 0.0), max=(1.0, 2.0, 3.0)),)
     """
     try:
-        values = json.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except FileNotFoundError as error:
-        raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
-    except OSError as error:
-        reason = reason_of(error)
-        raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
+        with input_errors(path):
+            values = json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:  # RecursionError: lists nested too deeply
         raise InvalidArgumentError(f"{path}: must be valid JSON, found: {error}.") from None
     listed = values if isinstance(values, list) else [values]

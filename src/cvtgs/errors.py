@@ -1,6 +1,7 @@
 """The errors and warnings of cvtgs; each also derives from the builtin that it specialises."""
 
 import errno
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -141,3 +142,17 @@ def memory_errors(work: str, advice: str) -> Iterator[None]:
         if isinstance(error, OutOfMemoryError) or cause is None or not is_out_of_memory(cause):
             raise
         raise OutOfMemoryError(f"{work} needs more memory than is available; {advice}.") from error
+
+
+@contextmanager
+def input_errors(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn system errors about a file into input errors of cvtgs."""
+    try:
+        yield
+    except CvtgsError:
+        raise
+    except FileNotFoundError as error:
+        raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
+    except OSError as error:
+        reason = reason_of(error)
+        raise InputError(f"{path}: the file must be readable, found: {reason}.") from error

@@ -320,7 +320,7 @@ def test_the_network_corrects_as_in_one_piece(which, request):
     neighbors = cvt.nearest_neighbors(inflated.means, 8)
     wanted = validity.standardized(
         correct_cells(
-            job.read_network().net,
+            job.read_network(scene.dtype),
             scene,
             inflated,
             shown,

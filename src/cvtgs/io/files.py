@@ -13,7 +13,13 @@ import pydantic
 from pydantic import AllowInfNan, BeforeValidator, Field, Strict
 from torch import Tensor
 
-from cvtgs.errors import CvtgsError, FileFormatError, InputError, InputNotFoundError, reason_of
+from cvtgs.errors import (
+    FileFormatError,
+    InputError,
+    InputNotFoundError,
+    input_errors,
+    reason_of,
+)
 from cvtgs.text import shown
 
 _POINTER = b"version https://git-lfs."
@@ -50,20 +56,6 @@ def open_input(path: Path) -> Iterator[BinaryIO]:
                     "file with: git lfs pull."
                 )
             yield file
-
-
-@contextmanager
-def input_errors(path: Path) -> Iterator[None]:
-    """Turn system errors about a file into input errors of cvtgs."""
-    try:
-        yield
-    except CvtgsError:
-        raise
-    except FileNotFoundError as error:
-        raise InputNotFoundError(f"{path}: the file to read must exist, found none.") from error
-    except OSError as error:
-        reason = reason_of(error)
-        raise InputError(f"{path}: the file must be readable, found: {reason}.") from error
 
 
 def is_file(path: Path) -> bool:

@@ -21,7 +21,7 @@ from cvtgs.io import atomic_output
 from cvtgs.io.axes import SCENE_AXES
 from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors
-from cvtgs.mergenet import Checkpoint, load_checkpoint, save_checkpoint
+from cvtgs.mergenet import Checkpoint, Net, load_checkpoint, save_checkpoint
 from cvtgs.outofcore.memory import CELL_ROOM
 from cvtgs.outofcore.scan import SAMPLE_ROWS, RowRange, SceneScan, read_scan, write_scan
 
@@ -210,9 +210,11 @@ class Job:
             if count or any(self.rows_path(block, number).exists() for number in numbers)
         ]
 
-    def read_network(self) -> Checkpoint | None:
-        """Read the checkpoint of the job."""
-        return load_checkpoint(self.path("network.safetensors")) if self.has_network else None
+    def read_network(self, dtype: torch.dtype) -> Net | None:
+        """Read the network of the job, if it has one."""
+        if not self.has_network:
+            return None
+        return load_checkpoint(self.path("network.safetensors")).net.to(dtype)
 
     def write_network(self, checkpoint: Checkpoint) -> None:
         """Write the checkpoint to the folder of the job."""

@@ -124,10 +124,10 @@ def correct(job: Job, block: int) -> None:
     own, _ = map_tensors(job.inflated_path(block))
     shown = partition.keep_only(own["representatives"])
     small, sizes, own_count = _with_halo(block, own["remote"], job.inflated_path)
-    checkpoint = job.read_network()
-    if checkpoint is not None:
+    net = job.read_network(scene.dtype)
+    if net is not None:
         small = correct_cells(
-            checkpoint.net.to(scene.dtype),
+            net,
             scene,
             small,
             shown,
@@ -161,8 +161,7 @@ def simplify_block(job: Job, block: int) -> None:
     no_filter = {"min_opacity": 0.0, "max_flyaway_share": 0.0}  # the sort filtered the rows
     filter_config = job.config.filter.model_copy(update=no_filter)
     config = job.config.model_copy(update={"filter": filter_config})
-    checkpoint = job.read_network()
-    net = None if checkpoint is None else checkpoint.net.to(scene.dtype)
+    net = job.read_network(scene.dtype)
     clock = StageClock(silent, scene.device)
     reduced = reduce_scene(scene, analysis, job.targets[block], config, net=net, clock=clock)
     report = BlockReport(

@@ -306,8 +306,7 @@ def write_block(spec: StreamJob, block: int) -> None:
     """Simplify a block to all of its sizes, and write it as a part of the stream."""
     job, targets = spec.job, spec.targets()[block]
     rows = read_rows(job, block)
-    checkpoint = job.read_network()
-    net = None if checkpoint is None else checkpoint.net.to(rows.scene.dtype)
+    net = job.read_network(rows.scene.dtype)
     scene = select_columns(rows.scene, job.config.effects)
     scan = job.read_scan()
     analysis = analysis_of(scan, rows)
