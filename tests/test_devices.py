@@ -231,3 +231,43 @@ def test_calls_at_the_same_time_restore_the_number_of_threads(two_threads):
     fresh.start()
     fresh.join()
     assert found == [2, 2]
+
+
+def test_a_number_of_threads_that_the_program_sets_is_kept(two_threads):
+    inside, found = threading.Barrier(2, timeout=30), []
+
+    def limited():
+        with one_thread():
+            inside.wait()
+            inside.wait()
+
+    def own():
+        inside.wait()
+        torch.set_num_threads(3)
+        with one_thread():
+            assert torch.get_num_threads() == 1
+        found.append(torch.get_num_threads())
+        inside.wait()
+
+    threads = [threading.Thread(target=work) for work in (limited, own)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == [3]
+
+
+def test_an_interrupted_correction_leaves_no_limit(two_threads, monkeypatch):
+    monkeypatch.setattr("cvtgs.mergenet.apply.CHUNK_MEMBERS", 50)
+
+    def refuse(event):
+        if event.stage == "network" and event.done:
+            raise InterruptedError
+
+    scene = cvtgs.synthetic.scene("object", 2000, sh_degree=0, seed=0)
+    with pytest.raises(InterruptedError) as held:
+        cvtgs.Simplifier(device="cpu", listener=refuse).simplify(scene, 0.1)
+    torch.set_num_threads(1)
+    cvtgs.Simplifier(device="cpu").simplify(scene, 0.1)
+    assert torch.get_num_threads() == 1
+    assert held.value is not None

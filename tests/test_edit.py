@@ -166,6 +166,8 @@ def test_merge_widens_unlike_scenes_and_warns() -> None:
         merge([])
     with pytest.raises(InvalidSceneError, match=r"at least one scene, found \['a.ply'\]"):
         merge(["a.ply"])
+    with pytest.raises(InvalidSceneError, match="at least one scene, found None"):
+        merge(None)
 
 
 @pytest.mark.parametrize(
@@ -183,6 +185,9 @@ def test_merge_widens_unlike_scenes_and_warns() -> None:
         (lambda: Motion.of_angles((90, 0)), "angles must be 3 finite numbers in degrees"),
         (lambda: Motion(quat=(1, 0, 0), shift=(0,) * 4), "must consist of finite numbers"),
         (lambda: Sphere(center=None, radius=1.0), "a centre of 3 finite numbers"),
+        (lambda: Sphere(center="123", radius=1.0), "a centre of 3 finite numbers"),
+        (lambda: Motion(scale="2"), "must consist of finite numbers"),
+        (lambda: Motion(scale=10**400), "must consist of finite numbers"),
         (lambda: Sphere(center=(0.0, 0.0, 0.0), radius=-1), "a radius of at least 0"),
         (lambda: drop_faint(random_scene(2), 1.5), "from 0 to 1, found 1.5"),
         (lambda: drop_large(random_scene(2), 0.0), "above 0, found 0.0"),

@@ -220,27 +220,29 @@ def _in_pool(
 def _threads_of_torch() -> int:
     """Return torch's number of threads, even where another call limits it at the moment."""
     with _Limits.lock:
-        is_free = _Limits.running == 0 or _OWN.is_limited
-        return torch.get_num_threads() if is_free else _Limits.threads
+        own = torch.get_num_threads()
+        return own if own > 1 or _Limits.running == 0 or _OWN.is_limited else _Limits.threads
 
 
 @contextmanager
 def _restored_threads() -> Iterator[None]:
     """Restore torch's number of threads at the end.
 
-    The number holds for the whole process, and threads of the program that start later take it, so
-    of calls at the same time, only the first may read it.
+    Threads of the program that start while a call limits torch take its limit, 1, for their own
+    number, so they get that of the first call instead.
     """
     with _Limits.lock:
+        own = torch.get_num_threads()
         if _Limits.running == 0:
-            _Limits.threads = torch.get_num_threads()
+            _Limits.threads = own
+        before = own if own > 1 else _Limits.threads
         _Limits.running += 1
     try:
         yield
     finally:
         with _Limits.lock:
             _Limits.running -= 1
-            torch.set_num_threads(_Limits.threads)
+            torch.set_num_threads(before)
 
 
 @contextmanager

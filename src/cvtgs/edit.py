@@ -141,8 +141,9 @@ class Motion:
 def _numbers(values: Iterable[float], count: int) -> tuple[float, ...] | None:
     """Return finite numbers of any type as floats; None if they are others."""
     try:
-        numbers = tuple(map(float, values))
-    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor of several numbers
+        listed = [] if isinstance(values, str | bytes) else list(values)
+        numbers = tuple(math.nan if isinstance(one, str) else float(one) for one in listed)
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # a tensor of several numbers
         return None
     return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else None
 

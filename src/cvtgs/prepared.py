@@ -1,6 +1,6 @@
 """Prepared: a scene to simplify repeatedly, with a fallback if the device lacks memory."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypeVar
 
@@ -206,7 +206,10 @@ class Prepared:
         Returns:
             One level per ratio, in the order of the ratios.
         """
-        ratios = list(rhos) if isinstance(rhos, Iterable) else []
+        try:
+            ratios = list(rhos)
+        except TypeError:  # also a tensor of one number
+            ratios = []
         if not ratios:
             raise InvalidArgumentError(f"levels need a list of ratios, found {shown(rhos)}.")
         targets = [target_count(self._total, rho) for rho in ratios]

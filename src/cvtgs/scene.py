@@ -345,9 +345,9 @@ def as_scene(scene: SceneLike, name: str = "scene") -> GaussianScene:
 
 def checked_scenes(scenes: Any, work: str) -> list[GaussianScene]:
     """Return several scenes as a list; raise if there is none, or not all are on one device."""
-    found = [scenes] if isinstance(scenes, GaussianScene) else list(scenes)
+    found = list(scenes) if isinstance(scenes, Iterable) else [scenes]
     if not found or not all(isinstance(scene, GaussianScene) for scene in found):
-        raise InvalidSceneError(f"{work} needs at least one scene, found {shown(found)}.")
+        raise InvalidSceneError(f"{work} needs at least one scene, found {shown(scenes)}.")
     places = sorted({str(scene.device) for scene in found})
     if len(places) > 1:
         raise InvalidSceneError(f"{work} needs scenes on one device, found {', '.join(places)}.")

@@ -97,7 +97,7 @@ def test_a_target_out_of_reach_of_the_format_says_so(capsys, source):
     cameras = write_cameras(source.with_name("views.json"))
     words = ["--target-psnr", "60", "--cameras", cameras, "--preset", "draft"]
     text = printed(capsys, "simplify", source, source.with_name("o.splat"), *words, status=1)
-    assert "These are scores of files like o.splat, which round; a plain .ply does not." in text
+    assert "These are scores of files of this format, which rounds; a plain .ply does not." in text
     text = printed(capsys, "simplify", source, source.with_name("o.ply"), *words, status=1)
     assert "no simplified scene reaches 60.00 dB" in text
     assert "These are scores" not in text

@@ -24,6 +24,7 @@ from cvtgs.errors import (
     OutputError,
 )
 from cvtgs.io import losses
+from cvtgs.io.streams import file_of
 from format_cases import storable_scene
 from ply_files import gaussian_properties, gaussian_rows, ply_bytes
 from scenes import same_bits
@@ -281,3 +282,18 @@ def test_a_level_of_a_stream_that_has_none_is_refused() -> None:
 def test_dropped_data_is_warned_about_for_streams() -> None:
     with pytest.warns(DroppedDataWarning, match="the BytesIO: files of this format do not hold"):
         cvtgs.save(storable_scene(5), io.BytesIO(), format=".splat")
+
+
+def test_warnings_that_are_caught_around_streams_can_be_shown_later() -> None:
+    """A thread may put the function of a stream back after the stream was read."""
+    before = warnings.showwarning
+    try:
+        with file_of(io.BytesIO(GOOD)):
+            left_behind = warnings.showwarning
+        warnings.showwarning = left_behind
+        cvtgs.load(io.BytesIO(GOOD))
+        with pytest.warns(UserWarning, match="seen"):
+            warnings.warn("seen", UserWarning, stacklevel=1)
+        left_behind("shown", UserWarning, "file", 1)
+    finally:
+        warnings.showwarning = before

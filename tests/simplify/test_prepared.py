@@ -139,7 +139,7 @@ def test_levels_take_any_iterable_of_ratios(scene):
     found = simplifier.levels(scene, (rho for rho in (0.2, 0.1)))
     wanted = simplifier.levels(scene, [0.2, 0.1])
     assert [len(level.scene) for level in found] == [len(level.scene) for level in wanted]
-    for wrong in (None, 0.1, []):
+    for wrong in (None, 0.1, [], torch.tensor(0.5)):
         with pytest.raises(InvalidArgumentError, match="levels need a list of ratios"):
             simplifier.levels(scene, wrong)
 

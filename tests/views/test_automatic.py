@@ -275,3 +275,7 @@ def test_scenes_that_require_gradients_and_any_seeds():
         wanted = automatic_views(scene, 2, width=32, height=32, seed=seed)
         assert torch.equal(found.viewmats, wanted.viewmats)
         assert not found.viewmats.requires_grad
+    minus = [
+        automatic_views(scene, 2, width=32, height=32, seed=seed).viewmats for seed in (-1, -2)
+    ]
+    assert not torch.equal(*minus)

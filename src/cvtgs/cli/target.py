@@ -59,8 +59,8 @@ def search_target(
         if not is_rounded:
             raise
         raise GoalError(
-            f"{error} These are scores of files like {options.output.name}, which round; a plain "
-            f".ply does not."
+            f"{error} These are scores of files of this format, which rounds; a plain .ply does "
+            f"not."
         ) from error
 
 

@@ -96,7 +96,7 @@ def _named_in_warnings(path: Path, name: str) -> Iterator[None]:
     read at the same time.
     """
     with _Shown.lock:
-        if not _Shown.names:
+        if warnings.showwarning is not _show:  # it may still be, put back by catch_warnings
             _Shown.before, warnings.showwarning = warnings.showwarning, _show
         _Shown.names[path] = name
     try:
@@ -104,7 +104,7 @@ def _named_in_warnings(path: Path, name: str) -> Iterator[None]:
     finally:
         with _Shown.lock:
             del _Shown.names[path]
-            if not _Shown.names:
+            if not _Shown.names and warnings.showwarning is _show:
                 warnings.showwarning = _Shown.before
 
 

@@ -1,6 +1,7 @@
 """Apply MergeNet: correct the cells of a scene by the residuals that the network predicts."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
+from contextlib import closing
 
 import torch
 from jaxtyping import Float, Int
@@ -75,23 +76,25 @@ def correct_cells(  # noqa: PLR0913 (options by name)
     sizes = counts if sizes is None else sizes
     cells, several = partition.select_several()
     done = len(counts) - len(cells)
+    if len(cells) == 0:
+        return merged
     originals = merged.tensors()
     tensors = {name: values.clone() for name, values in originals.items() if values.numel()}
-    with torch.no_grad():
-        if isinstance(net, PublishedMergeNet):
-            corrections = _correct_as_published(net, scene, merged, several, cells=cells)
-        else:
-            corrections = _correct_gated(
-                net,
-                scene,
-                merged,
-                several,
-                cells=cells,
-                neighbors=neighbors,
-                visibility=visibility,
-                sizes=sizes,
-                pixel_size=pixel_size,
-            )
+    if isinstance(net, PublishedMergeNet):
+        corrections = _correct_as_published(net, scene, merged, several, cells=cells)
+    else:
+        corrections = _correct_gated(
+            net,
+            scene,
+            merged,
+            several,
+            cells=cells,
+            neighbors=neighbors,
+            visibility=visibility,
+            sizes=sizes,
+            pixel_size=pixel_size,
+        )
+    with torch.no_grad(), closing(corrections):  # an error in `on_cells` ends their threads
         for rows, corrected in corrections:
             for name, values in tensors.items():
                 values[rows] = corrected[name]
@@ -100,6 +103,8 @@ def correct_cells(  # noqa: PLR0913 (options by name)
     # Near the limits of the dtype (a flyaway at 3e38) a correction may overflow.
     flat = [values.reshape(len(values), -1) for values in tensors.values()]
     finite = torch.stack([values.isfinite().all(dim=1) for values in flat]).all(dim=0)
+    if scene.device.type == "cpu" and bool(finite.all()):  # elsewhere, the host would wait
+        return merged.with_tensors(tensors)
     tensors = {
         name: torch.where(finite.view(-1, *[1] * (values.dim() - 1)), values, originals[name])
         for name, values in tensors.items()
@@ -118,7 +123,7 @@ def _correct_gated(  # noqa: PLR0913 (options by name)
     visibility: Float[Tensor, "n"],
     sizes: Int[Tensor, "m_all"],
     pixel_size: float,
-) -> Iterator[tuple[Int[Tensor, "r"], dict[str, Tensor]]]:
+) -> Generator[tuple[Int[Tensor, "r"], dict[str, Tensor]], None, None]:
     """Yield runs of cells and their corrected tensors."""
     chunk, near = chunk_length(CHUNK_MEMBERS, scene.device), neighbors.shape[1]
     step = max(1, chunk // max(1, near))
@@ -159,7 +164,7 @@ def _correct_as_published(
     several: Partition,
     *,
     cells: Int[Tensor, "m"],
-) -> Iterator[tuple[Int[Tensor, "r"], dict[str, Tensor]]]:
+) -> Generator[tuple[Int[Tensor, "r"], dict[str, Tensor]], None, None]:
     """Yield runs of cells and their corrected tensors."""
 
     def correct(item: tuple[slice, Partition]) -> tuple[Tensor, dict[str, Tensor]]:

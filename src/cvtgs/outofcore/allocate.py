@@ -72,7 +72,7 @@ def allocate(job: Job) -> None:
             f"{sum(cell_counts)} cells do not fit into memory together, so merge costs are only "
             f"compared within {len(regions)} parts of the scene; raise --memory if possible.",
             UserWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
     sizes = [sum(cell_counts[block] for block in region) for region in regions]
     counts = shared_out(manifest.total, sizes, rooms=sizes)

@@ -290,7 +290,7 @@ def _write_targets(
             f"dropped {spec.job.source.count - total} of {spec.job.source.count} Gaussians with "
             "NaN, infinite or zero values.",
             DroppedDataWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
     rooms, levels = list(rows), []
     for target in targets:

@@ -80,7 +80,8 @@ class SogFormat:
             for level in range(environment_level(far), len(far))
         }
         for name, scene in environments.items():
-            save(scene, folder / name, overwrite=True)
+            if len(scene):
+                save(scene, folder / name, overwrite=True)
         return StreamPart(
             levels=levels,
             chunks=len(plan.chunks),

@@ -3,6 +3,7 @@
 import copy
 import json
 from collections.abc import Callable, Iterable
+from itertools import zip_longest
 from pathlib import Path
 from statistics import mean
 from typing import Any, NamedTuple, Self
@@ -243,13 +244,14 @@ class TrainState:
             )
 
     def _check_scenes(self, path: Path, scenes: list[dict[str, Any]]) -> None:
-        """Raise an error for other scenes, which the checkpoint would not name."""
-        theirs = {LearnedScene.model_validate(scene) for scene in scenes}
-        odd = sorted(scene.name for scene in theirs ^ set(self.scenes))
+        """Raise an error for other scenes, or another order, in which steps draw them."""
+        theirs = [LearnedScene.model_validate(scene) for scene in scenes]
+        pairs = zip_longest(self.scenes, theirs)
+        odd = [(ours or other).name for ours, other in pairs if ours != other]
         if self.scenes and odd:
             raise CheckpointError(
-                f"{path}: the state belongs to a training run on other scenes ({odd[0]} differs); "
-                f"restore the scenes, or train to another output."
+                f"{path}: the state belongs to a training run on other scenes or in another "
+                f"order ({odd[0]} differs); restore the scenes, or train to another output."
             )
 
     def _load_tensors(self, tensors: dict[str, Tensor]) -> None:

@@ -32,7 +32,7 @@ from cvtgs.views.layout import find_layout
 if TYPE_CHECKING:
     import viser
 
-__all__ = ["check_viewer", "scene_page"]
+__all__ = ["ViewerServer", "check_viewer", "scene_page"]
 
 Point = tuple[float, float, float]
 
@@ -44,8 +44,6 @@ _ANY_PORT = 8999
 
 _ABOVE = 0.85
 """Height of labels in the initial view, as a share of half the image; all scenes share it."""
-
-__all__ = ["ViewerServer"]
 
 SLIDER = (-3.5, 0.0, 0.05)
 """Range of the slider in log10 of rho: minimum, maximum, step. It starts lower if need be."""
@@ -187,10 +185,6 @@ def _viser() -> Any:
             f"the viewer needs the package viser; {how_to_install('cvtgs[view]')}."
         ) from error
     return viser
-
-
-if TYPE_CHECKING:
-    import viser
 
 
 class ViewerServer:

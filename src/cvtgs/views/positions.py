@@ -36,7 +36,7 @@ from cvtgs.views.scoring import (
 REACH = (0.2, 3.0)
 """Range of distances of candidate positions, in robust radii from the centre of the frame."""
 
-_SEEDS = 1 << 62
+_SEEDS = 1 << 32
 _TRIED = 384
 _SEED = 17
 _STANDING_REACH = (0.2, 2.0)

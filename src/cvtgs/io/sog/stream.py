@@ -63,7 +63,8 @@ def read_lod_sog(path: Path, *, lod: int = 0, trust_sizes: bool = False) -> Gaus
     places = list(_places(meta, lod, path))
     own = [rows for level, rows in places if level == lod]
     stated = None if meta.counts is None else meta.counts[lod : lod + 1]
-    complete = len(own) == len(places) or stated == [sum(rows.count for rows in own)]
+    found = sum(rows.count for rows in own)
+    complete = len(own) == len(places) or (found > 0 and stated == [found])
     ranges: dict[int, list[_Range]] = {}
     for rows in own if complete else [rows for _, rows in places]:
         if rows.count:
