@@ -11,6 +11,7 @@ import pytest
 import cvtgs
 from cvtgs.cli.display import size_text
 from cvtgs.cli.main import main
+from format_cases import DATA
 
 NAMES = ("a.ply", "b.compressed.ply", "c.spz")
 
@@ -229,6 +230,17 @@ def test_standard_input_and_output_hold_scenes(
     first, second = capsysbinary.readouterr().out.decode().splitlines()[:2]
     assert re.fullmatch(r"file +standard input, [\d.]+ k?B", first)
     assert second.split() == ["Gaussians", str(len(cvtgs.load(name)))]
+
+
+def test_messages_name_standard_output(
+    scenes: Path, capsysbinary: pytest.CaptureFixture[bytes]
+) -> None:
+    assert main(["convert", str(DATA / "source.ply"), "-", "--suffix", ".splat"]) == 0
+    assert capsysbinary.readouterr().err.startswith(b"In .splat files:")
+    words = ["simplify", str(DATA / "source.ply"), "-", "--count", "7", "--suffix", ".splat"]
+    assert main([*words, *SMALL]) == 0
+    said = capsysbinary.readouterr().err.decode()
+    assert "warning: standard output: files of this format do not hold SH" in " ".join(said.split())
 
 
 def test_an_unknown_suffix_for_standard_output_is_refused(

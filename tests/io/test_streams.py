@@ -284,16 +284,17 @@ def test_dropped_data_is_warned_about_for_streams() -> None:
         cvtgs.save(storable_scene(5), io.BytesIO(), format=".splat")
 
 
-def test_warnings_that_are_caught_around_streams_can_be_shown_later() -> None:
+def test_warnings_that_are_caught_around_streams_can_be_shown_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A thread may put the function of a stream back after the stream was read."""
-    before = warnings.showwarning
-    try:
-        with file_of(io.BytesIO(GOOD)):
-            left_behind = warnings.showwarning
-        warnings.showwarning = left_behind
-        cvtgs.load(io.BytesIO(GOOD))
-        with pytest.warns(UserWarning, match="seen"):
-            warnings.warn("seen", UserWarning, stacklevel=1)
-        left_behind("shown", UserWarning, "file", 1)
-    finally:
-        warnings.showwarning = before
+    said: list[str] = []
+    own = lambda message, *others: said.append(str(message))  # noqa: E731
+    monkeypatch.setattr(warnings, "showwarning", own)
+    with file_of(io.BytesIO(GOOD)):
+        left_behind = warnings.showwarning
+    warnings.showwarning = left_behind
+    cvtgs.load(io.BytesIO(GOOD))
+    left_behind("shown", UserWarning, "file", 1)
+    assert said == ["shown"]
+    assert warnings.showwarning is own

@@ -356,7 +356,8 @@ def _convert_one(job: SceneJob, edits: SceneEdits) -> Outcome:
     if not (options.quiet or job.is_one_of_many):
         stream = sys.stderr if job.to_stream else sys.stdout
         if lost.changed:
-            say(f"In files like {options.output.name}:", file=stream)
+            name = f"files like {options.output.name}"
+            say(f"In {f'{options.suffix} files' if job.to_stream else name}:", file=stream)
         for phrase in lost.changed:
             say_wrapped(phrase, indent=2, file=stream)
         rest = "nothing but precision" if lost.changed else "nothing"

@@ -35,7 +35,7 @@ from cvtgs.text import counted, printable, shortened, shown
 STREAM = "-"
 """The path that stands for standard input or output."""
 
-STANDARD_INPUT = "standard input"
+STANDARD_INPUT, STANDARD_OUTPUT = "standard input", "standard output"
 _OTHER_FORMATS = "save a scene in another format as a file, whose suffix gives the format"
 
 
@@ -119,6 +119,8 @@ def check_paths(parser: CommandParser, options: argparse.Namespace) -> None:
 @contextmanager
 def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
     """Find the scenes of a command; standard streams are temporary files within the context."""
+    from cvtgs.io.streams import named_in_warnings
+
     check_suffix(options.suffix)
     if options.folder is not None:
         yield _folder_jobs(options)
@@ -134,6 +136,7 @@ def open_jobs(options: argparse.Namespace) -> Iterator[list[SceneJob]]:
                 raise OutputError("standard output must be a pipe or a file, found a terminal.")
             folder = stack.enter_context(TemporaryDirectory(prefix="cvtgs-"))
             target = f"{folder}/standard-output{options.suffix or '.ply'}"
+            stack.enter_context(named_in_warnings(Path(target), STANDARD_OUTPUT))
         own = {"input": stack.enter_context(input_file(source)), "output": Path(target)}
         job = argparse.Namespace(**{**vars(options), **own})
         yield [SceneJob(options=job, to_stream=to_stream)]
@@ -214,7 +217,7 @@ def _run_one(job: SceneJob, work: Callable[[SceneJob], Outcome]) -> None:
         return
     for note in outcome.notes:
         say_wrapped(note, file=stream)
-    name = "standard output" if job.to_stream else printable(str(options.output))
+    name = STANDARD_OUTPUT if job.to_stream else printable(str(options.output))
     facts = ", ".join(filter(None, (outcome.counts, sizes, outcome.seconds)))
     if len(name) + len(facts) + 2 > WIDTH:
         say(facts, file=stream)

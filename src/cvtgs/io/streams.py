@@ -78,7 +78,7 @@ def file_of(
                 f"{first!r}; {advice}."
             )
         path = path.rename(path.with_name(f"stream{suffix}"))
-        stack.enter_context(_named_in_warnings(path, name))
+        stack.enter_context(named_in_warnings(path, name))
         try:
             yield path
         except CvtgsError as error:
@@ -89,7 +89,7 @@ def file_of(
 
 
 @contextmanager
-def _named_in_warnings(path: Path, name: str) -> Iterator[None]:
+def named_in_warnings(path: Path, name: str) -> Iterator[None]:
     """Show warnings with the name of the stream.
 
     Python has one function that shows warnings, so it is replaced once for all streams that are
