@@ -26,7 +26,7 @@ print(json.dumps([found, "torch" in sys.modules, gc.isenabled(), gc.get_freeze_c
 @pytest.mark.parametrize(
     ("given", "wanted"),
     [
-        ({}, ["PASSIVE", "20000"]),
+        ({}, ["PASSIVE", "1000"]),
         ({"GOMP_SPINCOUNT": "7"}, ["PASSIVE", "7"]),
         ({"OMP_WAIT_POLICY": "ACTIVE"}, ["ACTIVE", None]),
     ],

@@ -17,14 +17,14 @@ def load_torch() -> None:
     ends, but take time; so none run meanwhile, and objects that exist after loading are excluded.
 
     Idle OpenMP threads sleep after a moment, unless the user has set a policy. By default they spin
-    for long and use much CPU time; if they never spin, waking them takes longer than many small
-    operations.
+    for long, and take the time from threads that compute where other programs need a core, too; if
+    they never spin, waking them takes longer than many small operations.
     """
     if "torch" in sys.modules:
         return
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
-        os.environ.setdefault("GOMP_SPINCOUNT", "20000")
+        os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     gc.disable()
     try:
         import torch  # noqa: F401, PLC0415 (the settings come first)
