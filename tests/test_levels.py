@@ -230,4 +230,7 @@ def test_the_command_writes_levels(scene, tmp_path, capsys):
     assert main([*words, "--no-scores"]) == 1
     assert "must not exist yet" in capsys.readouterr().err
     assert main([*words, "--no-scores", "--overwrite", "--quiet"]) == 0
+    assert main([*words[:-1], "0.1", "--no-scores", "--overwrite"]) == 0
+    said = capsys.readouterr().out
+    assert "Not in levels.json, of an earlier run: rho_0.01.ply." in said
     assert main([*words[:-1], "0.1,x"]) == 1

@@ -11,7 +11,7 @@ from cvtgs.cli.cameras import (
     choose_cameras,
     evaluation_settings,
 )
-from cvtgs.cli.display import progress_bars, say, size_text
+from cvtgs.cli.display import progress_bars, say, say_wrapped, size_text
 from cvtgs.cli.jobs import check_suffix
 from cvtgs.cli.options import (
     AddParser,
@@ -28,6 +28,7 @@ from cvtgs.cli.streams import (
     stream_levels,
 )
 from cvtgs.cli.view import check_page, write_page
+from cvtgs.text import printable
 
 if TYPE_CHECKING:
     from cvtgs.evaluation import Evaluation
@@ -125,6 +126,10 @@ def levels(options: argparse.Namespace) -> None:
             index = cvtgs.levels.add_scores(options.output, evaluation)
     if not options.quiet:
         _print_index(index)
+        older = {path.name for path in options.output.glob("rho_*")} - set(names)
+        if older:
+            listed = ", ".join(map(printable, sorted(older)))
+            say_wrapped(f"Not in {cvtgs.levels.INDEX_NAME}, of an earlier run: {listed}.")
     small = {name: level.scene for name, level in zip(names, made, strict=True)}
     write_page(options, {options.input.name: scene, **small})
 
