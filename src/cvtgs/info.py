@@ -77,7 +77,7 @@ def describe(scene: SceneLike, config: SimplifyConfig | None = None) -> SceneInf
 
     Raises:
         InvalidSceneError: The scene has no valid row.
-        InvalidArgumentError: The configuration is none.
+        InvalidArgumentError: The configuration is no SimplifyConfig.
 
     Example:
         >>> from cvtgs.synthetic import scene

@@ -15,7 +15,7 @@ from cvtgs.evaluation.scorer import BLACK, WHITE, Metrics, Scorer, ViewImage, re
 from cvtgs.math import parameters
 from cvtgs.refinement import RefineConfig
 from cvtgs.refinement import images as images_module
-from cvtgs.refinement import optimize as limits_module
+from cvtgs.refinement import optimize as optimize_module
 from cvtgs.refinement.images import ImageBuffer, RefineViews, generated_views, split_views
 from cvtgs.refinement.optimize import Limits, SceneOptimizer, heldout_psnr, psnr_cap, step_factor
 from cvtgs.refinement.refine import changed_count
@@ -29,7 +29,7 @@ class Clock:
 
     def __init__(self, monkeypatch):
         self.now = 100.0
-        monkeypatch.setattr(limits_module.time, "perf_counter", lambda: self.now)
+        monkeypatch.setattr(optimize_module.time, "perf_counter", lambda: self.now)
 
 
 @pytest.fixture

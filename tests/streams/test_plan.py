@@ -113,9 +113,9 @@ def test_all_parts_have_their_environment_at_one_level(
     """The finest with few enough Gaussians in total, or the coarsest."""
     monkeypatch.setattr("cvtgs.streams.plan.ENVIRONMENT_GAUSSIANS", limit)
     parts = [
-        SimpleNamespace(far=(60, 20, 3), environments=("a0", "a1", "a2")),
-        SimpleNamespace(far=(), environments=()),
-        SimpleNamespace(far=(50, 0, 1), environments=("b0", "b1", "b2")),
+        SimpleNamespace(far=(60, 20, 3), environments={0: "a0", 1: "a1", 2: "a2"}),
+        SimpleNamespace(far=(), environments={}),
+        SimpleNamespace(far=(50, 0, 1), environments={0: "b0", 2: "b2"}),
     ]
     assert vars(sog)["_far_files"](parts) == files
     assert vars(sog)["_far_files"](parts[1:2]) == []

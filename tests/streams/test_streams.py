@@ -11,7 +11,7 @@ import torch
 
 from cvtgs import GaussianScene, Simplifier, concatenate, load
 from cvtgs.errors import InvalidArgumentError, OutputExistsError
-from cvtgs.progress import ProgressEvent
+from cvtgs.progress import ProgressEvent, silent
 from cvtgs.report import Level
 from cvtgs.streams import (
     StreamNode,
@@ -21,6 +21,8 @@ from cvtgs.streams import (
     write_sog_stream,
     write_tiles,
 )
+from cvtgs.streams.files import StreamPart
+from cvtgs.streams.sog import SogFormat
 from cvtgs.synthetic import scene as make
 
 RHOS = [1.0, 0.25, 0.05, 0.0125]
@@ -309,3 +311,15 @@ def test_a_large_environment_uses_a_coarser_level(
     assert plan.environment is not None
     assert 1 <= len(plan.environment) <= 100
     assert plan.counts[0] == 3000
+
+
+def test_a_level_without_far_gaussians_has_no_file(plan: StreamPlan, tmp_path: Path) -> None:
+    """A resumed run looks for the named files."""
+    some, none = torch.tensor([0]), torch.zeros(0, dtype=torch.int64)
+    far = (some, none, *(some for _ in plan.levels[2:]))
+    write = SogFormat().write_part
+    part = write(plan._replace(far=far), tmp_path, part=0, listener=silent)
+    assert part.far[:2] == (1, 0)
+    assert sorted(part.environments) == [0, *range(2, len(far))]
+    assert all((tmp_path / name).exists() for name in part.environments.values())
+    assert StreamPart.model_validate_json(part.model_dump_json()) == part

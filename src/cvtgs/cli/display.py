@@ -13,6 +13,11 @@ from cvtgs.errors import OutputError, reason_of
 from cvtgs.progress import ProgressEvent, ProgressListener, silent
 from cvtgs.text import counted, printable
 
+if TYPE_CHECKING:
+    from cvtgs.budget import Found
+    from cvtgs.config import SimplifyConfig
+    from cvtgs.report import SimplifyReport
+
 WIDTH = 80
 """Maximum columns of a line of output."""
 
@@ -118,12 +123,6 @@ def progress_bars(*, quiet: bool, transient: bool = False) -> Iterator[ProgressL
                 progress.update(bars[event.stage], description=text)
 
         yield listen
-
-
-if TYPE_CHECKING:
-    from cvtgs.budget import Found
-    from cvtgs.config import SimplifyConfig
-    from cvtgs.report import SimplifyReport
 
 
 def target_note(found: "Found", config: "SimplifyConfig", *, is_given: bool) -> str:

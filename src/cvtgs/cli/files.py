@@ -25,8 +25,10 @@ from cvtgs.errors import DroppedDataWarning, InvalidArgumentError
 from cvtgs.text import printable
 
 if TYPE_CHECKING:
+    from cvtgs.analysis import Effect
     from cvtgs.boxes import Box
     from cvtgs.edit import Motion
+    from cvtgs.info import SceneInfo
     from cvtgs.scene import GaussianScene
 
 _NUMBERS = {
@@ -158,11 +160,6 @@ def _numbers(name: str, text: str, count: int) -> list[float]:
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
         raise InvalidArgumentError(f"{name} must be {_NUMBERS[name]}, found {text!r}.")
     return numbers
-
-
-if TYPE_CHECKING:
-    from cvtgs.analysis import Effect
-    from cvtgs.info import SceneInfo
 
 
 def add_info(add_parser: AddParser) -> None:

@@ -114,7 +114,7 @@ class StreamJob:
         try:
             part = StreamPart.model_validate_json(self.part_path(block).read_bytes())
             sizes = [_bytes_of(self.folder / name, self.form.kind) for name in part.names]
-            if not all((self.folder / name).exists() for name in part.environments):
+            if not all((self.folder / name).exists() for name in part.environments.values()):
                 return None
         except (OSError, ValueError):
             return None

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+import pydantic
+
 from cvtgs.boxes import Corner
 from cvtgs.config.base import Record
 from cvtgs.errors import (
@@ -64,8 +66,8 @@ class StreamPart(Record):
             returns them.
         far: Number of Gaussians of each level that are in no chunk, the finest level first; empty
             if there are none.
-        environments: Files with them, for each level from the finest that can be the environment
-            to the coarsest.
+        environments: Files with them by level, from the finest that can be the environment to the
+            coarsest, without empty ones.
     """
 
     levels: tuple[StreamLevel, ...]
@@ -76,7 +78,7 @@ class StreamPart(Record):
     box_max: Corner
     dropped: dict[str, int]
     far: tuple[int, ...] = ()
-    environments: tuple[str, ...] = ()
+    environments: dict[int, str] = pydantic.Field(default_factory=dict)
 
 
 class StreamFormat(Protocol):

@@ -76,12 +76,12 @@ class SogFormat:
         )
         far = tuple(map(len, plan.far))
         environments = {
-            f".environment_{part}_{level}.ply": plan.far_scene(level)
+            level: f".environment_{part}_{level}.ply"
             for level in range(environment_level(far), len(far))
+            if far[level]
         }
-        for name, scene in environments.items():
-            if len(scene):
-                save(scene, folder / name, overwrite=True)
+        for level, name in environments.items():
+            save(plan.far_scene(level), folder / name, overwrite=True)
         return StreamPart(
             levels=levels,
             chunks=len(plan.chunks),
@@ -91,7 +91,7 @@ class SogFormat:
             box_max=plan.root.box_max,
             dropped=dropped,
             far=far,
-            environments=tuple(environments),
+            environments=environments,
         )
 
     def index(self, parts: Sequence[StreamPart], folder: Path) -> dict[str, Any]:
@@ -167,7 +167,7 @@ def _far_files(parts: Sequence[StreamPart]) -> list[str]:
     with_far = [part for part in parts if part.far]
     counts = [sum(level) for level in zip(*(part.far for part in with_far), strict=True)]
     level = environment_level(counts)
-    return [part.environments[level - len(counts)] for part in with_far if part.far[level]]
+    return [part.environments[level] for part in with_far if part.far[level]]
 
 
 def _write_sog(scene: GaussianScene, folder: Path) -> int:
