@@ -12,6 +12,7 @@ from viewer_pages import MOST, Pictured, Served, case, least_difference
 pytestmark = [needs_browser, pytest.mark.long]
 
 
+@pytest.mark.filterwarnings("ignore::cvtgs.errors.DroppedDataWarning")
 @pytest.mark.parametrize("blocks", [1, 4])
 @pytest.mark.parametrize(("page", "kind"), [case("playcanvas", "sog"), case("cesium", "3dtiles")])
 def test_streams_look_the_same_in_other_viewers(
