@@ -260,6 +260,10 @@ class Prepared:
             return checked, analysis
         valid = checked.scene
         is_whole = target >= len(valid)
+        if self._cameras is not None and self._config.uses_images and not is_whole:
+            from cvtgs.evaluation.scorer import check_seen  # noqa: PLC0415 (few give cameras)
+
+            check_seen(valid, self._cameras, name="the scene")
         with clock.stage("plan"):
             sees = self._net is not None and self._net.sees_surroundings
             analysis = analyze(valid, self._config, with_visibility=sees and not is_whole)

@@ -33,3 +33,17 @@ def test_a_photograph_of_two_cameras_is_an_error(tmp_path):
         (tmp_path / side).mkdir()
         (tmp_path / side / "1.png").write_bytes(content)
     assert load_photographs(tmp_path, rig).shape == (2, 36, 48, 3)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_grey_of_16_bits_is_that_of_8(suffix, tmp_path):
+    from PIL import Image  # noqa: PLC0415
+
+    values = np.arange(0, 256, dtype=np.uint8).reshape(16, 16)
+    one = cvtgs.Cameras(
+        viewmats=torch.eye(4)[None], Ks=torch.eye(3)[None], width=16, height=16, names=("a",)
+    )
+    Image.fromarray(values.astype(np.uint16) * 257).save(tmp_path / f"a{suffix}")
+    found = load_photographs(tmp_path, one)[0]
+    for channel in range(3):
+        assert (found[:, :, channel] * 255).round().byte().numpy().tolist() == values.tolist()

@@ -262,14 +262,15 @@ def test_the_pinhole_part_of_every_colmap_model_is_read(
 
 def test_zero_distortion_gives_no_warning(tmp_path) -> None:
     colmap_bin(tmp_path / "a", model="OPENCV", parameters=[50, 51, 31, 23, 0, 0, 0, 0])
-    document = {**transforms(), "k1": 0.0, "p2": 0, "camera_model": "OPENCV"}
+    document = {**transforms(), "k1": 0.0, "p2": 0, "camera_model": "OPENCV", "is_fisheye": False}
     write_json(tmp_path / "b" / "transforms.json", document)
     assert len(load_cameras(tmp_path / "a")) == len(load_cameras(tmp_path / "b"))
 
 
-def test_distortion_in_transforms_json_is_warned_about(tmp_path) -> None:
-    document = transforms()
-    document["frames"][2]["k1"] = 0.01
+@pytest.mark.parametrize("given", [{"k1": 0.01}, {"distortion_params": [0, 0.01, 0, 0, 0, 0]}])
+def test_distortion_in_transforms_json_is_warned_about(given, tmp_path) -> None:
+    document = {**transforms(), "distortion_params": [0.0] * 6}
+    document["frames"][2] |= given
     path = write_json(tmp_path / "transforms.json", document)
     with pytest.warns(DroppedDataWarning) as caught:
         load_cameras(path)

@@ -96,6 +96,18 @@ TRANSFORMS: Mapping[str, tuple[Callable[[Any], None], str]] = {
         " 'camera_model' must be one of PINHOLE, SIMPLE_PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, "
         "FULL_OPENCV, PERSPECTIVE, found 'OPENCV_FISHEYE'.",
     ),
+    "fisheye of instant-ngp": (
+        put("is_fisheye", value=True),
+        " 'is_fisheye' must be false, since rendering uses pinhole cameras, found True.",
+    ),
+    "fisheye of a frame": (
+        put("frames", 2, "is_fisheye", value=True),
+        " frame 2: 'is_fisheye' must be false, since rendering uses pinhole cameras, found True.",
+    ),
+    "text for distortion": (
+        put("distortion_params", value=[0.1, "x"]),
+        " 'distortion_params' must be a list of finite numbers, found [0.1, 'x'].",
+    ),
     "no frames": (put("frames", value=[]), " must hold at least one camera, found none."),
 }
 

@@ -53,6 +53,15 @@ def squared_error(scene, small, cameras):
     return float((images[0] - images[1]).square().mean())
 
 
+def test_cameras_that_miss_the_scene_are_refused(source, tmp_path):
+    cameras = ring(4)
+    away = cameras.viewmats.clone()
+    away[:, 0, 3] += 1e4  # the scene lies far to the right of every image
+    with pytest.raises(InvalidArgumentError, match="must see the scene, found nothing of it in"):
+        in_blocks(source, tmp_path / "a.ply", MATCHED, cameras=replace(cameras, viewmats=away))
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("settings", [MATCHED, REFINED])
 def test_given_cameras_decide_what_blocks_look_like(scene, source, tmp_path, settings):

@@ -1,6 +1,7 @@
 """Refinement as a whole: gains, unchanged parts, limits, progress and reports."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -189,6 +190,23 @@ def test_bad_arguments_are_refused(options, error, text):
     with pytest.raises(error) as caught:
         refine(full, full, **options)
     assert text in str(caught.value)
+
+
+def test_cameras_that_miss_the_scene_are_refused():
+    """As for scores: otherwise the scene would seem perfect, and nothing would be refined."""
+    full, cameras = full_scene(200), ring(4)
+    away = cameras.viewmats.clone()
+    away[:, 0, 3] += 1e4  # the scene lies far to the right of every image
+    elsewhere = replace(cameras, viewmats=away)
+    simplifier = cvtgs.Simplifier(config="matched", device="cpu")
+    for use in (
+        lambda: refine(full, full, steps=1, cameras=elsewhere),
+        lambda: simplifier.simplify(full, 0.1, cameras=elsewhere),
+    ):
+        with pytest.raises(InvalidArgumentError, match=r"must see .*, found nothing of it in any"):
+            use()
+    mixed = replace(cameras, viewmats=torch.cat([away[:2], cameras.viewmats[2:]]))
+    assert refine(full, full, steps=1, cameras=mixed).report.heldout == 1
 
 
 @pytest.mark.parametrize("which", ["simplified", "full"])

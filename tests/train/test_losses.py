@@ -10,6 +10,7 @@ import torch
 
 import cvtgs
 from cvtgs.evaluation import psnr
+from cvtgs.evaluation.scorer import MOST_PSNR
 from cvtgs.losses import image_loss
 from cvtgs.rendering import Rendering, render
 from cvtgs.scene import ANTIALIASED_TAG
@@ -265,6 +266,18 @@ def test_validation_psnr_is_that_of_the_images_over_grey():
         rendered = render(scene, views.cameras, background=grey).rgb
         assert found == pytest.approx(psnr(rendered, wanted).mean().item(), abs=0.02)
     assert abs(after - before) > 0.005
+
+
+def test_a_view_that_shows_nothing_leaves_the_gain_of_the_others():
+    def turn_one_away(viewmats: torch.Tensor, Ks: torch.Tensor) -> None:  # noqa: N803
+        viewmats[1] = torch.diag(viewmats.new_tensor([-1, 1, -1, 1])) @ viewmats[1]
+
+    case, views, net = some_case(), views_by(turn_one_away), lively_net(torch.float32)
+    assert views.alpha.flatten(1).any(dim=1).tolist() == [True, False]
+    before, after = validation_psnr(net, case, views)
+    alone = validation_psnr(net, case, views.select(0))
+    assert (before, after) == pytest.approx([(MOST_PSNR + one) / 2 for one in alone])
+    assert after != before
 
 
 @pytest.mark.slow

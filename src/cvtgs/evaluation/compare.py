@@ -17,6 +17,7 @@ from cvtgs.evaluation.scorer import (
     EvaluationSettings,
     ImageScores,
     SceneScores,
+    check_seen,
     chosen_metrics,
     render_view,
     scene_scores,
@@ -27,9 +28,6 @@ from cvtgs.text import shown
 
 STAGE = "evaluate"
 """Stage name in progress events; one step per image."""
-
-LEAST_COVER = 1e-4
-"""Mean alpha that one image must reach if all Gaussian centres are outside every image."""
 
 ROUNDING = 1e-3
 """Values of photographs may be outside [0, 1] by this much, as in half precision."""
@@ -266,11 +264,7 @@ def _score_images(
     against_full: dict[str, list[ImageScores]] = {name: [] for name in scenes}
     against_photographs: dict[str, list[ImageScores]] = {name: [] for name in scenes}
     total, done, backend = len(cameras) * len(scenes), 0, ""
-    if not (cameras.shows_any(reference.means) or _covers_any(reference, cameras, settings)):
-        raise InvalidArgumentError(
-            f"the cameras must see {reference_name}, found nothing of it in any of {len(cameras)} "
-            f"views; give cameras of this scene, in its axes and units."
-        )
+    check_seen(reference, cameras, name=reference_name, backend=settings.backend)
     listener(ProgressEvent(stage=STAGE, done=0, total=total))
     for view, camera in enumerate(cameras.singles()):
         truth: tuple[Tensor, Tensor] | None = None
@@ -309,9 +303,3 @@ def _score_images(
             if rows
         ),
     )
-
-
-def _covers_any(scene: GaussianScene, cameras: Cameras, settings: EvaluationSettings) -> bool:
-    """Return whether the mean alpha of any image reaches ``LEAST_COVER``."""
-    images = (render_view(scene, camera, backend=settings.backend) for camera in cameras.singles())
-    return any(float(image.alpha.mean()) >= LEAST_COVER for image in images)

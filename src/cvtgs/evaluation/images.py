@@ -112,7 +112,10 @@ def read_image(
     from PIL import Image  # noqa: PLC0415
 
     with _opened(path), Image.open(path) as file:
-        whole = file.convert("RGBA")
+        image: Image.Image = file
+        if file.mode.startswith("I"):  # grey of 16 bits, which convert would clip at 255
+            image = Image.fromarray((np.asarray(file) >> 8).clip(0, 255).astype(np.uint8))
+        whole = image.convert("RGBA")
     pixels = np.asarray(whole.resize(size, Image.Resampling.LANCZOS), dtype=np.float32) / 255
     alpha = pixels[:, :, 3:]
     colors = pixels[:, :, :3] * alpha + np.asarray(background, dtype=np.float32) * (1 - alpha)

@@ -31,6 +31,9 @@ BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 MOST_PSNR = 60.0
 """Upper limit of PSNR where scores are compared, dB: closer images count as equal."""
 
+LEAST_COVER = 1e-4
+"""Mean alpha that one image must reach if all Gaussian centres are outside every image."""
+
 
 class Score(Record):
     """One metric.
@@ -214,6 +217,20 @@ def render_view(
     """Render one view of a scene, without gradients."""
     found = render(scene, camera, backend=backend)
     return ViewImage(camera=camera, rgb=found.rgb, alpha=found.alpha, backend=found.backend)
+
+
+def check_seen(
+    scene: GaussianScene, cameras: Cameras, *, name: str, backend: BackendName = "auto"
+) -> None:
+    """Raise if no camera sees anything of a scene."""
+    if cameras.shows_any(scene.means):
+        return
+    images = (render_view(scene, camera, backend=backend) for camera in cameras.singles())
+    if not any(float(image.alpha.mean()) >= LEAST_COVER for image in images):
+        raise InvalidArgumentError(
+            f"the cameras must see {name}, found nothing of it in any of {len(cameras)} "
+            f"views; give cameras of this scene, in its axes and units."
+        )
 
 
 class ImageScores(NamedTuple):

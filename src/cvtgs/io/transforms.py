@@ -64,6 +64,9 @@ class _Intrinsics(Document):
     camera_model: _PinholeModel | None = Field(
         None, description=f"one of {', '.join(get_args(_PinholeModel))}"
     )
+    is_fisheye: Literal[False] | None = Field(
+        None, description="false, since rendering uses pinhole cameras"
+    )
     k1: Number | None = None
     k2: Number | None = None
     k3: Number | None = None
@@ -72,6 +75,9 @@ class _Intrinsics(Document):
     k6: Number | None = None
     p1: Number | None = None
     p2: Number | None = None
+    distortion_params: tuple[Number, ...] | None = Field(
+        None, description="a list of finite numbers"
+    )
 
 
 class _Frame(_Intrinsics):
@@ -182,6 +188,7 @@ def _lens(frame: _Frame, document: _Transforms, *, path: Path, where: str) -> Le
             f"in the frame or at the top level of the file, found none."
         )
     distortions = (_either(getattr(frame, key), getattr(document, key)) for key in _DISTORTIONS)
+    listed = _either(frame.distortion_params, document.distortion_params) or ()
     return Lens(
         fx=fx,
         fy=fy,
@@ -189,7 +196,7 @@ def _lens(frame: _Frame, document: _Transforms, *, path: Path, where: str) -> Le
         cy=_either(frame.cy, _either(document.cy, height / 2)),
         width=width,
         height=height,
-        distorted=any(distortions),
+        distorted=any(distortions) or any(listed),
     )
 
 

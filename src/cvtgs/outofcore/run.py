@@ -17,6 +17,7 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.counts import shared_out, shortfall, target_count
 from cvtgs.devices import HOST, on_host, one_thread
 from cvtgs.errors import ConfigError, DroppedDataWarning
+from cvtgs.evaluation.scorer import check_seen
 from cvtgs.grouping import finer_count
 from cvtgs.io import atomic_output, check_save, load, save
 from cvtgs.io.axes import SCENE_AXES, checked_axes
@@ -147,7 +148,9 @@ def simplify_file(  # noqa: PLR0913 (options by name)
     room = memory or memory_to_plan(available_memory())
     if simplifier.config.uses_images:
         room -= IMAGE_BYTES
-        if cameras is None and source_axes is None:
+        if cameras is not None:
+            check_seen(_sampled(rows), cameras, name="the scene")
+        elif source_axes is None:
             own = find_own_cameras(_sampled(rows), source)
             cameras = None if own is None else own.cameras
     merging = finer_count(target, rows.count, simplifier.config.allocation)

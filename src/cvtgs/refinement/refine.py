@@ -9,7 +9,7 @@ from cvtgs.clock import StageClock
 from cvtgs.config import RefineConfig
 from cvtgs.devices import chosen_device, without_autocast
 from cvtgs.errors import InvalidArgumentError, InvalidSceneError
-from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer
+from cvtgs.evaluation.scorer import BLACK, MOST_PSNR, WHITE, Metrics, Scorer, check_seen
 from cvtgs.progress import ProgressListener, silent
 from cvtgs.refinement.images import ImageBuffer, generated_views, shared_views, split_views
 from cvtgs.refinement.optimize import STAGE, Limits, check_limits, learning_rate_scales, optimize
@@ -85,8 +85,8 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         The scene and the report.
 
     Raises:
-        InvalidArgumentError: Seconds or steps are not positive, there is only one camera, or
-            ``frozen`` is out of range.
+        InvalidArgumentError: Seconds or steps are not positive, there is only one camera, no
+            camera sees the full scene, or ``frozen`` is out of range.
         InvalidSceneError: A scene has no valid row.
         DeviceError: There is no such device.
 
@@ -111,7 +111,9 @@ def refine(  # noqa: PLR0913 (all but the scenes are options by name)
         )
     place = chosen_device(device, small.device)
     ours, theirs = _on_device(small, full, place)
-    cameras = None if cameras is None else checked_cameras(cameras).in_both_modes()
+    if cameras is not None:
+        cameras = checked_cameras(cameras).in_both_modes()
+        check_seen(theirs, cameras, name="the full scene")
     limits, clock = Limits(seconds, steps=steps), StageClock(listener, place)
     # The program may have disabled gradients, or be in inference mode or autocast.
     with (

@@ -15,6 +15,7 @@ from cvtgs.cameras import Cameras
 from cvtgs.cells import Partition
 from cvtgs.devices import chunk_length
 from cvtgs.evaluation import psnr
+from cvtgs.evaluation.scorer import MOST_PSNR
 from cvtgs.losses import image_loss, relative_loss
 from cvtgs.math import parameters, spherical_harmonics
 from cvtgs.math.segments import segment_ids, true_rows
@@ -213,15 +214,18 @@ def view_loss(
 
 @torch.no_grad()
 def validation_psnr(net: Net, case: Case, views: TargetViews) -> tuple[float, float]:
-    """Return the mean PSNR over grey without and with the network, in decibels."""
+    """Return the mean PSNR over grey without and with the network, in decibels.
+
+    A view counts at most ``MOST_PSNR``: an empty one has infinite PSNR, and no gain could be told.
+    """
     merged = case.reference.merged
     grey = merged.means.new_full((3,), 0.5)
     target = views.over(grey)
     before, after = (
-        float(psnr(render(scene, views.cameras, background=grey).rgb, target).mean())
+        psnr(render(scene, views.cameras, background=grey).rgb, target).clamp(max=MOST_PSNR)
         for scene in (merged, case.seen_by(views.cameras).correct_by(net))
     )
-    return before, after
+    return float(before.mean()), float(after.mean())
 
 
 def _residual_penalty(residuals: Residuals, config: LossConfig) -> Float[Tensor, ""]:
