@@ -197,6 +197,11 @@ def test_extras_are_not_shared_with_the_caller():
         ("SplatRenderMode: mip", True),
         ("splatrendermode: MIP", True),
         ("SplatRenderMode: rgb", False),
+        ("antialiased 1", True),  # of Postshot
+        ("Antialiased  1 ", True),
+        ("antialiased 0", False),
+        ("antialiased 10", False),
+        ("not antialiased 1", False),
     ],
 )
 def test_antialiased_tag(comment, tagged):

@@ -157,7 +157,7 @@ def check_levels(
 ) -> None:
     """Check that levels can be written, before any long computation."""
     for name in names:
-        if name.endswith(".usda"):  # the only write-only format
+        if name.lower().endswith(".usda"):  # the only write-only format
             raise InvalidArgumentError(
                 "levels need a format that cvtgs can also read, found '.usda'; write them as "
                 ".ply and convert those files."

@@ -1,6 +1,7 @@
 """GaussianScene: the Gaussians of a scene in stored (not activated) parameters."""
 
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -21,13 +22,12 @@ from cvtgs.text import shown
 
 ANTIALIASED_TAG = "SplatRenderMode: mip"
 """The comment of scenes that were trained with anti-aliasing (Mip-Splatting)."""
-
+ANTIALIASED_TAGS = re.compile(rf"(?im){ANTIALIASED_TAG}|^\s*antialiased\s+1\s*$")
+"""Matches this comment, which Brush also writes, and that of Postshot."""
 FLAT_LOG_SCALE = -20.0
 """Third log-scale of Gaussians with two scales (2DGS): two billionths of a scene unit."""
-
 NORMALS = ("nx", "ny", "nz")
 """Extra columns that are a direction. 3DGS writes zeros, which are not read."""
-
 _CHUNK = 1 << 16
 _NOT_INDEXABLE = (torch.uint16, torch.uint32, torch.uint64)  # torch cannot select their rows
 _TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
@@ -159,7 +159,7 @@ class GaussianScene:
     @property
     def antialiased(self) -> bool:
         """Whether the scene was trained with anti-aliasing and must be rendered with it."""
-        return ANTIALIASED_TAG.lower() in "\n".join(self.comments).lower()
+        return any(map(ANTIALIASED_TAGS.search, self.comments))
 
     @property
     def has_two_scales(self) -> bool:

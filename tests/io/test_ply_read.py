@@ -3,6 +3,7 @@
 import io
 import random
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,10 +18,11 @@ from cvtgs.errors import (
     InputError,
     InputNotFoundError,
 )
-from cvtgs.io import load
+from cvtgs.io import load, save
 from cvtgs.io.ply import join_plys, open_rows, read
 from cvtgs.scene import FLAT_LOG_SCALE, GaussianScene
 from ply_files import CODES, gaussian_properties, gaussian_rows, ply_bytes, write_ply_file
+from scenes import random_scene
 
 PROPERTIES = gaussian_properties()
 ROWS = gaussian_rows(PROPERTIES, 3)
@@ -301,3 +303,11 @@ def test_files_with_different_columns_are_not_joined(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError) as caught:
         join_plys([first, second], io.BytesIO())
     assert str(caught.value) == f"{second}: must have the same columns as {first}."
+
+
+def test_the_tag_of_postshot_is_kept_in_other_formats(tmp_path: Path) -> None:
+    scene = replace(random_scene(20), comments=("antialiased 1",))
+    save(scene, tmp_path / "a.ply")
+    for suffix in (".spz", ".sog", ".glb", ".compressed.ply"):
+        save(load(tmp_path / "a.ply"), tmp_path / f"b{suffix}")
+        assert load(tmp_path / f"b{suffix}").antialiased

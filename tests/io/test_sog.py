@@ -167,6 +167,27 @@ def test_the_codebook_keeps_few_values_exactly(values: np.ndarray) -> None:
     assert np.array_equal(codes[labels], values)
 
 
+@pytest.mark.parametrize("outlier", [30.0, 1e4, 1e10, -1e18, 3e38])
+def test_an_outlier_does_not_coarsen_other_values(outlier: float) -> None:
+    values = np.random.default_rng(0).normal(size=5000).astype(np.float32)
+    wanted = codebook(values)
+    values[0] = outlier
+    codes, labels = codebook(values)
+    near = np.square((codes[labels] - values)[1:]).mean()
+    assert near < 1.2 * np.square((wanted.codes[wanted.labels] - values)[1:]).mean()
+    assert codes[labels[0]] == np.float32(outlier)
+
+
+@pytest.mark.parametrize("outlier", [1e10, 1e25])
+def test_an_outlier_does_not_coarsen_a_palette(outlier: float) -> None:
+    rows = np.random.default_rng(0).normal(size=(3000, 9)).astype(np.float32)
+    wanted = palette(rows)
+    rows[0] = outlier
+    entries, labels = palette(rows)
+    near = np.square((entries[labels] - rows)[1:]).mean()
+    assert near < 1.2 * np.square((wanted.entries[wanted.labels] - rows)[1:]).mean()
+
+
 def test_the_palette_represents_many_rows() -> None:
     rng = np.random.default_rng(0)
     centres = rng.normal(size=(16, 9))

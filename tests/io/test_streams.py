@@ -193,6 +193,27 @@ class Cut(io.RawIOBase):
         raise EOFError("the stream ended too early")
 
 
+class Narrow(io.RawIOBase):
+    """Takes a few bytes at a time, as sockets with a timeout can, up to a number of them."""
+
+    def __init__(self, room: int) -> None:
+        self.taken, self.room = bytearray(), room
+
+    def write(self, data: bytes) -> int | None:  # type: ignore[override]
+        part = bytes(data[: min(1000, self.room - len(self.taken))])
+        self.taken += part
+        return len(part) or None
+
+
+def test_raw_streams_get_all_bytes_or_an_error() -> None:
+    scene, wanted, narrow = storable_scene(500), io.BytesIO(), Narrow(1 << 20)
+    cvtgs.save(scene, wanted)
+    cvtgs.save(scene, narrow)
+    assert bytes(narrow.taken) == wanted.getvalue()
+    with pytest.raises(OutputError, match="takes no more bytes without blocking"):
+        cvtgs.save(scene, Narrow(5000))
+
+
 def test_streams_that_break_and_closed_ones_are_refused() -> None:
     with pytest.raises(InputError, match="the Cut: must be readable to its end, found: the stream"):
         cvtgs.load(Cut())

@@ -96,9 +96,12 @@ def test_invalid_rows_are_left_out_with_a_warning(tmp_path: Path) -> None:
     assert not (tmp_path / "b.usda").exists()
 
 
-def test_levels_are_not_written_to_usd(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("suffix", [".usda", ".USDA"])
+def test_levels_are_not_written_to_usd(
+    suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     save(storable_scene(50, degree=0), tmp_path / "a.ply")
-    words = ["levels", str(tmp_path / "a.ply"), "-o", str(tmp_path / "out"), "--suffix", ".usda"]
+    words = ["levels", str(tmp_path / "a.ply"), "-o", str(tmp_path / "out"), "--suffix", suffix]
     assert main(words) == 1
     assert "levels need a format that cvtgs can also read, found '.usda'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

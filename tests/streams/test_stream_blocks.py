@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import torch
 from cvtgs import GaussianScene, Simplifier, concatenate, load, save
 from cvtgs.errors import DroppedDataWarning, InvalidArgumentError, OutputExistsError
 from cvtgs.outofcore import LocalWorkers
-from cvtgs.streams import stream_file
+from cvtgs.streams import plan_stream, stream_file, write_sog_stream
 from cvtgs.synthetic import scene as make
 
 RHOS = [1.0, 0.25, 0.05, 0.0125]
@@ -249,3 +250,26 @@ def test_blocks_share_one_environment(tmp_path: Path, monkeypatch: pytest.Monkey
     assert 2500 < report.levels[0].gaussians <= 3000
     assert len(load(tmp_path / "out")) == 3200
     assert sorted(path.name for path in (tmp_path / "out").glob("[.e]*")) == ["environment"]
+
+
+@pytest.mark.parametrize("blocks", [None, 3])
+def test_all_files_are_in_a_mounted_folder(
+    tmp_path: Path, source: Path, scene: GaussianScene, blocks: int | None, monkeypatch: Any
+) -> None:
+    """Nothing can be moved there from beside it, nor can the folder be replaced."""
+    out, moved, real = tmp_path / "out", [], Path.replace
+    out.mkdir()
+    monkeypatch.setattr(os.path, "ismount", lambda path: Path(path) == out)
+    monkeypatch.setattr(Path, "replace", lambda own, to: moved.append(own) or real(own, to))
+    monkeypatch.setattr(Path, "rmdir", lambda own: pytest.fail(f"removed {own}"))
+    for overwrite in (False, True):
+        if blocks:
+            stream(source, out, blocks=blocks, overwrite=overwrite)
+        else:
+            plan = plan_stream(FAST.levels(scene, RHOS), chunk_gaussians=300)
+            write_sog_stream(plan, out, overwrite=overwrite)
+        assert [len(load(out, lod=lod)) for lod in range(4)] == COUNTS
+        assert not [name for name in names_in(out) if name.startswith(".")]
+    assert moved
+    assert all(path.is_relative_to(out) for path in moved)
+    assert names_in(tmp_path) == ["out", "scene.ply"]

@@ -15,7 +15,7 @@ from cvtgs.losses import SSIM_WINDOW
 from cvtgs.math.frames import RobustFrame, robust_frame
 from cvtgs.math.parameters import divide
 from cvtgs.rendering import ObservedViews, contributions, observe
-from cvtgs.scene import ANTIALIASED_TAG, FLAT_LOG_SCALE, GaussianScene
+from cvtgs.scene import ANTIALIASED_TAGS, FLAT_LOG_SCALE, GaussianScene
 from cvtgs.views import mixed_views
 
 MIN_OPACITY = 1e-6
@@ -301,7 +301,8 @@ def drop_mip_tag(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
         >>> from cvtgs.config import SimplifyConfig
         >>> from cvtgs.analysis import plan_effects
         >>> from cvtgs.synthetic import scene as make
-        >>> scene = replace(make("object", 10, sh_degree=0, seed=0), comments=(ANTIALIASED_TAG,))
+        >>> scene = make("object", 10, sh_degree=0, seed=0)
+        >>> scene = replace(scene, comments=("SplatRenderMode: mip",))
         >>> config = SimplifyConfig(effects=EffectsConfig(mip="off"))
         >>> plan = plan_effects(scene, scene.masses, distances=torch.ones(10), config=config)
         >>> scene.antialiased, drop_mip_tag(scene, plan).antialiased
@@ -309,8 +310,9 @@ def drop_mip_tag(scene: GaussianScene, plan: EffectPlan) -> GaussianScene:
     """
     if plan.mip.active or not scene.antialiased:
         return scene
-    tag = ANTIALIASED_TAG.lower()
-    return replace(scene, comments=tuple(c for c in scene.comments if tag not in c.lower()))
+    return replace(
+        scene, comments=tuple(c for c in scene.comments if not ANTIALIASED_TAGS.search(c))
+    )
 
 
 def restore_columns(small: GaussianScene, scene: GaussianScene, plan: EffectPlan) -> GaussianScene:

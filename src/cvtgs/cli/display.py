@@ -1,6 +1,5 @@
 """Texts that several commands print: sizes, times, progress bars, and notes about a run."""
 
-import shutil
 import sys
 import textwrap
 from collections.abc import Iterator
@@ -45,8 +44,10 @@ def flush_output() -> None:
 
 def send_file(path: Path) -> None:
     """Write the bytes of a file to stdout."""
+    from cvtgs.io.streams import copy_to
+
     with path.open("rb") as file, _console_errors(sys.stdout):
-        shutil.copyfileobj(file, sys.stdout.buffer)
+        copy_to(sys.stdout.buffer, file)
         sys.stdout.buffer.flush()
 
 

@@ -64,11 +64,21 @@ def folder_lock(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def lock_path(path: str | os.PathLike[str]) -> Path:
-    """Return the lock file of an output: beside it, or in it if its parent is not writable."""
+    """Return the lock file of an output, a hidden path."""
+    return hidden_path(path, "lock")
+
+
+def hidden_path(path: str | os.PathLike[str], ending: str) -> Path:
+    """Return a hidden path that belongs to an output: beside it, or in it if need be.
+
+    That is so for a folder whose parent is not writable or on another disk (a mounted folder, such
+    as a volume of Docker), so that files can be moved from this path to the folder.
+    """
     target = Path(os.path.realpath(path))
-    if is_folder(target) and not os.access(target.parent, os.W_OK | os.X_OK):
-        return target / ".lock"
-    return target.with_name(f".{target.name}.lock")
+    is_apart = os.path.ismount(target) or not os.access(target.parent, os.W_OK | os.X_OK)
+    if is_folder(target) and is_apart:
+        return target / f".{ending}"
+    return target.with_name(f".{target.name}.{ending}")
 
 
 def _signature() -> str:

@@ -1,8 +1,8 @@
 """Open binary files as input and output: pipes, sockets, zip members, bytes in memory."""
 
+import io
 import os
 import re
-import shutil
 import threading
 import warnings
 import zipfile
@@ -153,12 +153,23 @@ def written_to(stream: ByteSink) -> Iterator[BinaryIO]:
         yield cast(BinaryIO, file)
         file.seek(0)
         try:
-            shutil.copyfileobj(file, stream)
+            copy_to(stream, cast(BinaryIO, file))
             getattr(stream, "flush", lambda: None)()
         except (OSError, TypeError, ValueError) as error:  # ValueError: it is closed
             raise OutputError(
                 f"{name_of(stream)}: must be open for writing in binary mode, found: {error}."
             ) from error
+
+
+def copy_to(stream: ByteSink, file: BinaryIO) -> None:
+    """Write the rest of a file to a stream; raw ones may take only some of the bytes at once."""
+    while chunk := file.read(CHUNK_BYTES):
+        count = stream.write(chunk)
+        while isinstance(stream, io.RawIOBase) and count != len(chunk):
+            if not isinstance(count, int) or count < 1:
+                raise BlockingIOError("it takes no more bytes without blocking")
+            chunk = chunk[count:]
+            count = stream.write(chunk)
 
 
 def format_of(path: Path) -> str | None:

@@ -19,6 +19,7 @@ from cvtgs.config import SimplifyConfig
 from cvtgs.errors import CvtgsError, OutputError, reason_of
 from cvtgs.io import atomic_output
 from cvtgs.io.axes import SCENE_AXES
+from cvtgs.io.locks import hidden_path
 from cvtgs.io.ply import PlyRows, open_rows
 from cvtgs.io.tensors import map_tensors
 from cvtgs.mergenet import Checkpoint, Net, load_checkpoint, save_checkpoint
@@ -341,12 +342,11 @@ class Job:
 
 
 def job_folder(output: str | os.PathLike[str], key: str) -> str:
-    """Return the folder of a job: named by its key, in a hidden folder beside the output.
+    """Return the folder of a job: named by its key, in a hidden folder beside the output, or in it.
 
     A worker that still writes for another job of this output therefore cannot write to it.
     """
-    target = Path(os.path.realpath(output))
-    return str(target.with_name(f".{target.name}.blocks") / key[:16])
+    return str(hidden_path(output, "blocks") / key[:16])
 
 
 def _listed(cameras: Cameras) -> list[object]:

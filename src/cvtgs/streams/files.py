@@ -25,6 +25,7 @@ from cvtgs.errors import (
 from cvtgs.io import atomic_output, check_output
 from cvtgs.io.atomic import make_folder
 from cvtgs.io.limits import phrases
+from cvtgs.io.locks import hidden_path
 from cvtgs.progress import ProgressListener
 from cvtgs.streams.plan import StreamPlan, join_boxes
 
@@ -208,10 +209,7 @@ def check_stream(folder: str | os.PathLike[str], kind: str, *, overwrite: bool =
 @contextmanager
 def _hidden_folder(place: Path) -> Iterator[Path]:
     """Make a temporary hidden folder beside the output folder, or in it if need be."""
-    target = Path(os.path.realpath(place))
-    hidden = target.with_name(f".{target.name}.stream")
-    if target.is_dir() and not os.access(target.parent, os.W_OK | os.X_OK):
-        hidden = target / ".stream"
+    hidden = hidden_path(place, "stream")
     shutil.rmtree(hidden, ignore_errors=True)
     make_folder(hidden, parents=False)
     try:

@@ -35,6 +35,11 @@ CODES = 256
 PALETTE = 1 << 16
 _ITERATIONS = 30
 _KNOTS = 4096
+_WIDEST_GAP = 1 / 64
+"""Largest share of the first codes that lie between two neighbouring knots, such as a value and an
+outlier."""
+_LARGEST_SHIFTED = 1e15
+"""Values this far from the median are not told apart in a palette, so that squares stay finite."""
 _RELATIVE_ROUNDING = 1e-5
 """Variances below this share of the mean square may be rounding errors of float32."""
 
@@ -183,19 +188,20 @@ def codebook(values: Float[np.ndarray, "*n"]) -> Codebook:
 
     This is one-dimensional k-means (Lloyd 1982) on the sorted values. The density of the initial
     codes follows the cube root of that of the values (Panter and Dite 1951). Up to 256 distinct
-    values are kept. Memory: three copies of the values in float64.
+    values are kept. A few outliers do not coarsen the others. Memory: two copies of the values in
+    float64.
     """
     ordered = np.sort(values, axis=None).astype(np.float64)
-    sums = np.concatenate([[0.0], np.cumsum(ordered)])
     codes = _first_codes(ordered)
     for _ in range(_ITERATIONS):
         inner = np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2)
-        bounds = np.concatenate([[0], inner, [len(ordered)]])
-        counts = np.diff(bounds)
-        means = np.diff(sums[bounds]) / np.maximum(counts, 1)
-        codes = np.sort(np.where(counts > 0, means, codes))
+        starts = np.concatenate([[0], inner])
+        counts = np.diff(starts, append=len(ordered))
+        # not differences of running sums, in which an outlier would absorb the others
+        sums = np.add.reduceat(ordered, np.minimum(starts, len(ordered) - 1))
+        codes = np.sort(np.where(counts > 0, sums / np.maximum(counts, 1), codes))
     codes = codes.astype(np.float32)
-    labels = np.searchsorted((codes[1:] + codes[:-1]) / 2, values).astype(np.uint8)
+    labels = np.searchsorted(codes[1:] / 2 + codes[:-1] / 2, values).astype(np.uint8)
     return Codebook(codes, labels)
 
 
@@ -206,7 +212,11 @@ def _first_codes(ordered: Float[np.ndarray, "n"]) -> Float[np.ndarray, "256"]:
         return np.pad(few, (0, CODES - len(few)), "edge")
     count = min(len(ordered), _KNOTS)
     knots = ordered[np.linspace(0, len(ordered) - 1, count).round().astype(np.int64)]
-    passed = np.concatenate([[0.0], np.cumsum(np.diff(knots) ** (2 / 3))])
+    steps = np.diff(knots) ** (2 / 3)
+    usual = float(np.sort(steps)[: -max(1, len(steps) // 100)].sum())
+    if usual > 0:
+        steps = np.minimum(steps, _WIDEST_GAP * usual)
+    passed = np.concatenate([[0.0], np.cumsum(steps)])
     codes: Float[np.ndarray, 256] = np.interp(np.linspace(0, passed[-1], CODES), passed, knots)
     return codes
 
@@ -238,8 +248,11 @@ def palette(rows: Float[np.ndarray, "n d"], most: int | None = None) -> Palette:
     most = palette_size(len(rows)) if most is None else most
     if len(rows) <= most:
         return Palette(rows, np.arange(len(rows)))
-    middle = rows.mean(axis=0)  # centred, so that squares lose no digits
-    shifted = torch.from_numpy(rows - middle)
+    some = rows[:: 1 + len(rows) // _KNOTS]
+    middle = np.median(some, axis=0)  # centred, so that squares lose no digits
+    with np.errstate(over="ignore"):
+        away = np.clip(rows - middle, -_LARGEST_SHIFTED, _LARGEST_SHIFTED)
+    shifted = torch.from_numpy(away)
     squares = shifted.square()
     order, starts = (
         torch.arange(len(rows), device="cpu"),
